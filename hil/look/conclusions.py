@@ -81,11 +81,12 @@ def concluded(
     if error > _OTHER_ARM:
         raise _other_arm(source, error)
     changed = _changed(look)
-    contradictions = Contradictions.of(cell, cell.model, samples, score, error)
-    if not changed:
-        imported = _of_this_arm(imported, source, contradictions)
-    if look.questions:
-        raise undecided(source, look.questions[0], contradictions)
+    if look.questions or not changed:
+        contradictions = Contradictions.of(cell, cell.model, samples, score, error)
+        if not changed:
+            imported = _of_this_arm(imported, source, contradictions)
+        if look.questions:
+            raise undecided(source, look.questions[0], contradictions)
     if look.map_text != imported.map_text or look.gravity is not None:
         again = _again(imported, source, robot_of, look, use)
         if (few := _few_rows(again.archive)) is not None:

@@ -80,11 +80,20 @@ def _with_torque(
     delay, low_pass = _channel(finding.axes.read(recording), finding.readings.model)
     channel = physics.channel_rows(delay, low_pass)
     groups = physics.determined(finding.readings)
-    return _look_of(finding, (*rows, *finding.rows(groups), *channel), groups)
+    rows = [*rows, *finding.rows(groups), *channel]
+    score = finding.readings.score
+    contradictions = Contradictions.of(
+        cell, finding.readings.model, finding.readings.samples, score, score.overall
+    )
+    if contradictions.is_doubtful:
+        rows.append(contradictions.row)
+    return _look_of(finding, rows, groups)
 
 
 def look_at_joints(source: Path, imported: ImportedRecording) -> Look:
     """Return what the torque of an imported recording says of its joints, and no more.
+
+    Whether the arm is another one is left to the caller.
 
     Raises:
         SourceError: the recording cannot be used.
@@ -105,13 +114,6 @@ def _finding(
 
 
 def _look_of(finding: physics.Finding, rows: Sequence[Row], groups: tuple[Group, ...]) -> Look:
-    readings = finding.readings
-    score = readings.score
-    contradictions = Contradictions.of(
-        finding.cell, readings.model, readings.samples, score, score.overall
-    )
-    if contradictions.is_doubtful:
-        rows = (*rows, contradictions.row)
     text = finding.map_text
     if text is not None:
         text = with_entries(text, finding.entries())

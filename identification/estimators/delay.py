@@ -381,13 +381,14 @@ class _Blocks:
     @cached_property
     def gram(self) -> Array:
         """The same with one delay of all joints (B, p + r + 2, p + r + 2)."""
-        width = self.by_joint.shape[-1]
-        together = np.eye(width)
-        together[:, self.delay] = 0.0
-        delays = np.arange(self.delay, self.delay + self.joints)
-        together[delays, self.delay] = 1.0
-        together = np.delete(together, delays[1:], axis=1)
-        return np.asarray(together.T @ self.by_joint @ together)
+        delays = slice(self.delay, self.delay + self.joints)
+        gram = self.by_joint
+        for axis in (1, 2):
+            gram = gram.swapaxes(1, axis)
+            together = gram[:, delays].sum(axis=1, keepdims=True)
+            parts = gram[:, : self.delay], together, gram[:, delays.stop :]
+            gram = np.concatenate(parts, axis=1).swapaxes(1, axis)
+        return gram
 
     def solution(self) -> Solution:
         """Solve by least squares."""

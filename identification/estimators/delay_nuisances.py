@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 from identification.arrays import Array
 from identification.estimators.prior import LOAD_SHARE
 from identification.estimators.torque_scale import DATA_SHEET
+from identification.model.motion import Motion
 from identification.model.robot import RobotModel
 from identification.signals.samples import Samples
 
@@ -57,12 +58,15 @@ def nuisances(model: RobotModel, samples: Samples, values: Array) -> Nuisances:
     torque = samples_before.predicted_torque(model, values)
     zeros = _of_zeros(model, samples_before, values, torque)
     torque = torque + samples_before.known_torque(model)
+    friction = samples_before.predicted_torque(model, values, model.friction_columns)
+    load = None if model.friction.has_load else model.gear_torque(values, samples.motion)
     columns = []
     places = []
     names = [f"zero {name}" for name in model.joint_names]
     for joint, name in enumerate(model.joint_names):
         own = {"scale": DATA_SHEET * torque[:, joint]}
-        own |= dict(_of_friction(model, samples_before, values, joint))
+        transmitted = None if load is None else load[:, joint]
+        own |= dict(_of_friction(samples.motion, joint, friction[:, joint], transmitted))
         table = np.column_stack([ZERO * zeros[:, :, joint].T, *own.values()])
         columns.append(samples.as_measured(joint, table))
         places.append(np.concatenate([np.arange(n), len(names) + np.arange(len(own))]))
@@ -83,13 +87,14 @@ def _of_zeros(model: RobotModel, samples: Samples, values: Array, torque: Array)
 
 
 def _of_friction(
-    model: RobotModel, samples: Samples, values: Array, joint: int
+    motion: Motion, joint: int, friction: Array, load: Array | None
 ) -> Iterator[tuple[str, Array]]:
-    """Yield names and columns (m,) of changing and unmodelled friction of a joint."""
-    motion = samples.motion
+    """Yield names and columns (m,) of changing and unmodelled friction of a joint.
+
+    By its friction (m,) and, if the law of friction has none, the load of its gears (m,).
+    """
     speed = np.abs(motion.velocity[:, joint])
     sign = np.sign(motion.velocity[:, joint])
-    friction = samples.predicted_torque(model, values, model.friction_columns)[:, joint]
     size = float(np.sqrt(np.mean(friction**2)))
     phase = np.pi * (motion.time - motion.time[0]) / max(np.ptp(motion.time), _TINY)
     for k in range(1, _CHANGES + 1):
@@ -98,6 +103,5 @@ def _of_friction(
         yield f"friction below {slow:g}", STATIC * size * sign * np.exp(-((speed / slow) ** 2))
     relative = speed / max(float(speed.max(initial=0.0)), _TINY)
     yield "quadratic friction", CURVATURE * size * sign * relative**2
-    if not model.friction.has_load:
-        load = np.abs(model.gear_torque(values, motion)[:, joint])
-        yield "friction over load", LOAD_SHARE * load * sign
+    if load is not None:
+        yield "friction over load", LOAD_SHARE * np.abs(load) * sign

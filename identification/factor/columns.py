@@ -159,17 +159,26 @@ def _friction_columns(
     return [samples.as_measured(j, column.T).T for j, column in enumerate(columns)]
 
 
-def every_torque_factor(model: RobotModel, samples: Samples) -> Factor:
-    """Reduce the usable rows of a recording to [W | y_1 ... y_n], whatever its torques are of.
+def every_torque_factor(model: RobotModel, motions: Sequence[Samples]) -> Factor:
+    """Reduce usable rows to [W | y_1 ... y_n], whatever the n torques are of, one block a motion.
 
-    :func:`of_torques` gives the factor of one order and signs of the n torques.
+    The motions are without a low-pass of the torque.
     """
     n = model.n_joints
     p = model.n_parameters
+    index = np.repeat(np.arange(len(motions)), [len(samples.torque) for samples in motions])
+    samples = replace(
+        motions[0],
+        motion=Motion.joined([samples.motion for samples in motions]),
+        torque=np.concatenate([samples.torque for samples in motions]),
+        usable=np.concatenate([samples.usable for samples in motions]),
+        segments=(),
+        mask=None,
+    )
     every = samples.torque.T
     chunks = (
         (
-            np.zeros(part.stop - part.start, dtype=np.intp),
+            index[part],
             [
                 np.concatenate(
                     [block[:-1], np.where(samples.usable[part, joint], every[:, part], 0.0)]
@@ -183,32 +192,7 @@ def every_torque_factor(model: RobotModel, samples: Samples) -> Factor:
         np.append(joint_columns, np.arange(p, p + n - 1)) for joint_columns in model.plan.columns
     )
     names = (*model.parameter_names, *(f"torque {joint}" for joint in range(1, n)))
-    counts = np.count_nonzero(samples.usable, axis=0)[None]
-    return Factor.of_rows(chunks, counts, columns, names)
-
-
-def of_torques(factor: Factor, order: NDArray[np.intp], sign: Array) -> Factor:
-    """Return the part [W | y] of an :func:`every_torque_factor`.
-
-    The torque of joint j is recorded in place ``order[j]`` of n, with the sign ``sign[j]``.
-    """
-    n = factor.n_joints
-    matrices = []
-    for joint, gram in enumerate(factor.matrices):
-        width = gram.shape[1] - n
-        places = np.append(np.arange(width), width + order[joint])
-        part = gram[:, places[:, None], places]
-        part[:, -1] *= sign[joint]
-        part[:, :, -1] *= sign[joint]
-        matrices.append(part)
-    return replace(
-        factor,
-        matrices=tuple(matrices),
-        columns=tuple(
-            joint_columns[: 1 - n] if n > 1 else joint_columns for joint_columns in factor.columns
-        ),
-        parameter_names=factor.parameter_names[: len(factor.parameter_names) + 1 - n],
-    )
+    return Factor.of_rows(chunks, count_by_block(index, samples.usable), columns, names)
 
 
 def standard_factor(model: RobotModel, recordings: Sequence[Samples]) -> Factor:

@@ -46,6 +46,8 @@ _COARSEST: Final = 4  # fine blocks in a block of a long recording
 _MANY_BLOCKS: Final = 400  # from which on they are longer: a covariance needs some tens
 
 QR_CONDITION: Final = 1e5
+SMALLEST_NOISE: Final = 1e-6
+"""Smallest noise that Gram matrices resolve, as a share of the torque's RMS."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -183,7 +185,7 @@ class Factor:
     @property
     def smallest_noise(self) -> float:
         """Smallest noise as a share of the torque's RMS, for joints that fit exactly."""
-        return 1e-12 if self.storage == "qr" else 1e-6
+        return 1e-12 if self.storage == "qr" else SMALLEST_NOISE
 
     @property
     def smallest_variance(self) -> Array:

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from functools import cached_property
+from functools import cached_property, lru_cache
 from types import MappingProxyType
-from typing import Any, Final
+from typing import Any, Final, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -450,6 +450,40 @@ def _base_parameters(
     friction: JointFriction,
     elements: JointElements,
 ) -> BaseParameters:
+    bodies = _base_of_bodies(_Geometry(chain, gravity), layout)
+    base = _without_carried_rotors(layout, friction, bodies)
+    _require_separate_elements(friction, elements, bodies.rows[:, base.pivots], bodies.position)
+    return base
+
+
+class _Geometry:
+    """A chain under a gravity, equal to those with the same joints, whatever their links weigh."""
+
+    def __init__(self, chain: Chain, gravity: Array) -> None:
+        self.chain = chain
+        self.gravity = gravity
+        parts = (chain.parents, chain.rotation, chain.translation, chain.axis, chain.revolute)
+        self._content = tuple(part.tobytes() for part in (*parts, gravity))
+
+    def __eq__(self, other: object) -> bool:
+        return isinstance(other, _Geometry) and self._content == other._content
+
+    def __hash__(self) -> int:
+        return hash(self._content)
+
+
+class _BaseOfBodies(NamedTuple):
+    """Base parameters of bodies and rotors, with what they were found by."""
+
+    base: BaseParameters
+    rows: Array  # regressor of standard parameters (m n, s) at random states
+    position: Array  # of these states (m, n)
+    constant: NDArray[np.bool_]  # joints (n,) of which they make any constant torque
+
+
+@lru_cache(maxsize=32)  # one arm has models of several mountings, and of drives and friction
+def _base_of_bodies(geometry: _Geometry, layout: StandardLayout) -> _BaseOfBodies:
+    chain, gravity = geometry.chain, geometry.gravity
     everything = np.arange(layout.size, dtype=np.intp)
     random = np.random.default_rng(_SEED)
     shape = (_N_STATES, chain.n_joints)
@@ -460,13 +494,17 @@ def _base_parameters(
     plan = _plan(chain, gravity, layout, everything, None)
     rows = plan.evaluate(states).dense(layout.size).reshape(-1, layout.size)
     base = select_base(rows, layout.names, layout.units)
-    base = _without_carried_rotors(layout, friction, rows, base)
-    _require_separate_elements(friction, elements, rows[:, base.pivots], q)
-    return base
+    left = share_left(_offsets(rows, chain.n_joints), rows[:, base.pivots])
+    return _BaseOfBodies(base, rows, q, left <= TOLERANCE)
+
+
+def _offsets(rows: Array, joints: int) -> Array:
+    """Return the columns of constant torques of the joints in rows of a regressor (m n, n)."""
+    return np.tile(np.eye(joints), (len(rows) // joints, 1))
 
 
 def _without_carried_rotors(
-    layout: StandardLayout, friction: JointFriction, rows: Array, base: BaseParameters
+    layout: StandardLayout, friction: JointFriction, bodies: _BaseOfBodies
 ) -> BaseParameters:
     """Return the base parameters with each offset of friction independent of them.
 
@@ -474,13 +512,12 @@ def _without_carried_rotors(
     carried mass M and the offset are one constant force. Such a rotor inertia I is lumped into the
     mass, M + I, and the offset is the rest of the force, fo - g I: both can have any value then.
     """
-    n = friction.n_joints
-    offsets = np.tile(np.eye(n), (len(rows) // n, 1))
-    left = share_left(offsets, rows[:, base.pivots])
     with_offset = [OFFSET.symbol in law.symbols for law in friction.laws]
-    joints = np.flatnonzero((left <= TOLERANCE) & np.array(with_offset))
+    joints = np.flatnonzero(bodies.constant & np.array(with_offset))
     if not joints.size:
-        return base
+        return bodies.base
+    rows = bodies.rows
+    offsets = _offsets(rows, friction.n_joints)
     rotors = [layout.names.index(f"I{joint + 1}m") for joint in joints]
     regressor = rows.copy()
     regressor[:, rotors] = 0.0
@@ -499,6 +536,8 @@ def _require_separate_elements(
     friction: JointFriction, elements: JointElements, columns: Array, q: Array
 ) -> None:
     """Check that the columns of elements are independent of all others."""
+    if not elements.identified:
+        return
     m, n = q.shape
     offsets = [j for j, law in enumerate(friction.laws) if OFFSET.symbol in law.symbols]
     columns = np.column_stack([columns, np.tile(np.eye(n)[:, offsets], (m, 1))])

@@ -14,9 +14,9 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import cache
+from functools import cache, lru_cache
 from math import comb, factorial
-from typing import Final
+from typing import Final, NamedTuple
 
 import numpy as np
 import scipy
@@ -187,7 +187,7 @@ def fit_smoothing_spline(
     """
     for samples_per_knot in (4, 2, 1):
         problem = _Problem.of(time, values, samples_per_knot * float(np.median(np.diff(time))))
-        fine = problem.spacing <= _KNOT_OF_CUTOFF / (2.0 * np.pi * widest)
+        fine = problem.design.spacing <= _KNOT_OF_CUTOFF / (2.0 * np.pi * widest)
         # Without the squares of all samples, which are the largest array of a long recording.
         squares = np.einsum("mc,mc->c", problem.closest_residual, problem.closest_residual)
         if fine or np.all(squares / len(time) <= tolerance):
@@ -198,8 +198,9 @@ def fit_smoothing_spline(
     coefficients = problem.closest.copy()
     for channel, penalty in enumerate(penalties.tolist()):
         coefficients[:, channel] += problem.correction(channel, penalty)
-    bandwidth = (problem.density / penalties) ** (1 / 6) / (2.0 * np.pi * problem.spacing)
-    return SmoothingSpline(float(time[0]), problem.spacing, coefficients, bandwidth)
+    spacing = problem.design.spacing
+    bandwidth = (problem.design.density / penalties) ** (1 / 6) / (2.0 * np.pi * spacing)
+    return SmoothingSpline(float(time[0]), spacing, coefficients, bandwidth)
 
 
 def low_pass(time: Array, values: Array, bandwidth: float) -> Array:
@@ -207,18 +208,41 @@ def low_pass(time: Array, values: Array, bandwidth: float) -> Array:
     step = float(np.median(np.diff(time)))
     problem = _Problem.of(time, values, max(step, _KNOT_OF_CUTOFF / (2.0 * np.pi * bandwidth)))
     correction = problem.correction(slice(None), problem.penalty_at(bandwidth))
-    return np.asarray(problem.rows @ (problem.closest + correction))
+    return np.asarray(problem.design.rows @ (problem.closest + correction))
+
+
+class _Design(NamedTuple):
+    """Normal equations of a spline, which the times alone determine, in knot units."""
+
+    spacing: float  # [s]
+    density: float  # samples per knot interval
+    rows: scipy.sparse.csr_array  # (m, k) values of the basis at the samples
+    transposed: scipy.sparse.csc_array  # (k, m)
+    gram: Array  # (6, k) lower band of rows' rows
+    penalty: Array  # (6, k) lower band of the roughness
+    lightest: Array  # (6, k) factor with the lightest penalty
+
+
+@lru_cache(maxsize=2)  # torques and columns of one recording are filtered one after the other
+def _design(times: bytes, spacing: float) -> _Design:
+    """Return the design for times (m,) as float64, with about this knot spacing [s]."""
+    time = np.frombuffer(times)
+    span = float(time[-1] - time[0])
+    intervals = max(1, round(span / spacing))
+    spacing = span / intervals
+    density = len(time) / intervals
+    rows = _rows(float(time[0]), spacing, intervals, time)
+    gram = _gram_band(rows)
+    penalty = _penalty_band(intervals)
+    lightest = _banded_factor(gram + _LIGHTEST * density * penalty)
+    return _Design(spacing, density, rows, rows.T, gram, penalty, lightest)
 
 
 @dataclass(frozen=True, eq=False)
 class _Problem:
     """Normal equations of samples in knot units, and their least smoothed solution."""
 
-    spacing: float  # [s]
-    density: float  # samples per knot interval
-    rows: scipy.sparse.csr_array  # (m, k) values of the basis at the samples
-    gram: Array  # (6, k) lower band of rows' rows
-    penalty: Array  # (6, k) lower band of the roughness
+    design: _Design
     closest: Array  # (k, c) coefficients with the lightest penalty
     closest_residual: Array  # (m, c)
     roughness: Array  # (k, c) penalty matrix times closest
@@ -226,22 +250,15 @@ class _Problem:
     @classmethod
     def of(cls, time: Array, values: Array, spacing: float) -> _Problem:
         """Set up the problem with about this knot spacing [s]."""
-        span = float(time[-1] - time[0])
-        intervals = max(1, round(span / spacing))
-        spacing = span / intervals
-        density = len(time) / intervals
-        rows = _rows(float(time[0]), spacing, intervals, time)
-        gram = _gram_band(rows)
-        penalty = _penalty_band(intervals)
-        lightest = _LIGHTEST * density
-        factor = _banded_factor(gram + lightest * penalty)
-        closest = _banded_solution(factor, rows.T @ values)
-        residual = rows @ closest
+        design = _design(time.tobytes(), spacing)
+        closest = _banded_solution(design.lightest, design.transposed @ values)
+        residual = design.rows @ closest
         np.subtract(values, residual, out=residual)
-        refined = rows.T @ residual - lightest * _roughness(closest)
-        closest += _banded_solution(factor, refined)
-        np.subtract(values, rows @ closest, out=residual)
-        return cls(spacing, density, rows, gram, penalty, closest, residual, _roughness(closest))
+        light = _LIGHTEST * design.density
+        refined = design.transposed @ residual - light * _roughness(closest)
+        closest += _banded_solution(design.lightest, refined)
+        np.subtract(values, design.rows @ closest, out=residual)
+        return cls(design, closest, residual, _roughness(closest))
 
     def correction(self, channel: int | slice, penalty: float) -> Array:
         """Return the change of coefficients from the least smoothed ones."""
@@ -249,15 +266,16 @@ class _Problem:
 
     def _corrected(self, penalty: float, roughness: Array) -> tuple[Array, Array]:
         """Return the factor (6, k) of the normal equations, and the change of coefficients."""
-        factor = _banded_factor(self.gram + penalty * self.penalty)
-        change = penalty - _LIGHTEST * self.density
+        design = self.design
+        factor = _banded_factor(design.gram + penalty * design.penalty)
+        change = penalty - _LIGHTEST * design.density
         return factor, _banded_solution(factor, -change * roughness)
 
     def penalty_at(self, bandwidth: float) -> float:
         """Return the penalty of a bandwidth [Hz], within the limits of the knots."""
-        cutoff = 2.0 * np.pi * bandwidth * self.spacing  # rad per knot
+        cutoff = 2.0 * np.pi * bandwidth * self.design.spacing  # rad per knot
         share = np.clip(1.0 / max(cutoff, 1e-3) ** 6, _LIGHTEST, _HEAVIEST)
-        return float(self.density * share)
+        return float(self.design.density * share)
 
     def penalty_for(self, channel: int, tolerance: float, widest: float) -> float:
         """Return the penalty at which a channel's mean squared residual equals the tolerance.
@@ -298,7 +316,7 @@ class _Problem:
         `roughness` (k,) that of its coefficients.
         """
         factor, correction = self._corrected(penalty, roughness)
-        residual = closest - self.rows @ correction
+        residual = closest - self.design.rows @ correction
         variance = max(float(np.mean(residual**2)), np.finfo(np.float64).tiny)
         bending = roughness + _roughness(correction)
         sensitivity = float(bending @ _banded_solution(factor, bending))
@@ -499,19 +517,21 @@ def _filtered_without_phase(columns: Array, cycles: float, order: int) -> Array:
     after = (length - count) // 2
     before = length - count - after
     ratio = np.tan(np.pi * np.arange(length // 2 + 1) / length) / math.tan(np.pi * cycles)
-    gain = (1.0 / (1.0 + ratio ** (2 * order)))[:, None]
-    share = np.linspace(0.0, 1.0, count)[:, None]
+    gain = 1.0 / (1.0 + ratio ** (2 * order))
+    share = np.linspace(0.0, 1.0, count)
     filtered = np.empty_like(columns)
     for first in range(0, columns.shape[1], _AT_ONCE):
-        part = columns[:, first : first + _AT_ONCE]
-        line = part[0] + share * (part[-1] - part[0])
-        extended = np.empty((length, part.shape[1]))
-        extended[:count] = part - line
-        extended[count : count + after] = -extended[count - 1 - after : count - 1][::-1]
-        extended[count + after :] = -extended[1 : before + 1][::-1]
-        spectrum = gain * np.fft.rfft(extended, axis=0)
-        line += np.fft.irfft(spectrum, length, axis=0)[:count]
-        filtered[:, first : first + _AT_ONCE] = line
+        # Transforms of rows take three quarters of the time.
+        part = columns[:, first : first + _AT_ONCE].T
+        line = part[:, :1] + share * (part[:, -1:] - part[:, :1])
+        extended = np.empty((len(part), length))
+        extended[:, :count] = part - line
+        extended[:, count : count + after] = -extended[:, count - 1 - after : count - 1][:, ::-1]
+        extended[:, count + after :] = -extended[:, 1 : before + 1][:, ::-1]
+        spectrum = np.fft.rfft(extended, axis=1)
+        spectrum *= gain
+        line += np.fft.irfft(spectrum, length, axis=1)[:, :count]
+        filtered[:, first : first + _AT_ONCE] = line.T
     return filtered
 
 

@@ -33,7 +33,7 @@ Meaning = Literal[
 DEGREE: Final = np.pi / 180.0
 SIGNS: Final[tuple[Meaning, ...]] = ("torque sign", "position sign", "axis sign")
 IN_ORDER: Final[tuple[Meaning, ...]] = ("torque order", "position order", "joint order")
-_GRAVITIES: Final[tuple[Meaning, ...]] = ("mounting", "no gravity")
+GRAVITIES: Final[tuple[Meaning, ...]] = ("mounting", "no gravity")
 
 
 class Change(NamedTuple):
@@ -74,7 +74,7 @@ def mounted_model(
     model: RobotModel, change: Change, mountings: Mapping[str, RobotModel]
 ) -> RobotModel:
     """Return the model with the gravity of a change, by the name of its mounting."""
-    return mountings[change.name] if change.meaning in _GRAVITIES else model
+    return mountings[change.name] if change.meaning in GRAVITIES else model
 
 
 def changed_samples(model: RobotModel, samples: Samples, change: Change) -> Samples:
@@ -82,7 +82,7 @@ def changed_samples(model: RobotModel, samples: Samples, change: Change) -> Samp
     meaning = change.meaning
     joints = change.joints
     motion = samples.motion
-    if meaning in _GRAVITIES:
+    if meaning in GRAVITIES:
         return samples
     if meaning.endswith("order"):
         return _reordered(model, samples, change)

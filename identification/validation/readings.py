@@ -17,15 +17,16 @@ from typing import Final
 
 import numpy as np
 
-from identification.estimators.prior import body_prior, posterior_values
-from identification.factor.columns import every_torque_factor, of_torques
-from identification.factor.factor import Factor
+from identification.estimators.prior import TorqueSums, body_priors
+from identification.factor.columns import every_torque_factor
+from identification.factor.factor import SMALLEST_NOISE, Factor
 from identification.model.robot import RobotModel
 from identification.signals.samples import Samples
 from identification.validation.faults import COUPLED, coupled_pairs
 from identification.validation.finding import little_torque
 from identification.validation.reading_changes import (
     DEGREE,
+    GRAVITIES,
     IN_ORDER,
     SIGNS,
     Axes,
@@ -71,6 +72,7 @@ _IMPROVES: Final = 0.98  # error ratio of one exchange from which a whole order 
 _ORDERS: Final = 2  # best orders of each kind that are compared
 _CLOSER: Final = 12  # changes of least error on fewer rows, which are compared
 _MOST_STEPS: Final = 6
+_AT_ONCE: Final = 24  # fits, so that their sums stay in the processor's cache
 _ZEROS: Final = (-135.0, -90.0, -45.0, -20.0, 20.0, 45.0, 90.0, 135.0, 180.0)  # deg
 _NEARER: Final = (-0.5, -0.25, 0.25, 0.5)  # of a zero, tried about it
 
@@ -331,7 +333,7 @@ class _Search:
         """Return the changes of least error, tried on all rows."""
         if self._trials is None:
             fits = _Fits(self.model, _thinned(self.samples, _FEWER_ROWS), self._mountings)
-            errors = {change: fits.error(change) for change in self._changes()}
+            errors = fits.errors(list(self._changes()))
             ranked = sorted(errors, key=lambda change: errors[change])
             closer = ranked[:_CLOSER]
             kinds = {kind_of(change) for change in closer}
@@ -397,35 +399,70 @@ class _Fits:
         self._mountings = mountings
         torque = np.sqrt(np.square(samples.torque).sum(axis=0))
         self._counts = ~little_torque(torque, ~np.array(model.chain.revolute))
-        self._sums: dict[Change, Factor] = {}  # by the change of the motion
+        self._sums: dict[Change, Factor] = {}  # of every torque, by the change of the motion
 
-    def error(self, change: Change) -> float:
-        """Return the logarithm of the squared error of a fit, summed over the torques.
+    def errors(self, changes: Sequence[Change]) -> dict[Change, float]:
+        """Return logarithms of the squared errors of fits, each summed over the torques.
 
         Small ones are aside: a fit makes their share as small as it likes.
         """
-        model = mounted_model(self.model, change, self._mountings)
-        motion = change_of_motion(change)
-        if motion not in self._sums:
-            moved = changed_samples(self.model, self._samples, motion)
-            self._sums[motion] = every_torque_factor(model, moved)
-        axes = Axes.of([change], self.model.n_joints)
-        sums = self._sums[motion]
-        factor = of_torques(sums, axes.torque_order, axes.torque_sign)
-        prior = body_prior(model, factor).gaussian
-        squares = factor.squared_errors(posterior_values(factor, prior, ROWS_PER_FACT)[0])
-        squares = squares[self._counts[axes.torque_order]]
-        return float(np.log(np.where(squares > 0.0, squares, 1.0)).sum())
+        errors: dict[Change, float] = {}
+        by_gravity: dict[str | None, list[Change]] = {}
+        for change in changes:
+            gravity = change.name if change.meaning in GRAVITIES else None
+            by_gravity.setdefault(gravity, []).append(change)
+        for alike in by_gravity.values():
+            model = mounted_model(self.model, alike[0], self._mountings)
+            for first in range(0, len(alike), _AT_ONCE):
+                errors.update(self._errors(model, alike[first : first + _AT_ONCE]))
+        return errors
+
+    def _errors(self, model: RobotModel, changes: Sequence[Change]) -> dict[Change, float]:
+        """Return the errors of changes under one gravity."""
+        motions = [change_of_motion(change) for change in changes]
+        if new := list(dict.fromkeys(motion for motion in motions if motion not in self._sums)):
+            moved = [changed_samples(self.model, self._samples, motion) for motion in new]
+            factor = every_torque_factor(model, moved)
+            for block, motion in enumerate(new):
+                self._sums[motion] = factor.blocks(slice(block, block + 1))
+        axes = [Axes.of([change], self.model.n_joints) for change in changes]
+        sums = of_torques([self._sums[motion] for motion in motions], axes)
+        priors = body_priors(model, sums)
+        errors = {}
+        for change, each, read, mean, information in zip(
+            changes, sums.each(), axes, *priors, strict=True
+        ):
+            values, _ = each.posterior(mean, ROWS_PER_FACT * information, SMALLEST_NOISE)
+            squares = each.squared_errors(values)[self._counts[read.torque_order]]
+            errors[change] = float(np.log(np.where(squares > 0.0, squares, 1.0)).sum())
+        return errors
+
+
+def of_torques(every: Sequence[Factor], axes: Sequence[Axes]) -> TorqueSums:
+    """Return the sums of [W | y], y as axes read it, by those of every torque."""
+    n = every[0].n_joints
+    p = every[0].n_parameters + 1 - n
+    gram = np.zeros((len(every), n, p + 1, p + 1))
+    for factor, read, parts in zip(every, axes, gram, strict=True):
+        for joint, (part, (matrix,)) in enumerate(zip(parts, factor.matrices, strict=True)):
+            width = len(matrix) - n
+            columns = factor.columns[joint][:width]
+            torque = width + read.torque_order[joint]
+            part[columns[:, None], columns] = matrix[:width, :width]
+            part[columns, p] = part[p, columns] = read.torque_sign[joint] * matrix[torque, :width]
+            part[p, p] = matrix[torque, torque]
+    return TorqueSums(gram, np.array([factor.samples for factor in every]))
 
 
 def _best_orders(fits: _Fits, kind: Meaning, starts: int) -> list[tuple[int, ...]]:
     """Return the orders of least error on few rows."""
     errors: dict[tuple[int, ...], float] = {}
 
-    def error(order: tuple[int, ...]) -> float:
-        if order not in errors:
-            errors[order] = fits.error(order_change(kind, order))
-        return errors[order]
+    def best_of(orders: Sequence[tuple[int, ...]]) -> tuple[int, ...]:
+        new = {order: order_change(kind, order) for order in orders if order not in errors}
+        found = fits.errors(list(dict.fromkeys(new.values())))
+        errors.update((order, found[change]) for order, change in new.items())
+        return min(orders, key=errors.__getitem__)
 
     n = fits.model.n_joints
     rng = np.random.default_rng(0)
@@ -434,12 +471,12 @@ def _best_orders(fits: _Fits, kind: Meaning, starts: int) -> list[tuple[int, ...
         order = tuple(range(n)) if start == 0 else tuple(rng.permutation(n).tolist())
         while True:
             others = [_exchanged(order, pair) for pair in combinations(range(n), 2)]
-            best = min(others, key=error)
-            if error(best) >= error(order):
+            best = best_of([order, *others])
+            if best == order:
                 break
             order = best
         reached.append(order)
-        if reached.count(min(reached, key=error)) > 1:
+        if reached.count(best_of(reached)) > 1:
             break
     return sorted(errors, key=lambda order: errors[order])[:_ORDERS]
 

@@ -10,10 +10,18 @@ import pytest
 from numpy.typing import NDArray
 
 from identification import Recording, RobotModel
+from identification.estimators.prior import TorqueSums, body_prior, body_priors
+from identification.factor.columns import every_torque_factor
+from identification.factor.factor import Factor
 from identification.model.motion import Motion
 from identification.signals.samples import Preprocessing, prepare
-from identification.validation.reading_changes import Change
-from identification.validation.readings import Step, find_readings
+from identification.validation.reading_changes import (
+    Axes,
+    Change,
+    change_of_motion,
+    changed_samples,
+)
+from identification.validation.readings import Step, find_readings, of_torques
 
 Floats = NDArray[np.float64]
 NAMES = ("hip", "knee", "ankle")
@@ -119,3 +127,36 @@ def test_one_joint_whose_friction_alone_speaks_is_not_sure() -> None:
     assert not step.sure
     assert replace(step, ratio=0.5).sure
     assert replace(step, change=Change("torque sign", (0, 1, 2))).sure
+
+
+CHANGES = [
+    Change("torque order", (0, 1, 2), order=(1, 2, 0)),
+    Change("torque sign", (0, 2)),
+    Change("joint order", (0, 1)),
+    Change("position order", (1, 2)),
+    Change("axis sign", (1,)),
+]
+
+
+def test_sums_of_every_torque_are_those_of_each_reading() -> None:
+    robot = model()
+    q, torque, _ = motion()
+    recording = Recording(TIME, q, NAMES, torque)
+    samples = prepare(recording, robot, options=Preprocessing(14.0)).thinned(3)
+    moved = [changed_samples(robot, samples, change_of_motion(change)) for change in CHANGES]
+    every = every_torque_factor(robot, moved)
+    blocks = [every.blocks(slice(k, k + 1)) for k in range(len(CHANGES))]
+    sums = of_torques(blocks, [Axes.of([change], 3) for change in CHANGES])
+    priors = body_priors(robot, sums)
+    for change, gram, rows, mean, information in zip(CHANGES, *sums, *priors, strict=True):
+        factor = Factor.of(robot, changed_samples(robot, samples, change))
+        np.testing.assert_array_equal(rows, factor.samples)
+        np.testing.assert_allclose(gram, factor.gram, rtol=1e-9, atol=1e-9 * factor.gram.max())
+        prior = body_prior(robot, factor).gaussian
+        np.testing.assert_allclose(mean, prior.mean, rtol=1e-9, atol=1e-12)
+        size = np.sqrt(prior.information.diagonal())
+        scaled = (information - prior.information) / np.outer(size, size)
+        np.testing.assert_allclose(scaled, 0.0, atol=1e-8)
+        of_factor = TorqueSums.of(factor).posterior(prior.mean, prior.information, 1e-6)
+        alone = TorqueSums(gram, rows).posterior(mean, information, 1e-6)
+        np.testing.assert_allclose(alone[1], of_factor[1], rtol=1e-6)

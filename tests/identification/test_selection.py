@@ -819,6 +819,16 @@ class TestLowPassShape:
         # Reflected points stay; a reflection is cut where 1e-6 of the response is left.
         assert filtered[[0, -1]] == pytest.approx(columns[[0, -1]], abs=1e-6 * size)
 
+    @pytest.mark.parametrize("order", [1, 2, 3, 4])
+    @pytest.mark.parametrize("bandwidth", [0.2, 4.0, 60.0])
+    def test_forwards_it_is_the_filter_of_scipy_from_rest(self, order, bandwidth):
+        time = np.arange(600) / RATE
+        columns = np.cumsum(np.random.default_rng(2).standard_normal((600, 3)), axis=0)
+        sections = butter(order, bandwidth, fs=RATE, output="sos")
+        expected = columns[0] + sosfilt(sections, columns - columns[0], axis=0)
+        filtered = low_passed(time, columns, bandwidth, LowPassShape(order, causal=True))
+        np.testing.assert_allclose(filtered, expected, rtol=0.0, atol=1e-9)
+
     @pytest.mark.parametrize("shape", WITHOUT_PHASE[1:], ids=str)
     def test_both_ways_leaves_a_line_as_it_is(self, shape):
         time = np.arange(500) / RATE
