@@ -35,7 +35,7 @@ BANNED: Final = {
 }
 _STATES: Final = {"q", "qd", "qdd"}
 _WITHOUT_MOTION: Final = ("planner", "drivers", "sim_fixtures")  # they may not import it
-_WITHOUT_ALIAS: Final = ("hil",)  # with an alias in each module
+_ALIASES: Final = {f"{package}.arrays" for package in PACKAGES} | {"hil.base.arrays"}
 _LONG: Final = 60  # Lines of a function, characters of a test's name
 
 
@@ -175,7 +175,7 @@ class Sources:
         return [
             f"{name}:{node.lineno}"
             for name, nodes in self.nodes.items()
-            if (package := name.split(".")[0]) not in _WITHOUT_ALIAS and name != f"{package}.arrays"
+            if name not in _ALIASES
             for node in nodes
             if isinstance(node, ast.Name) and isinstance(node.ctx, ast.Store) and node.id == "Array"
         ]

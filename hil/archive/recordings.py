@@ -11,10 +11,9 @@ from numpy.typing import NDArray
 
 from hil.archive import Archive, open_archive
 from hil.archive.header import REPLIES_LOST
+from hil.base.arrays import Array
 from hil.base.errors import ArchiveError
 from identification.signals.recording import Recording, unwrapped
-
-Array = NDArray[np.float64]
 
 _ALWAYS = ("cycle", "gap", "position")
 _CHANNELS = {

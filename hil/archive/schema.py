@@ -29,9 +29,8 @@ from hil.archive.cdr import (
     fixed_layout,
     joint_state_layout,
 )
+from hil.base.arrays import Array
 from hil.base.safe_input import parse_json
-
-Array = NDArray[np.float64]
 
 PROFILE = "ros2"
 LIBRARY = "hil"  # without version: the same recording gives the same bytes

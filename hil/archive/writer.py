@@ -46,11 +46,10 @@ from hil.archive.schema import (
     sample_messages,
 )
 from hil.archive.schema import DESCRIPTION as DESCRIPTION_TOPIC
+from hil.base.arrays import Array
 from hil.base.errors import ArchiveWriteError
 from hil.base.files import sync_folder
 from hil.base.terminal_text import with_joint_names
-
-Array = NDArray[np.float64]
 
 FLUSH_PERIOD = 0.1  # s of the controller's time in one chunk; a crash loses at most that
 _SAMPLES_PER_CHUNK: Final = 1000

@@ -11,6 +11,7 @@ from typing import Final, Literal
 import numpy as np
 from numpy.typing import NDArray
 
+from hil.base.arrays import Array
 from hil.cell import Cell
 from hil.pipeline.estimating import posterior_of
 from hil.pipeline.estimators import fit_of
@@ -38,8 +39,6 @@ from .reduction import (
     reduce_archives,
     settings_digest,
 )
-
-Array = NDArray[np.float64]
 
 Level = Literal["repetition", "campaign", "pooled"]
 BatchEstimator = Literal["auto", "wls", "consistent"]

@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hil.archive import Archive
+from hil.base.arrays import Array
 from hil.base.errors import ArchiveError
 from hil.base.files import json_digest
 from hil.pipeline.prepared import known_parameters, reduction_of, versions_of
@@ -30,7 +31,6 @@ from .cache import Arrays, CacheLocation, code_digest
 from .cluster import SkippedArchive, reason_of
 from .discovery import ArchiveRef, cell_in, open_ref
 
-Array = NDArray[np.float64]
 Term = TypeVar("Term", Factor, Reduction)
 
 

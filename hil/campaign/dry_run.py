@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from hil.archive import open_archive
 from hil.archive.recorded_campaign import load_record
+from hil.base.arrays import Array
 from hil.base.errors import ArchiveError
 from identification.model.motion import Motion
 
@@ -21,7 +22,6 @@ from .errors import AgainstGravityError, DryRunError
 from .folder import CampaignFolder, save_record
 from .state import CampaignState
 
-Array = NDArray[np.float64]
 DryRunState = Literal["accepted", "to be accepted", "left out"]
 
 SIMULATED: Final = "simulated"

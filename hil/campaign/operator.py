@@ -7,16 +7,11 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Any, Final, Protocol
 
-import numpy as np
-from numpy.typing import NDArray
-
 from hil.archive.header import KIND_NAMES
 from hil.control.motion_watch import MotionProgress, OperatorRequest, Stop
 
 if TYPE_CHECKING:
     from .dry_run import DryRunRecord
-
-Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True, eq=False)

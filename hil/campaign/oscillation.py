@@ -6,9 +6,8 @@ from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
-from numpy.typing import NDArray
 
-Array = NDArray[np.float64]
+from hil.base.arrays import Array
 
 SMOOTHED: Final = 0.05
 """Moving mean that is subtracted from the following error, s. It leaves what oscillates within it:

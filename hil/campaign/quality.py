@@ -14,13 +14,13 @@ from pathlib import Path
 from typing import Final
 
 import numpy as np
-from numpy.typing import NDArray
 
 from drivers.events import MotionStarted
 from drivers.exchange.serving import ARM_MOVED
 from hil.archive import Archive, ArchiveHeader, ArchiveName, open_archive
 from hil.archive.header import REJECTED
 from hil.archive.repair import amend_outcome
+from hil.base.arrays import Array
 from hil.base.errors import ArchiveError
 from hil.cell import Cell
 from hil.control.motions import CampaignMotion
@@ -30,8 +30,6 @@ from identification.text import percentage
 from planner import FourierSeries, PiecewiseCubic
 
 from .folder import CampaignFolder
-
-Array = NDArray[np.float64]
 
 _SENT: Final = ("commanded_position", "commanded_velocity")
 FIELDS: Final = ("cycle", "gap", "position", "target_current", *_SENT)

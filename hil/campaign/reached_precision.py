@@ -15,8 +15,8 @@ from pathlib import Path
 from typing import Final, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
+from hil.base.arrays import Array
 from hil.base.errors import InputError
 from hil.base.progress import Reporter, Silent
 from hil.base.safe_input import path_exists
@@ -48,8 +48,6 @@ from identification.signals.samples import Samples
 
 from .precision_record import IN_A_ROW, Look, PrecisionRecord, Reached
 from .state import CampaignState
-
-Array = NDArray[np.float64]
 
 _REFERENCE_PERIOD: Final = 0.04  # s
 

@@ -5,8 +5,6 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Final, Literal, Self
 
-import numpy as np
-from numpy.typing import NDArray
 from pydantic import StrictBool, model_validator
 
 from hil.archive.recorded_campaign import load_record
@@ -15,8 +13,6 @@ from hil.base.terminal_text import typed
 from hil.results.results import Frozen
 
 from .folder import CampaignFolder
-
-Array = NDArray[np.float64]
 
 FORMAT_VERSION: Final = 1
 AS_MODELLED: Final = "as modelled"

@@ -7,9 +7,9 @@ from pathlib import Path
 from typing import Final
 
 import numpy as np
-from numpy.typing import NDArray
 
 from hil.archive import open_archive
+from hil.base.arrays import Array
 from hil.base.errors import InputError
 from hil.base.progress import Reporter
 from hil.cell import Cell
@@ -27,8 +27,6 @@ from .folder import CampaignFolder
 from .oscillation import growing_oscillation
 from .rehearsal import EFFECTS, Criterion
 from .twin import Twin
-
-Array = NDArray[np.float64]
 
 MOST_SIGMA: Final = 4.0
 """Largest deviation of an estimate from the simulated value, in standard deviations."""

@@ -11,11 +11,9 @@ from contextlib import suppress
 from dataclasses import dataclass
 from typing import Protocol
 
-import numpy as np
-from numpy.typing import NDArray
-
 from hil.archive import ArchiveHeader, ArchiveSpec, open_archive
 from hil.archive.live import LiveView
+from hil.base.arrays import Array
 from hil.base.errors import ArchiveError
 from hil.base.progress import Reporter, Task
 from hil.base.safe_input import parse_json
@@ -35,8 +33,6 @@ from .folder import CampaignFolder
 from .operator import RunWatch
 from .quality import ArchiveReview, Problem
 from .state import CampaignState
-
-Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True)

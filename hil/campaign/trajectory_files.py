@@ -14,8 +14,9 @@ from pathlib import Path
 from typing import Final
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from hil.base.arrays import Array
 from hil.base.files import write_files
 from hil.base.version import software
 from hil.cell import Cell
@@ -24,8 +25,6 @@ from identification.text import percentage
 from planner import Trajectory, to_csv
 
 from .plan import CampaignPlan, plan_around
-
-Array = NDArray[np.float64]
 
 RATE: Final = 500.0  # Rate of the tables, Hz: the cycle of an e-Series controller
 ROS_RATE: Final = 100.0  # Rate of the points that a trajectory controller interpolates, Hz

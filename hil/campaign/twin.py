@@ -12,10 +12,10 @@ from typing import Any, Final
 
 import numpy as np
 import pinocchio
-from numpy.typing import NDArray
 
 from drivers.open_mode import MAX_TARGET_JUMP
 from drivers.transports.simulated import Delay, Duplicate, Fault, Lose, SimulatedTransport
+from hil.base.arrays import Array
 from hil.cell import Cell
 from hil.control.simulation import (
     controller_settings,
@@ -26,8 +26,6 @@ from hil.control.simulation import (
 from hil.control.virtual_link import VirtualLink
 from identification.text import percentage
 from sim_fixtures import ServoSettings, UnmodelledEffects
-
-Array = NDArray[np.float64]
 
 SPREAD: Final = 0.1  # Largest relative deviation of the simulated parameters from the nominal ones
 NOISE_SHARE: Final = 0.005  # Noise of the current, rms, as a share of the weakest motor's limit

@@ -17,18 +17,16 @@ from pathlib import Path
 from typing import Final, Literal, Self
 
 import numpy as np
-from numpy.typing import NDArray
 
 from hil.archive import open_archive
 from hil.archive.recorded_campaign import load_record
+from hil.base.arrays import Array
 from hil.cell import Cell
 from identification.model.motion import Motion
 from identification.text import percentage
 from planner import FourierSeries, PiecewiseCubic
 
 from .folder import save_record
-
-Array = NDArray[np.float64]
 
 DEFAULT_DRIFT: Final = 0.002
 """Change per motion below which a real arm is warm. Thirty repetitions then change friction by some

@@ -10,13 +10,13 @@ from pathlib import Path
 from typing import Any, Literal, TypeVar
 
 import numpy as np
-from numpy.typing import NDArray
 from pydantic import ValidationError
 
 from drivers.drive_train import DriveTrain
 from drivers.errors import DriverError
 from drivers.guard import GuardLimits
 from drivers.transports.base import TransportError, TransportSpec
+from hil.base.arrays import Array
 from hil.base.safe_input import parse_toml, read_text, remedy_for_missing
 from hil.base.terminal_text import typed
 from identification.model.robot import RobotModel
@@ -39,7 +39,6 @@ from .schema import (
 )
 from .text import urdf_limits, with_values
 
-Array = NDArray[np.float64]
 T = TypeVar("T")
 
 

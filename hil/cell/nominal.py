@@ -5,13 +5,11 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
+from hil.base.arrays import Array
 from identification.model.nominal_masses import without_masses
 
 from .cell import Cell
-
-Array = NDArray[np.float64]
 
 
 class Nominal(NamedTuple):

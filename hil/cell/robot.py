@@ -9,8 +9,8 @@ from pathlib import Path
 from typing import Final
 
 import numpy as np
-from numpy.typing import NDArray
 
+from hil.base.arrays import Array
 from identification.errors import ModelError
 from identification.model.coupling import Coupling
 from identification.model.elements import (
@@ -38,8 +38,6 @@ from .schema import (
     RobotTable,
     TorsionSpringTable,
 )
-
-Array = NDArray[np.float64]
 
 _GEARED: Final = 10.0  # turns of the motor per turn of the joint
 

@@ -8,11 +8,11 @@ from typing import Any, Final, NamedTuple
 
 import numpy as np
 import tomlkit
-from numpy.typing import NDArray
 from tomlkit.exceptions import TOMLKitError
 from tomlkit.items import Array as List
 from tomlkit.items import Item, Table
 
+from hil.base.arrays import Array
 from hil.base.errors import InputError
 from hil.base.safe_input import parse_toml
 from hil.base.toml_text import inline
@@ -97,9 +97,6 @@ def _entries(table: Mapping[str, Any], path: str) -> Iterator[tuple[str, str]]:
             yield from _entries(value, f"{path}{name}.")
         else:
             yield f"{path}{name}", repr(value)
-
-
-Array = NDArray[np.float64]
 
 
 _NO_LIMIT: Final = 1e4  # some URDFs have larger figures for "none"

@@ -9,8 +9,8 @@ from typing import Annotated, Any
 
 import numpy as np
 import typer
-from numpy.typing import NDArray
 
+from hil.base.arrays import Array
 from hil.base.errors import InputError
 from hil.base.safe_input import read_input
 from hil.base.terminal_text import printable
@@ -20,9 +20,6 @@ from hil.control.move import random_via_points
 from hil.plots import check_format, draw_plan, save
 from planner.moves import MotionPlan, Move, plan_moves
 from planner.worker import in_child
-
-Array = NDArray[np.float64]
-
 
 ROUNDING = 1e-9
 """Degrees by which an angle may pass a limit that was converted to radians and back."""

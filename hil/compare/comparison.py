@@ -15,10 +15,10 @@ from pathlib import Path
 from typing import Any, Final, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.optimize import brentq
 from scipy.stats import t as student
 
+from hil.base.arrays import Array
 from hil.base.errors import InputError
 from hil.base.progress import Reporter
 from hil.batch import graph as run
@@ -28,8 +28,6 @@ from hil.batch.estimates import Arm, BatchEstimate
 from hil.pipeline.options import Options
 from hil.pipeline.sources import arm_differences
 from identification import RobotModel
-
-Array = NDArray[np.float64]
 
 MIN_REPETITIONS: Final = 15
 """Repetitions needed to estimate their correlation. With fewer the effective number is 1, as all

@@ -7,7 +7,6 @@ from dataclasses import dataclass, replace
 from typing import Final, Literal
 
 import numpy as np
-from numpy.typing import NDArray
 
 from drivers.events import (
     InitReceived,
@@ -23,14 +22,13 @@ from drivers.init_check import float32_text, is_narrower
 from drivers.packets import InitPacket
 from drivers.states import State
 from hil.archive import ArchiveSpec
+from hil.base.arrays import Array
 from hil.base.errors import ControllerError
 from hil.base.terminal_text import plural
 from hil.cell import Cell
 from hil.control.errors import refusal_text
 from hil.control.motion_checks import MotionChecks
 from hil.control.motion_watch import REFUSED
-
-Array = NDArray[np.float64]
 
 START_TIMEOUT: Final = 60.0  # s within which an accepted motion must have started
 OFF_TIMEOUT: Final = 2.0  # s with the drive off after which an accepted motion is dropped

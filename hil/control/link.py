@@ -28,6 +28,7 @@ from hil.archive import ArchiveSpec
 from hil.archive.live import LiveView
 from hil.archive.recorder import Recorded, describe
 from hil.archive.supervised import NO_TIME
+from hil.base.arrays import Array
 from hil.base.errors import ArchiveWriteError, ControllerError, OperatorStopError
 from hil.base.terminal_text import with_joint_names
 from hil.cell import Cell
@@ -37,8 +38,6 @@ from hil.control.motion_watch import MotionWatch, Stop, unwatched_motion
 from .connection import Connection, StartTimeout, active_guard, described, not_ready, waiting_text
 from .operator_control import REQUEST_PERIOD, OperatorControl
 from .port import ControllerPort
-
-Array = NDArray[np.float64]
 
 REST_TIMEOUT: Final = 30.0
 """s for an arm to come to rest, and for the archive of a motion that has ended."""

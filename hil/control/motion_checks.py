@@ -7,9 +7,9 @@ from dataclasses import dataclass, replace
 from typing import Final, Self
 
 import numpy as np
-from numpy.typing import NDArray
 
 from drivers.init_check import float32_text, is_narrower
+from hil.base.arrays import Array
 from hil.cell import AngleFrame, Cell, CellError
 from identification.excitation import (
     CollisionChecker,
@@ -70,8 +70,6 @@ def always_so(violation: Violation, checker: CollisionChecker) -> str | None:
         return f"{message}; [workspace] margin must be below that"
     return f"{message}: they overlap; correct their collision shapes in the URDF"
 
-
-Array = NDArray[np.float64]
 
 LONGEST: Final = 600.0
 """Longest motion, s: checks take time and memory in proportion, and a failed motion is repeated."""

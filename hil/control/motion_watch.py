@@ -9,12 +9,8 @@ from dataclasses import dataclass
 from types import FrameType
 from typing import Final, Protocol
 
-import numpy as np
-from numpy.typing import NDArray
-
 from drivers.states import State
-
-Array = NDArray[np.float64]
+from hil.base.arrays import Array
 
 REQUESTS: Final = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 """Ctrl-C, the usual request to end, and the end of the terminal."""

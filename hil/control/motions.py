@@ -8,9 +8,9 @@ from itertools import pairwise
 from typing import Any, Final
 
 import numpy as np
-from numpy.typing import NDArray
 
 from hil.archive.header import motion_name
+from hil.base.arrays import Array
 from hil.cell import AngleFrame, Cell
 from hil.control.errors import MotionRefusedError
 from hil.control.motion_checks import MotionChecks
@@ -24,8 +24,6 @@ from planner import (
     in_child,
     plan_moves,
 )
-
-Array = NDArray[np.float64]
 
 _ROUNDED: Final = 9e-7
 """Rounding of a position at its limit in packets, as a share of half a joint's range; guard and

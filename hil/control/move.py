@@ -7,9 +7,9 @@ from pathlib import Path
 from typing import Final
 
 import numpy as np
-from numpy.typing import NDArray
 
 from drivers.events import MotionEnded
+from hil.base.arrays import Array
 from hil.base.errors import InputError
 from hil.cell import AngleFrame, Cell
 from hil.control.connection import active_checks
@@ -20,8 +20,6 @@ from hil.control.motion_watch import MotionWatch, Stop, unwatched_motion
 from hil.control.motions import CampaignMotion, moves_to_dict, player_of, straight_move
 from hil.control.record import archive_spec, kind_entry, origin_of
 from planner import FourierSeries, PiecewiseCubic
-
-Array = NDArray[np.float64]
 
 _ROUND: Final = 0.1
 """Resolution of random via points, deg."""

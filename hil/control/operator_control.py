@@ -16,12 +16,11 @@ from drivers.errors import RequestError
 from drivers.guard import Guard
 from drivers.motion_source import MotionSource
 from drivers.packets import DRIVE_ON
+from hil.base.arrays import Array
 from hil.base.errors import ControllerError
 from hil.control.motion_watch import MotionProgress, MotionWatch, Stop
 
 from .port import ControllerPort, PortStatus
-
-Array = NDArray[np.float64]
 
 REQUEST_PERIOD: Final = 0.02  # Period of reading the operator's request during a hold, s
 SHOW_PERIOD: Final = 0.1  # Period of showing the motion, s

@@ -5,13 +5,11 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
-from numpy.typing import NDArray
 
+from hil.base.arrays import Array
 from planner import JointLimits
 from planner.interpolator import Interpolator, Status
 from sim_fixtures import SettingError
-
-Array = NDArray[np.float64]
 
 
 class InterpolatedMoves:

@@ -8,9 +8,9 @@ from dataclasses import replace
 from typing import Literal
 
 import numpy as np
-from numpy.typing import NDArray
 
 from drivers.transports.simulated import SimulatedTransport
+from hil.base.arrays import Array
 from hil.cell import Cell, CellError
 from hil.control.motion_checks import collision_checker
 from hil.control.own_moves import InterpolatedMoves
@@ -28,8 +28,6 @@ from sim_fixtures import (
 from sim_fixtures.faults import InjectedFault
 from sim_fixtures.plant import Carried
 from sim_fixtures.servo import loops_per_cycle
-
-Array = NDArray[np.float64]
 
 STEP = 0.0005
 """Step of a simulated arm with effects that the model leaves out, s."""

@@ -7,6 +7,7 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
+from hil.base.arrays import Array
 from hil.cell import AngleFrame, Cell
 from hil.control.motion_checks import (
     always_so,
@@ -32,8 +33,6 @@ from identification.model.motion import Motion
 
 from .messages import NoExcitationError
 from .settings import DesignSettings, SettingsError
-
-Array = NDArray[np.float64]
 
 
 def problem_of(

@@ -9,8 +9,8 @@ from pathlib import Path
 from typing import Any, Final, Self
 
 import numpy as np
-from numpy.typing import NDArray
 
+from hil.base.arrays import Array
 from hil.base.errors import InputError
 from hil.base.files import json_digest, write_atomically
 from hil.base.safe_input import read_text, remedy_for_missing
@@ -28,8 +28,6 @@ from planner import FourierSeries, PiecewiseCubic, PlanFile, PlannerError, in_ch
 from planner.arrays import DAMAGED, Whole, numbers, strict
 
 from .settings import RESULT_FORMAT, DesignSettings, settings_of
-
-Array = NDArray[np.float64]
 
 VERSION: Final = 1
 RESULT: Final = "excitation.toml"

@@ -10,8 +10,8 @@ from typing import Final, Literal
 
 import numpy as np
 import pinocchio as pin
-from numpy.typing import NDArray
 
+from hil.base.arrays import Array
 from hil.base.files import make_folder, write_files
 from hil.pipeline.identified_model import IdentifiedModel, ensemble_of, model_of, remarks_of
 from hil.pipeline.run import Identification
@@ -29,7 +29,6 @@ from identification.export.simulators import (
 )
 from identification.model.motion import Motion
 
-Array = NDArray[np.float64]
 FormatName = Literal["mjcf", "urdf", "sdf", "pinocchio"]
 
 _SPREAD_TOLERANCE: Final = 0.05  # of drawn arms, from that of the stated intervals

@@ -13,11 +13,10 @@ from mcap.writer import CompressionType, Writer
 from numpy.typing import NDArray
 
 from hil.archive.schema import LIBRARY, MEASURED, PROFILE, joint_states, profile
+from hil.base.arrays import Array
 from hil.base.files import file_digest, make_folder, write_files
 from hil.pipeline.run import Identification
 from hil.pipeline.sources import stamps_of
-
-Array = NDArray[np.float64]
 
 PREDICTED: Final = "/joint_states_predicted"
 RESIDUAL: Final = "/joint_states_residual"

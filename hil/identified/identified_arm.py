@@ -13,10 +13,11 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from hil.archive import Archive, place_of
 from hil.archive.recorded_campaign import RecordedCampaign
+from hil.base.arrays import Array
 from hil.base.errors import InputError
 from hil.base.files import make_folder, write_output
 from hil.base.output_folder import SOURCES, folder_beside, sources_text
@@ -43,7 +44,6 @@ if TYPE_CHECKING:
     import pinocchio
     from matplotlib.figure import Figure
 
-Array = NDArray[np.float64]
 PathOrPaths = str | PathLike[str] | Sequence[str | PathLike[str]]
 
 _DOTS: Final = 100  # per inch, of a picture in a notebook

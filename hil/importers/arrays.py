@@ -14,6 +14,7 @@ import numpy as np
 from numpy.lib import format as npy
 from numpy.typing import NDArray
 
+from hil.base.arrays import Array
 from hil.base.errors import SourceError
 from hil.base.safe_input import open_file
 from hil.importers import mcap_messages
@@ -22,8 +23,6 @@ from hil.importers.conclusions import LeftOut
 from hil.importers.document_messages import ENCODINGS, columns_of_trees, trees
 from hil.importers.matlab import NUMBERS, lost_bytes, mat_array, mat_shapes, script_matrices
 from hil.importers.ros_messages import MessageError, columns_of, decoded, typestore_of
-
-Array = NDArray[np.float64]
 
 MOST_NUMBERS: Final = 2**28
 """Elements of one array: 2 GiB of doubles, hours of an arm at 5 kHz."""

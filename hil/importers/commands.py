@@ -19,6 +19,7 @@ import numpy as np
 import scipy
 from numpy.typing import NDArray
 
+from hil.base.arrays import Array
 from hil.base.errors import SourceError
 from hil.importers.bags import Bag, BagMessage
 from hil.importers.conclusions import Conclusion, DifferentCommands, KnownCommands, NotCommands
@@ -27,7 +28,6 @@ from hil.importers.messages import sentence
 from hil.importers.ros_messages import CONTROLLER_STATE, JOINT_STATE
 from identification.signals.recording import GAP_STEPS
 
-Array = NDArray[np.float64]
 Stamps = NDArray[np.int64]
 
 NO_COMMAND: Final = "none"

@@ -15,6 +15,7 @@ import scipy
 from numpy.typing import NDArray
 
 from hil.archive import Samples
+from hil.base.arrays import Array
 from hil.base.errors import SourceError
 from hil.cell.text import UrdfLimits, urdf_limits
 from hil.importers.conclusions import (
@@ -46,8 +47,6 @@ from identification.model.motion import Motion
 from identification.model.urdf_text import urdf_tree
 from identification.signals.clock import time_base
 from identification.signals.recording import STUCK_MOVEMENT, unwrap
-
-Array = NDArray[np.float64]
 
 _TOLERANCE: Final = 0.05  # rad or m beyond a limit, for calibration and overshoot
 _LEAST_TRAVEL: Final = 0.1  # rad or m

@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hil.archive import Samples
+from hil.base.arrays import Array
 from hil.base.errors import SourceError, UnrecordedJointError
 from hil.importers.arrays import ArrayFile
 from hil.importers.column_map import HOLE, KINEMATIC, ColumnMap, Quantity, TimeColumn
@@ -35,8 +36,6 @@ from hil.importers.row_names import row_names
 from hil.importers.stamps import YEAR, concluded_unit, sorted_neighbours, without_wraps
 from hil.importers.table import Table
 from hil.importers.units import PER_CENT, TIMES, UNITS, kind_named, unit_of
-
-Array = NDArray[np.float64]
 
 _MORE: Final = 64  # columns or files beyond the joints that are tried
 _LATEST: Final = 2**31 * 10**9  # ns, largest stamp of an archive

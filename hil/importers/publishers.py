@@ -7,9 +7,8 @@ from typing import Final, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from hil.base.arrays import Array
 from hil.importers.conclusions import Alternation, Sample, SecondPublisher
-
-Array = NDArray[np.float64]
 
 APART: Final = 0.1
 """rad or m between samples of one stamp, 20 ms at 5 rad/s."""

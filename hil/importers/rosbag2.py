@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hil.archive import Samples
+from hil.base.arrays import Array
 from hil.base.errors import SourceError, UnrecordedJointError
 from hil.importers.bags import Bag, BagMessage, open_bag
 from hil.importers.commands import Clock as CommandClock
@@ -35,7 +36,6 @@ from hil.importers.robot import NOT_RECORDED, RecordingContent, Robot, Use
 from hil.importers.ros_messages import CONTROLLER_STATE, JOINT_STATE
 from hil.importers.stamps import leading_zeros, sorted_neighbours
 
-Array = NDArray[np.float64]
 Effort = Literal["torque", "motor_current", "ignore"]
 Clock = Literal["auto", "header", "bag"]
 

@@ -12,8 +12,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
+from hil.base.arrays import Array
 from hil.base.errors import SourceError
 from hil.importers.column_map import HOLE, Column, Format
 from hil.importers.conclusions import LeftOut, Omitted
@@ -35,7 +35,6 @@ from hil.importers.units import unit_of, without_unit
 if TYPE_CHECKING:
     import pandas as pd
 
-Array = NDArray[np.float64]
 
 _COMMENTS = ("#", "%", "//")
 _EMPTY: Final = "record again, or name the file that has the samples"

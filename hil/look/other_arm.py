@@ -12,8 +12,8 @@ from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
-from numpy.typing import NDArray
 
+from hil.base.arrays import Array
 from hil.cell import Cell
 from hil.cell.text import urdf_limits
 from hil.importers.conclusions import Certainty
@@ -36,8 +36,6 @@ from identification.model.robot import RobotModel
 from identification.signals.samples import Samples
 from identification.validation.reading_scores import Comparison, Score, compare, score_of
 from identification.validation.readings import EXPLAINED, SEPARATE, SURE
-
-Array = NDArray[np.float64]
 
 _MOST: Final = 0.99  # quantile of the rows, so that single spikes are no evidence
 _BEYOND: Final = 0.17  # rad or m beyond a range; zeros of the same arm differ by less

@@ -9,7 +9,6 @@ from pathlib import Path
 from typing import Any, Final, Literal
 
 import numpy as np
-from numpy.typing import NDArray
 
 from hil.cell import Cell
 from hil.cell.nominal import nominal_of
@@ -66,8 +65,6 @@ from identification.validation.faults import COUPLED
 from identification.validation.nominal_scale import nominal_scale
 from identification.validation.reading_changes import IN_ORDER, Axes, Change, Meaning
 from identification.validation.readings import EXPLAINED, SEPARATE, Readings, Step
-
-Array = NDArray[np.float64]
 
 MOUNTINGS: Final = {
     "": (0.0, 0.0, 0.0),

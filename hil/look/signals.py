@@ -7,8 +7,8 @@ from collections.abc import Mapping, Sequence
 from typing import Final
 
 import numpy as np
-from numpy.typing import NDArray
 
+from hil.base.arrays import Array
 from hil.cell import Cell
 from hil.importers.commands import COMMANDED
 from hil.importers.conclusions import (
@@ -47,8 +47,6 @@ from hil.look.result import Aspect, Row
 from identification.signals.clock import time_base
 from identification.signals.recording import STUCK_MOVEMENT, UNWRAPPED, Recording
 from identification.signals.smoothing import noiseless_above
-
-Array = NDArray[np.float64]
 
 _FOLLOWS: Final = 0.7  # correlation of a velocity with the slope of its position
 _CLOSE: Final = 0.1  # relative deviation of their ratio

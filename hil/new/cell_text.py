@@ -15,12 +15,12 @@ from typing import Any, Final, get_origin
 
 import numpy as np
 import tomlkit
-from numpy.typing import NDArray
 from pydantic.fields import FieldInfo
 from scipy.spatial.transform import Rotation
 from tomlkit.items import Table
 
 from drivers.drive_train import WRIST_AXES
+from hil.base.arrays import Array
 from hil.base.errors import InputError
 from hil.base.safe_input import read_input, read_text
 from hil.base.toml_text import comment_lines, inline
@@ -35,8 +35,6 @@ from identification.model.kinematics import MOST_JOINTS, Chain, chain_from_urdf,
 from identification.model.urdf_text import urdf_tree
 
 from .cell_values import ASSUMED, CellValues, assumed_for_design, clear_home, from_urdf
-
-Array = NDArray[np.float64]
 
 
 @contextmanager

@@ -11,7 +11,7 @@ from os import PathLike
 from typing import Any, Final
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from drivers.drive_train import WRIST_AXES, DriveTrain
 from drivers.errors import DriverError, PacketError
@@ -20,6 +20,7 @@ from drivers.guard import GuardLimits
 from drivers.packets import N_ARMS, InitPacket
 from drivers.transports.base import TransportSpec
 from hil.archive import open_archive
+from hil.base.arrays import Array
 from hil.base.errors import ArchiveError, ControllerError, OperatorStopError
 from hil.base.safe_input import parse_toml
 from hil.cell.errors import UNKNOWN
@@ -29,8 +30,6 @@ from hil.control.live_link import END_TIMEOUT, ExchangeMonitor
 from hil.control.motion_watch import Stop
 from identification.excitation import CollisionChecker, CollisionModelError, Workspace
 from planner import JointLimits
-
-Array = NDArray[np.float64]
 
 _MOST_TURNED: Final = 3
 """Joints turned to find a clear home posture."""

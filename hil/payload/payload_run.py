@@ -9,8 +9,8 @@ from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
-from numpy.typing import NDArray
 
+from hil.base.arrays import Array
 from hil.base.errors import ArchiveError, InputError
 from hil.base.progress import Reporter
 from hil.pipeline.cell_context import TorqueScale, torque_scale
@@ -43,8 +43,6 @@ from identification.validation.finding import Thresholds
 from identification.validation.gravity import find_gravity
 
 from .payload_settings import NOT_DETERMINED, Load, controller_settings
-
-Array = NDArray[np.float64]
 
 _FLANGES: Final = ("tool0", "flange")  # flange frames of controllers, by their ROS-Industrial names
 _LEAST_DISTANCE: Final = 0.5  # m, of a hand tool on an arm that is shorter itself

@@ -10,14 +10,13 @@ from collections.abc import Callable, Mapping
 from typing import TYPE_CHECKING, Final, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
+from hil.base.arrays import Array
 from identification.model.pseudo_inertia import Body
 
 if TYPE_CHECKING:
     from scipy.spatial.transform import Rotation
 
-Array = NDArray[np.float64]
 
 NOT_DETERMINED: Final = "not determined: enter the maker's, or record faster motion"
 KGF_CM_S2: Final = 0.0980665

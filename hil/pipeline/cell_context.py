@@ -9,9 +9,9 @@ from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
-from numpy.typing import NDArray
 
 from hil.archive import open_archive
+from hil.base.arrays import Array
 from hil.cell import Cell
 from hil.cell.nominal import nominal_of
 from hil.cell.text import urdf_limits
@@ -34,8 +34,6 @@ from planner.arrays import numbers
 
 from .prepared import Prepared
 from .sources import Source, Sources
-
-Array = NDArray[np.float64]
 
 _POSTURES = 500
 _TIME_TOLERANCE = 1e-6  # s

@@ -8,8 +8,8 @@ from pathlib import Path
 from typing import Final
 
 import numpy as np
-from numpy.typing import NDArray
 
+from hil.base.arrays import Array
 from hil.base.errors import ArchiveError, InputError
 from hil.base.progress import Reporter
 from hil.cell import Cell
@@ -51,7 +51,6 @@ MIN_IV_BANDWIDTH: Final = 20.0
 # Difference between data and prior, in standard deviations, that is reported.
 _MAX_PRIOR_DEVIATION: Final = 4.0
 
-Array = NDArray[np.float64]
 
 # Time since the origin and commanded positions of a motion, and the lag of each axis, which is the
 # same in every repetition.

@@ -6,16 +6,14 @@ from collections.abc import Callable, Sequence
 from typing import Final, Literal
 
 import numpy as np
-from numpy.typing import NDArray
 
+from hil.base.arrays import Array
 from identification.estimators.consistent import consistent_estimate
 from identification.estimators.least_squares import Fit, Weighting, fit_least_squares
 from identification.factor.estimate import Estimate, joint_weights
 from identification.factor.factor import Factor
 from identification.model.robot import RobotModel
 from identification.signals.samples import Samples
-
-Array = NDArray[np.float64]
 
 Estimator = Literal["auto", "wls", "ols", "huber", "tukey", "prior", "consistent", "iv"]
 

@@ -5,8 +5,8 @@ from __future__ import annotations
 from typing import Final
 
 import numpy as np
-from numpy.typing import NDArray
 
+from hil.base.arrays import Array
 from hil.cell.nominal import nominal_of
 from hil.results.series import ReportSeries, example_series
 from identification import RobotModel
@@ -15,8 +15,6 @@ from identification.export.friction import friction_curve, friction_torque, medi
 from identification.signals.samples import Samples
 
 from .prepared import Prepared, moving_rows
-
-Array = NDArray[np.float64]
 
 FIGURE_SAMPLES: Final = 4000
 """Maximum number of rows of a time series in a figure."""

@@ -13,9 +13,9 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from hil.archive.recorded_campaign import RecordedCampaign
+from hil.base.arrays import Array
 from hil.base.errors import HilError, InputError
 from hil.base.files import file_digest
 from hil.base.progress import Reporter
@@ -52,8 +52,6 @@ from identification.model.robot import RobotModel
 from identification.reduction.posterior import Posterior
 from identification.rollout.comparison import driving_residual
 from identification.selection.folds import FOLDS
-
-Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True, eq=False)

@@ -13,6 +13,7 @@ from typing import Final, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from hil.base.arrays import Array
 from hil.base.errors import ArchiveError, InputError
 from hil.base.progress import Reporter, Silent
 from hil.cell import Cell
@@ -53,8 +54,6 @@ from planner.arrays import numbers
 
 from .options import Options
 from .sources import Source, Sources
-
-Array = NDArray[np.float64]
 
 
 def stated_delay(cell: Cell) -> float:

@@ -17,6 +17,7 @@ from hil.archive import Archive, ArchiveHeader, ArchiveName, open_archive, opene
 from hil.archive.header import REJECTED
 from hil.archive.recorded_campaign import RecordedCampaign
 from hil.archive.recordings import recording_of
+from hil.base.arrays import Array
 from hil.base.errors import ArchiveError, CampaignFolderError, InputError
 from hil.base.files import file_digest
 from hil.base.safe_input import path_exists
@@ -30,8 +31,6 @@ from identification.signals.recording import (
 )
 from identification.signals.smoothing import standstill_variance
 from identification.text import percentage
-
-Array = NDArray[np.float64]
 
 FLOAT32_STEP = 2.0**-24
 """Relative rounding error of a float32 position on the wire."""

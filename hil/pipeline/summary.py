@@ -6,9 +6,9 @@ from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from hil.archive import ArchiveHeader
+from hil.base.arrays import Array
 from hil.base.errors import InputError
 from hil.base.version import software
 from hil.cell import Cell
@@ -41,8 +41,6 @@ from .estimators import ESTIMATORS
 from .prepared import Prepared, executed_rows
 from .sources import Sources
 from .validation import Validation
-
-Array = NDArray[np.float64]
 
 
 def summary(

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from drivers.packets import DRIVE_ON
 from hil.archive import Archive, open_archive
 from hil.archive.check import Overview, read_overview
+from hil.base.arrays import Array
 from hil.base.errors import ArchiveError, HilError, InputError
 from hil.base.terminal_text import plural
 from hil.cell import AngleFrame, Cell
@@ -23,8 +24,6 @@ from hil.plots.plan_picture import wrapped
 from hil.report.chart import thinned
 from identification.errors import ModelError
 from identification.model.kinematics import chain_from_urdf
-
-Array = NDArray[np.float64]
 
 _BINS: Final = 4000
 """Intervals of a picture, each with its minimum and maximum."""

@@ -11,7 +11,6 @@ from typing import Any, Final
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
-from numpy.typing import NDArray
 
 from hil.cell import AngleFrame, Cell
 from hil.design.messages import criteria_text
@@ -30,8 +29,6 @@ from identification.excitation import (
 )
 from identification.model.robot import RobotModel
 from planner import Trajectory
-
-Array = NDArray[np.float64]
 
 _WHITE: Final[dict[str, Any]] = {"linestyle": "none", "markerfacecolor": "white"}
 # inch

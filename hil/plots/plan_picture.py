@@ -10,8 +10,8 @@ from pathlib import Path
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
-from numpy.typing import NDArray
 
+from hil.base.arrays import Array
 from hil.base.errors import InputError
 from hil.base.files import write_atomically
 from hil.cell import AngleFrame
@@ -20,8 +20,6 @@ from hil.report.chart import label, thinned
 from identification.text import percentage
 from planner import JointLimits, Trajectory
 from planner.moves import MotionPlan
-
-Array = NDArray[np.float64]
 
 FORMATS = (".png", ".svg", ".pdf")
 _SAMPLES = 4000

@@ -15,6 +15,7 @@ from typing import Any, Final, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from hil.base.arrays import Array
 from hil.base.errors import InputError
 from hil.base.terminal_text import plural
 from hil.cell import Cell
@@ -40,8 +41,6 @@ from sim_fixtures.servo import loops_per_cycle
 
 from .predicted import PredictedRows
 from .requirements import Requirement, require_known
-
-Array = NDArray[np.float64]
 
 ERROR_SHARE: Final = 0.03
 """Torque error of a fitted model, as a share of each joint's torque, where nothing was recorded.

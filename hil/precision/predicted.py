@@ -12,8 +12,8 @@ from dataclasses import dataclass
 from typing import Final, NamedTuple, Self
 
 import numpy as np
-from numpy.typing import NDArray
 
+from hil.base.arrays import Array
 from hil.cell import Cell
 from hil.pipeline.prepared import stated_delay, with_stated_delay
 from identification.distributions import student_limit
@@ -28,8 +28,6 @@ from identification.estimators.elasticity import (
 from identification.factor.blocks import FINE_BLOCK
 from identification.model.motion import Motion
 from identification.signals.samples import Preprocessing, Samples
-
-Array = NDArray[np.float64]
 
 _FEWEST_BLOCKS: Final = 2
 

@@ -9,13 +9,12 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
+from hil.base.arrays import Array
 from identification.excitation.precision import LoadQuantities, Quantities
 from identification.model.motion import Motion
 from identification.model.robot import RobotModel
 
 from .requirements import Requirement
-
-Array = NDArray[np.float64]
 
 MOVED: Final = 0.1
 """Share of a joint's torque below which a parameter counts by that share, not by its value."""

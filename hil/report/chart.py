@@ -11,9 +11,8 @@ from dataclasses import dataclass, replace
 from typing import Final, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
-Array = NDArray[np.float64]
+from hil.base.arrays import Array
 
 _MARGIN: Final = 0.05  # free on both sides of the values, as a share of their range
 _LABEL_LENGTH: Final = 28

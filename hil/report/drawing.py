@@ -15,11 +15,9 @@ from typing import Final, Literal
 
 import numpy as np
 from markupsafe import Markup, escape
-from numpy.typing import NDArray
 
+from hil.base.arrays import Array
 from hil.report.chart import Caption, Chart, joined, label, one_line, padded, thinned
-
-Array = NDArray[np.float64]
 
 INK, MUTED, GRID, BAND, FIRST, SECOND, WIDE = (
     f"var(--{name})" for name in ("ink", "muted", "grid", "band", "first", "second", "wide")

@@ -7,15 +7,13 @@ from dataclasses import replace
 from typing import Final, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
+from hil.base.arrays import Array
 from hil.report.chart import Caption, Chart, Legend, Plot, padded
 from hil.report.drawing import BAND, FIRST, MUTED, Panel, matrix_panel, panel, single
 from hil.report.numbers import MISSING, fixed, percent, significant
 from hil.results.results import FittedResult, Results, ValidationResult, by_id
 from hil.results.series import ReportSeries
-
-Array = NDArray[np.float64]
 
 _INTERVAL: Final = 1.96  # Half a 95 % interval, in standard errors
 # Percentiles of the torque inside the axes; outliers may lie outside.

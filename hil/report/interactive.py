@@ -18,9 +18,8 @@ import numpy as np
 from markupsafe import Markup
 from numpy.typing import NDArray
 
+from hil.base.arrays import Array
 from hil.report.chart import Chart, Trace, one_line
-
-Array = NDArray[np.float64]
 
 _LIBRARY: Final = ("bokeh.min.js", "bokeh-api.min.js")
 _VALUES: Final = 180_000

@@ -11,10 +11,10 @@ from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
-from numpy.typing import NDArray
 
 from hil.archive import open_archive
 from hil.archive.check import recording_date
+from hil.base.arrays import Array
 from hil.base.errors import InputError
 from hil.base.files import file_digest, write_files
 from hil.base.progress import Reporter
@@ -32,7 +32,6 @@ from identification.export.friction import median_load
 from identification.export.parameters import parameters_csv, parameters_json
 from identification.export.urdf import write_urdf
 
-Array = NDArray[np.float64]
 REPORT = "report.html"
 SERIES = "report_series.npz"
 _LARGEST: Final = 1 << 30

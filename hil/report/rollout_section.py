@@ -8,14 +8,12 @@ from dataclasses import replace
 from typing import Final
 
 import numpy as np
-from numpy.typing import NDArray
 
+from hil.base.arrays import Array
 from hil.report.chart import Caption, Chart, Legend, Plot, Trace, label
 from hil.report.figures import NOMINAL, PREDICTED
 from hil.results.rollout_result import WANTED, ArmErrors, RolloutResult
 from identification.text import percentage
-
-Array = NDArray[np.float64]
 
 _HEIGHT: Final = 190.0  # px
 _FLOOR: Final = 1e-3  # mrad or mm, of logarithmic axes

@@ -7,14 +7,12 @@ from dataclasses import dataclass, fields, replace
 from typing import Any, Final
 
 import numpy as np
-from numpy.typing import NDArray
 
+from hil.base.arrays import Array
 from identification import RobotModel
 from identification.signals.samples import Samples
 from identification.signals.spectrum import power_density
 from identification.validation.prediction import for_figure
-
-Array = NDArray[np.float64]
 
 _TOO_LARGE: Final = 1e100
 _ROWS: Final = 30_000

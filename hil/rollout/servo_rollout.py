@@ -7,7 +7,6 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
 from hil.archive import open_archive
 from hil.base.errors import InputError
@@ -48,8 +47,6 @@ from identification.rollout.polish import Driven
 from identification.rollout.servo import lead_of
 from identification.rollout.simulation import Feedback
 from identification.rollout.windows import STEP, windows_of
-
-Array = NDArray[np.float64]
 
 _FRICTION = "coulomb,viscous"
 _UNITS = ("N·m/rad", "N·m·s/rad", "kg·m²", "N·m", "N·m·s/rad")

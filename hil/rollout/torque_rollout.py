@@ -8,8 +8,8 @@ from pathlib import Path
 from typing import Final, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
+from hil.base.arrays import Array
 from hil.base.errors import InputError
 from hil.base.files import write_files
 from hil.base.progress import Reporter
@@ -50,8 +50,6 @@ from identification.rollout.polish import Driven
 from identification.rollout.servo import NoServoError, Servo, identify_servo, lead_of
 from identification.rollout.simulation import LARGEST_ERROR, Feedback
 from identification.rollout.windows import STEP, Stretch, windows_of
-
-Array = NDArray[np.float64]
 
 PICTURE = "rollout.png"
 POLISHED = "polished.xml"

@@ -16,9 +16,9 @@ from pathlib import Path
 from typing import Any, Final, Literal, Self
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy import stats
 
+from hil.base.arrays import Array
 from hil.base.errors import InputError
 from hil.base.progress import Silent
 from hil.base.safe_input import read_text
@@ -40,7 +40,6 @@ from sim_fixtures.ns16 import N_ESSENTIAL, TABLE2, URDF_PATH
 from .campaigns import LABELS, A, B
 from .settings import StudySettings
 
-Array = NDArray[np.float64]
 Verdict = Literal["better", "slightly better", "none", "slightly worse", "worse", "too few"]
 
 SCHEMA_VERSION: Final = 2

@@ -10,8 +10,8 @@ from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
-from numpy.typing import NDArray
 
+from hil.base.arrays import Array
 from hil.base.files import digest, write_files
 from hil.base.progress import Reporter
 from hil.base.threads import one_thread
@@ -30,8 +30,6 @@ from . import campaigns, results
 from .campaigns import Search
 from .results import ConditionResult, MotionRow, StudyResults
 from .settings import StudyFolder, StudySettings
-
-Array = NDArray[np.float64]
 
 _CONDITIONS: Final = {
     campaigns.NO_EFFECTS: "without unmodelled effects",

@@ -84,7 +84,7 @@ def test_each_file_is_called_by_one_before_it(title: str, traced: dict[str, set[
         assert traced[name] & set(files[start:number]), f"{name} is called by {traced[name]}"
 
 
-def test_the_walks_begin_with_the_command_and_end_with_the_verdict() -> None:
+def test_the_walks_lead_from_the_command_to_the_verdict() -> None:
     assert command.identify_recordings is identify_recordings  # which the command calls
     first, second = map(walk, MOST)
     assert first[0] == "hil/identified/identified_arm.py"
