@@ -78,9 +78,7 @@ def batch(
         if written:
             names = ", ".join(path.name for path in written)
             reporter.say(f"written to {written[0].parent}: {names}")
-        for line in _last(
-            [f"{each.path} could not be used: {each.message}" for each in result.broken]
-        ):
+        for line in _last(_broken_lines(result.broken)):
             typer.echo(printable(line), err=True)
         if result.skipped and not quiet:
             typer.echo(printable(skipped_line(result.skipped)))
@@ -131,6 +129,10 @@ def _last(lines: Sequence[str]) -> Iterator[str]:
     if (more := len(lines) - _MOST_LINES) > 0:
         yield f"  {more} more: see --output and --json"
     yield from lines[-_MOST_LINES:]
+
+
+def _broken_lines(broken: Sequence[SkippedArchive]) -> list[str]:
+    return [f"{unused.path} could not be used: {unused.message}" for unused in broken]
 
 
 def skipped_line(skipped: Sequence[SkippedArchive]) -> str:
