@@ -67,7 +67,7 @@ def found_in(*roots, cache=UNCACHED):
 
 def reasons_of(ones):
     """Return the reasons of unused archives by file name."""
-    return {Path(unused.path).name: unused.reason for unused in ones}
+    return {Path(unused.path).name: unused.message for unused in ones}
 
 
 def fitted(result):
@@ -382,7 +382,7 @@ class TestBroken:
             batch(alone)
         result = batch(alone, folder)
         assert len(result.campaigns) == 1
-        assert [tuple(unused) for unused in result.broken] == [
+        assert [(unused.path, unused.message) for unused in result.broken] == [
             (str(alone), "it holds no excitation")
         ]
 
