@@ -16,9 +16,11 @@ from typing import Any, Final
 import numpy as np
 from pydantic import BaseModel, ConfigDict
 
+from benchmarks.choices import judged_by_others
 from benchmarks.published import Published
 
 ELSEWHERE: Final = Path(__file__).with_name("elsewhere.toml")
+_SEEN: Final = 0.005  # difference of a ratio from one that is shown
 BEHIND: Final = 1.0  # ratio to an ordinary fit from which a row is a loss
 _HEAD: Final = (
     "| arm, source | split | ordinary | nominal | hil | ratio | inside | s |\n"
@@ -113,7 +115,9 @@ def page_text(rows: Sequence[Mapping[str, Any]], commit: str) -> str:
     every = sorted([*here, *elsewhere()], key=lambda line: -line.ratio)
     losses = [line for line in every if line.is_loss]
     others = [line for line in every if not line.is_loss]
-    return "\n".join([*_introduction(here, losses, commit), *_tables(losses, others)])
+    return "\n".join(
+        [*_introduction(here, losses, commit), *_tables(losses, others), *_choices(rows)]
+    )
 
 
 _TEXT: Final = """\
@@ -142,7 +146,7 @@ a range covers a group of rows. Sources that the report does not name are *not n
 _COMMANDS: Final = """\
 ```text
 python -m benchmarks.board --fetch FROM --data DIR   # collects the recordings
-python -m benchmarks.board --data DIR --page docs/board.md
+python -m benchmarks.board --data DIR --choices --page docs/board.md
 ```"""
 _WIDTH: Final = 110
 
@@ -183,6 +187,41 @@ def _tables(losses: Sequence[Line], others: Sequence[Line]) -> Iterator[str]:
         else:
             yield "None."
         yield ""
+
+
+_CHOICES: Final = """\
+Each cell is the error without a choice over that with all of them: above 1 the choice pays, below
+it costs; empty within 0.5 %. A choice that is left out has its first candidate. *Mean* is
+geometric, over robots. *Others* is the mean where each robot follows what the other robots prefer,
+which is the judgement leave-one-robot-out: at 1 the choice is kept everywhere.
+"""
+
+
+def _choices(rows: Sequence[Mapping[str, Any]]) -> Iterator[str]:
+    """Yield what each row has without each choice, and whether the other robots keep it."""
+    if not rows or any("without" not in row for row in rows):
+        return
+    judged = judged_by_others(rows)
+    used = [name for name in judged if any(abs(row["without"][name] - 1.0) > _SEEN for row in rows)]
+    yield "## Without each choice"
+    yield ""
+    yield from _wrapped(_CHOICES)
+    yield f"| row | {' | '.join(used)} |"
+    yield f"|---|{'---|' * len(used)}"
+    for row in rows:
+        yield f"| {row['data']}, {row['split']} | {' | '.join(_cells(row['without'], used))} |"
+    for title, key in (("mean", "mean"), ("others", "left_to_others")):
+        yield f"| *{title}* | {' | '.join(f'{judged[name][key]:.3f}' for name in used)} |"
+    yield ""
+    unused = ", ".join(name for name in judged if name not in used)
+    if unused:
+        yield f"Without effect on every row: {unused}."
+        yield ""
+
+
+def _cells(ratios: Mapping[str, float], used: Sequence[str]) -> Iterator[str]:
+    for name in used:
+        yield f"{ratios[name]:.2f}" if abs(ratios[name] - 1.0) > _SEEN else ""
 
 
 def _percent(share: float) -> str:

@@ -12,6 +12,7 @@ import pytest
 
 from benchmarks import board, board_page, fetch
 from benchmarks.board_page import Line
+from benchmarks.choices import CHOICES
 from benchmarks.published import Published, Source, known
 
 pytestmark = pytest.mark.long
@@ -130,6 +131,20 @@ class TestPage:
         assert text.count(f"(measured elsewhere, {commit})") == len(lines) > 20
         assert "wissem01chiha/dynamic-identification" in text
         assert "| a to b | 10 % | - | 5 % | 0.50 | 95 % | 4 |" in text
+
+    def test_choices_are_shown_where_they_change_a_row(self) -> None:
+        rows = [
+            row(0.05, without=dict.fromkeys(CHOICES, 1.0) | {"rows": 1.2, "velocity": 0.9}),
+            row(0.06, without=dict.fromkeys(CHOICES, 1.001) | {"rows": 1.1}),
+        ]
+        section = board_page.page_text(rows, "abc").split("## Without each choice")[1]
+        assert "| row | rows | velocity |" in section
+        assert "| gen3, a to b | 1.20 | 0.90 |" in section
+        assert "| gen3, a to b | 1.10 |  |" in section
+        assert "bandwidth" in section.split("Without effect on every row:")[1]
+
+    def test_without_choices_there_is_no_such_section(self) -> None:
+        assert "Without each choice" not in board_page.page_text([row(0.05)], "abc")
 
     @pytest.mark.parametrize(
         ("hil", "nominal", "with_friction", "loss"),
