@@ -84,9 +84,7 @@ def designed(cell: Cell, name: str, seed: int, limit: float) -> dict[str, Any]:
             return _processor_time() - begin
 
         try:
-            design = search(
-                population, search_settings(settings), stop=lambda: seconds() > limit
-            )
+            design = search(population, search_settings(settings), stop=lambda: seconds() > limit)
         except NoFeasibleMotionError as error:
             return row | {"infeasible": str(error), "seconds": round(seconds(), 1)}
         row["seconds"] = round(seconds(), 1)
@@ -102,7 +100,9 @@ def main() -> None:
     """Print the searches of each arm and seed."""
     parser = parser_of(__doc__)
     parser.add_argument("--arms", nargs="+", choices=_ARMS, default=list(_ARMS))
-    parser.add_argument("--searches", nargs="+", choices=_SEARCHES, default=["gradient"], metavar="NAME")
+    parser.add_argument(
+        "--searches", nargs="+", choices=_SEARCHES, default=["gradient"], metavar="NAME"
+    )
     parser.add_argument("--seeds", type=int, default=5, help="how many seeds, from 1 on")
     parser.add_argument("--seconds", type=float, help="of processor for each search")
     options = parser.parse_args()

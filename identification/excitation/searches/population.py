@@ -23,11 +23,11 @@ from identification.excitation.criteria import (
 from identification.excitation.errors import DesignError
 from identification.excitation.genomes import Genome, Motion
 from identification.excitation.searches.methods import Method
-from identification.excitation.searches.tangent import (
+from identification.excitation.searches.sensitivity import (
     Linearisation,
-    Tangent,
+    Sensitivity,
     gene_slopes,
-    tangent_of,
+    sensitivity_of,
 )
 from identification.excitation.violation import KINDS, Violation, excess_by_kind
 from planner import PlannerCrashed, PlannerError, PlanningTimedOut
@@ -299,7 +299,7 @@ class Problem:
             raise motion
         return motion, self.objective.criteria(motion, period)
 
-    def tangent(self, genes: Array, weights: Array | None) -> Tangent:
+    def sensitivity(self, genes: Array, weights: Array | None) -> Sensitivity:
         """Return the slopes of `weights` (d,) times the criteria along the motion of genes.
 
         Without weights they are those of minus the logarithm of the precision's criterion.
@@ -307,7 +307,7 @@ class Problem:
         Raises:
             PlannerError: the motion cannot be planned.
         """
-        return tangent_of(self, genes, weights)
+        return sensitivity_of(self, genes, weights)
 
     def _violations(self, motion: Motion) -> tuple[Violation, ...]:
         return self.constraints.violations(motion, sampled(motion, self.period))
@@ -380,24 +380,24 @@ class Population:
     def linearise(self, genes: Array, weights: Array | None) -> Linearisation | None:
         """Return `weights` (d,) times the criteria, and the margins, to first order in the genes.
 
-        Without weights: see `Problem.tangent`. None if the motion cannot be planned.
+        Without weights: see `Problem.sensitivity`. None if the motion cannot be planned.
         """
         try:
-            tangent: Tangent = self._call("tangent", genes, weights)
+            sensitivity: Sensitivity = self._call("sensitivity", genes, weights)
         except PlannerError:
             return None
         # As many together as possible: legs and corners that they share are planned once.
         chunks = chunks_of(len(genes), -(-len(genes) // len(self._children)))
-        packed = pack(tangent)
+        packed = pack(sensitivity)
         rows = map_in_children(
             self._children,
             _slopes,
             chunks,
             lambda chunk: (self._packed, packed, genes, np.array(chunk)),
         )
-        none = np.zeros(1 + len(tangent.left))
+        none = np.zeros(1 + len(sensitivity.left))
         slopes = np.array([none if isinstance(row, Exception) else row for row in rows])
-        return Linearisation(slopes[:, 0], slopes[:, 1:].T.copy(), tangent.left)
+        return Linearisation(slopes[:, 0], slopes[:, 1:].T.copy(), sensitivity.left)
 
     def _call(self, method: str, *arguments: object) -> Any:
         """Call a method of the problem in a child, again if another process killed the child."""
@@ -413,14 +413,14 @@ def _score(packed: bytes, genes: Array) -> Array:
     return _problem(packed).score(genes).rows
 
 
-def _slopes(packed: bytes, tangent: bytes, genes: Array, which: NDArray[np.intp]) -> Array:
-    return gene_slopes(_problem(packed), _tangent(tangent), genes, which)
+def _slopes(packed: bytes, sensitivity: bytes, genes: Array, which: NDArray[np.intp]) -> Array:
+    return gene_slopes(_problem(packed), _sensitivity(sensitivity), genes, which)
 
 
 @lru_cache(maxsize=1)
-def _tangent(packed: bytes) -> Tangent:
-    tangent: Tangent = load(packed)
-    return tangent
+def _sensitivity(packed: bytes) -> Sensitivity:
+    sensitivity: Sensitivity = load(packed)
+    return sensitivity
 
 
 def _apply(packed: bytes, method: str, *arguments: Any) -> list[Any]:

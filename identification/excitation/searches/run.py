@@ -15,7 +15,7 @@ from identification.excitation.criteria import OF_PAPER, SENSE, Criteria, column
 from identification.excitation.errors import DesignError
 from identification.excitation.excitation import Excitation
 from identification.excitation.genomes import ViaPointGenome
-from identification.excitation.searches.gradient import TRIED, Ascent, improve
+from identification.excitation.searches.bundle_method import TRIED, Ascent, improve
 from identification.excitation.searches.journal import Journal
 from identification.excitation.searches.methods import METHODS, SearchMethod
 from identification.excitation.searches.population import (
