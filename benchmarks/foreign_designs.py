@@ -1,12 +1,11 @@
 """Designs for the NS 16, UR5 and Panda: `python -m benchmarks.foreign_designs --seeds 5`.
 
 The cell of the UR5 and the Panda is that of ``hil new --design-only`` from their URDF; searches are
-those of ``hil design`` with all constraints, by one process. ``gradient``, ``front``, ``balanced``,
-``gradient+polish`` (half of the steps, then the polish) and, for sines in place of via points,
-``sines front`` and ``sines weighted`` end after ``--seconds`` (30, of the NS 16 60); ``quick``
-(``--quick``) runs to its end. Seconds are those of processor, of all processes of a search: on a
-machine with other work a wall clock times that as well. A search ends after the generation or step
-in which its time is over.
+those of ``hil design`` with all constraints, by one process. ``gradient`` and, for sines in place
+of via points, ``sines`` end after ``--seconds`` (30, of the NS 16 60); ``quick`` (``--quick``) runs
+to its end. Seconds are those of processor, of all processes of a search: on a machine with other
+work a wall clock times that as well. A search ends after the generation or step in which its time
+is over.
 """
 
 from __future__ import annotations
@@ -34,33 +33,14 @@ _ARMS: Final = {
     "panda": ARMS["panda"],
 }
 _SECONDS: Final = {"ns16": 60.0, "ur5": 30.0, "panda": 30.0}
-_SEARCHES: Final = (
-    "gradient",
-    "front",
-    "balanced",
-    "gradient+polish",
-    "sines front",
-    "sines weighted",
-    "quick",
-)
+_SEARCHES: Final = ("gradient", "sines", "quick")
 
 
 def _settings(name: str, cell: Cell) -> DesignSettings:
     if name == "quick":
         return quick_settings(cell)
-    if name == "front":
-        return preset("front")
-    if name == "balanced":
-        return preset("balanced")
-    if name == "gradient+polish":
-        return preset("gradient").replaced(search={"gradient": 90, "polish": 6000})
-    if name.startswith("sines"):
-        sines = preset("a").to_dict()["sines"] | {"fastest": "from limits"}
-        raw = {"method": "front", "sines": sines}
-        if name == "sines weighted":
-            effort = {"population": 100, "generations": 120, "gradient": 0, "starts": 1}
-            raw = {"method": "gradient", "sines": sines, "search": effort}
-        return settings_of(raw)
+    if name == "sines":
+        return settings_of({"sines": {"fastest": "from limits"}})
     return preset("gradient")
 
 
