@@ -63,6 +63,10 @@ FORMER_OPTIONS: Final[Mapping[str, tuple[str, Collection[str]]]] = {
 }
 """Options by their names in version 0.1: present name, and the commands that have it."""
 
+FORMER_METHODS: Final[Mapping[str, str]] = {"balanced": "gradient", "front": "gradient"}
+"""Methods of `hil design` in version 0.1, and those that replaced them. Settings files that name
+them are refused by `hil.design.settings`, whose list is the same; it is slow to load."""
+
 _METHOD_OPTIONS: Final = ("--method", "--show-settings")  # of `hil design`
 _EXAMPLES: Final = re.compile(r"\*\*Examples?:?\*\*(.*?)(?:\n\n(?!- )|\Z)", re.DOTALL)
 _COMMAND: Final = re.compile(r"`(hil [^`]+)`")
@@ -86,25 +90,13 @@ def with_present_names(arguments: Sequence[str]) -> tuple[list[str], list[str]]:
         if present[place] in commands:
             notes.append(f"{name} is now called {option}")
             present[k] = option + equals + value
-    if present[place] == "design":
-        notes += _replace_former_methods(present, place, end)
+        if present[place] == "design" and name in _METHOD_OPTIONS:
+            at = k if equals else k + 1
+            method = value if equals else "".join(present[at : min(at + 1, end)])
+            if new := FORMER_METHODS.get(method):
+                notes.append(f"the method {method} was replaced by {new}, used in this version")
+                present[at] = name + equals + new if equals else new
     return present, notes
-
-
-def _replace_former_methods(present: list[str], place: int, end: int) -> list[str]:
-    """Replace methods of version 0.1 in the arguments of `hil design`; return a note for each."""
-    from hil.design.settings import FORMER_METHODS  # slow to load
-
-    notes = []
-    for k in range(place + 1, end):
-        name, equals, method = present[k].partition("=")
-        if name not in _METHOD_OPTIONS or (not equals and k + 1 == end):
-            continue
-        method = method if equals else present[k + 1]
-        if method in FORMER_METHODS:
-            present[k if equals else k + 1] = f"{name}=gradient" if equals else "gradient"
-            notes.append(f"the method {method} was replaced by gradient, which is used instead")
-    return notes
 
 
 def improve(error: BaseException) -> None:

@@ -10,7 +10,7 @@ from typing import Any, Literal, get_args, get_origin
 import pytest
 from typer.testing import CliRunner
 
-from hil.cli import COMMANDS, GROUPS, app
+from hil.cli import COMMANDS, GROUPS, app, suggestions
 from hil.cli.suggestions import (
     FORMER_OPTIONS,
     OTHER_COMMANDS,
@@ -208,7 +208,8 @@ class TestFormerNames:
             ("design", "none.toml", *([f"{option}={name}"] if joined else [option, name]))
             for name in (method, "gradient")
         )
-        note = f"the method {method} was replaced by gradient, which is used instead"
+        assert set(suggestions.FORMER_METHODS) == set(FORMER_METHODS)
+        note = f"the method {method} was replaced by gradient, used in this version"
         assert with_present_names(former) == (list(present), [note])
         done = invoke(*former)
         expected = invoke(*present)
