@@ -12,7 +12,7 @@ Run with ``python -m benchmarks.design [--json] [--search]``: the NS 16 (6 joint
   with its preset, planned eight together as a search does; their mean, and
   ``individual_worst_ms`` the slowest one, ``individual_20_s_ms`` one that is as long as a motion
   may be. ``scoring_ms`` and ``scoring_worst_ms``: all that a search does with each, joint limits
-  included. The same of the default search, with ``_front``: 14 via points, and in its scoring
+  included. The same of the default search, with ``_default``: 16 via points, and in its scoring
   floor, self-collision and motor currents as well.
 - with ``--search``: wall time of the paper's whole method B (150 individuals, 120 generations) by
   one worker process and by two, kinematic limits only; and the processor time of all processes in
@@ -123,8 +123,8 @@ def time_individuals(cell: Cell, count: int, repetitions: int) -> dict[str, floa
     """Time random individuals of method B and of the default search."""
     result: dict[str, float] = {}
     b = problem_of(cell, preset("b").kinematic())
-    front = problem_of(cell, preset("front"))
-    for name, problem in (("", b), ("_front", front)):
+    default = problem_of(cell, preset("gradient"))
+    for name, problem in (("", b), ("_default", default)):
         times = time_problem(problem, count, repetitions)
         for kind, each in (("individual", times.judging), ("scoring", times.scoring)):
             result[f"{kind}{name}_ms"] = round(float(each.mean()) * 1e3, 3)

@@ -2,9 +2,9 @@
 
 Run with ``python -m benchmarks.excitation_study [--seeds 3] [--quick] [--workers 2]
 [--only NAME ...] [--weights OF_LOG_DET OF_I_C] [--via-points N --duration S] [--json]``. Every
-search is that of ``hil design`` with the preset of its method: ``B (eq. 7)``, ``gradient`` and
-``front`` with nothing but joint limits to keep, as in the paper; ``+ motor currents`` and ``all
-constraints`` closed at the cell's home, clear of floor and itself, and within 80 % of the currents.
+search is that of ``hil design`` with the preset of its method: ``B (eq. 7)`` and ``gradient`` with
+nothing but joint limits to keep, as in the paper; ``all constraints`` closed at the cell's home,
+clear of floor and itself, and within 80 % of the currents.
 Motions with a number of via points take at most 1.25 s for each and are improved from one start.
 ``--via-points`` and ``--duration`` of the longest motion replace those of a case.
 
@@ -58,10 +58,6 @@ CASES: Final[dict[str, DesignSettings]] = {
     "gradient, all constraints": preset("gradient"),
     "gradient, 60 via points": _longer(preset("gradient").kinematic(), 60, 75, 0.8),
     "gradient, all constraints, 36 via points": _longer(preset("gradient"), 36, 110),
-    "front": preset("front").kinematic(),
-    "+ motor currents": preset("front").replaced(
-        constraints={"closed": True, "collision": True, "current": True}
-    ),
 }
 
 
@@ -93,9 +89,8 @@ def run(
     if duration is not None:
         settings = settings.replaced(constraints={"max_duration": duration})
     if quick:
-        polish = min(settings.search.polish, 50)
-        effort = {"population": 24, "generations": 6, "polish": polish}
-        effort["gradient"] = min(settings.search.gradient, 5)
+        steps = min(settings.search.gradient, 5)
+        effort = {"population": 24, "generations": 6, "gradient": steps}
         settings = settings.replaced(search=effort)
     row: dict[str, Any] = {"case": name, "seed": seed}
     begin = time.perf_counter()

@@ -1,8 +1,9 @@
-"""Designs for arms from their URDF alone: `python -m benchmarks.foreign_designs --seeds 5`.
+"""Designs for the NS 16, UR5 and Panda: `python -m benchmarks.foreign_designs --seeds 5`.
 
-The cell is that of ``hil new --design-only``; searches are those of ``hil design``, by one process:
-``gradient`` (``--method gradient``) ended after 30 s, ``quick`` (``--quick``) and ``default`` ended
-after 60 s. Seconds are those of processor, of all processes of a search: on a machine with other
+The cell of the UR5 and the Panda is that of ``hil new --design-only`` from their URDF; searches are
+those of ``hil design`` with all constraints, by one process. ``gradient`` and, for sines in place
+of via points, ``sines`` end after ``--seconds`` (30, of the NS 16 60); ``quick`` (``--quick``) runs
+to its end. Seconds are those of processor, of all processes of a search: on a machine with other
 work a wall clock times that as well. A search ends after the generation or step in which its time
 is over.
 """
@@ -22,17 +23,25 @@ from hil.campaign.plan import quick_settings
 from hil.cell import Cell
 from hil.cli import new
 from hil.design.problem import problem_of, search_settings
-from hil.design.settings import DesignSettings, preset
+from hil.design.settings import DesignSettings, preset, settings_of
 from identification.excitation import NoFeasibleMotionError, Population, search
+from sim_fixtures.ns16 import CELL_PATH
 
-_ARMS: Final = {"ur5": "ur_description/urdf/ur5_robot.urdf", "panda": ARMS["panda"]}
-_SECONDS: Final = {"gradient": 30.0, "quick": np.inf, "default": 60.0}
+_ARMS: Final = {
+    "ns16": None,
+    "ur5": "ur_description/urdf/ur5_robot.urdf",
+    "panda": ARMS["panda"],
+}
+_SECONDS: Final = {"ns16": 60.0, "ur5": 30.0, "panda": 30.0}
+_SEARCHES: Final = ("gradient", "sines", "quick")
 
 
 def _settings(name: str, cell: Cell) -> DesignSettings:
     if name == "quick":
         return quick_settings(cell)
-    return preset("gradient" if name == "gradient" else "front")
+    if name == "sines":
+        return settings_of({"sines": {"fastest": "from limits"}})
+    return preset("gradient")
 
 
 def _processor_time() -> float:
@@ -44,7 +53,7 @@ def _processor_time() -> float:
     return time.process_time() + 1e-9 * sum(counts)
 
 
-def designed(cell: Cell, name: str, seed: int) -> dict[str, Any]:
+def designed(cell: Cell, name: str, seed: int, limit: float) -> dict[str, Any]:
     """Search once."""
     settings = _settings(name, cell).replaced(seed=seed)
     row: dict[str, Any] = {"search": name, "seed": seed}
@@ -55,9 +64,7 @@ def designed(cell: Cell, name: str, seed: int) -> dict[str, Any]:
             return _processor_time() - begin
 
         try:
-            design = search(
-                population, search_settings(settings), stop=lambda: seconds() > _SECONDS[name]
-            )
+            design = search(population, search_settings(settings), stop=lambda: seconds() > limit)
         except NoFeasibleMotionError as error:
             return row | {"infeasible": str(error), "seconds": round(seconds(), 1)}
         row["seconds"] = round(seconds(), 1)
@@ -73,18 +80,25 @@ def main() -> None:
     """Print the searches of each arm and seed."""
     parser = parser_of(__doc__)
     parser.add_argument("--arms", nargs="+", choices=_ARMS, default=list(_ARMS))
-    parser.add_argument("--searches", nargs="+", choices=_SECONDS, default=list(_SECONDS))
+    parser.add_argument(
+        "--searches", nargs="+", choices=_SEARCHES, default=["gradient"], metavar="NAME"
+    )
     parser.add_argument("--seeds", type=int, default=5, help="how many seeds, from 1 on")
+    parser.add_argument("--seconds", type=float, help="of processor for each search")
     options = parser.parse_args()
     rows = []
     with tempfile.TemporaryDirectory() as scratch:
         for arm in options.arms:
-            path = Path(scratch) / arm / "cell.toml"
-            new.new(urdf(_ARMS[arm]), output=path, design_only=True, json=True)
+            path = CELL_PATH
+            if (description := _ARMS[arm]) is not None:
+                path = Path(scratch) / arm / "cell.toml"
+                new.new(urdf(description), output=path, design_only=True, json=True)
             cell = Cell.load(path)
+            seconds = options.seconds or _SECONDS[arm]
             for seed in range(1, options.seeds + 1):
                 for name in options.searches:
-                    rows.append({"arm": arm} | designed(cell, name, seed))
+                    limit = np.inf if name == "quick" else seconds
+                    rows.append({"arm": arm} | designed(cell, name, seed, limit))
                     if not options.json:
                         print(
                             *(f"{key} {value}" for key, value in rows[-1].items()),

@@ -5,7 +5,7 @@ from __future__ import annotations
 from functools import cache
 from importlib.metadata import version
 
-_PACKAGES = ("hil", "numpy", "scipy", "pin", "ruckig", "pymoo", "cma", "mcap")
+_PACKAGES = ("hil", "numpy", "scipy", "pin", "ruckig", "pymoo", "mcap")
 
 
 @cache

@@ -131,7 +131,7 @@ def quick_settings(cell: Cell) -> DesignSettings:
     population = max(LEAST, isqrt(4 * motions // 3))
     return preset("b").replaced(
         seed=campaign.seed,
-        search={"population": population, "generations": motions // population, "polish": 0},
+        search={"population": population, "generations": motions // population},
         via_points={"n_via": campaign.n_via, "fly": campaign.fly, "slowest": SLOWEST},
         constraints={"closed": True, "collision": True, "current": True, "max_duration": LONGEST},
     )

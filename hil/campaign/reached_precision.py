@@ -22,7 +22,7 @@ from hil.base.progress import Reporter, Silent
 from hil.base.safe_input import path_exists
 from hil.base.terminal_text import plural
 from hil.design.result import RESULT
-from hil.design.settings import load_settings
+from hil.design.settings import recorded_settings
 from hil.pipeline.estimating import estimate_with, with_loading
 from hil.pipeline.options import Options
 from hil.pipeline.prepared import (
@@ -319,7 +319,7 @@ def given_to(campaign: CampaignState) -> tuple[Path, ...]:
     path = campaign.folder.root / RESULT
     if not path_exists(path):
         return ()
-    return tuple(Path(name) for name in load_settings(path).objective.given)
+    return tuple(Path(name) for name in recorded_settings(path).objective.given)
 
 
 def requirements_of(campaign: CampaignState, texts: Sequence[str]) -> tuple[Requirement, ...]:
@@ -335,7 +335,7 @@ def requirements_of(campaign: CampaignState, texts: Sequence[str]) -> tuple[Requ
     if record is not None:
         return requirements_from(record.requirements)
     if (folder.root / RESULT).exists():
-        stated = load_settings(folder.root / RESULT).objective.precision
+        stated = recorded_settings(folder.root / RESULT).objective.precision
         if stated:
             return requirements_from(stated)
     raise InputError(

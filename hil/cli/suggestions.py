@@ -63,6 +63,11 @@ FORMER_OPTIONS: Final[Mapping[str, tuple[str, Collection[str]]]] = {
 }
 """Options by their names in version 0.1: present name, and the commands that have it."""
 
+FORMER_METHODS: Final[Mapping[str, str]] = {"balanced": "gradient", "front": "gradient"}
+"""Methods of `hil design` in version 0.1, and those that replaced them. Settings files that name
+them are refused by `hil.design.settings`, whose list is the same; it is slow to load."""
+
+_METHOD_OPTIONS: Final = ("--method", "--show-settings")  # of `hil design`
 _EXAMPLES: Final = re.compile(r"\*\*Examples?:?\*\*(.*?)(?:\n\n(?!- )|\Z)", re.DOTALL)
 _COMMAND: Final = re.compile(r"`(hil [^`]+)`")
 _MOST: Final = 2  # examples of one error
@@ -85,6 +90,12 @@ def with_present_names(arguments: Sequence[str]) -> tuple[list[str], list[str]]:
         if present[place] in commands:
             notes.append(f"{name} is now called {option}")
             present[k] = option + equals + value
+        if present[place] == "design" and name in _METHOD_OPTIONS:
+            at = k if equals else k + 1
+            method = value if equals else "".join(present[at : min(at + 1, end)])
+            if new := FORMER_METHODS.get(method):
+                notes.append(f"the method {method} was replaced by {new}, used in this version")
+                present[at] = name + equals + new if equals else new
     return present, notes
 
 

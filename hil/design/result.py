@@ -27,7 +27,7 @@ from identification.excitation import (
 from planner import FourierSeries, PiecewiseCubic, PlanFile, PlannerError, in_child
 from planner.arrays import DAMAGED, Whole, numbers, strict
 
-from .settings import RESULT_FORMAT, DesignSettings, settings_of
+from .settings import RESULT_FORMAT, DesignSettings, settings_of, with_present_fields
 
 VERSION: Final = 1
 RESULT: Final = "excitation.toml"
@@ -51,10 +51,10 @@ _COMMENTS: Final = {
     "of one\nrobot in the same units; coupling_index (0 to coupling_index_max) has no unit.",
     "search": "infeasible: number of motions that violated each kind of constraint.",
     "front": "Pareto front by the second criterion, at the sample period of the search. chosen: "
-    "index\n(from 0) of the motion in this file; without it the motion was polished, see "
+    "index\n(from 0) of the motion in this file; without it the gradient improved it, see "
     "polished_from.",
-    "polished_from": "Index (from 0) in the front of the motion that the polish started from, and "
-    "its criteria,\nsampled every millisecond.",
+    "polished_from": "Index (from 0) in the front of the motion that the gradient started from, "
+    "and its criteria,\nsampled every millisecond.",
     "settings": "Settings of the search; `hil design --settings` can read them from this file.",
     "cell": "Name of the cell, and digests of its parts.",
     "precision": "Requirements: the worst quantity, half of its 95 % interval as promised for the\n"
@@ -221,7 +221,7 @@ class DesignResult:
 
     @classmethod
     def _from_data(cls, data: Mapping[str, Any], path: Path) -> Self:
-        settings = settings_of(data["settings"], path)
+        settings = settings_of(with_present_fields(data["settings"]), path)
         search = data["search"]
         via = settings.via_points
         figures = {k: v for k, v in data["criteria"].items() if k in Criteria.__dataclass_fields__}

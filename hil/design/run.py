@@ -299,10 +299,8 @@ def _without_motion(
 
 def _note(progress: excitation.Progress) -> str:
     where = {
-        "sample": "scoring random motions",
         "search": f"generation {progress.generation} of {progress.generations}",
         "gradient": "improving by the gradient",
-        "polish": "polishing",
     }[progress.phase]
     if math.isnan(progress.best[0]):
         return f"{where}, {progress.feasible} feasible"

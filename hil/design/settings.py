@@ -25,6 +25,8 @@ Eta = Annotated[Number, Field(ge=1, le=1000)]
 Frequencies = Annotated[list[Positive], Field(min_length=1)]
 Fraction = Annotated[Number, Field(gt=0, le=1)]
 _MOTIONS: Final[Mapping[str, Method]] = {"via_points": "b", "sines": "a"}
+FORMER_METHODS: Final = ("balanced", "front")
+"""Methods of version 0.1, which the gradient replaced."""
 RESULT_FORMAT: Final = "designed excitation"
 """Key `format` of a result file, which has a table of the settings."""
 MOST_VIA_POINTS: Final = 60
@@ -53,8 +55,8 @@ class SearchTable(Table):
     crossover_eta: Eta = field("the distribution index of the crossover (SBX), 1 to 1000", 15.0)
     mutation_eta: Eta = field("the distribution index of the mutation, 1 to 1000", 20.0)
     weights: tuple[Share, Share] = field(
-        "the weights of log det and of I_c,max / I_c, two shares from 0 to 1 that add "
-        "up to 1; methods b and balanced",
+        "the weights of log det and of -I_c (method gradient) or I_c,max / I_c (method b), two "
+        "shares from 0 to 1 that add up to 1",
         (0.7, 0.3),
     )
     gradient: Whole = field(
@@ -65,12 +67,6 @@ class SearchTable(Table):
     )
     starts: Whole = field(
         "a number of motions that share the first half of these steps, 1 to 100", 1, ge=1, le=100
-    )
-    polish: Whole = field(
-        "a number of motions for the local search from the best one, 0 for none",
-        0,
-        ge=0,
-        le=10_000_000,
     )
 
     @model_validator(mode="after")
@@ -257,6 +253,30 @@ def load_settings(path: Path) -> DesignSettings:
     Raises:
         SettingsError: names file, field, value and remedy.
     """
+    return settings_of(_read(path), path)
+
+
+def recorded_settings(path: Path) -> DesignSettings:
+    """Read the settings of a finished design, which a version up to 0.1 may have made.
+
+    Raises:
+        SettingsError: names file, field, value and remedy.
+    """
+    return settings_of(with_present_fields(_read(path)), path)
+
+
+def with_present_fields(raw: Mapping[str, Any]) -> dict[str, Any]:
+    """Return settings of a finished design by the methods and fields of this version."""
+    present = dict(raw)
+    if raw.get("method") in FORMER_METHODS:
+        present["method"] = "gradient"
+    if isinstance(raw.get("search"), Mapping):
+        present["search"] = {k: v for k, v in raw["search"].items() if k != "polish"}
+    return present
+
+
+def _read(path: Path) -> dict[str, Any]:
+    """Return the settings in a TOML file, or in the result of a design."""
     try:
         raw = parse_toml(read_text(path))
     except OSError as error:
@@ -266,13 +286,20 @@ def load_settings(path: Path) -> DesignSettings:
         remedy = "see `hil design --show-settings gradient`"
         raise SettingsError(path, f"is not TOML ({error})", remedy=remedy) from error
     if raw.get("format") == RESULT_FORMAT and isinstance(raw.get("settings"), dict):
-        raw = raw["settings"]
-    return settings_of(raw, path)
+        return dict(raw["settings"])
+    return raw
 
 
 def settings_of(raw: Mapping[str, Any], path: Path | None = None) -> DesignSettings:
     """Return settings from the data of a file; see :func:`load_settings`."""
-    method = raw.get("method", "front" if "sines" in raw else "gradient")
+    method = raw.get("method", "gradient")
+    if method in FORMER_METHODS:
+        raise SettingsError(
+            path,
+            "is a method of version 0.1, which the gradient replaced",
+            field=f"method = {method!r}",
+            remedy="leave out method and [search]: the defaults are those of the gradient",
+        )
     if method not in METHODS:
         raise SettingsError(
             path,
@@ -280,7 +307,13 @@ def settings_of(raw: Mapping[str, Any], path: Path | None = None) -> DesignSetti
             field=f"method = {method!r:.60}",
             remedy=f"known are: {', '.join(METHODS)}",
         )
+    raw = _without_polish(raw, path)
     base = tomllib.loads(preset_text(method))
+    if "sines" in raw and base["search"].get("gradient"):
+        # Their criteria have no gradient: a genetic search as long as that of method A.
+        effort = tomllib.loads(preset_text(_MOTIONS["sines"]))["search"]
+        size = {name: effort[name] for name in ("population", "generations")}
+        base["search"] |= {**size, "gradient": 0, "starts": 1}
     given = [name for name in _MOTIONS if name in raw]
     if given:  # defaults for a motion of another kind are those of the paper's method
         base = {
@@ -289,6 +322,21 @@ def settings_of(raw: Mapping[str, Any], path: Path | None = None) -> DesignSetti
         for name in given:
             base.setdefault(name, tomllib.loads(preset_text(_MOTIONS[name]))[name])
     return _validated(path, _merged(base, raw))
+
+
+def _without_polish(raw: Mapping[str, Any], path: Path | None) -> Mapping[str, Any]:
+    """Return settings without `polish`, which files of version 0.1 have, mostly as 0."""
+    search = raw.get("search")
+    if not isinstance(search, Mapping) or "polish" not in search:
+        return raw
+    if search["polish"] != 0:
+        raise SettingsError(
+            path,
+            "is a local search of version 0.1, which steps along the gradient replaced",
+            field=f"search.polish = {search['polish']!r:.60}",
+            remedy="leave it out; [search] gradient = 180 improves a motion through via points",
+        )
+    return with_present_fields(raw)
 
 
 def _merged(base: Mapping[str, Any], changes: Mapping[str, Any]) -> dict[str, Any]:

@@ -70,8 +70,8 @@ def draw_front(axes: Axes, design: Design) -> None:
     star = {"linestyle": "none", "marker": "*", "markersize": 13.0, "color": style.LIMIT}
     if chosen is None:
         criteria = design.excitation.criteria
-        polished = getattr(criteria, upward), getattr(criteria, rightward)
-        mark("chosen, polished", polished, **star, zorder=4.0)
+        improved = getattr(criteria, upward), getattr(criteria, rightward)
+        mark("chosen, improved", improved, **star, zorder=4.0)
         mark("grew from", origin, **_WHITE, marker="o", markeredgecolor=style.LIMIT)
     else:  # at the sample period of the front
         mark("chosen", origin, **star, zorder=4.0)

@@ -15,10 +15,10 @@ from hil.base.errors import InputError
 from hil.cell import Cell
 from hil.design.settings import SettingsError
 from hil.pipeline.options import Options
-from hil.pipeline.prepared import executed_rows, reduction_of, stated_settings, versions_of
+from hil.pipeline.prepared import executed_rows, samples_of, stated_settings
 from hil.pipeline.sources import Source, archives_in, arm_differences, gather_sources
-from identification.excitation import Given
-from identification.excitation.criteria import information
+from identification.excitation import Given, Objective
+from identification.excitation.constraints import SAMPLE_PERIOD
 
 
 def given_sources(cell: Cell, paths: Sequence[Path]) -> tuple[Source, ...]:
@@ -49,18 +49,23 @@ def given_of(cell: Cell, paths: Sequence[Path]) -> Given:
         InputError: the archives cannot be read, have no motion, or are of another arm.
     """
     options = Options()
+    objective = Objective(cell.model)
     settings = stated_settings(cell, options)
     total = np.zeros((cell.model.n_parameters, cell.model.n_parameters))
     count = 0
     duration = 0.0
     for source in given_sources(cell, paths):
-        versions = versions_of(source, cell, settings)
-        time = versions[0].motion.time[executed_rows(source, versions[0])]
-        if len(time) < 2:
+        samples = samples_of(source, cell, settings)
+        motion = samples.motion.rows(executed_rows(source, samples))
+        if motion.n_samples < 2:
             continue
-        total += information(reduction_of(cell, settings, versions, unmodelled=False).factor)
-        count += len(time)
-        duration += float(time[-1] - time[0])
+        seconds = float(motion.time[-1] - motion.time[0])
+        stride = max(1, int(SAMPLE_PERIOD * (motion.n_samples - 1) / seconds))
+        # As the objective has it of the motion that is designed: all executed rows.
+        part = motion.rows(slice(None, None, stride))
+        total += objective.information(part)
+        count += part.n_samples
+        duration += seconds
     if count == 0:
         raise InputError(
             paths[0], "nothing moves in the recordings", field="--given", remedy="omit them"

@@ -71,7 +71,6 @@ def searches(settings: StudySettings, n_joints: int) -> list[Search]:
             search={
                 "population": effort.population,
                 "generations": effort.generations,
-                "polish": 0,
             },
         )
         for preset_settings, effort in (

@@ -42,7 +42,6 @@ from identification.excitation.searches.population import (
     Front,
     Population,
     Problem,
-    Scale,
     Scores,
     SearchSettings,
 )

@@ -115,7 +115,7 @@ def test_the_demo_runs_a_design_and_identifies_from_its_archives(
 ) -> None:
     folder = tmp_path / "demo"
     made = tmp_path / "design"
-    small = {"population": 12, "generations": 2, "polish": 0}
+    small = {"population": 12, "generations": 2}
     settings = preset(method).replaced(search=small, **changes)
     run_design(DesignFolder(made), Cell.load(CELL_PATH), settings, Silent())
     arguments = ["demo", "--output", str(folder), "--excitation", str(made / "excitation.toml")]

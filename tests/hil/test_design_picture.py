@@ -55,9 +55,9 @@ OTHER = Criterion(lambda *_: 1.0, "κ", -1.0, "Spread of Φ", "of all", 3, relat
 
 
 def design_of(cell: Cell, trajectory: Trajectory, chosen: int | None = 1) -> Design:
-    """A design with three motions on its front, of which the second is chosen or polished."""
+    """A design with three motions on its front, of which the second is chosen or improved."""
     criteria = Objective(cell.model).criteria(trajectory, 0.008)
-    excitation = Excitation(trajectory, criteria, "front", seed=1, tried=1, rejected={})
+    excitation = Excitation(trajectory, criteria, "gradient", seed=1, tried=1, rejected={})
     measures = np.array([[100.0, 70.0], [105.7, 80.0], [108.0, 110.0]])
     return Design(
         genes=np.zeros(1),
@@ -104,12 +104,12 @@ class TestPage:
         assert position.get_yticks() == pytest.approx([-50.0, 0.0, 95.0])  # as in the file
         assert "position [deg, controller angles]" in texts(figure)
 
-    def test_a_polished_motion_is_not_on_the_front(self, two_link):
+    def test_an_improved_motion_is_not_on_the_front(self, two_link):
         design = design_of(two_link, wandering(two_link))
         assert "chosen (105.70, 80.0)" in texts(draw_design(design, two_link))
         figure = draw_design(replace(design, chosen=None), two_link)
         log10_det, index = design.excitation.criteria.measures
-        assert f"chosen, polished ({log10_det:.2f}, {index:.1f})" in texts(figure)
+        assert f"chosen, improved ({log10_det:.2f}, {index:.1f})" in texts(figure)
         assert "grew from (105.70, 80.0)" in texts(figure)
 
     def test_the_axes_of_the_front_are_its_criteria(self, two_link, monkeypatch):

@@ -16,7 +16,13 @@ from hil.cell import AngleFrame, Cell
 from hil.cli import app
 from hil.design import METHODS, load_settings, preset, problem_of, search_settings
 from hil.design.messages import NoExcitationError, advice_on_branches, no_excitation
-from hil.design.settings import SettingsError, preset_text, settings_of
+from hil.design.settings import (
+    FORMER_METHODS,
+    SettingsError,
+    preset_text,
+    recorded_settings,
+    settings_of,
+)
 from hil.new import cell_of_urdf
 from identification.excitation import NoFeasibleMotionError, Violation
 from identification.model.kinematics import chain_from_urdf
@@ -34,12 +40,12 @@ def test_presets_have_the_values_of_table_1():
     a = preset("a")
     b = preset("b")
     assert (a.search.population, a.search.generations) == (100, 120)
-    assert (a.search.mutation, a.search.crossover, a.search.polish) == (0.01, 0.7, 0)
+    assert (a.search.mutation, a.search.crossover, a.search.gradient) == (0.01, 0.7, 0)
     assert a.sines is not None and a.sines.harmonics == 3
     assert a.sines.fastest == [0.94, 2.38, 0.53, 0.44, 0.89, 0.44]
     assert a.sines.slowest == [0.314]
     assert (b.search.population, b.search.generations) == (150, 120)
-    assert (b.search.mutation, b.search.crossover, b.search.polish) == (0.01, 0.9, 0)
+    assert (b.search.mutation, b.search.crossover, b.search.gradient) == (0.01, 0.9, 0)
     assert b.search.weights == (0.7, 0.3)
     assert b.via_points is not None and b.via_points.n_via == 6
 
@@ -62,15 +68,17 @@ def test_presets_are_files_with_all_constraints_on(method, tmp_path):
 
 
 def test_missing_settings_are_those_of_the_preset():
-    """All methods but the gradient can search both kinds of motion."""
+    """Every method can search both kinds of motion; sines have no gradient, only its criteria."""
     assert settings_of({"method": "b"}) == preset("b")
     assert settings_of({}) == preset("gradient")
     mine = settings_of({"method": "b", "via_points": {"n_via": 9}})
     assert mine.via_points.n_via == 9
     assert mine.via_points.fly == 0.5 and mine.search == preset("b").search
-    front = settings_of({"method": "front", "sines": {"harmonics": 5}})
-    assert front.via_points is None
-    assert front.sines.harmonics == 5 and front.sines.length == 20.0
+    sines = settings_of({"sines": {"harmonics": 5}})
+    assert sines.method == "gradient" and sines.via_points is None
+    assert sines.sines.harmonics == 5 and sines.sines.length == 20.0
+    assert (sines.search.gradient, sines.search.weights) == (0, (0.75, 0.25))
+    assert (sines.search.population, sines.search.generations) == (100, 120)
     a = settings_of({"method": "a", "via_points": {}})
     assert a.sines is None and a.via_points == preset("b").via_points
 
@@ -78,9 +86,9 @@ def test_missing_settings_are_those_of_the_preset():
 @pytest.mark.parametrize(
     ("text", "named"),
     [
-        ('method = "gradient"\n[sines]', ["gradient = 180", "not [sines]", "make it 0"]),
+        ("[search]\ngradient = 180\n[sines]", ["gradient = 180", "not [sines]", "make it 0"]),
         ('metod = "b"', ["metod", "is not a field", "valid fields", "method"]),
-        ('method = "c"', ["method = 'c'", "a, b, balanced, front"]),
+        ('method = "c"', ["method = 'c'", "known are: a, b, gradient"]),
         ("[search]\npopulation = 2", ["search.population = 2", "4 to 10000"]),
         ('[search]\npopulation = "24"', ["search.population = '24'", "4 to 10000"]),
         ('[constraints]\nclosed = "yes"', ["constraints.closed = 'yes'", "true or false"]),
@@ -100,6 +108,12 @@ def test_missing_settings_are_those_of_the_preset():
             '[objective]\nparameters = ["mc2y"]',
             ["objective.parameters", "a list of at least two names"],
         ),
+        (
+            'method = "front"',
+            ["method = 'front'", "of version 0.1", "gradient replaced", "leave out method and [se"],
+        ),
+        ('method = "balanced"\n[sines]', ["method = 'balanced'", "leave out method and [search]"]),
+        ("[search]\npolish = 6000", ["search.polish = 6000", "leave it out", "gradient = 180"]),
         ("[search\n", ["is not TOML", "--show-settings"]),
     ],
 )
@@ -115,6 +129,27 @@ def test_invalid_settings_name_file_field_value_and_remedy(text, named, tmp_path
         assert word not in text
     with pytest.raises(SettingsError, match=r"none\.toml: cannot be read.*name a TOML file"):
         load_settings(tmp_path / "none.toml")
+
+
+def test_no_polish_is_left_out():
+    """Files of version 0.1 state it, mostly as 0."""
+    assert settings_of({"method": "b", "search": {"polish": 0}}) == preset("b")
+
+
+@pytest.mark.parametrize("method", FORMER_METHODS)
+@pytest.mark.parametrize("motion", ["via_points", "sines"])
+def test_records_of_former_methods_are_read(tmp_path, method, motion):
+    """Of a finished design: what it was to add to is needed later."""
+    path = tmp_path / "excitation.toml"
+    effort = {"population": 100, "generations": 150, "polish": 6000, "gradient": 0}
+    objective = {"given": ["runs/mine"]}
+    settings = {"method": method, "search": effort, "objective": objective, motion: {}}
+    path.write_text(to_text({"format": "designed excitation", "settings": settings}, {}))
+    recorded = recorded_settings(path)
+    assert recorded.objective.given == ["runs/mine"]
+    assert recorded.search.population == 100 and getattr(recorded, motion) is not None
+    with pytest.raises(SettingsError, match="gradient replaced"):
+        load_settings(path)
 
 
 def test_motions_through_via_points_are_closed_by_default(cell):

@@ -10,7 +10,7 @@ from typing import Any, Literal, get_args, get_origin
 import pytest
 from typer.testing import CliRunner
 
-from hil.cli import COMMANDS, GROUPS, app
+from hil.cli import COMMANDS, GROUPS, app, suggestions
 from hil.cli.suggestions import (
     FORMER_OPTIONS,
     OTHER_COMMANDS,
@@ -19,6 +19,7 @@ from hil.cli.suggestions import (
     with_present_names,
 )
 from hil.design import METHODS
+from hil.design.settings import FORMER_METHODS
 from hil.pipeline.estimators import ESTIMATORS
 from hil.pipeline.options import FRICTION_TERMS
 
@@ -196,6 +197,25 @@ class TestFormerNames:
         present = invoke(*with_present_names(arguments)[0])
         assert (str(done.exception), done.stdout) == (str(present.exception), present.stdout)
         assert "none" in str(present.exception)
+
+    @pytest.mark.parametrize("method", FORMER_METHODS)
+    @pytest.mark.parametrize("option", ["--method", "--show-settings"])
+    @pytest.mark.parametrize("joined", [True, False])
+    def test_a_former_search_method_is_the_gradient(
+        self, option: str, method: str, joined: bool
+    ) -> None:
+        former, present = (
+            ("design", "none.toml", *([f"{option}={name}"] if joined else [option, name]))
+            for name in (method, "gradient")
+        )
+        assert set(suggestions.FORMER_METHODS) == set(FORMER_METHODS)
+        note = f"the method {method} was replaced by gradient, used in this version"
+        assert with_present_names(former) == (list(present), [note])
+        done = invoke(*former)
+        expected = invoke(*present)
+        assert f"note: {note}" in done.stderr
+        assert done.exit_code == expected.exit_code
+        assert (str(done.exception), done.stdout) == (str(expected.exception), expected.stdout)
 
     def test_an_import_has_a_standstill_speed(self) -> None:
         arguments = ("import", "log", "a.csv", "--standstill", "0.02")

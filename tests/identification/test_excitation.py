@@ -36,7 +36,7 @@ from identification.excitation.criteria import (
 from identification.excitation.errors import DesignError
 from identification.excitation.excitation import Excitation
 from identification.excitation.genomes import SineGenome, ViaPointGenome
-from identification.excitation.searches.population import Front, Scale, Scores
+from identification.excitation.searches.population import Front, Scores
 from identification.excitation.validation_motions import random_validation_motions
 from identification.excitation.violation import KINDS, NoFeasibleMotionError, excess_by_kind
 from identification.model.friction import FrictionLaw
@@ -584,9 +584,6 @@ class TestMeasures:
         assert criteria.scaled_condition == pytest.approx(np.linalg.cond(unit), rel=1e-6)
 
 
-RANDOM_MOTIONS = Scale((20.0, 150.0), (10.0, 30.0))
-
-
 def scores_of(log10_det, coupling_index, *, duration=5.0, excess=0.0):
     """Scores with one excess, of collisions."""
     measures = np.array([log10_det, coupling_index], dtype=float).T.reshape(-1, 2)
@@ -622,10 +619,6 @@ def front_of_motions(rows):
     return Front.of(table[:, 3:5], scores)
 
 
-BENT = ([90.0, 104.0, 104.5, 105.0], [60.0, 61.0, 80.0, 100.0])
-FAR_END = ([-300.0, 90.0, 104.0, 104.5, 105.0], [59.9, 60.0, 64.0, 80.0, 100.0])
-
-
 class TestFront:
     @given(motions)
     def test_it_is_what_brute_force_finds(self, rows):
@@ -657,45 +650,6 @@ class TestFront:
 
     def test_motions_without_excitation_are_left_out(self):
         assert front_of([-np.inf, 50.0], [np.inf, 100.0]).measures.tolist() == [[50.0, 100.0]]
-
-    @pytest.mark.parametrize(
-        ("size", "coupled", "scale", "knee"),
-        [
-            ([50.0], [100.0], None, 50.0),
-            # Of two: nine units of the determinant against three of the coupling, in spreads.
-            ([100.0, 109.0], [80.0, 83.0], RANDOM_MOTIONS, 109.0),
-            ([100.0, 100.9], [80.0, 110.0], RANDOM_MOTIONS, 100.0),
-            (*BENT, None, 104.0),
-            (*FAR_END, RANDOM_MOTIONS, 104.0),
-            (*FAR_END, None, 90.0),  # all lie above the chord from an extreme motion
-            # Without a motion better than the median the whole front counts.
-            ([5.0, 10.0, 11.0], [151.0, 152.0, 170.0], RANDOM_MOTIONS, 10.0),
-        ],
-    )
-    def test_the_knee_is_the_corner_of_the_front(self, size, coupled, scale, knee):
-        front = front_of(size, coupled)
-        assert front.measure("log10_det")[front.knee(scale)] == knee
-
-
-@pytest.fixture
-def random_motions():
-    random = np.random.default_rng(4)
-    return random.normal(19.0, 8.0, 200), random.normal(148.0, 25.0, 200)
-
-
-class TestScale:
-    def test_it_counts_from_the_median_in_quartiles(self, random_motions):
-        scale = Scale.of(scores_of(*random_motions))
-        median = [np.median(values) for values in random_motions]
-        np.testing.assert_allclose(scale.gains(median), 0.0, atol=1e-12)
-        size, coupled = (np.quantile(values, (0.25, 0.75)) for values in random_motions)
-        worse, better = scale.gains([[size[0], coupled[1]], [size[1], coupled[0]]])
-        np.testing.assert_allclose(better - worse, 1.0)
-
-    @pytest.mark.parametrize("count", [0, 1, 5])
-    def test_it_needs_different_motions(self, count):
-        with pytest.raises(DesignError, match="random motions"):
-            Scale.of(scores_of(np.full(count, 20.0), np.full(count, 150.0)))
 
 
 NS16 = RobotModel.from_urdf(urdf_text())

@@ -19,11 +19,11 @@ from identification.excitation.criteria import (
 )
 from identification.excitation.precision import Precision, Quantities
 from identification.excitation.searches import run
-from identification.excitation.searches.gradient import Ascent, _Cut, _step, improve
+from identification.excitation.searches.bundle_method import Ascent, _Cut, _step, improve
 from identification.excitation.searches.local_change import Change
 from identification.excitation.searches.population import Population, Scores, SearchSettings
 from identification.excitation.searches.run import search
-from identification.excitation.searches.tangent import Linearisation, gene_slopes
+from identification.excitation.searches.sensitivity import Linearisation, gene_slopes
 from identification.model.coupling import Coupling
 from identification.model.motion import Motion
 from planner import PlannerError
@@ -118,8 +118,8 @@ def test_the_gradient_predicts_changes_of_the_criteria(population, start, kind):
         wanted = Precision(Quantities(np.eye(13), np.ones(13)), np.ones(2), np.eye(13))
         objective = replace(objective, precision=wanted)
     problem_ = replace(problem_, objective=objective)
-    tangent = problem_.tangent(genes, weights)
-    gradient = gene_slopes(problem_, tangent, genes, np.arange(len(genes)))[:, 0]
+    sensitivity = problem_.sensitivity(genes, weights)
+    gradient = gene_slopes(problem_, sensitivity, genes, np.arange(len(genes)))[:, 0]
 
     def value(row):
         (motion,) = problem_.genome.motions(row[None])
@@ -157,8 +157,8 @@ def test_slopes_of_slow_moves_are_not_smoothed(coupling, joint):
             random = np.random.default_rng(seed)
             genes = problem_.genome.sample(random, 1)[0]
             genes[slow] = 0.3 + 0.01 * random.random(5)
-            tangent = problem_.tangent(genes, weights)
-            slopes = gene_slopes(problem_, tangent, genes, slow)[:, 0]
+            sensitivity = problem_.sensitivity(genes, weights)
+            slopes = gene_slopes(problem_, sensitivity, genes, slow)[:, 0]
             changes = 1e-4 * np.eye(len(genes))[slow]
             expected = [(value(genes + d) - value(genes - d)) / 2e-4 for d in changes]
             yield np.linalg.norm(slopes - expected) / np.linalg.norm(expected)
@@ -170,11 +170,11 @@ def test_a_part_that_takes_longer_counts_more_often(population, start):
     """By a fiftieth: its samples 51 times beside the others 50 times, against 49 times."""
     genes, _ = start
     problem_ = population.problem
-    tangent = problem_.tangent(genes, np.array([1.0, 0.0]))
+    sensitivity = problem_.sensitivity(genes, np.array([1.0, 0.0]))
     (motion,) = problem_.genome.motions(genes[None])
-    count = len(tangent.time)
+    count = len(sensitivity.time)
     part = slice(count // 4, count // 2)
-    step = tangent.duration / count
+    step = sensitivity.duration / count
     enter, left = part.start * step, part.stop * step
 
     class Longer(Change):
@@ -183,12 +183,12 @@ def test_a_part_that_takes_longer_counts_more_often(population, start):
         def states(self, time):
             return np.array(motion.sample(time))
 
-    slopes = tangent.slopes(Longer(motion, 0.0, enter, left, (left - enter) / 50.0), 1.0)
+    slopes = sensitivity.slopes(Longer(motion, 0.0, enter, left, (left - enter) / 50.0), 1.0)
 
     def value(times):
         repeated = np.full(count, 50)
         repeated[part] = times
-        states = np.repeat(tangent.states, repeated, axis=1)
+        states = np.repeat(sensitivity.states, repeated, axis=1)
         return problem_.objective.measures(
             Motion(np.arange(states.shape[1], dtype=float), *states)
         )["log10_det"]
@@ -207,21 +207,23 @@ def test_a_via_point_changes_only_the_moves_around_it(home, n_via, fly):
     middle = 0.5 * (limits.lower + limits.upper) if home else None
     genome = replace(problem_.genome, n_via=n_via, fly=fly, home=middle)
     genes = genome.sample(np.random.default_rng(n_via), 1)[0]
-    tangent = replace(problem_, genome=genome).tangent(genes, WEIGHTS)
-    assert tangent.moves is not None
+    sensitivity = replace(problem_, genome=genome).sensitivity(genes, WEIGHTS)
+    assert sensitivity.moves is not None
     which = np.arange(genome.n_point_genes)
     rows = np.repeat(genes[None], len(which), axis=0)
     rows[which, which] += np.where(genes[which] > 0.5, -0.03, 0.03)
-    changes = list(tangent.moves.changed(genome, rows, which))
-    assert n_via < 9 or min(change.length for change in changes) < 0.7 * tangent.duration
+    changes = list(sensitivity.moves.changed(genome, rows, which))
+    assert n_via < 9 or min(change.length for change in changes) < 0.7 * sensitivity.duration
     for change, motion in zip(changes, genome.motions(rows), strict=True):
-        assert motion.duration == pytest.approx(tangent.duration + change.later, rel=1e-12)
-        part = (tangent.time >= change.enter) & (tangent.time <= change.left)
-        expected = tangent.states.copy()
-        expected[:, part] = change.states(tangent.time[part])
+        assert motion.duration == pytest.approx(sensitivity.duration + change.later, rel=1e-12)
+        part = (sensitivity.time >= change.enter) & (sensitivity.time <= change.left)
+        expected = sensitivity.states.copy()
+        expected[:, part] = change.states(sensitivity.time[part])
         stretch = 1.0 + change.later / change.length
-        time = np.where(part, change.enter + stretch * (tangent.time - change.enter), tangent.time)
-        time[tangent.time > change.left] += change.later
+        time = np.where(
+            part, change.enter + stretch * (sensitivity.time - change.enter), sensitivity.time
+        )
+        time[sensitivity.time > change.left] += change.later
         np.testing.assert_allclose(np.array(motion.sample(time)), expected, rtol=1e-7, atol=1e-7)
 
 

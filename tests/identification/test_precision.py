@@ -20,7 +20,7 @@ from identification.excitation import (
 from identification.excitation.criteria import friction_of_excitation
 from identification.excitation.precision import INTERVAL
 from identification.excitation.searches.population import Population
-from identification.excitation.searches.tangent import gene_slopes
+from identification.excitation.searches.sensitivity import gene_slopes
 from tests.identification.searching import problem as small_problem
 
 
@@ -131,8 +131,8 @@ class TestSearch:
         problem = search_problem(kind)
         random = np.random.default_rng(4)
         genes = random_genes(problem)
-        tangent = problem.tangent(genes, None)
-        gradient = gene_slopes(problem, tangent, genes, np.arange(len(genes)))[:, 0]
+        sensitivity = problem.sensitivity(genes, None)
+        gradient = gene_slopes(problem, sensitivity, genes, np.arange(len(genes)))[:, 0]
 
         def value(row: np.ndarray) -> float:
             (motion,) = problem.genome.motions(row[None])

@@ -24,7 +24,7 @@ from identification.excitation.errors import JournalError
 from identification.excitation.searches.population import Scores
 
 # Packages whose release may change the numbers of a search.
-_DISTRIBUTIONS: Final = ("hil", "numpy", "scipy", "pymoo", "cma", "ruckig", "pin", "coal")
+_DISTRIBUTIONS: Final = ("hil", "numpy", "scipy", "pymoo", "ruckig", "pin", "coal")
 _FIRST_LINE: Final = b"hil search journal 2\n"
 _FRAME: Final = struct.Struct("<QI")
 

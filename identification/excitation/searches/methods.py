@@ -1,4 +1,4 @@
-"""Search methods: which criteria they seek, and how one motion is chosen."""
+"""Search methods: the criteria and the fitness that each of them maximises."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ import numpy as np
 from identification.arrays import Array
 from identification.excitation.criteria import OF_PAPER, fitness_eq7
 
-Method = Literal["a", "b", "balanced", "front", "gradient"]
+Method = Literal["a", "b", "gradient"]
 
 
 class SearchMethod(NamedTuple):
@@ -19,14 +19,10 @@ class SearchMethod(NamedTuple):
     help: str  #: in `docs/commands.md`
     label: str  #: in the report
     #: fitness (m,) to maximise, for finite values (m,) of `criteria` by name, the weights of the
-    #: settings, and the number of parameters; it must not fall where one of the criteria improves.
-    #: None: the knee of the Pareto front is chosen
-    fitness: Callable[[Mapping[str, Array], tuple[float, float], int], Array] | None
+    #: settings, and the number of parameters; it must not fall where one of the criteria improves
+    fitness: Callable[[Mapping[str, Array], tuple[float, float], int], Array]
     #: of the Pareto front that is stored and drawn; the second one is the horizontal axis
     criteria: tuple[str, str] = OF_PAPER
-    #: whether values count from their median over random motions, in interquartile ranges, and
-    #: larger ones are better
-    scaled: bool = False
     #: fractions of their distance from home (or the middle) at which motions of the first
     #: generation have their via points, in turn: closer motions are shorter and clear of obstacles
     reach: tuple[float, ...] = (1.0,)
@@ -35,10 +31,6 @@ class SearchMethod(NamedTuple):
 def _eq7(values: Mapping[str, Array], weights: tuple[float, float], p: int) -> Array:
     pairs = zip(values["log10_det"].tolist(), values["coupling_index"].tolist(), strict=True)
     return np.array([fitness_eq7(size, coupled, p, weights) for size, coupled in pairs])
-
-
-def _balanced(values: Mapping[str, Array], weights: tuple[float, float], _: int) -> Array:
-    return weights[0] * values["log10_det"] + weights[1] * values["coupling_index"]
 
 
 def _weighted(values: Mapping[str, Array], weights: tuple[float, float], _: int) -> Array:
@@ -55,18 +47,6 @@ METHODS: Final[Mapping[Method, SearchMethod]] = {
         "method B of the paper, via points by the fitness of eq. 7",
         "designed by method B of the paper",
         _eq7,
-    ),
-    "balanced": SearchMethod(
-        "as b, with terms of equal weight",
-        "designed for balanced criteria",
-        _balanced,
-        scaled=True,
-    ),
-    "front": SearchMethod(
-        "both criteria, and the knee of their Pareto front",
-        "designed as the knee of log det and I_c",
-        None,
-        scaled=True,
     ),
     "gradient": SearchMethod(
         "log det less I_c by weights, a short search improved by the gradient",

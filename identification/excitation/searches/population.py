@@ -1,4 +1,4 @@
-"""The problem of a search, scores of its motions from child processes, their scale and front."""
+"""The problem of a search, scores of its motions from child processes, and their front."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from functools import lru_cache
 from typing import Any, Final, NamedTuple, Self
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 
 from identification.arrays import Array
 from identification.excitation.constraints import SAMPLE_PERIOD, Constraints, midpoints, sampled
@@ -20,14 +20,13 @@ from identification.excitation.criteria import (
     Objective,
     columns,
 )
-from identification.excitation.errors import DesignError
 from identification.excitation.genomes import Genome, Motion
 from identification.excitation.searches.methods import Method
-from identification.excitation.searches.tangent import (
+from identification.excitation.searches.sensitivity import (
     Linearisation,
-    Tangent,
+    Sensitivity,
     gene_slopes,
-    tangent_of,
+    sensitivity_of,
 )
 from identification.excitation.violation import KINDS, Violation, excess_by_kind
 from planner import PlannerCrashed, PlannerError, PlanningTimedOut
@@ -94,57 +93,6 @@ def unplanned() -> Array:
     return np.concatenate((-SENSE * np.inf, [np.inf, np.nan], excess))
 
 
-SAMPLE_COUNT: Final = 200
-"""Number of random motions for a scale."""
-
-# With fewer feasible motions than this the scale is that of all motions.
-_FEWEST_FEASIBLE: Final = 20
-_FEWEST: Final = 2
-
-
-class Scale(NamedTuple):
-    """Centre and spread of criteria over random motions.
-
-    The two terms of eq. 7 differ in size (about 75 and 5 on a six-axis arm), so that its weights
-    have little effect. Here each measure counts from its median over random motions of the same
-    genome, in units of their interquartile range.
-    """
-
-    centre: tuple[float, ...]  #: medians (k,)
-    spread: tuple[float, ...]  #: interquartile ranges (k,)
-    criteria: tuple[str, ...] = OF_PAPER  #: their names
-
-    @classmethod
-    def of(cls, scores: Scores, criteria: tuple[str, ...] = OF_PAPER) -> Self:
-        """Return the scale of random motions, `SAMPLE_COUNT` of them.
-
-        Raises:
-            DesignError: fewer than two different motions excite all parameters.
-        """
-        chosen = scores.usable
-        if np.count_nonzero(chosen) < _FEWEST_FEASIBLE:
-            chosen = scores.exciting
-        if np.count_nonzero(chosen) >= _FEWEST:
-            values = columns(scores.measures[chosen], criteria)
-            lower, median, upper = np.quantile(values, (0.25, 0.5, 0.75), axis=0)
-            if np.all(upper > lower):
-                return cls(tuple(median.tolist()), tuple((upper - lower).tolist()), criteria)
-        raise DesignError(
-            "random motions that excite all parameters",
-            int(np.count_nonzero(chosen)),
-            f"at least {_FEWEST} different ones",
-        )
-
-    def gains(self, measures: ArrayLike) -> Array:
-        """Return the improvement (..., k) of measures (..., d) over the median, in spreads."""
-        values = columns(np.asarray(measures), self.criteria)
-        return np.asarray(columns(SENSE, self.criteria) * (values - self.centre) / self.spread)
-
-
-# Distances from the chord, between -1 and 1, that differ by less are equal.
-_EQUAL: Final = 1e-12
-
-
 @dataclass(frozen=True, eq=False)
 class Front:
     """Pareto front: the k motions not dominated in some criteria, the best in the last first.
@@ -196,27 +144,6 @@ class Front:
             duration=np.concatenate((self.duration, other.duration)),
         )._nondominated()
 
-    def knee(self, scale: Scale | None = None) -> int:
-        """Return the index of the knee of a non-empty front, farthest beyond the chord of its ends.
-
-        Das 1999, "On characterizing the knee of the Pareto curve based on normal-boundary
-        intersection"; measures relative to the ranges of the front. With `scale` only motions
-        better than the median random motion in all measures count, if any. Of several the knee has
-        the largest sum of gains; without `scale` it is the first.
-        """
-        part = np.arange(len(self))
-        if scale is not None:
-            better = np.flatnonzero(np.all(scale.gains(self.measures) > 0.0, axis=1))
-            part = better if len(better) else part
-        values = columns(self.measures[part], self.criteria)
-        span = np.ptp(values, axis=0)
-        sense = columns(SENSE, self.criteria)
-        height = (values - values.min(axis=0)) / np.where(span > 0.0, span, 1.0) @ sense
-        highest = part[height >= height.max() - _EQUAL]
-        if scale is None or len(highest) == 1:
-            return int(highest[0])
-        return int(highest[np.argmax(scale.gains(self.measures[highest]).sum(axis=1))])
-
     def _part(self, rows: NDArray[np.bool_] | NDArray[np.intp]) -> Self:
         return replace(
             self,
@@ -240,18 +167,17 @@ class Front:
 class SearchSettings:
     """Method and effort of a search."""
 
-    method: Method = "front"  #: one of `METHODS`
+    method: Method = "b"  #: one of `METHODS`
     population: int = 150  #: individuals in a generation
     generations: int = 120  #: number of generations, the random first one included
     crossover: float = 0.9  #: probability that two parents are crossed (Table 1)
     mutation: float = 0.01  #: probability that a gene of a child is mutated (Table 1)
-    #: lambda_1 of log10 det and lambda_2 of the coupling index ("gradient", "b" and "balanced")
+    #: lambda_1 of log10 det and lambda_2 of the coupling index ("gradient" and "b")
     weights: tuple[float, float] = (0.7, 0.3)
     seed: int = 0  #: the same seed gives the same design bit for bit
-    polish: int = 0  #: evaluations of a local search from the best motion; 0: none
     crossover_eta: float = 15.0  #: distribution index of SBX; larger: children closer to parents
     mutation_eta: float = 20.0  #: distribution index of the mutation; larger: smaller changes
-    gradient: int = 0  #: steps along the gradient from the best motion, before the polish; 0: none
+    gradient: int = 0  #: steps along the gradient from the best motion; 0: none
     starts: int = 1  #: motions that share the first half of these steps
 
 
@@ -299,7 +225,7 @@ class Problem:
             raise motion
         return motion, self.objective.criteria(motion, period)
 
-    def tangent(self, genes: Array, weights: Array | None) -> Tangent:
+    def sensitivity(self, genes: Array, weights: Array | None) -> Sensitivity:
         """Return the slopes of `weights` (d,) times the criteria along the motion of genes.
 
         Without weights they are those of minus the logarithm of the precision's criterion.
@@ -307,7 +233,7 @@ class Problem:
         Raises:
             PlannerError: the motion cannot be planned.
         """
-        return tangent_of(self, genes, weights)
+        return sensitivity_of(self, genes, weights)
 
     def _violations(self, motion: Motion) -> tuple[Violation, ...]:
         return self.constraints.violations(motion, sampled(motion, self.period))
@@ -380,24 +306,24 @@ class Population:
     def linearise(self, genes: Array, weights: Array | None) -> Linearisation | None:
         """Return `weights` (d,) times the criteria, and the margins, to first order in the genes.
 
-        Without weights: see `Problem.tangent`. None if the motion cannot be planned.
+        Without weights: see `Problem.sensitivity`. None if the motion cannot be planned.
         """
         try:
-            tangent: Tangent = self._call("tangent", genes, weights)
+            sensitivity: Sensitivity = self._call("sensitivity", genes, weights)
         except PlannerError:
             return None
         # As many together as possible: legs and corners that they share are planned once.
         chunks = chunks_of(len(genes), -(-len(genes) // len(self._children)))
-        packed = pack(tangent)
+        packed = pack(sensitivity)
         rows = map_in_children(
             self._children,
             _slopes,
             chunks,
             lambda chunk: (self._packed, packed, genes, np.array(chunk)),
         )
-        none = np.zeros(1 + len(tangent.left))
+        none = np.zeros(1 + len(sensitivity.left))
         slopes = np.array([none if isinstance(row, Exception) else row for row in rows])
-        return Linearisation(slopes[:, 0], slopes[:, 1:].T.copy(), tangent.left)
+        return Linearisation(slopes[:, 0], slopes[:, 1:].T.copy(), sensitivity.left)
 
     def _call(self, method: str, *arguments: object) -> Any:
         """Call a method of the problem in a child, again if another process killed the child."""
@@ -413,14 +339,14 @@ def _score(packed: bytes, genes: Array) -> Array:
     return _problem(packed).score(genes).rows
 
 
-def _slopes(packed: bytes, tangent: bytes, genes: Array, which: NDArray[np.intp]) -> Array:
-    return gene_slopes(_problem(packed), _tangent(tangent), genes, which)
+def _slopes(packed: bytes, sensitivity: bytes, genes: Array, which: NDArray[np.intp]) -> Array:
+    return gene_slopes(_problem(packed), _sensitivity(sensitivity), genes, which)
 
 
 @lru_cache(maxsize=1)
-def _tangent(packed: bytes) -> Tangent:
-    tangent: Tangent = load(packed)
-    return tangent
+def _sensitivity(packed: bytes) -> Sensitivity:
+    sensitivity: Sensitivity = load(packed)
+    return sensitivity
 
 
 def _apply(packed: bytes, method: str, *arguments: Any) -> list[Any]:

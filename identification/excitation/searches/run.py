@@ -8,42 +8,36 @@ from dataclasses import dataclass
 from typing import Any, Final, Literal, NamedTuple
 
 import numpy as np
-import scipy
 
 from identification.arrays import Array
-from identification.excitation.criteria import OF_PAPER, SENSE, Criteria, columns
-from identification.excitation.errors import DesignError
+from identification.excitation.criteria import SENSE, Criteria, columns
 from identification.excitation.excitation import Excitation
 from identification.excitation.genomes import ViaPointGenome
-from identification.excitation.searches.gradient import TRIED, Ascent, improve
+from identification.excitation.searches.bundle_method import TRIED, Ascent, improve
 from identification.excitation.searches.journal import Journal
 from identification.excitation.searches.methods import METHODS, SearchMethod
 from identification.excitation.searches.population import (
-    CHUNK,
-    SAMPLE_COUNT,
     Front,
     Population,
-    Scale,
     Scores,
     SearchSettings,
     finite,
 )
 from identification.excitation.violation import KINDS, NoFeasibleMotionError
 
-Phase = Literal["sample", "search", "gradient", "polish"]
+Phase = Literal["search", "gradient"]
 Fitness = Callable[[Scores], Array]
 
 
 class Progress(NamedTuple):
     """Progress of a search."""
 
-    phase: Phase  #: "sample" (random motions for the scale), "search", "gradient", "polish"
+    phase: Phase  #: the genetic search, or the steps along the gradient after it
     generation: int  #: scored generations
     generations: int  #: all generations
     evaluated: int  #: scored motions of all phases
     feasible: int  #: scored motions that satisfy all constraints
-    #: `CRITERIA` of the best motion (of the knee for "front"), nan if there is none
-    best: tuple[float, ...]
+    best: tuple[float, ...]  #: `CRITERIA` of the best motion, nan if there is none
 
 
 @dataclass(frozen=True, eq=False)
@@ -52,11 +46,11 @@ class Design:
 
     genes: Array  #: (n_genes,) of the chosen motion
     excitation: Excitation  #: the motion and its criteria, sampled every `RESCORE_PERIOD`
-    front: Front  #: of all motions before the polish, sampled at the search's period
-    chosen: int | None  #: index of the motion in the front; None if the polish improved it
-    origin: int  #: index in the front of the motion, or of the one that the polish started from
-    #: criteria of that motion, sampled every `RESCORE_PERIOD`; the chosen motion is not worse in
-    #: its fitness or, with "front", in either criterion
+    front: Front  #: of all motions before the gradient, sampled at the search's period
+    chosen: int | None  #: index of the motion in the front; None if the gradient improved it
+    origin: int  #: index in the front of the motion, or of the one that the gradient started from
+    #: criteria of that motion, sampled every `RESCORE_PERIOD`; the chosen motion has no
+    #: smaller fitness
     origin_criteria: Criteria
     generations: int  #: number of scored generations
     complete: bool  #: whether the search ran to its end
@@ -66,80 +60,13 @@ class Design:
 RESCORE_PERIOD: Final = 0.001
 """Sample period of the criteria of the chosen motion, s."""
 
-# First seeds of independent random streams: evolution, first generation, and scale (the same for
-# all seeds, so that balanced fitnesses compare).
+# First seeds of independent random streams: evolution and first generation.
 _STREAM: Final = 6
 _FIRST: Final = 4
-_SCALE: Final = (5, 0)
 # Excess of a motion that leaves a parameter without excitation: it ranks behind all that excite,
 # and before unplannable ones, whose excess is infinite.
 _UNEXCITING: Final = 1e6
-
-
-# The polish is CMA-ES (Hansen 2016, "The CMA Evolution Strategy: A Tutorial") on ranks; feasible
-# motions rank first. Its covariance is diagonal (Ros and Hansen 2008): a full one has more entries
-# than a polish has evaluations, and its eigenvectors depend on the threads of linear algebra.
-_STEP: Final = 0.03  # first step, fraction of each gene's range
-_SMALLEST_STEP: Final = 1e-7
-_POLISH_STREAM: Final = 3
 _MEASURE_STEP: Final = 1e-3  # of criteria, for the derivatives of a fitness
-_SECOND: Final = 1e-3  # weight of the largest gain if none is negative
-
-
-def polish(
-    score: Callable[[Array], Scores],
-    genes: Array,
-    scores: Scores,
-    fitness: Fitness,
-    *,
-    evaluations: int,
-    seed: int,
-    stop: Callable[[], bool] = lambda: False,
-) -> tuple[Array, Scores]:
-    """Improve a motion by local search; return genes (n_genes,) and scores (m = 1) of the best.
-
-    Motions compare by their summed excess, then by fitness, of which -inf is the worst. Without
-    an improvement the start is returned unchanged. Generations (m, n_genes) are scored until
-    `evaluations` motions, or until `stop` is true. The start needs at least two genes.
-    """
-    best = genes.copy(), scores
-    least, most = (float(each[0]) for each in _merits(scores, fitness))
-    size = generation_size(len(genes))
-    strategy = _strategy(best[0], size, seed)
-    evaluated = 0
-    while evaluated + size <= evaluations and not stop():
-        asked = np.array(strategy.ask())
-        asked_scores = score(asked.copy())
-        excess, values = _merits(asked_scores, fitness)
-        strategy.tell(list(asked), _ranks(excess, values).tolist())
-        index = int(np.lexsort((-values, excess))[0])  # the first of equal ones
-        if (excess[index], -values[index]) < (least, -most):
-            least = float(excess[index])
-            most = float(values[index])
-            best = asked[index].copy(), asked_scores.take(index)
-        evaluated += size
-        if not _SMALLEST_STEP < float(np.max(strategy.stds)) < np.inf:
-            break
-    return best
-
-
-def dominating(
-    reference: Scores, scale: Scale | None = None, criteria: tuple[str, ...] = OF_PAPER
-) -> Fitness:
-    """Return a fitness above 0 only for motions that dominate a reference (m = 1).
-
-    It is the smallest gain, in units of the scale if given (Wierzbicki 1980); if no gain is
-    negative, plus a small share of the largest.
-    """
-    spread = 1.0 if scale is None else np.array(scale.spread)
-
-    def fitness(scores: Scores) -> Array:
-        gains = columns(SENSE * (scores.measures - reference.measures), criteria) / spread
-        least = gains.min(axis=1)
-        merit: Array = np.where(least < 0.0, least, least + _SECOND * gains.max(axis=1))
-        return merit
-
-    return fitness
 
 
 def partials(fitness: Fitness, scores: Scores) -> Array:
@@ -152,60 +79,15 @@ def partials(fitness: Fitness, scores: Scores) -> Array:
     return np.asarray((above - below) / (2.0 * _MEASURE_STEP))
 
 
-def generation_size(n_genes: int) -> int:
-    """Return the size of a generation: 4 + 3 ln n, rounded up to chunks."""
-    return CHUNK * int(np.ceil((4.0 + 3.0 * np.log(n_genes)) / CHUNK))
-
-
-def _merits(scores: Scores, fitness: Fitness) -> tuple[Array, Array]:
-    """Return what motions rank by: summed excess (m,), then fitness (m,); nan is the worst."""
-    excess = np.where(scores.feasible, 0.0, np.sum(scores.excess, axis=1))
-    values = np.asarray(fitness(scores), dtype=np.float64)
-    return np.nan_to_num(excess, nan=np.inf), np.nan_to_num(values, nan=-np.inf)
-
-
-def _ranks(excess: Array, fitness: Array) -> Array:
-    """Return ranks from 1 for the best (m,), equal for equal motions."""
-    pairs = np.stack((excess, -fitness))
-    _, place = np.unique(pairs, axis=1, return_inverse=True)
-    ranks: Array = scipy.stats.rankdata(place.ravel(), method="average")
-    return ranks
-
-
-def _strategy(start: Array, size: int, seed: int) -> Any:
-    """Return a CMA-ES with its own random generator, without output."""
-    import cma  # slow to load
-
-    random = np.random.default_rng([_POLISH_STREAM, seed])
-
-    def normal(count: int, length: int | None = None) -> Array:
-        return random.standard_normal(count if length is None else (count, length))
-
-    return cma.CMAEvolutionStrategy(
-        start,
-        _STEP,
-        {
-            "bounds": [0.0, 1.0],
-            "popsize": size,
-            "CMA_diagonal": True,
-            "randn": normal,
-            "seed": np.nan,  # leaves numpy's global generator unchanged
-            "verbose": -10,  # no output, no options file
-            "verb_log": 0,
-        },
-    )
-
-
 class Evolution:
-    """A GA for one objective, NSGA-II for more, from a first generation of genes (m, n_genes).
+    """A genetic algorithm, from a first generation of genes (m, n_genes).
 
     Feasible motions rank first, infeasible ones by the sum of their excesses. Simulated binary
     crossover, polynomial mutation, binary tournament.
     """
 
-    def __init__(self, settings: SearchSettings, first: Array, n_objectives: int) -> None:
+    def __init__(self, settings: SearchSettings, first: Array) -> None:
         # slow to load
-        from pymoo.algorithms.moo.nsga2 import NSGA2, binary_tournament
         from pymoo.algorithms.soo.nonconvex.ga import GA, FitnessSurvival, comp_by_cv_and_fitness
         from pymoo.config import Config
         from pymoo.core.problem import Problem
@@ -213,25 +95,19 @@ class Evolution:
         from pymoo.operators.crossover.sbx import SBX
         from pymoo.operators.mutation.pm import PM
         from pymoo.operators.selection.tournament import TournamentSelection
-        from pymoo.operators.survival.rank_and_crowding import RankAndCrowding
 
         Config.warnings["not_compiled"] = False
-        kind, compare, survival = (
-            (GA, comp_by_cv_and_fitness, FitnessSurvival())
-            if n_objectives == 1
-            else (NSGA2, binary_tournament, RankAndCrowding())
-        )
-        self._algorithm: Any = kind(
+        self._algorithm: Any = GA(
             pop_size=settings.population,
             sampling=first,
-            selection=TournamentSelection(func_comp=compare),
+            selection=TournamentSelection(func_comp=comp_by_cv_and_fitness),
             crossover=SBX(prob=settings.crossover, eta=settings.crossover_eta),
             mutation=PM(prob=1.0, prob_var=settings.mutation, eta=settings.mutation_eta),
-            survival=survival,
+            survival=FitnessSurvival(),
         )
         problem = Problem(
             n_var=first.shape[1],
-            n_obj=n_objectives,
+            n_obj=1,
             n_ieq_constr=len(KINDS) + 1,
             xl=np.zeros(first.shape[1]),
             xu=np.ones(first.shape[1]),
@@ -249,13 +125,12 @@ class Evolution:
             return None
         return np.array(self._asked.get("X"), dtype=np.float64)
 
-    def tell(self, scores: Scores, objectives: Array) -> None:
-        """Record scores and objectives (m, n_objectives) of the generation that `ask` returned."""
+    def tell(self, scores: Scores, costs: Array) -> None:
+        """Record scores, and costs to minimise (m,), of the generation that `ask` returned."""
         unexciting = np.where(scores.exciting, 0.0, _UNEXCITING)
         excess = np.column_stack((scores.excess, unexciting))
-        # Crowding distances need finite objectives.
-        finite = np.nan_to_num(np.where(scores.usable[:, None], objectives, 0.0))
-        self._asked.set("F", finite, "G", excess)
+        finite_costs = np.nan_to_num(np.where(scores.usable, costs, 0.0))
+        self._asked.set("F", finite_costs[:, None], "G", excess)
         self._algorithm.advance(infills=self._asked)
 
 
@@ -265,7 +140,6 @@ class Goal:
 
     settings: SearchSettings  # of the search
     p: int  # number of parameters in the criteria
-    scale: Scale | None  # units of the measures; None if not used
     precise: bool = False  # whether motions compare by the wanted precision
 
     @property
@@ -273,50 +147,36 @@ class Goal:
         """The method."""
         return METHODS[self.settings.method]
 
-    @property
-    def two_objectives(self) -> bool:
-        """Whether motions compare by two criteria."""
-        return self.method.fitness is None and not self.precise
-
     def costs(self, scores: Scores) -> Array:
-        """Return the objectives to minimise, (m, 1) or (m, 2), for scores of m motions."""
+        """Return what is minimised (m,), for scores of m motions."""
         if self.precise:
             with np.errstate(divide="ignore"):
-                return np.log(scores.precision)[:, None]
-        return self.objectives(scores.measures)
+                return np.asarray(np.log(scores.precision))
+        return self.costs_of_measures(scores.measures)
 
-    def objectives(self, measures: Array) -> Array:
-        """Return the objectives to minimise, (m, 1) or (m, 2), for measures (m, d)."""
+    def costs_of_measures(self, measures: Array) -> Array:
+        """Return minus the fitness (m,) for measures (m, d); inf without excitation."""
         method = self.method
-        if method.fitness is None:
-            return columns(-SENSE * measures, method.criteria)
         exciting = finite(measures)
-        values = np.where(exciting[:, None], measures, 0.0)
-        values = (
-            columns(values, method.criteria) if self.scale is None else self.scale.gains(values)
-        )
+        values = columns(np.where(exciting[:, None], measures, 0.0), method.criteria)
         by_name = dict(zip(method.criteria, values.T, strict=True))
         fitness = method.fitness(by_name, self.settings.weights, self.p)
-        return np.where(exciting, -fitness, np.inf)[:, None]
+        return np.where(exciting, -fitness, np.inf)
+
+    def fitness(self, scores: Scores) -> Array:
+        """Return what is maximised (m,), for scores of m motions."""
+        return -self.costs(scores)
 
     def choice(self, front: Front) -> int:
         """Return the index of the best motion of a non-empty front."""
         if self.precise:
             return int(np.argmin(front.precision))
-        if self.method.fitness is None:
-            return front.knee(self.scale)
-        return int(np.argmin(self.objectives(front.measures)[:, 0]))
+        return int(np.argmin(self.costs_of_measures(front.measures)))
 
     def is_worse(self, criteria: Criteria, other: Criteria) -> bool:
-        """Return whether a motion is worse than another, without a fitness in any criterion."""
-        first, second = self.objectives(np.array((criteria.measures, other.measures)))
-        return not bool(np.all(first <= second))
-
-    def polish_fitness(self, start: Scores) -> Fitness:
-        """Return the fitness that a polish from a motion (scores, m = 1) maximises."""
-        if self.method.fitness is None and not self.precise:
-            return dominating(start, self.scale, self.method.criteria)
-        return lambda scores: -self.costs(scores)[:, 0]
+        """Return whether a motion has a smaller fitness than another."""
+        first, second = self.costs_of_measures(np.array((criteria.measures, other.measures)))
+        return not bool(first <= second)
 
 
 def search(
@@ -342,9 +202,7 @@ def search(
 
 def most_evaluations(settings: SearchSettings) -> int:
     """Return the largest number of motions that a search scores in all its phases."""
-    sampled = SAMPLE_COUNT if METHODS[settings.method].scaled else 0
-    improved = TRIED * settings.gradient + settings.polish
-    return sampled + settings.population * settings.generations + improved
+    return settings.population * settings.generations + TRIED * settings.gradient
 
 
 class _Search:
@@ -367,12 +225,12 @@ class _Search:
         self._scored = scored
         self._stop = stop
         self._stopped = self._exhausted = False
-        self._phase: Phase = "sample"
-        self._goal: Goal | None = None
+        self._phase: Phase = "search"
+        objective = population.problem.objective
+        self._goal = Goal(settings, objective.n_parameters, objective.precision is not None)
         self._generations = 0
         self._first: tuple[Array, Scores] | None = None
-        self._method = METHODS[settings.method]
-        self._front = Front.empty(self._genome.n_genes, self._method.criteria)
+        self._front = Front.empty(self._genome.n_genes, self._goal.method.criteria)
         self._tried = self._feasible = 0
         self._rejected: Counter[str] = Counter()
         # Smallest positive excess of each kind, with the genes.
@@ -380,13 +238,12 @@ class _Search:
 
     def run(self) -> Design:
         settings = self._settings
-        goal = self._goal = self._make_goal()
-        self._phase = "search"
+        goal = self._goal
         random = np.random.default_rng((_FIRST, settings.seed))
         first = self._genome.sample(random, settings.population)
         if isinstance(self._genome, ViaPointGenome) and len(goal.method.reach) > 1:
             first = self._genome.contracted(first, goal.method.reach)
-        evolution = Evolution(settings, first, 2 if goal.two_objectives else 1)
+        evolution = Evolution(settings, first)
         while self._generations < settings.generations and not self._should_stop():
             children = evolution.ask()
             if children is None:
@@ -402,7 +259,7 @@ class _Search:
         winner = goal.choice(front)
         genes = start = front.genes[winner]
         origin = trajectory, criteria = self._population.evaluate(start, RESCORE_PERIOD)
-        genes = self._improved(goal, start, front.scores(winner))
+        genes = self._climbed(start, front.scores(winner))
         if genes.tobytes() != start.tobytes():
             trajectory, criteria = self._population.evaluate(genes, RESCORE_PERIOD)
             # better only at the search's sample period, or other genes of the same motion
@@ -430,76 +287,45 @@ class _Search:
             exhausted=self._exhausted,
         )
 
-    def _improved(self, goal: Goal, genes: Array, scores: Scores) -> Array:
-        """Return the genes (n_genes,) of the best motion, improved by gradient and polish."""
-        settings = self._settings
-        if settings.gradient > 0 and not self._should_stop():
-            self._phase = "gradient"
-            genes, scores = self._climbed(goal, genes, scores)
-        if settings.polish > 0 and not self._should_stop():
-            self._phase = "polish"
-            genes, _ = polish(
-                self._score,
-                genes,
-                scores,
-                goal.polish_fitness(scores),
-                evaluations=settings.polish,
-                seed=settings.seed,
-                stop=self._should_stop,
-            )
-        return genes
-
-    def _climbed(self, goal: Goal, genes: Array, scores: Scores) -> tuple[Array, Scores]:
-        """Return genes and scores of the best motion, improved by the gradient.
+    def _climbed(self, genes: Array, scores: Scores) -> Array:
+        """Return the genes (n_genes,) of the best motion, improved by the gradient.
 
         With several starts half of the steps are shared by this motion and the best ones of the
         first generation; the other half improve what is best then.
         """
-        settings = self._settings
-        fitness = goal.polish_fitness(scores)
+        steps = self._settings.gradient
+        if steps == 0 or self._should_stop():
+            return genes
+        self._phase = "gradient"
+        goal = self._goal
         ascent = Ascent(
             self._score,
             lambda genes, scores: self._population.linearise(
-                genes, None if goal.precise else partials(fitness, scores)
+                genes, None if goal.precise else partials(goal.fitness, scores)
             ),
-            fitness,
+            goal.fitness,
             self._should_stop,
         )
-        steps = settings.gradient
         best = (genes, scores)
-        if settings.starts > 1:
-            each = steps // (2 * settings.starts)
-            others = self._first_best(fitness, settings.starts - 1, genes)
+        starts = self._settings.starts
+        if starts > 1:
+            each = steps // (2 * starts)
+            others = self._first_best(starts - 1, genes)
             climbed = [improve(ascent, *start, each) for start in (best, *others)]
-            best = max(climbed, key=lambda motion: float(fitness(motion[1])[0]))
+            best = max(climbed, key=lambda motion: float(goal.fitness(motion[1])[0]))
             steps -= each * len(climbed)
-        return improve(ascent, *best, steps)
+        return improve(ascent, *best, steps)[0]
 
-    def _first_best(self, fitness: Fitness, count: int, but: Array) -> list[tuple[Array, Scores]]:
+    def _first_best(self, count: int, but: Array) -> list[tuple[Array, Scores]]:
         """Return genes and scores of the best usable motions of the first generation but one."""
         if self._first is None:
             return []
         genes, scores = self._first
-        values = np.where(scores.usable, fitness(scores), -np.inf)
+        values = np.where(scores.usable, self._goal.fitness(scores), -np.inf)
         order = np.argsort(-values, kind="stable")
         chosen = [k for k in order.tolist() if np.isfinite(values[k])]
         chosen = [k for k in chosen if genes[k].tobytes() != but.tobytes()]
         return [(genes[k].copy(), scores.take(k)) for k in chosen[:count]]
-
-    def _make_goal(self) -> Goal:
-        """Return the goal, with a scale from random motions if the method needs one."""
-        scale = None
-        method = self._method
-        settings = self._settings
-        if method.scaled:
-            scores = self._score(self._genome.sample(np.random.default_rng(_SCALE), SAMPLE_COUNT))
-            try:
-                scale = Scale.of(scores, method.criteria)
-            except DesignError:  # a front can do without a scale
-                if method.fitness is not None:
-                    raise self._failure() from None
-        objective = self._population.problem.objective
-        return Goal(settings, objective.n_parameters, scale, objective.precision is not None)
 
     def _score(self, genes: Array) -> Scores:
         """Return the scores of genes (m, n_genes), from the journal if it has them."""
@@ -517,20 +343,19 @@ class _Search:
                 index = int(broken[np.argmin(excess[broken])])
                 if kind not in self._nearest or excess[index] < self._nearest[kind][0]:
                     self._nearest[kind] = float(excess[index]), genes[index].copy()
-        self._front = self._front.merge(Front.of(genes, scores, self._method.criteria))
+        self._front = self._front.merge(Front.of(genes, scores, self._goal.method.criteria))
         self._report()
         return scores
 
     def _report(self) -> None:
         """Count the generation and report progress."""
-        goal = self._goal
         front = self._front
         self._generations += self._phase == "search"
         if self._progress is None:
             return
         best = np.full(len(SENSE), np.nan)
-        if goal is not None and len(front) > 0:
-            best = front.measures[goal.choice(front)]
+        if len(front) > 0:
+            best = front.measures[self._goal.choice(front)]
         self._progress(
             Progress(
                 self._phase,

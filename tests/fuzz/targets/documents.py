@@ -133,7 +133,7 @@ def seeds() -> list[bytes]:
         '"excitation_000_a1.mcap", "outcome": "completed", "sha256": "00", "reason": ""}]}',
         "rehearsal.json": (root / "rehearsal.json").read_text(),
         "dry_run.json": DRY_RUN, "warmup.json": WARMUP,
-        "settings.toml": preset_text("front"),
+        "settings.toml": preset_text("gradient"),
     }  # fmt: skip
     return [bytes((NAMES.index(name),)) + text.encode() for name, text in texts.items()]
 

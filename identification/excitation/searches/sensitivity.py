@@ -26,7 +26,7 @@ from planner import PlannerError
 
 
 class Problem(Protocol):
-    """What a tangent needs of a search's problem."""
+    """What a sensitivity needs of a search's problem."""
 
     @property
     def genome(self) -> Genome:
@@ -84,7 +84,7 @@ class Margins(NamedTuple):
 
 
 @dataclass(frozen=True, eq=False)
-class Tangent:
+class Sensitivity:
     """Slopes of a motion's criterion and constraints by its states."""
 
     time: Array  #: the middles of equal steps (N,) [s]
@@ -130,7 +130,7 @@ class Linearisation(NamedTuple):
     left: Array  #: the margins (1 + c,); negative if violated
 
 
-def tangent_of(problem: Problem, genes: Array, weights: Array | None) -> Tangent:
+def sensitivity_of(problem: Problem, genes: Array, weights: Array | None) -> Sensitivity:
     """Return the slopes of `weights` (d,) times the criteria, and of the margins, by the states.
 
     Without weights the criterion is minus the logarithm of that of the wanted precision.
@@ -157,7 +157,7 @@ def tangent_of(problem: Problem, genes: Array, weights: Array | None) -> Tangent
         problem.objective, states, steps, weights, motion.duration / len(time)
     )
     longest = (1.0 - _RESERVE) * constraints.max_duration
-    return Tangent(
+    return Sensitivity(
         time=time,
         states=states,
         duration=motion.duration,
@@ -175,7 +175,9 @@ def gene_steps(genes: Array) -> Array:
     return np.where(genes > 0.5, -_GENE_STEP, _GENE_STEP)
 
 
-def gene_slopes(problem: Problem, tangent: Tangent, genes: Array, which: NDArray[np.intp]) -> Array:
+def gene_slopes(
+    problem: Problem, sensitivity: Sensitivity, genes: Array, which: NDArray[np.intp]
+) -> Array:
     """Return the slopes (k, 2 + c) for some genes (k,), in ascending order.
 
     They are 0 for a gene whose step cannot be planned.
@@ -183,23 +185,23 @@ def gene_slopes(problem: Problem, tangent: Tangent, genes: Array, which: NDArray
     steps = gene_steps(genes)[which]
     rows = np.repeat(genes[None], len(which), axis=0)
     rows[np.arange(len(which)), which] += steps
-    slopes = np.zeros((len(which), 1 + len(tangent.left)))
-    changes = _changes(problem.genome, tangent, rows, which)
+    slopes = np.zeros((len(which), 1 + len(sensitivity.left)))
+    changes = _changes(problem.genome, sensitivity, rows, which)
     for row, (change, step) in enumerate(zip(changes, steps.tolist(), strict=True)):
         if change is not None:
-            slopes[row] = tangent.slopes(change, step)
+            slopes[row] = sensitivity.slopes(change, step)
     return slopes
 
 
 def _changes(
-    genome: Genome, tangent: Tangent, rows: Array, which: NDArray[np.intp]
+    genome: Genome, sensitivity: Sensitivity, rows: Array, which: NDArray[np.intp]
 ) -> Iterator[Change | None]:
     """Yield the change of the motion with each row of genes, of which one is changed."""
     local = 0
-    if tangent.moves is not None and isinstance(genome, ViaPointGenome):
+    if sensitivity.moves is not None and isinstance(genome, ViaPointGenome):
         local = int(np.searchsorted(which, genome.n_point_genes))
-        yield from tangent.moves.changed(genome, rows[:local], which[:local])
-    duration = tangent.duration
+        yield from sensitivity.moves.changed(genome, rows[:local], which[:local])
+    duration = sensitivity.duration
     for motion in genome.motions(rows[local:]):
         if isinstance(motion, PlannerError):
             yield None

@@ -21,7 +21,7 @@ import scipy
 
 from identification.arrays import Array
 from identification.excitation.searches.population import Scores
-from identification.excitation.searches.tangent import Linearisation
+from identification.excitation.searches.sensitivity import Linearisation
 
 Fitness = Callable[[Scores], Array]
 
