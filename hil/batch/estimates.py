@@ -211,7 +211,12 @@ def result_of(
 def group_of(pairs: Sequence[tuple[CampaignResult, Group] | SkippedArchive]) -> Group:
     """Return the campaigns with an excitation as one group."""
     groups = [pair[1] for pair in pairs if not isinstance(pair, SkippedArchive)]
-    return sum((group for group in groups if group.total is not None), Group())
+    fitted = (
+        replace(group, total=group.total.for_all_rows())
+        for group in groups
+        if group.total is not None
+    )
+    return sum(fitted, Group())
 
 
 def estimate_arm(parts: Sequence[Group], arm: ArmModel) -> BatchEstimate | SkippedArchive | None:

@@ -87,7 +87,8 @@ def to_reduce(refs: Sequence[ArchiveRef]) -> list[ToReduce]:
         seen[ref.motion] += 1
         if seen[ref.motion] <= ALIKE:
             shown.add(ref)
-    parts = PIECES if len(fitted) < PIECES else 1
+    # Some of them may turn out to be unusable.
+    parts = PIECES if len(fitted) < 2 * PIECES else 1
     return [ToReduce(ref, ref in shown, parts if ref.use == "excitation" else 1) for ref in refs]
 
 

@@ -150,6 +150,8 @@ class PrecisionMeter:
         of_rows = _variances(directions, posterior.free(estimation.result.factor).estimate)
         moved = np.asarray(np.linalg.solve(information, directions.T))
         of_repetitions = [repetition.reduction.factor for repetition in repetitions]
+        longest = max(factor.block for factor in of_repetitions)
+        of_repetitions = [factor.of_blocks(longest) for factor in of_repetitions]
         earlier = [recording.reduction.factor for recording in self._earlier]
         return Measured(
             wanted=wanted,

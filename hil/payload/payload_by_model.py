@@ -57,7 +57,8 @@ def weigh_by_model(
         remedy = "give recordings of the arm of the model"
         raise ArchiveError(paths[0], problem, remedy=remedy)
     _require_usable(sources.cell.file.robot.payload is not None, "carries a known payload", arm[0])
-    prepared = prepare_sources(sources, options, reporter)
+    # The loaded recordings have one bandwidth, and the arm must have the same.
+    prepared = prepare_sources(sources, options, reporter).unhedged()
     cell = prepared.sources.cell
     _require_usable(cell.model.friction.has_load, "has friction that grows with the load", arm[0])
     known_arm = _known(estimate_with(prepared, options, reporter))

@@ -52,6 +52,7 @@ from identification.text import percentage
 from identification.validation.finding import Thresholds
 from planner.arrays import numbers
 
+from .estimators import OF_PRIOR
 from .options import Options
 from .sources import Source, Sources
 
@@ -508,7 +509,8 @@ def _chosen(
             known_parameters(cell),
         )
         task.advance(1)
-    return chosen
+    # Estimators without prior read samples, of one bandwidth.
+    return chosen if options.estimator in OF_PRIOR else replace(chosen, hedge=None)
 
 
 def _ripples(cell: Cell) -> list[list[TorqueRipple]]:
@@ -623,6 +625,10 @@ class Prepared:
     def total(self) -> Reduction:
         """Their sum."""
         return Reduction.total(self.sources.cell.model, self.reductions)
+
+    def unhedged(self) -> Prepared:
+        """Return the same with the chosen bandwidth alone."""
+        return replace(self, hedged=(), settings=replace(self.settings, hedge=None))
 
     def warned(self, *warnings: str) -> Prepared:
         """Return the same with warnings of later steps."""

@@ -47,7 +47,7 @@ class ElasticTorque:
     measured: Array  #: E' t (n, n)
     #: expected compliances (n,) [rad/(N·m) or m/N], summed over the recordings
     compliance: Array
-    recordings: int = 1
+    recordings: float = 1.0
 
     @classmethod
     def of(cls, model: RobotModel, samples: Samples, values: Array) -> Self:
@@ -76,6 +76,16 @@ class ElasticTorque:
             self.measured + other.measured,
             self.compliance + other.compliance,
             self.recordings + other.recordings,
+        )
+
+    def scaled(self, share: float) -> ElasticTorque:
+        """Return the sums of rows that count so much."""
+        return ElasticTorque(
+            share * self.products,
+            share * self.squares,
+            share * self.measured,
+            share * self.compliance,
+            share * self.recordings,
         )
 
     def weighted(self, weights: Array, times: float) -> tuple[Array, Array, Array]:
@@ -176,6 +186,7 @@ def with_elastic_gears(
     precision: Array | None = None,
     believed: Array | None = None,
     times: float = 1.0,
+    excess: Array | None = None,
 ) -> Estimate:
     """Return the estimate with the mean square of the compliances in its covariance.
 
@@ -191,6 +202,8 @@ def with_elastic_gears(
         believed: parameters (p,) of rigid gears by that prior, by default those of the estimate;
             what a stronger prior leaves unexplained is no torque of gears.
         times: see `torque`.
+        excess: scores (p,) of the rows of `torque`, each `times`, beyond those of the factor; of
+            repetitions that differ from the others. None: of the same rows.
     """
     weights = inverse_variance(estimate.noise_std**2)
     products, squares, measured = torque.weighted(weights, times)
@@ -201,6 +214,8 @@ def with_elastic_gears(
     determined = np.isfinite(np.diag(estimate.covariance))
     inverse = np.where(determined[:, None], solve(equations).inverse, 0.0)
     moved, covariance = open_compliance(inverse, products, squares, design_effect)
+    if excess is not None:
+        errors = errors - moved.T @ excess
     # Correlated compliances cannot be cut off at zero one by one.
     root = np.linalg.cholesky(np.linalg.inv(covariance))
     mean, _ = scipy.optimize.nnls(root.T, root.T @ (covariance @ errors) / design_effect)

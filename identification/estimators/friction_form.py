@@ -172,7 +172,11 @@ def _trials(
     # What each further term leaves of itself beside the parameters.
     beside = np.concatenate([-moved, np.eye(n * q)])
     scores = forms.scores(weights, np.append(estimate.values, np.zeros(n * q)))
-    value = scores[:, p:].sum(axis=0) / np.where(possible, information, np.inf)
+    # Rows of some repetitions alone need not balance at the parameters of all, as when friction
+    # drifts: what their parameters pull is no term of friction.
+    excess = scores[:, :p].sum(axis=0) - factor.scores(weights, estimate.values).sum(axis=0) / times
+    pull = scores[:, p:].sum(axis=0) - moved.T @ excess
+    value = pull / np.where(possible, information, np.inf)
     shares = np.zeros((len(forms), n * q))
     for weight, matrix, used in zip(weights, forms.matrices, forms.columns, strict=True):
         part = beside[used]

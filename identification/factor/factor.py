@@ -355,6 +355,11 @@ class Factor:
         block = length * self.block
         return replace(self, matrices=matrices, counts=counts, block=block)
 
+    def scaled(self, times: float) -> Self:
+        """Return the sums of rows each of which counts so many times."""
+        counts = np.rint(times * self.counts).astype(np.intp)
+        return replace(self, matrices=tuple(times * m for m in self.matrices), counts=counts)
+
     def parts(self, count: int) -> Self:
         """Return the sums of equal parts of the occupied blocks; these, if they are fewer."""
         assert self.storage == "gram"

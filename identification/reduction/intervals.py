@@ -79,14 +79,31 @@ def widened(
     if total.unmodelled is not None:
         effect = posterior.design_effect
         if total.unmodelled.elastic is not None:
-            torque = total.unmodelled.elastic
             result = with_elastic_gears(
-                result, factor, torque, effect, precision, believed, total.times
+                result,
+                factor,
+                total.unmodelled.elastic,
+                effect,
+                precision,
+                believed,
+                total.times,
+                _excess(estimate, total, estimate.values if believed is None else believed),
             )
         own = estimate if believed is None else replace(estimate, values=believed)
         form = form_uncertainty(model, own, factor, total.unmodelled.forms, precision)
         result = with_uncertain_form(result, form)
     return Widened(_with_drift(model, result, recordings), form)
+
+
+def _excess(estimate: Estimate, total: Reduction, values: Array) -> Array:
+    """Return the scores (p,) of rows with unmodelled effects beyond their share of those of all."""
+    assert total.unmodelled is not None
+    forms = total.unmodelled.forms
+    weights = inverse_variance(estimate.noise_std**2)
+    size = len(values)
+    padded = np.append(values, np.zeros(forms.n_parameters - size))
+    shown = forms.scores(weights, padded)[:, :size].sum(axis=0)
+    return np.asarray(total.times * shown - total.factor.scores(weights, values).sum(axis=0))
 
 
 def _with_scale(

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import reduce as reduce_left
 from typing import Final
 
 import numpy as np
@@ -32,6 +33,11 @@ class Unmodelled:
     forms: Factor  #: with further terms of friction, by time
     #: with the torque of elastic gears; None if positions may be measured behind the gears
     elastic: ElasticTorque | None
+
+    def scaled(self, times: float) -> Unmodelled:
+        """Return the sums of rows each of which counts so many times."""
+        elastic = None if self.elastic is None else self.elastic.scaled(times)
+        return Unmodelled(self.forms.scaled(times), elastic)
 
     def __add__(self, other: Unmodelled) -> Unmodelled:
         """Return the sums over both."""
@@ -77,9 +83,14 @@ class Reduction:
             return np.inf
         return float(self.factor.samples.sum()) / max(1, int(self.unmodelled.forms.samples.sum()))
 
-    def without_details(self) -> Reduction:
-        """Return the sums that the parameters need, without those of their intervals."""
-        return replace(self, rates=None, unmodelled=None)
+    def for_all_rows(self) -> Reduction:
+        """Return these sums with unmodelled effects that stand for all rows.
+
+        So that reductions of different motions add in the proportion of their rows.
+        """
+        if self.unmodelled is None or not self.unmodelled.forms.samples.any():
+            return self
+        return replace(self, unmodelled=self.unmodelled.scaled(self.times))
 
 
 def reduce(
@@ -109,12 +120,15 @@ def reduce(
     factor = rows.restricted(np.arange(model.n_parameters)) if unmodelled else rows
     rates = None
     if uncertain_delay:
-        every = [rate_products(model, samples) for samples in versions]
-        rates = np.tensordot(shares, every, axes=1)
+        rates = np.tensordot(shares, [rate_products(model, each) for each in versions], axes=1)
     if not unmodelled or not factor.samples.any():
         return Reduction(factor, rates)
     torque = None
     if elastic:
         values, _ = posterior_values(factor, body_prior(model, factor, stated=known).gaussian)
-        torque = ElasticTorque.of(model, versions[0], values)
+        every = [
+            ElasticTorque.of(model, samples, values).scaled(share)
+            for samples, share in zip(versions, shares, strict=True)
+        ]
+        torque = reduce_left(ElasticTorque.plus, every)
     return Reduction(factor, rates, Unmodelled(rows, torque))

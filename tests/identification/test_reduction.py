@@ -74,6 +74,40 @@ def test_repetitions_share_what_the_first_show_of_the_model(halves):
     np.testing.assert_allclose(one_shown.std, all_shown.std, rtol=0.05)
 
 
+def drifting(count, drift):
+    """Reductions of repetitions whose friction falls; the first three show what the model lacks."""
+    motion = four_sines(np.arange(0.0, 16.0, STEP))
+    cold = np.where(MODEL.friction_columns, truth(), 0.0)
+    each = []
+    for k in range(count):
+        values = truth() + drift * np.exp(-k / 5.0) * cold
+        samples = simulated(MODEL, values, motion, NOISE, seed=k)
+        each.append(reduced(samples, unmodelled=k < 3))
+    return each
+
+
+@pytest.mark.parametrize("drift", [0.0, 0.02, 0.1])
+def test_friction_that_drifts_is_no_other_friction_law_and_no_elastic_gear(drift):
+    """The first repetitions alone do not balance at the parameters of all of them."""
+    total = Reduction.total(MODEL, drifting(10, drift))
+    posterior = Posterior.of(MODEL, total.factor, BODY_SHARE, {}, Strength())
+    pooled = posterior.fit(total.factor).estimate
+    wider = widened(pooled, total, posterior, posterior.precision, np.zeros(2), ())
+    assert wider.form is not None
+    assert np.all(wider.form.probability < 0.5)
+    assert np.max(wider.estimate.std / pooled.std) < 3.0
+
+
+def test_campaigns_of_different_motions_add_in_the_proportion_of_their_rows(halves):
+    """Three repetitions of one and thirty of another, of which three show what the model lacks."""
+    few = Reduction.total(MODEL, [reduced(halves[0]) for _ in range(3)])
+    many = Reduction.total(MODEL, [reduced(halves[1], unmodelled=k < 3) for k in range(30)])
+    total = few.for_all_rows() + many.for_all_rows()
+    assert total.times == pytest.approx(1.0, rel=1e-3)
+    shown = total.unmodelled.forms.restricted(np.arange(MODEL.n_parameters))
+    np.testing.assert_allclose(shown.gram, total.factor.gram, rtol=1e-9)
+
+
 def test_versions_are_averaged(halves):
     samples = halves[0]
     louder = replace(samples, torque=3.0 * samples.torque)
