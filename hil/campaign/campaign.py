@@ -20,12 +20,12 @@ from hil.precision.requirements import Requirement
 from identification.excitation import Excitation
 
 from .folder import LOCK, PAYLOADS, CampaignFolder
+from .motion_runner import RunOptions
 from .operator import Operator, RunWatch
 from .plan import CampaignPlan
 from .rehearsal import Rehearsal
 from .rehearsing import SEED, rehearse
 from .run import RunResult, run_motions
-from .runner import RunOptions
 from .state import CampaignState
 from .status import CampaignStatus, status_of
 

@@ -15,8 +15,8 @@ from hil.control.link import MotionLink
 from .dry_run import DryRunRecord, not_accepted, yes_or_no
 from .errors import DryRunError, NotRehearsedError
 from .folder import CampaignFolder
+from .motion_runner import RunOptions
 from .rehearsal import Rehearsal
-from .runner import RunOptions
 from .state import CampaignState
 
 _ADDRESS: Final = {"transport", "host", "port", "bind", "can"}

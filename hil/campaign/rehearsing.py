@@ -21,10 +21,10 @@ from hil.control.virtual_link import VirtualLink
 from sim_fixtures import SimulationError
 
 from .errors import RepetitionsRejectedError
+from .motion_runner import RunOptions
 from .operator import RunWatch
 from .rehearsal import AS_MODELLED, CRITERIA, EFFECTS, Criterion, Rehearsal
 from .run import run_motions
-from .runner import RunOptions
 from .state import CampaignState
 
 REPETITIONS: Final = 3

@@ -20,9 +20,9 @@ from hil.control.motions import CampaignMotion, StraightMoves, require_allowed
 
 from .dry_run import OVERRIDE, DryRunState
 from .gates import require_as_rehearsed, require_dry_run, require_gates
+from .motion_runner import RunArchives, Runner, RunOptions
 from .operator import RunWatch
 from .quality import Rejected
-from .runner import RunArchives, Runner, RunOptions
 from .stages import DryRunStage, WarmUpStage
 from .state import CampaignState
 

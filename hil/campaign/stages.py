@@ -11,9 +11,9 @@ from hil.base.progress import Reporter
 from hil.control.motions import CampaignMotion
 
 from .dry_run import OVERRIDE, DryRunRecord, DryRunState, is_from, not_accepted
+from .motion_runner import RunArchives, Runner, RunOptions
 from .operator import RunWatch
 from .quality import Problem
-from .runner import RunArchives, Runner, RunOptions
 from .state import CampaignState
 from .warmup import FrictionMeter, WarmUpRecord, drift_wanted
 

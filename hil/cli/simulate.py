@@ -17,18 +17,18 @@ from hil.base.terminal_text import plural, printable
 from hil.cell import Cell
 from hil.cli.arguments import JsonOption, print_json
 from hil.control.move import joint_index
-from hil.control.serving import (
-    Served,
-    buttons,
-    open_controller_link,
-    realtime_process,
-    serve_session,
-)
 from hil.control.simulation import (
     OWN_SPEED,
     controller_settings,
     own_postures,
     simulated_controller,
+)
+from hil.control.simulator_on_link import (
+    Served,
+    buttons,
+    open_controller_link,
+    realtime_process,
+    serve_session,
 )
 from sim_fixtures import ControllerSettings, Phase, SimulatedController
 from sim_fixtures.faults import parse_fault, split_faults

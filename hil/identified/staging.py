@@ -25,7 +25,7 @@ from hil.importers.recording import (
 )
 from hil.importers.required_signals import require_motion, require_torque
 from hil.importers.robot import Use
-from hil.look.conclusions import concluded
+from hil.look.before_identification import concluded
 
 MAP: Final = "map.toml"
 """File of the column map in a folder of results."""

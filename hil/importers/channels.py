@@ -25,7 +25,7 @@ from hil.importers.log_files import LogFiles
 from hil.importers.name_words import is_other, kind_by_words
 from hil.importers.rosbag2 import joint_state_topics
 from hil.importers.stamps import concluded_unit
-from hil.importers.table import Table
+from hil.importers.text_table import Table
 from hil.importers.units import TIMES, Kind, unit_of, without_unit
 
 _NUMBER: Final = r"[\[(_. ]*(?P<number>\d{1,2})[\])]*"

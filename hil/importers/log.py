@@ -34,7 +34,7 @@ from hil.importers.publishers import second_publisher
 from hil.importers.robot import NOT_RECORDED, RecordingContent, Robot, Use
 from hil.importers.row_names import row_names
 from hil.importers.stamps import YEAR, concluded_unit, sorted_neighbours, without_wraps
-from hil.importers.table import Table
+from hil.importers.text_table import Table
 from hil.importers.units import PER_CENT, TIMES, UNITS, kind_named, unit_of
 
 _MORE: Final = 64  # columns or files beyond the joints that are tried

@@ -6,7 +6,7 @@ from pathlib import Path
 
 from hil.importers.arrays import READERS, ArrayFile
 from hil.importers.column_map import Format
-from hil.importers.table import Table
+from hil.importers.text_table import Table
 
 
 class LogFiles:

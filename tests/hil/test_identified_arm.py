@@ -17,7 +17,7 @@ from typer.testing import CliRunner
 import hil
 from hil.base.errors import InputError, SourceError
 from hil.cli import app
-from hil.importers.table import Table
+from hil.importers.text_table import Table
 from hil.report.figures import joints_of, torque_charts
 from hil.results.results import Results
 from tests.hil.browser import OpenedPage, chromium

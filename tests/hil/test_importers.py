@@ -45,7 +45,7 @@ from hil.importers.log import import_log
 from hil.importers.messages import sentence as worded
 from hil.importers.robot import Robot, _cell_text
 from hil.importers.stamps import check_clock
-from hil.importers.table import Table
+from hil.importers.text_table import Table
 from hil.pipeline.sources import cell_of
 from identification import FrictionLaw
 from identification.model.kinematics import chain_from_urdf

@@ -13,8 +13,8 @@ from drivers.transports.base import TransportSpec
 from hil.base.errors import InputError
 from hil.cell import Cell
 from hil.cell.schema import LINKS, CanTable, ControllerTable
-from hil.control.serving import open_controller_link
 from hil.control.simulation import controller_settings
+from hil.control.simulator_on_link import open_controller_link
 from hil.doctor.checks import DoctorCheck, Status, System, link_checks
 from sim_fixtures.ns16 import CELL_PATH
 

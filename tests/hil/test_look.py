@@ -27,7 +27,7 @@ from hil.importers.conclusions import Certainty
 from hil.importers.recording import ImportOptions, import_recording
 from hil.importers.robot import Robot
 from hil.look import Look, look_at
-from hil.look.conclusions import concluded, undecided
+from hil.look.before_identification import concluded, undecided
 from hil.look.maps import entries_of
 from hil.look.messages import row_text
 from hil.look.other_arm import Contradictions

@@ -31,13 +31,13 @@ from hil.cell import Cell, CellError
 from hil.cli import exit_code_of, main
 from hil.cli.simulate import WORDS, Status, _sentences, simulate
 from hil.control.motion_checks import MotionChecks
-from hil.control.serving import Buttons, Served, open_controller_link
 from hil.control.simulation import (
     controller_settings,
     own_postures,
     simulated_controller,
     simulated_link,
 )
+from hil.control.simulator_on_link import Buttons, Served, open_controller_link
 from hil.control.simulator_process import free_port
 from sim_fixtures import ControllerSettings, Phase
 from sim_fixtures.ns16 import CELL_PATH

@@ -15,7 +15,7 @@ from drivers.packets import PacketSequence
 from drivers.states import LossTracker
 from hil.archive.recorder import Recorder
 from hil.campaign.folder import CampaignFolder
-from hil.campaign.runner import Runner
+from hil.campaign.motion_runner import Runner
 from planner import TrajectoryPlayer
 from tests.laws.table import judged
 from tests.simulate.many import stage_folder

@@ -42,7 +42,7 @@ from hil.cli.plan import read_via_points
 from hil.importers.arrays import READERS, ArrayFile
 from hil.importers.bags import bag_files, open_bag
 from hil.importers.column_map import Format
-from hil.importers.table import Table
+from hil.importers.text_table import Table
 from hil.report.output_files import SERIES, _load_series, rewrite_report
 from hil.results.results import Results
 from hil.study.results import StudyResults

@@ -119,7 +119,7 @@ def test_the_link_decides_whether_the_arm_is_simulated(
     campaign = make(real=True)
     twin = simulated_link(campaign.cell, instead_of_hardware=True)
     if provenance is None:  # as of a version that left it to the caller
-        monkeypatch.setattr("hil.campaign.runner.with_present_date", lambda _: {})
+        monkeypatch.setattr("hil.campaign.motion_runner.with_present_date", lambda _: {})
     campaign.run(twin, provenance=provenance, dry_run_only=True)
     monkeypatch.undo()
     first = next(campaign.folder.archives.iterdir())
