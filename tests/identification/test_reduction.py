@@ -87,7 +87,7 @@ def drifting(count, drift):
 
 
 @pytest.mark.parametrize("drift", [0.0, 0.02, 0.1])
-def test_friction_that_drifts_is_no_other_friction_law_and_no_elastic_gear(drift):
+def test_drift_is_neither_another_law_nor_an_elastic_gear(drift):
     """The first repetitions alone do not balance at the parameters of all of them."""
     total = Reduction.total(MODEL, drifting(10, drift))
     posterior = Posterior.of(MODEL, total.factor, BODY_SHARE, {}, Strength())
@@ -98,7 +98,7 @@ def test_friction_that_drifts_is_no_other_friction_law_and_no_elastic_gear(drift
     assert np.max(wider.estimate.std / pooled.std) < 3.0
 
 
-def test_campaigns_of_different_motions_add_in_the_proportion_of_their_rows(halves):
+def test_campaigns_of_other_motions_add_by_their_rows(halves):
     """Three repetitions of one and thirty of another, of which three show what the model lacks."""
     few = Reduction.total(MODEL, [reduced(halves[0]) for _ in range(3)])
     many = Reduction.total(MODEL, [reduced(halves[1], unmodelled=k < 3) for k in range(30)])
