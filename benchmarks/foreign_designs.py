@@ -1,11 +1,11 @@
 """Designs for the NS 16, UR5 and Panda: `python -m benchmarks.foreign_designs --seeds 5`.
 
-The cell of the UR5 and the Panda is that of ``hil new --design-only`` from their URDF; searches are
-those of ``hil design`` with all constraints, by one process. ``gradient`` and, for sines in place
+The cell of the UR5 and the Panda is that of ``hil new --design-only`` from their URDF; searches run
+as ``hil design`` with all constraints does, in one process. ``gradient`` and, for sines in place
 of via points, ``sines`` end after ``--seconds`` (30, of the NS 16 60); ``quick`` (``--quick``) runs
-to its end. Seconds are those of processor, of all processes of a search: on a machine with other
-work a wall clock times that as well. A search ends after the generation or step in which its time
-is over.
+to its end. Seconds are processor time, summed over the processes of a search: on a machine with
+other work a wall clock would count that as well. A search ends after the generation or step in
+which its time is over.
 """
 
 from __future__ import annotations

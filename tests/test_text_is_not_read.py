@@ -56,7 +56,6 @@ FOREIGN: Final[Mapping[str, str]] = {
 OURS: Final[Mapping[str, str]] = {
     "hil.batch.graph": "the reason of an unusable archive begins with its path",
     "hil.control.errors": "an outcome that begins the reason is not said twice",
-    "hil.cli.record": "an end by the operator is told by the reason of the recording",
     "hil.control.simulator_process": "the last error that the simulated controller printed",
     "hil.report.drawing": "the lines of a label make its height",
     "hil.report.numbers": "figures are typeset",
@@ -141,7 +140,6 @@ def test_every_exception_is_needed() -> None:
 
 
 def test_no_page_reads_a_text_of_ours() -> None:
-    """But the mark of an arm that was not warm, by its words in an archive of results."""
     found = [
         (path.name, line)
         for path in sorted((ROOT / "hil/report/templates").glob("*.j2"))
@@ -149,7 +147,7 @@ def test_no_page_reads_a_text_of_ours() -> None:
             r"\w+\.(?:startswith|endswith|partition|find)\([^)]*\)", path.read_text()
         )
     ]
-    assert found == [("conduct.html.j2", 'words.startswith("not warm")')]
+    assert not found
 
 
 @pytest.mark.parametrize(

@@ -300,7 +300,7 @@ class Estimator:
         """Return the estimate from a sum over archives, with the posterior of that sum.
 
         Its intervals are at least as wide as the scatter of repetitions of one motion, and allow
-        for all that those of `hil identify` do. Friction may drift over `recordings`.
+        for everything that `hil identify` intervals do. Friction may drift over `recordings`.
 
         Raises:
             IdentificationError: there is no consistent solution.

@@ -36,6 +36,7 @@ class Step:
         sentence: its result, or what is missing.
         command: to do it; "" for a step that is done, or for which there is no command.
         details: more sentences, for the report.
+        warning: whether what follows was recorded in spite of it.
         name: of the step.
     """
 
@@ -43,6 +44,7 @@ class Step:
     sentence: str
     command: str = ""
     details: tuple[str, ...] = ()
+    warning: bool = False
     name: str = ""
 
     @property
@@ -204,7 +206,8 @@ def _warm_up(record: WarmUpRecord | None) -> Step:
     message = f"{record.outcome} after {plural(len(record.motions), 'motion')}"
     cold = record.outcome == "not warm" and bool(record.motions)
     state: State = "done" if record.outcome == "warm" else "next"
-    return Step(state, message, "run {}", (record.sentence,) if cold else ())
+    details = (record.sentence,) if cold else ()
+    return Step(state, message, "run {}", details, warning=record.outcome == "not warm")
 
 
 def _conducted_warm_up(folder: CampaignFolder) -> Step:
@@ -265,7 +268,13 @@ def conduct_of(folder: CampaignFolder) -> ConductResult:
         steps["repetitions"] = replace(repeated, details=details)
     return ConductResult(
         steps=[
-            StepResult(step=name, done=step.done, words=step.sentence, details=[*step.details])
+            StepResult(
+                step=name,
+                done=step.done,
+                words=step.sentence,
+                details=[*step.details],
+                warning=step.warning,
+            )
             for name, step in steps.items()
         ],
         precision=[] if record is None else _over_repetitions(folder, record),

@@ -154,7 +154,7 @@ def too_far_without_a_packet(cell: Cell) -> str | None:
 
 
 def _varied(cell: Cell, rng: np.random.Generator) -> dict[str, list[float]]:
-    """Return inertias, rotors and friction varied about those of the URDF and `[nominal]`."""
+    """Return inertias, rotors and friction varied about the values of the URDF and `[nominal]`."""
     nominal = cell.nominal
     n = len(cell.joint_names)
 

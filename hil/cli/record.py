@@ -79,7 +79,7 @@ def record(
             link, loaded, path,
             kind=kind, stop=stop, duration=duration, wait=wait, watch=view.show,
         )  # fmt: skip
-    early = _early_end(path, done, duration)
+    early = _early_end(path, done, duration, by_operator=stop.requested)
     figures = _figures(path, done, loaded)
     if not json:
         say(_line(figures))
@@ -89,14 +89,16 @@ def record(
         raise early.beside(figures)
 
 
-def _early_end(path: Path, done: Recorded, duration: float | None) -> HilError | None:
+def _early_end(
+    path: Path, done: Recorded, duration: float | None, *, by_operator: bool
+) -> HilError | None:
     """Return the error of a recording that ended early."""
     if done.outcome == "completed" and (duration is None or done.seconds >= duration):
         return None
     if done.outcome == "completed":
         reached = f"after {done.seconds:.1f} s of {duration:g} s"
         return ControllerError(f"{done.reason} {reached}; {path} is complete.")
-    if done.outcome == "stopped" and done.reason == "ended by the operator":
+    if done.outcome == "stopped" and by_operator:
         return OperatorStopError(f"the recording was ended early; {path} is complete.")
     return ControllerError(f"{done.reason}; {path} is complete up to there.")
 

@@ -298,7 +298,7 @@ def settings_of(raw: Mapping[str, Any], path: Path | None = None) -> DesignSetti
             path,
             "is a method of version 0.1, which the gradient replaced",
             field=f"method = {method!r}",
-            remedy="leave out method and [search]: the defaults are those of the gradient",
+            remedy="leave out method and [search]: by default the gradient is used",
         )
     if method not in METHODS:
         raise SettingsError(

@@ -97,7 +97,7 @@ def staged(
 ) -> Iterator[Staging]:
     """Read those recordings that are no archives, and report what was concluded.
 
-    Errors about their archives in memory are raised as those of the recordings.
+    Errors about an archive in memory name the recording it was read from.
 
     Raises:
         SourceError: one cannot be imported, or nothing can be identified from it.

@@ -212,7 +212,7 @@ def _(publisher: SecondPublisher) -> str:
     where = ", ".join(f"{angle:.3g}" for angle in publisher.pose) or "0"
     return (
         f"{publisher.count} of {publisher.total} {publisher.sample}s have {where} for all positions"
-        " between others that do not: those of a second publisher, left out"
+        " between others that do not; dropped, as they come from a second publisher"
     )
 
 

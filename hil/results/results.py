@@ -81,6 +81,7 @@ class StepResult(Frozen):
     done: bool
     words: str  #: Summary
     details: list[str]
+    warning: bool = False  #: Whether what follows was recorded in spite of it
 
 
 class PrecisionResult(Frozen):

@@ -16,7 +16,7 @@ from typer.testing import CliRunner
 
 from hil.cli import app
 from hil.importers import messages as import_messages
-from hil.importers.conclusions import Certainty
+from hil.importers.conclusions import Certainty, Conclusion
 from hil.importers.recording import ImportOptions
 from hil.importers.robot import Robot
 from hil.look import Look, Row, look_at
@@ -208,3 +208,19 @@ def test_sentences_decide_nothing(
         by_keys = played("keys")
     assert by_keys.pop("said") != in_words.pop("said")
     assert by_keys == in_words
+
+
+def leaves(kind: type) -> set[type]:
+    """All types of conclusions without types of their own."""
+    below = kind.__subclasses__()
+    return set().union(*map(leaves, below)) if below else {kind}
+
+
+def test_every_conclusion_has_words() -> None:
+    """So that the base case, which only raises, is never reached."""
+    base = import_messages.worded.dispatch(Conclusion)
+    assert not [
+        kind.__name__
+        for kind in leaves(Conclusion)
+        if import_messages.worded.dispatch(kind) is base
+    ]
