@@ -372,7 +372,7 @@ _NO_CLASSIC: Final = "classic CAN is not supported any more: its frames do not c
 
 
 class CanTable(Table):
-    """`[controller.can]`: CAN adapter for transport = "can" (`docs/can.md`)."""
+    """`[controller.can]`: CAN adapter for transport = "can" (`docs/connect.md`)."""
 
     interface: str = field(
         'adapter by its python-can name, e.g. "socketcan" or "slcan"', min_length=1

@@ -1,7 +1,7 @@
 """Pytest plugin with fixtures of a simulated cell, down to the bytes of the protocol.
 
 pytest loads it once the package is installed; modules are imported when a fixture is used. See
-`docs/testing.md`.
+`docs/simulate.md`.
 """
 
 from __future__ import annotations

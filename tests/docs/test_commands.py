@@ -21,7 +21,7 @@ from hil.base.progress import Silent
 from hil.campaign import design
 from hil.cli import app
 from tests import messages
-from tests.docs.typed import PAGES, ROOT, commands, parse
+from tests.docs.typed import PAGES, ROOT, commands, parse, section
 from tests.hil.simulated_logs import write_moving_log
 
 pytestmark = pytest.mark.long
@@ -32,14 +32,17 @@ TYPED_ELSEWHERE = {
     **dict.fromkeys(
         (
             "bring-your-own-robot.md",
-            "first-hour.md",
-            "first-hour-simulated.md",
-            "other-robots.md",
+            "i-have-a-comau.md",
             "simulators.md",
         ),
         "tests/docs/test_typed_pages.py",
     ),
 }  # Pages whose commands another test types, one after the other
+
+SECTIONS_TYPED_ELSEWHERE = {
+    "design.md": "Arms with other controllers",
+    "tutorial.md": "The first hour with a simulated arm",
+}  # Sections likewise, by tests/docs/test_typed_pages.py
 
 OTHER_PROGRAMS = {
     "sudo": "changes the computer",
@@ -171,7 +174,10 @@ def reason_not_to(command: list[str]) -> str | None:
 def type_page(page: Path) -> list[str]:
     """Type what can be typed of a page; the commands that were."""
     typed = []
-    for command in commands(page):
+    text = page.read_text(encoding="utf-8")
+    if page.name in SECTIONS_TYPED_ELSEWHERE:
+        text = text.replace(section(page, SECTIONS_TYPED_ELSEWHERE[page.name]), "")
+    for command in commands(page, text):
         if reason_not_to(command) is not None:
             continue
         extra = SHORTER.get(command[1], ())

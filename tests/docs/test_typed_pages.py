@@ -30,12 +30,14 @@ from hil.control.simulator_process import free_port
 from hil.results.results import Results
 from hil.results.rollout_result import RolloutResult
 from identification.model.motion import Motion
-from tests.docs.typed import ROOT, commands
+from tests.docs.typed import ROOT, commands, section
 from tests.hil.simulated_logs import simulate
 from tests.hil.test_payload_command import CENTRE, MASS, archive_of_currents
 from tests.motion_table import MotionTable
 
 pytestmark = pytest.mark.long
+
+DESIGN = ROOT / "docs" / "design.md"
 
 
 def page(name: str) -> str:
@@ -156,7 +158,7 @@ def log_of(motion: str, path: str) -> None:
 
 
 def test_other_robots_from_a_urdf_to_a_good_model(workplace: Path) -> None:
-    for language, block in blocks(page("other-robots.md")):
+    for language, block in blocks(section(DESIGN, "Arms with other controllers")):
         if language == "toml":
             saved(block)
             log_of("excitation.csv", "log.csv")
@@ -226,8 +228,9 @@ def test_simulators_print_what_the_page_shows(workplace: Path) -> None:
 
 
 class TestFirstHour:
-    TEXT = page("first-hour-simulated.md")
-    STEPS = commands(ROOT / "docs" / "first-hour-simulated.md")
+    PAGE = ROOT / "docs" / "tutorial.md"
+    TEXT = section(PAGE, "The first hour with a simulated arm")
+    STEPS = commands(PAGE, TEXT)
 
     def edit(self, path: Path, **instead: int) -> None:
         """What the page asks to write into `[controller]` of the copy."""

@@ -21,10 +21,18 @@ _REDIRECTION = re.compile(r" > \S+$")
 _BLOCK = re.compile(r"^```(\w*)\n(.*?)^```$", re.MULTILINE | re.DOTALL)
 
 
-def commands(page: Path) -> list[list[str]]:
-    """The commands of a page in order, split into words; output and comments are left out."""
+def section(page: Path, heading: str) -> str:
+    """The text under a heading of the second level, up to the next one."""
+    text = page.read_text(encoding="utf-8")
+    _, found, rest = text.partition(f"\n## {heading}\n")
+    assert found, f"{page.name} has no section {heading!r}"
+    return rest.partition("\n## ")[0]
+
+
+def commands(page: Path, text: str | None = None) -> list[list[str]]:
+    """The commands of a page, or of its text given, in order, without output and comments."""
     lines = []
-    for language, block in _BLOCK.findall(page.read_text(encoding="utf-8")):
+    for language, block in _BLOCK.findall(text or page.read_text(encoding="utf-8")):
         if language in SHELL:
             lines += _of_block(page, block)
     return lines

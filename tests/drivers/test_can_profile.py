@@ -217,7 +217,7 @@ class TestBusLoad:
         ],
     )  # fmt: skip
     def test_load_of_a_cycle_and_its_limit(self, n_axes, period, percent):
-        """As `docs/can.md` has them."""
+        """As `docs/connect.md` has them."""
         rates = BusRates()
         assert f"{100.0 * rates.load(n_axes, period):.1f}" == percent
         if float(percent) <= 100.0 * LOAD_LIMIT:

@@ -54,8 +54,9 @@ slowest = 0.8
 
 
 def blocks(language: str) -> list[str]:
-    """Code blocks of the document in one language, "" for commands."""
-    return re.findall(rf"^```{language}\n(.*?)^```$", DOCUMENT.read_text("utf-8"), re.M | re.S)
+    """Code blocks of the day in one language, "" for commands; monitoring has a section of its own."""
+    day = DOCUMENT.read_text("utf-8").partition("\n## Monitoring a run\n")[0]
+    return re.findall(rf"^```{language}\n(.*?)^```$", day, re.M | re.S)
 
 
 def commands() -> list[list[str]]:

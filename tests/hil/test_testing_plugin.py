@@ -16,7 +16,7 @@ from sim_fixtures.ns16 import CELL_PATH
 
 pytestmark = pytest.mark.long
 
-DOCUMENT = Path(__file__).parents[2] / "docs" / "testing.md"
+DOCUMENT = Path(__file__).parents[2] / "docs" / "simulate.md"
 
 
 def pytest_in(folder: Path, *arguments: str) -> subprocess.CompletedProcess[str]:

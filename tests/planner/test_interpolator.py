@@ -664,12 +664,12 @@ class TestManyServices(AnyServices.TestCase):
 
 # -- the page ------------------------------------------------------------------------------
 
-PAGE = Path(__file__).parents[2] / "docs" / "interpolator.md"
+PAGE = Path(__file__).parents[2] / "docs" / "motion.md"
 
 
 @pytest.fixture(scope="module")
 def page():
-    return PAGE.read_text()
+    return PAGE.read_text().split("\n## The interpolator\n")[1]
 
 
 def test_the_example_runs_to_its_last_target(page):
@@ -688,7 +688,7 @@ def test_every_service_and_code_is_on_the_page_and_no_other(page):
         for name in dir(Interpolator)
         if not name.startswith("_") and callable(getattr(Interpolator, name))
     }
-    table = page.split("## Services")[1].split("## Where")[0]
+    table = page.split("## Services")[1].split("## Differences")[0]
     assert set(re.findall(r"`([a-z_]+)`", table)) == services
     codes = re.findall(r"^\| (-?\d+) \| ([A-Z_]+) \|", page, re.MULTILINE)
     assert [(int(code), name) for code, name in codes] == [(s.value, s.name) for s in Status]

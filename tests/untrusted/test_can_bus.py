@@ -23,7 +23,7 @@ from tests.drivers.can_bench import HOME, MOVE, PERIOD, Cycles, Run, UnstampedBu
 
 pytestmark = pytest.mark.safety
 
-REPLY_IDS = {0x100}  # Identifier of the PC (`docs/can.md`)
+REPLY_IDS = {0x100}  # Identifier of the PC (`docs/connect.md`)
 _channels = count()
 
 LAST_CYCLE = 600  # a session has 484
