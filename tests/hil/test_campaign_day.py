@@ -54,7 +54,7 @@ slowest = 0.8
 
 
 def blocks(language: str) -> list[str]:
-    """Code blocks of the day in one language, "" for commands; monitoring has a section of its own."""
+    """Code blocks in one language, "" for commands, up to the section on monitoring."""
     day = DOCUMENT.read_text("utf-8").partition("\n## Monitoring a run\n")[0]
     return re.findall(rf"^```{language}\n(.*?)^```$", day, re.M | re.S)
 

@@ -1,1 +1,1 @@
-"""The link over CAN: a profile of our own in frames that a DBC file describes; see docs/connect.md."""
+"""The link over CAN: our own profile, in frames that a DBC file describes (docs/connect.md)."""
