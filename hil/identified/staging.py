@@ -107,21 +107,21 @@ def staged(
         (fitted, staging.fitted, "excitation"),
         (predicted, staging.predicted, "validation"),
     )
-    for paths, archives, use in uses:
-        for path in paths:
-            if is_archive(path):
-                archives.append(path)
-                continue
-            place = staging.unused(path)
-            recording = read_recording(path, robot_of, options, place=place, use=use)
-            require_motion(recording.archive, path)
-            require_torque(recording.archive, path)
-            recording = concluded(recording, path, robot_of, options, use)
-            _report(recording, path, reporter)
-            archives.append(recording.archive)
-            staging.recordings[place] = recording
-            staging.sources[place] = path
     try:
+        for paths, archives, use in uses:
+            for path in paths:
+                if is_archive(path):
+                    archives.append(path)
+                    continue
+                place = staging.unused(path)
+                staging.sources[place] = path
+                recording = read_recording(path, robot_of, options, place=place, use=use)
+                require_motion(recording.archive, path)
+                require_torque(recording.archive, path)
+                recording = concluded(recording, path, robot_of, options, use)
+                _report(recording, path, reporter)
+                archives.append(recording.archive)
+                staging.recordings[place] = recording
         yield staging
     except InputError as error:
         if error.path not in staging.sources:

@@ -8,7 +8,7 @@ from __future__ import annotations
 import math
 import re
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Final, TypeVar
 
@@ -21,7 +21,7 @@ from hil.importers.bags import SUFFIXES, open_bag
 from hil.importers.column_map import Format
 from hil.importers.commands import as_joint_state, measured_topics
 from hil.importers.dialect import is_date
-from hil.importers.log_files import LogFiles
+from hil.importers.log_files import LogFiles, files_in, is_folder_of_logs
 from hil.importers.name_words import is_other, kind_by_words
 from hil.importers.rosbag2 import joint_state_topics
 from hil.importers.stamps import concluded_unit
@@ -111,6 +111,8 @@ def channels_of(
         SourceError: it cannot be read.
     """
     suffix = path.suffix.lower()
+    if path.is_dir() and is_folder_of_logs(path):
+        return tuple(_of_folder(path, form, files or LogFiles()))
     if path.is_dir() or suffix in SUFFIXES or Path(path.stem).suffix in SUFFIXES:
         bag = _of_bag(path)
         if bag or suffix != ".mcap":
@@ -140,6 +142,27 @@ def kind_of(name: str, unit: str | None = None) -> tuple[Kind | None, int | None
     if len(kinds) != 1 or is_other(bare, kinds[0]):
         return None, number
     return kinds[0], number
+
+
+def kinds_of_file(path: Path) -> list[Kind]:
+    """Return the quantities that the name of a file says, such as ``curr_data.csv``."""
+    stem = path.stem.lower()
+    parts = [part for part in re.split(r"[^a-z]+", stem) if len(part) > 1 or part == "q"]
+    kinds = [kind_of(part)[0] for part in (stem, *parts)]
+    return list(dict.fromkeys(kind for kind in kinds if kind is not None))
+
+
+def _of_folder(folder: Path, form: Format | None, files: LogFiles) -> Iterator[Channel]:
+    """Yield the channels of the files of a folder, by the files' names where theirs say nothing."""
+    for path in files_in(folder):
+        try:
+            channels = channels_of(path, form, files)
+        except SourceError:  # such as notes
+            continue
+        kinds = kinds_of_file(path)
+        for channel in channels:
+            kind = channel.kind or (kinds[0] if kinds else None)
+            yield replace(channel, kind=kind)
 
 
 def _of_table(table: Table) -> Iterator[Channel]:

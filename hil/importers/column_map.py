@@ -35,6 +35,23 @@ class _Table(BaseModel):
     model_config = ConfigDict(frozen=True, extra="forbid", defer_build=True)
 
 
+class TimeColumn(_Table):
+    """The column of the time, in the file of the positions or in another `file`.
+
+    If there is a file of positions per joint, all must have the same times. No unit is the one that
+    the file states, or else the one that gives a rate at which robots are sampled. With a column of
+    `nanoseconds` beside it the first is of whole seconds.
+    """
+
+    column: Column = Field(default=0, description="a name or an index from 0")
+    array: str | None = None
+    file: str | None = None
+    unit: Literal["s", "ms", "us", "ns"] | None = Field(
+        default=None, description='"s", "ms", "us" or "ns"'
+    )
+    nanoseconds: Column | None = Field(default=None, description="a name or an index from 0")
+
+
 class Quantity(_Table):
     """Columns of a joint quantity.
 
@@ -52,6 +69,7 @@ class Quantity(_Table):
         offset: added to the recorded numbers, one for all joints or one each.
         scale: factor after that, one for all joints or one each.
         side: ``motor`` if it was measured before the gears.
+        time: its own times, where they are not those of `[time]`; by default in its own file.
         coupled: angles or velocities that contain those of other joints, as terms ``[joint, other,
             factor]``, numbered from 1: with ``[3, 2, 1.0]`` axis 3 is stated relative to the base.
     """
@@ -71,27 +89,11 @@ class Quantity(_Table):
     offset: FiniteFloat | Vector = Field(default=0.0, description=_ONE_OR_EACH)
     scale: FiniteFloat | Vector = Field(default=1.0, description=_ONE_OR_EACH)
     side: Literal["joint", "motor"] = "joint"
+    time: TimeColumn | None = None
     coupled: tuple[tuple[_Number, _Number, FiniteFloat], ...] = Field(
         default=(),
         description="a list of [joint, other joint, factor], numbered from 1",
     )
-
-
-class TimeColumn(_Table):
-    """The column of the time, in the file of the positions or in another `file`.
-
-    If there is a file of positions per joint, all must have the same times. No unit is the one that
-    the file states, or else the one that gives a rate at which robots are sampled. With a column of
-    `nanoseconds` beside it the first is of whole seconds.
-    """
-
-    column: Column = Field(default=0, description="a name or an index from 0")
-    array: str | None = None
-    file: str | None = None
-    unit: Literal["s", "ms", "us", "ns"] | None = Field(
-        default=None, description='"s", "ms", "us" or "ns"'
-    )
-    nanoseconds: Column | None = Field(default=None, description="a name or an index from 0")
 
 
 class Drive(_Table):
@@ -147,8 +149,9 @@ class Format(_Table):
         header: whether a line of column names comes first.
         transposed: whether the lines of the file are channels instead of samples.
         skip_empty: ignore empty lines between the rows, which are refused otherwise.
-        missing: ``refuse`` a log with a number that is missing or not finite, or ``drop`` such rows
-            from all quantities.
+        missing: ``refuse`` a log with a number that is missing or not finite, ``drop`` such rows
+            from all quantities, or ``interpolate`` quantities that were recorded in rows of their
+            own, as of two topics in one table, to the times of the one with the fewest samples.
     """
 
     delimiter: Annotated[str, Field(min_length=1, max_length=1)] | None = Field(
@@ -163,7 +166,7 @@ class Format(_Table):
     header: bool | None = None
     transposed: bool = False
     skip_empty: bool = False
-    missing: Literal["refuse", "drop"] = "refuse"
+    missing: Literal["refuse", "drop", "interpolate"] = "refuse"
 
 
 class ColumnMap(_Table):
@@ -206,6 +209,9 @@ class ColumnMap(_Table):
             if isinstance(quantity.files, str) and "{}" not in quantity.files:
                 problem = f"{name}.files has no {{}} for the joint's number"
                 raise FieldError(problem, 'write it there, as in "q_{}.txt"')
+            if quantity.time is not None and self.time is None:
+                problem = f"{name}.time is given, and the positions have a sample_rate"
+                raise FieldError(problem, "give [time] of the positions instead of sample_rate")
             if quantity.coupled and name not in KINEMATIC:
                 remedy = f"give {KINEMATIC[0]}.coupled"
                 raise FieldError(f"{name} has no coupled angles", remedy)

@@ -25,8 +25,8 @@ from hil.importers.bags import Bag, BagMessage
 from hil.importers.conclusions import Conclusion, DifferentCommands, KnownCommands, NotCommands
 from hil.importers.mcap_messages import Topic
 from hil.importers.messages import sentence
+from hil.importers.resampling import at_stamps
 from hil.importers.ros_messages import CONTROLLER_STATE, JOINT_STATE
-from identification.signals.recording import GAP_STEPS
 
 Stamps = NDArray[np.int64]
 
@@ -237,7 +237,7 @@ def _of_states(messages: Iterable[BagMessage], measured: Measured) -> tuple[Arra
         rows.append(np.asarray(positions, np.float64)[places])
     if not rows:
         raise _NotCommandsError("it has no positions of these joints")
-    return _at_stamps(measured.stamp, np.array(stamps, np.int64), np.array(rows)), reading
+    return at_stamps(measured.stamp, np.array(stamps, np.int64), np.array(rows)), reading
 
 
 def _of_arrays(messages: Iterable[BagMessage], measured: Measured) -> tuple[Array, str]:
@@ -250,7 +250,7 @@ def _of_arrays(messages: Iterable[BagMessage], measured: Measured) -> tuple[Arra
     count = len(measured.joints)
     if not rows or any(row.shape != (count,) for row in rows):
         raise _NotCommandsError(f"it has no {count} numbers in each message, one for each joint")
-    values = _at_stamps(measured.stamp, np.array(stamps, np.int64), np.array(rows))
+    values = at_stamps(measured.stamp, np.array(stamps, np.int64), np.array(rows))
     known = np.asarray(np.isfinite(values).all(axis=1))
     if not known.any():
         return values, ""
@@ -346,22 +346,6 @@ def _at_rest(time: Array, values: Array, at: float) -> tuple[Array, Array]:
     """Return values at a time, at rest."""
     position = np.array([np.interp(at, time, column) for column in values.T])
     return position, np.zeros(len(position))
-
-
-def _at_stamps(stamp: Stamps, sent: Stamps, values: Array) -> Array:
-    """Return values (k, n) at other stamps (m,): linear, NaN outside and in gaps."""
-    sent, first = np.unique(sent, return_index=True)
-    values = values[first]
-    if len(sent) < 2:
-        return np.full((len(stamp), values.shape[1]), np.nan)
-    time = 1e-9 * (sent - sent[0])
-    at = 1e-9 * (stamp - sent[0])
-    after = np.clip(np.searchsorted(sent, stamp), 1, len(sent) - 1)
-    gap = np.diff(time)[after - 1] > GAP_STEPS * np.median(np.diff(time))
-    outside = (stamp < sent[0]) | (stamp > sent[-1]) | gap
-    result = np.column_stack([np.interp(at, time, column) for column in values.T])
-    result[outside & ~np.isin(stamp, sent)] = np.nan
-    return result
 
 
 def _point(content: Any, names: Sequence[str]) -> Any:

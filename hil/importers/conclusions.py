@@ -36,6 +36,7 @@ class NameBasis(Enum):
     WORDS = auto()  #: a word in each of several names, one for each joint
     READY_MAP = auto()
     OPTION = auto()  #: ``--columns``
+    FILE = auto()  #: the name of the file
     MESSAGE = auto()  #: the field of a message
     COMMANDS = auto()  #: a topic of commands that the positions follow
 
@@ -215,6 +216,21 @@ class MergedMessages(Conclusion):
 
     groups: tuple[tuple[str, ...], ...]
     same_stamps: bool  #: else interpolated to the stamps of the first
+
+
+@dataclass(frozen=True)
+class OneTimeBase(Conclusion):
+    """Quantities with times of their own, interpolated to those of one of them.
+
+    Attributes:
+        counts: samples of each quantity.
+        base: the one whose stamps were kept.
+        left_out: of its samples, where another was not recorded.
+    """
+
+    counts: Mapping[str, int]
+    base: str
+    left_out: int
 
 
 @dataclass(frozen=True)

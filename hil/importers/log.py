@@ -31,6 +31,7 @@ from hil.importers.conclusions import (
 from hil.importers.findings import are_degrees, has_degrees_per_second
 from hil.importers.log_files import LogFiles
 from hil.importers.publishers import second_publisher
+from hil.importers.resampling import Timed, are_interleaved, on_one_base
 from hil.importers.robot import NOT_RECORDED, RecordingContent, Robot, Use
 from hil.importers.row_names import row_names
 from hil.importers.stamps import YEAR, concluded_unit, sorted_neighbours, without_wraps
@@ -93,6 +94,7 @@ def read_log(
     with np.errstate(over="ignore", invalid="ignore"):  # such numbers are refused later
         values = {name: log.read(name) for name in columns.quantities()}
     clock = log.clock(len(values["position"]))
+    clock, values = log.on_one_clock(clock, values)
     _check_lengths({**values, "time": clock.stamp}, log.path, "quantities")
     metadata = {"importer": "log", "clock_origin_ns": str(clock.origin)}
     complete = log.complete_rows(clock, values)
@@ -119,6 +121,21 @@ def read_log(
     )
 
 
+def are_in_rows_of_their_own(
+    source: Path, *, robot: Robot, columns: ColumnMap, files: LogFiles
+) -> bool:
+    """Return whether a table has its quantities in different rows, as of two topics.
+
+    The map is one that interpolates.
+
+    Raises:
+        SourceError: the map does not fit the log.
+    """
+    log = _Log(source, columns, robot, files)
+    finite = [np.asarray(np.isfinite(log.read(name)).all(axis=1)) for name in columns.quantities()]
+    return are_interleaved(finite)
+
+
 class _Clock(NamedTuple):
     """Stamps of a log."""
 
@@ -126,6 +143,11 @@ class _Clock(NamedTuple):
     valid: NDArray[np.bool_]  #: (m,) rows whose time is known
     origin: int  #: [ns], was subtracted
     path: Path  #: of the file that has them
+
+    @property
+    def times(self) -> list[int]:
+        """Times [ns] with the origin."""
+        return [int(stamp) + self.origin for stamp in self.stamp]
 
 
 class _Log:
@@ -207,10 +229,14 @@ class _Log:
             assert rate is not None
             stamps = np.rint(np.arange(count) * (1e9 / rate)).astype(np.int64)
             return _Clock(stamps, np.ones(count, np.bool_), 0, self.path)
-        if time.file is None and position.files is not None:
-            first, *others = self._file_per_joint(position.files, "position.files")
+        return self._clock_of(time, position, "position")
+
+    def _clock_of(self, time: TimeColumn, quantity: Quantity, name: str) -> _Clock:
+        """Return the stamps of a quantity by its column of times."""
+        if time.file is None and quantity.files is not None:
+            first, *others = self._file_per_joint(quantity.files, f"{name}.files")
         else:
-            first, *others = (self._file(time.file or position.file, "time.file"),)
+            first, *others = (self._file(time.file or quantity.file, "time.file"),)
         times = self._times(first, time)
         for other in others:
             if self._times(other, time) != times:
@@ -222,6 +248,34 @@ class _Log:
             problem = f"has no time in sample {times.index(None)}"
             raise SourceError(first.path, problem, field="time", remedy=HOLE)
         return self._within_archive(times, valid, first.path)
+
+    def on_one_clock(
+        self, clock: _Clock, values: dict[str, Array]
+    ) -> tuple[_Clock, dict[str, Array]]:
+        """Return quantities at common times, those with times of their own interpolated.
+
+        Raises:
+            SourceError: they have no common time.
+        """
+        quantities = self._map.quantities()
+        clocks = {
+            name: self._clock_of(quantity.time, quantity, name)
+            for name, quantity in quantities.items()
+            if quantity.time is not None
+        }
+        differ = any(own.times != clock.times for own in clocks.values())
+        if not differ and self._map.format.missing != "interpolate":
+            return clock, values
+        parts = {}
+        for name, array in values.items():
+            own = clocks.get(name, clock)
+            _check_lengths({name: array, "time": own.stamp}, self.path, "quantities")
+            stamp = own.stamp[own.valid] + (own.origin - clock.origin)
+            parts[name] = Timed(stamp, array[own.valid])
+        joined = on_one_base(parts, self.path)
+        self.concluded.append(joined.conclusion)
+        valid = np.ones(len(joined.stamp), np.bool_)
+        return _Clock(joined.stamp, valid, clock.origin, clock.path), joined.values
 
     def _times(self, file: Table | ArrayFile, time: TimeColumn) -> list[int | None]:
         """Return the times of a file [ns], None where one is missing."""
@@ -292,7 +346,10 @@ class _Log:
         dropped = np.flatnonzero(~complete)
         if len(dropped) == len(complete):
             problem = "has a missing number in every row"
-            remedy = "check the columns of the map, delimiter and decimal mark ([format])"
+            remedy = (
+                "check the columns of the map, delimiter and decimal mark ([format]); quantities "
+                'in rows of their own need [format] missing = "interpolate" instead'
+            )
             raise SourceError(self.path, problem, remedy=remedy)
         if dropped.size:
             missing = MissingNumbers(len(dropped), len(complete), int(dropped[0]))

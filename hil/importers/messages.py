@@ -33,6 +33,7 @@ from hil.importers.conclusions import (
     NotCommands,
     NoTorque,
     Omitted,
+    OneTimeBase,
     OutsideLimits,
     PartialVelocity,
     RecordedArm,
@@ -60,6 +61,7 @@ _BASIS: Final[Mapping[NameBasis, str]] = {
     NameBasis.UNIT: "by the unit",
     NameBasis.WORD: "by a word in the name",
     NameBasis.WORDS: "by a word in the names, joints in the order of the log",
+    NameBasis.FILE: "by the name of the file",
     NameBasis.OPTION: "as given with --columns",
     NameBasis.MESSAGE: "by the field of the joint states; joints by their names",
 }
@@ -223,6 +225,16 @@ def _(merged: MergedMessages) -> str:
     )
     kinds = " and ".join(f"({', '.join(joints)})" for joints in merged.groups)
     return f"merged from messages of their own, {how}: {kinds}"
+
+
+@worded.register
+def _(base: OneTimeBase) -> str:
+    counts = ", ".join(f"{name} {count}" for name, count in base.counts.items())
+    some = f"; {base.left_out} of these have no neighbour in time" if base.left_out else ""
+    return (
+        f"quantities at times of their own ({counts} samples) were interpolated to the times of "
+        f"the {base.base.replace('_', ' ')}{some}"
+    )
 
 
 @worded.register

@@ -6,9 +6,7 @@ positions, velocities and torques against the URDF.
 
 from __future__ import annotations
 
-import re
-from collections import Counter
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Final, NoReturn
@@ -16,7 +14,8 @@ from typing import Final, NoReturn
 from hil.base.errors import SourceError, UnrecordedJointError
 from hil.base.safe_input import parse_toml
 from hil.base.toml_text import to_text
-from hil.importers.channels import CHANNEL_NAMES, Channel, channels_of, kind_of
+from hil.importers.channel_groups import NUMBER, Group, grouped
+from hil.importers.channels import CHANNEL_NAMES, Channel, channels_of, kind_of, kinds_of_file
 from hil.importers.column_map import ColumnMap, Format, ready_map, ready_maps
 from hil.importers.conclusions import (
     ChannelMeaning,
@@ -30,9 +29,8 @@ from hil.importers.log_files import LogFiles
 from hil.importers.name_words import is_measured, kind_by_words, kinds_said, words_of
 from hil.importers.robot import Robot
 from hil.importers.row_names import row_names
-from hil.importers.units import Kind, kind_named, unit_of, without_unit
+from hil.importers.units import Kind, kind_named, unit_of
 
-_NUMBER: Final = re.compile(r"\d{1,2}(?=\D*$)")
 _JOINT_KINDS: Final[tuple[Kind, ...]] = (
     "position", "velocity", "torque", "motor_current", "commanded_position",
 )  # fmt: skip
@@ -64,53 +62,6 @@ class Proposal:
         return self.columns.torque is not None
 
 
-@dataclass(frozen=True)
-class _Group:
-    """Channels that differ by the number or the name of a joint only.
-
-    Attributes:
-        pattern: their name, with ``{}`` in place of number or joint.
-        kind: the quantity, None if neither name nor unit says it.
-        names: in the order of the joints, without units.
-        size: numbers in a sample.
-        unit: that the log states for the first, None without one.
-        by_joint: whether the names are those of joints of the URDF.
-        by_words: how words in names say the quantity; None where a whole name does.
-    """
-
-    pattern: str
-    kind: Kind | None
-    names: tuple[str, ...]
-    size: int
-    unit: str | None
-    by_joint: bool = False
-    by_words: NameBasis | None = None
-
-    @property
-    def label(self) -> str:
-        """First and last name."""
-        first = self.names[0]
-        last = self.names[-1]
-        return first if first == last else f"{first} .. {last}"
-
-    def joints(self, joints: Sequence[str]) -> tuple[str, ...]:
-        """Return the joints of the URDF that the names are of."""
-        if not self.by_joint:
-            return ()
-        return tuple(joint for joint in joints if self.pattern.replace("{}", joint) in self.names)
-
-    def columns(self, joints: Sequence[str]) -> str | list[str]:
-        """Return `columns` of the map: the pattern where it gives these names, else the list."""
-        numbers = range(len(joints) + 1)
-        series = ([str(k) for k in numbers[1:]], [str(k) for k in numbers[:-1]], joints)
-        if self.size == 1 or self.pattern == self.names[0]:
-            return self.names[0]
-        for parts in series:
-            if self.names == tuple(self.pattern.replace("{}", part) for part in parts):
-                return self.pattern
-        return list(self.names)
-
-
 def proposed_map(
     log: Path,
     robot: Robot,
@@ -136,7 +87,7 @@ def proposed_map(
     form = Format(missing="drop") if drop_missing else None
     channels = channels_of(log, form, files)
     _refuse_row_for_each_joint(log, channels, joints)
-    groups = _groups([channel for channel in channels if not channel.is_repeated], joints)
+    groups = grouped([channel for channel in channels if not channel.is_repeated], joints)
     names = row_names([channel.text for channel in channels], joints)
     recorded = () if names.joints == tuple(joints) else names.joints
     nanoseconds = None
@@ -169,57 +120,7 @@ def _refuse_row_for_each_joint(
     raise SourceError(log, problem, field=column.name, remedy=remedy)
 
 
-def kinds_of_file(path: Path) -> list[Kind]:
-    """Return the quantities that the name of a file says, such as ``curr_data.csv``."""
-    parts = re.split(r"[^a-z]+", path.stem.lower())
-    kinds = [kind_of(part)[0] for part in parts if len(part) > 1]
-    return list(dict.fromkeys(kind for kind in kinds if kind is not None and kind != "time"))
-
-
-def _groups(channels: Iterable[Channel], joints: Sequence[str]) -> list[_Group]:
-    """Group channels by their name without number or joint, in the order of the log."""
-    channels = list(channels)
-    bare_names = [without_unit(channel.name)[0].strip() or channel.name for channel in channels]
-    repeated = {name for name, times in Counter(bare_names).items() if times > 1}
-    members: dict[tuple[str, Kind | None, bool], list[tuple[int, str, Channel]]] = {}
-    for channel, bare in zip(channels, bare_names, strict=True):
-        end = channel.name.strip()[len(bare) :] if bare in repeated else ""
-        kind = channel.kind
-        pattern = bare
-        place = 0
-        by_joint = False
-        match = _NUMBER.search(bare)
-        if match is not None:
-            pattern = f"{bare[: match.start()]}{{}}{bare[match.end() :]}"
-            place = int(match[0])
-        joint = _joint_in(bare, joints)
-        if joint is not None:
-            quantity = bare.replace(joint, "").strip(" _.-/")
-            of_joint = kind_of(quantity, channel.unit)[0] or kind_by_words(quantity)
-            if of_joint is not None and (kind in (None, of_joint) or "/" in bare):
-                kind = of_joint
-                by_joint = True
-                pattern = bare.replace(joint, "{}")
-                place = list(joints).index(joint)
-        entry = (place, bare + end, channel)
-        members.setdefault((pattern + end, kind, by_joint), []).append(entry)
-    groups = []
-    for (pattern, kind, by_joint), entries in members.items():
-        entries.sort(key=lambda entry: entry[0])
-        names = tuple(name for _, name, _ in entries)
-        size = sum(channel.size for _, _, channel in entries)
-        unit = entries[0][2].unit
-        whole = names[0] if len(names) == 1 else pattern
-        groups.append(_Group(whole, kind, names, size, unit, by_joint))
-    return groups
-
-
-def _joint_in(name: str, joints: Sequence[str]) -> str | None:
-    """Return the joint whose name is in that of a channel, the longest; None without one."""
-    return max((joint for joint in joints if joint in name), key=len, default=None)
-
-
-def _matching_ready_map(groups: Sequence[_Group], count: int) -> str | None:
+def _matching_ready_map(groups: Sequence[Group], count: int) -> str | None:
     """Return the ready map whose columns are all in the log, one for each of `count` joints."""
     sizes = {group.pattern: group.size for group in groups}
     has_torque = any(group.kind == "torque" for group in groups)
@@ -259,7 +160,7 @@ class _Search:
         self,
         log: Path,
         joints: Sequence[str],
-        groups: Sequence[_Group],
+        groups: Sequence[Group],
         chosen: Mapping[str, str],
         sample_rate: float | None,
         recorded: Sequence[str],
@@ -337,7 +238,7 @@ class _Search:
         self._concluded.append(self._meaning(kind, group))
         return group.columns(self._columns_of)
 
-    def _groups_of(self, kind: Kind) -> list[_Group]:
+    def _groups_of(self, kind: Kind) -> list[Group]:
         """Return the groups of a quantity: by whole names, else by words in them."""
         given = set(self._chosen.values())
         groups = [g for g in self._groups if g.pattern not in given]
@@ -358,7 +259,7 @@ class _Search:
             self._used.add(parts[0].pattern)
         return single or named
 
-    def _by_words(self, kind: Kind, groups: Sequence[_Group]) -> list[_Group]:
+    def _by_words(self, kind: Kind, groups: Sequence[Group]) -> list[Group]:
         """Return the groups whose names say a quantity by a word in them."""
         said = [g for g in groups if kind_by_words(g.pattern) == kind]
         said = [replace(g, by_words=NameBasis.WORD) for g in said]
@@ -372,9 +273,9 @@ class _Search:
             return exact or several
         names = tuple(g.names[0] for g in single)
         by_words = NameBasis.WORDS
-        return [_Group(",".join(names), kind, names, count, single[0].unit, by_words=by_words)]
+        return [Group(",".join(names), kind, names, count, single[0].unit, by_words=by_words)]
 
-    def _is_used(self, group: _Group) -> bool:
+    def _is_used(self, group: Group) -> bool:
         return group.pattern in self._used or self._used.issuperset(group.names)
 
     def _given(self, text: str) -> _Columns:
@@ -390,7 +291,7 @@ class _Search:
         return all(group.pattern in ("{}", "0") for group in self._groups)
 
     @staticmethod
-    def _meaning(kind: Kind, group: _Group) -> ChannelMeaning:
+    def _meaning(kind: Kind, group: Group) -> ChannelMeaning:
         """Return quantity and unit, and from what."""
         unit_basis = UnitBasis.LOG
         if group.unit is None:
@@ -402,7 +303,7 @@ class _Search:
         basis = group.by_words or basis
         return ChannelMeaning(group.label, kind, basis, group.unit, unit_basis)
 
-    def _refuse_several(self, kind: Kind, groups: Sequence[_Group]) -> NoReturn:
+    def _refuse_several(self, kind: Kind, groups: Sequence[Group]) -> NoReturn:
         names = [name for group in groups for name in (group.pattern, *group.names)]
         patterns = [group.pattern for group in groups]
         if len(groups) == 1:
@@ -412,14 +313,14 @@ class _Search:
         options = " or ".join(f"--columns '{kind}={pattern}'" for pattern in patterns[:_MOST_NAMED])
         raise SourceError(self._log, problem, field=kind, remedy=f"choose one: {options}")
 
-    def _refuse_unit(self, kind: Kind, group: _Group) -> NoReturn:
+    def _refuse_unit(self, kind: Kind, group: Group) -> NoReturn:
         assert group.unit is not None
         problem = f"{group.label} is named as {kind}, and {group.unit} is not a unit of it"
         kinds = [kind, *(other for other in _JOINT_KINDS[:4] if unit_of(group.unit, other))]
         options = " or ".join(f"--columns '{name}={group.pattern}'" for name in kinds)
         raise SourceError(self._log, problem, field=kind, remedy=f"choose one: {options}")
 
-    def _refuse_count(self, kind: Kind, group: _Group) -> NoReturn:
+    def _refuse_count(self, kind: Kind, group: Group) -> NoReturn:
         count = group.size
         joints = ", ".join(self._joints)
         problem = (
@@ -443,9 +344,9 @@ class _Search:
             remedy += f", or the channels of its joints, such as --columns '{kind}={some}'"
         raise SourceError(self._log, problem, field=kind, remedy=f"{remedy}; {otherwise}")
 
-    def _absent(self, group: _Group) -> tuple[Sequence[str], str]:
+    def _absent(self, group: Group) -> tuple[Sequence[str], str]:
         """Return the joints without a channel by the numbers of the others, else the last ones."""
-        numbers = [_NUMBER.search(name) for name in group.names]
+        numbers = [NUMBER.search(name) for name in group.names]
         places = {int(match[0]) for match in numbers if match is not None}
         first = 0 if 0 in places else 1
         expected = range(first, first + len(self._joints))
@@ -467,7 +368,7 @@ class _Search:
             f"{kind} ({', '.join(CHANNEL_NAMES[kind_named(kind)][:3])}, ...)" for kind in missing
         ]
         problem = f"no channel is named as {' or '.join(examples)}; its channels are {listing}"
-        stated = kinds_of_file(self._log)
+        stated = [kind for kind in kinds_of_file(self._log) if kind != "time"]
         files = self._files()
         if unnamed and stated and len(files) > 1:
             problem += f", which name no quantity (the name of the file says {_named(stated[0])})"
@@ -519,7 +420,7 @@ class _Search:
         )
 
 
-def _likely(kind: str, groups: Sequence[_Group]) -> str:
+def _likely(kind: str, groups: Sequence[Group]) -> str:
     """Return the pattern of the group that may be of a quantity: by its words, else the first."""
     said = {group.pattern: kinds_said(group.pattern) for group in groups if group.kind is None}
     patterns = [pattern for pattern, kinds in said.items() if kind in kinds]

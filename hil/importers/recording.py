@@ -13,10 +13,12 @@ from hil.base.errors import ArchiveError, NotAnArchiveError, SourceError, Unreco
 from hil.base.safe_input import parse_toml
 from hil.base.toml_text import to_text
 from hil.cell.arms import Arm, Links, arms_of, recorded_arms
+from hil.cell.text import with_values
+from hil.importers.arrays import READERS
 from hil.importers.bag_map import BagMap
 from hil.importers.bags import open_bag
 from hil.importers.channels import channels_of
-from hil.importers.column_map import ColumnMap, map_text
+from hil.importers.column_map import ColumnMap, Format, map_text
 from hil.importers.conclusions import (
     ChannelMeaning,
     Conclusion,
@@ -26,9 +28,10 @@ from hil.importers.conclusions import (
     RecordedArm,
     UnitBasis,
 )
-from hil.importers.log import read_log
-from hil.importers.log_files import LogFiles
-from hil.importers.proposal import proposed_map
+from hil.importers.folder import proposed_map_of_folder
+from hil.importers.log import are_in_rows_of_their_own, read_log
+from hil.importers.log_files import LogFiles, is_folder_of_logs
+from hil.importers.proposal import Proposal, proposed_map
 from hil.importers.robot import RecordingContent, Robot, Use, require_writable, write_to
 from hil.importers.rosbag2 import Effort, joint_state_topics, read_rosbag2, recorded_joints
 from hil.importers.units import UNITS, Kind
@@ -104,7 +107,8 @@ class ImportedRecording:
 def is_archive(path: Path) -> bool:
     """Return whether a file is an archive of this software, or a folder of such or a campaign."""
     if path.is_dir():
-        return not any(path.glob("*.db3*")) and not (path / "metadata.yaml").exists()
+        is_bag = any(path.glob("*.db3*")) or (path / "metadata.yaml").exists()
+        return not is_bag and not is_folder_of_logs(path)
     if path.suffix.lower() != ".mcap":
         return False
     try:
@@ -122,6 +126,8 @@ def has_joint_states(path: Path) -> bool:
     Raises:
         SourceError: it is named as a bag and cannot be read.
     """
+    if path.is_dir() and is_folder_of_logs(path):
+        return False
     if not path.is_dir() and path.suffix.lower() not in _BAGS:
         return False
     with open_bag(path) as bag:
@@ -405,6 +411,16 @@ def _imported(request: _Request, robot_of: RobotOf, *, options: ImportOptions) -
         columns = ColumnMap.load(path)
         return _of_map(request, _arm_of_map(robot, columns.arm, path), columns, map_text(path))
     robot = robot_of(partial(_no_joints, source))
+    if source.is_dir():
+        proposal = proposed_map_of_folder(
+            source,
+            robot,
+            options.chosen,
+            sample_rate=options.sample_rate,
+            form=Format(missing="drop") if options.drop_missing else None,
+            files=request.files,
+        )
+        return _of_map(request, robot, proposal.columns, proposal.text, proposal.concluded)
     proposal = proposed_map(
         source,
         robot,
@@ -413,7 +429,25 @@ def _imported(request: _Request, robot_of: RobotOf, *, options: ImportOptions) -
         drop_missing=options.drop_missing,
         files=request.files,
     )
+    proposal = _with_own_rows(request, robot, proposal)
     return _of_map(request, robot, proposal.columns, proposal.text, proposal.concluded)
+
+
+def _with_own_rows(request: _Request, robot: Robot, proposal: Proposal) -> Proposal:
+    """Return a proposal that interpolates, where quantities are in rows of their own."""
+    columns = proposal.columns
+    source = request.source
+    if source.is_dir() or source.suffix.lower() in READERS:
+        return proposal
+    if not request.files.table(source, columns.format).lacks_numbers:
+        return proposal
+    text = with_values(proposal.text, {"format.missing": "interpolate"})
+    interpolating = ColumnMap.model_validate(parse_toml(text))
+    if not are_in_rows_of_their_own(
+        source, robot=robot, columns=interpolating, files=request.files
+    ):
+        return proposal
+    return replace(proposal, text=text, columns=interpolating)
 
 
 def _of_map(

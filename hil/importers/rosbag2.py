@@ -32,6 +32,7 @@ from hil.importers.conclusions import (
 )
 from hil.importers.mcap_messages import Topic
 from hil.importers.publishers import APART, STALLED, second_publisher
+from hil.importers.resampling import at_stamps
 from hil.importers.robot import NOT_RECORDED, RecordingContent, Robot, Use
 from hil.importers.ros_messages import CONTROLLER_STATE, JOINT_STATE
 from hil.importers.stamps import leading_zeros, sorted_neighbours
@@ -447,7 +448,12 @@ class _States:
         values = {
             name: np.column_stack(
                 [
-                    _at(stamp, part_samples.stamp, part_samples.values[name])
+                    at_stamps(
+                        stamp,
+                        part_samples.stamp,
+                        part_samples.values[name],
+                        across_gaps=True,
+                    )
                     for part_samples in joined
                 ]
             )
@@ -474,11 +480,3 @@ class _States:
                     f"where {parts[0].joints[0]} comes every {1e-6 * period:.3g} ms"
                 )
         return ""
-
-
-def _at(stamp: NDArray[np.int64], stamps: NDArray[np.int64], values: Array) -> Array:
-    """Return values (k, n) known at stamps (k,), at other stamps: linear, exact where equal."""
-    origin = stamps[0]
-    at = (stamp - origin).astype(np.float64)
-    places = (stamps - origin).astype(np.float64)
-    return np.column_stack([np.interp(at, places, column) for column in values.T])

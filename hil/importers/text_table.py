@@ -80,7 +80,7 @@ class Table:
             SourceError: it cannot be read, or has no row of numbers.
         """
         text = text_of(path, form)
-        text = spread_lists(path, text, drop=form.missing == "drop")
+        text = spread_lists(path, text, drop=form.missing != "refuse")
         numbered = [
             (number, line)
             for number, line in enumerate(text.splitlines(), 1)
@@ -104,7 +104,7 @@ class Table:
         left_out = (LeftOut(Omitted.HEADERS, repeated),) if repeated else ()
         numbers = [number for number, _ in rows]
         lines = [line for _, line in rows]
-        gaps = form.missing == "drop"
+        gaps = form.missing != "refuse"
         return cls(path, names, units, width, lines, numbers, dialect, gaps, left_out)
 
     def unit(self, column: Column) -> str | None:
@@ -115,6 +115,11 @@ class Table:
         below = self.units[place] if place < len(self.units) else ""
         name = self.names[place] if place < len(self.names) else ""
         return unit_of(below.strip("[]() ")) or without_unit(name)[1]
+
+    @property
+    def lacks_numbers(self) -> bool:
+        """Whether cells at the start are empty."""
+        return any("" in self.dialect.cells(line) for line in self.lines[:_PROBED])
 
     @property
     def texts(self) -> list[str | None]:

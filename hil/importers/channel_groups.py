@@ -1,0 +1,107 @@
+"""Channels of a log that differ by the number or the name of a joint only, as one group."""
+
+from __future__ import annotations
+
+import re
+from collections import Counter
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from typing import Final
+
+from hil.importers.channels import Channel, kind_of
+from hil.importers.conclusions import NameBasis
+from hil.importers.name_words import kind_by_words
+from hil.importers.units import Kind, without_unit
+
+NUMBER: Final = re.compile(r"\d{1,2}(?=\D*$)")
+"""The number of a joint in a name."""
+
+
+@dataclass(frozen=True)
+class Group:
+    """Channels that differ by the number or the name of a joint only.
+
+    Attributes:
+        pattern: their name, with ``{}`` in place of number or joint.
+        kind: the quantity, None if neither name nor unit says it.
+        names: in the order of the joints, without units.
+        size: numbers in a sample.
+        unit: that the log states for the first, None without one.
+        by_joint: whether the names are those of joints of the URDF.
+        by_words: how words in names say the quantity; None where a whole name does.
+    """
+
+    pattern: str
+    kind: Kind | None
+    names: tuple[str, ...]
+    size: int
+    unit: str | None
+    by_joint: bool = False
+    by_words: NameBasis | None = None
+
+    @property
+    def label(self) -> str:
+        """First and last name."""
+        first = self.names[0]
+        last = self.names[-1]
+        return first if first == last else f"{first} .. {last}"
+
+    def joints(self, joints: Sequence[str]) -> tuple[str, ...]:
+        """Return the joints of the URDF that the names are of."""
+        if not self.by_joint:
+            return ()
+        return tuple(joint for joint in joints if self.pattern.replace("{}", joint) in self.names)
+
+    def columns(self, joints: Sequence[str]) -> str | list[str]:
+        """Return `columns` of the map: the pattern where it gives these names, else the list."""
+        numbers = range(len(joints) + 1)
+        series = ([str(k) for k in numbers[1:]], [str(k) for k in numbers[:-1]], joints)
+        if self.size == 1 or self.pattern == self.names[0]:
+            return self.names[0]
+        for parts in series:
+            if self.names == tuple(self.pattern.replace("{}", part) for part in parts):
+                return self.pattern
+        return list(self.names)
+
+
+def grouped(channels: Iterable[Channel], joints: Sequence[str]) -> list[Group]:
+    """Group channels by their name without number or joint, in the order of the log."""
+    channels = list(channels)
+    bare_names = [without_unit(channel.name)[0].strip() or channel.name for channel in channels]
+    repeated = {name for name, times in Counter(bare_names).items() if times > 1}
+    members: dict[tuple[str, Kind | None, bool], list[tuple[int, str, Channel]]] = {}
+    for channel, bare in zip(channels, bare_names, strict=True):
+        end = channel.name.strip()[len(bare) :] if bare in repeated else ""
+        kind = channel.kind
+        pattern = bare
+        place = 0
+        by_joint = False
+        match = NUMBER.search(bare)
+        if match is not None:
+            pattern = f"{bare[: match.start()]}{{}}{bare[match.end() :]}"
+            place = int(match[0])
+        joint = _joint_in(bare, joints)
+        if joint is not None:
+            quantity = bare.replace(joint, "").strip(" _.-/")
+            of_joint = kind_of(quantity, channel.unit)[0] or kind_by_words(quantity)
+            if of_joint is not None and (kind in (None, of_joint) or "/" in bare):
+                kind = of_joint
+                by_joint = True
+                pattern = bare.replace(joint, "{}")
+                place = list(joints).index(joint)
+        entry = (place, bare + end, channel)
+        members.setdefault((pattern + end, kind, by_joint), []).append(entry)
+    groups = []
+    for (pattern, kind, by_joint), entries in members.items():
+        entries.sort(key=lambda entry: entry[0])
+        names = tuple(name for _, name, _ in entries)
+        size = sum(channel.size for _, _, channel in entries)
+        unit = entries[0][2].unit
+        whole = names[0] if len(names) == 1 else pattern
+        groups.append(Group(whole, kind, names, size, unit, by_joint))
+    return groups
+
+
+def _joint_in(name: str, joints: Sequence[str]) -> str | None:
+    """Return the joint whose name is in that of a channel, the longest; None without one."""
+    return max((joint for joint in joints if joint in name), key=len, default=None)
