@@ -433,6 +433,21 @@ class ConstantPositions(Conclusion):
 
 
 @dataclass(frozen=True)
+class StoppedJoint(Conclusion):
+    """A joint whose position stays the same to the end while its command moves.
+
+    Attributes:
+        joint: name.
+        time: from which on, after the start [s].
+        travel: of the command after that [rad or m].
+    """
+
+    joint: str
+    time: float
+    travel: float
+
+
+@dataclass(frozen=True)
 class Examined:
     """Results of the examination of an imported recording.
 

@@ -32,6 +32,7 @@ from hil.importers.conclusions import (
     RecordedClock,
     SameStamp,
     ScaledVelocity,
+    StoppedJoint,
     TooFewSamples,
     TorqueSize,
     UnrelatedVelocity,
@@ -57,6 +58,7 @@ _OTHER_UNIT: Final = 30.0  # between the errors of a nominal torque and a factor
 _THOUSAND: Final = 1000.0
 _BLOCK: Final = 0.05  # s, over which signals are averaged before they are differentiated
 _MOST_BLOCKS: Final = 2000
+_STANDS: Final = 0.1  # of the samples, at the end: a joint that stands for good
 _SIGNIFICANT: Final = 0.01  # of the largest nominal torque
 
 NominalTorque = Callable[[Motion], Array]
@@ -99,6 +101,7 @@ def examine(
     if is_plausible:
         warnings += _torque_size(samples, joint_names, limits.effort, nominal)
     warnings += _constant(position, joint_names, held_joints)
+    warnings += _stopped(time, position, samples.commanded_position, joint_names)
     return Examined((RecordedClock(base), *held, *ranges), tuple(warnings))
 
 
@@ -111,6 +114,22 @@ def _constant(position: Array, names: Sequence[str], held: Collection[str]) -> I
     constant = [name for name in constant if name not in held]
     if constant:
         yield ConstantPositions(tuple(constant), len(position))
+
+
+def _stopped(
+    time: Array, position: Array, commanded: Array | None, names: Sequence[str]
+) -> Iterator[Conclusion]:
+    """Yield a warning for each joint that moved, and stands at the end against its command."""
+    if commanded is None:
+        return
+    for name, places, commands in zip(names, position.T, commanded.T, strict=True):
+        changes = np.flatnonzero(np.diff(places))
+        first = int(changes[-1]) + 1 if len(changes) else len(places)
+        if len(places) - first < _STANDS * len(places):
+            continue
+        travel = float(np.nan_to_num(np.ptp(commands[first:][np.isfinite(commands[first:])])))
+        if travel > STUCK_MOVEMENT:
+            yield StoppedJoint(name, float(time[first]), travel)
 
 
 def _turning(urdf: str, names: Sequence[str]) -> NDArray[np.bool_]:

@@ -43,6 +43,7 @@ from hil.importers.conclusions import (
     SecondPublisher,
     SortedSamples,
     StatedUnit,
+    StoppedJoint,
     TooFewSamples,
     TorqueSize,
     UnitBasis,
@@ -422,6 +423,15 @@ def _(size: TorqueSize) -> str:
         )
     return start + (
         "their unit (N·m read as mN·m would be 1000 times too small) and side (motor or joint)"
+    )
+
+
+@worded.register
+def _(stopped: StoppedJoint) -> str:
+    return (
+        f"the position of {stopped.joint} stays the same from {stopped.time:.3g} s to the end "
+        f"while its command moves by {stopped.travel:.3g} rad or m: it is assumed to stand still; "
+        "if it moved, its encoder failed"
     )
 
 

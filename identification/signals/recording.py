@@ -68,8 +68,8 @@ class Recording:
         """Return the recording if it can be identified from, with joint names as given.
 
         Raises:
-            RecordingError: too short, NaN or infinity, invalid time stamps, other joints than the
-                model, or a stuck joint.
+            RecordingError: too short, NaN or infinity, invalid time stamps, or other joints than
+                those of the model.
         """
         if self.n_samples < 2:
             raise RecordingError(f"the recording has {self.n_samples} samples")
@@ -88,7 +88,6 @@ class Recording:
         try:
             self.check_finite()
             self._check_clock()
-            self._check_stuck()
         except RecordingError as error:
             return str(error)
         return None
@@ -195,21 +194,6 @@ class Recording:
                 f"the time step is {steps[sample - 1]:.6g} s at sample {sample}, limit "
                 f"{LONGEST_PAUSE:g} s: cut the recording there"
             )
-
-    def _check_stuck(self) -> None:
-        """Raise RecordingError for a constant position of a joint that is commanded to move."""
-        if self.commanded_position is None:
-            return
-        for j, name in enumerate(self.joint_names):
-            if name in self.held_joints:
-                continue
-            standstill = stuck(self.position[:, j], self.commanded_position[:, j])
-            if standstill is not None:
-                raise RecordingError(
-                    f"joint {name} is stuck: its position stays"
-                    f" {self.position[standstill[0], j]:.6g} from sample {standstill[0]} on "
-                    f"while its command moves by {standstill[1]:.3g}"
-                )
 
 
 def in_succession(recordings: Sequence[Recording]) -> Recording:

@@ -39,6 +39,7 @@ from hil.importers import arrays as array_files
 from hil.importers import matlab
 from hil.importers.arrays import ArrayFile
 from hil.importers.column_map import UNITS, ColumnMap, Format, ready_map, ready_maps
+from hil.importers.conclusions import StoppedJoint
 from hil.importers.dh import Convention, urdf_of_dh
 from hil.importers.findings import examine
 from hil.importers.log import import_log
@@ -956,6 +957,21 @@ class TestWarnings:
         (sentence,) = findings()
         assert sentence.startswith("the position of elbow_joint is the same in all")
         assert findings([arm.joint_names[2]]) == []
+
+    @pytest.mark.parametrize(("last", "is_named"), [(0.5, True), (0.05, False)])
+    def test_a_joint_that_stands_at_the_end_is_named(
+        self, arm: Simulated, last: float, is_named: bool
+    ) -> None:
+        """A servo stands for a moment at every turning point."""
+        stamp = np.rint(arm.time * 1e9).astype(np.int64)
+        first = round((1.0 - last) * len(arm.time))
+        position = arm.position.copy()
+        position[first:, 1] = position[first, 1]
+        samples = Samples(stamp, position, commanded_position=arm.position)
+        robot = Robot.from_urdf(arm.urdf, recorded=arm.joint_names)
+        result = examine(samples, arm.joint_names, robot.urdf)
+        stopped = [found for found in result.warnings if isinstance(found, StoppedJoint)]
+        assert [found.joint for found in stopped] == [arm.joint_names[1]] * is_named
 
     def test_velocities_have_factors_by_joint(self, arm: Simulated, panda: Simulated) -> None:
         for factor in (DEGREES, -1.0):
