@@ -26,7 +26,7 @@ from enum import IntEnum, auto
 from itertools import chain
 from math import ceil, copysign, isfinite
 from operator import gt
-from typing import NamedTuple, Protocol
+from typing import Literal, NamedTuple, Protocol
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -131,9 +131,10 @@ class LoopProgram:
 
     The program opens `wanted_axes` (n,); `open_axes` (n,) are in open mode in the packet of this
     cycle, and their targets are read from the PC while it is `listening`. `reason` is that of the
-    last loss of the drive or of the end of the session. `intervals` counts the openings of all
-    wanted axes, `openings_lost` consecutive ones that ended by missing replies or 508; the session
-    ends because of too many of these if `gave_up`.
+    last loss of the drive or of the end of the session, `end_packet` what became of
+    the packet with 504: "none" was sent, "unanswered" or "replied".
+    `intervals` counts the openings of all wanted axes, `openings_lost` consecutive ones that ended
+    by missing replies or 508; the session ends because of too many of these if `gave_up`.
     """
 
     def __init__(self, n_axes: int, settings: ControllerSettings) -> None:
@@ -159,6 +160,7 @@ class LoopProgram:
         self.intervals = 0
         self.openings_lost = 0
         self.gave_up = False
+        self.end_packet: Literal["none", "unanswered", "replied"] = "none"
         self._enter(Phase.START)
 
     @property
@@ -344,6 +346,7 @@ class LoopProgram:
         elif phase is Phase.SHUTDOWN and age >= settings.drive_off_cycles:
             self._enter(Phase.ENDING)
         elif phase is Phase.ENDING:
+            self.end_packet = "unanswered" if self._missed else "replied"
             self._enter(Phase.ENDED)
 
 

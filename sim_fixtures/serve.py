@@ -146,6 +146,7 @@ class ServeCounts:
     surplus: int = 0  # further replies in a cycle that had one
     rejected: int = 0  # replies of wrong length, number or content
     extended: int = 0  # cycles extended to wait for their reply
+    read_late: int = 0  # replies read after their cycle only because the server itself was late
     own_late: int = 0
     slips: int = 0
     ended: bool = False  # whether the controller has ended its session (504)
@@ -314,6 +315,7 @@ class _Server:
     def _exchange(self, packet: bytes) -> bool:
         """Run one cycle with a packet; return whether it got a reply."""
         sent = self.clock.monotonic()
+        before = self.counts.extended
         self.counts.cycles += 1
         self.link.send(packet)
         reply = self._reply(packet, sent + self.peer.period)
@@ -332,7 +334,9 @@ class _Server:
             self.counts.longest_extension = max(self.counts.longest_extension, extended)
         self.without_reply = reply is None
         if reply is not None:
-            self.counts.reply.add(self.clock.monotonic() - sent)
+            took = self.clock.monotonic() - sent
+            self.counts.reply.add(took)
+            self.counts.read_late += took > self.peer.period and self.counts.extended == before
         self._hand_over(packet, reply)
         return reply is not None
 

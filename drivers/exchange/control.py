@@ -24,11 +24,11 @@ once by the end of its pipe."""
 
 # Latencies are counted in bins: percentiles for other processes at the cost of a logarithm and a
 # store per packet.
-BINS: Final = 48
+BINS: Final = 96
 PER_OCTAVE: Final = 4
 SHORTEST: Final = 2e-6
 """Upper edge of the first bin, s; each next one is 2 ** (1 / `PER_OCTAVE`) times longer. The last
-contains everything above 5.8 ms."""
+contains everything above 24 s."""
 OUTCOMES: Final[tuple[Outcome, ...]] = ("lost", "completed", "stopped", "refused")
 """Outcome of a motion by its number in the shared state; "lost" before the first."""
 

@@ -8,6 +8,7 @@ import socket
 import time
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
+from pathlib import Path
 from typing import Any, Final
 
 from drivers.child_process import ChildProcess
@@ -97,7 +98,7 @@ class ExchangeProcess:
             fds = [theirs.fileno(), settings_fd, self.ring_fd, self.event_fd, self.control_fd]
             # Thread pools would be locked into memory and never used.
             self._process = ChildProcess(
-                ("-m", "drivers.exchange", *map(str, fds)),
+                ("-m", _MODULE, *map(str, fds)),
                 descriptors=fds,
                 environment=dict.fromkeys(_THREADS, "1"),
             )
@@ -289,4 +290,14 @@ class ExchangeProcess:
             return pickle.loads(message)
 
 
+def is_exchange(pid: int) -> bool:
+    """Return whether a process is the exchange of a run of `hil`."""
+    try:
+        arguments = Path(f"/proc/{pid}/cmdline").read_bytes().split(b"\0")
+    except OSError:
+        return False
+    return b"-m" in arguments and _MODULE.encode() in arguments
+
+
+_MODULE: Final = "drivers.exchange"
 _THREADS: Final = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")

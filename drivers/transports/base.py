@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from dataclasses import dataclass
-from typing import Literal, Protocol, runtime_checkable
+from typing import Any, Literal, Protocol, runtime_checkable
 
 from drivers.errors import DriverError
 
@@ -17,6 +17,23 @@ class TransportError(DriverError):
         self.link = link
         self.reason = reason
         self.remedy = remedy
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        """Return the parts of a pickle: the exchange process opens links for another one."""
+        return type(self), (self.link, self.reason, self.remedy)
+
+
+class LinkInUseError(TransportError):
+    """A link that another program has open; `holder` is its process, None if unknown."""
+
+    def __init__(self, link: str, holder: int | None, remedy: str) -> None:
+        process = "unknown" if holder is None else holder
+        super().__init__(link, f"another program uses it (process {process})", remedy)
+        self.holder = holder
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        """Return the parts of a pickle."""
+        return type(self), (self.link, self.holder, self.remedy)
 
 
 class Transport(Protocol):

@@ -14,12 +14,20 @@ import select
 import socket
 import struct
 import time
+from contextlib import suppress
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Final
 
 from drivers.errors import TransportClosed
 from drivers.packets import HEADER_LENGTH
-from drivers.transports.base import DirectRoute, FreePort, TransportError, TransportSpec
+from drivers.transports.base import (
+    DirectRoute,
+    FreePort,
+    LinkInUseError,
+    TransportError,
+    TransportSpec,
+)
 
 LONGEST: Final = 1500
 """Bytes of the longest datagram accepted (the buffer of the manufacturer's library)."""
@@ -286,6 +294,9 @@ def _bound(bind: str, port: int) -> socket.socket:
         udp.bind((bind, port))
     except OSError as error:
         udp.close()
+        if error.errno == errno.EADDRINUSE:
+            remedy = f"find that program with: ss -ulnp sport = :{port}"
+            raise LinkInUseError(link, _holder(port), remedy) from error
         reason, remedy = _BIND_FAILURES.get(
             error.errno or 0, (str(error), "check the address of the PC on the link")
         )
@@ -293,11 +304,20 @@ def _bound(bind: str, port: int) -> socket.socket:
     return udp
 
 
+def _holder(port: int) -> int | None:
+    """Return a process of this user that has a UDP port bound (IPv4); None if none is found."""
+    with suppress(OSError, ValueError, IndexError):
+        rows = [line.split() for line in Path("/proc/net/udp").read_text().splitlines()[1:]]
+        inodes = {row[9] for row in rows if int(row[1].rpartition(":")[2], 16) == port}
+        sockets = {f"socket:[{inode}]" for inode in inodes}
+        for process in Path("/proc").glob("[0-9]*"):
+            with suppress(OSError):  # of another user, or ended meanwhile
+                if any(str(fd.readlink()) in sockets for fd in (process / "fd").iterdir()):
+                    return int(process.name)
+    return None
+
+
 _BIND_FAILURES: Final = {
-    errno.EADDRINUSE: (
-        "another program uses it",
-        "find that program with: ss -ulnp sport = :{port}",
-    ),
     errno.EACCES: (
         "a port below 1024 is privileged",
         "permit it with: sudo sysctl net.ipv4.ip_unprivileged_port_start={port}",

@@ -229,6 +229,11 @@ class ArchiveHeader(BaseModel):
         return self.simulated == "yes"
 
     @property
+    def simulated_by_unknown(self) -> bool:
+        """Whether a program at the other end of a link simulated the arm: it is not known which."""
+        return self.only_simulated and self.recorded_at is not None and self.planted is None
+
+    @property
     def by_controller_program(self) -> bool:
         """Whether a program of the controller made the motion."""
         return self.motion == CONTROLLER_PROGRAM

@@ -32,8 +32,10 @@ _FIELDS: Final = (
     *("cycle", "gap", "position", "target_position", "target_current", "torque"),
     "commanded_position",
 )
-AGAINST: Final = (
-    "measured torque runs against the model's gravity: joint_sign, URDF or torque sign may be wrong"
+AGAINST: Final = "measured torque runs against the model's gravity"
+_CAUSES: Final = "joint_sign, URDF or torque sign may be wrong"
+_CAUSES_WITH_PAYLOAD: Final = (
+    "the assumed centre of mass of the payload (--payload-centre) may be wrong; if it is right, "
 )
 CLEAR: Final = 0.5  # Magnitude of a correlation of torque and gravity that is significant
 _LEAST_SHARE: Final = 0.05  # Gravity as a share of the rms torque below which it is not compared
@@ -109,6 +111,7 @@ class DryRunRecord:
         accepted: None until it is.
         against_gravity: joints whose torque has the opposite sign of the model's gravity.
         gravity_not_seen: joints with too little gravity to be compared.
+        assumed_payload: whether the model had a payload whose mass and centre are assumed.
     """
 
     plan_hash: str
@@ -124,6 +127,7 @@ class DryRunRecord:
     accepted: Acceptance | None = None
     against_gravity: tuple[str, ...] = ()
     gravity_not_seen: tuple[str, ...] = ()
+    assumed_payload: bool = False
 
     def __post_init__(self) -> None:
         if not len(self.joint_names) == len(self.current_share) == len(self.following_error):
@@ -207,12 +211,19 @@ class DryRunRecord:
             late=late,
             against_gravity=tuple(joints[correlation < -CLEAR].tolist()),
             gravity_not_seen=tuple(joints[~(np.abs(correlation) >= CLEAR)].tolist()),
+            assumed_payload=cell.assumes_payload,
         )
 
     @property
     def warnings(self) -> tuple[str, ...]:
         """Warnings, in sentences."""
-        return tuple(f"{joint}: {AGAINST}" for joint in self.against_gravity)
+        return tuple(f"{joint}: {self.contradiction}" for joint in self.against_gravity)
+
+    @property
+    def contradiction(self) -> str:
+        """What a torque against gravity may mean, the likeliest first."""
+        first = _CAUSES_WITH_PAYLOAD if self.assumed_payload else ""
+        return f"{AGAINST}: {first}{_CAUSES}"
 
     def save(self, path: Path) -> None:
         """Write the file (OutputError if the disk refuses)."""
@@ -228,9 +239,16 @@ class DryRunRecord:
         return replace(self, accepted=Acceptance(user, at))
 
 
-def not_accepted(folder: CampaignFolder, against: Sequence[str] = ()) -> DryRunError:
+def not_accepted(
+    folder: CampaignFolder, record: DryRunRecord, against: Sequence[str] = ()
+) -> DryRunError:
     """Return the error of a dry run that is not accepted, or of joints that were not named."""
     if against:
-        return AgainstGravityError(folder.root, against, AGAINST, folder.run_command)
+        correct = "correct the cell file and rehearse again"
+        if record.assumed_payload:
+            correct = "weigh it under another name (--payload) with its --payload-centre"
+        return AgainstGravityError(
+            folder.root, against, record.contradiction, correct, folder.run_command
+        )
     how = f"if the motions looked right, run `{folder.run_command} --accept-dry-run`"
     return DryRunError(folder.root, "was done, but is not accepted", how)

@@ -27,14 +27,16 @@ class DryRunError(UnsafeError):
 class AgainstGravityError(DryRunError):
     """A dry run with torques against gravity of the model; `joints` must be accepted by name."""
 
-    def __init__(self, campaign: Path, joints: Sequence[str], problem: str, command: str) -> None:
+    def __init__(
+        self, campaign: Path, joints: Sequence[str], problem: str, correct: str, command: str
+    ) -> None:
         self.joints = tuple(joints)
         names = " ".join(f"--accept-torque {joint}" for joint in joints)
         super().__init__(
             campaign,
             f"was done, but is not accepted ({', '.join(joints)}: {problem})",
-            "correct the cell file and rehearse again, or, if you know that the arm is right and "
-            f"the model is not, run `{command} --accept-dry-run {names}`",
+            f"{correct}, or, if you know that the arm is right and the model is not, run "
+            f"`{command} --accept-dry-run {names}`",
         )
 
 

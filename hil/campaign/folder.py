@@ -46,6 +46,8 @@ MESH: Final = "mesh "  # Prefix of the entry of a mesh, by its name in the URDF
 MISSING: Final = "missing"
 PAYLOADS: Final = "payload"
 """Folder, in that of a campaign, with a folder for each payload that it weighs."""
+PAYLOAD_RESULT: Final = "payload.json"
+"""File of a payload that was weighed, in its folder."""
 SIDES: Final = ("bare", "loaded")
 """Campaigns in the folder of a payload: the same motion without and with it."""
 _ANOTHER: Final = "{} is not the one this campaign began with"

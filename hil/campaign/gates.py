@@ -75,7 +75,7 @@ def require_dry_run(
         remedy = f"{first} and watch the arm"
         raise DryRunError(root, "was not done, and there is no operator to accept it", remedy)
     if dry_run.accepted is None:
-        raise not_accepted(folder, dry_run.against_gravity)
+        raise not_accepted(folder, dry_run, dry_run.against_gravity)
 
 
 def require_rehearsed(folder: CampaignFolder, plan_hash: str | None = None) -> Rehearsal:

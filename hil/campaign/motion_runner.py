@@ -9,6 +9,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Protocol
 
 from hil.archive import ArchiveHeader, ArchiveSpec, open_archive
@@ -19,18 +20,19 @@ from hil.base.progress import Reporter, Task
 from hil.base.safe_input import parse_json
 from hil.base.version import software
 from hil.cell import Cell
-from hil.control.errors import MotionFailedError
+from hil.control.errors import MotionFailedError, SlippedError
 from hil.control.link import NOT_STARTED, MotionLink
 from hil.control.motions import REPEATED, CampaignMotion, StraightMoves, moves_to_dict, player_of
 from hil.control.record import archive_spec, origin_of, with_present_date
 from hil.control.simulation import simulated_provenance
+from hil.control.slips import CHECKED, require_no_slip
 from hil.precision.requirements import Requirement
 from identification.excitation.excitation import trajectory_from_dict
 
 from .dry_run import OVERRIDE, SIMULATED, yes_or_no
 from .errors import RepetitionsRejectedError
 from .folder import CampaignFolder
-from .operator import RunWatch
+from .operator import ExpectedMotion, RunWatch
 from .quality import ArchiveReview, Problem
 from .state import CampaignState
 
@@ -185,25 +187,27 @@ class Runner:
         self._moves = 0
         self._seen = None if unrehearsed else seen_in_dry_run(campaign.folder)
 
-    def times(self, joined: Sequence[CampaignMotion], slow: int) -> list[float]:
-        """Return the seconds of each motion and way; the first `slow` motions are run slowly."""
-        times = []
+    def expected(self, joined: Sequence[CampaignMotion], slow: int) -> list[ExpectedMotion]:
+        """Return motions and ways as they will be run, the first `slow` motions slowly."""
+        expected = []
         watched = slow > 0
         for motion in joined:
-            share = OVERRIDE if slow else 1.0
+            dry_run = slow > 0
+            share = OVERRIDE if dry_run else 1.0
             if motion.kind == "move":
                 unseen = motion.from_arm if watched else self._unseen(motion)
-                share = self._approach(OVERRIDE) if slow or unseen else 1.0
+                share = self._approach(OVERRIDE) if dry_run or unseen else 1.0
             else:
                 slow = max(0, slow - 1)
-            times.append(motion.trajectory.duration / share)
-        return times
+            expected.append(ExpectedMotion(motion.trajectory.duration, share, dry_run))
+        return expected
 
     def run_motion(self, motion: CampaignMotion, number: int, total: int, most: float = 1.0) -> str:
         """Move to the start of a motion, run it, and return its archive, not yet in the manifest.
 
         Raises:
             MotionFailedError: it ended otherwise than planned, or was not begun after a stop.
+            SlippedError: a measured position slipped.
             ControllerError: it was not accepted, or the link broke.
         """
         start, end = motion.endpoints(self.campaign.cell.home)
@@ -232,7 +236,7 @@ class Runner:
                 warm_up.motion_ended()
             if problem is None:
                 return name
-            self._watch.expect([motion.trajectory.duration])
+            self._watch.expect([ExpectedMotion(motion.trajectory.duration)])
             self._reporter.say(
                 f"{motion} ({name}) is rejected: {problem.sentence}; the motion is run again"
             )
@@ -277,9 +281,12 @@ class Runner:
         self._watch.begin(motion.kind, number, total, duration, most)
         player = player_of(self.campaign.cell, motion.trajectory)
         ended = self._link.run(player, spec, self._watch.stop, override=most, watch=self._watch)
+        self._watch.end()
         archived = spec.path.name if ended.outcome == "completed" or spec.path.exists() else None
         if archived is not None:  # else it was stopped before
             self._archives.names.append(archived)
+        if archived is not None and ended.outcome in CHECKED:
+            self._require_no_slip(motion, spec.path)
         if ended.outcome != "completed":
             if archived is not None:
                 self.campaign.folder.add(archived, ended.outcome, ended.reason)
@@ -287,6 +294,14 @@ class Runner:
             raise MotionFailedError(str(motion), ended.outcome, ended.reason, archived, refused)
         self.task.advance(duration / most, str(motion))
         return spec.path.name
+
+    def _require_no_slip(self, motion: CampaignMotion, path: Path) -> None:
+        """Reject a motion in which a measured position slipped, and move nothing any more."""
+        try:
+            require_no_slip(str(motion), path)
+        except SlippedError as slip:
+            self.campaign.folder.add(path.name, slip.outcome, slip.reason)
+            raise
 
 
 def seen_in_dry_run(folder: CampaignFolder) -> list[tuple[Array, Array]]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
@@ -22,9 +23,10 @@ class RunStatus:
         phase: purpose of the motion, such as "repetition"; "move" for a way between the others.
         number: which of its kind, from 1.
         total: number of its kind; of a warm-up, the largest number.
-        time_left: to the end of the run, the present motion at its override [s]; of a warm-up with
-            its least number of motions.
+        time_left: to the end of the run, each motion at its override [s]; of a warm-up with its
+            least number of motions. What is requested in a dry run counts until its end.
         motion: the motion that is being run; None between two.
+        most: largest override of the motion, whatever is requested.
     """
 
     phase: str
@@ -32,6 +34,26 @@ class RunStatus:
     total: int
     time_left: float
     motion: MotionProgress | None = None
+    most: float = 1.0
+
+
+@dataclass(frozen=True)
+class ExpectedMotion:
+    """A motion that is to be run.
+
+    Attributes:
+        duration: at full speed [s].
+        most: its largest override, a fraction.
+        dry_run: whether it belongs to the dry run.
+    """
+
+    duration: float
+    most: float = 1.0
+    dry_run: bool = False
+
+    def time(self, override: float = 1.0) -> float:
+        """Return the time of the motion at a requested override [s]."""
+        return self.duration / min(self.most, override)
 
 
 class Operator(Protocol):
@@ -56,6 +78,7 @@ class Operator(Protocol):
 
 
 BETWEEN: Final = 0.6  # s between two motions, to open and close the axes
+_SLOWEST: Final = 0.01  # override at which the time left is computed, at least
 
 
 @dataclass(eq=False)
@@ -66,37 +89,51 @@ class RunWatch:
     requested last. A hold that cannot be released any more becomes a stop.
 
     Attributes:
-        time_left: s after the present motion, each of the others at its largest override.
         began: when the present or the last motion began [s since 1970], after any hold.
         status: shown last, except for its time left.
     """
 
     operator: Operator
     stop: Stop
-    time_left: float = 0.0
     began: float = 0.0
     status: RunStatus = RunStatus("move", 1, 1, 0.0)
-    _duration: float = 0.0
-    _most: float = 1.0
+    _expected: list[ExpectedMotion] = field(default_factory=list)
+    _present: ExpectedMotion = ExpectedMotion(0.0)
+    _in_dry_run: bool = False
+    _override_after: float = 1.0
     _request: OperatorRequest = OperatorRequest()
     _problems: dict[str, str] = field(default_factory=dict)
 
-    def expect(self, times: Sequence[float]) -> None:
-        """Add motions that are to be run, with the duration of each [s]."""
-        self.time_left += sum(times) + BETWEEN * len(times)
+    def expect(self, motions: Sequence[ExpectedMotion]) -> None:
+        """Add motions that are to be run."""
+        self._expected += motions
 
     def begin(self, kind: str, number: int, total: int, duration: float, most: float) -> None:
         """Begin a motion of `duration` s at full speed, at an override of at most `most`."""
-        self.time_left = max(0.0, self.time_left - duration / most - BETWEEN)
-        self._duration = duration
-        self._most = most
+        if kind not in ("dryrun", "move"):
+            self._expected = [one for one in self._expected if not one.dry_run]
+        known = (one for one in self._expected if math.isclose(one.duration, duration))
+        if (expected := next(known, None)) is not None:
+            self._expected.remove(expected)
+        self._present = ExpectedMotion(duration, most)
+        in_dry_run = kind == "dryrun" or any(one.dry_run for one in self._expected)
+        if in_dry_run and not self._in_dry_run:
+            self._override_after = self.request().override
+        if in_dry_run or kind != "move":
+            self._in_dry_run = in_dry_run
         self.began = time.time()
         self._show(
             None,
             phase=KIND_NAMES.get(kind, kind),
             number=number,
             total=total,
+            most=most,
         )
+
+    def end(self) -> None:
+        """Show that the motion has ended."""
+        self._present = ExpectedMotion(0.0)
+        self._show(None)
 
     def show(self, progress: MotionProgress) -> None:
         """See `MotionWatch.show`."""
@@ -131,11 +168,12 @@ class RunWatch:
 
     def _show(self, progress: MotionProgress | None, **changes: Any) -> None:
         done = 0.0 if progress is None or progress.motion_time is None else progress.motion_time
-        requested = max(self._request.override, 0.01)
-        left = max(self._duration - done, 0.0) / min(self._most, requested)
-        self.status = replace(
-            self.status, motion=progress, time_left=left + self.time_left / requested, **changes
-        )
+        override = max(self._request.override, _SLOWEST)
+        after = max(self._override_after, _SLOWEST) if self._in_dry_run else override
+        left = self._present.time(override) - done / min(self._present.most, override)
+        left = max(left, 0.0) + BETWEEN * len(self._expected)
+        left += sum(one.time(override if one.dry_run else after) for one in self._expected)
+        self.status = replace(self.status, motion=progress, time_left=left, **changes)
         if "show" in self._problems:
             return
         try:

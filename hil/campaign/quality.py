@@ -24,6 +24,7 @@ from hil.base.arrays import Array
 from hil.base.errors import ArchiveError
 from hil.cell import Cell
 from hil.control.motions import CampaignMotion
+from hil.control.slips import slip_of
 from identification.signals.recording import stuck
 from identification.signals.smoothing import STANDSTILL_WINDOW
 from identification.text import percentage
@@ -318,7 +319,8 @@ class ArchiveReview:
             completed = archive.outcome is not None and archive.outcome.outcome == "completed"
             if archive.complete and completed and made(archive.header):
                 self.adopted.append(name)
-                self.enter(motion, name)
+                slip = slip_of(self._folder.archives / name)
+                self.enter(motion, name, Problem(slip) if slip else None)
 
     def _judged(self, executed: Executed) -> Problem | None:
         """Return the problem of a repetition, None for none.

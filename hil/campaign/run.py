@@ -158,14 +158,16 @@ class _CampaignRun:
         # What is wrong with a motion itself is reported before anything is connected.
         require_allowed(sent, checks)
         live = self._options.live
-        link_context = cell_link(cell, live=live) if self._link is None else nullcontext(self._link)
-        with link_context as link:
+        given = self._link
+        stop = self._watch.stop
+        own = cell_link(cell, live=live, report=reporter.say, stop=stop)
+        with own if given is None else nullcontext(given) as link:
             link.connection.report = reporter.say
             for note in link.notes():
                 reporter.say(f"note: {note}")
             if link.live is not None:
                 reporter.say(link.live.notice)
-            start = link.connect(self._watch.stop)
+            start = link.connect(stop)
             require_as_rehearsed(self._campaign, link.connection)
             narrowed = active_checks(cell, link.connection, checks)
             if narrowed is not checks:  # the controller's own limits are known only now
@@ -189,11 +191,12 @@ class _CampaignRun:
                 unrehearsed=self._options.unrehearsed,
             )
             before = link.cycles
-            times = runner.times(joined, len(slow))
+            expected = runner.expected(joined, len(slow))
             if any(motion.kind != "standstill" for motion in full):
-                times += self._warm_up.expected()
-            self._watch.expect(times)
-            with reporter.task("running the campaign (s of motion)", sum(times)) as runner.task:
+                expected += self._warm_up.expected()
+            self._watch.expect(expected)
+            total = sum(motion.time() for motion in expected)
+            with reporter.task("running the campaign (s of motion)", total) as runner.task:
                 yield runner
             link.close()
         self._archives.cycles = link.cycles - before

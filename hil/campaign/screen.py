@@ -347,6 +347,7 @@ class Screen:
         self._status: RunStatus | None = None
         self._came = time.monotonic()
         self._messages: deque[str] = deque(maxlen=REMEMBERED)
+        self._news = ""  # said since the last status
         self._undo = contextlib.ExitStack()
         self._stuck = False
         self._changing = threading.Lock()  # keys come in a thread of their own
@@ -375,6 +376,7 @@ class Screen:
     def show(self, status: RunStatus) -> None:
         """Show the progress of the run at once. ScreenError: the drawing thread has ended."""
         self._came = time.monotonic()
+        self._news = ""
         self._status = status
         self._leave_dry_run(status)
         if self._undrawn is not None:
@@ -408,6 +410,7 @@ class Screen:
 
     def say(self, text: str) -> None:
         """Print a line at once, or after the screen has closed."""
+        self._news = text
         if not self._quiet:
             self._messages.append(text)
 
@@ -426,15 +429,21 @@ class Screen:
         if _ACTIONS.get(key) == "stop":
             self._stop.requested = True
             return
-        motion = None if self._status is None else self._status.motion
         with self._changing:
-            override = self._request.override
-            if motion is not None:
-                override = min(override, motion.override)
-            self._request = after(self._request, key, override)
+            self._request = after(self._request, key, self._override)
         if _ACTIONS.get(key) not in ("hold", "resume"):
             # An override chosen after the dry run is for what follows.
             self._slow_phase &= self._status is not None and self._status.phase == "dry run"
+
+    @property
+    def _override(self) -> float:
+        """Override of the present motion, or of the next one of its kind."""
+        status = self._status
+        if status is None:
+            return self._request.override
+        if status.motion is not None:
+            return min(self._request.override, status.motion.override)
+        return min(self._request.override, status.most)
 
     @property
     def age(self) -> float:
@@ -463,13 +472,12 @@ class Screen:
             word, colour = ("STOPPING", "red") if stopping else ("HELD", "yellow")
             state.append(f" {word} ", style=f"bold {colour} reverse").append("  ")
         if status is not None and self.age > STALE:
-            # What was shown last is over; the newest message is why the run waits.
-            reason = f": {self._messages[-1]}" if self._messages else ""
-            state.append(printable(f"no news for {self.age:.0f} s{reason}  "), style="bold red")
+            # What was shown last is over; a message that came since is why the run waits.
+            reason = f": {self._news}" if self._news else ""
+            what, style = ("motion", "bold") if motion is None else ("news", "bold red")
+            state.append(printable(f"no {what} for {self.age:.0f} s{reason}  "), style=style)
             motion = None
-        state.append(
-            f"override {percentage(request.override if motion is None else motion.override)}"
-        )
+        state.append(f"override {percentage(self._override)}")
         if motion is not None and motion.rate is not None:
             state.append(f", now {percentage(motion.rate)}")
         if motion is not None:

@@ -12,7 +12,7 @@ from hil.control.motions import CampaignMotion
 
 from .dry_run import OVERRIDE, DryRunRecord, DryRunState, is_from, not_accepted
 from .motion_runner import RunArchives, Runner, RunOptions
-from .operator import RunWatch
+from .operator import ExpectedMotion, RunWatch
 from .quality import Problem
 from .state import CampaignState
 from .warmup import FrictionMeter, WarmUpRecord, drift_wanted
@@ -98,7 +98,7 @@ class DryRunStage:
             unknown = [joint for joint in record.against_gravity if joint not in self._known]
             if not self._agreed(record, unknown):
                 if not self._options.dry_run_only:
-                    raise not_accepted(self._folder, unknown)
+                    raise not_accepted(self._folder, record, unknown)
                 return
             record.accepted_now().save(self._folder.dry_run)
         self.state = "accepted"
@@ -162,14 +162,14 @@ class WarmUpStage:
         """Return the next motion of a warm-up; none where no warm-up is wanted."""
         return [self._motion_of(self._state())] if self._threshold else []
 
-    def expected(self) -> list[float]:
-        """Return the durations [s] of the motions that it runs at least."""
+    def expected(self) -> list[ExpectedMotion]:
+        """Return the motions that it runs at least."""
         state = self._state()
         motions = self.next_motion()
         if state.outcome != "going on":
             return []
         missing = self._cell.campaign.warmup_least - len(state.motions)
-        return [motion.trajectory.duration for motion in motions] * max(missing, 0)
+        return [ExpectedMotion(one.trajectory.duration) for one in motions] * max(missing, 0)
 
     def run(self, runner: Runner) -> None:
         """Run motions until the arm is warm, if any are missing (RepetitionsRejectedError)."""
@@ -182,7 +182,7 @@ class WarmUpStage:
             motion = self._motion_of(state)
             done = len(state.motions)
             if done >= settings.warmup_least:
-                self._watch.expect([motion.trajectory.duration])
+                self._watch.expect([ExpectedMotion(motion.trajectory.duration)])
             name = runner.run_until_accepted(motion, done + 1, settings.warmup_most)
             friction = meter.measure(self._campaign.folder.archives / name)
             state = state.with_motion(name, friction, settings.warmup_least, settings.warmup_most)

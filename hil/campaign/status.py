@@ -17,7 +17,7 @@ from hil.results.results import ConductResult, PrecisionResult, Results, StepRes
 from identification.text import percentage
 
 from .dry_run import DryRunRecord
-from .folder import CampaignFolder
+from .folder import PAYLOAD_RESULT, PAYLOADS, SIDES, CampaignFolder
 from .precision_record import PrecisionRecord
 from .rehearsal import Rehearsal
 from .state import CampaignState
@@ -55,11 +55,21 @@ class Step:
 
 @dataclass(frozen=True)
 class CampaignStatus:
-    """Progress of a campaign: its steps in order."""
+    """Progress of a campaign: its steps in order.
+
+    Attributes:
+        weighed: names of the payloads that it weighed.
+        weighing: of those that it has begun to weigh, the last one first, each with the command
+            that goes on.
+        only_weighs: whether it has recordings of payloads and none of its own.
+    """
 
     root: str
     plan_hash: str
     steps: tuple[Step, ...]
+    weighed: tuple[str, ...] = ()
+    weighing: tuple[tuple[str, str], ...] = ()
+    only_weighs: bool = False
 
     @property
     def complete(self) -> bool:
@@ -68,7 +78,9 @@ class CampaignStatus:
 
     @property
     def next_command(self) -> str:
-        """Command of the next step; "" where there is none."""
+        """Command of the next step, or of a weighing that goes on; "" where there is none."""
+        if self.only_weighs:
+            return next((command for _, command in self.weighing), "")
         return next((step.command for step in self.steps if step.state == "next"), "")
 
     def to_dict(self) -> dict[str, Any]:
@@ -106,7 +118,30 @@ def status_of(campaign: CampaignState) -> CampaignStatus:
         first = first or ("" if step.done else name)
         command = f"hil {step.command.replace('{}', at)}" if step.command else ""
         steps.append(replace(step, command=command))
-    return CampaignStatus(str(folder.root), folder.plan_hash, tuple(steps))
+    weighed, weighing = _weighings(folder)
+    return CampaignStatus(
+        str(folder.root),
+        folder.plan_hash,
+        tuple(steps),
+        weighed,
+        weighing,
+        only_weighs=bool(weighed or weighing) and not folder.manifest(),
+    )
+
+
+def _weighings(
+    folder: CampaignFolder,
+) -> tuple[tuple[str, ...], tuple[tuple[str, str], ...]]:
+    """Return the payloads that were weighed, and those that were begun with their commands."""
+    weighed = []
+    weighing = []
+    for payload in sorted((folder.root / PAYLOADS).glob("*"), key=lambda path: path.name):
+        sides = [CampaignFolder(payload / side) for side in SIDES]
+        if path_exists(payload / PAYLOAD_RESULT):
+            weighed.append(payload.name)
+        elif any(side.sealed for side in sides):
+            weighing.append((payload.name, sides[1].run_command))
+    return tuple(weighed), tuple(weighing)
 
 
 def _step(evaluate: Callable[[], Step], repair: str = "") -> Step:

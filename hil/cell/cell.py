@@ -7,7 +7,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
-from typing import Any, Literal, TypeVar
+from typing import Any, Final, Literal, TypeVar
 
 import numpy as np
 from pydantic import ValidationError
@@ -40,6 +40,9 @@ from .schema import (
 from .text import urdf_limits, with_values
 
 T = TypeVar("T")
+
+ASSUMED_PAYLOAD: Final = "robot.payload"
+"""Entry of `[cell] assumed` in the cell of an arm with a payload that is to be weighed."""
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -257,6 +260,11 @@ class Cell:
             problem = f"{error.link}: {error.reason}"
             raise self.error(field, None, problem, error.remedy) from error
         return spec
+
+    @property
+    def assumes_payload(self) -> bool:
+        """Whether `[robot.payload]` is assumed: the loaded side of a payload campaign."""
+        return ASSUMED_PAYLOAD in self.file.cell.assumed
 
     @property
     def only_simulated(self) -> bool:

@@ -9,7 +9,7 @@ from typing import Annotated
 
 import typer
 
-from hil.base.errors import ExecutionError, InputError, OperatorStopError
+from hil.base.errors import ExecutionError, InputError
 from hil.base.progress import Reporter
 from hil.base.progress import reporter as make_reporter
 from hil.campaign import (
@@ -24,6 +24,7 @@ from hil.campaign.planned_motions import require_runnable
 from hil.cell import Cell
 from hil.cli.arguments import JsonOption, QuietOption
 from hil.cli.verdict import finish
+from hil.control.errors import stopped
 from hil.control.simulation import simulated_link, simulated_provenance
 from hil.design import load_design
 from hil.report.output_files import FILES, REPORT, SERIES
@@ -120,8 +121,7 @@ def _run(campaign: Campaign, reporter: Reporter, *, effects: bool) -> None:
             )
         except ExecutionError as fault:
             if stop.requested:
-                ended = str(fault).rstrip(".")
-                raise OperatorStopError(f"{ended}; resume with --resume") from fault
+                raise stopped(fault, "resume with --resume") from fault
             raise
     took = time.perf_counter() - started
     seconds = link.cycles * cell.period

@@ -29,6 +29,7 @@ from hil.cell import AngleFrame, Cell
 from hil.cli.arguments import JsonOption
 from hil.control.cell_link import cell_link
 from hil.control.connection import active_checks, narrower_limits
+from hil.control.errors import SlippedError
 from hil.control.motion_watch import MotionProgress, OperatorRequest
 from hil.control.move import THERE, CheckedMove, axis_alone, plan_move, posture, send, turned
 from hil.control.record import archive_path
@@ -83,8 +84,9 @@ def move(
     if to is not None:
         motion = None if campaign is None else campaign.plan.excitation.trajectory
         wanted = posture(cell, to, None if motion is None else motion.sample(np.array([0.0]))[0][0])
-    with _reserved(campaign), cell_link(cell, only_axis=axis) as link:
-        link.connection.report = partial(say, err=json)
+    report = partial(say, err=json)
+    with _reserved(campaign), cell_link(cell, only_axis=axis, report=report) as link:
+        link.connection.report = report
         if yes and not link.only_simulated:
             most = 100.0 * cell.campaign.approach_speed
             if speed is not None and speed > most:
@@ -126,7 +128,12 @@ def move(
             stop_on_interrupt() as stop,
             bar.task("moving (s)", move.duration) as task,
         ):
-            ended = send(move, cell, link, path, stop=stop, watch=_Shown(task), durable=durable)
+            try:
+                ended = send(move, cell, link, path, stop=stop, watch=_Shown(task), durable=durable)
+            except SlippedError as slip:
+                if folder is not None:
+                    folder.add(path.name, slip.outcome, slip.reason)
+                raise slip.beside({"archive": str(path), "outcome": slip.outcome}) from None
             stopped = stop.requested
         if folder is not None:
             folder.add(path.name, ended.outcome)

@@ -64,12 +64,18 @@ def record(
     """
     loaded = Cell.load(cell)
     path = archive_path(output, kind)
+    report = partial(say, err=True)
     with (
         stop_on_interrupt(twice=True) as stop,
-        LiveLink.open(loaded, live=None if live is None else LiveView.parse(live)) as link,
+        LiveLink.open(
+            loaded,
+            live=None if live is None else LiveView.parse(live),
+            report=report,
+            stop=stop,
+        ) as link,
     ):
         view = View(loaded, quiet=quiet or json)
-        link.connection.report = partial(say, err=True)
+        link.connection.report = report
         view.say(f"waiting for the controller; recording to {path}. Ctrl-C to stop")
         if link.live is not None:
             view.say(link.live.notice)

@@ -12,7 +12,7 @@ import typer
 
 from hil.archive import ArchiveName
 from hil.archive.live import LiveView
-from hil.base.errors import ExecutionError, InputError, OperatorStopError
+from hil.base.errors import ExecutionError, InputError
 from hil.base.progress import reporter as make_reporter
 from hil.base.progress import say
 from hil.campaign import Campaign, MotionFailedError, stop_on_interrupt
@@ -30,8 +30,8 @@ from hil.cli.arguments import (
 from hil.cli.verdict import NOT_GOOD, as_json, finish
 from hil.cli.weigh import Weighing, weigh
 from hil.control.cell_link import require_real_time
+from hil.control.errors import stopped
 from hil.precision.requirements import Requirement
-from hil.weighing.payload_campaign import assumes_payload
 
 
 @with_options(Weighing, "weighing")
@@ -125,7 +125,7 @@ def _opened(root: Path) -> Campaign:
             problem = f"lies where a payload campaign has a side; {whole.resolve()} is no campaign"
             remedy = "move the folder to a path without payload/NAME and run it there"
         raise InputError(root, problem, remedy=remedy)
-    if assumes_payload(opened.cell):
+    if opened.cell.assumes_payload:
         problem = "is a copy of the loaded side of a payload campaign"
         remedy = "run the campaign that it was copied from, with --payload"
         raise InputError(root, problem, remedy=remedy)
@@ -164,7 +164,7 @@ def _run(
             failed = isinstance(fault, MotionFailedError) and fault.outcome != "stopped"
             if stop.requested and not failed:  # an OSError: of a terminal that was closed
                 again = f"resume with `{campaign.folder.run_command}`"
-                raise OperatorStopError(f"{str(fault).rstrip('.')}; {again}") from fault
+                raise stopped(fault, again) from fault
             raise
 
 

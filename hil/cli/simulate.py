@@ -276,6 +276,12 @@ def _postures(cell: Cell) -> tuple[tuple[float, ...], ...]:
     return postures
 
 
+ENDINGS: Final = {
+    "none": "without 504",
+    "unanswered": "504, without a reply to it",
+    "replied": "504",
+}
+"""Ends of a session by what became of the packet with 504."""
 _KEYS: Final = {"first_packets": "knocks", "extended": "stretched"}
 """Keys of `--json` by the counts that have another name."""
 
@@ -309,7 +315,9 @@ def _sentences(served: Served) -> list[str]:
     if not summary.cycles:
         sent = plural(summary.first_packets, "time")
         return [f"no reply of a PC program; the first packet was sent {sent}"]
-    end = "the session has ended (504)" if summary.ended else "the session was aborted"
+    end = "the session was aborted"
+    if summary.ended:
+        end = f"the session has ended ({ENDINGS[served.controller.program.end_packet]})"
     because = f": {reason}" if reason else ""
     late = f"; {plural(summary.own_late, 'cycle')} started late by the simulation"
     if summary.own_late:
@@ -332,10 +340,17 @@ def _sentences(served: Served) -> list[str]:
 def _replies(served: Served) -> str:
     """Return how many cycles had a valid reply, and which packets were of no use."""
     summary = served.summary
-    if not summary.missed:
-        text = "each with a valid reply in time"
-    else:
+    if summary.missed:
         text = f"{summary.missed} without a valid reply in time"
+    elif summary.extended or summary.read_late:
+        text = "each with a valid reply"
+    else:
+        text = "each with a valid reply in time"
+    if summary.read_late:
+        text += (
+            f"; {plural(summary.read_late, 'reply')} counted as in time, but read later than that: "
+            "this computer was busy"
+        )
     unused = {
         "too late": summary.late,
         "a further one in its cycle": summary.surplus,

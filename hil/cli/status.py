@@ -36,6 +36,10 @@ def _last(progress: CampaignStatus) -> str:
     """Return the line with the next command."""
     if progress.complete:
         return "all steps are done"
+    if progress.only_weighs and not progress.weighing:
+        names = ", ".join(progress.weighed)
+        arm = next(step.command for step in progress.steps if step.state == "next")
+        return f"weighed: {names} (in payload/); nothing is missing. To identify the arm: {arm}"
     if progress.next_command:
         return f"next: {progress.next_command}"
     stuck = next(step for step in progress.steps if step.state == "next")

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 
 from hil.archive.live import LiveView, LiveViewError
 from hil.cell import Cell
 from hil.control.link import MotionLink
 from hil.control.live_link import LiveLink
+from hil.control.motion_watch import Stop
 from hil.control.simulation import simulated_link
 
 
@@ -18,11 +19,19 @@ def cell_link(
     *,
     only_axis: int | None = None,
     live: LiveView | None = None,
+    report: Callable[[str], object] = str,
+    stop: Stop | None = None,
 ) -> Iterator[MotionLink]:
     """Open the link of a cell; leaving the context stops the arm and closes the link.
 
     With transport "simulated" the controller is simulated in this process, in virtual time.
-    `only_axis`, from 1, is the only one to be open.
+
+    Args:
+        cell: the cell.
+        only_axis: the only axis, from 1, to be open.
+        live: where viewers may connect.
+        report: receives what is waited for.
+        stop: ends the wait.
 
     Raises:
         ControllerError: the link cannot be opened.
@@ -32,7 +41,7 @@ def cell_link(
         require_real_time(cell, live)
         yield simulated_link(cell, only_axis=only_axis)
         return
-    with LiveLink.open(cell, only_axis=only_axis, live=live) as link:
+    with LiveLink.open(cell, only_axis=only_axis, live=live, report=report, stop=stop) as link:
         yield link
 
 

@@ -15,6 +15,7 @@ from drivers.events import (
     MotionStarted,
     PacketRejected,
     Refused,
+    StateChanged,
 )
 from drivers.exchange.event_log import EventsLost, ExchangeEvent
 from drivers.guard import Guard
@@ -32,6 +33,9 @@ from hil.control.motion_watch import REFUSED
 
 START_TIMEOUT: Final = 60.0  # s within which an accepted motion must have started
 OFF_TIMEOUT: Final = 2.0  # s with the drive off after which an accepted motion is dropped
+READY: Final = frozenset((State.CLOSED, State.OPENING, State.OPEN))
+"""States with the drive on. A controller may open its axes at once: they are held where they are
+until a motion is requested."""
 _WITHOUT_DRIVE: Final = (State.SYNC, State.INIT, State.DRIVE_OFF, State.FAULTED, State.ENDED)
 
 
@@ -47,6 +51,7 @@ class Connection:
         not_understood: number and cause of packets without a reply; "" for none.
         no_reply: the cause alone.
         refused: the last refusal since a motion was requested.
+        switched_off: the last refusal since the drive was on: this PC asked for drive-off (505).
         started: whether the motion has sent anything, or may have.
         ended: the end of the motion, if its event came.
         report: receives a line for each refusal at once.
@@ -61,6 +66,7 @@ class Connection:
     not_understood: str = ""
     no_reply: str = ""
     refused: Refused | None = None
+    switched_off: Refused | None = None
     started: bool = False
     ended: MotionEnded | None = None
     report: Callable[[str], object] = str
@@ -75,8 +81,11 @@ class Connection:
                 self.unusable = event.unusable
                 self.differences = event.differences
                 self.inits += 1
+            case StateChanged() if event.after in READY:
+                self.switched_off = None
             case Refused():
                 self.refused = event
+                self.switched_off = event
                 self._report(event)
             case LinkLost():
                 self.lost = event
@@ -102,9 +111,20 @@ class Connection:
             remedy = "; correct the cell file, or the controller" if self.differences else ""
             raise ControllerError(f"the controller cannot be used: {self.unusable}{remedy}")
 
-    def _report(self, event: Refused) -> None:
+    @property
+    def why_off(self) -> str:
+        """Why this PC had the drive switched off since it was on last, with the remedy, or ""."""
+        event = self.switched_off
+        if event is None:
+            return ""
+        return f"this PC asked the controller for drive-off (505): {self._sentence(event)}"
+
+    def _sentence(self, event: Refused) -> str:
         text = str(event.error) if self.cell is None else refusal_text(self.cell, event.error)
-        self.report(f"{REFUSED}: {text}; {event.error.remedy}")
+        return f"{text}; {event.error.remedy}"
+
+    def _report(self, event: Refused) -> None:
+        self.report(f"{REFUSED}: {self._sentence(event)}")
 
 
 class StartTimeout:
@@ -141,8 +161,11 @@ def waiting_text(state: State, received: str) -> str:
             return ""
 
 
-def not_ready(state: State, waited: float) -> ControllerError:
-    """Return the error of a controller that was not ready for a motion after `waited` s."""
+def not_ready(state: State, waited: float, why_off: str = "") -> ControllerError:
+    """Return the error of a controller that was not ready for a motion after `waited` s.
+
+    `why_off` is why this PC had its drive switched off, or "".
+    """
     after = f"within {waited:.3g} s"
     restart = "restart the program on the controller"
     match state:
@@ -154,8 +177,9 @@ def not_ready(state: State, waited: float) -> ControllerError:
         case State.ENDED:
             problem = f"ended the session {after} before its drive was on; {restart} and try again"
         case _:
-            problem = f"did not reach drive-on {after} (state {state.name}); switch the drive on"
-            problem += " and try again"
+            because = f": {why_off}" if why_off else ""
+            problem = f"did not reach drive-on {after} (state {state.name}){because}; switch the"
+            problem += " drive on and try again"
     return ControllerError(f"the controller {problem}")
 
 

@@ -8,7 +8,7 @@ from typing import Final
 
 from drivers.errors import Check, GuardError, RefusalError
 from drivers.events import Refused
-from hil.base.errors import ExecutionError, UnsafeError
+from hil.base.errors import ExecutionError, OperatorStopError, UnsafeError
 from hil.base.terminal_text import with_joint_names
 from hil.cell import AngleFrame, Cell
 
@@ -26,6 +26,7 @@ class MotionFailedError(ExecutionError):
     Attributes:
         outcome: "stopped", "refused" by this PC, or "lost".
         sentence: motion, archive, outcome and reason.
+        archived: it, and that everything recorded is archived.
         refused: the refusal, with its error and the last records before it; else None.
     """
 
@@ -43,8 +44,31 @@ class MotionFailedError(ExecutionError):
         which = motion if archive is None else f"{motion} ({archive})"
         how = reason if reason.startswith(outcome) else f"{outcome}: {reason}"
         self.sentence = f"{which} was {how}"
-        remedy = "run the campaign again to continue" if refused is None else refused.error.remedy
-        super().__init__(f"{self.sentence}; everything recorded is archived; {remedy}.")
+        self.archived = f"{self.sentence}; everything recorded is archived"
+        remedy = "run the campaign again to continue"
+        if refused is not None:
+            remedy = refused.error.remedy
+        elif outcome == "lost":  # by an emergency stop, too
+            remedy = f"find the cause and check the arm, then {remedy}"
+        super().__init__(f"{self.archived}; {remedy}.")
+
+
+class SlippedError(MotionFailedError):
+    """A motion in which a measured position slipped: the arm is not where its encoders say."""
+
+    def __init__(self, motion: str, slip: str, archive: str) -> None:
+        super().__init__(motion, "rejected", slip, archive)
+        remedy = (
+            "it does not count, and nothing else was moved. Check encoder, coupling, belt and "
+            "brake of that joint, and its position at a known mark, before the arm moves again"
+        )
+        self.args = (f"{self.archived}; {remedy}.",)
+
+
+def stopped(fault: Exception, again: str) -> OperatorStopError:
+    """Return the error of a run that its operator stopped; `again` is how it is resumed."""
+    what = fault.archived if isinstance(fault, MotionFailedError) else str(fault)
+    return OperatorStopError(f"{what.rstrip('.')}; {again}")
 
 
 _SET_BY: Final[Mapping[Check, str]] = {

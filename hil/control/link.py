@@ -35,7 +35,15 @@ from hil.cell import Cell
 from hil.control.errors import refusal_text
 from hil.control.motion_watch import MotionWatch, Stop, unwatched_motion
 
-from .connection import Connection, StartTimeout, active_guard, described, not_ready, waiting_text
+from .connection import (
+    READY,
+    Connection,
+    StartTimeout,
+    active_guard,
+    described,
+    not_ready,
+    waiting_text,
+)
 from .operator_control import REQUEST_PERIOD, OperatorControl
 from .port import ControllerPort
 
@@ -47,9 +55,6 @@ NOT_STARTED: Final = "it had not begun"
 """Reason of a motion that was stopped before it was requested."""
 STOPPED: Final = "stopped by the operator"
 WAIT_REPORTED: Final = 2.0  # s after which a controller that is not ready is reported
-READY: Final = frozenset((State.CLOSED, State.OPENING, State.OPEN))
-"""States with the drive on. A controller may open its axes at once: they are held where they are
-until a motion is requested."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -151,7 +156,7 @@ class MotionLink:
         if stop.requested:
             raise ControllerError("ended by the operator before anything moved")
         if target is None or port.status().state not in READY:
-            raise not_ready(port.status().state, port.now - began)
+            raise not_ready(port.status().state, port.now - began, self.connection.why_off)
         self._inits = self.connection.inits
         return target
 
@@ -597,7 +602,8 @@ class _Supervision:
         self._link.complete("void" if refused is None else "refused", reason)
         self._port.stop(reason)
         if refused is None:
-            raise ControllerError(f"{reason}; nothing was sent ({self._spec.path})")
+            why = f" ({why_off})" if (why_off := self._connection.why_off) else ""
+            raise ControllerError(f"{reason}{why}; nothing was sent ({self._spec.path})")
         return MotionEnded("refused", reason, -1, -1)
 
 

@@ -21,12 +21,12 @@ from numpy.typing import NDArray
 from drivers.errors import DriverError
 from drivers.exchange.control import HeartbeatMonitor, SharedState
 from drivers.exchange.event_log import ExchangeEnded, ExchangeEvent, ExchangeFailed, Leaving
-from drivers.exchange.process import ExchangeProcess, ExchangeSettings
+from drivers.exchange.process import ExchangeProcess, ExchangeSettings, is_exchange
 from drivers.exchange.realtime import RealTimeSettings
 from drivers.motion_source import MotionSource
 from drivers.record import RingReader
 from drivers.states import State
-from drivers.transports.base import TransportSpec
+from drivers.transports.base import LinkInUseError, TransportSpec
 from hil.archive import ArchiveSpec
 from hil.archive.live import LiveView, LiveViewError, Serve
 from hil.archive.recorder import Recorded
@@ -56,6 +56,9 @@ STALL: Final = 1.0  # Longest time between two turns of the loop that supervises
 HUNG: Final = 5.0
 """s without a heartbeat after which an exchange process is killed: the controller, without replies
 for so long, has acted by its own watchdog."""
+EARLIER_EXCHANGE: Final = 30.0
+"""s to wait for the exchange of an earlier run: longer than one without a supervisor needs to bring
+the arm to rest and to end."""
 POLL: Final = 0.02  # Period of the supervising loop, s
 OPEN_TIMEOUT = 10.0  # s within which a file must have been created, or completed
 END_TIMEOUT: Final = 30.0  # s within which a session must end after that was requested
@@ -454,10 +457,13 @@ class LiveLink(MotionLink):
         realtime: RealTimeSettings | None = None,
         finish: Callable[[], None] = lambda: None,
         live: LiveView | None = None,
+        report: Callable[[str], object] = str,
+        stop: Stop | None = None,
     ) -> Self:
         """Start exchange and archive process on the cell's link, or on another `transport` to it.
 
-        From here on large arrays of this process return to the system when they are freed.
+        From here on large arrays of this process return to the system when they are freed. The end
+        of an exchange that an earlier run has left is waited for.
 
         Args:
             cell: the cell.
@@ -466,6 +472,8 @@ class LiveLink(MotionLink):
             realtime: what the exchange requests from the system.
             finish: asks the controller to end the session.
             live: where viewers may connect.
+            report: receives what is waited for.
+            stop: ends the wait.
 
         Raises:
             LiveViewError: the live view cannot be served.
@@ -474,21 +482,8 @@ class LiveLink(MotionLink):
         """
         return_large_arrays()
         spec = transport if transport is not None else cell.transport_spec()
-        settings = ExchangeSettings(
-            transport=spec,
-            drive_train=cell.drive_train,
-            guard_limits=cell.guard_limits,
-            period=cell.period,
-            session=cell.session_settings(only_axis=only_axis),
-            realtime=realtime or RealTimeSettings(),
-            preload=("planner",),
-        )
-        try:
-            exchange = ExchangeProcess.start(settings)
-        except DriverError as error:
-            raise ControllerError(str(error)) from error
-        except OSError as error:
-            raise ControllerError(f"the exchange process cannot be started: {error}") from error
+        settings = _settings(cell, spec, only_axis, realtime)
+        exchange = _started(settings, report, stop or Stop())
         # At once: the archive process may take longer to start than the exchange waits for a beat.
         heart = Heartbeat(exchange.send_heartbeat)
         heart.start()
@@ -518,6 +513,64 @@ class LiveLink(MotionLink):
             self.close()
         else:
             self.port.abort(error)
+
+
+def _settings(
+    cell: Cell, transport: TransportSpec, only_axis: int | None, realtime: RealTimeSettings | None
+) -> ExchangeSettings:
+    return ExchangeSettings(
+        transport=transport,
+        drive_train=cell.drive_train,
+        guard_limits=cell.guard_limits,
+        period=cell.period,
+        session=cell.session_settings(only_axis=only_axis),
+        realtime=realtime or RealTimeSettings(),
+        preload=("planner",),
+    )
+
+
+def _started(
+    settings: ExchangeSettings, report: Callable[[str], object], stop: Stop
+) -> ExchangeProcess:
+    """Start an exchange process, after the end of one that an earlier run has left on the link.
+
+    A run that was killed leaves it: it replies until the arm has come to rest.
+
+    Raises:
+        ControllerError: it cannot be started, another run still has the link, or a stop was
+            requested.
+    """
+    until = time.monotonic() + EARLIER_EXCHANGE
+    reported = 0
+    while True:
+        try:
+            return ExchangeProcess.start(settings)
+        except LinkInUseError as error:
+            holder = error.holder
+            if holder is None or not is_exchange(holder):
+                raise ControllerError(str(error)) from error
+            link = error.link
+        except DriverError as error:
+            raise ControllerError(str(error)) from error
+        except OSError as error:
+            raise ControllerError(f"the exchange process cannot be started: {error}") from error
+        whose = f"{link} is held by the exchange of another run of hil (process {holder})"
+        if reported != holder:
+            reported = holder
+            report(
+                f"{whose}: if that run was killed, it replies to the controller until the arm has "
+                f"rested, and then ends; waiting for that, up to {EARLIER_EXCHANGE:g} s"
+            )
+        while is_exchange(holder):
+            if stop.requested:
+                raise ControllerError("ended by the operator before anything moved")
+            if time.monotonic() > until:
+                raise ControllerError(
+                    f"{whose} and was not released within {EARLIER_EXCHANGE:g} s; wait for the end "
+                    "of that run, or stop it by Ctrl-C in its terminal, and run again. Do not kill "
+                    "the exchange: it replies to the controller"
+                )
+            time.sleep(POLL)
 
 
 def write_error(failed: Failed) -> ArchiveWriteError:

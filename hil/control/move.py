@@ -19,6 +19,7 @@ from hil.control.motion_checks import MotionChecks
 from hil.control.motion_watch import MotionWatch, Stop, unwatched_motion
 from hil.control.motions import CampaignMotion, moves_to_dict, player_of, straight_move
 from hil.control.record import archive_spec, kind_entry, origin_of
+from hil.control.slips import CHECKED, require_no_slip
 from planner import FourierSeries, PiecewiseCubic
 
 _ROUND: Final = 0.1
@@ -164,6 +165,7 @@ def send(
         MotionRefusedError: the motion needs more current than the controller's limit.
         ControllerError: it was not accepted (nothing moved), or the link failed.
         ArchiveWriteError: the archive cannot be written; the arm was stopped.
+        SlippedError: a measured position slipped.
     """
     checks = active_checks(cell, link.connection, planned.checks)
     if checks is not planned.checks:
@@ -178,7 +180,10 @@ def send(
         },
         durable=durable,
     )
-    return link.run(player_of(cell, planned.motion.trajectory), spec, stop, watch=watch)
+    ended = link.run(player_of(cell, planned.motion.trajectory), spec, stop, watch=watch)
+    if ended.outcome in CHECKED and path.exists():
+        require_no_slip("the motion", path)
+    return ended
 
 
 def _require(checks: MotionChecks, trajectory: PiecewiseCubic | FourierSeries) -> None:

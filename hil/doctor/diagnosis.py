@@ -247,8 +247,8 @@ def examine(
 
 _COLOUR = {Status.OK: "green", Status.WARN: "yellow", Status.BAD: "red", Status.UNKNOWN: "blue"}
 _OTHERWISE = (
-    "If it is still not fit after that: switch off C-states, frequency stepping and "
-    "hyper-threading in the firmware set-up (BIOS); isolate a processor; {}use another PC."
+    "switch off C-states, frequency stepping and hyper-threading in the firmware set-up (BIOS); "
+    "isolate a processor; {}use another PC."
 )
 
 
@@ -272,9 +272,12 @@ def show(diagnosis: Diagnosis, console: Console) -> None:
         f"{verdict.cycle_ms} ms: {'fit' if verdict.fit else 'not fit'}; {verdict.reason}"
         for verdict in diagnosis.cycles
     ]
-    lines += [f"({CRITERIA})", *remedies(diagnosis.checks)]
+    first = [*remedies(diagnosis.checks)]
+    lines += [f"({CRITERIA})", *first]
     if not diagnosis.cycle_fit:
-        lines.append("\n" + _OTHERWISE.format("use 2 ms; " if diagnosis.cycles[1].fit else ""))
+        case = "If it is still not fit after that" if first else "To make it fit"
+        otherwise = _OTHERWISE.format("use 2 ms; " if diagnosis.cycles[1].fit else "")
+        lines.append(f"\n{case}: {otherwise}")
     for line in (*lines, ""):
         console.print(printable(line), markup=False, highlight=False, soft_wrap=True)
     style = "bold green" if diagnosis.fit else "bold red"

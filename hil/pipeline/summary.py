@@ -61,11 +61,13 @@ def summary(
     calibration = validation.calibration
     excitation, gram = _excitation(prepared)
     simulated = sources.header.only_simulated
-    truth = true_values(cell, sources.header) if simulated else None
+    known = simulated and not sources.header.simulated_by_unknown
+    truth = true_values(cell, sources.header) if known else None
     return results.Results(
         name=name,
         cell=cell.name,
         simulated=simulated,
+        simulated_by_unknown=sources.header.simulated_by_unknown,
         effects=[*sources.header.effects],
         joint_names=list(model.joint_names),
         period=_period(prepared.training[0]),

@@ -484,6 +484,7 @@ class Results(Frozen):
     name: str
     cell: str
     simulated: bool
+    simulated_by_unknown: bool = False  #: By a program at the other end of a link
     effects: list[str]  #: Unmodelled effects of the simulation, with their sizes
     joint_names: list[str]
     period: float

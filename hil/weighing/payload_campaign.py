@@ -26,13 +26,14 @@ from hil.base.safe_input import path_exists
 from hil.base.terminal_text import plural
 from hil.campaign.campaign import Campaign, campaign_of_design
 from hil.campaign.errors import RepetitionsRejectedError
-from hil.campaign.folder import PAYLOADS, SIDES, CampaignFolder
+from hil.campaign.folder import PAYLOAD_RESULT, PAYLOADS, SIDES, CampaignFolder
 from hil.campaign.gates import require_rehearsed
 from hil.campaign.plan import CampaignPlan
 from hil.campaign.precision_record import Look, PrecisionRecord, Reached
 from hil.campaign.reached_precision import further
 from hil.campaign.run import RunResult
 from hil.cell import Cell
+from hil.cell.cell import ASSUMED_PAYLOAD
 from hil.cell.schema import CellFile
 from hil.control.errors import MotionRefusedError
 from hil.control.link import MotionLink
@@ -50,7 +51,6 @@ CENTRE: Final = (0.0, 0.0, 0.1)
 """Centre of mass of a payload in the frame of the flange [m] where it is not stated."""
 FEWEST: Final = 2  # pairs: bare, loaded, loaded, bare
 _NAME: Final = re.compile(r"[A-Za-z0-9][\w.-]{0,63}")
-_ASSUMED: Final = "robot.payload"
 
 Execute = Callable[[Campaign, Mapping[str, Any]], RunResult]
 """Runs a side with further arguments of `Campaign.run`."""
@@ -289,7 +289,7 @@ class PayloadCampaign:
         sides = ((self.bare.folder.root,), (self.loaded.folder.root,))
         weighed = Weighed(replace(result, typed=sides), pairs, record)
         text = json.dumps(weighed.as_json(), indent=1, ensure_ascii=False)
-        write_output(self.root / "payload.json", text + "\n")
+        write_output(self.root / PAYLOAD_RESULT, text + "\n")
         write_output(self.root / "payload.txt", "\n".join(weighed.lines) + "\n")
         return weighed
 
@@ -419,17 +419,17 @@ def loaded_cell(cell: Cell, name: str, assumed: Payload) -> Cell:
         where, tool_body = tool.carried_by(chain)
         if where != joint:
             remedy = "describe it as a part of the URDF"
-            raise cell.error(_ASSUMED, None, "is not on the last joint", remedy)
+            raise cell.error(ASSUMED_PAYLOAD, None, "is not on the last joint", remedy)
         inertial = inertial + tool_body
     mass, centre, tensor = body(inertial)
     return cell.with_values(
         {
-            f"{_ASSUMED}.name": name,
-            f"{_ASSUMED}.mass": mass,
-            f"{_ASSUMED}.centre": centre.tolist(),
-            f"{_ASSUMED}.inertia": tensor[np.triu_indices(3)].tolist(),
-            f"{_ASSUMED}.frame": "",
-            "cell.assumed": [*cell.file.cell.assumed, _ASSUMED],
+            f"{ASSUMED_PAYLOAD}.name": name,
+            f"{ASSUMED_PAYLOAD}.mass": mass,
+            f"{ASSUMED_PAYLOAD}.centre": centre.tolist(),
+            f"{ASSUMED_PAYLOAD}.inertia": tensor[np.triu_indices(3)].tolist(),
+            f"{ASSUMED_PAYLOAD}.frame": "",
+            "cell.assumed": [*cell.file.cell.assumed, ASSUMED_PAYLOAD],
         }
     )
 
@@ -479,15 +479,10 @@ def _order(pair: int) -> tuple[bool, bool]:
     return (False, True) if pair % 2 == 0 else (True, False)
 
 
-def assumes_payload(cell: Cell) -> bool:
-    """Whether a cell is that of a loaded side, which runs only when the payload is mounted."""
-    return _ASSUMED in cell.file.cell.assumed
-
-
 def _bare_file(cell: Cell) -> CellFile:
     """Return a cell's file without its payload, assumed or stated."""
     robot = cell.file.robot.model_copy(update={"payload": None})
-    assumed = [entry for entry in cell.file.cell.assumed if entry != _ASSUMED]
+    assumed = [entry for entry in cell.file.cell.assumed if entry != ASSUMED_PAYLOAD]
     described = cell.file.cell.model_copy(update={"assumed": assumed})
     return cell.file.model_copy(update={"robot": robot, "cell": described})
 

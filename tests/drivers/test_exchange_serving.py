@@ -204,12 +204,12 @@ class TestLatencyBins:
 
     @pytest.mark.parametrize(
         ("latencies", "place"),
-        [((0.0, -1e-3, math.nan, SHORTEST), 0), ((1.0, 1e300, math.inf), BINS - 1)],
+        [((0.0, -1e-3, math.nan, SHORTEST), 0), ((100.0, 1e300, math.inf), BINS - 1)],
     )
     def test_first_and_last_bin_are_unbounded(self, latencies, place):
         assert {bin_of(seconds) for seconds in latencies} == {place}
         assert upper_edge(BINS - 1) == math.inf
-        assert 5e-3 < self.LONGEST < 6e-3
+        assert 20.0 < self.LONGEST < 25.0, "longer than any reply that is waited for"
 
 
 class Clock:

@@ -122,6 +122,14 @@ def test_a_cycle_of_2_ms_is_advised_only_where_it_is_fit(fit_at_1: bool, fit_at_
     )
 
 
+def test_the_last_remedy_follows_others_only_where_some_are() -> None:
+    assert "If it is still not fit" not in page(diagnosis(fit=False))
+    bad = DoctorCheck("disk", Status.BAD, "slow", ("use another disk",))
+    assert "If it is still not fit after that: switch off C-states" in page(
+        diagnosis(bad, fit=False)
+    )
+
+
 def test_a_bad_check_makes_a_fast_pc_unfit_and_is_named() -> None:
     assert diagnosis(
         *(DoctorCheck("x", status, "y") for status in Status if status is not Status.BAD)

@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 
 from drivers.exchange.event_log import NO_ARCHIVE
+from drivers.exchange.process import ExchangeProcess, ExchangeSettings
 from drivers.motion_source import MotionSource
 from drivers.packets import INIT_LENGTH
 from drivers.states import State
@@ -105,6 +106,30 @@ def test_a_real_controller_is_not_driven_without_a_rehearsal(
             campaign.run(link, Stop(), Silent(), unrehearsed=True)
     assert refused.value.exit_code == 3
     assert not list(campaign.folder.archives.iterdir())
+
+
+def test_the_exchange_that_a_killed_run_has_left_is_waited_for(cell: Cell) -> None:
+    """It replies to the controller, so that nobody is told to kill it."""
+    linked = cell.with_link(transport="udp", host="127.0.0.1", bind="127.0.0.1", port=free_port())
+    earlier = ExchangeProcess.start(
+        ExchangeSettings(
+            transport=linked.transport_spec(),
+            drive_train=linked.drive_train,
+            guard_limits=linked.guard_limits,
+            period=linked.period,
+            session=linked.session_settings(),
+        )
+    )
+    lines: list[str] = []
+    stopped = Stop(requested=True)
+    with pytest.raises(ControllerError, match="ended by the operator before anything moved"):
+        LiveLink.open(linked, report=lines.append, stop=stopped)
+    with LiveLink.open(linked, report=lines.append):  # `earlier` gets no heartbeat any more
+        assert not earlier.alive
+    earlier.close()
+    assert lines == [lines[0]] * 2
+    assert f"another run of hil (process {earlier.pid})" in lines[0]
+    assert "ss -ulnp" not in lines[0]
 
 
 def test_each_difference_of_the_init_packet_is_named(

@@ -10,8 +10,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from drivers.errors import RequestError
-from drivers.events import MotionEnded, MotionStarted, PacketRejected
+from drivers.errors import AxisNotInMode, RequestError
+from drivers.events import MotionEnded, MotionStarted, PacketRejected, Refused, StateChanged
 from drivers.exchange.event_log import NO_ARCHIVE, EventsLost
 from drivers.exchange.process import ExchangeError, WithdrawnError
 from drivers.states import State
@@ -21,6 +21,7 @@ from hil.base.errors import ArchiveWriteError, ControllerError
 from hil.campaign import Stop
 from hil.cell import Cell
 from hil.control.connection import OFF_TIMEOUT, START_TIMEOUT
+from hil.control.errors import MotionFailedError, stopped
 from hil.control.link import REST_TIMEOUT, MotionLink
 from hil.control.port import PortStatus
 from tests.messages import DRIVE_IS_OFF, OPEN_MODE_BEING_LEFT, START_OPEN_PROGRAM
@@ -230,6 +231,27 @@ def test_a_motion_that_does_not_begin_is_dropped(
     assert port.now == pytest.approx(after, abs=3 * TURN)
 
 
+def test_a_drive_off_requested_by_this_pc_is_named(cell: Cell) -> None:
+    """A refusal at rest, before the motion was requested."""
+    refusal = AxisNotInMode("joint 2 is in mode 0; the motion needs 4", 7)
+
+    def refused_at_rest(port: ScriptedPort) -> None:
+        port.state = State.DRIVE_OFF
+        port.events.append(Refused(refusal, np.zeros(0)))
+
+    port = ScriptedPort()
+    refused_at_rest(port)
+    why = rf"this PC asked the controller for drive-off \(505\): {cell.joint_names[1]} is in mode 0"
+    with pytest.raises(ControllerError, match=f"{why}.*; nothing was sent"):
+        run(cell, port)
+    # After the drive was on again, the refusal is over.
+    link = MotionLink(cell, port)  # type: ignore[arg-type]
+    refused_at_rest(port)
+    port.events.append(StateChanged(State.DRIVING_ON, State.CLOSED, 9))
+    link._poll()
+    assert link.connection.why_off == ""
+
+
 @pytest.mark.parametrize(
     ("fault", "error", "message"),
     [
@@ -299,3 +321,12 @@ def test_a_stop_before_the_request_sends_nothing(cell: Cell) -> None:
         "stopped", "it had not begun", -1, -1
     )
     assert port.diary == ["open", "stopped"]
+
+
+def test_a_stopped_run_names_one_way_to_continue() -> None:
+    lost = MotionFailedError("repetition 2", "lost", "the drive went off", "a.mcap")
+    assert "check the arm, then run the campaign again" in str(lost)
+    by_operator = MotionFailedError("repetition 2", "stopped", "stopped by the operator", "a.mcap")
+    text = str(stopped(by_operator, "resume with `hil run C`"))
+    assert text.endswith("everything recorded is archived; resume with `hil run C`")
+    assert "run the campaign again" not in text

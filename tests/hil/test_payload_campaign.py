@@ -155,6 +155,14 @@ class TestRecording:
         )
         assert printed.stdout == text
 
+    def test_the_status_of_a_weighing_asks_for_nothing(self, designed, done) -> None:
+        status = designed.status()
+        assert (status.weighed, status.weighing) == (("weight",), ())
+        assert status.next_command == ""
+        printed = CliRunner().invoke(app, ["status", str(designed.folder.root)]).stdout
+        last = printed.splitlines()[-1]
+        assert last.startswith("weighed: weight (in payload/); nothing is missing. To identify")
+
     def test_nothing_is_recorded_again(self, designed, done) -> None:
         _, payload, _ = done
 

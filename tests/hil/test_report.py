@@ -381,6 +381,10 @@ class TestPage:
         assert all(effect in whole.text for effect in make_results().effects)
         assert "lower bound" not in whole.text
         assert "lower bound" in rendered(make_results(effects=[])).text
+        linked = rendered(make_results(simulated_by_unknown=True)).text
+        assert "no true parameters are shown" in linked
+        assert "No robot moved" not in linked
+        assert not any(effect in linked for effect in make_results().effects)
         recording = rendered(real_recording())
         assert not {"simulated", "truth:", "planned"} & set(recording.text.lower().split())
         assert not any("Truth" in rows[0] for rows in recording.tables)

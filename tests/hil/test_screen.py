@@ -129,11 +129,27 @@ class TestPicture:
     def test_after_a_silence_it_shows_why_the_run_waits(self) -> None:
         screen = screen_of(status())
         assert any("open" in line for line in screen_lines(80, 24, screen))
-        screen._messages.append("waiting for the controller")
+        screen.say("waiting for the controller")
         screen._came -= 30.0
         lines = screen_lines(80, 24, screen)
         assert "no news for 30 s: waiting for the controller" in lines[1]
         assert not any("open" in line or line.startswith("joint_") for line in lines[:-1])
+
+    def test_between_two_motions_an_older_message_is_no_reason(self) -> None:
+        screen = screen_of(status())
+        screen.say("not checked for collisions: link_1 and link_2")
+        screen.show(RunStatus("repetition", 7, 30, 1145.0))
+        screen._came -= 30.0
+        line = screen_lines(80, 24, screen)[1]
+        assert "no motion for 30 s" in line
+        assert "collisions" not in line
+
+    def test_between_two_motions_it_shows_the_next_override(self) -> None:
+        screen = screen_of(RunStatus("dry run", 1, 2, 60.0, most=0.2))
+        assert "override 20 %" in screen_lines(80, 24, screen)[1]
+        screen.press("-")
+        assert screen.request().override == pytest.approx(0.1)
+        assert "override 10 %" in screen_lines(80, 24, screen)[1]
 
     def test_names_the_controller(self) -> None:
         cell = Cell.load(CELL_PATH)

@@ -41,7 +41,7 @@ from hil.control.simulator_on_link import Buttons, Served, open_controller_link
 from hil.control.simulator_process import free_port
 from sim_fixtures import ControllerSettings, Phase
 from sim_fixtures.ns16 import CELL_PATH
-from sim_fixtures.serve import Request, ServeCounts
+from sim_fixtures.serve import Latencies, Request, ServeCounts
 
 pytestmark = pytest.mark.long
 
@@ -395,8 +395,8 @@ class TestClosing:
     """The last lines of a session: words of a manual, and only counts that are not zero."""
 
     @staticmethod
-    def lines(foreign: int = 0, **counts: int) -> str:
-        controller: Any = SimpleNamespace(reason="")
+    def lines(foreign: int = 0, *, end: str = "replied", **counts: int) -> str:
+        controller: Any = SimpleNamespace(reason="", program=SimpleNamespace(end_packet=end))
         summary = ServeCounts(cycles=1164, first_packets=3, replies=1164, ended=True, **counts)
         return "\n".join(_sentences(Served(controller, summary, 1, 1, foreign)))
 
@@ -404,6 +404,25 @@ class TestClosing:
         text = self.lines()
         assert "1164 cycles, each with a valid reply in time" in text
         assert not re.search("knock|slip|foreign|surplus|rejected", text)
+
+    def test_of_another_end_than_504(self) -> None:
+        assert "the session has ended (504)" in self.lines()
+        assert "the session has ended (504, without a reply to it)" in self.lines(end="unanswered")
+        assert "the session has ended (without 504)" in self.lines(end="none")
+
+    def test_of_replies_after_their_cycle(self) -> None:
+        for counts in ({"extended": 3}, {"read_late": 2}):
+            text = self.lines(**counts)
+            assert "each with a valid reply in time" not in text
+            assert "each with a valid reply" in text
+        assert "2 replies counted as in time, but read later" in text
+
+    def test_percentiles_of_long_times_are_not_the_longest(self) -> None:
+        times = Latencies()
+        for milliseconds in range(1, 101):
+            times.add(1e-3 * milliseconds)
+        assert 0.049 < times.quantile(0.5) < 1.2 * 0.051
+        assert times.largest == 0.1
 
     def test_of_replies_that_were_of_no_use(self) -> None:
         text = self.lines(2, missed=4, late=1, rejected=3)

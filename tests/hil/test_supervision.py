@@ -22,7 +22,7 @@ from drivers.states import State
 from hil.archive import Archive, ArchiveSpec, ArchiveWriter, open_archive
 from hil.base.errors import ControllerError
 from hil.campaign import Stop
-from hil.campaign.operator import RunStatus, RunWatch
+from hil.campaign.operator import BETWEEN, ExpectedMotion, RunStatus, RunWatch
 from hil.cell import Cell
 from hil.control.connection import StartTimeout
 from hil.control.link import Standstill
@@ -421,6 +421,32 @@ def test_a_screen_that_fails_is_asked_all_the_same() -> None:
     assert watch.request().held
     assert watch.stop.requested
     assert "the run was stopped" in watch.problems[-1]
+
+
+def test_an_override_is_counted_once_in_the_time_left() -> None:
+    """Five motions of 8 s at 20 % of their speed, then two of 10 s at full speed."""
+    operator = Failing()
+    watch = RunWatch(operator, Stop())
+    slow = ExpectedMotion(8.0, 0.2, dry_run=True)
+    watch.expect([slow] * 5 + [ExpectedMotion(10.0)] * 2)
+
+    def left(override: float, done: float, duration: float) -> float:
+        operator.answer = OperatorRequest(override)
+        watch.request()
+        watch.show(MotionProgress(done, duration, 0, 0, 0, 0, State.OPEN))
+        return watch.status.time_left
+
+    watch.begin("dryrun", 1, 5, 8.0, 0.2)
+    full = 5 * 40.0 + 2 * 10.0 + 6 * BETWEEN
+    assert left(1.0, 0.0, 8.0) == pytest.approx(full)
+    assert left(0.3, 0.0, 8.0) == pytest.approx(full)
+    # What is requested in the dry run does not count for what follows it.
+    assert left(0.1, 0.0, 8.0) == pytest.approx(full + 5 * 40.0)
+    watch.begin("excitation", 1, 2, 10.0, 1.0)
+    assert left(0.5, 5.0, 10.0) == pytest.approx(10.0 + 20.0 + BETWEEN)
+    watch.end()
+    assert watch.status.motion is None
+    assert watch.status.time_left == pytest.approx(20.0 + BETWEEN)
 
 
 PERIOD = 0.002

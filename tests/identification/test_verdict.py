@@ -584,7 +584,18 @@ class TestJudgement:
         near = replace(LATE, delay=0.0005)
         finding = finding_of("delay", delays=near, assumed_delay=0.0004)
         assert finding.level == "good"
-        assert "(0 ms assumed, 0.4 ms in the fit)" in finding.words
+        assert finding.words == (
+            "the torque lags the position by 0.5 ± 0.2 ms (0 ms stated, 0.4 ms in the fit), which "
+            "agrees with what the fit assumed"
+        )
+
+    def test_a_delay_outside_its_interval_is_not_as_assumed(self):
+        """A difference of less than 60 % of a cycle does not matter, but it is one."""
+        near = replace(LATE, delay=0.0004)
+        finding = finding_of("delay", delays=near, assumed_delay=0.0)
+        assert finding.level == "good"
+        assert "as assumed" not in finding.words
+        assert "by 0.4 ± 0.2 ms (0 ms stated), within 0.6 ms of what the fit" in finding.words
 
     def test_models_of_the_same_fit_that_predict_apart_are_named(self):
         large = an_error(0.2)

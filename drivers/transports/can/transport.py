@@ -20,7 +20,7 @@ from can.interfaces.slcan import slcanBus
 from can.interfaces.udp_multicast import UdpMulticastBus
 
 from drivers.errors import TransportClosed
-from drivers.transports.base import CanBus, TransportError, TransportSpec
+from drivers.transports.base import CanBus, LinkInUseError, TransportError, TransportSpec
 from drivers.transports.can.profile import DOWN, BusRates, CanError, End, Frame
 
 logging.getLogger("can").addHandler(logging.NullHandler())  # our errors have its reasons
@@ -274,8 +274,8 @@ def lock_bus(interface: str, channel: str) -> int | None:
     except OSError as error:
         holder = os.pread(lock, 20, 0).decode("ascii", "replace").strip()
         os.close(lock)
-        reason = f"another program uses it (process {holder or 'unknown'})"
-        raise TransportError(link, reason, "wait for it to end, or stop it") from error
+        process = int(holder) if holder.isdecimal() else None
+        raise LinkInUseError(link, process, "wait for it to end, or stop it") from error
     os.ftruncate(lock, 0)
     os.pwrite(lock, f"{os.getpid()}\n".encode(), 0)
     return lock

@@ -123,6 +123,7 @@ class DelayFacts:
     half_interval: float  # of 95 %
     stated: float
     assumed: float  # in the fit
+    tolerance: float  # below which a difference from it does not matter
     outcome: _DelayOutcome | None  # None: not determined
 
     @classmethod
@@ -152,6 +153,7 @@ class DelayFacts:
             half_interval=1e3 * delays.half_interval,
             stated=1e3 * delays.assumed,
             assumed=1e3 * assumed,
+            tolerance=1e3 * beyond,
             outcome=outcome,
         )
 
@@ -188,11 +190,14 @@ class DelayFacts:
             )
         elif self.outcome == "as assumed":
             used = "" if self.assumed == self.stated else f", {self.assumed:.3g} ms in the fit"
+            what = f"the torque lags the position by {estimate}"
+            within = f"within {self.tolerance:.2g} ms of what the fit assumed"
+            if abs(self.delay - self.assumed) <= self.half_interval:
+                within = "which agrees with what the fit assumed"
             yield Finding(
                 "delay",
                 "good",
-                f"the delay of the torque is as assumed: {estimate} ({self.stated:.3g} ms"
-                f" assumed{used})",
+                f"{what} ({self.stated:.3g} ms stated{used}), {within}",
             )
 
 

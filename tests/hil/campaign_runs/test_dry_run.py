@@ -13,11 +13,12 @@ from hil.campaign import (
     Campaign,
     CampaignFolderError,
 )
-from hil.campaign.dry_run import OVERRIDE, DryRunRecord, agreement
+from hil.campaign.dry_run import OVERRIDE, DryRunRecord, agreement, not_accepted
 from hil.campaign.errors import (
     AgainstGravityError,
     DryRunError,
 )
+from hil.campaign.folder import CampaignFolder
 from hil.control.motion_watch import Stop
 from hil.control.simulation import simulated_link
 from tests.hil.campaign_runs.rig import Make, Operator, Real, kinds, peak_speed
@@ -114,6 +115,18 @@ def test_a_mirrored_joint_is_accepted_by_its_name_only(tmp_path: Path, designed:
     assert not campaign.folder.completed("excitation")
     done = campaign.run(accept_dry_run=True, accept_torque=against)
     assert (done.complete, done.against_gravity) == (True, against)
+
+
+def test_with_an_assumed_payload_its_centre_is_the_first_cause(tmp_path: Path) -> None:
+    folder = CampaignFolder(tmp_path)
+    record = DryRunRecord(
+        "0", 0.2, ("a.mcap",), 1.0, False, ("shoulder",), (0.1,), (0.0,), 0, 0,
+        against_gravity=("shoulder",),
+    )  # fmt: skip
+    loaded = replace(record, assumed_payload=True)
+    assert "--payload-centre" not in record.warnings[0]
+    for text in (loaded.warnings[0], str(not_accepted(folder, loaded, ("shoulder",)))):
+        assert text.index("--payload-centre") < text.index("joint_sign")
 
 
 def test_a_torque_is_judged_by_weight_beside_friction() -> None:

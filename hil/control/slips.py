@@ -1,0 +1,84 @@
+"""Slips of a measured position within a motion, by its archive.
+
+A slip of less than the following-error threshold passes the controller and the guard, and every
+later motion of the joint is off by it. The positions show it, or the velocities recorded with them
+contradict it.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+from typing import Final
+
+import numpy as np
+
+from hil.archive import open_archive
+from hil.archive.header import REJECTED
+from hil.archive.recordings import recording_of
+from hil.archive.repair import amend_outcome
+from hil.base.arrays import Array
+from hil.base.errors import ArchiveError
+from identification.validation.position_jumps import PositionJump, position_jumps
+
+from .errors import SlippedError
+
+CHECKED: Final = ("completed", "stopped")
+"""Outcomes of motions whose measured positions are checked; the others are failures already."""
+_FIELDS: Final = ("cycle", "gap", "position", "velocity")
+
+
+def slip_of(path: Path) -> str:
+    """Return the largest slip of a measured position in an archive, in a sentence; "" for none.
+
+    Raises:
+        ArchiveError: it cannot be read.
+    """
+    try:
+        archive = open_archive(path, fields=_FIELDS)
+        recording = recording_of(archive)
+    except ArchiveError:
+        if path.exists() and not open_archive(path, fields=()).n_samples:
+            return ""  # nothing was recorded
+        raise
+    found = position_jumps(recording)
+    velocity = archive.columns.get("velocity")
+    if velocity is not None and archive.period is not None:
+        position = recording.position
+        driven = _travel(velocity, recording.time)
+        jumps = position_jumps(replace(recording, position=position - driven))
+        names = recording.joint_names
+        found += [jump for jump in jumps if not _frozen(recording.time, position, names, jump)]
+    if not found:
+        return ""
+    largest = max(found, key=lambda jump: abs(jump.size))
+    return (
+        f"the measured position of {largest.joint} slipped by {np.degrees(abs(largest.size)):.2g}° "
+        f"{largest.time:.2f} s after the archive begins, which no motion of the arm explains"
+    )
+
+
+def require_no_slip(motion: str, path: Path) -> None:
+    """Reject the archive of a motion in which a measured position slipped.
+
+    Raises:
+        SlippedError: it did.
+        ArchiveError: the archive cannot be read, or changed.
+    """
+    if slip := slip_of(path):
+        amend_outcome(path, REJECTED, slip)
+        raise SlippedError(motion, slip, path.name)
+
+
+def _travel(velocity: Array, time: Array) -> Array:
+    """Return how far the joints moved by their velocities (m, n) since the first sample."""
+    mean = 0.5 * (velocity[1:] + velocity[:-1])
+    steps = np.where(np.isfinite(mean), mean, 0.0) * np.diff(time)[:, None]
+    return np.concatenate([np.zeros_like(velocity[:1]), np.cumsum(steps, axis=0)])
+
+
+def _frozen(time: Array, position: Array, names: tuple[str, ...], jump: PositionJump) -> bool:
+    """Return whether a jump ends a position that was repeated, not measured anew."""
+    row = int(np.searchsorted(time, time[0] + jump.time))
+    column = position[:, names.index(jump.joint)]
+    return row < 2 or bool(column[row - 1] == column[row - 2])
