@@ -10,7 +10,7 @@ import ast
 import re
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cache, cached_property
 from graphlib import CycleError, TopologicalSorter
 from pathlib import Path
 from typing import Final
@@ -39,6 +39,18 @@ _ALIASES: Final = {f"{package}.arrays" for package in PACKAGES} | {"hil.base.arr
 _LONG: Final = 60  # Lines of a function, characters of a test's name
 
 
+@cache
+def tree_of(module: Path) -> ast.Module:
+    """Syntax tree of a module, parsed once for all tests of a process."""
+    return ast.parse(module.read_text("utf-8"))
+
+
+@cache
+def nodes_of(module: Path) -> tuple[ast.AST, ...]:
+    """All nodes of a module, likewise."""
+    return tuple(ast.walk(tree_of(module)))
+
+
 @dataclass(frozen=True)
 class Sources:
     """Python files of the five packages by module name."""
@@ -58,12 +70,12 @@ class Sources:
     @cached_property
     def trees(self) -> dict[str, ast.Module]:
         """Syntax tree of each module."""
-        return {name: ast.parse(path.read_text("utf-8")) for name, path in self.files.items()}
+        return {name: tree_of(path) for name, path in self.files.items()}
 
     @cached_property
     def nodes(self) -> dict[str, tuple[ast.AST, ...]]:
         """All nodes of each module."""
-        return {name: tuple(ast.walk(tree)) for name, tree in self.trees.items()}
+        return {name: nodes_of(path) for name, path in self.files.items()}
 
     @cached_property
     def imports(self) -> dict[str, set[str]]:
@@ -269,7 +281,7 @@ def sizes(sources: Sources) -> dict[str, int]:
         package: [tree for name, tree in sources.trees.items() if name.split(".")[0] == package]
         for package in PACKAGES
     }
-    trees["tests"] = [ast.parse(path.read_text("utf-8")) for path in _tests()]
+    trees["tests"] = [tree_of(path) for path in _tests()]
     table = {f"statements of {name}": sum(map(statements, some)) for name, some in trees.items()}
     classes = [
         node

@@ -8,14 +8,13 @@ from __future__ import annotations
 
 import ast
 import re
-from collections.abc import Iterator, Mapping
-from pathlib import Path
+from collections.abc import Iterable, Iterator, Mapping
 from typing import Final
 
 import pytest
 
-ROOT: Final = Path(__file__).resolve().parents[1]
-PACKAGES: Final = ("drivers", "planner", "identification", "sim_fixtures", "hil")
+from tests.house import ROOT, Sources, nodes_of
+
 TEXTS: Final = re.compile(
     r"(\w+_)?(notes?|lines?|text|reasons?|messages?|warnings?|words|sentences?|problems?|remedy"
     r"|remedies|description|method|msg|stderr)"
@@ -95,9 +94,9 @@ def is_sentence(node: ast.expr) -> bool:
     return isinstance(node, ast.Constant) and " " in str(node.value).strip()
 
 
-def readings(tree: ast.AST) -> Iterator[int]:
+def readings(nodes: Iterable[ast.AST]) -> Iterator[int]:
     """Yield the lines of a module in which a text is read."""
-    for node in ast.walk(tree):
+    for node in nodes:
         match node:
             case ast.Call(func=ast.Attribute(value=value, attr=name)) if name in SEARCHES:
                 if is_text(value) and node.args:
@@ -115,27 +114,18 @@ def readings(tree: ast.AST) -> Iterator[int]:
                     yield node.lineno
 
 
-def modules() -> Iterator[tuple[str, Path]]:
-    for package in PACKAGES:
-        for path in sorted((ROOT / package).rglob("*.py")):
-            name = ".".join(path.relative_to(ROOT).with_suffix("").parts)
-            yield name.removesuffix(".__init__"), path
-
-
 def test_no_module_reads_a_text_of_ours() -> None:
     found = {
         f"{name}:{line}"
-        for name, path in modules()
+        for name, path in Sources.read().files.items()
         if name not in FOREIGN and name not in OURS
-        for line in readings(ast.parse(path.read_text("utf-8")))
+        for line in readings(nodes_of(path))
     }
     assert not found
 
 
 def test_every_exception_is_needed() -> None:
-    reading = {
-        name for name, path in modules() if any(readings(ast.parse(path.read_text("utf-8"))))
-    }
+    reading = {name for name, path in Sources.read().files.items() if any(readings(nodes_of(path)))}
     assert {*FOREIGN, *OURS} <= reading
 
 
@@ -163,9 +153,9 @@ def test_no_page_reads_a_text_of_ours() -> None:
     ],
 )
 def test_what_counts_as_reading(source: str) -> None:
-    assert list(readings(ast.parse(source)))
+    assert list(readings(ast.walk(ast.parse(source))))
 
 
 @pytest.mark.parametrize("source", ['"; ".join(lines)', "line.strip()", "joint in joints"])
 def test_what_does_not(source: str) -> None:
-    assert not list(readings(ast.parse(source)))
+    assert not list(readings(ast.walk(ast.parse(source))))

@@ -100,7 +100,9 @@ class ArrayFile:
         """Return an array as a matrix; without a name the only one there is, else SourceError."""
         return self._matrix(name, field).astype(np.float64)
 
-    def times(self, column: Column, decimals: int, array: str | None = None) -> list[int | None]:
+    def times(
+        self, column: Column, decimals: int, array: str | None = None
+    ) -> Sequence[int | None]:
         """Return times as whole nanoseconds, None where one is missing.
 
         There are `decimals` decimal places between the unit and the second; dates in numpy's types

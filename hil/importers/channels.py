@@ -213,7 +213,7 @@ _Place = TypeVar("_Place", int, str)
 def _repeated_times(table: Table | ArrayFile, places: Sequence[_Place]) -> set[_Place]:
     """Return the columns of times that are all those of a column before."""
     repeated = set()
-    earlier: list[list[int | None]] = []
+    earlier: list[Sequence[int | None]] = []
     for place in places if len(places) > 1 else ():
         try:
             times = table.times(place, 0)

@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 import csv
+import math
 import re
 from collections.abc import Sequence
+from functools import cache
 from typing import Final, NamedTuple
-
-import numpy as np
 
 from hil.importers.column_map import Format
 
@@ -85,7 +85,7 @@ def number_of(text: str) -> float:
     try:
         return float(text)
     except ValueError:
-        return np.nan
+        return math.nan
 
 
 def thousands_mark(text: str, dialect: Dialect) -> str | None:
@@ -94,6 +94,7 @@ def thousands_mark(text: str, dialect: Dialect) -> str | None:
     return None if match is None else match["mark"]
 
 
+@cache
 def _groups(decimal: str) -> re.Pattern[str]:
     marks = "".join(mark for mark in _THOUSANDS if mark != decimal)
     return re.compile(
@@ -129,12 +130,15 @@ def is_date(cell: str) -> bool:
 
 def is_written(cell: str, dialect: Dialect) -> bool:
     """Return whether a cell is a number in this dialect, a missing one, or a date stamp."""
+    pointed = dialect.decimal == "," and "." in cell
+    numeral = cell.replace(dialect.decimal, ".")
+    if not pointed and math.isfinite(number_of(numeral)):  # as most cells are
+        return True
     if cell.lower() in _MISSING_TEXTS or _DATE.fullmatch(cell):
         return True
-    if dialect.decimal == "," and "." in cell:
+    if pointed:
         return thousands_mark(cell, dialect) is not None
-    numeral = cell.replace(dialect.decimal, ".")
-    is_number = np.isfinite(number_of(FORTRAN.sub("e", numeral))) or numeral.lower() in (
+    is_number = math.isfinite(number_of(FORTRAN.sub("e", numeral))) or numeral.lower() in (
         "inf",
         "-inf",
     )

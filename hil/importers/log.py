@@ -277,7 +277,7 @@ class _Log:
         valid = np.ones(len(joined.stamp), np.bool_)
         return _Clock(joined.stamp, valid, clock.origin, clock.path), joined.values
 
-    def _times(self, file: Table | ArrayFile, time: TimeColumn) -> list[int | None]:
+    def _times(self, file: Table | ArrayFile, time: TimeColumn) -> Sequence[int | None]:
         """Return the times of a file [ns], None where one is missing."""
         if time.nanoseconds is None:
             unit = time.unit or self._unit_of_time(file, time)

@@ -8,6 +8,7 @@ import re
 from collections.abc import Collection, Sequence
 from dataclasses import dataclass, field
 from decimal import Decimal
+from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final, NamedTuple
 
@@ -71,6 +72,7 @@ class Table:
     gaps: bool  #: whether rows may lack numbers
     left_out: tuple[LeftOut, ...] = ()
     _converted: dict[tuple[int, ...], Array] = field(default_factory=dict, compare=False)
+    _times: dict[tuple[int, int], Sequence[int | None]] = field(default_factory=dict, compare=False)
 
     @classmethod
     def read(cls, path: Path, form: Format) -> Table:
@@ -176,16 +178,23 @@ class Table:
         """Return all columns; see `numbers`."""
         return self.numbers(range(self.width), field)
 
-    def times(self, column: Column, decimals: int, _array: str | None = None) -> list[int | None]:
+    def times(
+        self, column: Column, decimals: int, _array: str | None = None
+    ) -> Sequence[int | None]:
         """Return a column of times as whole nanoseconds, exactly; of a single line, that line.
 
         There are `decimals` decimal places between the column's unit and the second; a date stamp
-        needs none. Missing times are None where they are allowed.
+        needs none. Missing times are None where they are allowed. They are converted once.
 
         Raises:
             SourceError: no such column, or a time that is neither a number nor a date.
         """
-        index = self._index(column, "time")
+        key = self._index(column, "time"), decimals
+        if key not in self._times:
+            self._times[key] = tuple(self._converted_times(*key))
+        return self._times[key]
+
+    def _converted_times(self, index: int, decimals: int) -> list[int | None]:
         if len(self.lines) == 1 and not self.names:
             texts = self.dialect.cells(self.lines[0])
             numbers = [self.numbered[0]] * len(texts)
@@ -231,21 +240,26 @@ class Table:
             remedy = f"it has {self.width} columns and no header; count them from 0"
         raise SourceError(self.path, f"there is no column {column!r}", field=field, remedy=remedy)
 
+    @cached_property
+    def _widest(self) -> int:
+        """Largest number of cells in a line."""
+        delimiter = self.dialect.delimiter
+        return max(
+            len(self.dialect.cells(line) if '"' in line else line.split(delimiter))
+            for line in self.lines
+        )
+
     def _frame(self, indices: Sequence[int], **options: Any) -> pd.DataFrame:
         """Return columns by index, one row for each line."""
         import pandas as pd  # 0.4 s; only a text table needs it
 
         text = "\n".join(self.lines)
         delimiter = self.dialect.delimiter
-        width = max(
-            len(self.dialect.cells(line) if '"' in line else line.split(delimiter))
-            for line in self.lines
-        )
         return pd.read_csv(
             io.StringIO(text),
             sep=r"\s+" if delimiter is None else delimiter,
             header=None,
-            names=range(max(width, self.width)),
+            names=range(max(self._widest, self.width)),
             usecols=sorted(set(indices)),
             index_col=False,
             skipinitialspace=True,

@@ -376,7 +376,11 @@ def _low_passed(
     for segment in segments:
         if segment.stop - segment.start < _SHORTEST_SEGMENT:
             continue
-        for value in np.unique(bandwidth):
+        widths = np.unique(bandwidth)
+        if len(widths) == 1:
+            filtered[segment] = low_passed(time[segment], columns[segment], float(widths[0]), shape)
+            continue
+        for value in widths:
             alike = bandwidth == value
             filtered[segment, alike] = low_passed(
                 time[segment], columns[segment][:, alike], float(value), shape

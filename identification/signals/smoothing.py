@@ -151,6 +151,9 @@ ORDER: Final = DEGREE + 1  # non-zero basis functions per knot interval
 # normal equations.
 _LIGHTEST: Final = 1e-9
 _HEAVIEST: Final = 1e11
+_ROUNDED: Final = 1e4
+"""Penalty, per samples of a knot, above which the normal equations lose digits: their solution is
+then that of the lightest penalty and a correction."""
 _PENALTY: Final = 1e-2  # of its logarithm; 0.2 % of the bandwidth
 _FLAT: Final = 1e-6  # slope of the residual over the penalty that is none
 _KNOT_OF_CUTOFF: Final = 0.5  # radians of the cutoff frequency per knot
@@ -206,9 +209,16 @@ def fit_smoothing_spline(
 def low_pass(time: Array, values: Array, bandwidth: float) -> Array:
     """Filter values (m, c) by the same smoother with a fixed bandwidth [Hz]: linear, zero-phase."""
     step = float(np.median(np.diff(time)))
-    problem = _Problem.of(time, values, max(step, _KNOT_OF_CUTOFF / (2.0 * np.pi * bandwidth)))
-    correction = problem.correction(slice(None), problem.penalty_at(bandwidth))
-    return np.asarray(problem.design.rows @ (problem.closest + correction))
+    times = time.tobytes()
+    spacing = max(step, _KNOT_OF_CUTOFF / (2.0 * np.pi * bandwidth))
+    design = _design(times, spacing)
+    penalty, factor = _low_pass_factor(times, spacing, bandwidth)
+    if penalty > _ROUNDED * design.density:  # of few samples, as the knots follow the bandwidth
+        problem = _Problem.of(time, values, spacing)
+        coefficients = problem.closest + problem.correction(slice(None), penalty)
+    else:
+        coefficients = _banded_solution(factor, design.transposed @ values)
+    return np.asarray(design.rows @ coefficients)
 
 
 class _Design(NamedTuple):
@@ -220,7 +230,16 @@ class _Design(NamedTuple):
     transposed: scipy.sparse.csc_array  # (k, m)
     gram: Array  # (6, k) lower band of rows' rows
     penalty: Array  # (6, k) lower band of the roughness
-    lightest: Array  # (6, k) factor with the lightest penalty
+
+    def penalty_at(self, bandwidth: float) -> float:
+        """Return the penalty of a bandwidth [Hz], within the limits of the knots."""
+        cutoff = 2.0 * np.pi * bandwidth * self.spacing  # rad per knot
+        share = np.clip(1.0 / max(cutoff, 1e-3) ** 6, _LIGHTEST, _HEAVIEST)
+        return float(self.density * share)
+
+    def factor(self, penalty: float) -> Array:
+        """Return the factor (6, k) of the normal equations with a penalty."""
+        return _banded_factor(self.gram + penalty * self.penalty)
 
 
 @lru_cache(maxsize=2)  # torques and columns of one recording are filtered one after the other
@@ -233,9 +252,15 @@ def _design(times: bytes, spacing: float) -> _Design:
     density = len(time) / intervals
     rows = _rows(float(time[0]), spacing, intervals, time)
     gram = _gram_band(rows)
-    penalty = _penalty_band(intervals)
-    lightest = _banded_factor(gram + _LIGHTEST * density * penalty)
-    return _Design(spacing, density, rows, rows.T, gram, penalty, lightest)
+    return _Design(spacing, density, rows, rows.T, gram, _penalty_band(intervals))
+
+
+@lru_cache(maxsize=2)
+def _low_pass_factor(times: bytes, spacing: float, bandwidth: float) -> tuple[float, Array]:
+    """Return the penalty of a bandwidth [Hz], and the factor (6, k) with it, of a design."""
+    design = _design(times, spacing)
+    penalty = design.penalty_at(bandwidth)
+    return penalty, design.factor(penalty)
 
 
 @dataclass(frozen=True, eq=False)
@@ -251,12 +276,13 @@ class _Problem:
     def of(cls, time: Array, values: Array, spacing: float) -> _Problem:
         """Set up the problem with about this knot spacing [s]."""
         design = _design(time.tobytes(), spacing)
-        closest = _banded_solution(design.lightest, design.transposed @ values)
+        light = _LIGHTEST * design.density
+        factor = design.factor(light)
+        closest = _banded_solution(factor, design.transposed @ values)
         residual = design.rows @ closest
         np.subtract(values, residual, out=residual)
-        light = _LIGHTEST * design.density
         refined = design.transposed @ residual - light * _roughness(closest)
-        closest += _banded_solution(design.lightest, refined)
+        closest += _banded_solution(factor, refined)
         np.subtract(values, design.rows @ closest, out=residual)
         return cls(design, closest, residual, _roughness(closest))
 
@@ -267,22 +293,16 @@ class _Problem:
     def _corrected(self, penalty: float, roughness: Array) -> tuple[Array, Array]:
         """Return the factor (6, k) of the normal equations, and the change of coefficients."""
         design = self.design
-        factor = _banded_factor(design.gram + penalty * design.penalty)
+        factor = design.factor(penalty)
         change = penalty - _LIGHTEST * design.density
         return factor, _banded_solution(factor, -change * roughness)
-
-    def penalty_at(self, bandwidth: float) -> float:
-        """Return the penalty of a bandwidth [Hz], within the limits of the knots."""
-        cutoff = 2.0 * np.pi * bandwidth * self.design.spacing  # rad per knot
-        share = np.clip(1.0 / max(cutoff, 1e-3) ** 6, _LIGHTEST, _HEAVIEST)
-        return float(self.design.density * share)
 
     def penalty_for(self, channel: int, tolerance: float, widest: float) -> float:
         """Return the penalty at which a channel's mean squared residual equals the tolerance.
 
         By Newton's method in logarithms, or bisection where a step would leave the bracket.
         """
-        low, high = (float(np.log(self.penalty_at(width))) for width in (widest, 0.0))
+        low, high = (float(np.log(self.design.penalty_at(width))) for width in (widest, 0.0))
         closest = np.ascontiguousarray(self.closest_residual[:, channel])
         roughness = np.ascontiguousarray(self.roughness[:, channel])
         point = low

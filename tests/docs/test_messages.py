@@ -13,8 +13,9 @@ from pydantic import BaseModel
 from hil.cell.schema import CellFile
 from hil.design.settings import DesignSettings
 from hil.importers.column_map import ColumnMap
-from tests.docs.test_words import MODULES, docstrings, nodes_of
+from tests.docs.test_words import MODULES, docstrings
 from tests.docs.typed import ROOT, command_of, options
+from tests.house import nodes_of
 
 FIELD = "FIELD"
 OPTION = re.compile(r"(?<![\w-])--[a-z][a-z-]+")

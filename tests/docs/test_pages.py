@@ -13,6 +13,7 @@ from pathlib import Path
 import pytest
 
 from tests.docs.typed import PAGES, ROOT, command_of, options
+from tests.house import nodes_of
 
 NAME = re.compile(r"`((?:hil|drivers|planner|identification|sim_fixtures)(?:\.\w+)+)(?:\(\))?`")
 RECORDS = {"hil.outcome"}  # metadata of an archive
@@ -85,7 +86,7 @@ COMMAND = re.compile(r"`hil ([^`]+)`")
 
 def sentences(module: Path) -> Iterator[str]:
     """The strings of a module; a figure in one of them is an X."""
-    for node in ast.walk(ast.parse(module.read_text("utf-8"))):
+    for node in nodes_of(module):
         if isinstance(node, ast.JoinedStr):
             yield "".join(str(getattr(part, "value", "X")) for part in node.values)
         elif isinstance(node, ast.Constant) and isinstance(node.value, str):

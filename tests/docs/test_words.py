@@ -11,7 +11,7 @@ from pathlib import Path
 import pytest
 
 from tests.docs.typed import PAGES, ROOT
-from tests.house import PACKAGES
+from tests.house import PACKAGES, nodes_of
 
 MODULES = [path for name in PACKAGES for path in sorted((ROOT / name).rglob("*.py"))]
 TEMPLATES = sorted((ROOT / "hil" / "report" / "templates").glob("*.j2"))
@@ -30,16 +30,6 @@ LITERAL = {
 }
 INDEX = re.compile(r"\bpypi\b|\bconda\b|\bnpm\b|https?://\S*/simple\b", re.IGNORECASE)
 MOST_TERMS = 72
-
-
-@cache
-def tree_of(module: Path) -> ast.Module:
-    return ast.parse(module.read_text("utf-8"))
-
-
-@cache
-def nodes_of(module: Path) -> tuple[ast.AST, ...]:
-    return tuple(ast.walk(tree_of(module)))
 
 
 def docstrings(module: Path) -> set[ast.AST]:
@@ -101,9 +91,9 @@ class TestWords:
         assert not INDEX.search(page.read_text("utf-8"))
 
 
-def fields_with_percent(tree: ast.AST) -> Iterator[ast.FormattedValue]:
+def fields_with_percent(module: Path) -> Iterator[ast.FormattedValue]:
     """Fields of f-strings with a per cent sign at once behind the number."""
-    for text in (node for node in ast.walk(tree) if isinstance(node, ast.JoinedStr)):
+    for text in (node for node in nodes_of(module) if isinstance(node, ast.JoinedStr)):
         for part, after in zip(text.values, [*text.values[1:], None], strict=True):
             if isinstance(part, ast.FormattedValue):
                 spec = ast.unparse(part.format_spec) if part.format_spec is not None else ""
@@ -117,8 +107,7 @@ class TestPercentages:
     def test_messages_have_a_space_before_the_sign(self, package: str) -> None:
         wrong: list[str] = []
         for module in (path for path in MODULES if path.is_relative_to(ROOT / package)):
-            tree = tree_of(module)
-            wrong += [f"{module}:{field.lineno}" for field in fields_with_percent(tree)]
+            wrong += [f"{module}:{field.lineno}" for field in fields_with_percent(module)]
             literals = ((k, text) for k, text, inner in texts(module) if not inner)
             wrong += found(module, literals, re.compile(r"[^.{}]\d%(?!})|\{[^{}]*%\}"))
         assert not wrong, "use identification.text.percentage:\n" + "\n".join(wrong)

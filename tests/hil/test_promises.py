@@ -32,7 +32,7 @@ def kept(cell: Cell, required: str, seeds: range, within: float = 1.25) -> dict:
 def test_a_promise_that_is_kept_asks_for_no_other_motion() -> None:
     """Two joints in cycles of 2 ms: intervals of the delay were ten times its error."""
     cell = Cell.load(TWO_JOINTS)
-    figures = kept(cell, "parameters 5 %, torque 0.5, friction 2 %", range(1, 4))
+    figures = kept(cell, "parameters 5 %, torque 0.5, friction 2 %", range(1, 2))
     assert figures["repetitions"] == 2
 
 
