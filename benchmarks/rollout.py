@@ -48,7 +48,6 @@ from identification.model.motion import Motion
 from identification.rollout.comparison import (
     HORIZONS,
     RecordedMotion,
-    ToolFrame,
     continued,
     errors_of,
     horizon_rows,
@@ -169,7 +168,7 @@ def _print_comparison(name: str, archives: Sequence[Path], iterations: int) -> N
     print(f"{'position error (rms) [mrad]':30}" + "".join(f"{f'{h:g} s':>10}" for h in HORIZONS))
     measured = held_out.windows.reached[:, horizon_rows(held_out.windows)]
     for label, (positions, spent) in rows.items():
-        joints = errors_of(positions, measured, ToolFrame(arm)).joints
+        joints = errors_of(positions, measured, arm.model.chain).joints
         overall = 1e3 * np.sqrt(np.mean(joints**2, axis=1))
         figures = "".join(f"{error:10.3g}" for error in overall)
         print(

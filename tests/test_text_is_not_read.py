@@ -33,6 +33,7 @@ FOREIGN: Final[Mapping[str, str]] = {
     "hil.cli": "the docstrings of commands, and what typer says of pydantic",
     "hil.cli.arguments": "options",
     "hil.cli.imports": "options",
+    "hil.cli.purpose_options": "quantities that the user writes",
     "hil.precision.requirements": "requirements that the user writes",
     "hil.importers.bags": "errors of rosbags",
     "hil.importers.column_map": "the first comment of a ready map",

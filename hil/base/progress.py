@@ -121,6 +121,28 @@ class Messages(LineReporter):
         yield Task(lambda _done, _note: None)
 
 
+class Collecting:
+    """Keeps the messages, for a command that shows one screen; progress is shown by another."""
+
+    def __init__(self, progress: Reporter) -> None:
+        self._progress = progress
+        self.lines: list[str] = []
+
+    def say(self, text: str) -> None:
+        """Keep the line."""
+        self.lines.append(text)
+
+    def step(self, text: str) -> None:
+        """Show what is being done."""
+        self._progress.step(text)
+
+    @contextmanager
+    def task(self, title: str, total: float) -> Iterator[Task]:
+        """Show the progress of a task."""
+        with self._progress.task(title, total) as task:
+            yield task
+
+
 class Bar:
     """rich progress bars on a terminal; `output` receives the messages, by default it too."""
 
@@ -170,8 +192,13 @@ class _WithNote(Progress):
             yield Text(task.fields["note"], no_wrap=True, overflow="ellipsis")
 
 
-def reporter(*, quiet: bool = False) -> Reporter:
-    """Return a reporter, silent if `quiet`: messages on standard output, progress on a terminal."""
+def reporter(*, quiet: bool = False, messages: bool = True) -> Reporter:
+    """Return a reporter, silent if `quiet`: messages on standard output, progress on a terminal.
+
+    Without `messages` there is progress alone.
+    """
+    if not messages:
+        return Collecting(reporter(quiet=quiet))
     if quiet:
         return Silent()
     console = progress_console()

@@ -18,6 +18,7 @@ ARM = "Arm"
 CHANNELS = "Channels of logs and bags"
 ESTIMATION = "Estimation"
 PAYLOAD = "Payload"
+PURPOSE = "Purpose"
 """Panels of options in help texts."""
 
 CampaignArgument = Annotated[Path, typer.Argument(help="Campaign folder (`hil design -o`).")]
@@ -29,6 +30,9 @@ ArchivesArgument = Annotated[
     ),
 ]
 QuietOption = Annotated[bool, typer.Option("--quiet", "-q", help="Print only the result.")]
+VerboseOption = Annotated[
+    bool, typer.Option("--verbose", "-v", help="Print everything, not one screen.")
+]
 JsonOption = Annotated[bool, typer.Option("--json", help="Print one JSON object.")]
 DhOption = Annotated[
     Path | None,

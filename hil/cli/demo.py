@@ -22,7 +22,7 @@ from hil.campaign import (
 )
 from hil.campaign.planned_motions import require_runnable
 from hil.cell import Cell
-from hil.cli.arguments import JsonOption, QuietOption
+from hil.cli.arguments import JsonOption, QuietOption, VerboseOption
 from hil.cli.verdict import finish
 from hil.control.errors import stopped
 from hil.control.simulation import simulated_link, simulated_provenance
@@ -42,12 +42,13 @@ def demo(
     force: bool = False,
     resume: bool = False,
     quiet: QuietOption = False,
+    verbose: VerboseOption = False,
     json: JsonOption = False,
 ) -> None:
     """Design, run, archive, identify and report a campaign on the simulated COMAU NS 16.
 
-    Writes `archives/*.mcap`, `results.json` and `report.html` to OUTPUT. The last line printed is
-    the verdict: how well the identified model predicts motions that were not fitted. No hardware is
+    Writes `archives/*.mcap`, `results.json` and `report.html` to OUTPUT. Prints first
+    what the identified model is good for, judged on motions that were not fitted. No hardware is
     used; controller, drives and arm are simulated down to the packet, in virtual time.
 
     Options:
@@ -62,7 +63,7 @@ def demo(
         force: Replace an earlier campaign in OUTPUT.
         resume: Continue an interrupted campaign in OUTPUT.
     """
-    reporter = make_reporter(quiet=quiet or json)
+    reporter = make_reporter(quiet=quiet or json, messages=verbose)
     if resume:
         if excitation is not None:
             problem = "contradicts --resume, which continues with the excitation of the campaign"
@@ -84,7 +85,9 @@ def demo(
         _make_room(output)
         campaign = Campaign.create(output, cell, plan)
     _run(campaign, reporter, effects=effects)
-    finish(campaign.identify(reporter=reporter).results, json=json, quiet=quiet)
+    results = campaign.identify(reporter=reporter).results
+    written = (output, output / REPORT)
+    finish(results, json=json, quiet=quiet, verbose=verbose, written=written)
 
 
 def _require_same(

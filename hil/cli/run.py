@@ -24,6 +24,7 @@ from hil.cli.arguments import (
     CampaignArgument,
     JsonOption,
     QuietOption,
+    VerboseOption,
     print_json,
     with_options,
 )
@@ -32,6 +33,8 @@ from hil.cli.weigh import Weighing, weigh
 from hil.control.cell_link import require_real_time
 from hil.control.errors import stopped
 from hil.precision.requirements import Requirement
+from hil.report.output_files import REPORT
+from hil.weighing.payload_campaign import assumes_payload
 
 
 @with_options(Weighing, "weighing")
@@ -48,6 +51,7 @@ def run(
     weighing: Weighing,
     live: Annotated[str | None, typer.Option(metavar="[HOST:]PORT")] = None,
     quiet: QuietOption = False,
+    verbose: VerboseOption = False,
     json: JsonOption = False,
 ) -> None:
     """Run the missing motions of a campaign on its controller, then identify and report.
@@ -70,8 +74,7 @@ def run(
         dry_run: Run only the dry run: every motion at 20 % of its speed.
         accept_dry_run: Confirm that the dry run was watched and its motions are clear. On a
             simulated controller no earlier dry run is needed.
-        accept_torque: With --accept-dry-run: confirm that the torque of this joint had a known
-            reason to oppose the modelled gravity in the dry run (repeatable).
+        accept_torque: Joint whose torque had a known reason to oppose gravity in the dry run.
         no_identify: Only run; no parameters and no report.
         until_precise: End the repetitions when the required precision is reached, or when more of
             them do not help. Their number in [campaign] is the limit.
@@ -94,7 +97,7 @@ def run(
     if result is not None and (dry_run or no_identify):
         _print(result, json=json)
     elif result is not None:
-        _identify(opened, result, quiet=quiet, json=json)
+        _identify(opened, result, quiet=quiet, verbose=verbose, json=json)
 
 
 def _choices(dry_run: bool, accept_dry_run: bool, accept_torque: Sequence[str]) -> dict[str, Any]:
@@ -168,11 +171,16 @@ def _run(
             raise
 
 
-def _identify(campaign: Campaign, result: RunResult, *, quiet: bool, json: bool) -> None:
+def _identify(
+    campaign: Campaign, result: RunResult, *, quiet: bool, verbose: bool, json: bool
+) -> None:
     """Identify from all complete archives, report, and end with the verdict."""
-    identification = campaign.identify(reporter=make_reporter(quiet=quiet or json))
+    reporter = make_reporter(quiet=quiet or json, messages=verbose)
+    identification = campaign.identify(reporter=reporter)
     if not json:
-        finish(identification.results, json=False, quiet=quiet)
+        root = campaign.folder.root
+        written = (root, root / REPORT)
+        finish(identification.results, json=False, quiet=quiet, verbose=verbose, written=written)
         return
     verdict = json_format.loads(as_json(identification.results))
     print_json({**result.to_dict(), "verdict": verdict})

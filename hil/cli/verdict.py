@@ -1,24 +1,43 @@
-"""Output of commands that identify: a table, findings, the verdict and an exit status."""
+"""Output of commands that identify: verdict, table of joints, findings, and an exit status."""
 
 from __future__ import annotations
 
 import json as json_module
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Final
 
 import typer
 
+from hil.base.one_screen import Paragraph, Part, columns, one_screen
 from hil.base.progress import say
-from hil.results.results import JointJudgement, Results
+from hil.base.terminal_text import printable, typed
+from hil.results.results import JointJudgement, OverallJudgement, Results
 from identification.text import percentage
+from identification.validation.purpose_messages import TITLES, figure, requirement
+from identification.validation.verdict import fault_of
 
 NOT_GOOD = 5
 """Exit status of a command whose model is not good."""
 
+MOST: Final = 3
+"""Findings, and next steps, on one screen."""
+_MOST_JOINTS: Final = 8  # rows on one screen
 _MISSING: Final = "-"
-_LEVELS: Final = {"wrong": "WRONG", "doubtful": "warning", "information": "info", "good": "ok"}
+_LEVELS: Final = {"wrong": "wrong", "doubtful": "doubtful", "information": "info", "good": "ok"}
+LABEL: Final = 10
+"""Columns before a finding."""
+_LEGEND: Final = (
+    ("RMS error", "root mean square of measured minus predicted torque, on unseen motion"),
+    ("of limit", "RMS error over the torque limit of the joint"),
+    ("relative", "RMS error over the root mean square of the measured torque"),
+    ("training", "relative error on the motion that was fitted"),
+    ("noise", "relative error that the noise of the torque alone would cause"),
+    ("nominal", "relative error of the nominal model (URDF or [nominal])"),
+    ("controller", "relative error of the controller's own dynamic model"),
+    ("R²", "share of the torque's variance that the model explains; 1 is all of it"),
+)
 
 
 def finish(
@@ -26,28 +45,32 @@ def finish(
     *,
     json: bool,
     quiet: bool = False,
+    verbose: bool = False,
     written: tuple[Path, Path] | None = None,
+    read: Sequence[Part] = (),
 ) -> None:
-    """Print table, findings and verdict, or JSON; exit 5 if it is not good.
+    """Print the verdict with everything behind it, or JSON; exit 5 if it is not good.
 
-    With `quiet`, warnings go to stderr. `written` are folder and report, which the last line or
-    the JSON names.
+    Args:
+        results: of the identification.
+        json: print one JSON object.
+        quiet: print the line of the verdict, and warnings to stderr.
+        verbose: print everything, else one screen.
+        written: folder and report.
+        read: what was read of each recording.
     """
     if json:
         typer.echo(as_json(results, written))
-    else:
-        lines = sentences(results, quiet=quiet)
-        if not quiet:
-            if results.calibration is not None:
-                lines.insert(0, results.calibration.message)
-            lines.insert(0, results.fitted.message)
-            for line in table(results):
-                typer.echo(line)
-        for line in lines:
-            say(line, err=quiet)
+    elif quiet:
+        for warning in results.verdict.warnings:
+            say(f"note: {warning}", err=True)
         say(results.verdict.line)
-    if written is not None and not (quiet or json):
-        say(f"results: {written[0]}, report: {written[1]}")
+    elif verbose:
+        for line in whole(results, written):
+            say(line)
+    else:
+        for line in screen(results, written, read):
+            typer.echo(printable(line))
     if not results.verdict.good:
         raise typer.Exit(NOT_GOOD)
 
@@ -58,7 +81,7 @@ def as_json(results: Results, written: tuple[Path, Path] | None = None) -> str:
     `written` are the folder and the report, which it names.
     """
     fields = results.model_dump(mode="json")
-    keys = ("next_steps", "findings", "joints", "in_sample")
+    keys = ("next_steps", "findings", "joints", "all_joints", "in_sample")
     document = fields["verdict"] | {key: fields["judgement"][key] for key in keys}
     document["undetermined"] = [
         parameter.name for parameter in results.parameters if parameter.undetermined
@@ -69,40 +92,143 @@ def as_json(results: Results, written: tuple[Path, Path] | None = None) -> str:
     return json_module.dumps(document)
 
 
-def table(results: Results) -> list[str]:
-    """Format one row per joint: errors on held-out motion, with references."""
+def screen(
+    results: Results, written: tuple[Path, Path] | None = None, read: Sequence[Part] = ()
+) -> list[str]:
+    """Return one screen: verdict, recordings, table, findings, next steps, files."""
+    judgement = results.judgement
+    named = fault_of(judgement.findings)
+    open_findings = [
+        finding
+        for finding in judgement.worst_first
+        if finding.level in ("wrong", "doubtful") and finding != named
+    ]
+    shown = open_findings[:MOST]
+    steps = judgement.next_steps[:MOST]
+    mentioned = {*shown, named}
+    remarks = len([f for f in judgement.findings if f.level != "good" and f not in mentioned])
+    remarks += len(results.remarks) + len(judgement.next_steps) - len(steps)
+    table_lines = table(results)
+    parts: list[Part] = [Paragraph(results.verdict.line), *read, ""]
+    parts += table_lines if len(table_lines) <= _MOST_JOINTS + 2 else _some_joints(results)
+    parts.append("")
+    parts += [Paragraph(f.words, _LEVELS[f.level].ljust(LABEL), 3) for f in shown]
+    parts += [Paragraph(step, "next".ljust(LABEL), 3) for step in steps]
+    parts += _files(results, written)
+    if remarks:
+        report = "" if written is None else f", or {written[1]}"
+        parts.append(f"{remarks} more remark{'s' if remarks > 1 else ''}: -v{report}")
+    return one_screen(parts)
+
+
+def whole(results: Results, written: tuple[Path, Path] | None = None) -> list[str]:
+    """Return everything: the table with its legend, purposes, every check, notes and files."""
+    rows = table(results, everything=True)
+    lines = [results.verdict.line, "", *rows, ""]
+    lines += [f"{name:10}  {text}" for name, text in _LEGEND if f" {name}" in rows[0]]
+    lines += ["", *purposes(results), ""]
+    lines.append(f"{results.fitted.message}")
+    if results.calibration is not None:
+        lines.append(results.calibration.message)
+    lines += sentences(results)
+    lines += [part for part in _files(results, written) if isinstance(part, str)]
+    if written is not None:
+        lines.append(f"report: {written[1]}")
+    return lines
+
+
+def table(results: Results, *, everything: bool = False) -> list[str]:
+    """Format one row per joint, and one of all: errors on unseen motion, with references."""
     joints = results.judgement.joints
-    in_sample = results.judgement.in_sample
-    columns: list[tuple[str, Callable[[JointJudgement], str]]] = [
+    rows: list[JointJudgement | OverallJudgement] = [*joints]
+    if results.judgement.all_joints is not None and len(joints) > 1:
+        rows.append(results.judgement.all_joints)
+    return _table(rows, in_sample=results.judgement.in_sample, everything=everything)
+
+
+def _table(
+    rows: Sequence[JointJudgement | OverallJudgement], *, in_sample: bool, everything: bool
+) -> list[str]:
+    of_joint: list[tuple[str, Callable[[JointJudgement], str]]] = [
         ("joint", lambda joint: joint.joint),
         ("RMS error", lambda joint: f"{joint.rms:.3g} {joint.unit}"),
-        ("in-sample" if in_sample else "relative", lambda joint: _percent(joint.relative)),
-        ("fitted", lambda joint: _MISSING if in_sample else _percent(joint.fitted_relative)),
-        ("of limit", lambda joint: _percent(joint.share_of_limit)),
-        ("R²", lambda joint: _percent(joint.explained)),
-        ("nominal", lambda joint: _percent(joint.nominal_relative)),
-        ("controller", lambda joint: _percent(joint.controller_relative)),
+        ("of limit", lambda joint: _percent(joint.share_of_limit) if everything else _MISSING),
     ]
-    cells = [[title, *(text(joint) for joint in joints)] for title, text in columns]
-    shown = [column for column in cells if set(column[1:]) != {_MISSING}]
-    padded = [
-        [cell.ljust(width) if column is shown[0] else cell.rjust(width) for cell in column]
-        for column in shown
-        for width in [max(map(len, column))]
+    of_both: list[tuple[str, Callable[[JointJudgement | OverallJudgement], str]]] = [
+        ("training" if in_sample else "relative", lambda row: _percent(row.relative)),
+        ("training", lambda row: _MISSING if in_sample else _percent(row.fitted_relative)),
+        ("noise", lambda row: _percent(row.noise_relative)),
+        ("nominal", lambda row: _percent(row.nominal_relative)),
+        ("controller", lambda row: _percent(row.controller_relative)),
     ]
-    return ["  ".join(row).rstrip() for row in zip(*padded, strict=True)]
+    cells = [
+        [title, *(text(row) if isinstance(row, JointJudgement) else _OF_ALL[title] for row in rows)]
+        for title, text in of_joint
+    ]
+    cells += [[title, *map(text, rows)] for title, text in of_both]
+    explained = [
+        _MISSING
+        if not isinstance(row, JointJudgement) or row.explained is None
+        else f"{row.explained:.3f}"
+        for row in rows
+    ]
+    cells.append(["R²", *explained])
+    shown = [column for column in cells if set(column[1:]) - {_MISSING, ""}]
+    return columns([*zip(*shown, strict=True)])
 
 
-def sentences(results: Results, *, quiet: bool = False) -> list[str]:
+_OF_ALL: Final = {"joint": "all", "RMS error": "", "of limit": ""}
+
+
+def _some_joints(results: Results) -> list[str]:
+    """Return the table of the joints with the largest errors of an arm of many joints."""
+    judgement = results.judgement
+    worst = sorted(judgement.joints, key=lambda joint: -(joint.relative or 0.0))[:_MOST_JOINTS]
+    shown = [joint for joint in judgement.joints if joint in worst]
+    rows: list[JointJudgement | OverallJudgement] = [*shown]
+    if judgement.all_joints is not None:
+        rows.append(judgement.all_joints)
+    lines = _table(rows, in_sample=judgement.in_sample, everything=False)
+    more = len(judgement.joints) - len(shown)
+    return [*lines[:-1], f"{lines[-1]}   ({more} more joints, with smaller errors)"]
+
+
+def purposes(results: Results) -> list[str]:
+    """Return a row for each purpose: whether the model is good for it, its figure, the limit."""
+    words = {True: "good", False: "not good", None: _MISSING}
+    rows = [
+        (
+            TITLES[purpose.name],
+            words[purpose.good],
+            figure(purpose, results.joint_names),
+            requirement(purpose),
+        )
+        for purpose in results.verdict.purposes
+    ]
+    return columns([("purpose", "", "figure", "good if"), *rows], left=4) if rows else []
+
+
+def sentences(results: Results) -> list[str]:
     """Format the findings, from good to wrong and the most consequential last, and next steps."""
     judgement = results.judgement
-    if quiet:
-        return [f"note: {warning}" for warning in results.verdict.warnings]
     lines = [
         f"{_LEVELS[finding.level]}: {finding.words}" for finding in reversed(judgement.worst_first)
     ]
     lines += [f"note: {remark}" for remark in results.remarks]
     return lines + [f"next: {step}" for step in judgement.next_steps]
+
+
+def _files(results: Results, written: tuple[Path, Path] | None) -> list[Part]:
+    """Return what was written and what to do with it."""
+    if written is None or results.exports is None:
+        return []
+    folder = written[0]
+    model = next((name for name in results.exports.written if name.endswith(".urdf")), None)
+    if model is None:
+        return [f"results in {folder}; no model for simulators: see -v"]
+    return [
+        f"{folder / model}: for pinocchio, MuJoCo, Gazebo; hil export {typed(folder)} --to mjcf"
+    ]
 
 
 def _percent(share: float | None) -> str:

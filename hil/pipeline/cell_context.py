@@ -146,6 +146,29 @@ def cell_context_of(prepared: Prepared, estimate: Estimate) -> CellContext:
     )
 
 
+def joint_ranges(sources: Sources) -> tuple[Array, Array]:
+    """Return the lower and upper ends (n,) of the workspace [rad or m].
+
+    The limits of the cell, else those of the URDF; without these a whole turn, or of a prismatic
+    joint what was recorded.
+    """
+    cell = sources.cell
+    if cell.file.limits is not None:
+        limits = cell.joint_limits
+        return limits.lower, limits.upper
+    stated = urdf_limits(cell.urdf, cell.joint_names)
+    recorded = np.concatenate(
+        [source.recording.position for source in (*sources.training, *sources.held_out)]
+    )
+    turns = cell.model.chain.revolute
+    ends = (
+        np.where(turns, -np.pi, recorded.min(axis=0)),
+        np.where(turns, np.pi, recorded.max(axis=0)),
+    )
+    bounded = np.isfinite(stated.lower) & np.isfinite(stated.upper)
+    return np.where(bounded, stated.lower, ends[0]), np.where(bounded, stated.upper, ends[1])
+
+
 def _condition(check: str, text: str, advice: str) -> Finding:
     return Finding(check, "doubtful", text, advice, "condition")
 

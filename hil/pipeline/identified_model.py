@@ -50,8 +50,8 @@ from identification.model.link_wrenches import LINK_SYMBOLS
 from identification.model.pseudo_inertia import margin
 from identification.model.robot import RobotModel
 from identification.reduction.posterior import Posterior
-from identification.rollout.comparison import driving_residual
 from identification.selection.folds import FOLDS
+from identification.validation.prediction import driving_residual
 
 
 @dataclass(frozen=True, eq=False)

@@ -11,6 +11,7 @@ from hil.base.errors import InputError
 from identification.model.friction import ABSENT, TERMS
 from identification.signals.masks import LeftOut
 from identification.signals.samples import RIGID_BANDWIDTH, VelocitySource
+from identification.validation.purpose import NOTHING_REQUIRED, PurposeLimits, PurposeName
 
 from .estimators import ESTIMATORS, Estimator
 
@@ -46,6 +47,9 @@ class Options:
     #: rows and those near a reversal, or "none"; None depends on the friction law
     standstill: LeftOut | Literal["auto"] | None = "auto"
     in_sample: bool = False  #: fit all recordings and hold out none
+    #: what the model has to be good for; by default it is judged by its error on unseen motion
+    purposes: tuple[PurposeName, ...] = ()
+    required: PurposeLimits = NOTHING_REQUIRED  #: of these
 
     def __post_init__(self) -> None:
         for name, choices in (("method", get_args(Method)), ("estimator", tuple(ESTIMATORS))):

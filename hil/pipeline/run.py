@@ -105,7 +105,7 @@ def identify_archives(
     sources = gather_sources(archives, options.split, predict, in_sample=options.in_sample)
     prepared = with_transmitted_load(prepare_sources(sources, options, reporter))
     estimation = estimate_with(prepared, options, reporter)
-    validation = validate(prepared, estimation, reporter)
+    validation = validate(prepared, estimation, options, reporter)
     warnings = (*warnings, *payload_warnings(prepared.sources.cell))
     prepared = prepared.warned(*warnings, *estimation.warnings, *validation.warnings)
     paths = tuple(map(place_of, (*archives, *predict)))

@@ -27,6 +27,7 @@ from identification.model.elements import TorqueRipple
 from identification.selection.essential import Elimination
 from identification.signals.samples import Samples
 from identification.validation.consistency import ConsistencyCheck
+from identification.validation.evidence import Evidence
 from identification.validation.prediction import (
     PredictionError,
     pooled_error,
@@ -317,6 +318,21 @@ def _coverage(values: Array, std: Array, truth: Array) -> results.CoverageResult
     return results.CoverageResult(within_2=within_2, within_3=within_3, total=len(std))
 
 
+def _all_joints(evidence: Evidence) -> results.OverallJudgement:
+    """Return the errors over all joints together."""
+    references = {
+        "nominal_relative": evidence.nominal,
+        "nominal_with_friction_relative": evidence.nominal_with_friction,
+        "controller_relative": evidence.context.controller,
+    }
+    return results.OverallJudgement(
+        relative=evidence.held_out.overall,
+        fitted_relative=evidence.training.overall,
+        noise_relative=evidence.floor,
+        **{name: None if error is None else error.overall for name, error in references.items()},
+    )
+
+
 def _judgement(joint_names: Sequence[str], validation: Validation) -> results.JudgementResult:
     """Return the verdict with the numbers behind it."""
 
@@ -341,6 +357,7 @@ def _judgement(joint_names: Sequence[str], validation: Validation) -> results.Ju
         rms=error.rms,
         relative=error.relative,
         fitted_relative=evidence.training.relative,
+        noise_relative=evidence.noise_relative,
         explained=error.explained,
         limit=limit,
         share_of_limit=None if limit is None else error.rms / limit,
@@ -356,6 +373,7 @@ def _judgement(joint_names: Sequence[str], validation: Validation) -> results.Ju
         findings=verdict.findings,
         next_steps=verdict.next_steps,
         joints=joints,
+        all_joints=_all_joints(evidence),
         speed=profile(checks.speed),
         position=profile(checks.position),
     )

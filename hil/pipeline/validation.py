@@ -8,7 +8,8 @@ from dataclasses import dataclass, replace
 
 from hil.base.progress import Reporter
 from hil.cell.nominal import Nominal, nominal_of
-from identification import Factor, IdentificationError
+from identification import Estimate, Factor, IdentificationError
+from identification.purposes.purposes import Application, purposes_of
 from identification.selection.essential import Elimination, choose_essential
 from identification.validation.calibration import Calibration, TorqueMeans, calibrate
 from identification.validation.consistency import ConsistencyCheck, check_consistency
@@ -16,8 +17,9 @@ from identification.validation.evidence import Evidence, gather
 from identification.validation.fault_scores import ScorePrior
 from identification.validation.verdict import Verdict, judge
 
-from .cell_context import cell_context_of
+from .cell_context import cell_context_of, joint_ranges
 from .estimating import Estimation
+from .options import Options
 from .prepared import Prepared
 
 
@@ -39,14 +41,16 @@ class Validation:
         return tuple(_warnings(self.consistency, self.essential))
 
 
-def validate(prepared: Prepared, estimation: Estimation, reporter: Reporter) -> Validation:
-    """Gather the evidence on an estimate, and judge it."""
+def validate(
+    prepared: Prepared, estimation: Estimation, options: Options, reporter: Reporter
+) -> Validation:
+    """Gather the evidence on an estimate, and judge it by the purposes of the options."""
     sources = prepared.sources
     result = estimation.result
     model = sources.cell.model
     nominal = nominal_of(sources.cell)
     posterior = estimation.posterior
-    with reporter.task("validating", 3) as task:
+    with reporter.task("validating", 4) as task:
         unseen = sum(estimation.held_out, Factor.zero(model))
         consistency = _consistency(estimation, unseen, in_sample=sources.in_sample)
         task.advance(1, "essential parameters")
@@ -67,10 +71,38 @@ def validate(prepared: Prepared, estimation: Estimation, reporter: Reporter) -> 
             prior=ScorePrior(posterior.prior.belief.gaussian, posterior.design_effect),
         )
         evidence = replace(evidence, form=estimation.form)
-        verdict = judge(model.joint_names, evidence, tested_on=sources.tested_on)
+        task.advance(1, "purposes")
+        application = _application(prepared, result.pooled, evidence, consistency)
+        verdict = judge(
+            model.joint_names,
+            evidence,
+            tested_on=sources.tested_on,
+            purposes=purposes_of(application, options.required),
+            asked=options.purposes,
+        )
         task.advance(1)
     calibration = _calibration(prepared, estimation)
     return Validation(consistency, essential, calibration, nominal, evidence, verdict)
+
+
+def _application(
+    prepared: Prepared,
+    estimate: Estimate,
+    evidence: Evidence,
+    consistency: ConsistencyCheck | str,
+) -> Application:
+    sources = prepared.sources
+    lower, upper = joint_ranges(sources)
+    possible = None if isinstance(consistency, str) else consistency.consistent.estimate.values
+    return Application(
+        model=sources.cell.model,
+        estimate=estimate,
+        evidence=evidence,
+        held_out=() if sources.in_sample else prepared.held_out,
+        consistent=possible,
+        lower=lower,
+        upper=upper,
+    )
 
 
 def _warnings(consistency: ConsistencyCheck | str, essential: Elimination | str) -> Iterator[str]:

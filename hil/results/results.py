@@ -23,6 +23,7 @@ from identification.selection.essential import EliminationStep
 from identification.selection.settings import Choice, Settings
 from identification.text import percentage
 from identification.validation.finding import Finding
+from identification.validation.purpose import Purpose
 
 
 class Frozen(BaseModel):
@@ -109,6 +110,7 @@ class JointJudgement(Frozen):
     rms: float  #: Root mean square of the torque error, in `unit`
     relative: Known  #: ||e|| / ||tau||
     fitted_relative: Known = None  #: `relative` on the fitted motion
+    noise_relative: Known = None  #: `relative` that the noise of the torque alone would cause
     explained: Known  #: Variance explained (R²)
     limit: Known  #: Torque limit of the drive, or the URDF's effort limit, in `unit`
     share_of_limit: Known  #: RMS error over `limit`
@@ -120,6 +122,18 @@ class JointJudgement(Frozen):
     """The controller's diagonal inertia (joint side, with rotor) over the identified one: median
     over the recorded postures."""
     controller_inertia_spread: Known = None  #: Standard deviation of that ratio
+
+
+class OverallJudgement(Frozen):
+    """Relative errors over all joints together, each as of :class:`JointJudgement`."""
+
+    relative: Known
+    fitted_relative: Known
+    noise_relative: Known
+    nominal_relative: Known
+    nominal_with_friction_relative: Known
+    """Of the nominal model with friction that is fitted to the same recordings."""
+    controller_relative: Known
 
 
 class ProfileResult(Frozen):
@@ -138,6 +152,7 @@ class JudgementResult(Frozen):
     findings: list[Finding]
     next_steps: list[str]
     joints: list[JointJudgement]
+    all_joints: OverallJudgement | None = None  #: Null in earlier files
     speed: list[ProfileResult]  #: Over rad/s or m/s
     position: list[ProfileResult]  #: Over rad or m
 
@@ -430,6 +445,7 @@ class VerdictResult(Frozen):
     line: str  #: Summary
     reasons: list[str]  #: Why the model is not good
     warnings: list[str]  #: Problems that do not make the model bad
+    purposes: list[Purpose] = []  #: What the model is good for; empty in earlier files
 
 
 class EstimatorResult(Frozen):

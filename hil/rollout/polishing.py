@@ -7,7 +7,7 @@ import numpy as np
 from hil.base.progress import Reporter
 from hil.results.rollout_result import ArmErrors, PolishedParameter, PolishResult
 from identification.export.arm import Arm
-from identification.rollout.comparison import Errors, ToolFrame, errors_of, horizon_rows
+from identification.rollout.comparison import Errors, errors_of, horizon_rows
 from identification.rollout.polish import Driven, polished
 from identification.text import percentage
 
@@ -28,7 +28,7 @@ def polish(
         task.advance(1)
     windows = held_out.motion.windows
     measured = windows.reached[:, horizon_rows(windows)]
-    errors = errors_of(best.on(held_out.motion).positions(), measured, ToolFrame(best.arm))
+    errors = errors_of(best.on(held_out.motion).positions(), measured, best.arm.model.chain)
     change = float(np.mean(np.log(errors.joints / identified.joints)))
     accepted = change < 0.0 and errors.unstable <= identified.unstable and not in_sample
     return PolishResult(

@@ -30,11 +30,11 @@ from hil.rollout.torque_rollout import (
 )
 from identification import IdentificationError, Samples
 from identification.export.arm import Arm
+from identification.model.flange import flange_name
 from identification.rollout.comparison import (
     HORIZONS,
     Errors,
     RecordedMotion,
-    ToolFrame,
     continued,
     errors_of,
     horizon_rows,
@@ -130,7 +130,7 @@ def _driven(
 def _errors(driven: Driven) -> Errors:
     windows = driven.motion.windows
     measured = windows.reached[:, horizon_rows(windows)]
-    return errors_of(driven.positions(), measured, ToolFrame(driven.arm))
+    return errors_of(driven.positions(), measured, driven.arm.model.chain)
 
 
 def _result(
@@ -141,9 +141,9 @@ def _result(
     motion = driven.motion
     windows = motion.windows
     measured = windows.reached[:, horizon_rows(windows)]
-    tool = ToolFrame(arm)
+    chain = arm.model.chain
     positions = driven.positions()
-    joint = leading_joint(positions[:, JUDGED], measured[:, JUDGED], tool)
+    joint = leading_joint(positions[:, JUDGED], measured[:, JUDGED], chain)
     alone = simulate(bodies, motion, driven.feedback)
     names = list(arm.model.joint_names)
     return RolloutResult(
@@ -153,12 +153,12 @@ def _result(
         units=["rad" if turns else "m" for turns in arm.model.chain.revolute],
         parameters="",
         drive="a servo that was identified from commanded and measured positions",
-        tool=tool.name,
+        tool=flange_name(chain),
         windows=len(windows),
         step=windows.step,
         horizons=list(HORIZONS),
-        identified=ArmErrors.of(errors_of(positions, measured, tool)),
-        nominal=ArmErrors.of(errors_of(alone, measured, tool)),
+        identified=ArmErrors.of(errors_of(positions, measured, chain)),
+        nominal=ArmErrors.of(errors_of(alone, measured, chain)),
         no_nominal="",
         continued=root_mean_squares(continued(windows) - measured),
         samples=0,

@@ -30,12 +30,12 @@ from identification import IdentificationError, Samples
 from identification.estimators.ensemble import Ensemble
 from identification.export.arm import Arm
 from identification.export.simulators import FORMATS, read_back
+from identification.model.flange import flange_name
 from identification.rollout.comparison import (
     HORIZONS,
     Errors,
     RecordedMotion,
     ResidualTorque,
-    ToolFrame,
     continued,
     coverage,
     errors_of,
@@ -91,15 +91,15 @@ def roll_out(model: IdentifiedModel, options: RolloutOptions, reporter: Reporter
     prepared = model.prepared
     motion, feedback, drive = _motion_of(model, options)
     windows = motion.windows
-    tool = ToolFrame(arm)
+    chain = arm.model.chain
     measured = windows.reached[:, horizon_rows(windows)]
     positions = simulate(arm, motion, feedback)
-    nominal, reason, notes = _nominal(model.cell, arm, motion, feedback, measured, tool)
+    nominal, reason, notes = _nominal(model.cell, arm, motion, feedback, measured)
     ensemble, simulated = _simulated_ensemble(model, motion, feedback, options, reporter)
     few = windows.some(_FEW_WINDOWS)
     measured_few = few.reached[:, horizon_rows(few)]
-    identified = errors_of(positions, measured, tool)
-    joint = leading_joint(positions[:, JUDGED], measured[:, JUDGED], tool)
+    identified = errors_of(positions, measured, chain)
+    joint = leading_joint(positions[:, JUDGED], measured[:, JUDGED], chain)
     if 2 * identified.unstable_joints.max() > len(windows):
         joint = int(np.argmax(identified.unstable_joints))
     polished = None
@@ -113,7 +113,7 @@ def roll_out(model: IdentifiedModel, options: RolloutOptions, reporter: Reporter
         units=["rad" if turns else "m" for turns in arm.model.chain.revolute],
         parameters=model.parameters_digest,
         drive=drive,
-        tool=tool.name,
+        tool=flange_name(chain),
         windows=len(windows),
         step=windows.step,
         horizons=list(HORIZONS),
@@ -124,7 +124,7 @@ def roll_out(model: IdentifiedModel, options: RolloutOptions, reporter: Reporter
         samples=len(ensemble),
         seed=options.seed,
         sample_errors=[
-            ArmErrors.of(errors_of(rollout, measured_few, tool)) for rollout in simulated[0]
+            ArmErrors.of(errors_of(rollout, measured_few, chain)) for rollout in simulated[0]
         ],
         widened=ensemble.widened,
         inside=coverage(simulated[1], measured).tolist(),
@@ -227,7 +227,6 @@ def _nominal(
     motion: RecordedMotion,
     feedback: Feedback,
     measured: Array,
-    tool: ToolFrame,
 ) -> tuple[ArmErrors | None, str, list[str]]:
     """Return the errors of the nominal arm, why there is none, and notes."""
     described = nominal_arm(cell, arm)
@@ -244,7 +243,7 @@ def _nominal(
         positions = simulate(described, motion, feedback)
     except IdentificationError as error:
         return None, str(error), []
-    return ArmErrors.of(errors_of(positions, measured, tool)), "", notes
+    return ArmErrors.of(errors_of(positions, measured, arm.model.chain)), "", notes
 
 
 def nominal_arm(cell: Cell, arm: Arm) -> Arm | None:

@@ -8,14 +8,14 @@ from functools import lru_cache
 from typing import Final
 
 import numpy as np
-import pinocchio as pin
 from numpy.typing import NDArray
 
 from identification.arrays import Array
 from identification.distributions import student_limit
 from identification.export.arm import Arm
 from identification.export.simulators import unsupported_torque
-from identification.model.kinematics import pinocchio_model
+from identification.model.flange import flange_motion
+from identification.model.kinematics import Chain
 from identification.model.regressor import RegressorPlan
 from identification.model.robot import RobotModel
 from identification.rollout.servo import Servo, command_of
@@ -174,7 +174,7 @@ class Errors:
     unstable_joints: NDArray[np.intp]  #: of these, by the joint that left first (n,)
 
 
-def errors_of(positions: Array, measured: Array, tool: ToolFrame) -> Errors:
+def errors_of(positions: Array, measured: Array, chain: Chain) -> Errors:
     """Return the errors of simulated positions (w, h, n)."""
     stable = np.isfinite(positions)
     difference = np.where(stable, positions - measured, LARGEST_ERROR)
@@ -183,47 +183,26 @@ def errors_of(positions: Array, measured: Array, tool: ToolFrame) -> Errors:
     for k in range(len(HORIZONS)):
         rows = whole[:, k]
         if rows.any():
-            away = tool.positions(positions[rows, k]) - tool.positions(measured[rows, k])
+            ends = [flange_motion(chain, at[rows, k]).position for at in (positions, measured)]
+            away = ends[0] - ends[1]
             distances[k] = np.sqrt(np.mean(np.sum(away**2, axis=1)))
     rms = np.sqrt(np.mean(difference**2, axis=0))
     first = np.count_nonzero(np.isinf(positions[:, -1]), axis=0)
     return Errors(rms, distances, int(np.count_nonzero(~whole[:, -1])), first)
 
 
-class ToolFrame:
-    """The last link of an arm that its last joint moves."""
-
-    def __init__(self, arm: Arm) -> None:
-        chain = arm.model.chain
-        names = [name for name, frame in chain.frames.items() if frame.joint == chain.n_joints - 1]
-        self._model = pinocchio_model(arm.urdf, arm.model.locked)
-        self._data = self._model.createData()
-        self.name = names[-1] if names else chain.joint_names[-1]
-        place = chain.frame(names[-1] if names else None).translation
-        self._joint = self._model.getJointId(chain.joint_names[-1])
-        self._place = place
-
-    def positions(self, joints: Array) -> Array:
-        """Return the origins (m, 3) [m] at joint positions (m, n)."""
-        neutral = pin.neutral(self._model)
-        origins = np.empty((len(joints), 3))
-        for k, q in enumerate(joints):
-            pin.forwardKinematics(self._model, self._data, pin.integrate(self._model, neutral, q))
-            origins[k] = self._data.oMi[self._joint].act(self._place)
-        return origins
-
-
-def leading_joint(positions: Array, measured: Array, tool: ToolFrame) -> int:
+def leading_joint(positions: Array, measured: Array, chain: Chain) -> int:
     """Return the joint whose error alone moves the tool most, of positions (w, n) at a horizon."""
     stable = np.isfinite(positions).all(axis=1)
     moved = np.zeros(measured.shape[1])
     if not stable.any():
         return 0
-    at = tool.positions(measured[stable])
+    at = flange_motion(chain, measured[stable]).position
     for joint in range(len(moved)):
         alone = measured[stable].copy()
         alone[:, joint] = positions[stable, joint]
-        moved[joint] = np.mean(np.sum((tool.positions(alone) - at) ** 2, axis=1))
+        away = flange_motion(chain, alone).position - at
+        moved[joint] = np.mean(np.sum(away**2, axis=1))
     return int(np.argmax(moved))
 
 
@@ -244,21 +223,6 @@ def coverage(ensemble: Array, measured: Array) -> Array:
 
 
 _FEWEST: Final = 3  # arms of which a scatter is computed
-
-
-def driving_residual(model: RobotModel, samples: Samples, values: Array) -> Array:
-    """Return the measured less the predicted torque (m, n), as far as it would move a joint.
-
-    The dry friction of a joint at rest holds any torque between those of sliding either way, and
-    what a fit leaves of it there is no error of joints that move.
-    """
-    residual = samples.torque - samples.predicted_torque(model, values)
-    at_rest = ~model.moving(samples.motion.velocity)
-    if not at_rest.any():
-        return residual
-    ends = [samples.sliding(model, sign).predicted_torque(model, values) for sign in (-1.0, 1.0)]
-    held = np.clip(samples.torque, np.minimum(*ends), np.maximum(*ends))
-    return np.where(at_rest, samples.torque - held, residual)
 
 
 @dataclass(frozen=True, eq=False)

@@ -22,8 +22,9 @@ from identification.validation.causes import Cause, find_causes
 from identification.validation.changes import Change, find_changes
 from identification.validation.consistency import ConsistencyCheck
 from identification.validation.fault_scores import ScorePrior
-from identification.validation.finding import Finding
+from identification.validation.finding import Finding, Thresholds
 from identification.validation.gravity import CarriedLoad, GravityDirection, find_gravity, find_load
+from identification.validation.nominal_friction import with_fitted_friction
 from identification.validation.nominal_scale import InertiaRatio, NominalScale
 from identification.validation.physical_signs import (
     Dissipation,
@@ -128,6 +129,8 @@ class Evidence:
     load: CarriedLoad | None = None  #: body on the last link in unseen motion only
     #: error of the nominal (CAD) model on the same unseen motion
     nominal: PredictionError | None = None
+    #: the same with the friction of the fitted motion
+    nominal_with_friction: PredictionError | None = None
     implausible: Implausible = _PLAUSIBLE  #: physically impossible signs of the estimate
     consistency: ConsistencyCheck | None = None  #: with the nearest consistent parameters
     dissipation: Dissipation | None = None  #: friction of each joint at its top speed
@@ -151,6 +154,20 @@ class Evidence:
         power = float(self.held_out.torque_squared.sum())
         noise = float((np.nan_to_num(self.noise_floor) ** 2 * self.held_out.rows).sum())
         return float(np.sqrt(noise / power)) if power > 0.0 else None
+
+    @property
+    def noise_relative(self) -> Array | None:
+        """Noise floor of each joint as a share of its held-out torque (n,); None: not measured."""
+        if self.noise_floor is None:
+            return None
+        torque = self.held_out.torque_rms
+        return np.where(
+            torque > 0.0, self.noise_floor / np.where(torque > 0.0, torque, 1.0), np.nan
+        )
+
+    def allowed(self, limits: Thresholds) -> float:
+        """Return the error over all axes, as a share of the torque, up to which a model is good."""
+        return max(limits.overall, limits.noise * (self.floor or 0.0))
 
 
 def _implausible(
@@ -223,7 +240,7 @@ def gather(
         one_way=_one_way(training),
         gravity=gravity,
         load=load,
-        nominal=None if nominal is None else _error(model, nominal, held_out),
+        **_nominal_errors(model, nominal, result.factor, held_out),
         implausible=_implausible(model, pooled, unseen, error, speed, context),
         consistency=consistency,
         dissipation=dissipation_of(model, pooled, speed),
@@ -235,6 +252,19 @@ def gather(
         prismatic=tuple(np.flatnonzero(~model.chain.revolute).tolist()),
         moved=np.sum([_time_moved(run) for run in held_out], axis=0),
     )
+
+
+def _nominal_errors(
+    model: RobotModel, nominal: Array | None, factor: Factor, held_out: Sequence[Samples]
+) -> dict[str, PredictionError]:
+    """Return the errors of nominal parameters (p,) by field, without and with friction."""
+    if nominal is None:
+        return {}
+    with_friction = with_fitted_friction(model, nominal, factor)
+    return {
+        "nominal": _error(model, nominal, held_out),
+        "nominal_with_friction": _error(model, with_friction, held_out),
+    }
 
 
 def _noise(

@@ -129,6 +129,21 @@ def _usable_part(samples: Samples, torque: Array, bandwidth: float | None) -> Ar
     return slow
 
 
+def driving_residual(model: RobotModel, samples: Samples, values: Array) -> Array:
+    """Return the measured less the predicted torque (m, n), as far as it would move a joint.
+
+    The dry friction of a joint at rest holds any torque between those of sliding either way, and
+    what a fit leaves of it there is no error of joints that move.
+    """
+    residual = samples.torque - samples.predicted_torque(model, values)
+    at_rest = ~model.moving(samples.motion.velocity)
+    if not at_rest.any():
+        return residual
+    ends = [samples.sliding(model, sign).predicted_torque(model, values) for sign in (-1.0, 1.0)]
+    held = np.clip(samples.torque, np.minimum(*ends), np.maximum(*ends))
+    return np.where(at_rest, samples.torque - held, residual)
+
+
 def noise_floor(
     model: RobotModel,
     values: Array,

@@ -29,6 +29,7 @@ from identification.validation.facts.patterns import (
     WhitenessFacts,
 )
 from identification.validation.facts.recordings import (
+    UNTESTED,
     CorrectionFacts,
     DelayFacts,
     JumpFacts,
@@ -37,8 +38,15 @@ from identification.validation.facts.recordings import (
 )
 from identification.validation.facts.references import ControllerFacts, InertiaFacts, NominalFacts
 from identification.validation.facts.sameness import ChangeFacts, FrictionFacts, LoadFacts
-from identification.validation.facts.scale import PhysicalSignFacts, ScaleFacts, SignFacts
+from identification.validation.facts.scale import (
+    IMPOSSIBLE,
+    PhysicalSignFacts,
+    ScaleFacts,
+    SignFacts,
+)
 from identification.validation.finding import Facts, Finding, Naming, Thresholds
+from identification.validation.purpose import Purpose, PurposeName, good_for
+from identification.validation.purpose_messages import purposes_in_a_sentence
 
 __all__ = ["Finding", "Thresholds", "Verdict", "judge"]
 
@@ -47,14 +55,15 @@ __all__ = ["Finding", "Thresholds", "Verdict", "judge"]
 class Verdict:
     """Whether a model may be used, with findings and next steps."""
 
-    good: bool  #: whether the model may be used
-    line: str  #: one sentence: whether it predicts held-out motion well, with the error
+    good: bool  #: whether the model may be used, for the purposes that were asked for if any
+    line: str  #: what it is good for, or what is wrong; without purposes the error
     reasons: tuple[str, ...]  #: messages of wrong findings; empty if good
     warnings: tuple[str, ...] = ()  #: messages of doubtful findings
     #: of causes, then of the other wrong findings, or of doubtful ones if none is wrong; of
     #: symptoms only if no cause was found
     next_steps: tuple[str, ...] = ()
     findings: tuple[Finding, ...] = ()  #: every check with its outcome
+    purposes: tuple[Purpose, ...] = ()  #: what the model is good for; empty if not examined
 
 
 def judge(
@@ -63,8 +72,19 @@ def judge(
     thresholds: Thresholds = Thresholds(),  # noqa: B008 - frozen
     *,
     tested_on: str = "unseen motion",
+    purposes: Sequence[Purpose] = (),
+    asked: Sequence[PurposeName] = (),
 ) -> Verdict:
-    """Return the verdict on axes of these names; `tested_on` describes the held-out motion."""
+    """Return the verdict on axes of these names.
+
+    Args:
+        joint_names: of the axes.
+        evidence: errors of the estimate and their possible causes.
+        thresholds: limits of the checks.
+        tested_on: description of the held-out motion.
+        purposes: what the model is good for.
+        asked: purposes that decide; by default the error on unseen motion and every check does.
+    """
     naming = Naming(tuple(joint_names), tested_on)
     facts = facts_in_order(evidence, thresholds)
     findings = _without_explained(
@@ -77,20 +97,45 @@ def judge(
     reserve = "; ".join(finding.reservation for finding in findings if finding.reservation)
     but = f", but {reserve}" if reserve else ""
     line = f"The model predicts {tested_on} well{but}: {measure}."
-    if wrong:
-        line = f"The model must not be relied on: {wrong[0].words}; {measure}."
+    fault = fault_of(findings)
+    good = not wrong
+    if asked:
+        good = fault is None and good_for(purposes, asked)
+    if wrong and (fault is not None or not purposes):
+        error = "" if purposes else f"; {measure}"
+        line = f"The model must not be relied on: {(fault or wrong[0]).words}{error}."
+    elif purposes:
+        line = purposes_in_a_sentence(purposes, naming.joints)
+        if wrong:
+            line += " Doubtful for anything else."
+        elif reserve:
+            line += f" {reserve[0].upper()}{reserve[1:]}."
     causes = [finding for finding in (*wrong, *doubtful) if finding.role == "cause"]
     explained = bool(causes) and (not wrong or causes[0].level == "wrong")
     roles = ("condition",) if explained else ("condition", "symptom")
     others = [finding for finding in wrong or doubtful if finding.role in roles]
     steps = dict.fromkeys(finding.next_step for finding in (*causes, *others))
     return Verdict(
-        good=not wrong,
+        good=good,
         line=line,
         reasons=tuple(finding.words for finding in wrong),
         warnings=tuple(finding.words for finding in doubtful),
         next_steps=tuple(step for step in steps if step),
         findings=tuple(findings),
+        purposes=tuple(purposes),
+    )
+
+
+def fault_of(findings: Sequence[Finding]) -> Finding | None:
+    """Return the first wrong finding for which a model is good for no purpose."""
+    return next(
+        (
+            finding
+            for finding in findings
+            if finding.level == "wrong"
+            and (finding.role == "cause" or finding.check in (UNTESTED, IMPOSSIBLE))
+        ),
+        None,
     )
 
 

@@ -16,10 +16,11 @@ from typer.testing import CliRunner
 
 from hil.archive import Samples, write_samples
 from hil.base.errors import ArchiveError, InputError, OutputError
+from hil.base.one_screen import COLUMNS, LINES
 from hil.base.progress import Silent
 from hil.campaign.identified import identify_campaign
 from hil.cli import app
-from hil.cli.verdict import NOT_GOOD, as_json, finish, sentences, table
+from hil.cli.verdict import NOT_GOOD, as_json, finish, screen, sentences, table, whole
 from hil.control.simulation import planted_values
 from hil.importers.robot import Robot
 from hil.pipeline.estimating import estimate_with
@@ -401,13 +402,13 @@ class TestJudgement:
             assert 0.01 < joint.controller_relative < 0.15
 
     def test_is_a_table_sentences_and_json(self, identification, judgement):
-        rows = table(identification.results)
+        rows = table(identification.results, everything=True)
         lines = sentences(identification.results)
-        heading = "joint RMS error relative fitted of limit R² nominal controller"
+        heading = "joint RMS error of limit relative training noise nominal controller R²"
         assert rows[0].split() == heading.split()
-        for row, name in zip(rows[1:], identification.results.joint_names, strict=True):
-            assert row.startswith(name) and row.count("%") == 6
-        assert len({len(row) for row in rows}) == 1
+        names = (*identification.results.joint_names, "all")
+        for row, name in zip(rows[1:], names, strict=True):
+            assert row.startswith(name) and row.count("%") == (5 if name == "all" else 6)
         for finding in judgement.findings:
             assert sum(finding.words in line for line in lines) == 1
         read = json.loads(as_json(identification.results))
@@ -417,15 +418,21 @@ class TestJudgement:
         assert len(read["joints"]) == 6
         assert read["in_sample"] is False and read["undetermined"] == []
 
+    def test_is_one_screen_that_begins_with_its_line(self, identification):
+        shown = screen(identification.results, (Path("out"), Path("out/report.html")))
+        assert len(shown) <= LINES and max(map(len, shown)) <= COLUMNS
+        text = " ".join(" ".join(shown).split())
+        assert text.startswith(identification.results.verdict.line)
+        assert len(whole(identification.results)) > len(shown)
+
     @pytest.mark.parametrize("good", [True, False])
-    def test_ends_with_its_line_and_a_status(self, identification, good, capsys):
+    def test_begins_with_its_line_and_ends_with_a_status(self, identification, good, capsys):
         verdict = identification.results.verdict.model_copy(update={"good": good})
         with nullcontext() if good else pytest.raises(typer.Exit) as left:
             finish(identification.results.model_copy(update={"verdict": verdict}), json=False)
         assert good or left.value.exit_code == NOT_GOOD
         printed = capsys.readouterr()
-        assert printed.out.splitlines()[0].startswith("joint ")
-        assert printed.out.splitlines()[-1] == verdict.line
+        assert " ".join(printed.out.split()).startswith(verdict.line)
         assert printed.err == ""
 
 

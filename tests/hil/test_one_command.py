@@ -19,6 +19,7 @@ from typer.testing import CliRunner
 
 from hil.archive import open_archive
 from hil.archive.recordings import open_recording
+from hil.base import one_screen
 from hil.base.errors import InputError, SourceError
 from hil.base.output_folder import SOURCES, folder_beside, sources_text
 from hil.cli import app
@@ -367,10 +368,13 @@ class TestIdentify:
         assert result.exit_code == 0, (result.output, result.exception)
         folder = tmp_path / "a"
         report = folder / "report.html"
-        assert result.output.splitlines()[-1] == f"results: {folder}, report: {report}"
-        assert "a.csv: tau1 .. tau3: torque, by the name; no unit stated, read as N.m" in (
-            result.output
-        )
+        shown = result.output.splitlines()
+        assert len(shown) <= one_screen.LINES and max(map(len, shown)) <= one_screen.COLUMNS
+        assert "fitted    a.csv: 3 joints" in result.output
+        assert "predicted b.csv: 3 joints" in result.output
+        everything = hil("identify", first, "--urdf", urdf, "--predict", second, "-v").output
+        assert f"report: {report}" in everything
+        assert "a.csv: tau1 .. tau3: torque, by the name; no unit stated, read as N.m" in everything
         names = {path.name for path in folder.iterdir()}
         assert names >= {"a.mcap", "b.mcap", "map.toml", "results.json", "report.html", SOURCES}
         before = (folder / "results.json").stat().st_mtime_ns
@@ -379,8 +383,8 @@ class TestIdentify:
         assert not (tmp_path / "a-2").exists()
         again = hil("identify", folder, "--output", tmp_path / "again")
         assert again.exit_code == 0
-        verdict = [line for line in result.output.splitlines() if line.startswith("The model")]
-        assert verdict[0] in again.output.splitlines()
+        verdicts = [output.splitlines()[0] for output in (result.output, again.output)]
+        assert verdicts[0].startswith("Good for feed-forward") and verdicts[1] == verdicts[0]
 
     def test_archives_get_a_folder_as_well(self, tmp_path: Path, urdf: Path) -> None:
         archive = tmp_path / "rec.mcap"

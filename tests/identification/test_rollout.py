@@ -14,9 +14,7 @@ from identification.model.robot import RobotModel
 from identification.rollout.comparison import (
     HORIZONS,
     RecordedMotion,
-    ToolFrame,
     coverage,
-    driving_residual,
     errors_of,
     horizon_rows,
     joint_inertia,
@@ -34,6 +32,7 @@ from identification.rollout.windows import (
     stretches_of,
     windows_of,
 )
+from identification.validation.prediction import driving_residual
 from tests.identification.test_encoders import on_its_servo
 from tests.identification.two_link import MODEL, URDF, as_samples, four_sines, simulated
 
@@ -62,7 +61,7 @@ def a_recording(arm: Arm, step: float, duration: float = 3.0):
 
 def final_errors(arm: Arm, motion: RecordedMotion, feedback: Feedback = NOTHING):
     measured = motion.windows.reached[:, horizon_rows(motion.windows)]
-    return errors_of(simulate(arm, motion, feedback), measured, ToolFrame(arm))
+    return errors_of(simulate(arm, motion, feedback), measured, arm.model.chain)
 
 
 def test_errors_of_the_true_arm_are_of_second_order() -> None:
@@ -173,8 +172,8 @@ def test_the_joint_that_moves_the_tool_leads() -> None:
     arm = replace(arm, model=RobotModel.from_urdf(arm.urdf, friction=FrictionLaw(third=None)))
     measured = np.zeros((4, N))
     off = measured + np.array([0.001, 0.2])
-    assert leading_joint(off, measured, ToolFrame(arm)) == 1
-    assert leading_joint(off[:, ::-1], measured, ToolFrame(arm)) == 0
+    assert leading_joint(off, measured, arm.model.chain) == 1
+    assert leading_joint(off[:, ::-1], measured, arm.model.chain) == 0
 
 
 def test_a_band_holds_its_share() -> None:

@@ -77,6 +77,7 @@ class ErrorFacts:
     """Errors as shares of the torque."""
 
     overall: float
+    allowed: float  # of it
     relative: Array  # of each axis (n,)
     torque: tuple[str, ...]  # RMS torque of each axis, with its unit
     overall_large: bool
@@ -95,9 +96,10 @@ class ErrorFacts:
         _, grown = _growth(evidence, limits)
         return cls(
             overall=error.overall,
+            allowed=evidence.allowed(limits),
             relative=error.relative,
             torque=tuple(f"{size:.2g} {unit}" for size, unit in sizes),
-            overall_large=error.overall > limits.overall,
+            overall_large=error.overall > evidence.allowed(limits),
             overall_grown=error.overall > limits.generalisation * evidence.training.overall,
             large=error.relative > limits.axis,
             grown=grown,
@@ -117,7 +119,7 @@ class ErrorFacts:
                 "error on unseen motion",
                 "wrong",
                 f"the torque error on {naming.motion} is {percentage(self.overall, 1)} over all"
-                f" axes, limit {percentage(self.limits.overall)}",
+                f" axes, limit {percentage(self.allowed)}",
                 _NOT_COVERED if self.overall_grown else step,
                 "symptom",
             )
@@ -177,6 +179,7 @@ class UnexplainedFacts:
     overall: float
     floor: float  # noise floor, as a share of the torque
     large: bool
+    beyond: bool  # whether the model is not good for it
 
     @classmethod
     def of(cls, evidence: Evidence, limits: Thresholds) -> UnexplainedFacts | None:
@@ -187,7 +190,7 @@ class UnexplainedFacts:
             return None
         overall = evidence.held_out.overall
         large = overall > max(limits.unexplained, limits.multiple * floor)
-        return cls(overall, floor, large)
+        return cls(overall, floor, large, overall > evidence.allowed(limits))
 
     def findings(self, naming: Naming) -> Iterator[Finding]:
         """Yield the error."""
@@ -195,7 +198,7 @@ class UnexplainedFacts:
             multiple = self.overall / max(self.floor, 1e-300)
             yield Finding(
                 UNEXPLAINED,
-                "wrong",
+                "wrong" if self.beyond else "doubtful",
                 f"the torque error on {naming.motion} is {percentage(self.overall, 1)},"
                 f" {multiple:.1f} times the noise floor of {percentage(self.floor, 1)}; none of the"
                 " tested faults explains it (delay, torque constants, signs and order of joints,"

@@ -44,7 +44,7 @@ class OutlierFacts:
         # An error of rounding has a distribution of its own.
         few &= (outliers.share > 0.0) & (np.nan_to_num(error.relative) > limits.pattern)
         axis = (error.relative > limits.axis) & (outliers.without.relative <= limits.axis)
-        all_axes = error.overall > limits.overall >= outliers.without.overall
+        all_axes = error.overall > evidence.allowed(limits) >= outliers.without.overall
         return cls(
             few=few,
             share=outliers.share,

@@ -11,6 +11,8 @@ from identification.text import percentage
 from identification.validation.evidence import SIGMAS, Evidence
 from identification.validation.finding import Finding, Mask, Naming, Thresholds, joined
 
+UNTESTED: Final = "tested"
+"""Name of the check whether every joint was tested on held-out motion."""
 _JUMPS_SHOWN: Final = 3
 
 
@@ -38,7 +40,7 @@ class TestedFacts:
         """Yield what was not tested."""
         if self.in_sample:
             yield Finding(
-                "tested",
+                UNTESTED,
                 "wrong",
                 "no motion was held out: all errors are in-sample",
                 "predict a recording that is not fitted (`hil identify --predict ARCHIVE`)",
@@ -46,7 +48,7 @@ class TestedFacts:
         if self.still.any():
             joints = naming.of(self.still)
             yield Finding(
-                "tested",
+                UNTESTED,
                 "wrong",
                 f"{joints} moved for less than {self.least:g} s of {naming.motion}",
                 f"record a validation motion that moves {joints}; a joint that must not move is"
@@ -56,7 +58,7 @@ class TestedFacts:
         if self.silent.any():
             joints = naming.of(self.silent)
             yield Finding(
-                "tested",
+                UNTESTED,
                 "wrong",
                 f"the measured torque of {joints} is zero throughout {naming.motion}",
                 f"record the torque of {joints} with sufficient resolution",

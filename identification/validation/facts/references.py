@@ -21,8 +21,9 @@ class NominalFacts:
     """Error of the nominal model on held-out motion, over all axes."""
 
     nominal: float
+    with_friction: float  # and with the friction of the fitted motion
     identified: float
-    better: bool  # whether the nominal model predicts better
+    better: bool  # whether the nominal model predicts better, with friction or without
 
     @classmethod
     def of(cls, evidence: Evidence, limits: Thresholds) -> NominalFacts | None:
@@ -30,13 +31,18 @@ class NominalFacts:
         if evidence.nominal is None:
             return None
         nominal = evidence.nominal.overall
+        friction = evidence.nominal_with_friction
+        with_friction = nominal if friction is None else friction.overall
         identified = evidence.held_out.overall
-        return cls(nominal, identified, identified > nominal + limits.nominal)
+        better = identified > min(nominal, with_friction) + limits.nominal
+        return cls(nominal, with_friction, identified, better)
 
     def findings(self, _: Naming) -> Iterator[Finding]:
         """Yield which model predicts better."""
         nominal = percentage(self.nominal, 1)
         identified = percentage(self.identified, 1)
+        if self.with_friction != self.nominal:
+            nominal += f" ({percentage(self.with_friction, 1)} with fitted friction)"
         if self.better:
             yield Finding(
                 "against the nominal model",

@@ -13,6 +13,8 @@ from identification.validation.consistency import ELEMENTS
 from identification.validation.evidence import Evidence
 from identification.validation.finding import Finding, Mask, Naming
 
+IMPOSSIBLE: Final = "physical signs"
+"""Name of the check whether bodies with these parameters can exist."""
 # Beyond this ratio the unit is wrong, or motor torques are in place of joint torques (gear ratios
 # are 30 to 200); descriptions in use are closer.
 _IMPOSSIBLE_SCALE: Final = 10.0
@@ -175,13 +177,13 @@ class PhysicalSignFacts:
     def findings(self, _: Naming) -> Iterator[Finding]:
         """Yield each message."""
         for message in self.impossible:
-            yield Finding("physical signs", "wrong", message, _SIGNS, "symptom")
+            yield Finding(IMPOSSIBLE, "wrong", message, _SIGNS, "symptom")
         if self.inconsistency:
             step = _BALANCED if self.is_balanced else _SIGNS
-            yield Finding("physical signs", "wrong", self.inconsistency, step, "symptom")
+            yield Finding(IMPOSSIBLE, "wrong", self.inconsistency, step, "symptom")
         step = "use the consistent estimate where the model must be physical (simulation, URDF)"
         for message in self.doubtful:
-            yield Finding("physical signs", "doubtful", message, step)
+            yield Finding(IMPOSSIBLE, "doubtful", message, step)
         step = "compare with `hil identify --friction coulomb,viscous,offset`"
         for message in self.added_friction:
             yield Finding("friction law", "doubtful", message, step)

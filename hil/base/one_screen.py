@@ -1,0 +1,80 @@
+"""Text for one screen: at most 24 lines of 100 columns."""
+
+from __future__ import annotations
+
+import textwrap
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Final
+
+LINES: Final = 24
+COLUMNS: Final = 100
+_CUT: Final = " ..."
+
+
+@dataclass(frozen=True)
+class Paragraph:
+    """Text that takes at least one line, and more where there is room."""
+
+    text: str
+    label: str = ""  #: before the first line; the others are indented by as much
+    most: int = 4  #: lines
+
+    def lines(self, count: int) -> list[str]:
+        """Return the text on at most so many lines, cut at the end of a word."""
+        return textwrap.wrap(
+            " ".join(self.text.split()),
+            COLUMNS,
+            initial_indent=self.label,
+            subsequent_indent=" " * len(self.label),
+            max_lines=count,
+            placeholder=_CUT,
+            break_on_hyphens=False,
+        )
+
+    @property
+    def whole(self) -> int:
+        """Number of lines of the whole text, at most `most`."""
+        return min(self.most, len(self.lines(len(self.text) + 1)))
+
+
+Part = str | Paragraph
+"""A line as it is, such as the row of a table; or text that may be cut."""
+
+
+def one_screen(parts: Sequence[Part], lines: int = LINES) -> list[str]:
+    """Return parts on at most so many lines: a line each, the rest of the room to the first ones.
+
+    Empty lines are dropped, from the end on, where text needs their room.
+    """
+    chosen = list(parts)
+    wanted = len(chosen) + sum(part.whole - 1 for part in chosen if isinstance(part, Paragraph))
+    while wanted > lines and "" in chosen:
+        del chosen[len(chosen) - 1 - chosen[::-1].index("")]
+        wanted = wanted - 1
+    spare = lines - len(chosen)
+    shown: list[str] = []
+    for part in chosen:
+        if isinstance(part, str):
+            shown.append(part[:COLUMNS].rstrip() if len(part) <= COLUMNS else _cut(part))
+            continue
+        more = min(part.whole - 1, max(spare, 0))
+        spare -= max(more, 0)
+        shown += part.lines(1 + max(more, 0))
+    return shown[:lines]
+
+
+def _cut(line: str) -> str:
+    return line[: COLUMNS - len(_CUT)].rstrip() + _CUT
+
+
+def columns(rows: Sequence[Sequence[str]], *, left: int = 1) -> list[str]:
+    """Return rows as lines with aligned columns, the first ones flush left, the others right."""
+    widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
+    return [
+        "  ".join(
+            cell.ljust(width) if k < left else cell.rjust(width)
+            for k, (cell, width) in enumerate(zip(row, widths, strict=True))
+        ).rstrip()
+        for row in rows
+    ]

@@ -1,0 +1,100 @@
+"""What was read of each recording, in a line that says only what is unusual about it."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+from typing import Final
+
+from hil.base.terminal_text import plural
+from hil.identified.identified_arm import IdentifiedArm
+from hil.importers.conclusions import (
+    ChannelMeaning,
+    ConcludedUnit,
+    Conclusion,
+    JointOrder,
+    JointRange,
+    KnownCommands,
+    LockedJoints,
+    RecordedClock,
+    StatedUnit,
+)
+from hil.importers.messages import sentence
+from hil.importers.recording import ImportedRecording
+from hil.pipeline.sources import Source
+
+_USUAL: Final = (
+    ChannelMeaning,
+    ConcludedUnit,
+    JointOrder,
+    JointRange,
+    KnownCommands,
+    LockedJoints,
+    RecordedClock,
+    StatedUnit,
+)
+_MOST: Final = 3
+
+
+def read_lines(arm: IdentifiedArm) -> list[tuple[str, str]]:
+    """Return use and content of each recording; of many the first ones, and their number."""
+    lines = [*_imported(arm)]
+    sources = arm.identification.prepared.sources
+    imported = {*(() if arm.staging is None else arm.staging.recordings)}
+    of_archives = [
+        (use, [source for source in group if source.path not in imported])
+        for use, group in (("fitted", sources.training), ("predicted", sources.held_out))
+        if not (use == "predicted" and sources.in_sample)
+    ]
+    lines += [(use, _archives(group)) for use, group in of_archives if group and not _same(arm)]
+    if len(lines) <= _MOST:
+        return lines
+    more = len(lines) - _MOST + 1
+    return [*lines[: _MOST - 1], ("", f"and {plural(more, 'recording')} more")]
+
+
+def _same(arm: IdentifiedArm) -> bool:
+    """Return whether every recording was imported: those need no line of their archives."""
+    return arm.staging is not None and not any(
+        isinstance(entry, Path) for entry in (*arm.staging.fitted, *arm.staging.predicted)
+    )
+
+
+def _imported(arm: IdentifiedArm) -> Iterator[tuple[str, str]]:
+    staging = arm.staging
+    if staging is None:
+        return
+    in_sample = arm.identification.prepared.sources.in_sample
+    shared = not arm.predicted and len(staging.recordings) == 1 and not in_sample
+    for place, recording in staging.recordings.items():
+        source = staging.sources[place]
+        use = "predicted" if source in arm.predicted else "fitted"
+        text = content(recording)
+        if shared:
+            text = f"{text}; the end is predicted, not fitted"
+        yield use, f"{source.name}: {text}"
+
+
+def content(recording: ImportedRecording) -> str:
+    """Return joints, duration and rate of a recording, and what is unusual about it."""
+    found = (*recording.concluded, *recording.examined.found)
+    clock = next((each.base for each in found if isinstance(each, RecordedClock)), None)
+    joints = sum(isinstance(each, JointRange) for each in found)
+    parts = [plural(joints, "joint")]
+    if clock is not None:
+        parts = [f"{parts[0]}, {clock.duration:.3g} s at {clock.rate:.4g} Hz"]
+        parts += clock.describe()[1:]
+    return "; ".join([*parts, *map(sentence, _unusual(found, recording.examined.warnings))])
+
+
+def _unusual(found: Sequence[Conclusion], warnings: Sequence[Conclusion]) -> list[Conclusion]:
+    return [*warnings, *(each for each in found if not isinstance(each, _USUAL))]
+
+
+def _archives(sources: Sequence[Source]) -> str:
+    names = sources[0].name if len(sources) == 1 else plural(len(sources), "archive")
+    duration = sum(
+        float(source.recording.time[-1] - source.recording.time[0]) for source in sources
+    )
+    joints = plural(sources[0].recording.n_joints, "joint")
+    return f"{names}: {joints}, {duration:.3g} s"

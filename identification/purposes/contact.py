@@ -1,0 +1,93 @@
+"""Contact and payload: the smallest force and mass at the flange that residuals would show."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Final, NamedTuple
+
+import numpy as np
+
+from identification.arrays import Array
+from identification.model.flange import flange_motion, flange_name
+from identification.model.payload import Load, Payload
+from identification.model.robot import RobotModel
+from identification.purposes.quiet_torque import PERIOD, SlowResidual, once_in, whole_blocks
+
+DIRECTIONS: Final = 100
+SHARE: Final = 0.95
+"""Of directions and postures: the force is seen in so many."""
+_SEED: Final = 20140902
+_ROUNDING: Final = 1e-9  # m, of a lever
+_LEVERAGE: Final = 0.1  # of the median one; with less a mass cannot be told from the residual
+
+
+class Contact(NamedTuple):
+    """What motion without contact exceeds once in `PERIOD`, and the force that exceeds it."""
+
+    torque: Array  # of each joint (n,) [N·m or N]
+    force: float  # at the flange [N]; infinite where no joint feels it
+
+
+def contact(
+    model: RobotModel, residuals: Sequence[SlowResidual], postures: Array
+) -> Contact | None:
+    """Return thresholds and force at postures (m, n); None of too little unseen motion."""
+    peaks = [_summed(np.maximum, part, np.abs(part.torque)) for part in residuals]
+    torque = once_in(PERIOD, np.concatenate(peaks)) if peaks else None
+    if torque is None:
+        return None
+    return Contact(torque, seen_force(model, torque, postures))
+
+
+def seen_force(model: RobotModel, torque: Array, postures: Array) -> float:
+    """Return the force [N] at the flange that exceeds the torque (n,) of some joint.
+
+    In `SHARE` of directions and postures (m, n), at rest.
+    """
+    random = np.random.default_rng(_SEED)
+    direction = random.normal(size=(DIRECTIONS, 3))
+    direction /= np.linalg.norm(direction, axis=1)[:, None]
+    jacobian = flange_motion(model.chain, postures).jacobian
+    shares = np.abs(direction @ jacobian) / torque
+    largest = shares.max(axis=2).ravel()
+    weakest = float(np.quantile(largest, 1.0 - SHARE))
+    return 1.0 / weakest if weakest > _ROUNDING / float(torque.max()) else float("inf")
+
+
+def seen_mass(model: RobotModel, residuals: Sequence[SlowResidual]) -> float | None:
+    """Return the mass [kg] at the flange that is seen in half a second (`BLOCK`).
+
+    The residual of each block is fitted by the torque of a kilogram at the flange, with all joints
+    weighted by their residual; motion without another payload exceeds the mass once in `PERIOD`.
+    None of too little unseen motion, or where gravity does not load a joint.
+    """
+    if not residuals:
+        return None
+    name = flange_name(model.chain)
+    frame = name if name in model.chain.frames else None
+    load = Load(model.chain, model.gravity, Payload(1.0, (0.0, 0.0, 0.0), frame=frame))
+    every = np.concatenate([part.torque for part in residuals])
+    variance = np.maximum(np.mean(every**2, axis=0), np.finfo(np.float64).tiny)
+    sums = [_by_block(part, load.torque(part.motion), variance) for part in residuals]
+    product, square = np.concatenate(sums).T
+    median = float(np.median(square)) if len(square) else 0.0
+    if median == 0.0:
+        return None
+    seen = square > _LEVERAGE * median
+    limit = once_in(PERIOD, np.abs(product[seen] / square[seen]))
+    return None if limit is None else float(limit)
+
+
+def _summed(operation: np.ufunc, part: SlowResidual, rows: Array) -> Array:
+    """Return rows (m, ...) of a part, reduced over each whole block of time (B, ...)."""
+    edges, end = whole_blocks(part.motion.time)
+    if not len(edges):
+        return np.zeros((0, *rows.shape[1:]))
+    return np.asarray(operation.reduceat(rows[:end], edges, axis=0))
+
+
+def _by_block(part: SlowResidual, unit: Array, variance: Array) -> Array:
+    """Return residual times torque of a kilogram (m, n), and its square, by block (B, 2)."""
+    weighted = unit / variance
+    products = [(part.torque * weighted).sum(axis=1), (unit * weighted).sum(axis=1)]
+    return _summed(np.add, part, np.column_stack(products))

@@ -1,0 +1,163 @@
+"""The purposes of a model: what each figure is, and the limit that it is held against."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from identification.arrays import Array
+from identification.errors import IdentificationError
+from identification.factor.estimate import Estimate
+from identification.model.robot import RobotModel
+from identification.purposes.contact import contact, seen_mass
+from identification.purposes.gravity import gravity_error, workspace
+from identification.purposes.quiet_torque import PERIOD, SlowResidual, slow_residuals
+from identification.purposes.simulation import HORIZON, flange_error
+from identification.signals.samples import Samples
+from identification.validation.evidence import Evidence
+from identification.validation.finding import Thresholds
+from identification.validation.purpose import KNOWN, Purpose, PurposeLimits
+
+
+@dataclass(frozen=True, eq=False)
+class Application:
+    """What is known of an identified arm and of the motion that it predicts.
+
+    Attributes:
+        model: of the arm.
+        estimate: the result.
+        evidence: errors on held-out motion.
+        held_out: this motion; empty if nothing was held out.
+        consistent: parameters (p,) of possible bodies, as files for simulators have them; None:
+            there are none.
+        lower: joint limits (n,) [rad or m].
+        upper: the same.
+    """
+
+    model: RobotModel
+    estimate: Estimate
+    evidence: Evidence
+    held_out: Sequence[Samples]
+    consistent: Array | None
+    lower: Array
+    upper: Array
+
+
+def purposes_of(arm: Application, limits: PurposeLimits) -> tuple[Purpose, ...]:
+    """Return all purposes, in the order in which they are shown."""
+    postures = workspace(arm.lower, arm.upper)
+    residuals = slow_residuals(arm.model, arm.estimate.values, arm.held_out)
+    return (
+        feed_forward(arm.evidence, limits),
+        gravity_compensation(arm.model, arm.estimate, postures),
+        simulation(arm, limits),
+        contact_detection(arm.model, residuals, postures, limits),
+        change_of_payload(arm.model, residuals, limits),
+        single_parameters(arm.estimate),
+    )
+
+
+def feed_forward(evidence: Evidence, limits: PurposeLimits) -> Purpose:
+    """Return the share of the torque that feedback has to add on unseen motion."""
+    share = evidence.held_out.overall
+    if evidence.in_sample or not np.isfinite(share):
+        return Purpose.unknown("feed-forward", "nothing held out")
+    references = {"none": 1.0}
+    worse = False
+    for name, error in (
+        ("nominal", evidence.nominal),
+        ("nominal with friction", evidence.nominal_with_friction),
+    ):
+        if error is not None:
+            references[name] = error.overall
+            worse = worse or share > error.overall + Thresholds().nominal
+    return Purpose(
+        "feed-forward",
+        share <= limits.feed_forward and not worse,
+        share,
+        limits.feed_forward,
+        references=references,
+    )
+
+
+def gravity_compensation(model: RobotModel, estimate: Estimate, postures: Array) -> Purpose:
+    """Return the error of the gravity torque over dry friction: below one the arm stays."""
+    error, friction = gravity_error(model, estimate, postures)
+    known = friction > 0.0
+    ratio = error / np.where(known, friction, 1.0)
+    worst = float(ratio[known].max(initial=0.0))
+    missing = not known.all()
+    good = False if worst > 1.0 else None if missing else True
+    return Purpose(
+        "gravity",
+        good,
+        worst if known.any() else None,
+        1.0,
+        joints=tuple(error.tolist()),
+        joint_limits=tuple(np.where(known, friction, 0.0).tolist()),
+        missing="no dry friction" if missing else "",
+    )
+
+
+def contact_detection(
+    model: RobotModel,
+    residuals: Sequence[SlowResidual],
+    postures: Array,
+    limits: PurposeLimits,
+) -> Purpose:
+    """Return the force at the flange that a threshold sees which holds without contact."""
+    if not residuals:
+        return Purpose.unknown("contact", "nothing held out", "N")
+    found = contact(model, residuals, postures)
+    if found is None:
+        return Purpose.unknown("contact", "too short", "N")
+    return Purpose(
+        "contact",
+        None if limits.contact is None else found.force <= limits.contact,
+        found.force,
+        limits.contact,
+        "N",
+        joints=tuple(found.torque.tolist()),
+        references={"period": PERIOD},
+    )
+
+
+def change_of_payload(
+    model: RobotModel, residuals: Sequence[SlowResidual], limits: PurposeLimits
+) -> Purpose:
+    """Return the smallest mass at the flange that would be seen."""
+    if not residuals:
+        return Purpose.unknown("payload", "nothing held out", "kg")
+    mass = seen_mass(model, residuals)
+    if mass is None:
+        return Purpose.unknown("payload", "too short", "kg")
+    good = None if limits.payload is None else mass <= limits.payload
+    return Purpose("payload", good, mass, limits.payload, "kg", references={"period": PERIOD})
+
+
+def simulation(arm: Application, limits: PurposeLimits) -> Purpose:
+    """Return how far a simulated flange is from its measured path after `HORIZON`."""
+    if not arm.held_out:
+        return Purpose.unknown("simulation", "nothing held out", "m")
+    if arm.consistent is None:
+        return Purpose.unknown("simulation", "not possible", "m")
+    try:
+        error = flange_error(arm.model, arm.consistent, arm.held_out)
+    except IdentificationError:
+        return Purpose.unknown("simulation", "not possible", "m")
+    if error is None:
+        return Purpose.unknown("simulation", "too short", "m")
+    good = error <= limits.distance
+    return Purpose("simulation", good, error, limits.distance, "m", references={"horizon": HORIZON})
+
+
+def single_parameters(estimate: Estimate) -> Purpose:
+    """Return how many parameters are known, to each of the shares `KNOWN` of themselves."""
+    std = np.where(np.isfinite(estimate.std), estimate.std, np.inf)
+    well, roughly = (
+        int(np.count_nonzero(std <= share * np.abs(estimate.values))) for share in KNOWN
+    )
+    references = {"roughly": float(roughly - well), "not": float(len(std) - roughly)}
+    return Purpose("parameters", None, float(well), references=references)

@@ -1,0 +1,82 @@
+"""Residual of motion without contact: how large it becomes once in a stated time."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Final, NamedTuple
+
+import numpy as np
+
+from identification.arrays import Array, Indices
+from identification.model.motion import Motion
+from identification.model.robot import RobotModel
+from identification.signals.masks import EDGE, SATURATED
+from identification.signals.samples import Samples
+from identification.signals.smoothing import low_pass
+from identification.validation.prediction import SLOW, driving_residual
+from identification.validation.residuals import BLOCK
+
+PERIOD: Final = 60.0
+"""A threshold is exceeded once in this time of motion without contact [s]."""
+_WHOLE: Final = 0.8  # of a block's time
+_FEWEST: Final = 10  # blocks that show how the largest residuals are distributed
+_TAIL: Final = 0.2  # of the blocks, from which larger ones are inferred
+_MANY: Final = 50  # blocks, of which a share would be more peaks than a tail needs
+_WITHIN: Final = 3.0  # times as many blocks as exceed the threshold, at most
+
+
+class SlowResidual(NamedTuple):
+    """Part of a recording without gap, and what a monitor of contact forces sees in it."""
+
+    motion: Motion  # (m, n)
+    torque: Array  # residual below `SLOW` (m, n) [N·m or N]
+
+
+def slow_residuals(
+    model: RobotModel, values: Array, recordings: Sequence[Samples]
+) -> list[SlowResidual]:
+    """Return the residual of parameters (p,), as an observer of contact forces passes it.
+
+    Reversals and rests are part of it; at the ends of recordings and in saturated rows it is zero.
+    """
+    parts = []
+    for samples in recordings:
+        error = driving_residual(model, samples, values)
+        if samples.mask is not None:
+            for reason in (EDGE, SATURATED):
+                error = np.where(samples.mask.reasons[reason], 0.0, error)
+        for segment in samples.segments:
+            motion = samples.motion.rows(segment)
+            if motion.n_samples > _FEWEST and np.ptp(motion.time) > BLOCK:
+                slow = low_pass(motion.time, error[segment], SLOW)
+                parts.append(SlowResidual(motion, slow))
+    return parts
+
+
+def whole_blocks(time: Array) -> tuple[Indices, int]:
+    """Return the first row of each whole block of times (m,) [s], and the row after the last."""
+    index = np.floor((time - time[0]) / BLOCK + 1e-9).astype(np.intp)
+    edges = np.flatnonzero(np.diff(index, prepend=-1))
+    # A part of a block at the end would have a smaller peak than a whole one.
+    if time[-1] - time[edges[-1]] > _WHOLE * BLOCK:
+        return edges, len(time)
+    return edges[:-1], int(edges[-1])
+
+
+def once_in(period: float, peaks: Array) -> Array | None:
+    """Return what the peaks of blocks (B, ...) exceed once in a time [s]; None of too few.
+
+    From the largest of them on, as of an exponential tail whose scale k peaks show: the chance of a
+    further one beyond x is (1 + x / (k scale))^-k, so that few peaks give a larger threshold. Of
+    normal residuals, whose tail is shorter, it errs to the larger side.
+    """
+    count = len(peaks)
+    if count < _FEWEST:
+        return None
+    share = min(1.0, BLOCK / period)
+    beyond = int(np.clip(_WITHIN * share * count, _TAIL * min(count, _MANY), 0.5 * count))
+    ordered = np.sort(peaks, axis=0)[::-1]
+    threshold = ordered[beyond]
+    scale = (ordered[:beyond] - threshold).mean(axis=0)
+    growth = beyond * ((beyond / (count * share)) ** (1.0 / beyond) - 1.0)
+    return np.asarray(threshold + scale * growth)
