@@ -34,7 +34,6 @@ from hil.control.cell_link import require_real_time
 from hil.control.errors import stopped
 from hil.precision.requirements import Requirement
 from hil.report.output_files import REPORT
-from hil.weighing.payload_campaign import assumes_payload
 
 
 @with_options(Weighing, "weighing")

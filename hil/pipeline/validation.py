@@ -67,10 +67,10 @@ def validate(
             in_sample=sources.in_sample,
             names=[source.name for source in sources.training],
             unseen=unseen,
-            consistency=None if isinstance(consistency, str) else consistency,
             prior=ScorePrior(posterior.prior.belief.gaussian, posterior.design_effect),
         )
-        evidence = replace(evidence, form=estimation.form)
+        possible = None if isinstance(consistency, str) else consistency
+        evidence = replace(evidence, form=estimation.form, consistency=possible)
         task.advance(1, "purposes")
         application = _application(prepared, result.pooled, evidence, consistency)
         verdict = judge(

@@ -204,21 +204,20 @@ def gather(
     in_sample: bool = False,
     names: Sequence[str] = (),
     unseen: Factor | None = None,
-    consistency: ConsistencyCheck | None = None,
     prior: ScorePrior | None = None,
 ) -> Evidence:
     """Collect the evidence for a verdict; every recording is read a few times.
 
     With `same_motion` the training recordings, in the order of the result, repeat one motion, and
-    noise is measured. `nominal` are parameters (p,); with `in_sample` the held-out motions are the
-    training. `unseen` is the sum of the held-out factors, if known; `prior` is that of the arm.
+    noise is measured. `nominal` are parameters (p,). With `in_sample` the held-out motions are the
+    training; `unseen` is the sum of their factors, if known, and `prior` that of the arm.
     """
     pooled, values = result.pooled, result.pooled.values
     unseen = total_factor(model, held_out) if unseen is None else unseen
     gravity, load = _gravity_and_load(model, training, held_out)
     noise = _noise(model, result, training) if same_motion else None
     floor = noise_floor(model, values, training[:_MOST_RECORDINGS], noise)
-    error = _error(model, values, held_out)
+    error, fitted = (_error(model, values, runs) for runs in (held_out, training))
     slow = None if noise is None else _slow_errors(model, result, held_out, error, unseen, noise)
     speed = np.abs(np.concatenate([run.motion.velocity for run in held_out])).max(axis=0)
     others, motors = (() if in_sample else held_out), context.motor_from_joint
@@ -228,7 +227,7 @@ def gather(
     return Evidence(
         estimate=pooled,
         held_out=error,
-        training=_error(model, values, training),
+        training=fitted,
         systematic=None if slow is None else slow.beyond_noise,
         systematic_without_friction=None if slow is None else slow.without_friction,
         friction_change=None if slow is None else slow.friction_change,
@@ -240,9 +239,9 @@ def gather(
         one_way=_one_way(training),
         gravity=gravity,
         load=load,
-        **_nominal_errors(model, nominal, result.factor, held_out),
+        nominal=None if nominal is None else _error(model, nominal, held_out),
+        nominal_with_friction=_with_friction(model, nominal, result.factor, held_out),
         implausible=_implausible(model, pooled, unseen, error, speed, context),
-        consistency=consistency,
         dissipation=dissipation_of(model, pooled, speed),
         residuals=check_residuals(
             model, values, training, others, same_motion=same_motion, motor_from_joint=motors
@@ -250,21 +249,17 @@ def gather(
         context=context,
         in_sample=in_sample,
         prismatic=tuple(np.flatnonzero(~model.chain.revolute).tolist()),
-        moved=np.sum([_time_moved(run) for run in held_out], axis=0),
+        moved=np.sum([*map(_time_moved, held_out)], axis=0),
     )
 
 
-def _nominal_errors(
+def _with_friction(
     model: RobotModel, nominal: Array | None, factor: Factor, held_out: Sequence[Samples]
-) -> dict[str, PredictionError]:
-    """Return the errors of nominal parameters (p,) by field, without and with friction."""
+) -> PredictionError | None:
+    """Return the error of nominal parameters (p,) with fitted friction, None without them."""
     if nominal is None:
-        return {}
-    with_friction = with_fitted_friction(model, nominal, factor)
-    return {
-        "nominal": _error(model, nominal, held_out),
-        "nominal_with_friction": _error(model, with_friction, held_out),
-    }
+        return None
+    return _error(model, with_fitted_friction(model, nominal, factor), held_out)
 
 
 def _noise(
