@@ -10,20 +10,23 @@ import tempfile
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Final
+from typing import Any, Final, Literal
 
 import numpy as np
 
 from hil.base.arrays import Array
 from hil.base.errors import InputError
 from hil.base.files import make_folder, write_files
-from hil.pipeline.identified_model import IdentifiedModel, remarks_of
+from hil.pipeline.identified_model import IdentifiedModel
 from identification.export.arm import Arm
 from identification.export.controller.c_source import CSource, Precision, c_source
 from identification.export.controller.reference import reference_torque
+from identification.export.controller.structured_text import structured_text
 from identification.export.controller.tables import control_tables
 from identification.export.simulators import STATES, random_states
 from identification.export.urdf import WriteBackError
+
+CodeName = Literal["c", "st"]
 
 AGREES: Final[dict[Precision, float]] = {"double": 1e-12, "single": 1e-4}
 """Largest difference of the compiled code, relative to the largest torque of a joint."""
@@ -73,7 +76,7 @@ class ExportedCode:
         lines = [*([f"parameters: {self.origin}"] if self.origin else [])]
         lines.append(f"written: {', '.join(map(str, self.paths))}")
         if isinstance(self.check, str):
-            lines.append(f"warning: not compiled: {self.check}")
+            lines.append(f"not compiled: {self.check}")
         else:
             lines.append(
                 f"compiled by {self.check.compiler}: torque within {self.check.difference:.1e} of"
@@ -96,33 +99,70 @@ class ExportedCode:
         }
 
 
-def export_c(model: IdentifiedModel, output: Path, precision: Precision) -> ExportedCode:
-    """Write the header and the source next to each other, compile and compare them.
+def export_code(
+    model: IdentifiedModel, output: Path, to: CodeName, precision: Precision
+) -> ExportedCode:
+    """Write code for a controller; C is compiled and compared with pinocchio first.
 
     Args:
         model: the identified arm.
-        output: of the source, NAME.c; the header is NAME.h, and names in both begin with NAME.
-        precision: of all numbers.
+        output: NAME.c, whose header becomes NAME.h, or NAME.st; names in the code begin with NAME.
+        to: the language.
+        precision: of numbers in C.
 
     Raises:
-        InputError: NAME is no identifier in lower case.
+        InputError: NAME is no identifier in lower case, or structured text in single precision.
         WriteBackError: the code computes another torque, or does not compile.
     """
     name = output.stem
-    if output.suffix != ".c" or not _IDENTIFIER.match(name):
+    if output.suffix != f".{to}" or not _IDENTIFIER.match(name):
         raise InputError(
             output,
-            "is no name for C code",
+            "is no name for code of a controller",
             field="--output",
-            remedy="give NAME.c with NAME of lower-case letters, digits and _; it begins the names"
-            " of all functions",
+            remedy=f"give NAME.{to} with NAME of lower-case letters, digits and _; names of all"
+            " functions begin with it",
         )
-    code = c_source(control_tables(model.arm), name, remarks_of(model), precision)
+    tables = control_tables(model.arm)
+    remarks = _remarks(model)
+    check: CompiledCheck | str
+    if to == "c":
+        code = c_source(tables, name, remarks, precision)
+        check = checked(code, name, model.arm, precision)
+        files = {output.name: code.source, f"{name}.h": code.header}
+    else:
+        if precision == "single":
+            raise InputError(
+                None,
+                "structured text has numbers of double precision (LREAL)",
+                field="--precision",
+                remedy="leave it out",
+            )
+        check = "structured text has no compiler here; the tests of hil run its function blocks"
+        files = {output.name: structured_text(tables, name, remarks)}
     make_folder(output.parent)
-    check = checked(code, name, model.arm, precision)
-    header = output.with_suffix(".h")
-    write_files(output.parent, {output.name: code.source, header.name: code.header})
-    return ExportedCode((output, header), check, model.verdict, model.origin)
+    write_files(output.parent, files)
+    paths = tuple(output.parent / written for written in files)
+    return ExportedCode(paths, check, model.verdict, model.origin)
+
+
+def _remarks(model: IdentifiedModel) -> tuple[str, ...]:
+    """Return the verdict first, the long list of archives last."""
+    unknown = ", ".join(model.estimate.undetermined)
+    others = {k: v for k, v in model.provenance.items() if k not in ("verdict", "archives")}
+    return (
+        f"Verdict: {model.verdict}",
+        "Identified by hil; bodies are physically consistent parameters.",
+        *([f"Not determined by the data: {unknown}."] if unknown else []),
+        *(f"{key}: {value}" for key, value in others.items()),
+        f"archives: {model.provenance.get('archives', '')}",
+    )
+
+
+def default_code_output(sources: Sequence[Path], to: CodeName) -> Path:
+    """Return the default path: in the campaign folder, or in the working directory."""
+    folder = sources[0] if sources[0].is_dir() else Path()
+    return folder / f"arm.{to}"
 
 
 def checked(code: CSource, name: str, arm: Arm, precision: Precision) -> CompiledCheck | str:

@@ -29,12 +29,14 @@ from hil.identified.staging import Staging, staged
 from hil.importers.messages import sentence
 from hil.importers.recording import ImportOptions, RobotOf, is_archive
 from hil.importers.robot import Robot
+from hil.pipeline.identified_model import model_of
 from hil.pipeline.identify_folder import identify_paths
 from hil.pipeline.options import Options
 from hil.pipeline.run import Identification
 from hil.report.figures import MEASURED, NOMINAL, PREDICTED, RESIDUAL, joints_of, torque_charts
 from hil.report.output_files import write_outcome
 from hil.results.results import Results
+from identification.export.observer import MomentumObserver
 from identification.model.motion import Motion
 from identification.text import percentage
 from identification.validation.verdict import Verdict
@@ -134,6 +136,19 @@ class IdentifiedArm:
             InputError: there are no physically consistent parameters.
         """
         return pinocchio_of(self.identification)
+
+    def observer(self, gain: float, dt: float) -> MomentumObserver:
+        """Return an observer of the torque from outside, such as that of a contact.
+
+        Args:
+            gain: 1 over the time constant of the estimate [1/s], such as 25.
+            dt: time between two cycles [s].
+
+        Raises:
+            InputError: there are no physically consistent parameters.
+            ModelError: gain or dt is not positive.
+        """
+        return MomentumObserver(model_of(self.identification).arm, gain, dt)
 
     def plot(self) -> Figure:
         """Draw measured torque of the held-out motion, and that of identified and nominal model."""

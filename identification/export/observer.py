@@ -81,7 +81,7 @@ class MomentumObserver:
         return array
 
     def _momentum(self, q: Array, v: Array) -> tuple[Array, Array, Array]:
-        """Return M v, C' v less gravity and elements, and the load of the gears without acceleration (n,)."""
+        """Return M v, C' v less gravity and elements, and the gears' load at no acceleration."""
         model = self._pinocchio
         data = self._data
         posture = pin.integrate(model, self._neutral, q)

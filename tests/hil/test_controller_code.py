@@ -35,9 +35,9 @@ from identification.model.friction import FrictionLaw
 from identification.model.motion import Motion
 from identification.model.payload import Payload
 from sim_fixtures.ns16 import urdf_text
+from tests.hil.structured_text_reader import Block, blocks_of
 from tests.identification.robots import random_urdf
 from tests.identification.test_export import WRIST, an_arm
-from tests.hil.structured_text_reader import Block, blocks_of
 from tests.identification.two_link import four_sines
 
 COMPILER = next(filter(shutil.which, ("cc", "gcc", "clang")), None)
@@ -164,7 +164,9 @@ def test_dry_friction_follows_the_motion_as_identified(whole: tuple[Arm, Compile
     n = arm.model.n_joints
     motion = slow_motion(n)
     expected = reference_torque(arm, motion, presliding=True)
-    rows = [np.ascontiguousarray(x) for x in (motion.position, motion.velocity, motion.acceleration)]
+    rows = [
+        np.ascontiguousarray(x) for x in (motion.position, motion.velocity, motion.acceleration)
+    ]
     state = ctypes.create_string_buffer(4096)
     dt = ctypes.c_double(float(np.diff(motion.time)[0]))
     code.function("presliding_start")(state, dt, pointer(rows[0][0]), pointer(rows[1][0]))

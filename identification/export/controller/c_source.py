@@ -18,7 +18,7 @@ from identification.export.controller.tables import (
 
 Precision = Literal["double", "single"]
 
-_DIGITS: Final = {"double": 17, "single": 9}  # that a number needs to be read back as it was
+_REALS: Final = {"double": np.float64, "single": np.float32}
 _FUNCTIONS: Final = ("sin", "cos", "sqrt", "exp", "tanh", "fabs")
 _MACROS: Final = ("ARM_SIN", "ARM_COS", "ARM_SQRT", "ARM_EXP", "ARM_TANH", "ARM_ABS")
 _WIDTH: Final = 100  # of the comment at the top
@@ -42,7 +42,6 @@ def c_source(
         remarks: origin and verdict, in the comment at the top of the header.
         precision: of all numbers.
     """
-    digits = _DIGITS[precision]
     header = "".join(
         [
             *(f"{line}\n" for line in _comment(tables, remarks, precision)),
@@ -62,7 +61,7 @@ def c_source(
                 f"#define {macro} {function}{'f' if precision == 'single' else ''}\n"
                 for macro, function in zip(_MACROS, _FUNCTIONS, strict=True)
             ),
-            *_constants(tables, precision, digits),
+            *_constants(tables, precision),
             "\n",
             _engine("engine.c"),
         ]
@@ -85,18 +84,11 @@ def _plain(text: str) -> str:
     return " ".join(text.replace("*/", "* /").split())
 
 
-def _comment(
-    tables: ControlTables, remarks: Sequence[str], precision: Precision
-) -> Iterator[str]:
+def _comment(tables: ControlTables, remarks: Sequence[str], precision: Precision) -> Iterator[str]:
     yield "/*"
-    for remark in remarks:
-        yield from _folded(_plain(remark))
-    yield ""
     joints = [
         f"{k} {name}{'' if revolute else ' (prismatic)'}"
-        for k, (name, revolute) in enumerate(
-            zip(tables.joint_names, tables.revolute, strict=True)
-        )
+        for k, (name, revolute) in enumerate(zip(tables.joint_names, tables.revolute, strict=True))
     ]
     yield from _folded(f"Joints: {', '.join(joints)}.")
     yield from _folded(
@@ -105,10 +97,11 @@ def _comment(
         " precision."
     )
     numbers = ", ".join(f"{x:g}" for x in tables.gravity)
-    yield from _folded(
-        f"Gravity in the axes of the base: {numbers} m/s2."
-    )
-    yield "*/"
+    yield from _folded(f"Gravity in the axes of the base: {numbers} m/s2.")
+    yield " *"
+    for remark in remarks:
+        yield from _folded(_plain(remark))
+    yield " */"
 
 
 def _folded(text: str) -> Iterator[str]:
@@ -129,12 +122,12 @@ def _definitions(tables: ControlTables, precision: Precision) -> str:
     )
 
 
-def _constants(tables: ControlTables, precision: Precision, digits: int) -> Iterator[str]:
+def _constants(tables: ControlTables, precision: Precision) -> Iterator[str]:
     """Yield the definitions of all tables."""
     suffix = "f" if precision == "single" else ""
 
     def number(value: float) -> str:
-        text = f"{value + 0.0:.{digits}g}"
+        text = str(_REALS[precision](value + 0.0))  # as few digits as are read back as it was
         return (text if re.search(r"[.e]", text) else f"{text}.0") + suffix
 
     def reals(name: str, values: Array, note: str) -> str:
@@ -165,11 +158,15 @@ def _constants(tables: ControlTables, precision: Precision, digits: int) -> Iter
     )
     yield reals("turn_cos", flat(tables.turn_cos), "by rows")
     yield reals("turn_sin", flat(tables.turn_sin), "by rows")
-    yield reals("origin", tables.origin, "Origin of joint i in its parent's frame: origin + q slide.")
+    yield reals(
+        "origin", tables.origin, "Origin of joint i in its parent's frame: origin + q slide."
+    )
     yield reals("slide", tables.slide, "Zero for revolute joints.")
     yield reals("axis", tables.axis, "Axis of each joint in its own frame.")
     yield reals(
-        "body", tables.body, "Ixx Ixy Ixz Iyy Iyz Izz about the joint's origin, m cx, m cy, m cz, m."
+        "body",
+        tables.body,
+        "Ixx Ixy Ixz Iyy Iyz Izz about the joint's origin, m cx, m cy, m cz, m.",
     )
     yield reals("rotor", tables.rotor, "Inertia of the rotors, on the side of the joints.")
     if tables.has_load:
@@ -178,7 +175,9 @@ def _constants(tables: ControlTables, precision: Precision, digits: int) -> Iter
     yield reals("presliding", tables.presliding, "Displacement over which dry friction reverses.")
     yield reals("linear_zone", tables.linear_zone, "Speed below which dry friction is linear.")
     if tables.n_axes > tables.n_joints:
-        yield reals("motor_turns", tables.motor_turns, "Speed of each coupled motor by the joints'.")
+        yield reals(
+            "motor_turns", tables.motor_turns, "Speed of each coupled motor by the joints'."
+        )
     yield reals("payload_rotation", tables.payload_rotation, "Axes of the payload frame.")
     yield reals("payload_origin", tables.payload_origin, "Its origin in the joint's frame.")
     if tables.elements:

@@ -17,7 +17,6 @@ from identification.export.controller.tables import (
     ControlTables,
 )
 
-_DIGITS: Final = 17
 _PAYLOAD_INPUTS: Final = """\
 gravity : ARRAY [1..3] OF LREAL := ARM_GRAVITY_VECTOR; (* base axes [m/s2] *)
     payload_mass : LREAL := ARM_PAYLOAD_MASS; (* [kg] *)
@@ -75,13 +74,12 @@ def _comment(tables: ControlTables, remarks: Sequence[str]) -> Iterator[str]:
         )
     )
     yield "(*"
+    yield f"   Joints: {joints}."
+    yield "   Units: rad, m, s, kg, N m, N. Angles are those of the robot description;"
+    yield f"   a payload is stated in the frame of {tables.payload_frame}."
+    yield ""
     for remark in remarks:
         yield f"   {' '.join(remark.replace('*)', '* )').replace('(*', '( *').split())}"
-    yield f"   Joints: {joints}."
-    yield (
-        "   Units: rad, m, s, kg, N m, N. Angles and their signs are those of the robot description;"
-    )
-    yield f"   a payload is stated in the frame of {tables.payload_frame}."
     yield "*)"
 
 
@@ -127,7 +125,7 @@ def _friction(tables: ControlTables) -> Iterator[str]:
 
 def _number(value: float) -> str:
     """Return a literal: a point, and an exponent in upper case."""
-    digits, _, exponent = f"{value + 0.0:.{_DIGITS}g}".partition("e")
+    digits, _, exponent = str(value + 0.0).partition("e")  # as few as are read back as it was
     digits = digits if "." in digits else f"{digits}.0"
     return f"{digits}E{exponent}" if exponent else digits
 

@@ -179,14 +179,14 @@ def _friction(model: RobotModel, values: Array) -> Array:
     """Return the coefficients of joints and coupled motors (n + k, 11)."""
     friction = model.friction
     table = np.zeros((len(friction.all_laws), len(FRICTION_COLUMNS)))
-    for row, law in zip(table, friction.all_laws, strict=True):
-        row[FRICTION_COLUMNS.index("TANH_SPEED")] = law.tanh or 1.0
-        row[FRICTION_COLUMNS.index("STRIBECK_SPEED")] = law.stribeck or 1.0
+    for k, law in enumerate(friction.all_laws):
+        table[k, FRICTION_COLUMNS.index("TANH_SPEED")] = law.tanh or 1.0
+        table[k, FRICTION_COLUMNS.index("STRIBECK_SPEED")] = law.stribeck or 1.0
     for joint_term, value in zip(friction.terms, values[model.friction_part], strict=True):
-        row = joint_term.owner
+        k = joint_term.owner
         if joint_term.motor:
-            row = model.n_joints + friction.motors.index(joint_term.owner)
-        table[row, FRICTION_COLUMNS.index(_COLUMN_OF_LABEL[joint_term.term.label])] = value
+            k = model.n_joints + friction.motors.index(joint_term.owner)
+        table[k, FRICTION_COLUMNS.index(_COLUMN_OF_LABEL[joint_term.term.label])] = value
     return table
 
 
@@ -208,9 +208,7 @@ def _stated(coefficient: Coefficient) -> float:
     return coefficient.value or 0.0
 
 
-def _numbers(
-    placed: PlacedElement, coefficients: list[float]
-) -> Iterator[tuple[str, list[float]]]:
+def _numbers(placed: PlacedElement, coefficients: list[float]) -> Iterator[tuple[str, list[float]]]:
     """Yield kind and numbers of an element; of a torque ripple those of each order."""
 
     def between(anchors: Anchors) -> list[float]:
@@ -233,4 +231,3 @@ def _numbers(
                 yield "TORQUE_RIPPLE", [cosine, sine, float(order)]
         case other:
             raise TypeError(f"{type(other).__name__} has no code for a controller")
-
