@@ -68,12 +68,10 @@ def export(
     **Example:** `hil export runs/demo --to mjcf`, `hil export runs/demo --to c -o arm.c`
 
     Options:
-        to: For simulators mjcf (MuJoCo XML), urdf, sdf (Gazebo, Drake) or pinocchio (text archive
-            of its model); for a controller c (C99: torque, gravity, mass matrix, friction, momentum
-            observer) or st (the same in structured text of IEC 61131-3).
+        to: For a simulator mjcf (MuJoCo), urdf, sdf or pinocchio; for a controller c (C99) or st
+            (structured text).
         output: File to write; with --ensemble a folder, or an .npz file of all parameters.
-            Default: identified.*, or arm.c and arm.h, or arm.st, in the campaign folder or the
-            working directory.
+            Default: identified.*, arm.c or arm.st in the campaign folder or working directory.
         ensemble: Write so many arms drawn from the posterior, all of them physically consistent.
         seed: Of the draws.
         precision: Of the numbers in code for a controller.

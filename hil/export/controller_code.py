@@ -32,7 +32,8 @@ AGREES: Final[dict[Precision, float]] = {"double": 1e-12, "single": 1e-4}
 """Largest difference of the compiled code, relative to the largest torque of a joint."""
 
 _COMPILERS: Final = ("cc", "gcc", "clang")
-_STRICT: Final = ("-std=c99", "-O2", "-Wall", "-Wextra", "-Wconversion", "-pedantic", "-Werror")
+STRICT: Final = ("-std=c99", "-O2", "-Wall", "-Wextra", "-Wconversion", "-pedantic", "-Werror")
+"""Flags of a compiler that lets no warning pass."""
 _IDENTIFIER: Final = re.compile(r"[a-z][a-z0-9_]*\Z")
 _MOST_SECONDS: Final = 60.0  # for a compiler
 _TIMED_CALLS: Final = 100_000
@@ -217,7 +218,7 @@ class CompiledArm:
         timer = re.sub(r"\barm_", f"{name}_", _TIMER).replace("ARM_", f"{name.upper()}_")
         sources = {f"{name}.h": code.header, f"{name}.c": code.source}
         write_files(folder, {**sources, "timer.c": f'#include "{name}.h"\n{timer}'})
-        _compile(compiler, [*_STRICT, "-c", f"{name}.c", "-o", "strict.o"], folder)
+        _compile(compiler, [*STRICT, "-c", f"{name}.c", "-o", "strict.o"], folder)
         library = folder / "arm.so"
         shared = ["-std=c99", "-O2", "-fPIC", "-shared", f"{name}.c", "timer.c", "-lm"]
         _compile(compiler, [*shared, "-o", library.name], folder)

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import ctypes
+import re
 import shutil
+import subprocess
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -13,7 +15,7 @@ import pinocchio as pin
 import pytest
 
 from hil.base.arrays import Array
-from hil.export.controller_code import AGREES, CompiledArm, checked, pointer
+from hil.export.controller_code import AGREES, STRICT, CompiledArm, checked, pointer
 from identification.errors import ModelError, ShapeError
 from identification.export.arm import Arm
 from identification.export.controller.c_source import Precision, c_source
@@ -262,6 +264,27 @@ class TestObserver:
             MomentumObserver(arm, 0.0, 0.001)
         with pytest.raises(ShapeError, match="tau"):
             MomentumObserver(arm, 1.0, 0.001).step(np.zeros(6), np.zeros(6), np.zeros(5))
+
+
+def test_the_loop_of_the_page_compiles(tmp_path: Path) -> None:
+    page = (Path(__file__).parents[2] / "docs" / "controller.md").read_text("utf-8")
+    (loop,) = re.findall(r"```c\n(.*?)```", page, re.DOTALL)
+    code = c_source(control_tables(an_arm(urdf_text())), "arm", [])
+    (tmp_path / "arm.h").write_text(code.header)
+    (tmp_path / "loop.c").write_text(loop)
+    assert COMPILER is not None
+    done = subprocess.run(
+        [COMPILER, *STRICT, "-c", "loop.c", "-o", "loop.o"],
+        cwd=tmp_path, capture_output=True, text=True, check=False,
+    )  # fmt: skip
+    assert done.returncode == 0, done.stderr
+
+
+def test_the_page_names_every_function() -> None:
+    page = (Path(__file__).parents[2] / "docs" / "controller.md").read_text("utf-8")
+    header = c_source(control_tables(an_arm(urdf_text())), "arm", []).header
+    for name in re.findall(r"^void (arm_\w+)\(", header, re.MULTILINE):
+        assert name in page, name
 
 
 class TestStructuredText:

@@ -21,6 +21,7 @@ Precision = Literal["double", "single"]
 _REALS: Final = {"double": np.float64, "single": np.float32}
 _FUNCTIONS: Final = ("sin", "cos", "sqrt", "exp", "tanh", "fabs")
 _MACROS: Final = ("ARM_SIN", "ARM_COS", "ARM_SQRT", "ARM_EXP", "ARM_TANH", "ARM_ABS")
+_COLUMNS: Final = ",\n    ".join(FRICTION_COLUMNS)
 _WIDTH: Final = 100  # of the comment at the top
 
 
@@ -55,7 +56,7 @@ def c_source(
     )
     source = "".join(
         [
-            f"/* Constants of {_plain(name)}, and the code that reads them; see {name}.h. */\n\n",
+            f"/* Constants of {_uncommented(name)}, and the code that reads them; see {name}.h. */\n\n",
             f'#include "{name}.h"\n\n#include <math.h>\n\n',
             *(
                 f"#define {macro} {function}{'f' if precision == 'single' else ''}\n"
@@ -79,7 +80,7 @@ def _renamed(text: str, name: str) -> str:
     return re.sub(r"\bARM_(?=[A-Z])", f"{name.upper()}_", text)
 
 
-def _plain(text: str) -> str:
+def _uncommented(text: str) -> str:
     """Return a text that ends no comment of C."""
     return " ".join(text.replace("*/", "* /").split())
 
@@ -92,7 +93,7 @@ def _comment(tables: ControlTables, remarks: Sequence[str], precision: Precision
     ]
     yield from _folded(f"Joints: {', '.join(joints)}.")
     yield from _folded(
-        "Units: rad, m, s, kg, N m, N. Angles and their signs are those of the robot description;"
+        "SI units: rad, m, s, kg, N. Angles and their signs are those of the robot description;"
         f" a payload is stated in the frame of {tables.payload_frame}. Numbers are of {precision}"
         " precision."
     )
@@ -100,7 +101,7 @@ def _comment(tables: ControlTables, remarks: Sequence[str], precision: Precision
     yield from _folded(f"Gravity in the axes of the base: {numbers} m/s2.")
     yield " *"
     for remark in remarks:
-        yield from _folded(_plain(remark))
+        yield from _folded(_uncommented(remark))
     yield " */"
 
 
@@ -122,71 +123,88 @@ def _definitions(tables: ControlTables, precision: Precision) -> str:
     )
 
 
-def _constants(tables: ControlTables, precision: Precision) -> Iterator[str]:
-    """Yield the definitions of all tables."""
-    suffix = "f" if precision == "single" else ""
+class _Writer:
+    """Definitions of constants in C, of one precision."""
 
-    def number(value: float) -> str:
-        text = str(_REALS[precision](value + 0.0))  # as few digits as are read back as it was
-        return (text if re.search(r"[.e]", text) else f"{text}.0") + suffix
+    def __init__(self, precision: Precision) -> None:
+        self._real = _REALS[precision]
+        self._suffix = "f" if precision == "single" else ""
 
-    def reals(name: str, values: Array, note: str) -> str:
-        rows = np.reshape(values, (-1, values.shape[-1] if values.ndim > 1 else values.size))
-        lines = ",\n".join("    " + ", ".join(map(number, row)) for row in rows.tolist())
+    def number(self, value: float) -> str:
+        """Return a literal with as few digits as are read back as it was."""
+        text = str(self._real(value + 0.0))
+        return (text if re.search(r"[.e]", text) else f"{text}.0") + self._suffix
+
+    def initial(self, values: Array) -> str:
+        """Return values in braces, on one line."""
+        return f"{{{', '.join(map(self.number, values.tolist()))}}}"
+
+    def reals(self, name: str, values: Array, note: str) -> str:
+        """Return a table, a row a line."""
+        flat = values.reshape(len(values), -1) if values.ndim > 1 else values[None, :]
+        lines = ",\n".join("    " + ", ".join(map(self.number, row)) for row in flat.tolist())
         return f"\n/* {note} */\nstatic const arm_real {name}[{values.size}] = {{\n{lines}}};\n"
 
-    def integers(name: str, values: Sequence[int], note: str) -> str:
-        listed = ", ".join(map(str, values))
-        return f"\n/* {note} */\nstatic const int {name}[{len(values)}] = {{{listed}}};\n"
+    def integers(self, name: str, values: Sequence[int], note: str) -> str:
+        """Return a table of integers on one line."""
+        entries = ", ".join(map(str, values))
+        return f"\n/* {note} */\nstatic const int {name}[{len(values)}] = {{{entries}}};\n"
 
-    def flat(matrices: Array) -> Array:
-        return matrices.reshape(len(matrices), -1)
 
-    yield f"\n#define ARM_GRAVITY {{{', '.join(map(number, tables.gravity.tolist()))}}}\n"
-    yield f"#define ARM_PAYLOAD {{{', '.join(map(number, tables.payload.tolist()))}}}\n"
+def _constants(tables: ControlTables, precision: Precision) -> Iterator[str]:
+    """Yield the definitions of all tables."""
+    write = _Writer(precision)
+    yield f"\n#define ARM_GRAVITY {write.initial(tables.gravity)}\n"
+    yield f"#define ARM_PAYLOAD {write.initial(tables.payload)}\n"
     yield f"#define ARM_ELEMENTS {len(tables.elements)}\n"
     yield f"#define PAYLOAD_JOINT {tables.payload_joint}\n"
     yield f"#define FRICTION_HAS_LOAD {int(tables.has_load)}\n"
     yield f"#define FRICTION_SIZE {len(FRICTION_COLUMNS)}\n"
-    yield f"enum {{ {', '.join(FRICTION_COLUMNS)} }};\n"
-    yield integers("parent", tables.parent.tolist(), "Joint that carries each joint, -1: the base.")
-    yield integers("revolute", tables.revolute.astype(int).tolist(), "0: prismatic.")
-    yield reals(
-        "turn_fixed",
-        flat(tables.turn_fixed),
-        "Axes of joint i in its parent's: turn_fixed + cos(q) turn_cos + sin(q) turn_sin.",
-    )
-    yield reals("turn_cos", flat(tables.turn_cos), "by rows")
-    yield reals("turn_sin", flat(tables.turn_sin), "by rows")
-    yield reals(
-        "origin", tables.origin, "Origin of joint i in its parent's frame: origin + q slide."
-    )
-    yield reals("slide", tables.slide, "Zero for revolute joints.")
-    yield reals("axis", tables.axis, "Axis of each joint in its own frame.")
-    yield reals(
-        "body",
-        tables.body,
-        "Ixx Ixy Ixz Iyy Iyz Izz about the joint's origin, m cx, m cy, m cz, m.",
-    )
-    yield reals("rotor", tables.rotor, "Inertia of the rotors, on the side of the joints.")
+    yield f"enum {{\n    {_COLUMNS}\n}};\n"
+    yield from _geometry(tables, write)
+    bodies = "Ixx Ixy Ixz Iyy Iyz Izz about the joint's origin, m cx, m cy, m cz, m."
+    yield write.reals("body", tables.body, bodies)
+    yield write.reals("rotor", tables.rotor, "Inertia of the rotors, on the side of the joints.")
     if tables.has_load:
-        yield reals("load_rotor", tables.load_rotor, "Of rotors that the bodies contain.")
-    yield reals("friction", tables.friction, "Columns FRICTION_..., joints, then coupled motors.")
-    yield reals("presliding", tables.presliding, "Displacement over which dry friction reverses.")
-    yield reals("linear_zone", tables.linear_zone, "Speed below which dry friction is linear.")
+        yield write.reals("load_rotor", tables.load_rotor, "Of rotors that the bodies contain.")
+    yield write.reals("friction", tables.friction, "Columns FRICTION_..., joints, then motors.")
+    travel = "Displacement over which dry friction reverses."
+    yield write.reals("presliding", tables.presliding, travel)
+    yield write.reals("linear_zone", tables.linear_zone, "Speed below which it is linear.")
     if tables.n_axes > tables.n_joints:
-        yield reals(
-            "motor_turns", tables.motor_turns, "Speed of each coupled motor by the joints'."
+        yield write.reals(
+            "motor_turns", tables.motor_turns, "Of each coupled motor by the joints'."
         )
-    yield reals("payload_rotation", tables.payload_rotation, "Axes of the payload frame.")
-    yield reals("payload_origin", tables.payload_origin, "Its origin in the joint's frame.")
     if tables.elements:
-        kinds = [ELEMENT_KINDS.index(element.kind) for element in tables.elements]
-        yield f"\nenum {{ {', '.join(ELEMENT_KINDS)} }};\n"
-        yield integers("element_kind", kinds, "Springs, balancers, orders of ripple.")
-        joints = [element.joint for element in tables.elements]
-        yield integers("element_joint", joints, "Joint that each acts on.")
-        turns = np.array([element.turns for element in tables.elements])
-        yield reals("element_turns", turns, "Derivative of its angle by that of each joint.")
-        numbers = np.array([element.numbers for element in tables.elements])
-        yield reals("element_value", numbers, "As add_elements reads them.")
+        yield from _elements(tables, write)
+
+
+def _geometry(tables: ControlTables, write: _Writer) -> Iterator[str]:
+    carrier = "Joint that carries each joint, -1: the base."
+    yield write.integers("parent", tables.parent.tolist(), carrier)
+    yield write.integers("revolute", tables.revolute.astype(int).tolist(), "0: prismatic.")
+    axes = (
+        "Axes of a joint in its parent's, by rows: turn_fixed + cos(q) turn_cos + sin(q) turn_sin."
+    )
+    yield write.reals("turn_fixed", tables.turn_fixed, axes)
+    yield write.reals("turn_cos", tables.turn_cos, "Times cos(q).")
+    yield write.reals("turn_sin", tables.turn_sin, "Times sin(q).")
+    yield write.reals(
+        "origin", tables.origin, "Of a joint in its parent's frame: origin + q slide."
+    )
+    yield write.reals("slide", tables.slide, "Zero for revolute joints.")
+    yield write.reals("axis", tables.axis, "Axis of each joint in its own frame.")
+    yield write.reals("payload_rotation", tables.payload_rotation, "Axes of the payload frame.")
+    yield write.reals("payload_origin", tables.payload_origin, "Its origin in the joint's frame.")
+
+
+def _elements(tables: ControlTables, write: _Writer) -> Iterator[str]:
+    elements = tables.elements
+    kinds = [ELEMENT_KINDS.index(element.kind) for element in elements]
+    yield f"\nenum {{ {', '.join(ELEMENT_KINDS)} }};\n"
+    yield write.integers("element_kind", kinds, "Springs, balancers, orders of ripple.")
+    yield write.integers("element_joint", [e.joint for e in elements], "Joint each acts on.")
+    turns = np.array([element.turns for element in elements])
+    yield write.reals("element_turns", turns, "Derivative of its angle by that of each joint.")
+    numbers = np.array([element.numbers for element in elements])
+    yield write.reals("element_value", numbers, "As add_elements reads them.")

@@ -75,7 +75,7 @@ def _comment(tables: ControlTables, remarks: Sequence[str]) -> Iterator[str]:
     )
     yield "(*"
     yield f"   Joints: {joints}."
-    yield "   Units: rad, m, s, kg, N m, N. Angles are those of the robot description;"
+    yield "   SI units: rad, m, s, kg, N. Angles are those of the robot description;"
     yield f"   a payload is stated in the frame of {tables.payload_frame}."
     yield ""
     for remark in remarks:
@@ -135,8 +135,8 @@ def _list(values: Sequence[float]) -> str:
 
 
 def _integers(name: str, values: Sequence[int], note: str) -> str:
-    listed = ", ".join(map(str, values))
-    return f"{name} : ARRAY [1..{len(values)}] OF DINT := [{listed}]; (* {note} *)"
+    entries = ", ".join(map(str, values))
+    return f"{name} : ARRAY [1..{len(values)}] OF DINT := [{entries}]; (* {note} *)"
 
 
 def _reals(name: str, values: Array, note: str) -> str:
