@@ -56,7 +56,7 @@ def c_source(
     )
     source = "".join(
         [
-            f"/* Constants of {_uncommented(name)}, and the code that reads them; see {name}.h. */\n\n",
+            f"/* Constants of an arm, and the code that reads them; see {name}.h. */\n\n",
             f'#include "{name}.h"\n\n#include <math.h>\n\n',
             *(
                 f"#define {macro} {function}{'f' if precision == 'single' else ''}\n"
