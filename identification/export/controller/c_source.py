@@ -74,10 +74,10 @@ def _engine(name: str) -> str:
     return files(__package__).joinpath(name).read_text(encoding="utf-8")
 
 
-def _renamed(text: str, name: str) -> str:
-    """Return a text of C with the prefix of its names replaced."""
-    text = re.sub(r"\barm_(?=[a-z])", f"{name}_", text)
-    return re.sub(r"\bARM_(?=[A-Z])", f"{name.upper()}_", text)
+def _renamed(code: str, name: str) -> str:
+    """Return code of C with the prefix of its names replaced."""
+    code = re.sub(r"\barm_(?=[a-z])", f"{name}_", code)
+    return re.sub(r"\bARM_(?=[A-Z])", f"{name.upper()}_", code)
 
 
 def _uncommented(text: str) -> str:
@@ -132,8 +132,8 @@ class _Writer:
 
     def number(self, value: float) -> str:
         """Return a literal with as few digits as are read back as it was."""
-        text = str(self._real(value + 0.0))
-        return (text if re.search(r"[.e]", text) else f"{text}.0") + self._suffix
+        digits = str(self._real(value + 0.0))
+        return (digits if re.search(r"[.e]", digits) else f"{digits}.0") + self._suffix
 
     def initial(self, values: Array) -> str:
         """Return values in braces, on one line."""

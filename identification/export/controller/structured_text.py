@@ -47,10 +47,10 @@ def structured_text(tables: ControlTables, name: str, remarks: Sequence[str]) ->
         name: an identifier.
         remarks: origin and verdict, in the comment at the top.
     """
-    text = files(__package__).joinpath("engine.st").read_text(encoding="utf-8")
-    text = text.replace("(*TABLES dynamics*)", "\n    ".join(_dynamics(tables)))
-    text = text.replace("(*TABLES friction*)", "\n    ".join(_friction(tables)))
-    text = text.replace("(*PAYLOAD INPUTS*)", _PAYLOAD_INPUTS)
+    code = files(__package__).joinpath("engine.st").read_text(encoding="utf-8")
+    code = code.replace("(*TABLES dynamics*)", "\n    ".join(_dynamics(tables)))
+    code = code.replace("(*TABLES friction*)", "\n    ".join(_friction(tables)))
+    code = code.replace("(*PAYLOAD INPUTS*)", _PAYLOAD_INPUTS)
     payload = tables.payload_body
     constants = {
         "ARM_JOINTS": str(tables.n_joints),
@@ -61,9 +61,9 @@ def structured_text(tables: ControlTables, name: str, remarks: Sequence[str]) ->
         "ARM_PAYLOAD_INERTIA": _list(payload.inertia),
     }
     for constant, value in constants.items():
-        text = re.sub(rf"\b{constant}\b", value, text)
-    text = re.sub(rf"\bARM_(?={'|'.join(_BLOCKS)})", f"{name.upper()}_", text)
-    return "\n".join([*_comment(tables, remarks), "", text])
+        code = re.sub(rf"\b{constant}\b", value, code)
+    code = re.sub(rf"\bARM_(?={'|'.join(_BLOCKS)})", f"{name.upper()}_", code)
+    return "\n".join([*_comment(tables, remarks), "", code])
 
 
 def _comment(tables: ControlTables, remarks: Sequence[str]) -> Iterator[str]:
