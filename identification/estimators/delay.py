@@ -14,6 +14,8 @@ a velocity reversal are left out: presliding friction is similar to a delay.
 
 from __future__ import annotations
 
+import math
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any, Final, NamedTuple
@@ -279,8 +281,7 @@ def _estimated(
     assumed = options.torque_delay
     samples = prepare(recording, model, noise_variance=noise_variance, options=options)
     ends = (-LONGEST_DELAY - assumed, LONGEST_DELAY - assumed)
-    grid = np.linspace(*ends, 1 + 2 * int(np.ceil(LONGEST_DELAY / _PROFILE_STEP)))
-    reader, (heights, values) = _profiled(model, samples, grid)
+    reader, (grid, heights, values) = _profiled(model, samples, ends)
     shift = float(grid[np.argmin(heights)])
     for iteration in range(_ITERATIONS):
         blocks = reader.linearised(shift, values)
@@ -294,12 +295,17 @@ def _estimated(
         # What is far from determined need not settle, and often does not.
         if iteration >= _FIRST_ITERATIONS and blocks.delay_std(solution)[0] > WIDEST_INTERVAL:
             break
-    height = reader.profile(np.array([shift])).heights[0]
+    height = reader.profile(np.array([shift]), reader.rows_at).heights[0]
     other = _other_minimum(grid, heights, shift, height)
     std, count = blocks.delay_std(solution)
     factor, by_chance = (float(student_limit(share, count - 1)) for share in (0.025, _CHANCE))
     at_limit = shift <= ends[0] or shift >= ends[1]
-    unshifted = reader.linearised(0.0, values, blocks.weights)
+
+    def predicts_better() -> bool:
+        """Return whether left-out blocks are predicted better than without the delay."""
+        unshifted = reader.linearised(0.0, values, blocks.weights)
+        return blocks.predicted() < unshifted.predicted(with_delay=False)
+
     return DelayEstimate(
         delay=shift + assumed,
         std=std,
@@ -308,10 +314,7 @@ def _estimated(
         interval_factor=factor,
         reason=_undetermined_reason(factor * std, at_limit, other + assumed),
         significant=bool(
-            not at_limit
-            and np.isnan(other)
-            and abs(shift) > by_chance * std
-            and blocks.predicted() < unshifted.predicted(with_delay=False)
+            not at_limit and np.isnan(other) and abs(shift) > by_chance * std and predicts_better()
         ),
     )
 
@@ -332,11 +335,13 @@ def _narrow(options: Preprocessing) -> Preprocessing:
     return replace(options, smooth_torque=False, rigid_bandwidth=narrow)
 
 
-def _profiled(model: RobotModel, samples: Samples, shifts: Array) -> tuple[_Reader, _Profile]:
-    """Return a reader of the samples, with their load, and its profile at common shifts (K,)."""
+def _profiled(
+    model: RobotModel, samples: Samples, ends: tuple[float, float]
+) -> tuple[_Reader, _Profile]:
+    """Return a reader of the samples, with their load, and its profile between two shifts."""
     # Friction that grows with load resembles a delay of some milliseconds.
     loaded = fit_with_load(
-        model, (samples,), lambda parts: _Reader.of(model, parts[0]).profile(shifts)
+        model, (samples,), lambda parts: _Reader.of(model, parts[0]).whole_profile(ends)
     )
     return _Reader.of(model, loaded.samples[0]), loaded.result
 
@@ -464,9 +469,18 @@ def _between_joints(delays: Array, variances: Array, freedom: int) -> float:
     return share * (squares - others) / (whole * (1.0 - share))
 
 
+class _ShiftedRows(NamedTuple):
+    """Rows of the model with the motion of an earlier time, and what was measured at them."""
+
+    blocks: Sequence[Array]  # columns of each joint (m, c_j)
+    torque: Array  # without that of known payloads (m, n)
+    usable: Rows  # (m, n)
+
+
 class _Profile(NamedTuple):
     """Fits at K common shifts."""
 
+    shifts: Array  # (K,) [s]
     heights: Array  # mean log residual variance (K,)
     values: Array  # parameters (p,) of the lowest
 
@@ -538,12 +552,54 @@ class _Reader:
         result = replace(self.binned, motion=Motion(time, **moved), usable=usable)
         return replace(result, torque=result.torque - result.known_torque(self.model))
 
-    def profile(self, shifts: Array) -> _Profile:
+    def rows_at(self, shift: float) -> _ShiftedRows:
+        """Return the rows at a shift."""
+        samples = self.at(shift)
+        return _ShiftedRows(samples.regressor(self.model).blocks, samples.torque, samples.usable)
+
+    def rows_behind(self, shift: float) -> _ShiftedRows:
+        """Return the rows at a shift by whole bins: those without one, so many bins earlier.
+
+        The low-pass of the torque, which both have, does not depend on time.
+        """
+        count = round(shift / self.bin)
+        start, torque, _ = self._unshifted
+        source = np.arange(len(torque))
+        there = np.zeros(len(torque), dtype=np.bool_)
+        for _, b in self.parts:
+            source[b] = np.clip(source[b] - count, b.start, b.stop - 1)
+            there[b] = np.arange(b.start, b.stop) == source[b] + count
+        usable = self.binned.usable & self.clear[source] & there[:, None]
+        load = (self.binned.torque - torque)[source]
+        return _ShiftedRows([block[source] for block in start], self.binned.torque - load, usable)
+
+    @cached_property
+    def _unshifted(self) -> _ShiftedRows:
+        return self.rows_at(0.0)
+
+    @property
+    def bin(self) -> float:
+        """Usual step of the bins [s]."""
+        return float(np.median(np.diff(self.binned.motion.time)))
+
+    def whole_profile(self, ends: tuple[float, float]) -> _Profile:
+        """Fit the parameters at shifts between two, a profile step apart.
+
+        By whole bins, with one regressor for all, unless a bin is longer than a step.
+        """
+        if not self.parts or self.bin > _PROFILE_STEP:
+            steps = 1 + 2 * math.ceil(LONGEST_DELAY / _PROFILE_STEP)
+            return self.profile(np.linspace(*ends, steps), self.rows_at)
+        step = self.bin * round(_PROFILE_STEP / self.bin)
+        first, last = math.ceil(ends[0] / step), math.floor(ends[1] / step)
+        return self.profile(np.asarray(step * np.arange(first, last + 1)), self.rows_behind)
+
+    def profile(self, shifts: Array, rows_at: Callable[[float], _ShiftedRows]) -> _Profile:
         """Fit the parameters at common shifts (K,)."""
         heights = np.full(len(shifts), np.inf)
         best = np.zeros(self.model.n_parameters)
         for k, shift in enumerate(shifts.tolist()):
-            factor = Factor.of(self.model, self.at(shift))
+            factor = self._factor(rows_at(shift))
             moving = factor.samples > 0
             if moving.any():
                 fit = estimate(self.model, factor)
@@ -552,7 +608,18 @@ class _Reader:
                 best = fit.values if heights[k] <= heights.min() else best
         if not np.isfinite(heights).any():
             raise IdentificationError(no_rows_message(self.model))
-        return _Profile(heights, best)
+        return _Profile(shifts, heights, best)
+
+    def _factor(self, rows: _ShiftedRows) -> Factor:
+        """Reduce rows to one block."""
+        index = np.zeros(len(rows.torque), dtype=np.intp)
+        tables = [
+            np.where(usable, np.column_stack([block, torque]).T, 0.0)
+            for block, torque, usable in zip(rows.blocks, rows.torque.T, rows.usable.T, strict=True)
+        ]
+        counts = count_by_block(index, rows.usable)
+        model = self.model
+        return Factor.of_rows([(index, tables)], counts, model.plan.columns, model.parameter_names)
 
     def linearised(self, shift: float, values: Array, weights: Array | None = None) -> _Blocks:
         """Return normal equations at a shift, linear near parameters.
