@@ -52,7 +52,7 @@ from identification.model.payload import Payload
 from identification.model.regressor import Regressor
 from identification.model.robot import RobotModel
 from identification.selection.essential import Elimination, eliminate
-from identification.signals.clock import TimeBase, time_base, true_times
+from identification.signals.clock import SampleTimes, TimeBase, time_base, true_times
 from identification.signals.recording import Recording, RecordingError
 from identification.signals.samples import Preprocessing, Samples, prepare, smooth
 from identification.signals.smoothing import standstill_variance

@@ -14,6 +14,10 @@ from hil.archive.header import DESCRIPTION, ArchiveHeader, ArchiveOutcome, check
 from hil.archive.reader import Archive
 from hil.archive.writer import Samples, described, require_storable, write_samples
 
+COPIED_COMMANDS: Final = "copied_commands"
+"""Entry of the header: the commands that the positions of a log copy bit for bit."""
+ROW_COUNTER: Final = "row_counter"
+"""Entry of the header: the unit in which a map reads a column of times that counts the rows."""
 _OUTCOME: Final = "completed"
 _DERIVED: Final = ("joint_names", "period", "format_version", "attachments", "kind")
 """Entries of the header that `write_samples` makes itself."""

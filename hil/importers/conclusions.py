@@ -193,6 +193,29 @@ class CounterContinued(Conclusion):
 
 
 @dataclass(frozen=True)
+class ClockRestarted(Conclusion):
+    """Motions in one log, each with a clock that begins again."""
+
+    parts: int
+
+
+@dataclass(frozen=True)
+class RowCounter(Conclusion):
+    """A column of times that counts the rows, and the unit that a map states for it."""
+
+    column: str
+    unit: str
+
+
+@dataclass(frozen=True)
+class CopiedCommands(Conclusion):
+    """Positions that are commands bit for bit; `measured` are channels that may be measured."""
+
+    commands: str
+    measured: tuple[str, ...]
+
+
+@dataclass(frozen=True)
 class SortedSamples(Conclusion):
     """Samples that came before an older one, and were sorted."""
 

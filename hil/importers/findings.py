@@ -59,6 +59,7 @@ _THOUSAND: Final = 1000.0
 _BLOCK: Final = 0.05  # s, over which signals are averaged before they are differentiated
 _MOST_BLOCKS: Final = 2000
 _STANDS: Final = 0.1  # of the samples, at the end: a joint that stands for good
+_FEWEST_BLOCKS: Final = 8  # in which a speed shows
 _SIGNIFICANT: Final = 0.01  # of the largest nominal torque
 
 NominalTorque = Callable[[Motion], Array]
@@ -282,12 +283,15 @@ def _positions(
     travel = float((high - low).max())
     if travel < _LEAST_TRAVEL:
         yield LittleMotion(travel)
-    stride = max(1, len(time) // 2000)  # longer steps, in which noise is negligible
+    # Longer steps, in which noise and late stamps are negligible.
+    block = min(_BLOCK * len(time) / float(time[-1] - time[0]), len(time) / _FEWEST_BLOCKS)
+    stride = max(1, len(time) // _MOST_BLOCKS, round(block))
     steps = np.diff(time[::stride])[:, None]
-    moved = np.abs(np.diff(position[::stride], axis=0))[steps[:, 0] > 0.0]
+    whole = steps[:, 0] > 0.5 * np.median(steps)
+    moved = np.abs(np.diff(position[::stride], axis=0))[whole]
     if not len(moved) or not has_speed:
         return
-    usual = np.quantile(moved / steps[steps[:, 0] > 0.0], 0.9, axis=0)
+    usual = np.quantile(moved / steps[whole], 0.9, axis=0)
     for name, speed, limit in zip(names, usual, limits.velocity, strict=True):
         if speed > _TOO_FAST * limit:
             yield FastJoint(name, float(speed), float(limit))

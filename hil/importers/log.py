@@ -14,18 +14,24 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hil.archive import Samples
+from hil.archive.imported import COPIED_COMMANDS, ROW_COUNTER
 from hil.base.arrays import Array
 from hil.base.errors import SourceError, UnrecordedJointError
 from hil.importers.arrays import ArrayFile
+from hil.importers.channel_groups import grouped
+from hil.importers.channels import channels_of
 from hil.importers.column_map import HOLE, KINEMATIC, ColumnMap, Quantity, TimeColumn
+from hil.importers.command_copies import copied_commands
 from hil.importers.conclusions import (
     ConcludedUnit,
     Conclusion,
+    CopiedCommands,
     JointOrder,
     LeftOut,
     MappedUnit,
     MissingNumbers,
     Omitted,
+    RowCounter,
     StatedUnit,
 )
 from hil.importers.findings import are_degrees, has_degrees_per_second
@@ -34,7 +40,14 @@ from hil.importers.publishers import second_publisher
 from hil.importers.resampling import Timed, are_interleaved, on_one_base
 from hil.importers.robot import NOT_RECORDED, RecordingContent, Robot, Use
 from hil.importers.row_names import row_names
-from hil.importers.stamps import YEAR, concluded_unit, sorted_neighbours, without_wraps
+from hil.importers.stamps import (
+    YEAR,
+    concluded_unit,
+    is_row_counter,
+    sorted_neighbours,
+    without_restarts,
+    without_wraps,
+)
 from hil.importers.text_table import Table
 from hil.importers.units import PER_CENT, TIMES, UNITS, kind_named, unit_of
 
@@ -106,6 +119,13 @@ def read_log(
         metadata["motor_from_joint"] = json.dumps(matrix.tolist())
         if coupled and np.any(matrix != np.diag(np.diag(matrix))):
             robot = robot.with_coupling(matrix)
+    copied = log.copied_commands()
+    if copied is not None:
+        log.concluded.append(copied)
+        metadata[COPIED_COMMANDS] = copied.commands
+    counters = [each for each in log.concluded if isinstance(each, RowCounter)]
+    if counters:
+        metadata[ROW_COUNTER] = counters[0].unit
     if (uncertainty := columns.drive.torque_uncertainty) is not None:
         each = np.broadcast_to(uncertainty, len(log.joints))[log.order]
         metadata["torque_uncertainty"] = json.dumps(each.tolist())
@@ -281,6 +301,10 @@ class _Log:
         """Return the times of a file [ns], None where one is missing."""
         if time.nanoseconds is None:
             unit = time.unit or self._unit_of_time(file, time)
+            if time.unit is not None and is_row_counter(file.times(time.column, 0, time.array)):
+                counter = RowCounter(str(time.column), time.unit)
+                if counter not in self.concluded:
+                    self.concluded.append(counter)
             return file.times(time.column, TIMES[unit], time.array)
         whole = file.times(time.column, TIMES["s"], time.array)
         parts = file.times(time.nanoseconds, TIMES["ns"], time.array)
@@ -294,7 +318,15 @@ class _Log:
         stated = unit_of(file.unit(time.column) or "", "time")
         if stated is not None:
             return stated
-        unit = concluded_unit(file.times(time.column, TIMES["s"], time.array))
+        times = file.times(time.column, TIMES["s"], time.array)
+        if is_row_counter(times):
+            problem = f"column {time.column} counts the rows from {int((times[0] or 0) / 1e9)}"
+            remedy = (
+                "state the rate of the controller: --sample-rate HZ, or with a map sample_rate and "
+                "no [time]"
+            )
+            raise SourceError(file.path, problem, field="time", remedy=remedy)
+        unit = concluded_unit(times)
         if unit != "s":
             self.concluded.append(ConcludedUnit("time", unit))
         return unit
@@ -369,7 +401,10 @@ class _Log:
         if swapped.swapped is not None:
             self.concluded.append(swapped.swapped)
         rows = rows[swapped.order]
-        stamp = clock.stamp[rows]
+        restarted = without_restarts(clock.stamp[rows])
+        if restarted.restarted is not None:
+            self.concluded.append(restarted.restarted)
+        stamp = restarted.stamp
         joint = self.in_concluded_units(
             stamp, {name: array[rows] for name, array in values.items()}, robot
         )
@@ -411,6 +446,21 @@ class _Log:
                 joint = _joint_side(degrees, self._map, self)
                 self.concluded.append(ConcludedUnit("velocity", "deg/s"))
         return joint
+
+    def copied_commands(self) -> CopiedCommands | None:
+        """Return which commands of the log its positions copy bit for bit, None if they do not."""
+        quantity = self._map.position
+        if quantity.files is not None or self.path.is_dir():
+            return None
+        file = self._file(quantity.file, "position.file")
+        channels = channels_of(file.path, self._map.format, self._parsed)
+        groups = grouped(channels, self.joints)
+        columns = quantity.columns
+        if isinstance(columns, str) and "{}" in columns:
+            used = self._numbered(columns, file.names, "columns", "position.columns", file.has)
+        else:
+            used = [columns] if isinstance(columns, str) else [*map(str, columns or ())]
+        return copied_commands(self._numbers("position", quantity)[0], file, groups, used)
 
     def _numbers(self, name: str, quantity: Quantity) -> tuple[Array, list[str | None]]:
         """Return the numbers of a quantity as in the file, (m, k), and the units it states."""

@@ -11,9 +11,11 @@ from hil.archive import Findings
 from hil.importers.conclusions import (
     Alternation,
     ChannelMeaning,
+    ClockRestarted,
     ConcludedUnit,
     Conclusion,
     ConstantPositions,
+    CopiedCommands,
     CounterContinued,
     DifferentCommands,
     Examined,
@@ -38,6 +40,7 @@ from hil.importers.conclusions import (
     PartialVelocity,
     RecordedArm,
     RecordedClock,
+    RowCounter,
     SameStamp,
     ScaledVelocity,
     SecondPublisher,
@@ -226,6 +229,34 @@ def _(merged: MergedMessages) -> str:
     )
     kinds = " and ".join(f"({', '.join(joints)})" for joints in merged.groups)
     return f"merged from messages of their own, {how}: {kinds}"
+
+
+@worded.register
+def _(restarted: ClockRestarted) -> str:
+    return (
+        f"the clock begins again {restarted.parts - 1} times: read as {restarted.parts} motions "
+        "with a second between them"
+    )
+
+
+@worded.register
+def _(copied: CopiedCommands) -> str:
+    remedy = "record the measured positions too"
+    if copied.measured:
+        options = " or ".join(f"--columns 'position={name}'" for name in copied.measured)
+        remedy = f"if they are measured, choose {options}"
+    return (
+        f"the positions are those of {copied.commands} bit for bit: commands, which the arm "
+        f"follows late and never exactly; {remedy}"
+    )
+
+
+@worded.register
+def _(counter: RowCounter) -> str:
+    return (
+        f"{counter.column} counts the rows, and the map reads it in {counter.unit}: right only if "
+        f"the controller's cycle is one {counter.unit}; else state sample_rate and no [time]"
+    )
 
 
 @worded.register

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from itertools import pairwise
 from pathlib import Path
 from typing import Final, NamedTuple
 
@@ -10,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hil.base.errors import SourceError
-from hil.importers.conclusions import CounterContinued, Sample, SortedSamples
+from hil.importers.conclusions import ClockRestarted, CounterContinued, Sample, SortedSamples
 from hil.importers.units import TIMES
 
 Stamps = NDArray[np.int64]
@@ -20,6 +21,9 @@ FASTEST: Final = 20_000.0  # Hz
 _LARGEST: Final = 10**40  # ns; more is no time in any unit
 _NO_MOTION: Final = 10.0  # Hz; 5 kHz in ms, read as s, are 5 Hz
 _MOST_STEPS: Final = 10  # median steps that a counter may pass where it wraps
+_SHORTEST_PART: Final = 10**9  # ns of a motion that was recorded after another one
+_PAUSE: Final = 10**9  # ns between them
+_FEWEST_COUNTED: Final = 20  # rows
 _SWAPPED: Final = 0.02  # share of the samples of a recording that may have changed places
 YEAR: Final = 365 * 86_400 * 10**9
 """[ns]"""
@@ -109,6 +113,37 @@ def sorted_neighbours(stamp: Stamps, sample: Sample) -> Sorted:
     if farthest > 2 or backward > max(1.0, _SWAPPED * len(stamp)):
         return Sorted(unchanged, None)
     return Sorted(order, SortedSamples(backward, sample))
+
+
+class Restarted(NamedTuple):
+    """Stamps whose parts follow each other."""
+
+    stamp: Stamps
+    restarted: ClockRestarted | None  #: None if the clock never began again
+
+
+def without_restarts(stamp: Stamps) -> Restarted:
+    """Return stamps (m,) [ns] in which motions recorded one after the other have a pause between.
+
+    Every part must be long, and run forward: else the clock runs backwards, which is refused.
+    """
+    edges = [0, *(np.flatnonzero(np.diff(stamp) < 0) + 1).tolist(), len(stamp)]
+    parts = [stamp[a:b] for a, b in pairwise(edges)]
+    shortest = min(int(part[-1] - part[0]) if len(part) else 0 for part in parts)
+    if len(parts) == 1 or shortest < _SHORTEST_PART:
+        return Restarted(stamp, None)
+    joined = [parts[0]]
+    for part in parts[1:]:
+        joined.append(part - part[0] + joined[-1][-1] + _PAUSE)
+    return Restarted(np.concatenate(joined), ClockRestarted(len(parts)))
+
+
+def is_row_counter(times: Sequence[int | None]) -> bool:
+    """Return whether times that are read as seconds [ns] count the rows, from 0 or 1."""
+    known = [time for time in times if time is not None and abs(time) < _LARGEST]
+    if len(known) < _FEWEST_COUNTED or known[0] not in (0, 10**9):
+        return False
+    return all(after - before == 10**9 for before, after in pairwise(known))
 
 
 def check_clock(stamp: Stamps, path: Path, remedy: str | None = None) -> None:

@@ -57,6 +57,7 @@ from hil.look.readings import (
     NotSlopes,
     OtherAxes,
     OtherLengths,
+    Rows,
     Setting,
     SizeRatio,
     SlopeFactors,
@@ -126,6 +127,7 @@ _BASES: Final[Mapping[Basis, str]] = {
     Basis.NO_TURN: "no step of a turn",
     Basis.TURNS: "steps of a turn",
     Basis.EVERY_ROW: "every row of every joint",
+    Basis.POSITIONS_ALONE: "by the positions alone",
     Basis.LIMITS: "limits of the URDF",
     Basis.NAME: "by the name",
     Basis.NAME_OR_UNIT: "by name or unit",
@@ -339,6 +341,12 @@ def _(clock: Clock) -> str:
     unit = "stamps of the messages; " if clock.of_messages else ""
     unit = f"{clock.unit}; " if clock.unit is not None else unit
     return f"{unit}{'; '.join(clock.base.describe())}"
+
+
+@_worded.register
+def _(rows: Rows) -> str:
+    times = () if rows.times is None else rows.times.describe()
+    return "; ".join([*(fault.describe() for fault in rows.faults), *times])
 
 
 @_worded.register

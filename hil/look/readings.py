@@ -11,13 +11,15 @@ from hil.importers.conclusions import (
     ChannelMeaning,
     ConcludedUnit,
     Conclusion,
+    CopiedCommands,
     FixedFingers,
     JointOrder,
     OutsideLimits,
     RecordedArm,
     StatedUnit,
 )
-from identification.signals.clock import TimeBase
+from identification.signals.clock import SampleTimes, TimeBase
+from identification.signals.row_faults import RowFault
 from identification.validation.reading_changes import Change
 
 Vector = tuple[float, ...]
@@ -69,6 +71,14 @@ class Clock:
     base: TimeBase
     unit: str | None = None
     of_messages: bool = False
+
+
+@dataclass(frozen=True)
+class Rows:
+    """Rows that are not of the motion, and times of the others that are not their stamps."""
+
+    faults: tuple[RowFault, ...]
+    times: SampleTimes | None
 
 
 @dataclass(frozen=True)
@@ -198,6 +208,7 @@ class LowPassedTorque:
 Reading = (
     Fact
     | Clock
+    | Rows
     | Channels
     | JointOrder
     | NotSlopes
@@ -232,6 +243,7 @@ class Basis(Enum):
     NO_TURN = auto()
     TURNS = auto()
     EVERY_ROW = auto()
+    POSITIONS_ALONE = auto()
     LIMITS = auto()
     NAME = auto()
     NAME_OR_UNIT = auto()
@@ -437,7 +449,8 @@ Contradiction = (
 """What contradicts the arm of the URDF."""
 
 Evidence = (
-    Basis
+    CopiedCommands
+    | Basis
     | ChannelMeaning
     | ConcludedUnit
     | StatedUnit

@@ -10,6 +10,7 @@ from hil.look.readings import ArmChange, Decider, Evidence, MapEntries, Reading,
 
 Aspect = Literal[
     "time",
+    "rows",
     "joints",
     "position",
     "velocity",

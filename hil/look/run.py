@@ -53,7 +53,7 @@ def look_at(source: Path, robot_of: RobotOf | None, options: ImportOptions) -> L
         recorded.recording.checked(cell.joint_names)
     except (RecordingError, SourceError) as error:
         raise SourceError(source, str(error)) from error
-    rows = signals.rows(recorded.recording, imported, None if robot_of is None else cell)
+    rows = signals.rows(recorded, imported, None if robot_of is None else cell)
     if robot_of is None:
         rows.append(_without_robot(recorded.recording))
         return Look(source.name, tuple(rows), (), (), imported.map_text)

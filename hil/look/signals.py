@@ -16,6 +16,7 @@ from hil.importers.conclusions import (
     ChannelMeaning,
     ConcludedUnit,
     Conclusion,
+    CopiedCommands,
     FixedFingers,
     JointOrder,
     NameBasis,
@@ -35,6 +36,7 @@ from hil.look.readings import (
     LateVelocity,
     MapKey,
     NotSlopes,
+    Rows,
     SlopeFactors,
     SlopeRatio,
     SmoothPositions,
@@ -44,6 +46,7 @@ from hil.look.readings import (
     Wrapped,
 )
 from hil.look.result import Aspect, Row
+from hil.pipeline.sources import Source
 from identification.signals.clock import time_base
 from identification.signals.recording import STUCK_MOVEMENT, UNWRAPPED, Recording
 from identification.signals.smoothing import noiseless_above
@@ -71,15 +74,23 @@ _SLOPES: Final[Mapping[float, Fact]] = {
 """What a velocity is whose factor to the slope of the position is this."""
 
 
-def rows(recording: Recording, imported: ImportedRecording, arm: Cell | None) -> list[Row]:
+def rows(source: Source, imported: ImportedRecording, arm: Cell | None) -> list[Row]:
     """Return the rows; `arm` is that of the recording, None where nobody described it."""
+    recording = source.recording
     concluded = imported.concluded
     units = [each for each in imported.examined.found if isinstance(each, _UNITS)]
     table = [_time(recording, concluded, units)]
+    if source.faults or source.retimed:
+        found = Rows(source.faults, source.times if source.retimed else None)
+        table.append(Row("rows", found, Certainty.CERTAIN, (Basis.POSITIONS_ALONE,)))
     table += [row for each in concluded if (row := _concluded(each, units)) is not None]
     if recording.velocity is not None:
         table.append(_velocity(recording))
-    table += [_rests(recording), _wraps(recording), _measured(recording, concluded)]
+    table += [
+        _rests(recording),
+        _wraps(recording),
+        _measured(recording, concluded, imported.examined.found),
+    ]
     if arm is not None:
         table.append(_range(recording, arm))
     return table
@@ -182,8 +193,14 @@ def _range(recording: Recording, cell: Cell) -> Row:
     return Row("range", outside, Certainty.CERTAIN, (Basis.LIMITS,), outside)
 
 
-def _measured(recording: Recording, concluded: Sequence[Conclusion]) -> Row:
+def _measured(
+    recording: Recording, concluded: Sequence[Conclusion], found: Sequence[Conclusion]
+) -> Row:
     """Return whether positions are measured, by their noise and the lag of the velocity."""
+    copied = next((each for each in found if isinstance(each, CopiedCommands)), None)
+    if copied is not None:
+        decider = Step.RECORD_MEASURED
+        return Row("positions", Fact.COMMANDED, Certainty.CERTAIN, (copied,), decider)
     names = [
         each.channels
         for each in concluded

@@ -11,6 +11,7 @@ from typing import Final
 import numpy as np
 
 from hil.archive import open_archive
+from hil.archive.imported import COPIED_COMMANDS, ROW_COUNTER
 from hil.base.arrays import Array
 from hil.cell import Cell
 from hil.cell.nominal import nominal_of
@@ -22,6 +23,7 @@ from identification.model.friction import TERMS, FrictionLaw
 from identification.selection.questions import FRICTION_AT_SPEED, LOAD, LOW_PASS, REVERSAL
 from identification.signals.masks import SATURATED
 from identification.signals.recording import UNWRAPPED, Recording
+from identification.signals.row_faults import RowFaultKind
 from identification.signals.samples import Samples
 from identification.text import percentage
 from identification.validation.evidence import CellContext
@@ -133,6 +135,9 @@ def cell_context_of(prepared: Prepared, estimate: Estimate) -> CellContext:
         delays=prepared.delays,
         assumed_delay=prepared.assumed_delay,
         corrections=(
+            *_rows(recorded),
+            *_commanded(recorded, prepared),
+            *_counted(recorded),
             *_clock(prepared),
             *_log([jump for source_steps in steps for jump in source_steps.logged]),
             *_wrapped(recorded),
@@ -141,6 +146,7 @@ def cell_context_of(prepared: Prepared, estimate: Estimate) -> CellContext:
             *_resolution(prepared),
             *_sampling_rate(prepared, estimate),
         ),
+        commanded_positions=any(map(_are_commands, recorded)),
         added_friction=_added_friction(prepared),
         scale_std=torque_scale_of(sources).std,
     )
@@ -169,14 +175,74 @@ def joint_ranges(sources: Sources) -> tuple[Array, Array]:
     return np.where(bounded, stated.lower, ends[0]), np.where(bounded, stated.upper, ends[1])
 
 
+_ROW_ADVICE: Final[Mapping[RowFaultKind, str]] = {
+    RowFaultKind.FROZEN: "find out why the logger stopped; the rest of the recording is used",
+    RowFaultKind.WRITTEN_TWICE: "check what wrote rows twice; they were used once",
+    RowFaultKind.JUMP: "give the motions as files of their own if they are of different days",
+}
+
+
 def _condition(check: str, text: str, advice: str) -> Finding:
     return Finding(check, "doubtful", text, advice, "condition")
 
 
+def _rows(sources: Sequence[Source]) -> Iterator[Finding]:
+    """Yield findings about rows that are not of one motion, once for both parts of a recording."""
+    for source in {source.path: source for source in sources}.values():
+        for fault in source.faults:
+            text = f"{source.path.name}: {fault.describe()}"
+            yield _condition("rows", text, _ROW_ADVICE[fault.kind])
+
+
+def _are_commands(source: Source) -> bool:
+    """Return whether the positions of a recording are commands, bit for bit."""
+    recording = source.recording
+    if COPIED_COMMANDS in recording.provenance:
+        return True
+    commands = recording.commanded_position
+    if commands is None or not np.ptp(recording.position, axis=0).any():
+        return False
+    return bool(np.array_equal(commands, recording.position))
+
+
+def _commanded(sources: Sequence[Source], prepared: Prepared) -> Iterator[Finding]:
+    """Yield a finding about positions that are commands."""
+    copies = [source for source in sources if _are_commands(source)]
+    if not copies:
+        return
+    names = joined(list(dict.fromkeys(source.path.name for source in copies)))
+    delays = prepared.delays
+    lag = ""
+    if delays is not None and delays.significant:
+        lag = f", here by about {1e3 * delays.delay:.0f} ms"
+    yield Finding(
+        "positions",
+        "wrong",
+        f"the positions of {names} are the commands, bit for bit: the arm follows them late{lag}, "
+        "and every speed and acceleration is that of the plan, not of the arm",
+        "give the column of the measured positions (--columns 'position=NAME{}'), or record it",
+        "cause",
+    )
+
+
+def _counted(sources: Sequence[Source]) -> Iterator[Finding]:
+    """Yield a finding about times that count rows, and are read in a unit that a map states."""
+    for source in {source.path: source for source in sources}.values():
+        unit = source.recording.provenance.get(ROW_COUNTER)
+        if unit is not None:
+            text = (
+                f"the times of {source.path.name} count its rows, and the map reads them in {unit}:"
+                " with another cycle of the controller, speeds and accelerations are wrong by the "
+                "same factor in all joints"
+            )
+            advice = "state the rate of the controller: sample_rate = HZ and no [time]"
+            yield Finding("time", "doubtful", text, advice, "cause")
+
+
 def _clock(prepared: Prepared) -> Iterator[Finding]:
     retimed = [source for source in prepared.sources.training if source.retimed]
-    if retimed:
-        text = f"{joined([source.name for source in retimed])}: {'; '.join(retimed[0].clock)}"
+    if retimed and (times := retimed[0].times) is not None:
+        text = f"{joined([source.name for source in retimed])}: {'; '.join(times.describe())}"
         yield _condition("clock", text, "log the controller's time with each sample")
 
 

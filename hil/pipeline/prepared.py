@@ -671,7 +671,8 @@ def prepare_sources(sources: Sources, options: Options, reporter: Reporter) -> P
     notes = []
     stated = stated_settings(sources.cell, options)
     for source in (*sources.training, *sources.held_out):
-        notes += [f"{source.name}: {line}" for line in (source.merged, *source.clock) if line]
+        lines = [] if source.times is None else source.times.describe()
+        notes += [f"{source.name}: {line}" for line in (source.merged, *lines) if line]
         base = time_base(source.recording.time, source.recording.gap_before)
         if not base.uniform or base.gaps:
             notes.append(f"{source.name}: {'; '.join(base.describe())}")

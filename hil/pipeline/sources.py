@@ -22,13 +22,14 @@ from hil.base.errors import ArchiveError, CampaignFolderError, InputError
 from hil.base.files import file_digest
 from hil.base.safe_input import path_exists
 from hil.cell import Cell
-from identification.signals.clock import true_times
+from identification.signals.clock import SampleTimes, true_times
 from identification.signals.recording import (
     Recording,
     RecordingError,
     offsets_of_repetitions,
     without_repeats,
 )
+from identification.signals.row_faults import RowFault, without_faulty_rows
 from identification.signals.smoothing import standstill_variance
 from identification.text import percentage
 
@@ -45,11 +46,16 @@ class Source:
     recording: Recording  #: joints in the order of the model
     origin: float  #: time of the first set-point [s]
     merged: str = ""  #: note about repeated time stamps
-    clock: tuple[str, ...] = ()  #: notes about its time stamps
-    retimed: bool = False  #: whether other times than the time stamps are used
+    times: SampleTimes | None = None  #: of its samples; None where the controller counts cycles
+    faults: tuple[RowFault, ...] = ()  #: rows that are not of its motion
     #: of a part: the complete recording, with torques set to zero outside the part, and the index
     #: of its first sample, so that filters see the motion beyond its ends
     context: tuple[Recording, int] | None = None
+
+    @property
+    def retimed(self) -> bool:
+        """Whether other times than the time stamps are used, or rows were left out for them."""
+        return self.times is not None and (self.times.even or self.times.removed > 0)
 
     @property
     def whole(self) -> Recording:
@@ -398,24 +404,28 @@ def _usable(archive: Archive, cell: Cell, recording: Recording) -> Source:
     useful = useful_part(archive, recording)
     if useful is not None:
         recording = recording.between(useful.start, useful.stop)
+    sound = recording
+    timed = recording
+    times = None
+    faults: tuple[RowFault, ...] = ()
     try:
-        single = without_repeats(recording).checked(cell.joint_names)
+        if archive.kind == "imported":  # other archives have the cycle counter of the controller
+            recording.check_finite()
+            sound, faults = without_faulty_rows(recording)
+            timed, times = true_times(sound)
+        single = without_repeats(timed).checked(cell.joint_names)
     except RecordingError as error:
         raise ArchiveError(archive.path, str(error), remedy="leave it out") from error
-    merged = recording.n_samples - single.n_samples
-    timed = single
+    merged = timed.n_samples - single.n_samples
     averaged = f"{merged} samples had the time stamp of the one before and were averaged with it"
-    clock: tuple[str, ...] = ()
-    if archive.kind == "imported":  # other archives have the cycle counter of the controller
-        timed, clock = true_times(single)
     return Source(
         archive.path,
         archive.path.name,
-        timed,
-        float(timed.time[0]),
+        single,
+        float(single.time[0]),
         averaged if merged else "",
-        clock,
-        retimed=timed is not single,
+        times,
+        faults,
     )
 
 

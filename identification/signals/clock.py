@@ -35,6 +35,7 @@ _ROWS_AT_ONCE: Final = 20_000
 _SHORTEST: Final = 32  # samples; shorter segments keep their stamps
 _BESIDE: Final = 4  # steps to either side for the speed at one
 _SPEED_TIME: Final = 0.025  # s to either side for the speed beside a residual
+_BURSTS: Final = 0.9  # of the pauses of stamps that are late, not of missing rows
 _CLEAR: Final = 8.0  # steps are counted by positions that resolve an eighth of a clock step
 _MOVES: Final = 3.0  # multiples of noise and resolution of a moving joint
 # Rounding noise of the distance from the cubic: sqrt((1 + 17 / 18) / 12).
@@ -150,8 +151,60 @@ def _steps_by_phase(time: Array, step: float) -> Array:
     return np.asarray(np.diff(ahead) + 1.0)
 
 
-def true_times(recording: Recording) -> tuple[Recording, tuple[str, ...]]:
-    """Return the recording at the times of its samples, and sentences on the decision.
+@dataclass(frozen=True)
+class SampleTimes:
+    """Which times of the samples were used, and what speaks for them.
+
+    Attributes:
+        removed: rows that repeat the sample before them while the arm moves.
+        even: whether even times are used instead of the stamps.
+        missing: samples that are counted in them.
+        rate: of the even times [Hz].
+        scatter: standard deviation of the stamps about even times, in steps.
+        share: of the lateness of the stamps that the positions show: 0 if times are even, 1 if the
+            stamps are right, NaN if the stamps are even.
+        deviation: standard deviation of the share.
+        residuals: high-frequency residual in multiples of noise, with the stamps and evenly.
+    """
+
+    removed: int
+    even: bool
+    missing: int
+    rate: float
+    scatter: float
+    share: float
+    deviation: float
+    residuals: tuple[float, float]
+
+    @property
+    def certain(self) -> bool:
+        """Whether the positions decide: the share is not between the hypotheses."""
+        return bool(abs(self.share - 0.5) > max(_MARGIN * self.deviation, 0.25))
+
+    def describe(self) -> list[str]:
+        """Return sentences on the decision, none where the stamps are even and nothing repeats."""
+        sentences = []
+        if self.removed:
+            sentences.append(
+                f"{self.removed} rows repeat the sample before them while the arm moves and"
+                " were removed"
+            )
+        if self.even or not np.isnan(self.share):
+            used = f"even times, {self.missing} missing samples counted"
+            used = used if self.even else "the stamps"
+            if not self.certain or (self.share < 0.5 and not self.even):
+                used += " (positions are inconclusive)"
+            sentences.append(
+                f"the time stamps scatter by {percentage(self.scatter, 1)} of a step;"
+                f" share confirmed by the positions: {self.share:.2f} ± {self.deviation:.1g};"
+                f" high-frequency residual in multiples of noise: {self.residuals[0]:.3g} with the"
+                f" stamps, {self.residuals[1]:.3g} with even times; used: {used}"
+            )
+        return sentences
+
+
+def true_times(recording: Recording) -> tuple[Recording, SampleTimes]:
+    """Return the recording at the times of its samples, and how they were decided.
 
     Two hypotheses are compared by positions, and velocities if given: the stamps, which may repeat
     or fall back, and even times that follow their slow drift, with missing samples counted. With
@@ -168,39 +221,88 @@ def true_times(recording: Recording) -> tuple[Recording, tuple[str, ...]]:
     signals = recording.position
     if recording.velocity is not None:
         signals = np.hstack([signals, recording.velocity])
-    base = time_base(time, recording.gap_before)
-    clock = _even_clock(time, signals, recording.segments(), base)
+    base, clock = _clock_of(recording, signals)
     share = np.nan
     deviation = np.nan
     residuals = (1.0, 1.0)
     if np.abs(clock.late).max() > UNIFORM:
         parts = [_residuals(*part, base.step) for part in clock.evidence]
         share, deviation, residuals = _stamp_share(*map(np.concatenate, zip(*parts, strict=True)))
-    # Not between the hypotheses.
-    certain = bool(abs(share - 0.5) > max(_MARGIN * deviation, 0.25))
     rows = ~(clock.repeated | clock.idle)
-    is_even = certain and share < 0.5 and bool(np.all(np.diff(clock.time[rows]) > 0.0))
+    advances = bool(np.all(np.diff(clock.time[rows]) > 0.0))
+    scatter = 0.0 if base.uniform else float(clock.late.std())
+    times = SampleTimes(0, False, clock.missing, base.rate, scatter, share, deviation, residuals)
+    is_even = times.certain and share < 0.5 and advances
     out = ~rows if is_even else clock.repeated
-    sentences = []
-    if out.any():
-        sentences.append(
-            f"{np.count_nonzero(out)} rows repeat the sample before them while the arm moves and"
-            " were removed"
-        )
-    if is_even or (base.largest_deviation > UNIFORM and not np.isnan(share)):
-        used = f"even times, {clock.missing} missing samples counted" if is_even else "the stamps"
-        if not certain or (share < 0.5 and not is_even):
-            used += " (positions are inconclusive)"
-        scatter = percentage(0.0 if base.uniform else clock.late.std(), 1)
-        sentences.append(
-            f"the time stamps scatter by {scatter} of a step;"
-            f" share confirmed by the positions: {share:.2f} ± {deviation:.1g}; high-frequency"
-            f" residual in multiples of noise: {residuals[0]:.3g} with the stamps,"
-            f" {residuals[1]:.3g} with even times; used: {used}"
-        )
+    shown = share if is_even or base.largest_deviation > UNIFORM else np.nan
+    times = replace(times, removed=int(np.count_nonzero(out)), even=is_even, share=shown)
     if not out.any() and not is_even:
-        return recording, tuple(sentences)
-    return replace(recording, time=clock.time if is_even else time).rows(~out), tuple(sentences)
+        return recording, times
+    return replace(recording, time=clock.time if is_even else time).rows(~out), times
+
+
+def _clock_of(recording: Recording, signals: Array) -> tuple[TimeBase, _EvenClock]:
+    """Return the time base of the stamps, and the even clock that they may be late of."""
+    time = recording.time
+    gap = recording.gap_before
+    base = time_base(time, gap)
+    if not _are_late_in_bursts(time, signals, gap):
+        return base, _even_clock(time, signals, recording.segments(), base)
+    reported = np.zeros(len(time), np.bool_) if gap is None else gap
+    numbered = replace(recording, time=np.arange(len(time), dtype=np.float64), gap_before=reported)
+    segments = numbered.segments()
+    base = replace(base, step=_mean_step(time, segments))
+    return base, _even_clock(time, signals, segments, base, by_rows=True)
+
+
+def _are_late_in_bursts(time: Array, signals: Array, reported: Rows | None) -> bool:
+    """Return whether pauses of the stamps (m,) are late rows, across which the arm moved one step.
+
+    Stamps of arrival come in bursts after a pause. Where rows are missing the arm has moved on.
+    """
+    steps = np.diff(time)
+    forward = steps[steps > 0.0]
+    if len(time) < _SHORTEST or not forward.size:
+        return False
+    pause = steps > GAP_STEPS * float(np.median(forward))
+    if reported is not None:
+        pause &= ~reported[1:]
+    if not pause.any():
+        return False
+    moved = np.diff(signals, axis=0)
+    before, after = (_run(signals, side) for side in (-1, 1))
+    each = (before + after) / (2 * _BESIDE)
+    noise = np.maximum(_robust_rms(moved - each), _resolution(signals)[1:])
+    unit = each / noise
+    clarity = (unit**2).sum(axis=1)
+    passed = (unit * moved / noise).sum(axis=1) / np.maximum(clarity, 1.0)
+    clear = pause & (clarity > _CLEAR**2) & _steady(before / noise, after / noise, 0.5)
+    if not clear.any():
+        return False
+    return bool(np.mean(passed[clear] < 1.5) >= _BURSTS)
+
+
+def _mean_step(time: Array, segments: Sequence[slice]) -> float:
+    """Return the step [s] of the line below the stamps of the longest segment.
+
+    Stamps come late and never early, so that the earliest show the clock.
+    """
+    longest = max(segments, key=lambda part: part.stop - part.start)
+    stamps = time[longest] - time[longest.start]
+    rows = np.arange(len(stamps), dtype=np.float64)
+    early = np.ones(len(stamps), np.bool_)
+    slope = 0.0
+    for _ in range(_REFINEMENTS):
+        line = np.polynomial.Polynomial.fit(rows[early], stamps[early], 1)
+        late = stamps - line(rows)
+        early = late <= np.median(late)
+        slope = float(line.convert().coef[1])
+    return slope
+
+
+def _line_below(number: Array, stamps: Array, step: float) -> Array:
+    """Return even times (m,) [s] of samples with numbers, from the usual lateness of the stamps."""
+    return np.asarray(step * number + np.median(stamps - step * number))
 
 
 class _EvenClock(NamedTuple):
@@ -216,9 +318,26 @@ class _EvenClock(NamedTuple):
 
 
 def _even_clock(
-    time: Array, signals: Array, segments: Sequence[slice], base: TimeBase
+    time: Array,
+    signals: Array,
+    segments: Sequence[slice],
+    base: TimeBase,
+    *,
+    by_rows: bool = False,
 ) -> _EvenClock:
-    """Number the samples of each segment, and place them at even times."""
+    """Number the samples of each segment, and place them at even times.
+
+    Args:
+        time: stamps (m,) [s].
+        signals: positions, and velocities if measured (m, k).
+        segments: between gaps.
+        base: of the stamps.
+        by_rows: each row is the next sample unless positions show otherwise; else the stamps
+            count.
+
+    Returns:
+        the clock.
+    """
     even = time.copy()
     repeated = np.zeros(len(time), dtype=np.bool_)
     idle = np.zeros(len(time), dtype=np.bool_)
@@ -232,7 +351,7 @@ def _even_clock(
         rows = part.start + np.flatnonzero(~repeated[part])
         if len(rows) < _SHORTEST:
             continue
-        number = _numbers(time[rows], signals[rows], base.step)
+        number = _numbers(time[rows], signals[rows], base.step, by_rows=by_rows)
         new = np.diff(number, prepend=-1.0) > 0.0
         idle[rows[~new]] = True
         rows = rows[new]
@@ -244,6 +363,8 @@ def _even_clock(
             times = time[rows[0]] + base.step * number
             even[rows] = times + longer
             longer += base.step * lost
+        elif by_rows:  # drift of the lateness in bursts is none of the clock
+            even[rows] = times = _line_below(number, time[rows], base.step)
         else:
             even[rows] = times = _even_times(time[rows], number)
         late = time[rows] - times
@@ -255,7 +376,7 @@ def _even_clock(
     )
 
 
-def _numbers(time: Array, signals: Array, step: float) -> Array:
+def _numbers(time: Array, signals: Array, step: float, *, by_rows: bool) -> Array:
     """Return the number of each sample (m,) in an even clock, the first zero."""
     starts = range(0, len(time) - 1, _ROWS_AT_ONCE)
     # Each part begins with the last sample of the one before; a short rest belongs to the last.
@@ -263,13 +384,16 @@ def _numbers(time: Array, signals: Array, step: float) -> Array:
     if len(starts) > 1 and edges[-1] - edges[-2] < _SHORTEST:
         del edges[-2]
     parts = [slice(start, stop + 1) for start, stop in pairwise(edges)]
-    steps = [_steps_by_position(time[part], signals[part], step) for part in parts]
+    steps = []
+    for part in parts:
+        count = len(time[part]) - 1
+        counted = np.ones(count) if by_rows else _steps_by_phase(time[part], step)
+        steps.append(_steps_by_position(signals[part], counted))
     return np.concatenate([[0.0], np.cumsum(np.concatenate(steps))])
 
 
-def _steps_by_position(time: Array, signals: Array, step: float) -> Array:
-    """Return the steps of an even clock between samples (m - 1,), by stamps and positions."""
-    phased = _steps_by_phase(time, step)
+def _steps_by_position(signals: Array, phased: Array) -> Array:
+    """Return the steps of an even clock between samples (m - 1,), counted, then by positions."""
     moved = np.diff(signals, axis=0)
     resolution = _resolution(signals)[1:]
     before, after = (_run(signals, side) for side in (-1, 1))

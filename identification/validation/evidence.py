@@ -94,6 +94,8 @@ class CellContext:
     jumps: tuple[PositionJump, ...] = ()  # impossible steps of measured positions
     controller_inertia: InertiaRatio | None = None  # its diagonal inertia over the identified one
     corrections: tuple[Finding, ...] = ()  # faults of recordings that were corrected
+    #: whether the positions are commands, which the arm follows late
+    commanded_positions: bool = False
     added_friction: tuple[str, ...] = ()  # symbols of friction terms that nobody stated
     scale_std: Array | None = None  # relative uncertainty of each joint's torque scale (n,)
 

@@ -134,6 +134,8 @@ class FaultFacts:
         causes = evidence.causes or ()
         if outliers is not None and outliers.decide:
             causes = ()
+        if evidence.context.commanded_positions:  # the lag is that of the servo
+            causes = tuple(cause for cause in causes if cause.fault.kind != "delay")
         if gravity is not None and gravity.off:
             causes = tuple(cause for cause in causes if not cause.ratio > gravity.error)
         if signs.all_opposite:

@@ -133,8 +133,8 @@ class DelayFacts:
         """Compare the estimated delay with the assumed one."""
         delays = evidence.context.delays
         assumed = evidence.context.assumed_delay
-        if delays is None:
-            return None
+        if delays is None or evidence.context.commanded_positions:
+            return None  # behind commands it is the lag of the servo
         # With a poor motion a delay cannot be separated from the parameters.
         estimate = evidence.estimate
         poor = bool(estimate.undetermined) or estimate.condition > limits.condition

@@ -1,0 +1,67 @@
+"""Positions of a log that are its commands, bit for bit: nobody measured them."""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Sequence
+from typing import Final
+
+import numpy as np
+
+from hil.base.arrays import Array
+from hil.base.errors import SourceError
+from hil.importers.arrays import ArrayFile
+from hil.importers.channel_groups import Group
+from hil.importers.commands import COMMANDED
+from hil.importers.conclusions import CopiedCommands
+from hil.importers.name_words import kinds_said
+from hil.importers.text_table import Table
+
+_ALIKE: Final = 0.999  # of the rows
+
+
+def copied_commands(
+    position: Array, file: Table | ArrayFile, groups: Sequence[Group], used: Collection[str]
+) -> CopiedCommands | None:
+    """Return which commands positions (m, n) copy, and which channels may hold measured ones.
+
+    Args:
+        position: numbers of the file, not converted.
+        file: of the log.
+        groups: of its channels.
+        used: names of the channels of the positions.
+
+    Returns:
+        what was found; None where positions differ from every command, or nothing moves.
+    """
+    if not len(position) or not np.ptp(position, axis=0).any():
+        return None
+    others = [
+        group
+        for group in groups
+        if group.size == position.shape[1] and not set(group.names) & set(used)
+    ]
+    commands = [group for group in others if COMMANDED.search(group.pattern)]
+    for group in commands:
+        values = _numbers(file, group)
+        if values is None or values.shape != position.shape:
+            continue
+        if np.mean((values == position).all(axis=1)) >= _ALIKE:
+            measured = [
+                other.pattern
+                for other in others
+                if other not in commands and "position" in kinds_said(other.pattern)
+            ]
+            return CopiedCommands(group.label, tuple(measured))
+    return None
+
+
+def _numbers(file: Table | ArrayFile, group: Group) -> Array | None:
+    """Return the numbers of a group of channels (m, n); None where they are none."""
+    try:
+        if isinstance(file, Table):
+            return file.numbers(group.names, "position")
+        if len(group.names) == 1:
+            return file.matrix(group.names[0], "position")
+        return file.numbers(group.names, "position", None)
+    except SourceError:
+        return None

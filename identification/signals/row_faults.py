@@ -1,0 +1,203 @@
+"""Rows that a log cannot have from one motion: frozen, written twice, or of another motion.
+
+Positions alone show them, so they are left out before anything is judged by torque.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+from enum import Enum, auto
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from identification.arrays import Array
+from identification.signals.recording import GAP_STEPS, Recording
+
+Rows = NDArray[np.bool_]
+
+# Acceleration within one step of the clock; robots reach a fifth of it.
+FASTEST: Final = 150.0
+"""rad/s² or m/s²"""
+_BESIDE: Final = 4  # rows to either side
+_SHORTEST_BLOCK: Final = 10  # rows that are written twice
+_USUAL: Final = 0.9  # quantile of the rows for which a sample is held in a slower channel
+
+
+class RowFaultKind(Enum):
+    """What is wrong with rows of a log."""
+
+    FROZEN = auto()  #: the logger repeated a row while the arm moved on
+    WRITTEN_TWICE = auto()  #: the same rows again
+    JUMP = auto()  #: another motion begins, or rows are missing and the stamps do not show it
+
+
+@dataclass(frozen=True)
+class RowFault:
+    """Rows of a log that are not of its motion.
+
+    Attributes:
+        kind: what is wrong.
+        time: of the first of them, or of the first row after a jump [s].
+        duration: of the rows [s].
+        rows: how many were left out; 0 at a jump, which separates two motions.
+        joints: whose positions jump.
+    """
+
+    kind: RowFaultKind
+    time: float
+    duration: float
+    rows: int
+    joints: tuple[str, ...] = ()
+
+    def describe(self) -> str:
+        """Return what is wrong, and what was done about it."""
+        at = f"at {self.time:.4g} s"
+        if self.kind is RowFaultKind.FROZEN:
+            return (
+                f"the log repeats one row for {self.duration:.3g} s {at} while the arm moved on: "
+                f"{self.rows} rows were left out"
+            )
+        if self.kind is RowFaultKind.WRITTEN_TWICE:
+            return f"{self.rows} rows {at} were written before, bit for bit, and were left out"
+        return (
+            f"the positions of {', '.join(self.joints)} jump {at}, further than any arm moves in "
+            "a step: two motions in one file, or rows missing that the stamps do not show; both "
+            "parts are used, and no row beside the jump"
+        )
+
+
+def without_faulty_rows(recording: Recording) -> tuple[Recording, tuple[RowFault, ...]]:
+    """Return a recording without such rows, with gaps where they were, and what was found."""
+    frozen = list(_frozen(recording))
+    kept = np.ones(recording.n_samples, np.bool_)
+    for start, stop in frozen:
+        kept[start:stop] = False
+    faults = [_fault(RowFaultKind.FROZEN, recording, *each) for each in frozen]
+    gap = np.zeros(recording.n_samples, np.bool_)
+    if recording.gap_before is not None:
+        gap |= recording.gap_before
+    gap[[stop for _, stop in frozen if stop < len(gap)]] = True
+    starts: list[tuple[int, NDArray[np.intp] | None]] = [
+        (part.start, None) for part in recording.segments()[1:]
+    ]
+    for row, joints in (*starts, *_jumps(recording, gap)):
+        if not kept[row]:
+            continue
+        stop = row + _written_before(recording, row)
+        if stop > row:
+            kept[row:stop] = False
+            faults.append(_fault(RowFaultKind.WRITTEN_TWICE, recording, row, stop))
+            gap[stop : stop + 1] = True
+            continue
+        if joints is None:
+            continue
+        gap[row] = True
+        names = tuple(np.array(recording.joint_names)[joints].tolist())
+        time = float(recording.time[row])
+        faults.append(RowFault(RowFaultKind.JUMP, time, 0.0, 0, names))
+    if not faults:
+        return recording, ()
+    faults.sort(key=lambda fault: fault.time)
+    return replace(recording, gap_before=gap).rows(kept), tuple(faults)
+
+
+def _fault(kind: RowFaultKind, recording: Recording, start: int, stop: int) -> RowFault:
+    time = recording.time
+    duration = float(time[min(stop, len(time) - 1)] - time[start])
+    return RowFault(kind, float(time[start]), duration, stop - start)
+
+
+def _frozen(recording: Recording) -> Iterator[tuple[int, int]]:
+    """Yield start and stop of rows that repeat the one before them while the arm moves on.
+
+    Many more than a slower channel is held for; before or after them a joint would stop or start
+    faster than any robot.
+    """
+    position = recording.position
+    equal = np.ones(recording.n_samples - 1, np.bool_)
+    for values in (position, recording.torque, recording.velocity):
+        if values is not None:
+            equal &= (values[1:] == values[:-1]).all(axis=1)
+    edges = np.flatnonzero(np.diff(equal.astype(np.int8), prepend=0, append=0))
+    runs = list(zip(edges[::2].tolist(), edges[1::2].tolist(), strict=True))
+    lengths = np.array([stop - start for start, stop in runs])
+    if not len(runs):
+        return
+    single = recording.n_samples - int(lengths.sum()) - len(runs)  # rows that nothing repeats
+    held = np.quantile(np.concatenate([lengths + 1, np.ones(max(0, single))]), _USUAL)
+    step = float(np.median(np.diff(recording.time)))
+    least = FASTEST * step**2
+    for start, stop in runs:
+        if stop - start <= GAP_STEPS * held:
+            continue
+        beside = []
+        if start > 0:
+            beside.append(np.abs(position[start] - position[start - 1]))
+        if stop + 1 < len(position):
+            beside.append(np.abs(position[stop + 1] - position[stop]))
+        resolution = _resolution(position)
+        if any((size > np.maximum(least, 3.0 * resolution)).any() for size in beside):
+            yield start + 1, stop + 1
+
+
+def _jumps(recording: Recording, gap: Rows) -> Iterator[tuple[int, NDArray[np.intp]]]:
+    """Yield rows before which several joints jump at once, and which do.
+
+    No few missing rows explain such a step: it is larger than `GAP_STEPS` further steps at the
+    speed beside it. The positions stay there, other than after a single wrong row.
+    """
+    changed = np.any(np.diff(recording.position, axis=0) != 0.0, axis=1)
+    places = np.concatenate([[0], np.flatnonzero(changed) + 1])  # of a slower channel too
+    position = recording.position[places]
+    if len(position) < 2 * _BESIDE + 2:
+        return
+    step = np.diff(position, axis=0)
+    padded = np.pad(np.abs(step), ((_BESIDE, _BESIDE), (0, 0)), mode="edge")
+    windows = np.lib.stride_tricks.sliding_window_view(padded, 2 * _BESIDE + 1, axis=0)
+    before, after = windows[..., :_BESIDE], windows[..., _BESIDE + 1 :]
+    usual = np.maximum(np.median(before, axis=-1), np.median(after, axis=-1))
+    clock = np.diff(recording.time[places])
+    median = float(np.median(clock))
+    passed = np.maximum(clock / median, 1.0)[:, None] + GAP_STEPS
+    possible = passed * usual + FASTEST * (passed * median) ** 2 + 3.0 * _resolution(position)
+    beyond = np.abs(step) > possible
+    moving = np.count_nonzero(np.ptp(position, axis=0) > 0.0)
+    found = np.flatnonzero(np.count_nonzero(beyond, axis=1) >= max(2.0, 0.5 * moving))
+    breaks = {part.start for part in recording.segments()}
+    for place in (found + 1).tolist():
+        row = int(places[place])
+        if row in breaks or gap[row]:
+            continue
+        stays = np.median(position[place : place + _BESIDE], axis=0)
+        stays = stays - np.median(position[max(0, place - _BESIDE) : place], axis=0)
+        joints = np.flatnonzero(beyond[place - 1])
+        if (np.abs(stays)[joints] > 0.5 * np.abs(step[place - 1])[joints]).all():
+            yield row, joints
+
+
+def _written_before(recording: Recording, row: int) -> int:
+    """Return how many rows from this one on are those of an earlier place, bit for bit."""
+    rows = np.hstack(
+        [recording.position, *([] if recording.torque is None else [recording.torque])]
+    )
+    earlier = np.flatnonzero((rows[:row] == rows[row]).all(axis=1))
+    longest = 0
+    for place in {*earlier[:1].tolist(), *earlier[-1:].tolist()}:  # an arm at rest has many
+        lag = row - place
+        same = (rows[row:] == rows[place : len(rows) - lag]).all(axis=1)
+        length = len(same) if same.all() else int(np.argmin(same))
+        longest = max(longest, min(length, lag))
+    if longest < _SHORTEST_BLOCK:
+        return 0
+    moves = np.ptp(recording.position[row : row + longest], axis=0).any()
+    return longest if moves else 0
+
+
+def _resolution(position: Array) -> Array:
+    """Return the smallest step of each position (n,), zero if it never moves."""
+    steps = np.abs(np.diff(position, axis=0))
+    least = np.min(steps, axis=0, where=steps > 0.0, initial=np.inf)
+    return np.where(np.isfinite(least), least, 0.0)
