@@ -144,6 +144,17 @@ def kind_of(name: str, unit: str | None = None) -> tuple[Kind | None, int | None
     return kinds[0], number
 
 
+def named_channels(file: Table | ArrayFile) -> list[Channel]:
+    """Return the channels of a file by their names, of which no number is read."""
+    if isinstance(file, Table):
+        return [Channel(name, 1, len(file.lines), kind=kind_of(name)[0]) for name in file.names]
+    shapes = {name: file.shape(name) for name in file.names}
+    return [
+        Channel(name, math.prod(shape) // max(shape), max(shape), kind=kind_of(name)[0])
+        for name, shape in shapes.items()
+    ]
+
+
 def kinds_of_file(path: Path) -> list[Kind]:
     """Return the quantities that the name of a file says, such as ``curr_data.csv``."""
     stem = path.stem.lower()

@@ -19,7 +19,7 @@ from hil.base.arrays import Array
 from hil.base.errors import SourceError, UnrecordedJointError
 from hil.importers.arrays import ArrayFile
 from hil.importers.channel_groups import grouped
-from hil.importers.channels import channels_of
+from hil.importers.channels import named_channels
 from hil.importers.column_map import HOLE, KINEMATIC, ColumnMap, Quantity, TimeColumn
 from hil.importers.command_copies import copied_commands
 from hil.importers.conclusions import (
@@ -453,8 +453,7 @@ class _Log:
         if quantity.files is not None or self.path.is_dir():
             return None
         file = self._file(quantity.file, "position.file")
-        channels = channels_of(file.path, self._map.format, self._parsed)
-        groups = grouped(channels, self.joints)
+        groups = grouped(named_channels(file), self.joints)
         columns = quantity.columns
         if isinstance(columns, str) and "{}" in columns:
             used = self._numbered(columns, file.names, "columns", "position.columns", file.has)

@@ -140,10 +140,17 @@ class Recording:
         moved = with_command & (self.commanded_position != first).any(axis=1)
         return float(self.time[int(np.argmax(moved))])
 
-    def segments(self) -> list[slice]:
-        """Segments between reported gaps, or steps above `GAP_STEPS` median steps, in order."""
+    @property
+    def usual_step(self) -> float:
+        """Median step of the clock [s], without stamps that repeat; 0 where it stands still."""
         steps = np.diff(self.time)
-        breaks = steps > GAP_STEPS * np.median(steps)
+        forward = steps[steps > 0.0]
+        return float(np.median(forward)) if forward.size else 0.0
+
+    def segments(self) -> list[slice]:
+        """Segments between reported gaps, or steps above `GAP_STEPS` usual steps, in order."""
+        steps = np.diff(self.time)
+        breaks = steps > GAP_STEPS * self.usual_step
         if self.gap_before is not None:
             breaks |= self.gap_before[1:]
         edges = [0, *(np.flatnonzero(breaks) + 1).tolist(), self.n_samples]

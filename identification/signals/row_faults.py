@@ -128,8 +128,7 @@ def _frozen(recording: Recording) -> Iterator[tuple[int, int]]:
         return
     single = recording.n_samples - int(lengths.sum()) - len(runs)  # rows that nothing repeats
     held = np.quantile(np.concatenate([lengths + 1, np.ones(max(0, single))]), _USUAL)
-    step = float(np.median(np.diff(recording.time)))
-    least = FASTEST * step**2
+    least = FASTEST * recording.usual_step**2
     for start, stop in runs:
         if stop - start <= GAP_STEPS * held:
             continue
@@ -160,7 +159,9 @@ def _jumps(recording: Recording, gap: Rows) -> Iterator[tuple[int, NDArray[np.in
     before, after = windows[..., :_BESIDE], windows[..., _BESIDE + 1 :]
     usual = np.maximum(np.median(before, axis=-1), np.median(after, axis=-1))
     clock = np.diff(recording.time[places])
-    median = float(np.median(clock))
+    median = recording.usual_step
+    if not median:
+        return
     passed = np.maximum(clock / median, 1.0)[:, None] + GAP_STEPS
     possible = passed * usual + FASTEST * (passed * median) ** 2 + 3.0 * _resolution(position)
     beyond = np.abs(step) > possible

@@ -174,7 +174,7 @@ class TestLogs:
     def test_a_counter_for_a_time(self, urdf: Path) -> None:
         content = text(rows(time=range(COUNT)))
         refused = log(urdf, content)
-        assert "sample_rate in Hz" in refused
+        assert "counts the rows from 0; state the rate" in refused
         columns = MAP.replace('[time]\ncolumn = "t"\n', f"sample_rate = {RATE}\n")
         assert log(urdf, content, columns) == ""
         assert_right(urdf.with_name("log.csv"))
