@@ -23,7 +23,7 @@ _NO_MOTION: Final = 10.0  # Hz; 5 kHz in ms, read as s, are 5 Hz
 _MOST_STEPS: Final = 10  # median steps that a counter may pass where it wraps
 _SHORTEST_PART: Final = 10**9  # ns of a motion that was recorded after another one
 _PAUSE: Final = 10**9  # ns between them
-_FEWEST_COUNTED: Final = 20  # rows
+_FEWEST_ROWS: Final = 20  # rows
 _SWAPPED: Final = 0.02  # share of the samples of a recording that may have changed places
 YEAR: Final = 365 * 86_400 * 10**9
 """[ns]"""
@@ -141,7 +141,7 @@ def without_restarts(stamp: Stamps) -> Restarted:
 def is_row_counter(times: Sequence[int | None]) -> bool:
     """Return whether times that are read as seconds [ns] count the rows, from 0 or 1."""
     known = [time for time in times if time is not None and abs(time) < _LARGEST]
-    if len(known) < _FEWEST_COUNTED or known[0] not in (0, 10**9):
+    if len(known) < _FEWEST_ROWS or known[0] not in (0, 10**9):
         return False
     return all(after - before == 10**9 for before, after in pairwise(known))
 

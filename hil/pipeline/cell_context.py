@@ -137,7 +137,7 @@ def cell_context_of(prepared: Prepared, estimate: Estimate) -> CellContext:
         corrections=(
             *_rows(recorded),
             *_commanded(recorded, prepared),
-            *_counted(recorded),
+            *_row_counters(recorded),
             *_clock(prepared),
             *_log([jump for source_steps in steps for jump in source_steps.logged]),
             *_wrapped(recorded),
@@ -225,7 +225,7 @@ def _commanded(sources: Sequence[Source], prepared: Prepared) -> Iterator[Findin
     )
 
 
-def _counted(sources: Sequence[Source]) -> Iterator[Finding]:
+def _row_counters(sources: Sequence[Source]) -> Iterator[Finding]:
     """Yield a finding about times that count rows, and are read in a unit that a map states."""
     for source in {source.path: source for source in sources}.values():
         unit = source.recording.provenance.get(ROW_COUNTER)

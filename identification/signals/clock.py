@@ -387,8 +387,8 @@ def _numbers(time: Array, signals: Array, step: float, *, by_rows: bool) -> Arra
     steps = []
     for part in parts:
         count = len(time[part]) - 1
-        counted = np.ones(count) if by_rows else _steps_by_phase(time[part], step)
-        steps.append(_steps_by_position(signals[part], counted))
+        by_clock = np.ones(count) if by_rows else _steps_by_phase(time[part], step)
+        steps.append(_steps_by_position(signals[part], by_clock))
     return np.concatenate([[0.0], np.cumsum(np.concatenate(steps))])
 
 

@@ -72,9 +72,9 @@ class RowFault:
 def without_faulty_rows(recording: Recording) -> tuple[Recording, tuple[RowFault, ...]]:
     """Return a recording without such rows, with gaps where they were, and what was found."""
     frozen = list(_frozen(recording))
-    kept = np.ones(recording.n_samples, np.bool_)
+    valid = np.ones(recording.n_samples, np.bool_)
     for start, stop in frozen:
-        kept[start:stop] = False
+        valid[start:stop] = False
     faults = [_fault(RowFaultKind.FROZEN, recording, *each) for each in frozen]
     gap = np.zeros(recording.n_samples, np.bool_)
     if recording.gap_before is not None:
@@ -84,11 +84,11 @@ def without_faulty_rows(recording: Recording) -> tuple[Recording, tuple[RowFault
         (part.start, None) for part in recording.segments()[1:]
     ]
     for row, joints in (*starts, *_jumps(recording, gap)):
-        if not kept[row]:
+        if not valid[row]:
             continue
         stop = row + _written_before(recording, row)
         if stop > row:
-            kept[row:stop] = False
+            valid[row:stop] = False
             faults.append(_fault(RowFaultKind.WRITTEN_TWICE, recording, row, stop))
             gap[stop : stop + 1] = True
             continue
@@ -101,7 +101,7 @@ def without_faulty_rows(recording: Recording) -> tuple[Recording, tuple[RowFault
     if not faults:
         return recording, ()
     faults.sort(key=lambda fault: fault.time)
-    return replace(recording, gap_before=gap).rows(kept), tuple(faults)
+    return replace(recording, gap_before=gap).rows(valid), tuple(faults)
 
 
 def _fault(kind: RowFaultKind, recording: Recording, start: int, stop: int) -> RowFault:
