@@ -15,7 +15,13 @@ from typing import Final
 
 from drivers.exchange import realtime
 from drivers.exchange.control import SharedState
-from drivers.exchange.event_log import EventWriter, ExchangeEnded, ExchangeFailed, ExchangeStarted
+from drivers.exchange.event_log import (
+    SESSION_ENDED,
+    EventWriter,
+    ExchangeEnded,
+    ExchangeFailed,
+    ExchangeStarted,
+)
 from drivers.exchange.loop import MAX_LATE, exchange
 from drivers.exchange.process import ExchangeSettings
 from drivers.exchange.serving import CommandHandler, portable
@@ -113,7 +119,7 @@ def _serve(
     finally:
         transport.close()
     if session.state is State.ENDED:
-        server.log(ExchangeEnded("the controller ended the session"))
+        server.log(ExchangeEnded(SESSION_ENDED))
     elif server.reason:
         server.log(ExchangeEnded(server.reason))
     else:

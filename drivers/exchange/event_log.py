@@ -13,10 +13,20 @@ from dataclasses import dataclass
 from typing import Final
 
 from drivers.events import Event
+from drivers.exchange.control import HEARTBEAT_TIMEOUT, IDLE_HEARTBEAT_TIMEOUT
 from drivers.exchange.realtime import RealTimeReport
 from drivers.record import attach_memory, create_memory
 
-NO_SUPERVISOR: Final = "the supervisor sends no heartbeat"
+_SUSPENDED: Final = "it was suspended (Ctrl-Z, SIGSTOP, a debugger), or had no processor time"
+NO_SUPERVISOR: Final = (
+    f"the supervising program sent no heartbeat for more than {HEARTBEAT_TIMEOUT:g} s: {_SUSPENDED}"
+)
+"""Reason of a motion that was stopped because its supervisor was silent."""
+NO_SUPERVISOR_AT_REST: Final = (
+    f"the supervising program sent no heartbeat for more than {IDLE_HEARTBEAT_TIMEOUT:g} s: "
+    f"{_SUSPENDED}"
+)
+SESSION_ENDED: Final = "the controller ended the session"
 NO_ARCHIVE: Final = "the archive process sends no heartbeat"
 
 

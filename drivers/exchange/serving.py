@@ -27,6 +27,7 @@ from drivers.exchange.control import (
 from drivers.exchange.event_log import (
     NO_ARCHIVE,
     NO_SUPERVISOR,
+    NO_SUPERVISOR_AT_REST,
     CommandRefused,
     EventWriter,
     ExchangeEvent,
@@ -230,8 +231,10 @@ class CommandHandler:
         silence = self._supervisor.silence()
         if self._terminated():
             self._leave("the exchange process was asked to terminate", DETACHED_LINGER)
-        elif silence > (HEARTBEAT_TIMEOUT if self._session.requested else IDLE_HEARTBEAT_TIMEOUT):
+        elif self._session.requested and silence > HEARTBEAT_TIMEOUT:
             self._detach(NO_SUPERVISOR)
+        elif silence > IDLE_HEARTBEAT_TIMEOUT:
+            self._detach(NO_SUPERVISOR_AT_REST)
         elif self._control.finish:
             self._leave("the supervisor requested the end", FINISH_LINGER)
 

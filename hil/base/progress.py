@@ -21,6 +21,7 @@ from rich.progress import (
 from rich.table import Column
 from rich.text import Text
 
+from hil.base.progress_lines import PROGRESS_LINES, progress_console
 from hil.base.terminal_text import printable
 
 _NARROWEST = 8  # columns of a bar
@@ -35,12 +36,6 @@ def put(console: Console, text: str) -> None:
 def say(text: str, *, err: bool = False) -> None:
     """Print one line to standard output, or to standard error."""
     put(Console(stderr=err), text)
-
-
-def progress_console() -> Console | None:
-    """Return the terminal that shows progress: standard output, else standard error, else None."""
-    consoles = (Console(), Console(stderr=True))
-    return next((console for console in consoles if console.is_terminal), None)
 
 
 class Task:
@@ -109,16 +104,27 @@ class LineReporter(Silent):
 
 
 class Messages(LineReporter):
-    """Messages without progress: for output that is piped or redirected."""
+    """Messages on standard output, progress as `PROGRESS_LINES`: without a terminal."""
+
+    def say(self, text: str) -> None:
+        """Print the line at once."""
+        super().say(text)
+        PROGRESS_LINES.heard()
 
     def step(self, text: str) -> None:
-        """Report nothing."""
+        """Begin a stage, which lasts until the next one."""
+        PROGRESS_LINES.step(text)
 
     @contextmanager
     def task(self, title: str, total: float) -> Iterator[Task]:
-        """Report nothing: the result is what the output is for."""
-        del title, total
-        yield Task(lambda _done, _note: None)
+        """Begin a stage of `total` units."""
+        with PROGRESS_LINES.stage(title, total) as stage:
+
+            def show(done: float, note: str) -> None:
+                stage.done = done
+                stage.note = note
+
+            yield Task(show)
 
 
 class Collecting:
@@ -195,7 +201,8 @@ class _WithNote(Progress):
 def reporter(*, quiet: bool = False, messages: bool = True) -> Reporter:
     """Return a reporter, silent if `quiet`: messages on standard output, progress on a terminal.
 
-    Without `messages` there is progress alone.
+    Without a terminal progress is plain lines on standard error. Without `messages` there is
+    progress alone.
     """
     if not messages:
         return Collecting(reporter(quiet=quiet))

@@ -120,6 +120,7 @@ class Campaign(CampaignState):
         live: LiveView | None = None,
         until_precise: Sequence[Requirement] = (),
         repetitions: int | None = None,
+        say_unchecked: bool = True,
     ) -> RunResult:
         """Run the motions that are missing, in order, and return the arm to its first position.
 
@@ -145,6 +146,7 @@ class Campaign(CampaignState):
             until_precise: end the repetitions when these are met, or more of them do not help.
             repetitions: to run the excitation up to this number of complete ones; by default to
                 that of the cell.
+            say_unchecked: report which shapes are not checked for collisions.
 
         Raises:
             NotRehearsedError: the plan did not pass its rehearsal.
@@ -172,6 +174,7 @@ class Campaign(CampaignState):
             live=live,
             until_precise=tuple(until_precise),
             repetitions=repetitions,
+            say_unchecked=say_unchecked,
         )
         return run_motions(self, link, watch, reporter or Silent(), options)
 

@@ -50,6 +50,7 @@ class RunOptions:
     live: LiveView | None = None
     until_precise: tuple[Requirement, ...] = ()
     repetitions: int | None = None
+    say_unchecked: bool = True
 
 
 class RunArchives:

@@ -15,7 +15,7 @@ from hil.campaign.rehearsal_criteria import SATURATED, of_currents, of_estimate,
 from hil.campaign.twin import Twin
 from hil.cell import Cell
 from hil.control.errors import MotionFailedError
-from hil.control.motion_checks import PLANNED_CURRENT
+from hil.control.motion_checks import PLANNED_CURRENT, collision_checker
 from hil.control.motion_watch import Stop, Unattended
 from hil.control.virtual_link import VirtualLink
 from sim_fixtures import SimulationError
@@ -109,7 +109,9 @@ def _failure(
 ) -> str:
     """Run what is missing; return the failure in a sentence, "" for none."""
     try:
-        options = RunOptions(provenance=twin.provenance, durable=False, unrehearsed=True)
+        options = RunOptions(
+            provenance=twin.provenance, durable=False, unrehearsed=True, say_unchecked=False
+        )
         run_motions(rehearsal, link, RunWatch(Unattended(), stop), reporter, options)
     except (ExecutionError, RepetitionsRejectedError, SimulationError) as error:
         if stop.requested:
@@ -131,6 +133,8 @@ def _not_seen(cell: Cell) -> list[str]:
         "torque constants and current limits: the simulated motors have those of the cell file",
         "floor, walls and shapes: they are checked, but as the cell file and the URDF have them",
     ]
+    if (unchecked := collision_checker(cell).exceptions) is not None:
+        sentences.append(unchecked)
     if unknown:
         sentences.append(
             f"{', '.join(unknown)} of [drive_train]: the simulated arm takes them from there, so "

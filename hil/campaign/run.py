@@ -152,7 +152,7 @@ class _CampaignRun:
         cell = self._campaign.cell
         reporter = self._reporter
         checks = MotionChecks.of(cell)
-        if checks.not_checked is not None:
+        if checks.not_checked is not None and self._options.say_unchecked:
             reporter.say(checks.not_checked)
         sent = [*slow, *full, *(self._warm_up.next_motion() if full else ())]
         # What is wrong with a motion itself is reported before anything is connected.

@@ -29,7 +29,8 @@ from rich.progress_bar import ProgressBar
 from rich.table import Table
 from rich.text import Text
 
-from hil.base.progress import Silent, Task, progress_console, put
+from hil.base.progress import Silent, Task, put
+from hil.base.progress_lines import LINE_PERIOD, progress_console
 from hil.base.terminal_text import plural, printable
 from hil.campaign.dry_run import DryRunRecord
 from hil.campaign.operator import RunStatus
@@ -322,7 +323,7 @@ class Screen:
         controller: `SIMULATED`, or the controller's address.
         quiet: show nothing and read no keys.
         console: written to; standard output if left out. If that is no terminal, status lines
-            go to standard error, and only if it is one.
+            go to standard error, less often if that is none either.
     """
 
     def __init__(
@@ -336,7 +337,9 @@ class Screen:
         console: Console | None = None,
     ) -> None:
         self._console = console or Console()
-        self._log = console or progress_console()
+        log = console or progress_console()
+        self._sparse = log is None
+        self._log = log or Console(stderr=True)
         self._full = not quiet and self._console.is_terminal and not self._console.is_dumb_terminal
         self._quiet = quiet
         self._stop = stop
@@ -547,15 +550,21 @@ class Screen:
         live.update(self.picture(), refresh=True)
 
     def _print_line(self) -> None:
-        """Print new messages, and a status line every `LINE_EVERY` s and for each motion."""
+        """Print new messages, and a status line now and then and for each motion.
+
+        Without any terminal a line for each kind of motion, and every `LINE_PERIOD` s.
+        """
         self._print_messages()
         status = self._status
-        if status is None or self._log is None or self.age > LINE_EVERY:
+        period = LINE_PERIOD if self._sparse else LINE_EVERY
+        if status is None or self.age > period:
             return
         at = (status.phase, status.number)
+        if self._sparse:  # ways between the others are none of their own
+            at = self._line_of or at if status.phase == "move" else (status.phase, 0)
         if at != self._line_of or time.monotonic() >= self._line_due:
             self._line_of = at
-            self._line_due = time.monotonic() + LINE_EVERY
+            self._line_due = time.monotonic() + period
             put(self._log, status_line(status))
 
     def _print_messages(self) -> None:

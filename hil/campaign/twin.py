@@ -18,6 +18,9 @@ from drivers.transports.simulated import Delay, Duplicate, Fault, Lose, Simulate
 from hil.base.arrays import Array
 from hil.cell import Cell
 from hil.control.simulation import (
+    NOISE_SHARE,
+    RESOLUTION_SHARE,
+    assumed_simulation,
     controller_settings,
     planted_values,
     simulated_controller,
@@ -28,8 +31,6 @@ from identification.text import percentage
 from sim_fixtures import ServoSettings, UnmodelledEffects
 
 SPREAD: Final = 0.1  # Largest relative deviation of the simulated parameters from the nominal ones
-NOISE_SHARE: Final = 0.005  # Noise of the current, rms, as a share of the weakest motor's limit
-RESOLUTION_SHARE: Final = 0.001  # Resolution of the target current, as a share of the same limit
 FAULT_EVERY: Final = 3.0  # Mean time between two faults of the link, s
 LOOP_CYCLES: Final = 0.5
 """Mean delay of a target current, cycles: it acts over the cycle before the packet."""
@@ -179,10 +180,7 @@ def _simulation(
     assumed = []
     given = cell.file.simulation
     if given is None:
-        weakest = min(cell.drive_table.current_limit)
-        table["initial_deg"] = cell.campaign.home_deg
-        table["current_noise"] = NOISE_SHARE * weakest
-        table["current_resolution"] = RESOLUTION_SHARE * weakest
+        table |= assumed_simulation(cell)
         assumed.append(
             f"the current has a noise of {table['current_noise']:.3g} A rms and a resolution of "
             f"{table['current_resolution']:.3g} A ({percentage(NOISE_SHARE, 1)} and "

@@ -26,6 +26,7 @@ from rich.text import Text
 from typer.core import TyperCommand, TyperGroup, TyperOption
 
 from hil.base.errors import DISK_REFUSES, HilError, InputError, OperatorStopError
+from hil.base.progress_lines import command_lines
 from hil.base.startup_interrupt import leave_if_interrupted
 from hil.base.terminal_text import printable
 from hil.base.version import software
@@ -212,6 +213,9 @@ COMMANDS = LazyCommands(dict.fromkeys(name for names in GROUPS.values() for name
 """All commands by name."""
 
 _JSON = "hil.cli.json"
+_LINES = "hil.cli.lines"
+OWN_LINES: Final = frozenset(("simulate", "run", "record", "move"))
+"""Commands that print lines of their own."""
 
 
 class Group(TyperGroup):
@@ -247,11 +251,17 @@ class Group(TyperGroup):
         with errors_as_json(asked):
             context = super().make_context(info_name, args, *more, **extra)
         context.meta[_JSON] = asked
+        quiet = asked or bool({"-q", "--quiet"} & {*args}) or args[:1] == [] or args[0] in OWN_LINES
+        context.meta[_LINES] = "" if quiet else args[0]
         return context
 
     def invoke(self, ctx: Any) -> Any:
         """Run the command; print a failure as JSON if requested."""
-        with errors_as_json(ctx.meta.get(_JSON, False)):
+        command = ctx.meta.get(_LINES, "")
+        with (
+            errors_as_json(ctx.meta.get(_JSON, False)),
+            command_lines(command, quiet=not command),
+        ):
             return super().invoke(ctx)
 
 

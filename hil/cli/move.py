@@ -31,7 +31,16 @@ from hil.control.cell_link import cell_link
 from hil.control.connection import active_checks, narrower_limits
 from hil.control.errors import SlippedError
 from hil.control.motion_watch import MotionProgress, OperatorRequest
-from hil.control.move import THERE, CheckedMove, axis_alone, plan_move, posture, send, turned
+from hil.control.move import (
+    THERE,
+    CheckedMove,
+    axis_alone,
+    joint_index,
+    plan_move,
+    posture,
+    send,
+    turned,
+)
 from hil.control.record import archive_path
 
 
@@ -79,6 +88,8 @@ def move(
         raise InputError(None, "one target is needed", remedy=remedy)
     campaign = Campaign.open(where) if where.is_dir() else None
     cell = Cell.load(where) if campaign is None else campaign.cell
+    if joint is not None:
+        joint_index(cell, joint, "--joint")  # refused before anything is connected
     axis = axis_alone(cell, joint) if only_axis else None
     wanted = None
     if to is not None:

@@ -10,11 +10,13 @@ from typing import Annotated, Literal
 
 import numpy as np
 import typer
+from rich.console import Console
 
 from hil.archive.live import LiveView
 from hil.archive.recorder import Recorded
 from hil.base.errors import ControllerError, HilError, OperatorStopError
-from hil.base.progress import progress_console, put, say
+from hil.base.progress import put, say
+from hil.base.progress_lines import LINE_PERIOD, progress_console
 from hil.campaign import Progress, stop_on_interrupt
 from hil.cell import AngleFrame, Cell
 from hil.cli.arguments import JsonOption, QuietOption, print_json
@@ -23,7 +25,7 @@ from hil.control.record import archive_path
 from hil.control.record import record as record_motion
 
 Kind = Annotated[Literal["excitation", "validation", "standstill"], typer.Option(metavar="USE")]
-LINE_PERIOD = 5.0
+LINE_EVERY = 5.0
 """Time between two lines, s."""
 
 
@@ -135,13 +137,16 @@ def _line(figures: Mapping[str, object]) -> str:
 class View:
     """Progress of a recording: a line every 5 s, and one when it is over.
 
-    Progress is shown on a terminal: standard output, else standard error.
+    Progress is shown on a terminal: standard output, else standard error. Without one it goes to
+    standard error, less often.
     """
 
     def __init__(self, cell: Cell, *, quiet: bool) -> None:
         self._cell = cell
         self._quiet = quiet
-        self._progress = None if quiet else progress_console()
+        console = progress_console()
+        self._progress = None if quiet else console or Console(stderr=True)
+        self._period = LINE_EVERY if console is not None else LINE_PERIOD
         self._over = ""
         self._next = 0.0
 
@@ -158,7 +163,7 @@ class View:
             how = "replying until the arm is at rest (Ctrl-C to exit at once)"
             say(f"{progress.over}; {how}", err=self._quiet)
         if self._progress is not None and time.monotonic() >= self._next:
-            self._next = time.monotonic() + LINE_PERIOD
+            self._next = time.monotonic() + self._period
             put(self._progress, self._line(progress))
 
     def _line(self, progress: Progress) -> str:

@@ -22,6 +22,7 @@ from hil.control.simulation import (
     controller_settings,
     own_postures,
     simulated_controller,
+    with_simulation,
 )
 from hil.control.simulator_on_link import (
     Served,
@@ -162,7 +163,7 @@ def simulate(
     the emergency stop. See `docs/simulate.md`, also for the faults.
 
     Options:
-        cell: Cell file with a [simulation] table.
+        cell: Cell file; without a [simulation] table the arm has the values of [nominal].
         udp: Address of the PC program.
         can: CAN bus in place of UDP, in python-can names, such as socketcan:can0.
         link: Either of them, or another transport of cell files, such as udp:127.0.0.1:2001.
@@ -188,7 +189,8 @@ def simulate(
             Ctrl-C or --duration; --json prints one line for each.
         priority: Real-time priority (SCHED_FIFO) to request.
     """
-    loaded = Cell.load(cell)
+    read = Cell.load(cell)
+    loaded = with_simulation(read)
     if only_axis is not None:
         joint_index(loaded, str(only_axis), "--only-axis")
     settings = replace(
@@ -228,6 +230,8 @@ def simulate(
         f"{loaded.name}: a SIMULATED controller for {udp or can or link}; nothing moves.\n"
         f"cycle {1e3 * settings.period:g} ms, mode {settings.open_mode}, process {os.getpid()}"
     )
+    if loaded is not read:
+        status.say("no table [simulation]: the arm has the values of [nominal], and begins at home")
     if patience:
         status.say(f"cycles are extended by up to {patience:g} s to wait for a reply")
     sessions = 0

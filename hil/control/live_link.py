@@ -20,7 +20,15 @@ from numpy.typing import NDArray
 
 from drivers.errors import DriverError
 from drivers.exchange.control import HeartbeatMonitor, SharedState
-from drivers.exchange.event_log import ExchangeEnded, ExchangeEvent, ExchangeFailed, Leaving
+from drivers.exchange.event_log import (
+    NO_SUPERVISOR,
+    NO_SUPERVISOR_AT_REST,
+    SESSION_ENDED,
+    ExchangeEnded,
+    ExchangeEvent,
+    ExchangeFailed,
+    Leaving,
+)
 from drivers.exchange.process import ExchangeProcess, ExchangeSettings, is_exchange
 from drivers.exchange.realtime import RealTimeSettings
 from drivers.motion_source import MotionSource
@@ -121,6 +129,14 @@ class Heartbeat:
             self._beat()
 
 
+_REMEDIES: Final = {
+    SESSION_ENDED: "; start its Open program again, then run the same command",
+    NO_SUPERVISOR: "; check the arm, then run the same command again",
+    NO_SUPERVISOR_AT_REST: "; run the same command again",
+}
+"""What to do about an exchange process that ended, by its reason."""
+
+
 class ExchangeMonitor:
     """Detects that an exchange process ended or hangs, and why.
 
@@ -151,7 +167,8 @@ class ExchangeMonitor:
         if self.exchange.alive:
             return None
         self._read()
-        message = f" ({self._last_message})" if self._last_message else ""
+        remedy = _REMEDIES.get(self._last_message, "")
+        message = f" ({self._last_message}{remedy})" if self._last_message else ""
         return f"the exchange process {self.ended_for or 'ended' + message}"
 
     def _read(self) -> None:

@@ -5,13 +5,13 @@ from __future__ import annotations
 import json
 from collections.abc import Sequence
 from dataclasses import replace
-from typing import Literal
+from typing import Any, Final, Literal
 
 import numpy as np
 
 from drivers.transports.simulated import SimulatedTransport
 from hil.base.arrays import Array
-from hil.cell import Cell, CellError
+from hil.cell import AngleFrame, Cell, CellError
 from hil.control.motion_checks import collision_checker
 from hil.control.own_moves import InterpolatedMoves
 from hil.control.virtual_link import VirtualLink
@@ -29,6 +29,8 @@ from sim_fixtures.faults import InjectedFault
 from sim_fixtures.plant import Carried
 from sim_fixtures.servo import loops_per_cycle
 
+NOISE_SHARE: Final = 0.005  # Noise of the current, rms, as a share of the weakest motor's limit
+RESOLUTION_SHARE: Final = 0.001  # Resolution of the target current, as a share of the same limit
 STEP = 0.0005
 """Step of a simulated arm with effects that the model leaves out, s."""
 OWN_SPEED = 0.3
@@ -77,6 +79,37 @@ def simulated_link(
     )
     transport = SimulatedTransport(controller)
     return VirtualLink.over(transport, cell, finish=controller.finish, only_axis=only_axis)
+
+
+def assumed_simulation(cell: Cell) -> dict[str, Any]:
+    """Return initial posture and noise of `[simulation]` for a cell without it.
+
+    The posture is home, or the middle of the ranges without `[campaign]`.
+    """
+    weakest = min(cell.drive_table.current_limit)
+    table = cell.file.campaign
+    limits = cell.joint_limits
+    middle = AngleFrame.of(cell).shown((limits.lower + limits.upper) / 2.0)
+    return {
+        "initial_deg": middle.tolist() if table is None else table.home_deg,
+        "current_noise": NOISE_SHARE * weakest,
+        "current_resolution": RESOLUTION_SHARE * weakest,
+    }
+
+
+def with_simulation(cell: Cell) -> Cell:
+    """Return the cell with `[simulation]`: where it has none, with the values of `[nominal]`."""
+    if cell.file.simulation is not None:
+        return cell
+    nominal = cell.nominal
+    table = {
+        "rotor_inertia": nominal.rotor_inertia,
+        "coulomb": nominal.coulomb,
+        "viscous": nominal.viscous,
+        "third": nominal.third or [0.0] * len(cell.joint_names),
+        **assumed_simulation(cell),
+    }
+    return cell.with_values({f"simulation.{key}": value for key, value in table.items()})
 
 
 def simulated_controller(

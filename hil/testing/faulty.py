@@ -79,6 +79,10 @@ PATIENCE: Final = 0.5
 """Time that the controller waits for a reply, s; longer than a real one, for slow computers."""
 
 
+LONGEST: Final = 120.0
+"""Time after which the controller ends its session, s: a test's program moves for seconds."""
+
+
 class SessionError(HilError):
     """The session of a simulated controller has no summary."""
 
@@ -113,7 +117,11 @@ class UdpController:
         faults: Sequence[str] = (),
         options: Sequence[str] = (),
     ) -> Iterator[UdpController]:
-        """Start a controller with faults and options of `hil simulate`; its cell is in `folder`."""
+        """Start a controller with faults and options of `hil simulate`; its cell is in `folder`.
+
+        Unless the options say otherwise, it ends its session (504) after `LONGEST`: a program that
+        stays until then must not wait for ever.
+        """
         port = free_port()
         path = folder / "udp_cell.toml"
         linked = cell.with_link(transport="udp", host=LOOPBACK, port=port, bind=LOOPBACK)
@@ -122,8 +130,9 @@ class UdpController:
         path.write_text(own_cell.text, encoding="utf-8")
         given = [argument for fault in faults for argument in ("--fault", fault)]
         simulator = SimulatorProcess.start(
-            path, "--udp", f"{LOOPBACK}:{port}", "--patience", str(PATIENCE), *given, *options
-        )
+            path, "--udp", f"{LOOPBACK}:{port}", "--patience", str(PATIENCE),
+            "--duration", str(LONGEST), *given, *options,
+        )  # fmt: skip
         controller = cls(own_cell, path, LOOPBACK, port, simulator)
         try:
             yield controller

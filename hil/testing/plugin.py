@@ -19,14 +19,20 @@ if TYPE_CHECKING:
     from sim_fixtures import SimulatedController
 
 MARKER = "controller_faults"
+OPTIONS_MARKER = "controller_options"
 
 
 def pytest_configure(config: pytest.Config) -> None:
-    """Register the marker."""
+    """Register the markers."""
     config.addinivalue_line(
         "markers",
         f"{MARKER}(*lines): faults of the simulated controller or its link, as for "
         '`hil simulate --fault`: "e-stop@4000", "lose@3000x3"',
+    )
+    config.addinivalue_line(
+        "markers",
+        f"{OPTIONS_MARKER}(*options): options of `hil simulate` for udp_controller: "
+        '"--intervals", "1" ends the session (504) after the first motion',
     )
 
 
@@ -94,11 +100,23 @@ def identified_campaign(
 
 
 @pytest.fixture
+def controller_options(request: pytest.FixtureRequest) -> tuple[str, ...]:
+    """Options of the test's `controller_options` markers."""
+    marks = request.node.iter_markers(OPTIONS_MARKER)
+    return tuple(str(option) for mark in marks for option in mark.args)
+
+
+@pytest.fixture
 def udp_controller(
-    tmp_path: Path, simulated_cell: Cell, controller_faults: tuple[str, ...]
+    tmp_path: Path,
+    simulated_cell: Cell,
+    controller_faults: tuple[str, ...],
+    controller_options: tuple[str, ...],
 ) -> Iterator[UdpController]:
     """A simulated controller in another process, over loopback UDP, in real time."""
     from hil.testing.faulty import UdpController
 
-    with UdpController.started(simulated_cell, tmp_path, faults=controller_faults) as controller:
+    with UdpController.started(
+        simulated_cell, tmp_path, faults=controller_faults, options=controller_options
+    ) as controller:
         yield controller

@@ -36,6 +36,7 @@ from drivers.exchange.control import (
 )
 from drivers.exchange.event_log import (
     NO_SUPERVISOR,
+    NO_SUPERVISOR_AT_REST,
     EventReader,
     EventsLost,
     EventWriter,
@@ -405,7 +406,8 @@ class TestSupervisorHeartbeat:
         while not bench.serving.reason:
             bench.later()
         assert bench.clock.time - silent_from == pytest.approx(timeout, abs=1.1 * STEP)
-        assert bench.serving.reason == NO_SUPERVISOR
+        reason = NO_SUPERVISOR if requested else NO_SUPERVISOR_AT_REST
+        assert bench.serving.reason == reason
         assert "stop" in bench.session.calls
 
     def test_motion_requested_after_a_silence_is_stopped(self, bench):

@@ -100,6 +100,16 @@ def test_one_axis_alone_is_refused_where_others_open_or_turn(ns16: Cell, tmp_pat
     assert "joint_4 is moved by the motors of axes 4, 5, 6" in str(error)
 
 
+def test_an_unknown_joint_is_refused_before_connecting(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("hil.cli.move.cell_link", lambda *_, **__: pytest.fail("connected"))
+    way = ["move", str(CELL_PATH), "--joint", "knee", "--by", "2", "-o", str(tmp_path)]
+    error = CliRunner().invoke(app, way).exception
+    assert isinstance(error, InputError)
+    assert "'knee' is not a joint" in str(error)
+
+
 def test_a_campaign_keeps_its_moves_and_knows_its_start(campaign: Campaign, tmp_path: Path) -> None:
     root = tmp_path / "campaign"
     shutil.copytree(campaign.folder.root, root)

@@ -111,12 +111,19 @@ def designed(tmp_path_factory: pytest.TempPathFactory) -> Campaign:
 
 
 @pytest.fixture(scope="module")
-def done(designed: Campaign) -> tuple[PayloadCampaign, Weighed, list[str]]:
+def reported() -> list[bool]:
+    """Whether each run of `done` was to report what is not checked for collisions."""
+    return []
+
+
+@pytest.fixture(scope="module")
+def done(designed: Campaign, reported: list[bool]) -> tuple[PayloadCampaign, Weighed, list[str]]:
     weighed = begun(designed)
     order: list[str] = []
 
     def noting(side: Campaign, choices: Mapping[str, Any]) -> RunResult:
         before = recorded(weighed)
+        reported.append(choices["say_unchecked"])
         result = execute(side, choices)
         order.extend(path for path in recorded(weighed) if path not in before)
         return result
@@ -129,6 +136,11 @@ class TestRecording:
         _, payload, order = done
         assert order == ORDER
         assert payload.pairs == 2
+
+    @pytest.mark.usefixtures("done")
+    def test_what_is_not_checked_is_reported_once(self, reported: list[bool]) -> None:
+        assert len(reported) > 2
+        assert reported == [True, *[False] * (len(reported) - 1)]
 
     def test_the_carried_mass_is_found_and_not_the_assumed_one(self, done) -> None:
         _, payload, _ = done

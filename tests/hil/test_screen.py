@@ -23,6 +23,7 @@ from rich.console import Console
 
 from drivers.states import State
 from hil.base.progress import Bar, LineReporter, Silent, reporter
+from hil.base.progress_lines import ProgressLines
 from hil.campaign import screen as layout
 from hil.campaign.operator import RunStatus
 from hil.campaign.screen import Keyboard, Screen, ScreenError, after, single_keys, typed
@@ -438,13 +439,17 @@ def test_without_a_terminal_there_are_lines_or_none() -> None:
     assert out.getvalue() == ""
 
 
-def test_piped_output_has_messages_and_no_progress(capsys: pytest.CaptureFixture[str]) -> None:
+def test_piped_output_has_messages_apart_from_progress(
+    capsys: pytest.CaptureFixture[str],
+) -> None:
     with Screen(NAMES, Stop()) as screen:
         screen.say("the cell is open")
         screen.show(status())
         time.sleep(0.3)
     printed = capsys.readouterr()
-    assert (printed.out, printed.err) == ("the cell is open\n", "")
+    assert printed.out == "the cell is open\n"
+    (line,) = printed.err.splitlines()
+    assert line.startswith("repetition 7 of 30, ")
 
 
 def test_progress_is_shown_on_a_terminal_only(
@@ -525,6 +530,52 @@ def test_eighty_columns_hold_count_times_and_note() -> None:
     (shown,) = [line for line in lines if "11500/23000" in line]
     assert title in shown and "0:00:0" in shown and " left " in shown and "━" in shown
     assert note in lines
+
+
+class TestProgressLines:
+    """Progress without a terminal."""
+
+    def lines(self, capsys: pytest.CaptureFixture[str], *moments: float) -> list[str]:
+        """Lines of a command that designs; no thread looks, but the test."""
+        plain = ProgressLines()
+        plain._looking = True
+        with plain.stage("hil design", is_command=True), plain.stage("designing", 100.0) as stage:
+            for done, moment in enumerate(moments, 1):
+                stage.done = done
+                stage.note = f"motion {done}"
+                plain.look(stage.began + moment)
+        captured = capsys.readouterr()
+        assert captured.out == "", "results alone"
+        return captured.err.splitlines()
+
+    def test_a_stage_is_named_unless_it_is_over_at_once(self, capsys) -> None:
+        assert self.lines(capsys, 0.1, 0.9) == []
+        assert self.lines(capsys, 0.1, 1.1) == ["designing: 2 %, motion 2"]
+
+    def test_silence_lasts_at_most_thirty_seconds(self, capsys) -> None:
+        lines = self.lines(capsys, *range(1, 100))
+        assert len(lines) == 4
+        assert lines[1] == "designing: 31 %, about 1:09 min left, motion 31"
+
+    def test_a_command_without_stages_is_named_after_thirty_seconds(self, capsys) -> None:
+        plain = ProgressLines()
+        plain._looking = True
+        with plain.stage("hil look", is_command=True) as stage:
+            for moment in (2.0, 29.0, 31.0, 40.0, 65.0):
+                plain.look(stage.began + moment)
+        said = ["hil look, 31 s so far", "hil look, 1:05 min so far"]
+        assert capsys.readouterr().err.splitlines() == said
+
+    def test_a_thread_looks_while_there_are_stages(self, capsys) -> None:
+        plain = ProgressLines()
+        plain.step("rehearsing")
+        with plain.stage("reading", 1.0):
+            time.sleep(1.7)
+        assert capsys.readouterr().err.splitlines() == ["rehearsing; reading"]
+        until = time.monotonic() + 5.0
+        while plain._looking:
+            assert time.monotonic() < until
+            time.sleep(0.05)
 
 
 def test_quiet_prints_nothing(capsys: pytest.CaptureFixture[str]) -> None:

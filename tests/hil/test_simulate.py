@@ -22,6 +22,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+import tomlkit
 import typer
 from typer.testing import CliRunner
 
@@ -36,6 +37,7 @@ from hil.control.simulation import (
     own_postures,
     simulated_controller,
     simulated_link,
+    with_simulation,
 )
 from hil.control.simulator_on_link import Buttons, Served, open_controller_link
 from hil.control.simulator_process import free_port
@@ -309,6 +311,20 @@ def test_real_hardware_is_simulated_only_where_asked_for():
         simulated_link(real)
     assert simulated_link(real, instead_of_hardware=True).is_virtual
     assert simulated_controller(real).period == 0.001
+
+
+def test_a_cell_without_simulation_has_the_nominal_arm():
+    cell = Cell.load(CELL_PATH)
+    document = tomlkit.parse(cell.text)
+    del document["simulation"]
+    document["cell"]["assumed"] = []  # type: ignore[index]
+    bare = Cell.from_texts(tomlkit.dumps(document), cell.urdf, cell.path)
+    assert bare.file.simulation is None
+    simulated = with_simulation(bare)
+    assert simulated.simulation.rotor_inertia == cell.nominal.rotor_inertia
+    assert simulated.simulation.initial_deg == cell.campaign.home_deg
+    assert simulated_controller(simulated).period == cell.period
+    assert with_simulation(cell) is cell
 
 
 def invoke(*options: str) -> Any:

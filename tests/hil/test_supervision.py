@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import os
 import re
 import subprocess
 import sys
@@ -16,7 +17,14 @@ import pytest
 from numpy.typing import NDArray
 
 from drivers.events import MotionEnded, MotionStarted
-from drivers.exchange.event_log import EventsLost
+from drivers.exchange.control import create as create_control
+from drivers.exchange.event_log import (
+    NO_SUPERVISOR,
+    NO_SUPERVISOR_AT_REST,
+    SESSION_ENDED,
+    EventsLost,
+    ExchangeEnded,
+)
 from drivers.record import cycle_dtype
 from drivers.states import State
 from hil.archive import Archive, ArchiveSpec, ArchiveWriter, open_archive
@@ -26,7 +34,7 @@ from hil.campaign.operator import BETWEEN, ExpectedMotion, RunStatus, RunWatch
 from hil.cell import Cell
 from hil.control.connection import StartTimeout
 from hil.control.link import Standstill
-from hil.control.live_link import STALL, Heartbeat
+from hil.control.live_link import STALL, ExchangeMonitor, Heartbeat
 from hil.control.motion_watch import MotionProgress, OperatorRequest
 from hil.control.motions import player_of
 from hil.control.simulation import simulated_link
@@ -447,6 +455,29 @@ def test_an_override_is_counted_once_in_the_time_left() -> None:
     watch.end()
     assert watch.status.motion is None
     assert watch.status.time_left == pytest.approx(20.0 + BETWEEN)
+
+
+@pytest.mark.parametrize(
+    ("reason", "remedy"),
+    [
+        (SESSION_ENDED, "start its Open program again"),
+        (NO_SUPERVISOR, "for more than 0.5 s: it was suspended .*; check the arm, then run"),
+        (NO_SUPERVISOR_AT_REST, "for more than 5 s: it was suspended .*; run the same command"),
+    ],
+)
+def test_the_end_of_the_exchange_has_a_remedy(reason: str, remedy: str) -> None:
+    class Ended:
+        alive = False
+        control_fd = create_control()
+
+        def events(self) -> list[ExchangeEnded]:
+            return [ExchangeEnded(reason)]
+
+    monitor = ExchangeMonitor(Ended())  # type: ignore[arg-type]
+    failure = monitor.failure()
+    os.close(Ended.control_fd)
+    assert failure is not None
+    assert re.search(remedy, failure)
 
 
 PERIOD = 0.002

@@ -100,7 +100,7 @@ def test_another_arm_a_wrong_script_and_a_fault_that_is_none(tmp_path: Path) -> 
     assert "'earthquake' is none of lose" in done.stdout
 
 
-def test_a_project_without_it_pays_for_five_small_modules() -> None:
+def test_a_project_without_it_pays_for_a_few_small_modules() -> None:
     """Its own are those of the names of errors; all others are Python's."""
     code = (
         "import sys, pytest; before = set(sys.modules); import hil.testing.plugin;"
@@ -111,12 +111,27 @@ def test_a_project_without_it_pays_for_five_small_modules() -> None:
     ours = {name for name in modules if name.partition(".")[0] == "hil"}
     assert ours == {
         "hil",
+        "hil.base",
         "hil.base.errors",
         "hil.base.terminal_text",
         "hil.testing",
         "hil.testing.plugin",
     }
     assert {name.partition(".")[0] for name in modules - ours} <= sys.stdlib_module_names
+
+
+@pytest.mark.parametrize("options", [("--intervals", "1"), ("--duration", "4")])
+def test_a_program_that_stays_until_504_ends(tmp_path: Path, options: tuple[str, ...]) -> None:
+    cell = shortened(Cell.load(CELL_PATH))
+    program = Path(__file__).with_name("foreign_pc.py")
+    with UdpController.started(cell, tmp_path, options=options) as controller:
+        command = [sys.executable, str(program), "--port", str(controller.port)]
+        done = subprocess.run(
+            [*command, "--exit-after", "100"], capture_output=True, text=True, timeout=60.0
+        )
+        assert done.returncode == 0, done.stderr
+        assert "504" in done.stdout
+        assert controller.finish()["phase"] == "ended"
 
 
 def test_a_program_that_never_replied_is_named(tmp_path: Path) -> None:
