@@ -24,7 +24,7 @@ from hil.pipeline.sources import Source, all_fitted
 from identification.selection.settings import Settings
 
 from .cache import CacheLocation, code_digest
-from .cluster import AnyFuture, Cluster, Death, SkippedArchive, Task, reason_of
+from .cluster import AnyFuture, Cluster, Death, SkippedArchive, Task, error_of, reason_of
 from .discovery import (
     ArchiveRef,
     CellTexts,
@@ -356,10 +356,10 @@ class _Batch:
         The archives that did are removed from these, and reported.
         """
         archives = sum(self._uncached(campaign) for arm in arms for campaign in arm.campaigns)
-        #: who receives a future that is done, by its key. No reference to one is held, so that the
-        #: workers release results that nothing else needs, and only results of campaigns and arms
-        #: are fetched: sums are fifty times as large
-        receivers: dict[str, Callable[[AnyFuture], None]] = {}
+        #: who receives a future that is done, by its identity. No reference to one is held, so that
+        #: the workers release results that nothing else needs, and only results of campaigns and
+        #: arms are fetched: sums are fifty times as large
+        receivers: dict[int, Callable[[AnyFuture], None]] = {}
         damaged: list[_ArmWork] = []
 
         def submitted() -> Iterator[AnyFuture]:
@@ -367,7 +367,7 @@ class _Batch:
                 yield from self._submit(arm, receivers, archives, advance)
 
         for future in self.cluster.completed(submitted()):
-            receivers[future.key](future)
+            receivers[id(future)](future)
         for arm in arms:
             if any(campaign.key not in arm.results for campaign in arm.campaigns):
                 damaged.append(arm)
@@ -379,7 +379,7 @@ class _Batch:
     def _submit(
         self,
         arm: _ArmWork,
-        receivers: dict[str, Callable[[AnyFuture], None]],
+        receivers: dict[int, Callable[[AnyFuture], None]],
         archives: int,
         advance: Callable[[float, str], None],
     ) -> Iterator[AnyFuture]:
@@ -396,24 +396,24 @@ class _Batch:
             estimated = (arm.model, campaign.ready, place)
             if all(self._has(wanted, campaign) for wanted in partitions):
                 pair = submit(place, estimate_cached, partitions, self.cache, *estimated)
-                receivers[pair.key] = _advance(advance, sum(map(len, partitions)), place)
+                receivers[id(pair)] = _advance(advance, sum(map(len, partitions)), place)
                 yield pair
             else:
                 parts = []
                 for wanted in partitions:
                     part = submit(place, reduce_archives, wanted, campaign.ready, self.cache)
-                    receivers[part.key] = _advance(advance, len(wanted), place)
+                    receivers[id(part)] = _advance(advance, len(wanted), place)
                     parts.append(part)
                 pair = submit(place, estimate_campaign, parts, *estimated)
                 yield from parts
             result = submit(place, result_of, pair)
-            receivers[result.key] = self._receive_campaign(arm, campaign.key)
+            receivers[id(result)] = self._receive_campaign(arm, campaign.key)
             campaigns.append(pair)
             yield result
         if arm.has_pooled:
             sums = [submit("", group_of, chunk) for chunk in _chunks(campaigns)]
             pooled = submit(f"arm {arm.model.digest[:8]}", estimate_arm, sums, arm.model)
-            receivers[pooled.key] = self._receive_pooled(arm)
+            receivers[id(pooled)] = self._receive_pooled(arm)
             yield pooled
 
     def _receive_campaign(self, arm: _ArmWork, key: GroupKey) -> Callable[[AnyFuture], None]:
@@ -498,7 +498,7 @@ def _advance(
     """Return what is done when `count` archives are reduced."""
 
     def receive(future: AnyFuture) -> None:
-        if future.status != "error":
+        if error_of(future) is None:
             advance(count, note)
 
     return receive

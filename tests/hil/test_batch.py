@@ -101,17 +101,9 @@ def bits(result):
 
 
 def assert_equal_repetitions(result, single_result):
-    """Values are equal; of standard deviations the leverages of blocks are those of the archive.
-
-    They agree far better than the scatter over its blocks, at least 20, determines them.
-    """
-    for mine, theirs in zip(result.repetitions, single_result.repetitions, strict=True):
-        mine = mine.estimate
-        np.testing.assert_allclose(mine.values, theirs.values, **EXACT)
-        np.testing.assert_allclose(mine.noise_std, theirs.noise_std, **EXACT)
-        np.testing.assert_allclose(mine.std, theirs.std, rtol=1.0 / np.sqrt(2.0 * 20.0))
-        assert mine.interval_factor == theirs.interval_factor
-        assert mine.method == theirs.method
+    """Values of each alone; an identification has the intervals of all together only."""
+    for mine, values in zip(result.repetitions, single_result.values, strict=True):
+        np.testing.assert_allclose(mine.estimate.values, values, **EXACT)
 
 
 @pytest.fixture
@@ -164,7 +156,7 @@ class TestNumbers:
             assert getattr(level, name) == getattr(stated, name)
         assert list(level.samples) == list(stated.samples)
         repeated = identification.estimate
-        assert len(result.repetitions) == len(repeated.repetitions) == 3
+        assert len(result.repetitions) == len(repeated.values) == 3
         assert_equal_repetitions(result, repeated)
 
     @pytest.mark.parametrize(

@@ -25,7 +25,7 @@ from hypothesis import strategies as st
 from pyarrow import parquet
 
 from hil.batch.cache import HEADER, JSON, NPZ, NUMBERS, CacheError, CacheLocation, code_digest
-from hil.batch.cluster import SkippedArchive
+from hil.batch.cluster import Cluster, SkippedArchive, Task, error_of
 from hil.batch.discovery import ArchiveRef, arm_digest
 from hil.batch.estimates import Arm
 from hil.batch.graph import PARTITION, BatchResult, _Campaign
@@ -38,7 +38,6 @@ from hil.batch.reduction import (
     settings_digest,
 )
 from hil.batch.table import COLUMNS, write_tables
-from hil.batch.thread import ThreadClient
 from hil.cell import Cell
 from hil.cell.schema import PayloadTable, TorsionSpringTable
 from identification.factor.factor import Factor
@@ -101,31 +100,31 @@ class TestThread:
         assert ran.stdout == "[3] False\n", ran.stderr
 
     def test_executes_in_order_and_passes_results_on(self):
-        client = ThreadClient()
-        three = client.submit(abs, -3, key="three", pure=False)
-        five = client.submit(max, [three, 5], key="five", pure=False)
-        assert client.submit(pow, three, five, key="power", pure=False).result() == 243
-        assert (three.key, three.status, three.result()) == ("three", "finished", 3)
-        client.close()
+        with Cluster() as cluster:
+            three, five = (cluster.submit(Task("", abs, (-n,)), archives=1) for n in (3, 5))
+            most = cluster.submit(Task("", max, ([three, five, 4],)), archives=1)
+            power = cluster.submit(Task("", pow, (three, most)), archives=1)
+            assert power.result() == 243
+            assert error_of(power) is None
 
-    def test_an_error_is_that_of_the_task_and_of_those_that_need_it(self):
-        client = ThreadClient()
-        failed = client.submit(int, "three", key="failed", pure=False)
-        for future in (failed, client.submit(abs, failed, key="needs it", pure=False)):
-            assert isinstance(future.exception(), ValueError)
-            assert future.status == "error"
-        client.close()
+    def test_an_error_of_the_cache_is_that_of_all_that_need_the_task(self):
+        def refused() -> None:
+            raise CacheError(None, "it is full")
+
+        with Cluster() as cluster:
+            failed = cluster.submit(Task("", refused, ()), archives=1)
+            for future in (failed, cluster.submit(Task("", abs, (failed,)), archives=1)):
+                assert isinstance(error_of(future), CacheError)
 
     def test_is_waited_for_when_closed_and_begins_no_other_task(self):
         begun = threading.Event()
         go = threading.Event()
-        client = ThreadClient()
-        first = client.submit(lambda: begun.set() or go.wait(), key="first", pure=False)
-        second = client.submit(abs, 1, key="second", pure=False)
-        begun.wait()
-        threading.Timer(0.05, go.set).start()
-        client.close()
-        assert (first.done(), second.done()) == (True, False)
+        with Cluster() as cluster:
+            first = cluster.submit(Task("", lambda: begun.set() or go.wait(), ()), archives=1)
+            second = cluster.submit(Task("", abs, (1,)), archives=1)
+            begun.wait()
+            threading.Timer(0.05, go.set).start()
+        assert (first.done(), second.cancelled()) == (True, True)
 
 
 class TestCache:
