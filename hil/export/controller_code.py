@@ -128,7 +128,7 @@ def export_code(
     remarks = _remarks(model)
     check: CompiledCheck | str
     if to == "c":
-        code = c_source(tables, name, remarks, precision)
+        code = c_source(tables, name, remarks, precision, model.thresholds)
         check = checked(code, name, model.arm, precision)
         files = {output.name: code.source, f"{name}.h": code.header}
     else:
@@ -200,7 +200,7 @@ class CompiledArm:
     """The functions of compiled code; the library's file may go once it is open."""
 
     def __init__(self, library: Path, name: str, n_joints: int, precision: Precision) -> None:
-        self._library = ctypes.CDLL(str(library))
+        self.library = ctypes.CDLL(str(library))
         self._name = name
         self._n = n_joints
         self._real = np.dtype(np.float64 if precision == "double" else np.float32)
@@ -228,7 +228,7 @@ class CompiledArm:
 
     def function(self, name: str) -> Any:
         """Return a function by its name without the prefix."""
-        return getattr(self._library, f"{self._name}_{name}")
+        return getattr(self.library, f"{self._name}_{name}")
 
     def array(self, values: Array) -> Array:
         """Return values as the code reads them."""
@@ -245,7 +245,7 @@ class CompiledArm:
 
     def seconds(self, q: Array, v: Array, a: Array) -> float:
         """Return the time of one call of the whole torque [s]."""
-        timed = self._library.seconds_of_a_call
+        timed = self.library.seconds_of_a_call
         timed.restype = ctypes.c_double
         states = [self.array(values) for values in (q, v, a)]
         count = ctypes.c_long(len(q))

@@ -49,6 +49,7 @@ from identification.factor.blocks import FINE_BLOCK, fine_blocks
 from identification.model.link_wrenches import LINK_SYMBOLS
 from identification.model.pseudo_inertia import margin
 from identification.model.robot import RobotModel
+from identification.purposes.thresholds import ContactThreshold
 from identification.reduction.posterior import Posterior
 from identification.selection.folds import FOLDS
 from identification.validation.prediction import driving_residual
@@ -72,6 +73,7 @@ class IdentifiedModel:
     verdict: str
     good: bool
     origin: str = ""  #: where it was read from
+    thresholds: tuple[ContactThreshold, ...] = ()  #: of contacts, from held-out motion
     parameters_digest: str = ""  #: SHA-256 of the `parameters.json` that it was read from
 
     @property
@@ -164,6 +166,7 @@ def model_of(identification: Identification) -> IdentifiedModel:
         provenance_of(identification.results, identification.paths),
         identification.verdict.line,
         identification.verdict.good,
+        thresholds=identification.validation.thresholds,
     )
 
 
@@ -284,6 +287,7 @@ def stored_model(folder: Path, reporter: Reporter, predict: Sequence[Path] = ())
         results.verdict.good,
         f"from {folder / RESULTS} and {PARAMETERS_JSON}, identified by hil {program}; "
         "--again identifies again",
+        tuple(results.contact_thresholds),
         file_digest(folder / PARAMETERS_JSON),
     )
 

@@ -90,6 +90,7 @@ def summary(
         choices=[*prepared.settings.choices],
         coverage=None if truth is None else _coverage(pooled.values, pooled.std, truth),
         verdict=results.VerdictResult.of(verdict, warnings=[*verdict.warnings, *sources.warnings]),
+        contact_thresholds=[*validation.thresholds],
         essential=_essential(validation.essential),
         consistency=None if isinstance(consistency, str) else _consistency(model, consistency),
         judgement=_judgement(model.joint_names, validation),

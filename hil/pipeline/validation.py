@@ -10,6 +10,7 @@ from hil.base.progress import Reporter
 from hil.cell.nominal import Nominal, nominal_of
 from identification import Estimate, Factor, IdentificationError
 from identification.purposes.purposes import Application, purposes_of
+from identification.purposes.thresholds import ContactThreshold
 from identification.selection.essential import Elimination, choose_essential
 from identification.validation.calibration import Calibration, TorqueMeans, calibrate
 from identification.validation.consistency import ConsistencyCheck, check_consistency
@@ -34,6 +35,7 @@ class Validation:
     nominal: Nominal | None  #: nominal model
     evidence: Evidence
     verdict: Verdict
+    thresholds: tuple[ContactThreshold, ...] = ()  #: of contacts, from held-out motion
 
     @property
     def warnings(self) -> tuple[str, ...]:
@@ -82,7 +84,9 @@ def validate(
         )
         task.advance(1)
     calibration = _calibration(prepared, estimation)
-    return Validation(consistency, essential, calibration, nominal, evidence, verdict)
+    return Validation(
+        consistency, essential, calibration, nominal, evidence, verdict, application.thresholds()
+    )
 
 
 def _application(

@@ -19,6 +19,7 @@ from hil.base.errors import InputError
 from hil.base.safe_input import parse_json, read_text
 from hil.base.type_adapter import adapter_of
 from identification.excitation.criteria import Criteria
+from identification.purposes.thresholds import ContactThreshold
 from identification.selection.essential import EliminationStep
 from identification.selection.settings import Choice, Settings
 from identification.text import percentage
@@ -523,6 +524,7 @@ class Results(Frozen):
     choices: list[Choice]  #: Settings chosen by inner prediction, in order
     coverage: CoverageResult | None
     verdict: VerdictResult
+    contact_thresholds: list[ContactThreshold] = []  #: Empty if too little was held out
     essential: EssentialResult | None = None
     consistency: ConsistencyResult | None = None
     exports: ExportResult | None = None

@@ -32,11 +32,16 @@ def contact(
     model: RobotModel, residuals: Sequence[SlowResidual], postures: Array
 ) -> Contact | None:
     """Return thresholds and force at postures (m, n); None of too little unseen motion."""
-    peaks = [_summed(np.maximum, part, np.abs(part.torque)) for part in residuals]
+    peaks = residual_peaks(residuals)
     torque = once_in(PERIOD, np.concatenate(peaks)) if peaks else None
     if torque is None:
         return None
     return Contact(torque, seen_force(model, torque, postures))
+
+
+def residual_peaks(residuals: Sequence[SlowResidual]) -> list[Array]:
+    """Return the largest residual in each whole block of time of each part (B, n)."""
+    return [_summed(np.maximum, part, np.abs(part.torque)) for part in residuals]
 
 
 def seen_force(model: RobotModel, torque: Array, postures: Array) -> float:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 
@@ -15,6 +16,7 @@ from identification.purposes.contact import contact, seen_mass
 from identification.purposes.gravity import gravity_error, workspace
 from identification.purposes.quiet_torque import PERIOD, SlowResidual, slow_residuals
 from identification.purposes.simulation import HORIZON, flange_error
+from identification.purposes.thresholds import ContactThreshold, contact_thresholds
 from identification.signals.samples import Samples
 from identification.validation.evidence import Evidence
 from identification.validation.finding import Thresholds
@@ -44,11 +46,20 @@ class Application:
     lower: Array
     upper: Array
 
+    @cached_property
+    def residuals(self) -> list[SlowResidual]:
+        """What a monitor of contacts sees of the held-out motion."""
+        return slow_residuals(self.model, self.estimate.values, self.held_out)
+
+    def thresholds(self) -> tuple[ContactThreshold, ...]:
+        """Return thresholds of contacts; force and mass in the middle of the ranges."""
+        return contact_thresholds(self.model, self.residuals, 0.5 * (self.lower + self.upper))
+
 
 def purposes_of(arm: Application, limits: PurposeLimits) -> tuple[Purpose, ...]:
     """Return all purposes, in the order in which they are shown."""
     postures = workspace(arm.lower, arm.upper)
-    residuals = slow_residuals(arm.model, arm.estimate.values, arm.held_out)
+    residuals = arm.residuals
     return (
         feed_forward(arm.evidence, limits),
         gravity_compensation(arm.model, arm.estimate, postures),

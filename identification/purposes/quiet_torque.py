@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from typing import Final, NamedTuple
 
 import numpy as np
+from scipy.special import chdtri
 
 from identification.arrays import Array, Indices
 from identification.model.motion import Motion
@@ -63,6 +64,26 @@ def whole_blocks(time: Array) -> tuple[Indices, int]:
     return edges[:-1], int(edges[-1])
 
 
+class _Tail(NamedTuple):
+    """The largest peaks, as of an exponential distribution."""
+
+    beyond: int  # number k of peaks beyond the threshold
+    threshold: Array  # (...)
+    scale: Array  # mean excess over it (...)
+    chance: float  # of exceeding a level once in the period, over that of the threshold
+
+    @classmethod
+    def of(cls, period: float, peaks: Array) -> _Tail:
+        """Choose the tail of peaks of blocks (B, ...) for what is exceeded once in a time [s]."""
+        count = len(peaks)
+        share = min(1.0, BLOCK / period)
+        beyond = int(np.clip(_WITHIN * share * count, _TAIL * min(count, _MANY), 0.5 * count))
+        ordered = np.sort(peaks, axis=0)[::-1]
+        threshold = ordered[beyond]
+        scale = (ordered[:beyond] - threshold).mean(axis=0)
+        return cls(beyond, threshold, scale, count * share / beyond)
+
+
 def once_in(period: float, peaks: Array) -> Array | None:
     """Return what the peaks of blocks (B, ...) exceed once in a time [s]; None of too few.
 
@@ -70,13 +91,22 @@ def once_in(period: float, peaks: Array) -> Array | None:
     further one beyond x is (1 + x / (k scale))^-k, so that few peaks give a larger threshold. Of
     normal residuals, whose tail is shorter, it errs to the larger side.
     """
-    count = len(peaks)
-    if count < _FEWEST:
+    if len(peaks) < _FEWEST:
         return None
-    share = min(1.0, BLOCK / period)
-    beyond = int(np.clip(_WITHIN * share * count, _TAIL * min(count, _MANY), 0.5 * count))
-    ordered = np.sort(peaks, axis=0)[::-1]
-    threshold = ordered[beyond]
-    scale = (ordered[:beyond] - threshold).mean(axis=0)
-    growth = beyond * ((beyond / (count * share)) ** (1.0 / beyond) - 1.0)
-    return np.asarray(threshold + scale * growth)
+    tail = _Tail.of(period, peaks)
+    growth = tail.beyond * (tail.chance ** (-1.0 / tail.beyond) - 1.0)
+    return np.asarray(tail.threshold + tail.scale * growth)
+
+
+def once_in_interval(period: float, peaks: Array) -> tuple[Array, Array]:
+    """Return the ends of the 95 % interval of the level that is exceeded once in a time [s].
+
+    The mean of k excesses of an exponential distribution is distributed as chi-squared of 2 k
+    degrees of freedom; peaks of blocks are (B, ...), at least ten.
+    """
+    tail = _Tail.of(period, peaks)
+    freedom = 2.0 * tail.beyond
+    longest, shortest = freedom / chdtri(freedom, [0.975, 0.025])
+    growth = -np.log(tail.chance)
+    ends = [tail.threshold + tail.scale * growth * share for share in (shortest, longest)]
+    return np.minimum(*ends), np.maximum(*ends)

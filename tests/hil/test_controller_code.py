@@ -36,6 +36,7 @@ from identification.model.elements import (
 from identification.model.friction import FrictionLaw
 from identification.model.motion import Motion
 from identification.model.payload import Payload
+from identification.purposes.thresholds import ContactThreshold
 from sim_fixtures.ns16 import urdf_text
 from tests.hil.structured_text_reader import Block, blocks_of
 from tests.identification.robots import random_urdf
@@ -106,6 +107,22 @@ def test_the_compiled_torque_is_pinocchios(name: str, precision: Precision) -> N
     assert not isinstance(check, str)
     assert check.difference <= AGREES[precision]
     assert 0.0 < check.seconds < 1e-3
+
+
+def test_thresholds_are_tables_that_a_program_reads(tmp_path: Path) -> None:
+    arm = an_arm(urdf_text())
+    torque = tuple(np.arange(1.0, 7.0).tolist())
+    levels = [
+        ContactThreshold(period, False, torque, torque, torque, 50.0, 5.0)
+        for period in (12.5, 60.0)
+    ]
+    code = c_source(control_tables(arm), "arm", [], "double", levels)
+    assert COMPILER is not None
+    built = CompiledArm.of(code, "arm", tmp_path, COMPILER, "double")
+    periods = (ctypes.c_double * 2).in_dll(built.library, "arm_threshold_period")
+    rows = (ctypes.c_double * 12).in_dll(built.library, "arm_threshold")
+    assert [*periods] == [12.5, 60.0]
+    assert tuple(rows[6:]) == torque
 
 
 def test_another_arm_is_refused() -> None:
@@ -269,7 +286,8 @@ class TestObserver:
 def test_the_loop_of_the_page_compiles(tmp_path: Path) -> None:
     page = (Path(__file__).parents[2] / "docs" / "controller.md").read_text("utf-8")
     (loop,) = re.findall(r"```c\n(.*?)```", page, re.DOTALL)
-    code = c_source(control_tables(an_arm(urdf_text())), "arm", [])
+    level = ContactThreshold(60.0, True, (1.0,) * 6, (1.0,) * 6, (1.0,) * 6, 50.0, 5.0)
+    code = c_source(control_tables(an_arm(urdf_text())), "arm", [], "double", [level])
     (tmp_path / "arm.h").write_text(code.header)
     (tmp_path / "loop.c").write_text(loop)
     assert COMPILER is not None

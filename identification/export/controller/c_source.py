@@ -5,7 +5,7 @@ from __future__ import annotations
 import re
 from collections.abc import Iterator, Sequence
 from importlib.resources import files
-from typing import Final, Literal, NamedTuple
+from typing import Final, Literal, NamedTuple, Protocol
 
 import numpy as np
 
@@ -25,6 +25,18 @@ _COLUMNS: Final = ",\n    ".join(FRICTION_COLUMNS)
 _WIDTH: Final = 100  # of the comment at the top
 
 
+class Threshold(Protocol):
+    """A threshold of contacts, as `identification.purposes` finds it."""
+
+    @property
+    def period(self) -> float:
+        """Time in which motion without contact exceeds it once [s]."""
+
+    @property
+    def torque(self) -> Sequence[float]:
+        """Of each joint (n,) [N·m or N]."""
+
+
 class CSource(NamedTuple):
     """Header and source of an arm."""
 
@@ -33,7 +45,11 @@ class CSource(NamedTuple):
 
 
 def c_source(
-    tables: ControlTables, name: str, remarks: Sequence[str], precision: Precision = "double"
+    tables: ControlTables,
+    name: str,
+    remarks: Sequence[str],
+    precision: Precision = "double",
+    thresholds: Sequence[Threshold] = (),
 ) -> CSource:
     """Return header and source whose names begin with `name`.
 
@@ -42,6 +58,7 @@ def c_source(
         name: of the files and the prefix of their functions, an identifier of C.
         remarks: origin and verdict, in the comment at the top of the header.
         precision: of all numbers.
+        thresholds: of the torque from outside, which motion without contact exceeds rarely.
     """
     header = "".join(
         [
@@ -49,7 +66,7 @@ def c_source(
             "\n",
             _engine("engine.h").replace(
                 "#define ARM_H\n",
-                "#define ARM_H\n\n" + _definitions(tables, precision),
+                "#define ARM_H\n\n" + _definitions(tables, precision, len(thresholds)),
                 1,
             ),
         ]
@@ -63,6 +80,7 @@ def c_source(
                 for macro, function in zip(_MACROS, _FUNCTIONS, strict=True)
             ),
             *_constants(tables, precision),
+            *_thresholds(thresholds, precision),
             "\n",
             _engine("engine.c"),
         ]
@@ -115,12 +133,24 @@ def _folded(text: str) -> Iterator[str]:
     yield line
 
 
-def _definitions(tables: ControlTables, precision: Precision) -> str:
+def _definitions(tables: ControlTables, precision: Precision, thresholds: int) -> str:
     return (
         f"typedef {'float' if precision == 'single' else 'double'} arm_real;\n\n"
         f"#define ARM_JOINTS {tables.n_joints}\n"
         f"#define ARM_AXES {tables.n_axes} /* joints, and motors that turn several joints */\n"
+        f"#define ARM_THRESHOLDS {thresholds}\n"
     )
+
+
+def _thresholds(thresholds: Sequence[Threshold], precision: Precision) -> Iterator[str]:
+    """Yield the tables that the header declares, if there is a threshold."""
+    if not thresholds:
+        return
+    write = _Writer(precision)
+    periods = write.initial(np.array([each.period for each in thresholds]))
+    yield f"\nconst arm_real arm_threshold_period[{len(thresholds)}] = {periods};\n"
+    rows = ",\n".join(f"    {write.initial(np.array(each.torque))}" for each in thresholds)
+    yield f"const arm_real arm_threshold[{len(thresholds)}][ARM_JOINTS] = {{\n{rows}}};\n"
 
 
 class _Writer:

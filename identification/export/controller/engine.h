@@ -51,6 +51,13 @@ void arm_observer_start(arm_observer *observer, arm_real gain, arm_real dt, cons
 void arm_observer_step(arm_observer *observer, const arm_real q[], const arm_real v[],
                        const arm_real tau[], arm_real external[]);
 
+#if ARM_THRESHOLDS > 0
+/* Torque from outside that motion without contact exceeded once in a period [s], from motion that was
+   not fitted and for an observer below 10 Hz; the longer periods are extrapolated. */
+extern const arm_real arm_threshold_period[ARM_THRESHOLDS];
+extern const arm_real arm_threshold[ARM_THRESHOLDS][ARM_JOINTS];
+#endif
+
 #ifdef __cplusplus
 }
 #endif

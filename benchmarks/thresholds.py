@@ -1,0 +1,115 @@
+"""Thresholds of contacts: how often motion of other recordings exceeds them, over the promise.
+
+Each split of the board is identified. One half of its unseen motion sets the threshold that it
+shows itself, the other half is counted, and the other way round. Recordings are without contact.
+"""
+
+from __future__ import annotations
+
+import tempfile
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+from typing import Any, Final, NamedTuple
+
+import numpy as np
+
+from benchmarks import parser_of, show
+from benchmarks.board import DATA, FITTED_SHARE, import_all
+from benchmarks.published import Published, Split, known
+from hil.base.progress import Silent
+from hil.pipeline.options import Options
+from hil.pipeline.run import identify_archives
+from identification.arrays import Array
+from identification.purposes.contact import residual_peaks
+from identification.purposes.quiet_torque import once_in, slow_residuals
+from identification.purposes.thresholds import SHOWN
+from identification.validation.residuals import BLOCK
+
+WITHIN: Final = 3.0
+"""Factor within which the rate of false alarms is to be."""
+
+
+class Count(NamedTuple):
+    """Blocks of half a second of all joints that exceed a threshold, and how many should."""
+
+    robot: str
+    split: str
+    seconds: float
+    joints: int
+    found: int
+    promised: float
+
+    @property
+    def ratio(self) -> float:
+        """Of found to promised."""
+        return self.found / self.promised
+
+
+def counts(name: str, data: Path) -> Iterator[Count]:
+    """Count on each split of a robot that predicts by the defaults of the command line."""
+    published = Published.named(name)
+    with tempfile.TemporaryDirectory() as scratch:
+        archives = import_all(published, data / (published.folder or name), Path(scratch))
+        for split in published.splits:
+            if split.in_sample or split.part == "last" or split.share != FITTED_SHARE:
+                continue
+            predicted = [] if split.predicted is None else [archives[split.predicted]]
+            yield from _counted(name, split, archives[split.fitted], predicted)
+
+
+def _counted(name: str, split: Split, fitted: Path, predicted: Sequence[Path]) -> Iterator[Count]:
+    options = Options(split=FITTED_SHARE)
+    found = identify_archives([fitted], Silent(), options, predict=predicted)
+    values = found.estimate.pooled.values
+    residuals = slow_residuals(found.cell.model, values, found.prepared.held_out)
+    peaks = np.concatenate(residual_peaks(residuals))
+    middle = len(peaks) // 2
+    exceeded, promised = 0, 0.0
+    for setting, counted in ((peaks[:middle], peaks[middle:]), (peaks[middle:], peaks[:middle])):
+        torque = _shown(setting)
+        if torque is None:
+            return
+        exceeded += int(np.count_nonzero(counted > torque))
+        promised += SHOWN * len(counted) / len(setting) * peaks.shape[1]
+    seconds = len(peaks) * BLOCK
+    yield Count(name, str(split), seconds, peaks.shape[1], exceeded, promised)
+
+
+def _shown(peaks: Array) -> Array | None:
+    return once_in(len(peaks) * BLOCK / SHOWN, peaks)
+
+
+def main() -> None:
+    """Print each split as it comes, then the sums."""
+    parser = parser_of(__doc__)
+    parser.add_argument("--data", type=Path, default=DATA, help="folder of recordings")
+    parser.add_argument("--only", action="append", choices=known(), help="may be repeated")
+    options = parser.parse_args()
+    rows: list[Count] = []
+    for name in options.only or known():
+        for row in counts(name, options.data):
+            rows.append(row)
+            if not options.json:
+                print(
+                    f"{row.robot}, {row.split}: {row.seconds:.0f} s of unseen motion, {row.found}"
+                    f" of {row.promised:.1f} promised exceed it: {row.ratio:.2f}",
+                    flush=True,
+                )
+    show(_summary(rows), only_json=options.json)
+
+
+def _summary(rows: Sequence[Count]) -> dict[str, Any]:
+    ratios = [row.ratio for row in rows]
+    within = [1.0 / WITHIN <= ratio <= WITHIN for ratio in ratios]
+    return {
+        "splits": len(rows),
+        "within a factor of three": sum(within),
+        "all found over all promised": sum(row.found for row in rows)
+        / sum(row.promised for row in rows),
+        "least": min(ratios),
+        "most": max(ratios),
+    }
+
+
+if __name__ == "__main__":
+    main()
