@@ -68,6 +68,7 @@ def _counted(name: str, split: Split, fitted: Path, predicted: Sequence[Path]) -
     for setting, counted in ((peaks[:middle], peaks[middle:]), (peaks[middle:], peaks[:middle])):
         torque = _shown(setting)
         if torque is None:
+            yield Count(name, str(split), len(peaks) * BLOCK, peaks.shape[1], 0, 0.0)
             return
         exceeded += int(np.count_nonzero(counted > torque))
         promised += SHOWN * len(counted) / len(setting) * peaks.shape[1]
@@ -90,15 +91,19 @@ def main() -> None:
         for row in counts(name, options.data):
             rows.append(row)
             if not options.json:
-                print(
-                    f"{row.robot}, {row.split}: {row.seconds:.0f} s of unseen motion, {row.found}"
-                    f" of {row.promised:.1f} promised exceed it: {row.ratio:.2f}",
-                    flush=True,
-                )
+                print(_line(row), flush=True)
     show(_summary(rows), only_json=options.json)
 
 
+def _line(row: Count) -> str:
+    unseen = f"{row.robot}, {row.split}: {row.seconds:.0f} s of unseen motion"
+    if row.promised == 0.0:
+        return f"{unseen}, too short for a threshold"
+    return f"{unseen}, {row.found} of {row.promised:.1f} promised exceed it: {row.ratio:.2f}"
+
+
 def _summary(rows: Sequence[Count]) -> dict[str, Any]:
+    rows = [row for row in rows if row.promised > 0.0]
     ratios = [row.ratio for row in rows]
     within = [1.0 / WITHIN <= ratio <= WITHIN for ratio in ratios]
     return {
