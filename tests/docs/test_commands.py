@@ -20,7 +20,6 @@ from hil import Campaign, Cell
 from hil.base.progress import Silent
 from hil.campaign import design
 from hil.cli import app
-from tests import messages
 from tests.docs.typed import PAGES, ROOT, commands, parse, section
 from tests.hil.simulated_logs import write_moving_log
 
