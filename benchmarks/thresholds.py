@@ -14,8 +14,8 @@ from typing import Any, Final, NamedTuple
 import numpy as np
 
 from benchmarks import parser_of, show
-from benchmarks.board import DATA, FITTED_SHARE, import_all
-from benchmarks.published import Published, Split, known
+from benchmarks.board import DATA, import_all
+from benchmarks.published import FITTED_SHARE, Published, Split, known
 from hil.base.progress import Silent
 from hil.pipeline.options import Options
 from hil.pipeline.run import identify_archives
