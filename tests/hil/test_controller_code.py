@@ -14,8 +14,11 @@ import numpy as np
 import pinocchio as pin
 import pytest
 
+import hil
 from hil.base.arrays import Array
 from hil.export.controller_code import AGREES, STRICT, CompiledArm, checked, pointer
+from hil.importers.recording import ImportOptions
+from hil.pipeline.identified_model import model_of
 from identification.errors import ModelError, ShapeError
 from identification.export.arm import Arm
 from identification.export.controller.c_source import Precision, c_source
@@ -303,6 +306,32 @@ def test_the_page_names_every_function() -> None:
     header = c_source(control_tables(an_arm(urdf_text())), "arm", []).header
     for name in re.findall(r"^void (arm_\w+)\(", header, re.MULTILINE):
         assert name in page, name
+
+
+@pytest.mark.slow
+def test_on_a_real_arm_without_contact_it_shows_the_residual() -> None:
+    """Predicted minus measured torque of an unseen motion, low-passed."""
+    data = Path(__file__).parents[3] / "shared" / "data" / "kr300"
+    if not data.is_dir():
+        pytest.skip(f"there is no recording {data}")
+    reading = ImportOptions(columns=data / "map.toml")
+    arm = hil.identify(
+        data / "A.csv", urdf=data / "robot.urdf", predict=data / "B.csv", reading=reading
+    )
+    (samples,) = arm.identification.prepared.held_out
+    gain, dt = 25.0, float(np.median(np.diff(samples.motion.time)))
+    observer = arm.observer(gain, dt)
+    model = model_of(arm.identification).arm
+    residual = reference_torque(model, samples.motion, presliding=True) - samples.torque
+    shown, expected = np.zeros(residual.shape), np.zeros(residual.shape)
+    for k, (q, v, _) in enumerate(samples.motion.states()):
+        shown[k] = observer.step(q, v, samples.torque[k])
+        before = expected[k - 1] if k else 0.0
+        expected[k] = (before + gain * dt * residual[k]) / (1.0 + gain * dt)
+    settled = round(5.0 / gain / dt)
+    error = np.sqrt(np.mean((shown - expected)[settled:] ** 2, axis=0))
+    size = np.sqrt(np.mean(samples.torque**2, axis=0))
+    assert (error < 0.02 * size).all()
 
 
 class TestStructuredText:
