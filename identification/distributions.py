@@ -19,6 +19,11 @@ def student_limit(share: ArrayLike, freedom: ArrayLike) -> Any:
     return -scipy.special.stdtrit(freedom, share)
 
 
+def chi_squared_limit(share: ArrayLike, freedom: ArrayLike) -> Any:
+    """Value that chi-squared of so many degrees of freedom exceeds with probability `share`."""
+    return scipy.special.chdtri(freedom, share)
+
+
 def fisher_limit(share: ArrayLike, freedom: ArrayLike, of_variance: ArrayLike) -> Any:
     """Value that Fisher's F exceeds with probability `share`.
 

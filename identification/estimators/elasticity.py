@@ -28,6 +28,7 @@ from identification.factor.rows import augmented_rows
 from identification.model.motion import Motion
 from identification.model.robot import RobotModel
 from identification.signals.samples import Samples
+from identification.signals.smoothing import LowPassShape, low_passed
 
 RESONANCE: Final = 2.0 * np.pi * 15.0
 """Resonance of a joint's links on its gear [rad/s] that compliances are expected at: industrial
@@ -132,8 +133,8 @@ def elastic_torque(model: RobotModel, samples: Samples, values: Array, complianc
         rate = len(rows) / max(float(np.ptp(at)), step)
         if len(rows) <= 3 * (2 * order + 1) or rate <= 2.0 * DELAY_BANDWIDTH:
             continue
-        low_pass = scipy.signal.butter(order, DELAY_BANDWIDTH, fs=rate, output="sos")
-        sag = _LINEAR * compliance * scipy.signal.sosfiltfilt(low_pass, rigid, axis=0)
+        slow = low_passed(at, rigid, DELAY_BANDWIDTH, LowPassShape(order))
+        sag = _LINEAR * compliance * slow
         sag_rate = np.gradient(sag, at, axis=0)
         sag_acceleration = np.gradient(sag_rate, at, axis=0)
         for joint in np.flatnonzero(compliance):

@@ -7,9 +7,9 @@ from dataclasses import dataclass, replace
 from typing import Final, Literal
 
 import numpy as np
-import scipy
 
 from identification.arrays import Array
+from identification.distributions import chi_squared_limit
 from identification.estimators.covariance import Clustered, block_covariance, clustered_covariance
 from identification.factor.estimate import Estimate, estimate, estimate_of, joint_weights
 from identification.factor.factor import Factor, reduced, total_factor
@@ -116,7 +116,7 @@ def no_narrower(covariance: Array, values: Array) -> Array:
     scatter = values.std(axis=0, ddof=1) / np.sqrt(len(values))
     ratio = np.where(determined, scatter / np.where(determined, std, 1.0), 1.0)
     certain = _CERTAIN ** (1.0 / max(1, int(determined.sum())))
-    chance = np.sqrt(scipy.stats.chi2.ppf(certain, freedom) / freedom)
+    chance = np.sqrt(chi_squared_limit(1.0 - certain, freedom) / freedom)
     wider = np.where(ratio > chance, ratio, 1.0)
     return np.where(
         np.outer(determined, determined), covariance * np.outer(wider, wider), covariance

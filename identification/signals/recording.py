@@ -9,7 +9,6 @@ from itertools import pairwise
 from typing import Any, Final
 
 import numpy as np
-import scipy
 from numpy.typing import NDArray
 
 from identification.arrays import Array
@@ -366,9 +365,10 @@ def _lag(a: Array, b: Array) -> int | None:
     enough = rows >= _OVERLAP * max(len(a), len(b))
     if not enough.any():
         return None
-    common = np.zeros(len(lags))
-    for x, y in zip(a.T, b.T, strict=True):
-        common += scipy.signal.correlate(y, x, method="fft")
+    # By transforms: `scipy.signal`, which has this, takes a second to import.
+    length = 1 << (len(lags) - 1).bit_length()
+    spectra = np.fft.rfft(b, length, axis=0) * np.fft.rfft(a, length, axis=0).conj()
+    common = np.fft.irfft(spectra.sum(axis=1), length)[lags]
     power_a, power_b = (np.append(0.0, np.cumsum((signal**2).sum(axis=1))) for signal in (a, b))
     powers = power_a[last] - power_a[first] + power_b[last + lags] - power_b[first + lags]
     squares = np.where(enough, (powers - 2.0 * common) / np.maximum(rows, 1), np.inf)
