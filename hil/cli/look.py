@@ -5,14 +5,16 @@ from __future__ import annotations
 import sys
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Annotated
+from textwrap import shorten
+from typing import Annotated, Final
 
 import typer
 
 from hil.base.files import write_output
+from hil.base.one_screen import COLUMNS, LINES, Paragraph, Part, one_screen
 from hil.base.progress import say
 from hil.base.terminal_text import printable
-from hil.cli.arguments import JsonOption, print_json, with_options
+from hil.cli.arguments import JsonOption, VerboseOption, print_json, with_options
 from hil.cli.imports import Described, Reading
 from hil.importers.conclusions import Certainty
 from hil.look import Choice, Group, Look, Row, look_at
@@ -25,7 +27,9 @@ from hil.look.messages import (
     row_text,
     setting_text,
 )
+from hil.look.readings import Fact
 from identification.text import percentage
+from identification.validation.finding import joined
 
 IN_DOUBT = 2
 """Exit status of a recording with two readings that fit alike."""
@@ -39,9 +43,10 @@ def look(
     *,
     arm: Described,
     reading: Reading,
+    verbose: VerboseOption = False,
     json: JsonOption = False,
 ) -> None:
-    """Say what each channel of a recording is, how sure that is, and what it can determine.
+    """Say what each channel of a recording is, how certain that is, and what it can determine.
 
     Names and units say a part, the slope of the positions another, and with --urdf the torque:
     side, sign, order and zero of the joints, gravity, mounting, delay and low-pass. Where two
@@ -51,14 +56,15 @@ def look(
     **Example:** `hil look log.csv --urdf arm.urdf`
 
     Options:
-        output: Write the column map with the sure conclusions, for `hil identify --map`.
+        output: Write the column map with what is certain, for `hil identify --map`.
     """
     result = look_at(recording, arm.robot if arm.is_given else None, reading.options)
     asks = sys.stdin.isatty() and sys.stdout.isatty() and not json
     if json:
         print_json(as_json(result))
     else:
-        _print(result)
+        for line in whole(result) if verbose else screen(result):
+            typer.echo(printable(line))
     text = result.map_text
     is_open = False
     for choices in result.questions:
@@ -77,23 +83,49 @@ def look(
         raise typer.Exit(IN_DOUBT)
 
 
-def _print(result: Look) -> None:
-    for line in table(result.rows):
-        typer.echo(printable(line))
+def whole(result: Look) -> list[str]:
+    """Return everything: rows with their reasons, what would decide them, and the counts."""
+    lines = table(result.rows)
     if result.groups:
-        typer.echo("\nthe recording determines (parameters):")
-        for line in groups_table(result.groups):
-            typer.echo(printable(line))
+        lines += ["", "the recording determines (parameters):", *groups_table(result.groups)]
     for choices in result.questions:
-        doubt = fit_alike(choices)
-        typer.echo(f"\n{choices[0].aspect}: {doubt}; choose one line for the map:")
-        for number, choice in enumerate(choices, 1):
-            error = "" if choice.error is None else f" (error {percentage(choice.error, 2)})"
-            reading = choice_text(choice)
-            typer.echo(printable(f"  {number}  {setting_text(choice.setting) or reading}"))
-            typer.echo(printable(f"     {reading}{error}"))
-    if result.gravity is not None:
-        say(f"for `hil identify`: {gravity_option(result.gravity)}")
+        lines += ["", *question(choices)]
+    return [*lines, *_options(result)]
+
+
+def screen(result: Look) -> list[str]:
+    """Return one screen: what is unusual, one line for all that is as the URDF says, next steps."""
+    parts: list[Part] = [*summary(result.rows)]
+    if result.groups:
+        parts += ["", "this recording can determine", *determined(result.groups)]
+    steps = [
+        Paragraph(row_text(row).decide, f"next  {row.aspect}: ", 2)
+        for row in result.rows
+        if row.certainty is Certainty.UNDETERMINED and row.decider is not None
+    ]
+    questions = [line for choices in result.questions for line in question(choices)]
+    parts += ["", *questions, *_options(result), "reasons, and all rows: -v"]
+    room = LINES - len([part for part in parts if part])
+    if not questions:
+        parts[-1:-1] = steps[: max(1, min(_STEPS, room))]
+    return one_screen(parts)
+
+
+def question(choices: Sequence[Choice]) -> list[str]:
+    """Return a question about readings that fit alike, and a line for each of them."""
+    lines = [f"{choices[0].aspect}: {fit_alike(choices)}; choose one line for the map:"]
+    for number, choice in enumerate(choices, 1):
+        error = "" if choice.error is None else f" (error {percentage(choice.error, 2)})"
+        reading = choice_text(choice)
+        setting = setting_text(choice.setting)
+        lines.append(f"  {number}  {setting or reading}{error}")
+        if setting:
+            lines.append(f"     {reading}")
+    return lines
+
+
+def _options(result: Look) -> list[str]:
+    return [] if result.gravity is None else [f"hil identify {gravity_option(result.gravity)}"]
 
 
 def _ask(choices: Sequence[Choice]) -> Choice | None:
@@ -106,13 +138,80 @@ def _ask(choices: Sequence[Choice]) -> Choice | None:
 def table(rows: Sequence[Row]) -> list[str]:
     """Return the rows as lines, and below each what would decide it."""
     width = max((len(row.aspect) for row in rows), default=0)
+    indent = " " * (width + _CERTAINTY + 4)
     lines = []
     for row in rows:
         text = row_text(row)
-        lines.append(f"{row.aspect.ljust(width)}  {row.certainty.ljust(6)}  {text.reading}")
-        lines.append(f"{' ' * width}          {text.reason}")
+        lines.append(f"{row.aspect:{width}}  {row.certainty:{_CERTAINTY}}  {text.reading}")
+        lines.append(f"{indent}{text.reason}")
         if text.decide and row.certainty is not Certainty.CERTAIN:
-            lines.append(f"{' ' * width}          to decide: {text.decide}")
+            lines.append(f"{indent}to decide: {text.decide}")
+    return lines
+
+
+_CERTAINTY: Final = max(map(len, Certainty))
+_MEANING: Final = 42  # columns
+_WORDS: Final = 6  # of the evidence
+_STEPS: Final = 3
+_NAMES: Final = 4  # of joints
+_AS_DESCRIBED: Final = frozenset(
+    {
+        Fact.EVERY_JOINT_MOVES,
+        Fact.CONTINUOUS,
+        Fact.WITHIN_LIMITS,
+        Fact.ORDER_OF_URDF,
+        Fact.SIGNS_OF_URDF,
+        Fact.UNIT_AS_READ,
+        Fact.ZERO_OF_URDF,
+        Fact.UNCOUPLED,
+        Fact.WITH_GRAVITY,
+        Fact.STATED_MOUNTING,
+        Fact.JOINT_SIDE,
+        Fact.JOINT_TORQUE,
+        Fact.NO_DELAY,
+        Fact.NO_LOW_PASS,
+    }
+)
+
+
+def summary(rows: Sequence[Row]) -> list[str]:
+    """Return a line for each row, and one for those that are as the URDF says."""
+    usual = [row for row in rows if row.reading in _AS_DESCRIBED]
+    width = max(len("channel"), *(len(row.aspect) for row in rows))
+    lines = [f"{'channel':{width}}  {'meaning':{_MEANING}}  {'certainty':{_CERTAINTY}}  evidence"]
+    for row in rows:
+        if row not in usual:
+            text = row_text(row)
+            meaning = shorten(text.reading, _MEANING, placeholder=" ...")
+            first = f"{row.aspect:{width}}  {meaning:{_MEANING}}  {row.certainty:{_CERTAINTY}}  "
+            words = " ".join(text.reason.split()[:_WORDS]).rstrip(":;,")
+            lines.append(first + shorten(words, COLUMNS - len(first), placeholder=" ..."))
+    for certainty in Certainty:
+        names = ", ".join(row.aspect for row in usual if row.certainty is certainty)
+        if names:
+            lines.append(f"as the URDF says, {certainty}: {names}")
+    return lines
+
+
+def determined(groups: Sequence[Group]) -> list[str]:
+    """Return three lines: what the recording determines well, weakly, and not."""
+    lines = []
+    for title, counted in (
+        ("well", lambda group: group.identifiable),
+        ("weakly", lambda group: group.weak),
+        ("not", lambda group: group.missing),
+    ):
+        parts = []
+        for quantity in ("friction", "body"):
+            of_it = [group for group in groups if group.quantity == quantity]
+            total = sum(group.identifiable + group.weak + group.missing for group in of_it)
+            count = sum(map(counted, of_it))
+            names = [group.body for group in of_it if counted(group)]
+            joints = "all joints" if len(names) == len(of_it) else joined(names, _NAMES)
+            if count:
+                name = "friction" if quantity == "friction" else "bodies"
+                parts.append(f"{name} {count} of {total} ({joints})")
+        lines.append(f"  {title:6}  {'; '.join(parts) or 'nothing'}")
     return lines
 
 

@@ -21,6 +21,8 @@ from hil.importers.conclusions import (
 )
 from hil.importers.messages import sentence
 from hil.importers.recording import ImportedRecording
+from hil.look.readings import DoubtfulArm
+from hil.look.result import ChangedReading
 from hil.pipeline.sources import Source
 
 _USUAL: Final = (
@@ -32,12 +34,15 @@ _USUAL: Final = (
     LockedJoints,
     RecordedClock,
     StatedUnit,
+    ChangedReading,
+    DoubtfulArm,
 )
 _MOST: Final = 3
 
 
 def read_lines(arm: IdentifiedArm) -> list[tuple[str, str]]:
     """Return use and content of each recording; of many the first ones, and their number."""
+    decisive = [*_decisive(arm)]
     lines = [*_imported(arm)]
     sources = arm.identification.prepared.sources
     imported = {*(() if arm.staging is None else arm.staging.recordings)}
@@ -47,10 +52,20 @@ def read_lines(arm: IdentifiedArm) -> list[tuple[str, str]]:
         if not (use == "predicted" and sources.in_sample)
     ]
     lines += [(use, _archives(group)) for use, group in of_archives if group and not _same(arm)]
-    if len(lines) <= _MOST:
-        return lines
-    more = len(lines) - _MOST + 1
-    return [*lines[: _MOST - 1], ("", f"and {plural(more, 'recording')} more")]
+    if (more := len(lines) - _MOST) > 0:
+        lines = [*lines[: _MOST - 1], ("", f"and {plural(more + 1, 'recording')} more")]
+    return [*decisive[:_MOST], *lines]
+
+
+def _decisive(arm: IdentifiedArm) -> Iterator[tuple[str, str]]:
+    """Yield what was changed in recordings, and doubts whether they are of this arm."""
+    if arm.staging is None:
+        return
+    for place, recording in arm.staging.recordings.items():
+        for found in recording.concluded:
+            if isinstance(found, DoubtfulArm | ChangedReading):
+                label = "doubtful" if isinstance(found, DoubtfulArm) else "changed"
+                yield label, f"{arm.staging.sources[place].name}: {sentence(found)}"
 
 
 def _same(arm: IdentifiedArm) -> bool:

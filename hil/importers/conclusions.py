@@ -21,9 +21,9 @@ Sample = Literal["row", "message"]
 class Certainty(StrEnum):
     """How certain a conclusion is; the value is what a person and a program read."""
 
-    CERTAIN = "sure"  #: nothing else fits
+    CERTAIN = "certain"  #: nothing else fits
     LIKELY = "likely"  #: by names or custom
-    UNDETERMINED = "open"  #: the recording does not say
+    UNDETERMINED = "undetermined"  #: the recording does not say
 
 
 class NameBasis(Enum):

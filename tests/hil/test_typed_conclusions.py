@@ -76,7 +76,7 @@ class TestNamesOfChannels:
         (nearest,) = row.evidence
         assert isinstance(nearest, NextBest)
         assert nearest.ratio > 3.0
-        result = hil("look", path, "--urdf", urdf)
+        result = hil("look", path, "--urdf", urdf, "-v")
         assert re.search(r"next best: \w+, error \d+\.\d+ times", result.output)
 
     def test_the_recorded_arm_has_a_row_of_its_own(self, tmp_path: Path) -> None:
