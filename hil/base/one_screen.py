@@ -64,6 +64,21 @@ def one_screen(parts: Sequence[Part], lines: int = LINES) -> list[str]:
     return shown[:lines]
 
 
+def brief(lines: Sequence[str], last: int = 1) -> list[str]:
+    """Return lines on one screen: of too many the first ones, their number, and the last ones."""
+    shown: list[str] = list(lines)
+    if (more := len(shown) - LINES) > 0:
+        head = shown[: LINES - last - 1]
+        shown = [*head, f"{more + 1} more lines: -v", *shown[len(shown) - last :]]
+    return one_screen(
+        [line if len(line) <= COLUMNS else Paragraph(line, _indent(line)) for line in shown]
+    )
+
+
+def _indent(line: str) -> str:
+    return " " * (len(line) - len(line.lstrip()))
+
+
 def _cut(line: str) -> str:
     return line[: COLUMNS - len(_CUT)].rstrip() + _CUT
 

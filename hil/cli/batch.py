@@ -11,6 +11,7 @@ from typing import Annotated, Any, Final
 import typer
 
 from hil.base.files import convert_write_errors, make_folder
+from hil.base.one_screen import brief
 from hil.base.progress import reporter as make_reporter
 from hil.base.terminal_text import plural, printable
 from hil.batch import graph as run
@@ -19,7 +20,7 @@ from hil.batch.cluster import Cluster, SkippedArchive
 from hil.batch.estimates import BatchEstimate, BatchEstimator, relative_error
 from hil.batch.graph import BatchResult
 from hil.batch.table import write_tables
-from hil.cli.arguments import JsonOption, QuietOption, print_json, with_options
+from hil.cli.arguments import JsonOption, QuietOption, VerboseOption, print_json, with_options
 from hil.cli.identify_options import Identifying
 from identification.text import percentage
 
@@ -40,6 +41,7 @@ def batch(
     *,
     how: Identifying,
     quiet: QuietOption = False,
+    verbose: VerboseOption = False,
     json: JsonOption = False,
 ) -> None:
     """Identify every arm from all archives below given folders, campaign by campaign.
@@ -61,7 +63,7 @@ def batch(
         cache: Folder of cached factors, or none. Default: .hil-cache next to the archives, or in
             the user's cache folder if those are read-only.
     """
-    reporter = make_reporter(quiet=quiet or json)
+    reporter = make_reporter(quiet=quiet or json, messages=verbose)
     if output is not None:
         make_folder(output)
     options = how.options(estimator=estimator)
@@ -73,23 +75,31 @@ def batch(
     if json:
         print_json(as_dict(result, written))
     else:
-        for line in () if quiet else result_lines(result):
-            typer.echo(printable(line))
-        if written:
+        lines = [] if quiet else [*result_lines(result)]
+        if written and not quiet:
             names = ", ".join(path.name for path in written)
-            reporter.say(f"written to {written[0].parent}: {names}")
+            lines.append(f"written to {written[0].parent}: {names}")
         for line in _last(_broken_lines(result.broken)):
             typer.echo(printable(line), err=True)
         if result.skipped and not quiet:
-            typer.echo(printable(skipped_line(result.skipped)))
-        typer.echo(
-            f"{plural(len(result.repetitions), 'repetition')} in "
-            f"{plural(len(result.campaigns), 'campaign')} of {plural(len(result.arms), 'arm')}; "
-            f"{plural(result.read, 'archive')} read, {result.cached} cached, "
-            f"{len(result.skipped)} skipped, {len(result.broken)} failed"
-        )
+            lines.append(skipped_line(result.skipped))
+        lines.append(_counts(result))
+        for line in lines if verbose else brief(lines, last=_TAIL):
+            typer.echo(printable(line))
     if result.broken:
         raise typer.Exit(SOME_BROKEN)
+
+
+_TAIL: Final = 3  # lines at the end: files, what was skipped, counts
+
+
+def _counts(result: BatchResult) -> str:
+    return (
+        f"{plural(len(result.repetitions), 'repetition')} in "
+        f"{plural(len(result.campaigns), 'campaign')} of {plural(len(result.arms), 'arm')}; "
+        f"{plural(result.read, 'archive')} read, {result.cached} cached, "
+        f"{len(result.skipped)} skipped, {len(result.broken)} failed"
+    )
 
 
 def _tables(folder: Path | None, result: BatchResult) -> list[Path]:

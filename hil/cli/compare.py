@@ -8,10 +8,11 @@ from typing import Annotated, Final
 import typer
 
 from hil.base.files import make_folder, write_files
+from hil.base.one_screen import brief
 from hil.base.progress import reporter as make_reporter
 from hil.base.terminal_text import printable
 from hil.batch.cluster import Cluster
-from hil.cli.arguments import JsonOption, QuietOption, print_json
+from hil.cli.arguments import JsonOption, QuietOption, VerboseOption, print_json
 from hil.compare import comparison as comparing
 from identification.text import unit_text
 
@@ -24,6 +25,7 @@ def compare(
     output: Annotated[Path | None, typer.Option("--output", "-o")] = None,
     fail_on_change: bool = False,
     quiet: QuietOption = False,
+    verbose: VerboseOption = False,
     json: JsonOption = False,
 ) -> None:
     """Compare campaigns of one arm: parameters of friction and inertia that changed, by axis.
@@ -37,7 +39,7 @@ def compare(
         output: HTML file for the report. Default: no report.
         fail_on_change: Return exit status 5 if something has changed.
     """
-    reporter = make_reporter(quiet=quiet or json)
+    reporter = make_reporter(quiet=quiet or json, messages=verbose)
     with Cluster(reporter=reporter) as cluster:
         comparison = comparing.compare(campaigns, cluster, reporter)
     if output is not None:
@@ -49,17 +51,20 @@ def compare(
     if json:
         print_json(comparison.document)
     else:
-        if not quiet:
-            for change in comparison.changed:
-                line = (
-                    f"{change.parameter} in {change.campaign}:"
-                    f" {change.after:.4g} instead of {change.before:.4g} {unit_text(change.unit)}, "
-                    f"change {change.change:+.3g} ± {change.half:.2g} (95 %),"
-                    f" p {change.p_value:.1g}"
-                )
-                typer.echo(printable(line))
-            for warning in comparison.warnings:
-                typer.echo(printable(f"note: {warning}"))
-        typer.echo(printable(f"{comparison.verdict}."))
+        lines = [] if quiet else _lines(comparison)
+        lines = [f"{comparison.verdict}.", *lines]
+        for line in lines if verbose else brief(lines):
+            typer.echo(printable(line))
     if fail_on_change and comparison.changed:
         raise typer.Exit(CHANGED)
+
+
+def _lines(comparison: comparing.Comparison) -> list[str]:
+    """Return the changes, the most significant first, and what limits the comparison."""
+    changes = [
+        f"{change.parameter} in {change.campaign}:"
+        f" {change.after:.4g} instead of {change.before:.4g} {unit_text(change.unit)}, "
+        f"change {change.change:+.3g} ± {change.half:.2g} (95 %), p {change.p_value:.1g}"
+        for change in sorted(comparison.changed, key=lambda change: change.p_value)
+    ]
+    return [*changes, *(f"note: {warning}" for warning in comparison.warnings)]

@@ -12,6 +12,7 @@ from typing import Annotated, Any, Literal
 import typer
 
 from hil.base.errors import HilError, InputError, OperatorStopError
+from hil.base.one_screen import brief
 from hil.base.progress import Reporter, say
 from hil.base.progress import reporter as make_reporter
 from hil.base.terminal_text import printable, typed
@@ -19,7 +20,7 @@ from hil.campaign.campaign import campaign_of_design, require_replaceable
 from hil.campaign.plan import quick_settings, validation_motions
 from hil.campaign.trajectory_files import write_trajectories
 from hil.cell import Cell
-from hil.cli.arguments import JsonOption, QuietOption, at_most_one, print_json
+from hil.cli.arguments import JsonOption, QuietOption, VerboseOption, at_most_one, print_json
 from hil.cli.weigh import centre_from
 from hil.control.motion_checks import MotionChecks
 from hil.control.motion_watch import stop_on_interrupt
@@ -90,6 +91,7 @@ def design(
     resume: bool = False,
     force: bool = False,
     quiet: QuietOption = False,
+    verbose: VerboseOption = False,
     json: JsonOption = False,
 ) -> None:
     """Search for a motion that excites and decouples the parameters of CELL. Nothing moves.
@@ -147,7 +149,7 @@ def design(
         raise InputError(None, "no cell file", remedy="name a cell file: hil design CELL")
     at_most_one(method=method, settings=settings, quick=quick)
     at_most_one(resume=resume, force=force)
-    reporter = make_reporter(quiet=quiet or json)
+    reporter = make_reporter(quiet=quiet or json, messages=verbose)
     loaded = Cell.load(cell).with_campaign(repetitions=repetitions)
     folder = DesignFolder(output)
     require_replaceable(output)
@@ -198,16 +200,16 @@ def design(
         excitation = done.result.excitation
         unchecked = done.result.settings.unchecked
         broken = ", ".join(f"{kind} {count}" for kind, count in excitation.rejected.items())
-        reporter.say(
+        lines = [
             f"{excitation.tried} motions tried; broken constraints: {broken or 'none'}; "
             f"{len(done.design.front)} on the front"
-        )
+        ]
         if unchecked:
             text = f"not checked: {', '.join(unchecked)}; {loaded.name} may refuse this motion"
             say(f"warning: {text}", err=True)  # also with --quiet
         lacking, files = _campaign(folder, loaded, done)
         if files:
-            reporter.say(f"trajectory files in {folder.root}: {', '.join(files)}")
+            lines.append(f"trajectory files in {folder.root}: {', '.join(files)}")
         elif lacking is None:
             command = f"hil rehearse {typed(folder.root)}"
             if assumed is not None:
@@ -215,9 +217,9 @@ def design(
                 if stated:
                     weighing += " --until-precise"
                 command = f"hil run {typed(folder.root)} {weighing}"
-            reporter.say(f"{folder.root} is now a campaign; next: {command}")
+            lines.append(f"{folder.root} is now a campaign; next: {command}")
         else:
-            reporter.say(f"note: no campaign was created: {lacking}")
+            lines.append(f"note: no campaign was created: {lacking}")
         summary = design_summary(done, folder) | {
             "campaign": str(folder.root) if lacking is None and not files else None,
             "no_campaign": lacking,
@@ -229,10 +231,13 @@ def design(
             p = done.problem.objective.n_parameters
             figures = criteria_text(excitation.criteria.measures, p)
             duration = excitation.trajectory.duration
-            typer.echo(printable(f"{figures}, {duration:.2f} s: {folder.result}"))
-        if promise is not None and not json:
-            for forecast in promise.forecasts(excitation, planned):
-                typer.echo(printable(forecast.message(planned, promise.scale)))
+            found = [f"{figures}, {duration:.2f} s: {folder.result}"]
+            if promise is not None:
+                forecasts = promise.forecasts(excitation, planned)
+                found += [each.message(planned, promise.scale) for each in forecasts]
+            shown = found if quiet else [*found, *lines]
+            for line in shown if verbose else brief(shown):
+                typer.echo(printable(line))
         _draw(folder, done, loaded)
 
     with stop_on_interrupt() as stop:

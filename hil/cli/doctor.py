@@ -8,11 +8,12 @@ from typing import Annotated
 import typer
 from rich.console import Console
 
-from hil.base.progress import reporter
+from hil.base.one_screen import brief
+from hil.base.progress import reporter, say
 from hil.cell import Cell
-from hil.cli.arguments import JsonOption, print_json
+from hil.cli.arguments import JsonOption, VerboseOption, print_json
 from hil.cli.verdict import NOT_GOOD
-from hil.doctor.diagnosis import as_json, examine, show
+from hil.doctor.diagnosis import as_json, examine, show, summary
 
 QUICK_SECONDS = 5.0
 
@@ -22,6 +23,7 @@ def doctor(
     duration: Annotated[float, typer.Option(min=1.0, max=36000.0)] = 60.0,
     output: Path = Path("runs"),
     quick: bool = False,
+    verbose: VerboseOption = False,
     json: JsonOption = False,
 ) -> None:
     """Measure whether this PC can reply to a controller in time, and list what to change.
@@ -50,7 +52,10 @@ def doctor(
     )
     if json:
         print_json(as_json(diagnosis))
-    else:
+    elif verbose:
         show(diagnosis, Console())
+    else:
+        for line in brief([*summary(diagnosis), "all checks, every remedy and the criteria: -v"]):
+            say(line)
     if not diagnosis.fit or diagnosis.provisional:
         raise typer.Exit(NOT_GOOD)

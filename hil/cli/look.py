@@ -195,22 +195,21 @@ def summary(rows: Sequence[Row]) -> list[str]:
 
 def determined(groups: Sequence[Group]) -> list[str]:
     """Return three lines: what the recording determines well, weakly, and not."""
+    numbers = {
+        "well": [group.identifiable for group in groups],
+        "weakly": [group.weak for group in groups],
+        "not": [group.missing for group in groups],
+    }
     lines = []
-    for title, counted in (
-        ("well", lambda group: group.identifiable),
-        ("weakly", lambda group: group.weak),
-        ("not", lambda group: group.missing),
-    ):
+    for title, counts in numbers.items():
         parts = []
-        for quantity in ("friction", "body"):
-            of_it = [group for group in groups if group.quantity == quantity]
-            total = sum(group.identifiable + group.weak + group.missing for group in of_it)
-            count = sum(map(counted, of_it))
-            names = [group.body for group in of_it if counted(group)]
-            joints = "all joints" if len(names) == len(of_it) else joined(names, _NAMES)
-            if count:
-                name = "friction" if quantity == "friction" else "bodies"
-                parts.append(f"{name} {count} of {total} ({joints})")
+        for quantity, name in (("friction", "friction"), ("body", "bodies")):
+            alike = [k for k, group in enumerate(groups) if group.quantity == quantity]
+            total = sum(column[k] for column in numbers.values() for k in alike)
+            names = [groups[k].body for k in alike if counts[k]]
+            joints = "all joints" if len(names) == len(alike) else joined(names, _NAMES)
+            if names:
+                parts.append(f"{name} {sum(counts[k] for k in alike)} of {total} ({joints})")
         lines.append(f"  {title:6}  {'; '.join(parts) or 'nothing'}")
     return lines
 

@@ -8,8 +8,9 @@ from typing import Annotated
 
 import typer
 
+from hil.base.one_screen import brief
 from hil.base.progress import reporter as make_reporter
-from hil.cli.arguments import JsonOption, QuietOption, figures
+from hil.cli.arguments import JsonOption, QuietOption, VerboseOption, figures
 from hil.cli.identify_options import DelayOption, delay_from
 from hil.cli.verdict import NOT_GOOD
 from hil.payload.payload_by_model import weigh_by_model
@@ -25,12 +26,14 @@ def payload(
     check: Annotated[list[str] | None, typer.Option(metavar="NAME=VALUE")] = None,
     delay: DelayOption = None,
     quiet: QuietOption = False,
+    verbose: VerboseOption = False,
     json: JsonOption = False,
 ) -> None:
     """Identify the payload: mass, centre of mass and inertia with 95 % intervals.
 
     Fits the difference between recordings without and with the payload, on one model of the arm.
-    Prints the values in the form that controllers of COMAU, UR, Franka, KUKA, ABB and FANUC expect.
+    With -v prints the values in the form that controllers of COMAU, UR, Franka, KUKA, ABB and FANUC
+    expect.
     Exit status 5 if a value of --check lies outside its interval, or if another mounting of the arm
     explains the bare recordings much better.
 
@@ -51,7 +54,7 @@ def payload(
             interval (repeatable).
     """
     wanted = figures(check or [], "--check", "mass=4.0", bare=False)
-    reporter = make_reporter(quiet=quiet or json)
+    reporter = make_reporter(quiet=quiet or json, messages=verbose)
     if model:
         automatic = Options(delay=delay_from(delay))
         weighed = [*bare, *(loaded or [])]
@@ -63,7 +66,7 @@ def payload(
     remedies = result.remedy(wanted) if outside else []
     fields = result.as_json() | {"checked": wanted, "outside": outside, "next_steps": remedies}
     text = json_module.dumps(fields, indent=1, ensure_ascii=False)
-    lines = result.lines(wanted, outside)
-    typer.echo(text if json else "\n".join(lines))
+    lines = result.lines(wanted, outside, settings=verbose)
+    typer.echo(text if json else "\n".join(lines if verbose else brief(lines)))
     if outside or result.mounting is not None:
         raise typer.Exit(NOT_GOOD)

@@ -6,11 +6,12 @@ from typing import Annotated
 
 import typer
 
+from hil.base.one_screen import brief
 from hil.base.progress import reporter as make_reporter
 from hil.base.progress import say
 from hil.campaign import Campaign, stop_on_interrupt
 from hil.campaign.rehearsal import Rehearsal
-from hil.cli.arguments import CampaignArgument, JsonOption, QuietOption
+from hil.cli.arguments import CampaignArgument, JsonOption, QuietOption, VerboseOption
 from hil.cli.verdict import NOT_GOOD
 
 
@@ -19,6 +20,7 @@ def rehearse(
     seed: Annotated[int | None, typer.Option(min=0)] = None,
     again: bool = False,
     quiet: QuietOption = False,
+    verbose: VerboseOption = False,
     json: JsonOption = False,
 ) -> None:
     """Run the plan of CAMPAIGN on a simulated arm and judge the result. Nothing moves.
@@ -36,7 +38,7 @@ def rehearse(
         seed: Seed of the parameters, noise and link faults of the simulation. Default: 1.
         again: Rehearse again even if it passed.
     """
-    reporter = make_reporter(quiet=quiet or json)
+    reporter = make_reporter(quiet=quiet or json, messages=verbose)
     with stop_on_interrupt() as stop:
         rehearsal = Campaign.open(campaign).rehearse(
             reporter=reporter, seed=seed, stop=stop, again=again
@@ -44,16 +46,21 @@ def rehearse(
     if json:
         typer.echo(rehearsal.model_dump_json())
     else:
-        for line in [] if quiet else _lines(rehearsal):
+        lines = [] if quiet else _lines(rehearsal, verbose=verbose)
+        for line in [*lines, rehearsal.line] if verbose else brief([*lines, rehearsal.line]):
             say(line)
-        say(rehearsal.line)
     if not rehearsal.passed:
         raise typer.Exit(NOT_GOOD)
 
 
-def _lines(rehearsal: Rehearsal) -> list[str]:
+def _lines(rehearsal: Rehearsal, *, verbose: bool) -> list[str]:
+    """Return criteria, and what a rehearsal cannot detect; on one screen only what failed."""
     criteria = [
         f"{'ok' if criterion.passed else 'FAILED'}: {criterion.sentence}"
         for criterion in rehearsal.criteria
+        if verbose or not criterion.passed
     ]
-    return [*criteria, *(f"not covered: {sentence}" for sentence in rehearsal.not_seen)]
+    if verbose:
+        return [*criteria, *(f"not covered: {sentence}" for sentence in rehearsal.not_seen)]
+    passed = len(rehearsal.criteria) - len(rehearsal.failures)
+    return [*criteria, f"{passed} of {len(rehearsal.criteria)} criteria are met: -v shows them"]

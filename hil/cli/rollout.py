@@ -2,19 +2,22 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Final
 
 import typer
 
 from hil.base.errors import InputError
 from hil.base.files import make_folder
+from hil.base.one_screen import LINES, Paragraph, Part, columns, one_screen
 from hil.base.progress import Reporter, say
 from hil.base.progress import reporter as make_reporter
 from hil.cli.arguments import (
     ArchivesArgument,
     JsonOption,
     QuietOption,
+    VerboseOption,
     print_json,
     with_options,
 )
@@ -26,7 +29,7 @@ from hil.plots.chart_picture import draw_charts
 from hil.plots.plan_picture import save
 from hil.report.output_files import REPORT
 from hil.report.rollout_section import overview_charts, overview_legends
-from hil.results.rollout_result import ROLLOUT
+from hil.results.rollout_result import ROLLOUT, ArmErrors, RolloutResult, milli
 from hil.rollout.servo_rollout import roll_out_servo, without_torque
 from hil.rollout.torque_rollout import (
     PICTURE,
@@ -54,6 +57,7 @@ def rollout(
     how: Identifying,
     again: bool = False,
     quiet: QuietOption = False,
+    verbose: VerboseOption = False,
     json: JsonOption = False,
 ) -> None:
     """Simulate held-out motions by MuJoCo (extra `mujoco`) with the identified arm.
@@ -84,7 +88,7 @@ def rollout(
             simulated.
         again: Identify again even if results.json and parameters.json are there.
     """
-    reporter = make_reporter(quiet=quiet or json)
+    reporter = make_reporter(quiet=quiet or json, messages=verbose)
     asked = RolloutOptions(samples, seed, feedback, servo_from(servo), polish)
     options = how.options(split=split, estimator=estimator)
     output = _folder(output, archives)
@@ -104,10 +108,52 @@ def rollout(
     if json:
         print_json(simulated.result.model_dump(mode="json"))
     else:
-        for line in simulated.result.lines()[-1 if quiet else 0 :]:
+        lines = simulated.result.lines() if verbose else screen(simulated.result)
+        for line in [simulated.result.message] if quiet else lines:
             say(line)
     if not good:
         raise typer.Exit(NOT_GOOD)
+
+
+_MOST_JOINTS: Final = 8
+
+
+def screen(result: RolloutResult) -> list[str]:
+    """Return one screen: the result, the errors of identified and nominal arm side by side."""
+    arms = [("identified", result.identified), ("nominal", result.nominal)]
+    if result.polish is not None:
+        arms[1:] = [("polished", result.polish.errors)]
+    shown = [(name, arm) for name, arm in arms if arm is not None]
+    joints = range(min(_MOST_JOINTS, len(result.joint_names)))
+    more = len(result.joint_names) - len(joints)
+    lines = columns(
+        [
+            ["", "", *(f"{h:g} s" for _ in shown for h in result.horizons)],
+            *(_row(result, joint, shown) for joint in joints),
+            [result.tool, "mm", *(milli(at) for _, arm in shown for at in arm.tool)],
+        ],
+        left=2,
+    )
+    names = ", then ".join(name for name, _ in shown)
+    parts: list[Part] = [
+        Paragraph(result.message),
+        f"{result.windows} windows; error of the {names} arm after",
+        *lines,
+    ]
+    if more > 0:
+        parts.append(f"{more} more joints: -v")
+    servo = [] if result.servo is None else result.servo.lines(result.joint_names)
+    warning = f"warning: {result.band_message}" if result.band_message else ""
+    remarks = [*servo, *result.stability(), warning, *result.notes]
+    parts += [Paragraph(text, most=2) for text in remarks if text][: LINES - len(parts) - 1]
+    return one_screen([*parts, "drawn arms and what drives the arm: -v"])
+
+
+def _row(result: RolloutResult, joint: int, arms: Sequence[tuple[str, ArmErrors]]) -> list[str]:
+    """Return name, unit and errors of a joint for each arm at the horizons."""
+    unit = "mrad" if result.units[joint] == "rad" else "mm"
+    errors = [milli(at[joint]) for _, arm in arms for at in arm.joints]
+    return [result.joint_names[joint], unit, *errors]
 
 
 def _folder(output: Path | None, archives: list[Path]) -> Path | None:

@@ -13,6 +13,7 @@ import typer
 from hil.archive import ArchiveName
 from hil.archive.live import LiveView
 from hil.base.errors import ExecutionError, InputError
+from hil.base.one_screen import brief
 from hil.base.progress import reporter as make_reporter
 from hil.base.progress import say
 from hil.campaign import Campaign, MotionFailedError, stop_on_interrupt
@@ -87,14 +88,14 @@ def run(
     required = _required(opened, states, precision or [])
     execute = partial(_run, quiet=quiet or json, live=live)
     if weighing.payload is not None:
-        more = {"rehearse": rehearse, "quiet": quiet, "json": json}
+        more = {"rehearse": rehearse, "quiet": quiet, "verbose": verbose, "json": json}
         result = weigh(opened, weighing, execute, choices, required, **more)
     else:
         if rehearse:
             _rehearse(opened, quiet=quiet or json)
         result = execute(opened, {**choices, "until_precise": required})
     if result is not None and (dry_run or no_identify):
-        _print(result, json=json)
+        _print(result, verbose=verbose, json=json)
     elif result is not None:
         _identify(opened, result, quiet=quiet, verbose=verbose, json=json)
 
@@ -187,25 +188,25 @@ def _identify(
         raise typer.Exit(NOT_GOOD)
 
 
-def _print(result: RunResult, *, json: bool) -> None:
+def _print(result: RunResult, *, verbose: bool, json: bool) -> None:
     """Print what was run, without identification."""
     if json:
         print_json({**result.to_dict(), "verdict": None})
         return
     done, wanted = result.repetitions
     tested, tests = result.validations
-    say(
+    lines = [
         f"{result.campaign}: dry run {result.dry_run}, repetitions {done} of {wanted}, validation "
         f"{tested} of {tests}, {len(result.rejected)} rejected"
-    )
-    if result.precision:
-        say(result.precision)
-    for note in result.notes:
-        say(note)
+    ]
+    lines += [result.precision] if result.precision else []
+    lines += result.notes
     for rejection in result.rejected:
         name = ArchiveName.parse(rejection.archive)
         what = rejection.archive if name is None else f"{name.motion} ({rejection.archive})"
-        say(f"{what}: {rejection.reason}")
+        lines.append(f"{what}: {rejection.reason}")
+    for line in lines if verbose else brief(lines):
+        say(line)
     if result.dry_run == "to be accepted":
         accept_options = "".join(f" --accept-torque {joint}" for joint in result.against_gravity)
         why = "you know why, and " if accept_options else ""

@@ -131,7 +131,7 @@ def whole(results: Results, written: tuple[Path, Path] | None = None) -> list[st
     if results.calibration is not None:
         lines.append(results.calibration.message)
     lines += sentences(results)
-    lines += [part for part in _files(results, written) if isinstance(part, str)]
+    lines += [part if isinstance(part, str) else part.text for part in _files(results, written)]
     if written is not None:
         lines.append(f"report: {written[1]}")
     return lines
@@ -226,9 +226,8 @@ def _files(results: Results, written: tuple[Path, Path] | None) -> list[Part]:
     model = next((name for name in results.exports.written if name.endswith(".urdf")), None)
     if model is None:
         return [f"results in {folder}; no model for simulators: see -v"]
-    return [
-        f"{folder / model}: for pinocchio, MuJoCo, Gazebo; hil export {typed(folder)} --to mjcf"
-    ]
+    use = f"for pinocchio, MuJoCo, Gazebo; `hil export {typed(folder)} --to mjcf`"
+    return [Paragraph(f"{folder / model}: {use}")]
 
 
 def _percent(share: float | None) -> str:

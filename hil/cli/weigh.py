@@ -11,6 +11,7 @@ import typer
 from rich.console import Console
 
 from hil.base.errors import InputError
+from hil.base.one_screen import brief
 from hil.base.progress import reporter as make_reporter
 from hil.campaign import Campaign, stop_on_interrupt
 from hil.campaign.run import RunResult
@@ -113,6 +114,7 @@ def weigh(
     *,
     rehearse: bool,
     quiet: bool,
+    verbose: bool,
     json: bool,
 ) -> RunResult | None:
     """Run a payload campaign and print what it found; return the result of a dry run alone.
@@ -146,7 +148,7 @@ def weigh(
     if json:
         print_json(result.as_json())
     else:
-        typer.echo("\n".join(result.lines))
+        typer.echo("\n".join(result.lines if verbose else brief(result.summary)))
     if result.payload.mounting is not None:
         raise typer.Exit(NOT_GOOD)
     return None

@@ -284,6 +284,31 @@ def show(diagnosis: Diagnosis, console: Console) -> None:
     console.print(Text(printable(diagnosis.line), style=style), soft_wrap=True)
 
 
+def summary(diagnosis: Diagnosis) -> list[str]:
+    """Return the verdict, the checks that are not passed with their first remedy, and latencies."""
+    worst_first = sorted(diagnosis.checks, key=lambda check: _ORDER.index(check.status))
+    failed = [check for check in worst_first if check.status is not Status.OK]
+    lines = [diagnosis.line]
+    for check in failed:
+        lines.append(f"{check.status}: {check.name}: {check.facts}")
+        lines += [f"    {command}" for command in check.remedy[:1]]
+    for latency in diagnosis.latencies:
+        half, most, longest = (1e6 * latency.percentile(p) for p in (50.0, 99.9, 100.0))
+        lines.append(
+            f"{latency.name}: half within {half:.0f} µs, 99.9 % within {most:.0f} µs, all within"
+            f" {longest:.0f} µs"
+        )
+    lines += [
+        f"{verdict.cycle_ms} ms: {'fit' if verdict.fit else 'not fit'}; {verdict.reason}"
+        for verdict in diagnosis.cycles
+    ]
+    passed = [check.name for check in diagnosis.checks if check.status is Status.OK]
+    return [*lines, *([f"ok: {', '.join(passed)}"] if passed else [])]
+
+
+_ORDER: Final = (Status.BAD, Status.WARN, Status.UNKNOWN, Status.OK)
+
+
 def remedies(checks: Sequence[DoctorCheck]) -> Iterator[str]:
     """Yield the commands of each check with a remedy, worst first, each command once."""
     given: set[str] = set()

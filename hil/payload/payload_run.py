@@ -210,9 +210,16 @@ class PayloadFound:
         return controller_settings(Load(self.body, with_centre, with_inertia))
 
     def lines(
-        self, expected: Mapping[str, float] | None = None, outside: Sequence[str] = ()
+        self,
+        expected: Mapping[str, float] | None = None,
+        outside: Sequence[str] = (),
+        *,
+        settings: bool = True,
     ) -> list[str]:
-        """Return sentences, table and commands, and the comparison with expected values."""
+        """Return sentences, table and commands, and the comparison with expected values.
+
+        Without `settings` the commands of controllers are named and not written.
+        """
         lines = [*self.sentences, ""]
         lines += [
             f"{name:5} {'not determined':>10}"
@@ -220,7 +227,7 @@ class PayloadFound:
             else f"{name:5} {value:10.5g}  {low:10.5g} to {high:<10.5g} {unit}"
             for name, value, low, high, unit in self.table
         ]
-        for controller, command in self.controllers.items():
+        for controller, command in self.controllers.items() if settings else ():
             lines += ["", f"{controller}:", command]
         lines += ["", *(f"warning: {warning}" for warning in self.warnings)]
         lines += [f"check: {sentence}" for sentence in outside]
@@ -228,6 +235,8 @@ class PayloadFound:
             lines += [f"next: {sentence}" for sentence in self.remedy(expected or {})]
         elif expected:
             lines.append(f"check: {', '.join(expected)} inside the 95 % interval")
+        if self.controllers and not settings:
+            lines.append(f"settings of {', '.join(self.controllers)}: -v")
         return lines
 
     def as_json(self) -> dict[str, Any]:

@@ -96,8 +96,8 @@ class ServoResult(Frozen):
         for label, row in zip(labels, by_joint.values(), strict=True):
             figures = "".join(f"{_with_deviation(row[name]):>20}" for name in names)
             rows.append(f"{label:{width}}{figures}")
-        spread = "" if self.delay_deviation is None else f" ± {_milli(self.delay_deviation)}"
-        return [*rows, f"delay of the command: {_milli(self.delay)}{spread} ms", self.message]
+        spread = "" if self.delay_deviation is None else f" ± {milli(self.delay_deviation)}"
+        return [*rows, f"delay of the command: {milli(self.delay)}{spread} ms", self.message]
 
 
 def _with_deviation(parameter: ServoParameter) -> str:
@@ -175,7 +175,7 @@ class RolloutResult(Frozen):
             return ""
         return (
             f"At {self.horizons[0]:g} s it is further off than joints that continue at their start"
-            f" velocity ({_milli(error)} against {_milli(self.continued[0])} {self._unit}):"
+            f" velocity ({milli(error)} against {milli(self.continued[0])} {self._unit}):"
             " --polish, which fits friction, rotor inertias and delay to simulated windows, often"
             " lessens that."
         )
@@ -250,18 +250,18 @@ class RolloutResult(Frozen):
                 continue
             for joint, label in enumerate(self.joint_names):
                 unit = "mrad" if self.units[joint] == "rad" else "mm"
-                row = "".join(f"{_milli(at[joint]):>10}" for at in arm.joints)
+                row = "".join(f"{milli(at[joint]):>10}" for at in arm.joints)
                 lines.append(f"{f'{name:10} {label[:22]:22} [{unit}]':42}{row}")
-            tool = "".join(f"{_milli(at):>10}" for at in arm.tool)
+            tool = "".join(f"{milli(at):>10}" for at in arm.tool)
             lines.append(f"{f'{name:10} {self.tool[:22]:22} [mm]':42}{tool}")
         if self.continued:
-            row = "".join(f"{_milli(error):>10}" for error in self.continued)
+            row = "".join(f"{milli(error):>10}" for error in self.continued)
             lines.append(f"{f'at the start velocity, all joints [{self._unit}]':42}{row}")
         if self.sample_errors:
             spread = [
                 [arm.overall(k) for arm in self.sample_errors] for k in range(len(self.horizons))
             ]
-            row = "".join(f"{_milli(float(np.median(errors))):>10}" for errors in spread)
+            row = "".join(f"{milli(float(np.median(errors))):>10}" for errors in spread)
             lines.append(f"{f'{self.samples} samples, median [{self._unit}]':42}{row}")
             shares = "".join(f"{percentage(float(np.mean(at)), 1):>10}" for at in self.inside)
             lines.append(f"{'measured positions in their 95 % band':42}{shares}")
@@ -285,5 +285,8 @@ class RolloutResult(Frozen):
             raise InputError(path, problem, remedy="run `hil rollout` again") from error
 
 
-def _milli(value: float | None) -> str:
-    return "-" if value is None else f"{1e3 * value:.3g}"
+def milli(value: float | None) -> str:
+    """Return a thousandth of the unit with three digits, a dash if it is unknown."""
+    if value is None:
+        return "-"
+    return f"{1e3 * value:.0f}" if abs(value) >= 1.0 else f"{1e3 * value:.3g}"

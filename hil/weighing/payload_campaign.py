@@ -151,8 +151,16 @@ class Weighed:
     @property
     def lines(self) -> list[str]:
         """What `hil payload` prints, and the precision."""
-        reached = [] if self.precision is None else ["", self.precision.message]
-        return [*self.payload.lines(), *reached]
+        return [*self.payload.lines(), *self._reached]
+
+    @property
+    def summary(self) -> list[str]:
+        """The same without the commands of controllers."""
+        return [*self.payload.lines(settings=False), *self._reached]
+
+    @property
+    def _reached(self) -> list[str]:
+        return [] if self.precision is None else ["", self.precision.message]
 
     def as_json(self) -> dict[str, Any]:
         """Return all values as JSON data."""

@@ -1,0 +1,131 @@
+"""Every command prints one screen by default, of recordings good and bad."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+from typer.testing import CliRunner
+
+from hil.base.one_screen import COLUMNS, LINES, Paragraph, brief, one_screen
+from hil.cli import app
+from tests.hil.simulated_logs import simulate, urdf_path, write_log
+
+Floats = NDArray[np.float64]
+
+
+def require_one_screen(text: str) -> None:
+    lines = text.rstrip("\n").split("\n")
+    assert len(lines) <= LINES, text
+    assert max(map(len, lines)) <= COLUMNS, max(lines, key=len)
+
+
+class TestText:
+    def test_long_text_takes_the_room_that_is_left(self) -> None:
+        long = "word " * 60
+        shown = one_screen([Paragraph(long, "found  "), *["row"] * 22])
+        assert len(shown) == LINES
+        assert shown[0].startswith("found  word") and shown[1].startswith("       word")
+        assert shown[1].endswith(" ...")
+
+    def test_empty_lines_go_before_text_is_cut(self) -> None:
+        parts = [Paragraph("word " * 60), "", *["row"] * 21, ""]
+        shown = one_screen(parts)
+        assert len(shown) == LINES and "" not in shown
+
+    def test_of_too_many_lines_the_ends_stay(self) -> None:
+        shown = brief([f"line {k}" for k in range(40)], last=2)
+        assert len(shown) == LINES
+        assert shown[0] == "line 0" and shown[-2:] == ["line 38", "line 39"]
+        assert "17 more lines: -v" in shown
+        require_one_screen("\n".join(brief(["x " * 200] * 50)))
+
+
+@pytest.fixture(scope="module")
+def arm() -> Mapping[str, Floats]:
+    """A motion of a UR5 of six seconds."""
+    motion = simulate("ur5_robot.urdf", np.arange(0.0, 8.0, 0.02))
+    return {"t": motion.time, "q": motion.position, "v": motion.velocity, "tau": motion.torque}
+
+
+def scaled(name: str, factor: object) -> object:
+    return lambda table, rng: {**table, name: table[name] * factor}
+
+
+def noisy(size: float) -> object:
+    def change(table: Mapping[str, Floats], rng: np.random.Generator) -> Mapping[str, Floats]:
+        torque = table["tau"]
+        noise = size * torque.std(axis=0) * rng.standard_normal(torque.shape)
+        return {**table, "tau": torque + noise}
+
+    return change
+
+
+def rows(part: object) -> object:
+    return lambda table, rng: {name: column[part] for name, column in table.items()}
+
+
+def permuted(name: str, order: list[int]) -> object:
+    return lambda table, rng: {**table, name: table[name][:, order]}
+
+
+def jumping(table: Mapping[str, Floats], rng: np.random.Generator) -> Mapping[str, Floats]:
+    position = table["q"].copy()
+    position[200:, 1] += 0.5
+    return {**table, "q": position}
+
+
+def uneven(table: Mapping[str, Floats], rng: np.random.Generator) -> Mapping[str, Floats]:
+    return {**table, "t": table["t"] + 0.004 * rng.random(len(table["t"]))}
+
+
+WRIST = np.array([1.0, 1.0, 1.0, 1.0, 1.0, -1.0])
+LOGS = {
+    "right": rows(slice(None)),
+    "noisy": noisy(0.2),
+    "drowned in noise": noisy(3.0),
+    "all torques negated": scaled("tau", -1.0),
+    "one torque negated": scaled("tau", WRIST),
+    "one axis negated": scaled("q", WRIST),
+    "milli": scaled("tau", 1e-3),
+    "of motors": scaled("tau", 0.01),
+    "wrong constant": scaled("tau", 1.0 + 0.5 * (WRIST < 0.0)),
+    "degrees": scaled("q", 180.0 / np.pi),
+    "torques exchanged": permuted("tau", [1, 0, 2, 3, 4, 5]),
+    "positions exchanged": permuted("q", [0, 1, 2, 4, 3, 5]),
+    "two seconds": rows(slice(0, 100)),
+    "half a second": rows(slice(0, 25)),
+    "slow rate": rows(slice(None, None, 5)),
+    "with gaps": rows(np.r_[0:150, 190:300, 320:400]),
+    "jump": jumping,
+    "uneven": uneven,
+    "no torque": lambda table, rng: {**table, "tau": 0.0 * table["tau"]},
+    "no motion": lambda table, rng: {**table, "q": 0.0 * table["q"], "v": 0.0 * table["v"]},
+}
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("name", LOGS)
+@pytest.mark.parametrize("command", ["look", "identify"])
+def test_a_log_fills_one_screen(
+    command: str, name: str, arm: Mapping[str, Floats], tmp_path: Path
+) -> None:
+    table = LOGS[name](arm, np.random.default_rng(1))  # type: ignore[operator]
+    log = write_log(tmp_path / "log.csv", ["t", "q{}", "v{}", "tau{}"], *table.values())
+    result = CliRunner().invoke(
+        app, [command, str(log), "--urdf", str(urdf_path("ur5_robot.urdf"))]
+    )
+    if not isinstance(result.exception, SystemExit | None):
+        pytest.skip(f"refused in one sentence: {type(result.exception).__name__}")
+    require_one_screen(result.stdout)
+
+
+COMMANDS = "identify look design rehearse run batch payload rollout compare doctor demo"
+
+
+@pytest.mark.parametrize("command", COMMANDS.split())
+def test_a_command_prints_everything_if_asked(command: str) -> None:
+    assert "--verbose" in CliRunner().invoke(app, [command, "--help"]).output
