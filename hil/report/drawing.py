@@ -40,6 +40,7 @@ _THIN = 0.8  # width of thin lines, px
 _FOOT: Final = 32.0  # from the axis down to the base line of its quantity, px
 _FEWEST_FOR_A_BOX: Final = 5  # values
 _BINS: Final = 300  # of a line over time, which has up to two points in each, some one per px
+_FEWEST_TICKS: Final = 3  # of y: a printed chart has no pointer that reads it
 _STEPS: Final = (1.0, 2.0, 5.0, 10.0)  # of round ticks, times a power of ten
 _MOST_DIGITS: Final = 1e6  # Ticks from here on have an exponent
 
@@ -55,13 +56,20 @@ class Panel:
     joint: int | None = None  #: number of the joint of a chart, from 0
 
 
-def round_ticks(low: float, high: float, most: int) -> tuple[list[float], list[str]]:
+def round_ticks(
+    low: float, high: float, most: int, fewest: int = 0
+) -> tuple[list[float], list[str]]:
     """Return the round values from `low` to `high`, at most `most` intervals, with their texts."""
     size = (high - low) / most
     decade = 10.0 ** math.floor(math.log10(size))
-    step = next((s for s in _STEPS if s * decade >= size * (1.0 - 1e-9)), _STEPS[-1]) * decade
-    first = math.ceil(low / step - 1e-9)
-    last = math.floor(high / step + 1e-9)
+    steps = [0.1 * s * decade for s in _STEPS[:-1]] + [s * decade for s in _STEPS]
+    wide = [k for k, step in enumerate(steps) if step >= size * (1.0 - 1e-9)]
+    at = wide[0] if wide else len(steps) - 1
+    first, last = _multiples(low, high, steps[at])
+    while last - first + 1 < fewest and at > 0:
+        at = at - 1
+        first, last = _multiples(low, high, steps[at])
+    step = steps[at]
     ticks = [k * step for k in range(first, last + 1)]
     place = math.floor(math.log10(step) + 1e-9)
     if max(abs(low), abs(high)) < _MOST_DIGITS and place >= -6:
@@ -70,6 +78,11 @@ def round_ticks(low: float, high: float, most: int) -> tuple[list[float], list[s
         digits = [math.floor(math.log10(abs(tick))) - place if tick else 0 for tick in ticks]
         texts = [f"{tick:.{max(0, d)}e}" for tick, d in zip(ticks, digits, strict=True)]
     return ticks, [text.replace("-", "−") for text in texts]
+
+
+def _multiples(low: float, high: float, step: float) -> tuple[int, int]:
+    """Return the first and the last multiple of a step between two ends."""
+    return math.ceil(low / step - 1e-9), math.floor(high / step + 1e-9)
 
 
 @dataclass
@@ -136,7 +149,9 @@ class Axes:
 
         names = self.x_names or list(zip(*round_ticks(low, high, self.x_ticks), strict=True))
         x_at = across(np.array([place for place, _ in names])).tolist()
-        heights = self.y_names or list(zip(*round_ticks(bottom, top, self.y_ticks), strict=True))
+        heights = self.y_names or list(
+            zip(*round_ticks(bottom, top, self.y_ticks, _FEWEST_TICKS), strict=True)
+        )
         y_at = up(np.array([place for place, _ in heights])).tolist()
         rules = [f"M{self.left:g} {y:.1f}H{right:g}" for y in y_at]
         rules += [f"M{x:.1f} {self.top:g}V{foot:g}" for x in x_at if self.grid == "both"]

@@ -4,20 +4,24 @@ from __future__ import annotations
 
 import re
 from collections.abc import Sequence
-from typing import Final
+from functools import partial
+from typing import Final, NamedTuple
 
 import numpy as np
 
 from hil.report import figures
 from hil.report.drawing import chart_panel
 from hil.report.interactive import chart_data, library
+from hil.report.numbers import capitalised
 from hil.report.rendering import environment, page_bytes, template_text
 from hil.report.rollout_section import ROLLOUT_LEGENDS, rollout_charts
+from hil.results.provenance import RESULTS
 from hil.results.results import ParameterResult, Results, by_id, outside_mark
 from hil.results.rollout_result import RolloutResult
 from hil.results.series import ReportSeries
 from identification.excitation import CRITERIA, METHODS
 from identification.selection.settings import Choice
+from identification.validation.purpose_messages import TITLES, figure, requirement
 
 _MOST_CANDIDATES: Final = 6
 """Candidates shown of one choice: the first, and the best of the others."""
@@ -27,6 +31,29 @@ _BINS: Final = 2000
 _FEWEST_BINS = 80  # of one line
 _MOST_BINS = 300
 
+_OFFSET: Final = re.compile(r"fo_\d+")  # constant part of a torque, which may be a sensor's
+_USES: Final = {
+    "identified.urdf": "the arm for pinocchio, MuJoCo, Gazebo and controllers; other formats:"
+    " hil export FOLDER --to mjcf",
+    "parameters.json": "parameters with covariance and the bodies of the links, for programs",
+    "parameters.csv": "the same as a table, for spreadsheets, MATLAB and R",
+    RESULTS: "every number of this page",
+}
+_PICTURES: Final = {
+    "error on unseen motion": "torque",
+    "generalisation": "torque",
+    "systematic error": "torque",
+    "outliers": "torque",
+    "friction": "friction",
+    "friction law": "friction",
+    "friction over time": "friction",
+    "residual over speed": "residuals",
+    "residual over position": "residuals",
+    "excitation": "correlation",
+    "physical signs": "consistency",
+    "clock": "excitation",
+}
+"""Section of the figure that shows what a check found."""
 _OF_MODEL: Final = "About the model and its prediction"
 _OF_RECORDING: Final = "About the recording"
 _RECORDING_CHECKS: Final = frozenset(
@@ -73,6 +100,11 @@ def report_bytes(
         "has_absolute": any(p.absolute_std not in (None, p.std) for p in results.parameters),
         "has_repetitions": any(p.repetition_std is not None for p in results.parameters),
         "by_id": by_id,
+        "purposes": purpose_rows(results),
+        "files": files_of(results),
+        "picture_of": picture_of,
+        "offset_parameters": [p for p in results.parameters if _OFFSET.fullmatch(p.name)],
+        "of_paper": partial(of_paper, is_of_paper=any(p.table2_id for p in results.parameters)),
         "joint_of": lambda parameter: joint_of(parameter, results.joint_names),
         "by_name": {parameter.name: parameter for parameter in results.parameters},
         "outside_mark": outside_mark,
@@ -91,6 +123,45 @@ def report_bytes(
     }
     scripts = (*library(), template_text("charts.js"))
     return page_bytes(environment(*scripts).get_template("report.html.j2").render(**context))
+
+
+class PurposeRow(NamedTuple):
+    """A purpose in words."""
+
+    title: str
+    good: bool | None
+    figure: str
+    requirement: str
+
+
+def purpose_rows(results: Results) -> list[PurposeRow]:
+    """Return what the model is good for, a row for each purpose."""
+    names = results.joint_names
+    return [
+        PurposeRow(
+            capitalised(TITLES[purpose.name]),
+            purpose.good,
+            figure(purpose, names),
+            requirement(purpose),
+        )
+        for purpose in results.verdict.purposes
+    ]
+
+
+def files_of(results: Results) -> list[tuple[str, str]]:
+    """Return the files that were written, and what each is for."""
+    written = () if results.exports is None else results.exports.written
+    return [(name, use) for name, use in _USES.items() if name in written or name == RESULTS]
+
+
+def picture_of(check: str) -> str:
+    """Return the section whose figure shows what a check found; empty if there is none."""
+    return _PICTURES.get(check, "")
+
+
+def of_paper(place: str, *, is_of_paper: bool) -> str:
+    """Return a reference to the paper, for the arm of the paper only."""
+    return f" (paper, {place})" if is_of_paper else ""
 
 
 def grouped_warnings(results: Results) -> dict[str, list[str]]:

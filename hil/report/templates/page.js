@@ -62,11 +62,11 @@
 
   document.querySelectorAll("table").forEach(addCopyButton);
 
-  /* Paper cannot be unfolded ---------------------------------------------------------------- */
+  /* Paper cannot be unfolded. The appendix is printed if it is open: it is most of the pages. */
 
   var unfolded = [];
   window.addEventListener("beforeprint", function () {
-    unfolded = Array.prototype.slice.call(document.querySelectorAll("details:not([open])"));
+    unfolded = Array.prototype.slice.call(document.querySelectorAll("details:not([open]):not(#appendix)"));
     unfolded.forEach(function (part) { part.open = true; });
   });
   window.addEventListener("afterprint", function () {
