@@ -33,6 +33,7 @@ FEEDBACK: Final = 1.0
 STRIDE: Final = 0.1
 """Time between the starts of simulations [s]."""
 _MOST: Final = 200  # simulations
+_ALIKE: Final = 8  # steps of one inertia
 
 
 def flange_error(model: RobotModel, values: Array, recordings: Sequence[Samples]) -> float | None:
@@ -67,10 +68,12 @@ def departures(model: RobotModel, values: Array, windows: Windows, error: Array)
         IdentificationError: the inertia of the arm is not that of bodies.
     """
     count, steps, n = error.shape
-    inertia = moved_inertia(model, values, windows.position.reshape(-1, n))
+    # The inertia of an arm hardly changes in so many steps; of many joints it takes long.
+    postures = windows.position[:, ::_ALIKE]
+    inertia = moved_inertia(model, values, postures.reshape(-1, n))
     if np.linalg.eigvalsh(inertia).min() <= 0.0:
         raise IdentificationError("the inertia of the arm is not positive")
-    inertia = inertia.reshape(count, steps, n, n)
+    inertia = inertia.reshape(count, -1, n, n)
     alone = np.diagonal(moved_inertia(model, values, np.zeros((1, n)))[0])
     rate = 2.0 * np.pi * FEEDBACK
     stiffness = rate**2 * alone
@@ -78,8 +81,9 @@ def departures(model: RobotModel, values: Array, windows: Windows, error: Array)
     position, velocity = np.zeros((2, count, n))
     for step in range(steps):
         # Damping acts on the velocity after the step: a light joint of much friction stays stable.
-        matrix = inertia[:, step] + windows.step * np.diag(damping)
-        momentum = np.einsum("wij,wj->wi", inertia[:, step], velocity)
+        at = inertia[:, step // _ALIKE]
+        matrix = at + windows.step * np.diag(damping)
+        momentum = np.einsum("wij,wj->wi", at, velocity)
         impulse = windows.step * (error[:, step] - stiffness * position)
         velocity = np.linalg.solve(matrix, (momentum + impulse)[..., None])[..., 0]
         position = position + windows.step * velocity

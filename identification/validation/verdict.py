@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Final
 
 import numpy as np
 
@@ -51,6 +52,10 @@ from identification.validation.purpose_messages import purposes_in_a_sentence
 __all__ = ["Finding", "Thresholds", "Verdict", "judge"]
 
 
+UNSEEN: Final = "unseen motion"
+"""What a model is tested on if it is another motion than the fitted one."""
+
+
 @dataclass(frozen=True)
 class Verdict:
     """Whether a model may be used, with findings and next steps."""
@@ -71,7 +76,7 @@ def judge(
     evidence: Evidence,
     thresholds: Thresholds = Thresholds(),  # noqa: B008 - frozen
     *,
-    tested_on: str = "unseen motion",
+    tested_on: str = UNSEEN,
     purposes: Sequence[Purpose] = (),
     asked: Sequence[PurposeName] = (),
 ) -> Verdict:
@@ -106,6 +111,8 @@ def judge(
         line = f"The model must not be relied on: {(fault or wrong[0]).words}{error}."
     elif purposes:
         line = purposes_in_a_sentence(purposes, naming.joints)
+        if tested_on != UNSEEN:
+            line += f" Judged on {tested_on}."
         if wrong:
             line += " Doubtful for anything else."
         elif reserve:

@@ -377,8 +377,8 @@ class TestSources:
 
     def test_that_repeat_the_fitted_motion_are_not_unseen(self, campaign):
         identification = identified(*campaign.folder.completed("excitation"))
-        line = "The model predicts a repetition of the fitted motion"
-        assert identification.verdict.line.startswith(line)
+        line = "Judged on a repetition of the fitted motion"
+        assert line in identification.verdict.line
 
     @pytest.mark.parametrize("noise", [0.0, 0.01])
     def test_with_a_noiseless_torque_are_not_called_filtered(self, tmp_path, noise):

@@ -33,6 +33,7 @@ from hil.results.series import ReportSeries, SeriesError
 from identification.excitation import CRITERIA, METHODS
 from identification.excitation.criteria import Criterion
 from identification.selection.settings import Choice
+from identification.validation.purpose import Purpose
 from sim_fixtures.ns16 import N_ESSENTIAL, TABLE2
 
 pytestmark = pytest.mark.long
@@ -360,8 +361,8 @@ CONSISTENCY = {
 class TestPage:
     def test_has_the_verdict_first_and_details_folded(self, html):
         order = ["predicts unseen motion to 1.5\u00a0% of the torque", "SIMULATED", 'id="torque"',
-                 'id="friction"', 'id="parameters"', 'id="judgement"',
-                 "Torque error over all joints", 'id="trust"', '<details id="appendix">',
+                 'id="judgement"', "Torque error over all joints", 'id="files"',
+                 'id="friction"', 'id="parameters"', 'id="trust"', '<details id="appendix">',
                  'id="run"', 'id="excitation"', 'id="estimation"', 'id="correlation"']  # fmt: skip
         places = [html.index(mark) for mark in order]
         assert places == sorted(places)
@@ -500,7 +501,7 @@ class TestPage:
             {"check": "x", "level": "doubtful", "words": sentence, "role": role}
             for sentence, role in roles.items()
         ]
-        warnings = ["a note on the source", *roles]
+        warnings = [*roles, "a note on the source"]
         verdict = {"good": True, "line": "Good.", "reasons": [], "warnings": warnings}
         judgement = _judgement() | {"findings": findings}
         page = render(make_results(judgement=judgement, verdict=verdict))
@@ -508,12 +509,35 @@ class TestPage:
         assert re.findall(r"<li>(.*)</li>", section) == [*reversed(roles), "a note on the source"]
         assert "4 warnings , by rank . First: negated." in Page(page).text
 
-    def test_explains_a_noise_floor_where_the_verdict_has_one(self):
-        line = "The model predicts well: 1.2% over all axes; 0.9 times the noise floor of 1.3%."
-        verdict = {"good": True, "line": line, "reasons": [], "warnings": []}
-        text = rendered(make_results(verdict=verdict)).text
-        assert "The noise floor is an estimate" in text
-        assert "noise floor" not in rendered(make_results()).text
+    def test_begins_with_what_the_model_is_good_for(self):
+        purposes = [
+            Purpose("feed-forward", True, 0.06, 0.2, references={"nominal with friction": 0.41}),
+            Purpose("simulation", False, 0.012, 0.005, "m", references={"horizon": 0.2}),
+            Purpose("contact", None, 42.0, None, "N"),
+        ]
+        verdict = {
+            "good": False,
+            "line": "So.",
+            "reasons": [],
+            "warnings": [],
+            "purposes": purposes,
+        }
+        html = render(make_results(verdict=verdict))
+        rows = Page(html).table("Purpose")
+        assert [row["Good"] for row in rows] == ["✓ yes", "✕ no", "–"]
+        assert rows[0]["Figure"].startswith("6.0 % of the torque left")
+        assert rows[1]["Good if"] == "at most 5 mm"
+        assert html.index("Feed-forward") < html.index('id="torque"')
+
+    def test_shows_offsets_under_their_own_name(self):
+        results = make_results()
+        change = {"name": "fo_1", "of_this_run": False, "table2_id": None}
+        offset = results.parameters[-1].model_copy(update=change)
+        friction = [p.model_copy(update={"of_this_run": True}) for p in results.parameters]
+        parameters = [*results.parameters[: results.n_base], *friction[results.n_base :], offset]
+        text = rendered(results.model_copy(update={"parameters": parameters})).text
+        assert "Offsets of the torque (1)" in text
+        assert "Elements" not in text
 
     def test_writes_shares_of_messages_as_those_of_tables(self):
         verdict = {"good": False, "line": "off by 2.1% of 5%.", "reasons": ["a 3%"], "warnings": []}
