@@ -11,7 +11,7 @@ import re
 import subprocess
 import sys
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import replace
+from dataclasses import asdict, replace
 from html.parser import HTMLParser
 from typing import Any
 
@@ -520,12 +520,12 @@ class TestPage:
             "line": "So.",
             "reasons": [],
             "warnings": [],
-            "purposes": purposes,
+            "purposes": [asdict(purpose) for purpose in purposes],
         }
         html = render(make_results(verdict=verdict))
         rows = Page(html).table("Purpose")
         assert [row["Good"] for row in rows] == ["✓ yes", "✕ no", "–"]
-        assert rows[0]["Figure"].startswith("6.0 % of the torque left")
+        assert rows[0]["Figure"].startswith("6.0\u00a0% of the torque left")
         assert rows[1]["Good if"] == "at most 5 mm"
         assert html.index("Feed-forward") < html.index('id="torque"')
 
