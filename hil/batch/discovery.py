@@ -15,6 +15,7 @@ from tempfile import TemporaryDirectory
 from typing import Any, Final, NamedTuple
 
 from hil.archive import Archive, ArchiveName, ArchiveOutcome, open_archive
+from hil.archive.check import recording_date
 from hil.archive.header import KINDS
 from hil.archive.recorded_campaign import Entry, RecordedCampaign
 from hil.base.errors import ArchiveError, CampaignFolderError, InputError
@@ -372,6 +373,13 @@ def inspect_archives(
     return refs
 
 
+def _date_of(path: Path, archive: Archive) -> str:
+    """Return the date of a recording, ISO 8601; of an imported one by its clock, "" if unknown."""
+    if archive.kind == "imported":
+        archive = open_archive(path, fields=("stamp",))
+    return recording_date(archive) or ""
+
+
 def inspect_archive(place: str, cache: CacheLocation) -> ArchiveRef:
     """Hash an archive, read its metadata, and cache both with the texts of its cell.
 
@@ -387,6 +395,7 @@ def inspect_archive(place: str, cache: CacheLocation) -> ArchiveRef:
         sha256 = digest_of(path)
         # Of an intact file this reads summary, metadata, attachments and one chunk.
         archive = open_archive(path, fields=(), stop=-1.0)
+        when = _date_of(path, archive)
     require_complete(archive, place)
     header = archive.header
     plan = archive.attachments.get("plan.json")
@@ -404,7 +413,7 @@ def inspect_archive(place: str, cache: CacheLocation) -> ArchiveRef:
         index=index,
         cell="",
         motion="" if plan is None else digest(plan),
-        when=header.recorded_at or "",
+        when=when,
         stamp=stamp,
         kind=archive.kind,
         attempt=attempt,

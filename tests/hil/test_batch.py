@@ -480,6 +480,16 @@ def arm():
     return small()
 
 
+def test_the_clock_of_an_imported_recording_dates_it(tmp_path, arm):
+    path = recording(
+        tmp_path / "a.mcap", arm, kind="imported", clock_origin_ns="1773560000000000000"
+    )
+    (ref,) = found_in(path).refs
+    assert ref.when == "2026-03-15T07:33:20+00:00"
+    (undated,) = found_in(recording(tmp_path / "b.mcap", arm, kind="imported")).refs
+    assert undated.when == ""
+
+
 class TestPlaces:
     def test_links_are_followed_once_and_loops_end(self, tmp_path, arm):
         real = recording(tmp_path / "store" / "one" / "a.mcap", arm)
