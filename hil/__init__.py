@@ -17,6 +17,7 @@ Archives and other recordings:
 - `import_log`, `import_rosbag2`: convert text, arrays and bags to archives.
 - `Robot`, `ColumnMap`: robot and columns of an imported recording.
 - `identify`: from a log and a URDF to an `IdentifiedArm`: verdict, parameters, prediction, model.
+- `identify_servo`: the same of an arm without torque, to an `IdentifiedServo`.
 - `identify_archives`, `identify_campaign`: estimate, predict and judge.
 - `Options`: settings of the estimation; `ImportOptions`: what the channels of a recording are.
 - `Results`: content of `results.json`.
@@ -53,7 +54,8 @@ if TYPE_CHECKING:
     from hil.control.move import plan_move, send
     from hil.control.simulation import simulated_controller
     from hil.export.model_files import export_model
-    from hil.identified.identified_arm import IdentifiedArm
+    from hil.identified.identified_arm import IdentifiedArm, identify_servo
+    from hil.identified.identified_servo import IdentifiedServo
     from hil.importers.column_map import ColumnMap
     from hil.importers.log import import_log
     from hil.importers.recording import ImportOptions, RobotOf
@@ -72,6 +74,7 @@ _HOME = {
     "Cell": "cell",
     "ColumnMap": "importers.column_map",
     "IdentifiedArm": "identified.identified_arm",
+    "IdentifiedServo": "identified.identified_servo",
     "ImportOptions": "importers.recording",
     "Options": "pipeline.options",
     "Results": "results.results",
@@ -81,6 +84,7 @@ _HOME = {
     "export_model": "export.model_files",
     "identify_archives": "pipeline.run",
     "identify_campaign": "campaign.identified",
+    "identify_servo": "identified.identified_arm",
     "import_log": "importers.log",
     "import_rosbag2": "importers.rosbag2",
     "open_archive": "archive",
@@ -95,6 +99,7 @@ __all__ = [
     "Cell",
     "ColumnMap",
     "IdentifiedArm",
+    "IdentifiedServo",
     "ImportOptions",
     "LineReporter",
     "Options",
@@ -109,6 +114,7 @@ __all__ = [
     "identify",
     "identify_archives",
     "identify_campaign",
+    "identify_servo",
     "import_log",
     "import_rosbag2",
     "open_archive",

@@ -9,15 +9,18 @@ import typer
 
 from hil.base.one_screen import Paragraph
 from hil.base.output_folder import require_possible
+from hil.base.progress import Reporter
 from hil.base.progress import reporter as make_reporter
 from hil.base.safe_input import path_exists
 from hil.cli.arguments import JsonOption, QuietOption, VerboseOption, with_options
 from hil.cli.identify_options import EstimatorOption, Identifying
 from hil.cli.imports import Described, Reading
 from hil.cli.purpose_options import Required
+from hil.cli.servo_verdict import finish_servo
 from hil.cli.verdict import LABEL, finish
 from hil.identified.identified_arm import identify_recordings, write_arm
-from hil.identified.messages import read_lines
+from hil.identified.identified_servo import IdentifiedServo, write_servo
+from hil.identified.messages import read_lines, servo_read_lines
 from hil.importers.recording import is_archive
 from hil.report.output_files import REPORT
 
@@ -42,6 +45,7 @@ def identify(
     split: Annotated[float, typer.Option(min=0.1, max=0.9)] = 0.7,
     fit_all: bool = False,
     annotate: bool = False,
+    compare: Annotated[Path | None, typer.Option(metavar="FILE.xml")] = None,
     *,
     arm: Described,
     reading: Reading,
@@ -56,9 +60,11 @@ def identify(
 
     A log (CSV and other text, .npz, .mat, .mcap) or a bag needs the URDF of its arm; what its
     channels are is concluded from their names and units, and printed. Archives contain all inputs:
-    URDF, friction law, drive train. Validation runs are predicted and never fitted. Exit status 0
-    if the model is good for the purposes of --for, 5 if it is not; without --for, if it predicts
-    unseen motion to a tenth of the torque or to twice its noise, better than the nominal model.
+    URDF, friction law, drive train. Validation runs are predicted and never fitted. Recordings
+    with commanded positions and without torque give servo and friction of each joint, with the
+    masses of the URDF. Exit status 0 if the model is good for the purposes of --for, 5 if it is
+    not; without --for, if it predicts unseen motion to a tenth of the torque or to twice its
+    noise, better than the nominal model.
 
     **Examples:** `hil identify log.csv --urdf arm.urdf`, `hil identify runs/demo`
 
@@ -71,6 +77,7 @@ def identify(
         fit_all: Fit all recordings and hold nothing out: no model can then be judged good.
         annotate: Also write copies of the archives for viewers, with predicted torque and
             residual, into the subfolder annotated.
+        compare: MJCF whose servo parameters are compared, where there is no torque.
     """
     reporter = make_reporter(quiet=quiet or json, messages=verbose)
     stated = {"in_sample": fit_all, "estimator": estimator, **required.options()}
@@ -78,19 +85,18 @@ def identify(
     output = _folder(recordings, output, paper=paper)
     if not arm.is_given:
         reading.refuse_without_robot()
+    robot = arm.robot if arm.is_given else None
     identified = identify_recordings(
-        recordings,
-        predict or [],
-        arm.robot if arm.is_given else None,
-        reading.options,
-        options,
-        reporter,
-        output=output,
-    )
+        recordings, predict or [], robot, reading.options, options, reporter,
+        output=output, compare=compare,
+    )  # fmt: skip
+    show = {"json": json, "quiet": quiet, "verbose": verbose}
+    if isinstance(identified, IdentifiedServo):
+        _finish_servo(identified, output, reporter, **show)
+        return
     folder, results = write_arm(identified, output, annotate=annotate, reporter=reporter)
-    written = (folder, folder / REPORT)
     read = [Paragraph(text, use.ljust(LABEL), 2) for use, text in read_lines(identified)]
-    finish(results, json=json, quiet=quiet, verbose=verbose, written=written, read=read)
+    finish(results, **show, written=(folder, folder / REPORT), read=read)
 
 
 def _folder(recordings: list[Path], output: Path | None, *, paper: bool) -> Path | None:
@@ -100,3 +106,12 @@ def _folder(recordings: list[Path], output: Path | None, *, paper: bool) -> Path
     if output is not None or path_exists(recordings[0]):
         require_possible(output or recordings[0].resolve().parent)
     return output
+
+
+def _finish_servo(
+    servo: IdentifiedServo, output: Path | None, reporter: Reporter, **show: bool
+) -> None:
+    """Write the files of an arm without torque, and print its verdict."""
+    place = write_servo(servo, output, reporter)
+    read = [Paragraph(text, use.ljust(LABEL), 2) for use, text in servo_read_lines(servo)]
+    finish_servo(servo.results, **show, written=(place, place / REPORT), read=read)

@@ -25,7 +25,13 @@ from hil.base.progress import Reporter, Silent
 from hil.base.threads import one_thread
 from hil.export.model_files import pinocchio_of
 from hil.identified.annotate import annotate as write_annotated
-from hil.identified.staging import Staging, staged
+from hil.identified.identified_servo import (
+    IdentifiedServo,
+    are_servos,
+    identified_servo,
+    refuse_comparison,
+)
+from hil.identified.staging import Staging, require_torques, staged
 from hil.importers.messages import sentence
 from hil.importers.recording import ImportOptions, RobotOf, is_archive
 from hil.importers.robot import Robot
@@ -36,6 +42,7 @@ from hil.pipeline.run import Identification
 from hil.report.figures import MEASURED, NOMINAL, PREDICTED, RESIDUAL, joints_of, torque_charts
 from hil.report.output_files import write_outcome
 from hil.results.results import Results
+from hil.rollout.servo_rollout import without_torque
 from identification.export.observer import MomentumObserver
 from identification.model.motion import Motion
 from identification.text import percentage
@@ -237,7 +244,7 @@ def arm_from(
             raise InputError(None, problem, field="urdf and robot", remedy=remedy)
         robot = Robot.from_urdf(urdf)
     robot_of = (lambda _: robot) if isinstance(robot, Robot) else robot
-    return identify_recordings(
+    identified = identify_recordings(
         _paths(recordings),
         _paths(predict),
         robot_of,
@@ -245,6 +252,50 @@ def arm_from(
         options or Options(),
         reporter or Silent(),
     )
+    if isinstance(identified, IdentifiedServo):
+        problem = "has no torque, so that servo and friction can be identified, not an arm"
+        remedy = "use hil.identify_servo(...)"
+        raise InputError(identified.recordings[0], problem, field="torque", remedy=remedy)
+    return identified
+
+
+@one_thread()
+def identify_servo(
+    recordings: PathOrPaths,
+    *,
+    urdf: str | PathLike[str],
+    predict: PathOrPaths = (),
+    compare: str | PathLike[str] | None = None,
+    reading: ImportOptions | None = None,
+    reporter: Reporter | None = None,
+) -> IdentifiedServo:
+    """Identify servo and friction of an arm without torque; nothing is written before `save`.
+
+    Args:
+        recordings: logs, bags or folders with commanded and measured positions.
+        urdf: description of the arm, with masses.
+        predict: recordings to predict from their commands alone, and not to fit.
+        compare: MJCF whose servo parameters are compared.
+        reading: what the channels are, where that cannot be concluded from names and units.
+        reporter: receives messages and progress; None for none.
+
+    Raises:
+        InputError: a recording or the URDF cannot be read, or nothing can be identified from it.
+    """
+    robot = Robot.from_urdf(urdf)
+    identified = identify_recordings(
+        _paths(recordings),
+        _paths(predict),
+        lambda _: robot,
+        reading or ImportOptions(),
+        Options(),
+        reporter or Silent(),
+        compare=None if compare is None else Path(compare),
+    )
+    if isinstance(identified, IdentifiedArm):
+        remedy = "use hil.identify(...)"
+        raise InputError(_paths(recordings)[0], "has torques", field="torque", remedy=remedy)
+    return identified
 
 
 def identify_recordings(
@@ -256,8 +307,21 @@ def identify_recordings(
     reporter: Reporter,
     *,
     output: Path | None = None,
-) -> IdentifiedArm:
+    compare: Path | None = None,
+) -> IdentifiedArm | IdentifiedServo:
     """Import what is no archive, and identify; without a robot all must be archives.
+
+    Recordings with commanded positions and without torque are identified as servos.
+
+    Args:
+        recordings: that are fitted.
+        predict: that are predicted and not fitted.
+        robot_of: the robot of those that are no archives.
+        reading: how these are read.
+        options: of the identification.
+        reporter: of what is concluded, and of progress.
+        output: folder that will be written to.
+        compare: MJCF whose servo parameters are compared.
 
     Raises:
         InputError: as of :func:`hil.identify`, or an archive in the `output` would replace a
@@ -267,15 +331,34 @@ def identify_recordings(
         raise InputError(None, "there is no recording", remedy="name a log, a bag or an archive")
     if robot_of is None:
         _require_archives((*recordings, *predict))
+        if _lack_torque((*recordings, *predict)):
+            staging = Staging(list(recordings), list(predict))
+            return identified_servo(staging, recordings, predict, options, compare, (), reporter)
+        refuse_comparison(compare)
         identification = _identified(recordings, predict, options, reporter)
         return IdentifiedArm(tuple(recordings), tuple(predict), identification, ())
     with staged(recordings, predict, robot_of, reading, reporter) as staging:
         if output is not None:
             staging.check_places(output)
+        if are_servos([*staging.fitted, *staging.predicted]):
+            channels = _channels(staging)
+            return identified_servo(
+                staging, recordings, predict, options, compare, channels, reporter
+            )
+        refuse_comparison(compare)
+        require_torques(staging)
         identification = _identified(staging.fitted, staging.predicted, options, reporter)
     return IdentifiedArm(
         tuple(recordings), tuple(predict), identification, _channels(staging), staging
     )
+
+
+def _lack_torque(archives: Sequence[Path]) -> bool:
+    """Return whether archives have commands and no torque; what is wrong with one is said later."""
+    try:
+        return without_torque(archives)
+    except InputError:
+        return False
 
 
 def _identified(

@@ -8,6 +8,7 @@ from typing import Final
 
 from hil.base.terminal_text import plural
 from hil.identified.identified_arm import IdentifiedArm
+from hil.identified.identified_servo import IdentifiedServo
 from hil.importers.conclusions import (
     ChannelMeaning,
     ConcludedUnit,
@@ -66,6 +67,24 @@ def _decisive(arm: IdentifiedArm) -> Iterator[tuple[str, str]]:
             if isinstance(found, DoubtfulArm | ChangedReading):
                 label = "doubtful" if isinstance(found, DoubtfulArm) else "changed"
                 yield label, f"{arm.staging.sources[place].name}: {sentence(found)}"
+
+
+def servo_read_lines(servo: IdentifiedServo) -> list[tuple[str, str]]:
+    """Return use and content of each recording without torque; of many the first ones."""
+    staging = servo.staging
+    if staging is None or not staging.recordings:
+        return [("fitted", plural(len(servo.recordings), "archive"))]
+    lines = [
+        (
+            "predicted" if staging.sources[place] in servo.predicted else "fitted",
+            f"{staging.sources[place].name}: {content(recording)}",
+        )
+        for place, recording in staging.recordings.items()
+    ]
+    if len(lines) <= _MOST:
+        return lines
+    more = len(lines) - _MOST + 1
+    return [*lines[: _MOST - 1], ("", f"and {plural(more, 'recording')} more")]
 
 
 def _same(arm: IdentifiedArm) -> bool:

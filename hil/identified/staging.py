@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Final
 
 from hil.archive import Archive, write_archive
-from hil.base.errors import InputError
+from hil.base.errors import InputError, SourceError
 from hil.base.files import convert_write_errors, replace_file, write_output
 from hil.base.progress import Reporter
 from hil.importers.messages import sentence
@@ -23,7 +23,7 @@ from hil.importers.recording import (
     is_archive,
     read_recording,
 )
-from hil.importers.required_signals import require_motion, require_torque
+from hil.importers.required_signals import has_servo, require_motion, require_torque
 from hil.importers.robot import Use
 from hil.look.before_identification import concluded
 
@@ -128,6 +128,15 @@ def staged(
             raise
         source = staging.sources[error.path]
         raise InputError(source, error.problem, field=error.field, remedy=error.remedy) from error
+
+
+def require_torques(staging: Staging) -> None:
+    """Raise SourceError if some recordings have no torque, and others have."""
+    for place, recording in staging.recordings.items():
+        if has_servo(recording.archive):
+            problem = "has no torque, and other recordings have"
+            remedy = "identify those with and without torque separately"
+            raise SourceError(staging.sources[place], problem, field="torque", remedy=remedy)
 
 
 def _report(recording: ImportedRecording, source: Path, reporter: Reporter) -> None:

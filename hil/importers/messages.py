@@ -424,7 +424,7 @@ def _(scaled: ScaledVelocity) -> str:
 def _(none: NoTorque) -> str:
     use = "nothing can be identified from it"
     if none.is_commanded:
-        use = "bodies cannot be identified, servo and friction can (`hil rollout --polish`)"
+        use = "bodies cannot be identified, servo and friction are"
     return f"the log has neither torque nor motor current: {use}"
 
 

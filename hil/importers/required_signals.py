@@ -41,8 +41,15 @@ def require_motion(archive: Archive, recording: Path) -> None:
         raise SourceError(recording, problem, field="torque", remedy=remedy)
 
 
+def has_servo(archive: Archive) -> bool:
+    """Return whether an archive has commanded positions, and neither torques nor currents."""
+    columns = archive.columns
+    currents = {"target_current", "motor_current"}
+    return "commanded_position" in columns and not columns.keys() & {"torque", *currents}
+
+
 def require_torque(archive: Archive, recording: Path) -> None:
-    """Check that a recording has joint torques.
+    """Check that a recording has joint torques, or commanded positions in their place.
 
     Raises:
         SourceError: it has motor currents only, or not even these.
@@ -50,14 +57,11 @@ def require_torque(archive: Archive, recording: Path) -> None:
     columns = archive.columns
     if "torque" in columns:
         return
+    if has_servo(archive):
+        return
     if "motor_current" not in columns:
         problem = "has neither joint torques nor motor currents"
-        remedy = "record them"
-        if "commanded_position" in columns:
-            remedy += (
-                "; from its commanded positions `hil import log` and `hil rollout --polish`"
-                " identify servo and friction"
-            )
+        remedy = "record them, or the commanded positions, from which servo and friction follow"
         raise SourceError(recording, problem, field="torque", remedy=remedy)
     problem = "has motor currents and no joint torque"
     remedy = (

@@ -7,22 +7,24 @@ from pathlib import Path
 from typing import Final, NamedTuple
 
 import numpy as np
+import tomlkit
 
 from hil.archive import Archive
 from hil.base.errors import SourceError
 from hil.base.terminal_text import typed
 from hil.cell import Cell
-from hil.importers.conclusions import Certainty
+from hil.importers.conclusions import Certainty, ChannelMeaning
 from hil.importers.recording import ImportedRecording, ImportOptions, RobotOf, read_again
 from hil.importers.robot import Robot, Use
 from hil.look.messages import choice_text, fit_alike, sentences, setting_text
 from hil.look.other_arm import Contradictions
-from hil.look.readings import DoubtfulArm, ExplainedTorque, GravityOption
+from hil.look.readings import DoubtfulArm, ExplainedTorque, GravityOption, NoJointTorque
 from hil.look.result import ChangedReading, Choice, Look, Row
 from hil.look.run import SETTINGS, look_at_joints, mountings
 from hil.pipeline.sources import cell_of, source_of
 from identification.errors import IdentificationError
 from identification.estimators.torque_channel import possible_low_passes
+from identification.signals.recording import STUCK_MOVEMENT
 from identification.signals.samples import Samples, prepare
 from identification.text import percentage
 from identification.validation.reading_scores import Score, compare, score_of
@@ -60,8 +62,13 @@ def concluded(
     Raises:
         SourceError: two readings fit alike, or the URDF is that of another arm.
     """
-    if options.columns is not None:
+    if options.columns is not None or "torque" not in imported.archive.columns:
         return imported
+    may_be_load = (
+        "commanded_position" in imported.archive.columns and "torque" not in options.chosen
+    )
+    if may_be_load and _has_no_sign(imported.archive):
+        return _without_torque(imported, source, robot_of, use, NoJointTorque(None))
     few = _few_rows(imported.archive)
     if few is None:
         return imported
@@ -79,6 +86,8 @@ def concluded(
     look = look_at_joints(source, imported)
     error = score.overall if look.error is None else look.error
     if error > _OTHER_ARM:
+        if may_be_load:
+            return _without_torque(imported, source, robot_of, use, NoJointTorque(error))
         raise _other_arm(source, error)
     changed = _changed(look)
     if look.questions or not changed:
@@ -96,6 +105,38 @@ def concluded(
             return _of_this_arm(again, source, contradictions)
         return again
     return imported
+
+
+def _has_no_sign(archive: Archive) -> bool:
+    """Return whether no torque is ever negative, although joints move in both directions."""
+    torque = np.asarray(archive.columns["torque"])
+    moving = np.ptp(np.asarray(archive.columns["position"]), axis=0) > STUCK_MOVEMENT
+    return bool(np.count_nonzero(moving) > 1 and (torque >= 0.0).all() and torque.any())
+
+
+def _without_torque(
+    imported: ImportedRecording,
+    source: Path,
+    robot_of: RobotOf,
+    use: Use,
+    reason: NoJointTorque,
+) -> ImportedRecording:
+    """Return a recording without its torque, and why."""
+    if imported.map_text is None:
+        columns = {
+            name: column for name, column in imported.archive.columns.items() if name != "torque"
+        }
+        without = replace(imported, archive=replace(imported.archive, columns=columns))
+    else:
+        entries = tomlkit.parse(imported.map_text)
+        del entries["torque"]
+        without = read_again(imported, source, robot_of, tomlkit.dumps(entries), use)
+    others = [
+        each
+        for each in imported.concluded
+        if not (isinstance(each, ChannelMeaning) and each.kind == "torque")
+    ]
+    return replace(without, concluded=(*others, reason))
 
 
 def _few_rows(archive: Archive) -> tuple[Cell, Samples, Score] | None:

@@ -54,6 +54,7 @@ from hil.look.readings import (
     Mounting,
     NearestZero,
     NextBest,
+    NoJointTorque,
     NotSlopes,
     OtherAxes,
     OtherLengths,
@@ -648,6 +649,19 @@ def _(explained: ExplainedTorque) -> str:
         "with rotors heavier than the links" if explained.heavy_rotors else "",
     )
     return f"torque: follows the arm of the URDF, {', '.join(filter(None, parts))}"
+
+
+@import_messages.worded.register
+def _(none: NoJointTorque) -> str:
+    reason = (
+        "it is never negative, although the joints move in both directions"
+        if none.unexplained is None
+        else f"no masses explain {percentage(none.unexplained)} of it"
+    )
+    return (
+        f"torque: left out, {reason}, as of the load or the duty of a servo; to use it in spite of"
+        " that, name it: --columns 'torque=NAME'"
+    )
 
 
 @import_messages.worded.register

@@ -559,6 +559,18 @@ class ExplainedTorque(Conclusion):
 
 
 @dataclass(frozen=True)
+class NoJointTorque(Conclusion):
+    """A channel named as a torque that is none, such as the load or the duty of a servo.
+
+    Attributes:
+        unexplained: share of it that no masses of the arm explain; None where it has no sign,
+            although joints move in both directions.
+    """
+
+    unexplained: float | None
+
+
+@dataclass(frozen=True)
 class DoubtfulArm(Conclusion):
     """What contradicts the arm of the URDF."""
 

@@ -27,6 +27,7 @@ from hil.pipeline import identified_model
 from hil.pipeline.run import Identification
 from hil.report.output_files import FILES, Exports
 from hil.results.results import Results
+from hil.results.servo_result import ServoResults
 from identification.export.parameters import parameters_json
 from identification.model.kinematics import chain_from_urdf
 from identification.model.motion import Motion
@@ -180,6 +181,7 @@ def test_every_file_and_field_is_explained(text: str, arm: IdentifiedArm) -> Non
     content = json.loads(document)
     explained = named(text)
     assert set(fields(Results)) <= explained
+    assert set(fields(ServoResults)) <= explained
     assert set(content) | set(content["parameters"][0]) | set(content["standard"]) <= explained
     tensor = {"Ixy", "Ixz", "Iyy", "Iyz", "Izz", "mcx", "mcy", "mcz"}
     assert set(content["standard"]["links"][0]) - tensor <= explained

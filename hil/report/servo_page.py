@@ -1,0 +1,74 @@
+"""Page of an arm without torque: prediction over time, parameters with intervals, choices."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Final
+
+import numpy as np
+
+from hil.report.chart import Caption, Chart, Legend, Plot, label
+from hil.report.drawing import chart_panel
+from hil.report.interactive import chart_data, library
+from hil.report.rendering import environment, page_bytes, template_text
+from hil.results.servo_result import ServoResults
+from hil.results.servo_series import ServoSeries
+
+MEASURED: Final = Legend("measured", "measured", "--first", 1.6)
+COMMANDED: Final = Legend("commanded", "command", "--muted", 1.0, dashed=True)
+IDENTIFIED: Final = Legend("identified", "identified, from the commands alone", "--second", 1.6)
+COMPARED: Final = Legend("compared", "parameters of the maker's file", "--wide", 1.4)
+LEGENDS: Final = (MEASURED, COMMANDED, COMPARED, IDENTIFIED)
+_JOINTS: Final = 3  # of the picture
+_HEIGHT: Final = 170.0  # px
+_BINS: Final = 400
+_MILLI: Final = 1e3
+
+
+def motion_charts(results: ServoResults, series: ServoSeries, most: int = _JOINTS) -> list[Chart]:
+    """Return charts of the joints with the largest errors of the command, in their order."""
+    errors = np.sqrt(np.mean((series.commanded - series.measured) ** 2, axis=0))
+    chosen = np.sort(np.argsort(-errors)[:most])
+    return [_chart(results, series, int(joint)) for joint in chosen]
+
+
+def _chart(results: ServoResults, series: ServoSeries, joint: int) -> Chart:
+    unit = results.joint_units[joint]
+    error = _MILLI * np.sqrt(
+        np.mean((series.identified[:, joint] - series.measured[:, joint]) ** 2)
+    )
+    traces = [
+        COMMANDED.trace(series.commanded[:, joint]),
+        MEASURED.trace(series.measured[:, joint]),
+        *([] if series.compared is None else [COMPARED.trace(series.compared[:, joint])]),
+        IDENTIFIED.trace(series.identified[:, joint]),
+    ]
+    note = f"{label(series.archive)}: {error:.3g} {'mrad' if unit == 'rad' else 'mm'} rms"
+    return Chart(
+        Caption(f"motion-{joint}", label(results.joint_names[joint]), note, "position over time"),
+        series.time,
+        [Plot(_HEIGHT, f"position [{unit}]", traces)],
+        joint=joint,
+    )
+
+
+def servo_page_bytes(results: ServoResults, series: Sequence[ServoSeries]) -> bytes:
+    """Return the page as one HTML file; the same input gives the same bytes."""
+    charts = motion_charts(results, series[0], len(results.joint_names)) if series else []
+    by_joint = {
+        joint: [value for value in results.servo if value.joint == joint]
+        for joint in results.joint_names
+    }
+    context = {
+        "results": results,
+        "by_joint": by_joint,
+        "motions": [chart_panel(chart, _BINS) for chart in charts],
+        "legends": [
+            legend
+            for legend in LEGENDS
+            if legend is not COMPARED or (series and series[0].compared is not None)
+        ],
+        "chart_data": chart_data({"motions": charts}, results.joint_names),
+    }
+    scripts = (*library(), template_text("charts.js"))
+    return page_bytes(environment(*scripts).get_template("servo.html.j2").render(**context))

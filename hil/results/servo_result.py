@@ -1,0 +1,119 @@
+"""Schema of `results.json` of an arm without torque: servo and friction of each joint.
+
+Numbers are in SI units, errors of positions in mrad, or mm of joints that slide; infinite numbers
+are the string "Infinity". Lists per joint are in the order of `joint_names`.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Final, Literal
+
+from pydantic import ValidationError
+
+from hil.base.errors import InputError
+from hil.base.safe_input import parse_json, read_text
+from hil.results.results import Frozen, Known
+
+KIND: Final = "servo"
+SERVO_SCHEMA_VERSION: Final = 1
+
+
+class ServoValue(Frozen):
+    """A parameter of one joint."""
+
+    name: str  #: as in `identification.servo.parameters.TERMS`
+    joint: str
+    unit: str
+    value: float
+    lower: float  #: ends of the 95 % interval
+    upper: float
+    determined: bool  #: by the motion; otherwise the interval is mostly what was assumed before
+    present: bool  #: whether the model has this term
+
+
+class ServoPrediction(Frozen):
+    """Error of a motion that was simulated from its commands alone."""
+
+    archive: str
+    duration: float  #: s
+    position_error_mrad: float  #: root mean square over all samples and joints
+    joint_errors_mrad: list[float]
+    command_error_mrad: float  #: of the commanded position itself
+    command_joint_errors_mrad: list[float]
+    compared_error_mrad: Known = None  #: of the parameters of the file to compare with
+    compared_joint_errors_mrad: list[float] | None = None
+
+
+class ServoTermChoice(Frozen):
+    """Whether other windows are predicted better with some terms of a joint."""
+
+    terms: list[str]
+    joint: str
+    present: bool
+    gain: float  #: decrease of the root mean square error of windows that were not fitted, a share
+
+
+class ServoVerdict(Frozen):
+    """Whether the model may be used."""
+
+    good: bool
+    line: str
+    warnings: list[str]
+    next_steps: list[str]
+
+
+class ServoPosterior(Frozen):
+    """Logarithms of values in position errors of the servo, for draws."""
+
+    coordinates: list[list[float]]
+    present: list[list[bool]]
+    covariance: list[list[float]]  #: of them by joint, and of the delay of the bus
+
+
+class ServoResults(Frozen):
+    """Results of an identification without torque."""
+
+    schema_version: int = SERVO_SCHEMA_VERSION
+    kind: Literal["servo"] = "servo"
+    name: str
+    cell: str
+    simulated: bool
+    joint_names: list[str]
+    joint_units: list[str]  #: rad or m
+    software: dict[str, str]
+    archives: list[str]  #: that were fitted
+    windows: int  #: that were fitted
+    seconds: float  #: processor time of the fit
+    delay: float  #: of commands, common to all joints [s]
+    servo: list[ServoValue]
+    validation: list[ServoPrediction]
+    in_sample: bool  #: whether nothing was held out
+    tested_on: str
+    compared: str | None = None  #: file whose parameters were compared
+    term_choices: list[ServoTermChoice]
+    verdict: ServoVerdict
+    posterior: ServoPosterior
+    notes: list[str]
+
+    @classmethod
+    def load(cls, path: Path) -> ServoResults:
+        """Read a `results.json` of an arm without torque.
+
+        Raises:
+            InputError: the file does not match this schema.
+        """
+        try:
+            return cls.model_validate_json(read_text(path))
+        except (OSError, ValueError, ValidationError) as error:
+            problem = f"cannot be read as a result of an arm without torque ({error})"
+            raise InputError(path, problem.split("\n")[0], remedy="identify again") from error
+
+
+def is_servo_result(path: Path) -> bool:
+    """Return whether a file is the `results.json` of an arm without torque."""
+    try:
+        document = parse_json(read_text(path))
+    except (OSError, ValueError):
+        return False
+    return isinstance(document, dict) and document.get("kind") == KIND

@@ -1,0 +1,1 @@
+"""Arms without torque: servo and friction of each joint from commanded and measured positions."""

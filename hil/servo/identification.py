@@ -1,0 +1,260 @@
+"""Servo and friction of each joint, from archives without torque, judged on others."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Final
+
+import numpy as np
+
+from hil.archive import Archive, place_of
+from hil.base.arrays import Array
+from hil.base.errors import InputError
+from hil.base.progress import Reporter
+from hil.base.threads import one_thread
+from hil.base.version import software
+from hil.cell import Cell
+from hil.cell.nominal import nominal_of
+from hil.pipeline.sources import Source, Sources, gather_sources
+from hil.results.servo_result import (
+    ServoPosterior,
+    ServoPrediction,
+    ServoResults,
+    ServoTermChoice,
+    ServoValue,
+    ServoVerdict,
+)
+from hil.results.servo_series import ServoSeries
+from hil.servo.maker_file import maker_parameters
+from hil.servo.messages import verdict_of
+from identification.servo.choice import ServoFit, fit_servos, steps_of_a_fit
+from identification.servo.intervals import ServoIntervals, intervals_of
+from identification.servo.motion import Grid, ServoMotion, motions_of
+from identification.servo.parameters import TERMS
+from identification.servo.prediction import predicted
+
+_FINEST: Final = 1e-5  # rad or m, least resolution of positions
+_MILLI: Final = 1e3
+
+
+@dataclass(frozen=True)
+class ServoOptions:
+    """Options of an identification without torque.
+
+    Attributes:
+        split: fraction of a single recording that is fitted.
+        in_sample: fit all recordings and hold out none.
+        compare: MJCF whose parameters are compared.
+    """
+
+    split: float = 0.7
+    in_sample: bool = False
+    compare: Path | None = None
+
+
+@dataclass(frozen=True, eq=False)
+class ServoIdentification:
+    """An identification without torque."""
+
+    paths: tuple[Path, ...]
+    cell: Cell
+    fit: ServoFit
+    intervals: ServoIntervals
+    results: ServoResults
+    series: tuple[ServoSeries, ...]
+
+
+@one_thread()
+def identify_servos(
+    archives: Sequence[Path | Archive],
+    reporter: Reporter,
+    options: ServoOptions = ServoOptions(),
+    *,
+    predict: Sequence[Path | Archive] = (),
+    name: str = "",
+) -> ServoIdentification:
+    """Identify servos from archives of positions and commands; `predict` is held out.
+
+    The bodies are those of the URDF.
+
+    Raises:
+        InputError: there are no masses, no commanded positions, or no motion.
+    """
+    sources = gather_sources(
+        archives, options.split, predict, in_sample=options.in_sample, with_torque=False
+    )
+    cell = sources.cell
+    first = place_of(archives[0])
+    bodies = _bodies(cell, first)
+    compared = None
+    if options.compare is not None:
+        compared = maker_parameters(options.compare, cell.joint_names)
+    grid = Grid.of(sources.training[0].recording)
+    fitted = [
+        motion for source in sources.training for motion in _motions(source, cell, bodies, grid)
+    ]
+    if not fitted:
+        problem = "has no part in which the commanded positions are known"
+        remedy = "record the commanded positions, or name them (--columns)"
+        raise InputError(first, problem, field="commanded_position", remedy=remedy)
+    started = time.process_time()
+    with reporter.task("servos", steps_of_a_fit()) as task:
+        fit = fit_servos(fitted, _resolution(sources), done=lambda: task.advance(1))
+    seconds = time.process_time() - started
+    intervals = intervals_of(fit)
+    with reporter.task("held-out motions", len(sources.held_out)) as task:
+        series = []
+        for source in sources.held_out:
+            motions = _motions(source, cell, bodies, grid)
+            series += _series(source.name, motions, cell, bodies, intervals.values, compared)
+            task.advance(1)
+    predictions = [_prediction(each) for each in series]
+    results = _results(name or first.stem, sources, fit, intervals, predictions, seconds)
+    if options.compare is not None:
+        results = results.model_copy(update={"compared": options.compare.name})
+    results = results.model_copy(update={"verdict": verdict_of(results)})
+    paths = tuple(map(place_of, (*archives, *predict)))
+    return ServoIdentification(paths, cell, fit, intervals, results, tuple(series))
+
+
+def _bodies(cell: Cell, path: Path) -> Array:
+    """Return the parameters (p,) of the URDF's bodies, without friction and rotors."""
+    if nominal_of(cell) is None:
+        remedy = "give a URDF with masses, which set the scale of gains and friction"
+        raise InputError(path, "has no torque, and its URDF no masses", field="urdf", remedy=remedy)
+    model = cell.model
+    standard = model.nominal.copy()
+    if model.layout.rotor_inertia:
+        standard[model.layout.rotors] = 0.0
+    values = np.zeros(model.n_parameters)
+    values[: model.base.rank] = model.base.grouping @ standard
+    return values
+
+
+def _motions(source: Source, cell: Cell, bodies: Array, grid: Grid) -> list[ServoMotion]:
+    return motions_of(source.recording, cell.model, bodies, grid)
+
+
+def _resolution(sources: Sources) -> Array:
+    """Return the standard deviation of positions as they are rounded (n,)."""
+    steps = []
+    for source in sources.training:
+        columns = source.recording.position.T
+        steps.append([np.diff(np.unique(column)).min(initial=np.inf) for column in columns])
+    least = np.min(steps, axis=0)
+    return np.asarray(np.maximum(np.where(np.isfinite(least), least, 0.0) / np.sqrt(12.0), _FINEST))
+
+
+def _series(
+    name: str,
+    motions: Sequence[ServoMotion],
+    cell: Cell,
+    bodies: Array,
+    values: Array,
+    compared: Array | None,
+) -> list[ServoSeries]:
+    """Return the motions of a recording as they were simulated from their commands."""
+    sets = [values] if compared is None else [values, compared]
+    series = []
+    for motion in motions:
+        positions = predicted(cell.model, bodies, motion, sets)
+        series.append(
+            ServoSeries(
+                name,
+                np.asarray(motion.step * np.arange(len(motion.position)), np.float64),
+                motion.position,
+                motion.command,
+                positions[0],
+                positions[1] if compared is not None else None,
+            )
+        )
+    return series
+
+
+def _prediction(series: ServoSeries) -> ServoPrediction:
+    """Return the errors of a simulated motion."""
+
+    def errors(simulated: Array) -> list[float]:
+        mean = np.sqrt(np.mean((simulated - series.measured) ** 2, axis=0))
+        return [float(each) for each in _MILLI * mean]
+
+    def overall(each: list[float]) -> float:
+        return float(np.sqrt(np.mean(np.square(each))))
+
+    own = errors(series.identified)
+    command = errors(series.commanded)
+    other = None if series.compared is None else errors(series.compared)
+    return ServoPrediction(
+        archive=series.archive,
+        duration=float(series.time[-1]),
+        position_error_mrad=overall(own),
+        joint_errors_mrad=own,
+        command_error_mrad=overall(command),
+        command_joint_errors_mrad=command,
+        compared_error_mrad=None if other is None else overall(other),
+        compared_joint_errors_mrad=other,
+    )
+
+
+def _results(
+    name: str,
+    sources: Sources,
+    fit: ServoFit,
+    intervals: ServoIntervals,
+    predictions: Sequence[ServoPrediction],
+    seconds: float,
+) -> ServoResults:
+    """Return the results, without a verdict."""
+    cell = sources.cell
+    turning = [bool(turns) for turns in cell.model.chain.revolute]
+    estimate = fit.estimate
+    names = cell.joint_names
+    placeholder = ServoVerdict(good=False, line="", warnings=[], next_steps=[])
+    return ServoResults(
+        name=name,
+        cell=cell.name,
+        simulated=sources.header.only_simulated,
+        joint_names=list(names),
+        joint_units=["rad" if turns else "m" for turns in turning],
+        software=software(),
+        archives=[source.name for source in sources.training],
+        windows=fit.windows,
+        seconds=seconds,
+        delay=estimate.bus_delay,
+        servo=[
+            ServoValue(
+                name=term.name,
+                joint=joint,
+                unit=term.unit if turning[j] else term.unit_along,
+                value=float(intervals.values[j, k]),
+                lower=float(intervals.lower[j, k]),
+                upper=float(intervals.upper[j, k]),
+                determined=bool(intervals.determined[j, k]),
+                present=bool(estimate.present[j, k]),
+            )
+            for j, joint in enumerate(names)
+            for k, term in enumerate(TERMS)
+        ],
+        validation=list(predictions),
+        in_sample=sources.in_sample,
+        tested_on=sources.tested_on,
+        term_choices=[
+            ServoTermChoice(
+                terms=list(choice.terms),
+                joint=names[choice.joint],
+                present=choice.present,
+                gain=choice.gain,
+            )
+            for choice in fit.choices
+        ],
+        verdict=placeholder,
+        posterior=ServoPosterior(
+            coordinates=estimate.coordinates.tolist(),
+            present=estimate.present.tolist(),
+            covariance=estimate.covariance.tolist(),
+        ),
+        notes=list(sources.warnings),
+    )

@@ -1,0 +1,1 @@
+"""Position servos with friction, identified from commanded and measured positions alone."""

@@ -1,0 +1,97 @@
+"""Intervals of servo parameters in SI units, and which of them the motion determines."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from identification.arrays import Array
+from identification.distributions import student_limit
+from identification.servo.choice import ServoFit
+from identification.servo.fit import ServoEstimate
+from identification.servo.parameters import (
+    ABSENT,
+    NAMES,
+    PLACE,
+    POSITIVE,
+    TERMS,
+    in_units,
+    natural,
+    without_absent,
+)
+
+_LEARNT: Final = 0.5  # of the prior's deviation, above which the motion says little
+_FACTOR: Final = 3.0  # upper end over value, above which a parameter is not determined
+_POWER: Final = np.array([term.torque for term in TERMS])
+
+
+@dataclass(frozen=True, eq=False)
+class ServoIntervals:
+    """Values of n joints in SI units with ends of their 95 % intervals, each (n, P).
+
+    Attributes:
+        determined: whether the motion determines a parameter, not the prior.
+    """
+
+    values: Array
+    lower: Array
+    upper: Array
+    determined: NDArray[np.bool_]
+
+
+def intervals_of(fit: ServoFit) -> ServoIntervals:
+    """Return the intervals of a fit; that of a term that is not shown includes no effect."""
+    estimate = fit.estimate
+    values = in_units(estimate.values)
+    spread = _spread(estimate)
+    prior = _prior_spread(estimate)
+    reach = student_limit(0.025, max(1, fit.windows - 1)) * spread
+    ends = [
+        np.where(POSITIVE, values * np.exp(sign * np.minimum(reach, 700.0)), values + sign * reach)
+        for sign in (-1.0, 1.0)
+    ]
+    narrow = np.where(POSITIVE, np.exp(np.minimum(reach, 700.0)) <= _FACTOR, True)
+    determined = np.asarray((spread <= _LEARNT * prior) & narrow & estimate.present & fit.shown)
+    absent = without_absent(natural(estimate.coordinates), estimate.present)
+    lower, upper = (np.where(estimate.present, end, absent) for end in ends)
+    unseen = estimate.present & ~fit.shown
+    without = without_absent(natural(estimate.coordinates), ~unseen)
+    friction = np.array([name not in ABSENT for name in NAMES])
+    lower = np.where(unseen & friction, 0.0, lower)
+    upper = np.where(unseen & ~friction & np.isinf(without), np.inf, upper)
+    return ServoIntervals(values, lower, upper, determined)
+
+
+def sampled(estimate: ServoEstimate, count: int, seed: int) -> Array:
+    """Return parameters in SI units (count, n, P) drawn from the posterior, correlated."""
+    generator = np.random.default_rng(seed)
+    covariance = estimate.covariance
+    values, vectors = np.linalg.eigh(0.5 * (covariance + covariance.T))
+    root = vectors * np.sqrt(np.maximum(values, 0.0))
+    shifts = generator.standard_normal((count, len(values))) @ root.T
+    coordinates = estimate.coordinates + shifts[:, :-1].reshape(count, *estimate.coordinates.shape)
+    return in_units(without_absent(natural(coordinates), estimate.present))
+
+
+def _spread(estimate: ServoEstimate) -> Array:
+    """Return standard deviations of the parameters (n, P), logarithms of positive ones."""
+    n, count = estimate.coordinates.shape
+    blocks = np.stack(
+        [
+            estimate.covariance[j * count : (j + 1) * count, j * count : (j + 1) * count]
+            for j in range(n)
+        ]
+    )
+    own = np.diagonal(blocks, axis1=1, axis2=2)
+    kp = PLACE["kp"]
+    both = own[:, [kp]] + own - 2.0 * blocks[:, kp]
+    variance = np.where(_POWER == 1, both, own)
+    return np.sqrt(np.maximum(variance, 0.0))
+
+
+def _prior_spread(estimate: ServoEstimate) -> Array:
+    own = estimate.prior.spread**2
+    return np.sqrt(np.where(_POWER == 1, own + own[:, [PLACE["kp"]]], own))

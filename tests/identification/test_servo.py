@@ -1,0 +1,149 @@
+"""Servos identified from positions alone: simulation against other integrators, planted arms."""
+
+import numpy as np
+import pytest
+import scipy
+
+from identification import RobotModel
+from identification.servo.choice import fit_servos
+from identification.servo.intervals import intervals_of, sampled
+from identification.servo.motion import Grid, motions_of
+from identification.servo.parameters import NAMES, PLACE, TERMS, in_errors, in_units
+from identification.servo.prediction import predicted
+from identification.servo.simulation import JointInputs, simulate
+from identification.signals.recording import Recording
+from tests import servo_arm as arm
+
+STEP = 5e-3
+
+
+def alone(command, *, start=0.0, bias=0.0, step=STEP):
+    """Return the inputs of one joint without bodies but a constant torque."""
+    count = len(command)
+    column = np.zeros((count, 1))
+    lead = 20
+    before = np.full((lead, 1), command[0])
+    return JointInputs(
+        step, np.concatenate([before, command[:, None]]), lead, column + bias, column, column,
+        column, np.array([start]), np.zeros(1),
+    )  # fmt: skip
+
+
+def values(**given):
+    """Return parameters of one joint in position errors (1, 1, P), by their values in SI units."""
+    row = np.array([{"limit": np.inf, "speed": 1.0}.get(term.name, 0.0) for term in TERMS])
+    for name, value in given.items():
+        row[PLACE[name]] = value
+    return in_errors(row)[None, None]
+
+
+def test_units_and_position_errors_are_inverse():
+    row = np.exp(np.random.default_rng(1).standard_normal((3, len(TERMS))))
+    np.testing.assert_allclose(in_units(in_errors(row)), row)
+
+
+def test_a_smooth_servo_follows_its_differential_equation():
+    time = STEP * np.arange(600)
+    command = 0.3 * np.sin(2.0 * np.pi * 0.9 * time)
+    kp, kd, armature, viscous = 15.0, 0.3, 0.03, 0.4
+
+    def slope(t, state):
+        wanted = np.interp(t, time, command)
+        rate = np.interp(t, time, np.gradient(command, STEP))
+        torque = kp * (wanted - state[0]) + kd * (rate - state[1]) - viscous * state[1] - 0.2
+        return state[1], torque / armature
+
+    exact = scipy.integrate.solve_ivp(
+        slope, (0.0, time[-1]), (0.0, 0.0), t_eval=time, rtol=1e-9, atol=1e-9, max_step=STEP
+    ).y[0]
+    given = values(kp=kp, kd=kd, armature=armature, viscous=viscous)
+    simulated = simulate(alone(command, bias=0.2), given)[:, 0, 0]
+    assert np.abs(simulated - exact)[20:].max() < 1e-3
+
+
+@pytest.mark.parametrize("kp", [1.0, 1e2, 1e5])
+def test_no_gain_is_unstable(kp):
+    command = np.where(np.arange(400) < 20, 0.0, 0.5)
+    simulated = simulate(alone(command), values(kp=kp, armature=1e-4, viscous=0.1))
+    assert np.abs(simulated).max() < 1.1
+
+
+def test_a_joint_rests_where_friction_holds_it():
+    """It does not creep, and moves on once the error of the servo exceeds its friction."""
+    command = np.minimum(np.arange(1000) * 2e-5, 0.0195)
+    given = values(kp=10.0, armature=0.01, viscous=0.3, coulomb=0.1, static=0.1, speed=0.1)
+    simulated = simulate(alone(command), given)[:, 0, 0]
+    assert (simulated == 0.0).all()
+    simulated = simulate(alone(command + 0.001), given)[:, 0, 0]
+    assert simulated[-1] > 0.0
+
+
+def test_friction_grows_with_the_load():
+    command = np.zeros(200)
+    light = values(kp=10.0, armature=0.01, viscous=0.3, load=0.5)
+    held = values(kp=10.0, armature=0.01, viscous=0.3, load=1.1)
+    sags, stands = (simulate(alone(command, bias=1.0), each)[-1, 0, 0] for each in (light, held))
+    assert -0.15 < sags < -0.05
+    assert stands == 0.0
+
+
+def model_of_arm():
+    model = RobotModel.from_urdf(arm.urdf())
+    standard = model.nominal.copy()
+    if model.layout.rotor_inertia:
+        standard[model.layout.rotors] = 0.0
+    bodies = np.zeros(model.n_parameters)
+    bodies[: model.base.rank] = model.base.grouping @ standard
+    return model, bodies
+
+
+@pytest.fixture(scope="module")
+def planted():
+    """Truth, fit and prediction of a simulated arm."""
+    rng = np.random.default_rng(11)
+    truth = arm.Planted.drawn(rng)
+    model, bodies = model_of_arm()
+    motions = []
+    for duration in (40.0, 15.0):
+        time, command = arm.commands(rng, duration)
+        position = arm.simulated(truth, time, command)
+        recording = Recording(
+            time=time, position=position, joint_names=arm.NAMES, commanded_position=command
+        )
+        motions += motions_of(recording, model, bodies, Grid.of(recording))
+    fit = fit_servos(motions[:1], np.full(3, arm.COUNT / np.sqrt(12.0)))
+    intervals = intervals_of(fit)
+    (simulated,) = predicted(model, bodies, motions[1], [intervals.values])
+    return truth, fit, intervals, motions[1], simulated
+
+
+def test_a_planted_arm_is_predicted_within_encoder_steps(planted):
+    *_, motion, simulated = planted
+    error = np.sqrt(np.mean((simulated - motion.position) ** 2))
+    command = np.sqrt(np.mean((motion.command - motion.position) ** 2))
+    assert command > 0.02
+    assert error < 2.0 * arm.COUNT
+
+
+def test_planted_parameters_are_found(planted):
+    truth, _, intervals, *_ = planted
+    for name, most in (("kp", 0.1), ("armature", 0.2), ("viscous", 0.2), ("static", 0.4)):
+        relative = np.abs(intervals.values[:, PLACE[name]] / getattr(truth, name) - 1.0)
+        assert (relative < most).all(), name
+    assert intervals.determined[:, PLACE["kp"]].all()
+
+
+def test_a_limit_that_no_motion_reaches_is_not_determined(planted):
+    truth, _, intervals, *_ = planted
+    limit = PLACE["limit"]
+    assert not intervals.determined[:, limit].any()
+    assert (intervals.upper[:, limit] >= truth.limit).all()
+
+
+def test_draws_scatter_as_the_intervals_say(planted):
+    _, fit, intervals, *_ = planted
+    draws = sampled(fit.estimate, 400, 1)
+    kp = PLACE["kp"]
+    inside = (draws[:, :, kp] > intervals.lower[:, kp]) & (draws[:, :, kp] < intervals.upper[:, kp])
+    assert 0.9 < inside.mean() < 1.0
+    assert len(NAMES) == draws.shape[2]

@@ -1,0 +1,143 @@
+"""An arm on position servos, simulated by pinocchio and small steps: nothing of it is of `hil`."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import pinocchio as pin
+from numpy.typing import NDArray
+
+Array = NDArray[np.float64]
+
+URDF = """<robot name="servo_arm">
+ <link name="base"/>
+ {links}
+</robot>"""
+_LINK = """
+ <joint name="{name}" type="revolute"><parent link="{parent}"/><child link="{name}_link"/>
+  <origin xyz="{origin}"/><axis xyz="{axis}"/>
+  <limit lower="-2.5" upper="2.5" effort="10" velocity="10"/></joint>
+ <link name="{name}_link"><inertial><origin xyz="{centre}"/><mass value="{mass}"/>
+  <inertia ixx="2e-4" iyy="2e-4" izz="2e-4" ixy="0" ixz="0" iyz="0"/></inertial></link>"""
+NAMES = ("pan", "lift", "elbow")
+STEP = 2e-3
+RATE = 50.0
+COUNT = 2.0 * np.pi / 4096.0
+
+
+def urdf() -> str:
+    """Return the description of an arm of three joints."""
+    rows = (
+        ("pan", "base", "0 0 0.05", "0 0 1", "0 0 0.03", 0.15),
+        ("lift", "pan_link", "0 0 0.06", "0 1 0", "0.08 0 0.01", 0.2),
+        ("elbow", "lift_link", "0.15 0 0", "0 1 0", "0.09 0 0", 0.18),
+    )
+    keys = ("name", "parent", "origin", "axis", "centre", "mass")
+    return URDF.format(
+        links="".join(_LINK.format(**dict(zip(keys, row, strict=True))) for row in rows)
+    )
+
+
+@dataclass(frozen=True)
+class Planted:
+    """True parameters of each joint (3,), in SI units; `delay` of the bus [s]."""
+
+    kp: Array
+    kd: Array
+    armature: Array
+    viscous: Array
+    coulomb: Array
+    static: Array
+    speed: Array
+    load: Array
+    limit: Array
+    dead_band: Array
+    delay: float
+
+    @classmethod
+    def drawn(cls, rng: np.random.Generator) -> Planted:
+        """Return parameters of hobby servos."""
+
+        def about(value: float, spread: float = 0.3) -> Array:
+            return value * np.exp(spread * rng.standard_normal(3))
+
+        return cls(
+            kp=about(15.0), kd=about(0.3), armature=about(0.02), viscous=about(0.5),
+            coulomb=about(0.06), static=about(0.04), speed=about(0.1, 0.2), load=about(0.15),
+            limit=about(3.0, 0.1), dead_band=about(0.003), delay=float(rng.uniform(0.01, 0.04)),
+        )  # fmt: skip
+
+
+def commands(rng: np.random.Generator, duration: float) -> tuple[Array, Array]:
+    """Return times (m,) and commands (m, 3): slow and fast parts, and rests."""
+    time = np.arange(0.0, duration, 1.0 / RATE)
+    command = np.zeros((len(time), 3))
+    for joint in range(3):
+        for frequency in (0.05, 0.13, 0.4, 1.1, 2.1):
+            size = min(0.5, 0.12 / frequency) * rng.uniform(0.4, 1.0)
+            command[:, joint] += (
+                size
+                * np.sin(2.0 * np.pi * (frequency * time + rng.uniform()) * rng.uniform(0.8, 1.2))
+                * (0.5 + 0.5 * np.tanh(20.0 * np.sin(2 * np.pi * time / rng.uniform(11.0, 23.0))))
+            )
+    command += np.array([0.0, -0.6, 0.8])
+    smooth = np.minimum(1.0, time / 1.0)[:, None]
+    return time, command[0] + (command - command[0]) * smooth
+
+
+def _stepped(
+    whole: list[list[float]], push: list[float], bound: list[float], velocity: list[float]
+) -> list[float]:
+    """Return velocities after a step with dry friction, by projected Gauss-Seidel."""
+    new = list(velocity)
+    for _ in range(6):
+        before = list(new)
+        for j, row in enumerate(whole):
+            rest = push[j] - sum(a * b for a, b in zip(row, new, strict=True)) + row[j] * new[j]
+            slip = max(abs(rest) - bound[j], 0.0)
+            new[j] = (slip if rest > 0.0 else -slip) / row[j]
+        if max(abs(a - b) for a, b in zip(new, before, strict=True)) < 1e-9:
+            break
+    return new
+
+
+def simulated(planted: Planted, time: Array, command: Array) -> Array:
+    """Return measured positions at the times (m, 3), in counts of the encoder."""
+    model = pin.buildModelFromXML(urdf())
+    data = model.createData()
+    grid = np.arange(0.0, time[-1] + STEP, STEP)
+    wanted = np.column_stack([np.interp(grid - planted.delay, time, each) for each in command.T])
+    rate = np.gradient(wanted, STEP, axis=0)
+    q = command[0].copy()
+    v = np.zeros(3)
+    accelerated = np.zeros(3)
+    positions = np.empty((len(grid), 3))
+    for k in range(len(grid)):
+        positions[k] = q
+        error = wanted[k] - q
+        error = np.sign(error) * np.maximum(np.abs(error) - planted.dead_band, 0.0)
+        motor = planted.kp * error + planted.kd * (rate[k] - v)
+        free = np.abs(motor) < planted.limit
+        motor = np.clip(motor, -planted.limit, planted.limit)
+        inertia = pin.crba(model, data, q)
+        inertia = np.triu(inertia) + np.triu(inertia, 1).T
+        bias = pin.nle(model, data, q, v)
+        # Damping acts on the mean of the velocities before and after a step: of second order.
+        half = 0.5 * STEP * np.diag(planted.viscous + planted.kd * free)
+        masses = inertia + np.diag(planted.armature)
+        whole = masses + half
+        push = (masses - half) @ v + STEP * (motor + planted.kd * free * v - bias)
+        # Load of the gears: the torque of the bodies at the acceleration of the step before.
+        load = np.abs(bias + inertia @ accelerated)
+        bound = STEP * (
+            planted.coulomb
+            + planted.static * np.exp(-((v / planted.speed) ** 2))
+            + planted.load * load
+        )
+        new = np.array(_stepped(whole.tolist(), push.tolist(), bound.tolist(), v.tolist()))
+        accelerated = (new - v) / STEP
+        v = new
+        q = q + STEP * v
+    measured = np.column_stack([np.interp(time, grid, each) for each in positions.T])
+    return np.asarray(np.round(measured / COUNT) * COUNT)
