@@ -231,7 +231,7 @@ def simulate(
         f"cycle {1e3 * settings.period:g} ms, mode {settings.open_mode}, process {os.getpid()}"
     )
     if loaded is not read:
-        status.say("no table [simulation]: the arm has the values of [nominal], and begins at home")
+        status.say("[simulation] is missing: the nominal arm is simulated, from its home posture")
     if patience:
         status.say(f"cycles are extended by up to {patience:g} s to wait for a reply")
     sessions = 0
