@@ -368,7 +368,7 @@ class TestIdentify:
         assert result.exit_code == 0, (result.output, result.exception)
         folder = tmp_path / "a"
         report = folder / "report.html"
-        shown = result.output.splitlines()
+        shown = result.stdout.splitlines()
         assert len(shown) <= one_screen.LINES and max(map(len, shown)) <= one_screen.COLUMNS
         assert "fitted    a.csv: 3 joints" in result.output
         assert "predicted b.csv: 3 joints" in result.output
@@ -383,7 +383,7 @@ class TestIdentify:
         assert not (tmp_path / "a-2").exists()
         again = hil("identify", folder, "--output", tmp_path / "again")
         assert again.exit_code == 0
-        verdicts = [output.splitlines()[0] for output in (result.output, again.output)]
+        verdicts = [run.stdout.splitlines()[0] for run in (result, again)]
         assert verdicts[0].startswith("Good for feed-forward") and verdicts[1] == verdicts[0]
 
     def test_archives_get_a_folder_as_well(self, tmp_path: Path, urdf: Path) -> None:
