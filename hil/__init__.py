@@ -163,6 +163,8 @@ def identify(
 
 
 def __getattr__(name: str) -> Any:
+    if name == "__version__":
+        return import_module("hil.base.version").software()["hil"]
     if name in _HOME:
         return getattr(import_module(f"hil.{_HOME[name]}"), name)
     raise AttributeError(f"module {__name__!r} has no attribute {name!r}")

@@ -1,12 +1,15 @@
-"""`hil report`: regenerate the report of a campaign."""
+"""`hil report`: regenerate the report of a campaign, or of identified recordings."""
 
 from __future__ import annotations
 
 import typer
 
+from hil.archive.recorded_campaign import RecordedCampaign
 from hil.base.progress import reporter as make_reporter
 from hil.campaign import Campaign
 from hil.cli.arguments import CampaignArgument, JsonOption, QuietOption, print_json
+from hil.report.output_files import REPORT, rewrite_report
+from hil.results.provenance import RESULTS
 from hil.results.results import Results
 
 
@@ -18,12 +21,17 @@ def report(
     """Regenerate the report of CAMPAIGN and print its path.
 
     Uses the existing results without a new estimate. If archives were added since, or there are no
-    results yet, identifies first as `hil identify` does.
+    results yet, identifies first as `hil identify` does. The folder of `hil identify LOG` has a
+    report as well, which is regenerated from its results.
     """
-    opened = Campaign.open(campaign)
-    page = opened.report(reporter=make_reporter(quiet=quiet or json))
+    if (campaign / RESULTS).is_file() and not RecordedCampaign(campaign).sealed:
+        page = campaign / REPORT
+        verdict = rewrite_report(campaign).verdict
+    else:
+        opened = Campaign.open(campaign)
+        page = opened.report(reporter=make_reporter(quiet=quiet or json))
+        verdict = Results.load(opened.folder.results).verdict
     if not json:
         typer.echo(page)
         return
-    verdict = Results.load(opened.folder.results).verdict
     print_json({"report": str(page), "good": verdict.good, "verdict": verdict.line})

@@ -27,8 +27,13 @@ MISSING: Final[dict[NoFigure, str]] = {
 }
 
 
-def purposes_in_a_sentence(purposes: Sequence[Purpose], joints: Sequence[str]) -> str:
-    """Return what a model is good for, what not, and what it would notice."""
+def purposes_in_a_sentence(
+    purposes: Sequence[Purpose], joints: Sequence[str], asked: Sequence[PurposeName] = ()
+) -> str:
+    """Return what a model is good for, what not, and what it would notice.
+
+    Purposes that were asked for and could not be judged are named with the reason.
+    """
     good = [_with_figure(p, joints) for p in purposes if p.good]
     bad = [_with_figure(p, joints) for p in purposes if p.good is False]
     seen = [
@@ -37,9 +42,11 @@ def purposes_in_a_sentence(purposes: Sequence[Purpose], joints: Sequence[str]) -
         for what in [{"contact": "a force at the flange", "payload": "a payload"}.get(p.name)]
         if what and p.good is None and p.figure is not None and math.isfinite(p.figure)
     ]
+    unknown = [_with_figure(p, joints) for p in purposes if p.name in asked and p.good is None]
     sentences = [
         f"Good for {_enumerated(good)}." if good else "",
         f"Not for {_enumerated(bad)}." if bad else "",
+        f"Not judged: {_enumerated(unknown)}." if unknown else "",
         f"It notices {_enumerated(seen)}." if seen else "",
     ]
     return " ".join(filter(None, sentences))

@@ -110,7 +110,7 @@ def judge(
         error = "" if purposes else f"; {measure}"
         line = f"The model must not be relied on: {(fault or wrong[0]).words}{error}."
     elif purposes:
-        line = purposes_in_a_sentence(purposes, naming.joints)
+        line = purposes_in_a_sentence(purposes, naming.joints, asked)
         if tested_on != UNSEEN:
             line += f" Judged on {tested_on}."
         if wrong:

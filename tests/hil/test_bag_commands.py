@@ -413,7 +413,7 @@ def test_a_look_shows_the_commands(tmp_path, urdf) -> None:
         "/arm_controller/controller_state": controller(messages, MOVED),
     }
     path = written(tmp_path / "bag", messages, topics)
-    done = CliRunner().invoke(app, ["look", str(path)])
+    done = CliRunner().invoke(app, ["look", "-v", str(path)])
     assert done.exit_code == 0, done.exception
     text = " ".join(done.output.split())
     assert "commanded position" in text

@@ -76,6 +76,7 @@ def test_each_option_is_explained(command: str) -> None:
 
 def test_the_package_documents_its_names() -> None:
     assert hil_package.__doc__ is not None
+    assert hil_package.__version__ == version("hil")
     for name in hil_package.__all__:
         assert f"`{name}`" in hil_package.__doc__
         assert getattr(hil_package, name).__doc__

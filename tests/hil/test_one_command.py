@@ -381,6 +381,8 @@ class TestIdentify:
         assert hil("identify", first, "--urdf", urdf, "--predict", second).exit_code == 0
         assert (folder / "results.json").stat().st_mtime_ns > before
         assert not (tmp_path / "a-2").exists()
+        report.unlink()
+        assert hil("report", folder).output.strip() == str(report) and report.exists()
         again = hil("identify", folder, "--output", tmp_path / "again")
         assert again.exit_code == 0
         verdicts = [run.stdout.splitlines()[0] for run in (result, again)]

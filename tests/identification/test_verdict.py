@@ -345,6 +345,10 @@ class TestJudgement:
         assert judged(**large, purposes=purposes, asked=("feed-forward",)).good
         assert not judged(**large, purposes=purposes, asked=("feed-forward", "simulation")).good
         assert not judged(**large, purposes=purposes, asked=("contact",)).good
+        unknown = (*purposes, Purpose.unknown("contact", "too short", "N"))
+        refused = judged(**large, purposes=unknown, asked=("contact",))
+        assert not refused.good
+        assert "Not judged: contact detection (the unseen motion is too short)" in refused.line
         line = judged(**large, purposes=purposes).line
         assert line.startswith("Good for feed-forward (15 % of the torque left)")
         assert "Not for simulation (flange 20 mm off after 0.2 s)" in line
