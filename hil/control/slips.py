@@ -13,18 +13,20 @@ from typing import Final
 
 import numpy as np
 
-from hil.archive import open_archive
-from hil.archive.header import REJECTED
+from hil.archive import Archive, open_archive
+from hil.archive.header import REJECTED, REPLIES_LOST
 from hil.archive.recordings import recording_of
 from hil.archive.repair import amend_outcome
 from hil.base.arrays import Array
 from hil.base.errors import ArchiveError
+from identification.signals.recording import Recording
 from identification.validation.position_jumps import PositionJump, position_jumps
 
 from .errors import SlippedError
 
 CHECKED: Final = ("completed", "stopped")
 """Outcomes of motions whose measured positions are checked; the others are failures already."""
+NEAR: Final = 0.2  # s around a lost packet or reply in which a jump is no slip
 _FIELDS: Final = ("cycle", "gap", "position", "velocity")
 
 
@@ -49,6 +51,8 @@ def slip_of(path: Path) -> str:
         jumps = position_jumps(replace(recording, position=position - driven))
         names = recording.joint_names
         found += [jump for jump in jumps if not _frozen(recording.time, position, names, jump)]
+    disturbed = _disturbed(archive, recording)
+    found = [jump for jump in found if not (np.abs(disturbed - jump.time) < NEAR).any()]
     if not found:
         return ""
     largest = max(found, key=lambda jump: abs(jump.size))
@@ -68,6 +72,20 @@ def require_no_slip(motion: str, path: Path) -> None:
     if slip := slip_of(path):
         amend_outcome(path, REJECTED, slip)
         raise SlippedError(motion, slip, path.name)
+
+
+def _disturbed(archive: Archive, recording: Recording) -> Array:
+    """Return when packets or replies were lost (k,) [s since the first sample].
+
+    The controller's target then jumps, and the arm after it.
+    """
+    gaps = recording.gap_before
+    times = recording.time[:0] if gaps is None else recording.time[gaps]
+    lost = np.array([event.time for event in archive.events if event.name == REPLIES_LOST])
+    cycles = archive.columns.get("cycle")
+    if cycles is None or archive.period is None or not len(lost):
+        return times
+    return np.concatenate([times, lost - cycles[0] * archive.period])
 
 
 def _travel(velocity: Array, time: Array) -> Array:
