@@ -63,5 +63,7 @@ def _lines(rehearsal: Rehearsal, *, verbose: bool) -> list[str]:
     ]
     if verbose:
         return [*criteria, *(f"not covered: {sentence}" for sentence in rehearsal.not_seen)]
+    if rehearsal.passed:
+        return ["the criteria: -v"]
     passed = len(rehearsal.criteria) - len(rehearsal.failures)
     return [*criteria, f"{passed} of {len(rehearsal.criteria)} criteria are met: -v shows them"]
