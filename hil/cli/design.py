@@ -13,7 +13,7 @@ import typer
 
 from hil.base.errors import HilError, InputError, OperatorStopError
 from hil.base.one_screen import brief
-from hil.base.progress import Reporter, say
+from hil.base.progress import Collecting, Reporter, say
 from hil.base.progress import reporter as make_reporter
 from hil.base.terminal_text import printable, typed
 from hil.campaign.campaign import campaign_of_design, require_replaceable
@@ -235,7 +235,8 @@ def design(
             if promise is not None:
                 forecasts = promise.forecasts(excitation, planned)
                 found += [each.message(planned, promise.scale) for each in forecasts]
-            shown = found if quiet else [*found, *lines]
+            said = reporter.lines if isinstance(reporter, Collecting) else []
+            shown = found if quiet else [*found, *said, *lines]
             for line in shown if verbose else brief(shown):
                 typer.echo(printable(line))
         _draw(folder, done, loaded)
