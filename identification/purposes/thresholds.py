@@ -19,7 +19,7 @@ SHOWN: Final = 3.0
 """Times that unseen motion exceeds the threshold which it shows itself."""
 PERIODS: Final = (60.0, 600.0, 3600.0)
 """Times for which a threshold is extrapolated [s]."""
-_KNOWN: Final = 2.0  # upper over lower end of an extrapolated threshold, at most
+_KNOWN: Final = 3.0  # upper over lower end of an extrapolated threshold, at most
 
 
 @dataclass(frozen=True)
@@ -44,7 +44,7 @@ def contact_thresholds(
     """Return the threshold that unseen motion shows, and those that it lets be extrapolated.
 
     A longer time is left out where the residuals do not determine its threshold within a factor of
-    two.
+    three.
 
     Args:
         model: of an arm of n joints.

@@ -62,7 +62,7 @@ class TestThresholds:
         assert first.period == pytest.approx(60.0 / SHOWN, rel=0.05)
 
     def test_a_short_motion_says_nothing_of_an_hour(self) -> None:
-        assert thresholds(20.0)[-1].period < HOUR
+        assert thresholds(8.0)[-1].period < HOUR
         assert contact_thresholds(MODEL, residuals(3.0, 1), MIDDLE) == ()
         assert contact_thresholds(MODEL, [], MIDDLE) == ()
 
