@@ -14,7 +14,7 @@ from unittest.mock import patch
 import numpy as np
 
 from identification.selection import questions as names
-from identification.selection.scores import Decision, Trial
+from identification.selection.scores import SettingDecision, Trial
 from identification.selection.settings import Choice, Settings
 
 CHOICES: Final[Mapping[str, tuple[str, ...]]] = {
@@ -45,16 +45,16 @@ def without(choice: str) -> Iterator[None]:
         return
     left_out = CHOICES[choice]
 
-    def deciding(decide: Callable[..., Decision]) -> Callable[..., Decision]:
+    def deciding(decide: Callable[..., SettingDecision]) -> Callable[..., SettingDecision]:
         def decided(
             trial: Trial, name: str, candidates: Sequence[Settings], *others: Any, **more: Any
-        ) -> Decision:
+        ) -> SettingDecision:
             if name not in left_out:
                 return decide(trial, name, candidates, *others, **more)
             kept = candidates[0]
             if name == names.DELAY:
                 kept = min(candidates, key=_added_delay)
-            return Decision(kept, Choice(name, ("left out",), (), 0))
+            return SettingDecision(kept, Choice(name, ("left out",), (), 0))
 
         return decided
 

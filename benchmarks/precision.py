@@ -64,8 +64,8 @@ from hil.precision.forecast import PrecisionDesign, payload_search, short_search
 from hil.precision.requirements import Requirement, requirements_from
 from hil.weighing.payload_campaign import (
     FEWEST,
-    Mounting,
     PayloadCampaign,
+    PayloadMounting,
     Weighed,
     assumed_payload,
     loaded_cell,
@@ -434,7 +434,7 @@ def _weighed(
         weighing = PayloadCampaign.of(campaign, "load", assumed_payload(cell, _HEAVIEST, _FARTHEST))
         return weighing.run(
             lambda side, choices: side.run(**choices),
-            Mounting(weighing, Silent()),
+            PayloadMounting(weighing, Silent()),
             Silent(),
             requirements=requirements,
             choices={"unrehearsed": True, "durable": False},

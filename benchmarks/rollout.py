@@ -43,7 +43,7 @@ from hil.pipeline.identify_folder import identify_paths
 from hil.results.rollout_result import JUDGED, RolloutResult
 from hil.rollout.torque_rollout import RolloutOptions, nominal_arm, roll_out
 from identification import Samples
-from identification.export.arm import Arm, Ranges
+from identification.export.arm import ExportedArm, Ranges
 from identification.model.motion import Motion
 from identification.rollout.comparison import (
     HORIZONS,
@@ -68,7 +68,7 @@ LARGEST_RATIO = 0.5
 """Error of the identified arm over that of the nominal one at 0.5 s."""
 
 
-def recorded(arm: Arm) -> RecordedMotion:
+def recorded(arm: ExportedArm) -> RecordedMotion:
     """Return windows of the arm's exact torque along sines."""
     model = arm.model
     random = np.random.default_rng(1)
@@ -97,7 +97,7 @@ def time_of_windows() -> None:
     standard = model.nominal
     standard[model.layout.rotors] = cell.nominal.rotor_inertia
     ranges = Ranges(-infinite, infinite, infinite, infinite)
-    arm = Arm(cell.urdf, model, standard, cell.nominal_values(), ranges)
+    arm = ExportedArm(cell.urdf, model, standard, cell.nominal_values(), ranges)
     motion = recorded(arm)
     feedback = light_feedback(arm, STEP, 1.0)
     begin = time.perf_counter()
@@ -176,7 +176,7 @@ def _print_comparison(name: str, archives: Sequence[Path], iterations: int) -> N
         )
 
 
-def _with_heavier_rotors(arm: Arm) -> Arm:
+def _with_heavier_rotors(arm: ExportedArm) -> ExportedArm:
     """Return an arm whose rotors are heavier than the identified ones by `MORE_ROTOR`."""
     model = arm.model
     standard = arm.standard.copy()

@@ -17,10 +17,10 @@ from typing import Any, Final, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from identification.export.arm import Arm
+from identification.export.arm import ExportedArm
 from identification.export.simulators import mjcf
 from identification.rollout.comparison import RecordedMotion, horizon_rows
-from identification.rollout.simulation import Feedback, SimulatedArm
+from identification.rollout.simulation import Feedback, RolloutArm
 
 Array = NDArray[np.float64]
 
@@ -42,7 +42,9 @@ class Fitted(NamedTuple):
     simulations: int  #: of all windows
 
 
-def fit_by_sysid(arm: Arm, motion: RecordedMotion, feedback: Feedback, iterations: int) -> Fitted:
+def fit_by_sysid(
+    arm: ExportedArm, motion: RecordedMotion, feedback: Feedback, iterations: int
+) -> Fitted:
     """Fit a nominal arm to the positions in windows."""
     logging.getLogger("absl").setLevel(logging.ERROR)
     spec = _specification(arm, motion.windows.step, feedback)
@@ -67,10 +69,12 @@ def fit_by_sysid(arm: Arm, motion: RecordedMotion, feedback: Feedback, iteration
     return Fitted(sysid.apply_param_modifiers(parameters, spec), parameters.size, simulations)
 
 
-def positions_of(fitted: Fitted, arm: Arm, motion: RecordedMotion, feedback: Feedback) -> Array:
+def positions_of(
+    fitted: Fitted, arm: ExportedArm, motion: RecordedMotion, feedback: Feedback
+) -> Array:
     """Return the positions of a fitted model at the horizons (w, h, n)."""
     windows = motion.windows
-    bare = SimulatedArm.of(arm, windows.step, feedback)
+    bare = RolloutArm.of(arm, windows.step, feedback)
     model = fitted.model
     off = mujoco.mjtDisableBit
     model.opt.disableflags |= off.mjDSBL_ACTUATION | off.mjDSBL_AUTORESET
@@ -81,7 +85,7 @@ def positions_of(fitted: Fitted, arm: Arm, motion: RecordedMotion, feedback: Fee
     return positions[:, horizon_rows(windows)]
 
 
-def _specification(arm: Arm, step: float, feedback: Feedback) -> Any:
+def _specification(arm: ExportedArm, step: float, feedback: Feedback) -> Any:
     """Return the arm without limits and contacts, with the springs of the feedback."""
     spec = mujoco.MjSpec.from_string(mjcf(arm, "arm", step=step))
     off = mujoco.mjtDisableBit
@@ -94,7 +98,7 @@ def _specification(arm: Arm, step: float, feedback: Feedback) -> Any:
     return spec
 
 
-def _parameters(spec: Any, arm: Arm, motion: RecordedMotion, feedback: Feedback) -> Any:
+def _parameters(spec: Any, arm: ExportedArm, motion: RecordedMotion, feedback: Feedback) -> Any:
     """Return what is fitted, with where it starts and its bounds."""
     parameters = sysid.ParameterDict()
     model = spec.compile()
@@ -166,7 +170,7 @@ def _joint_setter(joint: str, field: str, constant: float) -> Callable[[Any, Any
     return write
 
 
-def _force(simulated: SimulatedArm, motion: RecordedMotion) -> Array:
+def _force(simulated: RolloutArm, motion: RecordedMotion) -> Array:
     """Return what acts on the joints beside friction and springs (w, K, n)."""
     return motion.windows.cut(
         [
@@ -181,12 +185,12 @@ def _force(simulated: SimulatedArm, motion: RecordedMotion) -> Array:
     )
 
 
-def _sequences(spec: Any, arm: Arm, motion: RecordedMotion, feedback: Feedback) -> Any:
+def _sequences(spec: Any, arm: ExportedArm, motion: RecordedMotion, feedback: Feedback) -> Any:
     """Return the windows for `mujoco.sysid`: torque by motors, and measured positions."""
     windows = motion.windows
     model = spec.compile()
     names = arm.model.joint_names
-    bare = SimulatedArm.of(arm, windows.step, feedback)
+    bare = RolloutArm.of(arm, windows.step, feedback)
     force = _force(replace(bare, viscous=0.0 * bare.viscous), motion)
     times = windows.step * np.arange(windows.steps + 1)
     signals = [(f"{name}_qpos", sysid.SignalType.MjStateQPos) for name in names]

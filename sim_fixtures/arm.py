@@ -113,7 +113,7 @@ class UnmodelledEffects:
         )
 
 
-class TorqueRipple:
+class SimulatedRipple:
     """Torque ripple of amplitudes (n,) [N m] on the joint side, with random phases."""
 
     def __init__(self, amplitude: Array, rng: np.random.Generator) -> None:
@@ -127,7 +127,7 @@ class TorqueRipple:
         return torque
 
 
-class FrictionDrift:
+class SimulatedDrift:
     """Friction of joints that warm up by moving, from cold; `drift` as `friction_drift`."""
 
     def __init__(self, drift: float, n_joints: int) -> None:
@@ -214,12 +214,12 @@ class SimulatedArm:
         self.currents = [0.0] * n
         self._load: Array | None = None
         self.disturbances = Disturbances(holding)
-        self._ripple: TorqueRipple | None = None
+        self._ripple: SimulatedRipple | None = None
         if effects.torque_ripple > 0.0:
-            self._ripple = TorqueRipple(effects.torque_ripple * truth.coulomb, ripple_rng)
-        self._drift: FrictionDrift | None = None
+            self._ripple = SimulatedRipple(effects.torque_ripple * truth.coulomb, ripple_rng)
+        self._drift: SimulatedDrift | None = None
         if effects.friction_drift > 0.0:
-            self._drift = FrictionDrift(effects.friction_drift, n)
+            self._drift = SimulatedDrift(effects.friction_drift, n)
 
     def encoders(self) -> list[float]:
         """Return the motor positions [rev] in whole encoder counts."""

@@ -42,7 +42,7 @@ _LONGEST_PATTERN = 16  # messages
 
 
 @dataclass(frozen=True, eq=False)
-class Messages:
+class ChunkMessages:
     """The messages of one channel in one chunk, or in several consecutive ones.
 
     Attributes:
@@ -137,12 +137,12 @@ class ChunkParser:
         if again:
             raise Damage(offset, f"defines {again} a second time, differently")
 
-    def messages(self, chunk: Content, offset: int) -> dict[int, Messages]:
+    def messages(self, chunk: Content, offset: int) -> dict[int, ChunkMessages]:
         """Return the messages of one chunk, or of several consecutive ones, by channel.
 
         `offset` is its place in the file. `Damage` if records are truncated or definitions differ.
         """
-        by_channel: dict[int, Messages] = {}
+        by_channel: dict[int, ChunkMessages] = {}
         recent: deque[Content] = deque(maxlen=_LONGEST_PATTERN)
         at = 0
         while at < len(chunk):
@@ -150,7 +150,7 @@ class ChunkParser:
             if len(rows):
                 first = at + rows.shape[1] * np.arange(len(rows))
                 for channel, place in self._round:
-                    messages = by_channel.setdefault(channel, Messages())
+                    messages = by_channel.setdefault(channel, ChunkMessages())
                     messages.parts.append(rows[:, place])
                     messages.places.append(first + place.start)
                 at += rows.size
@@ -164,7 +164,7 @@ class ChunkParser:
                     recent.clear()
                     continue
                 recent.append(head)
-                messages = by_channel.setdefault(_FIXED.unpack(head)[2], Messages())
+                messages = by_channel.setdefault(_FIXED.unpack(head)[2], ChunkMessages())
                 messages.parts.append(np.frombuffer(chunk, np.uint8, end - at, at)[None])
                 messages.places.append(np.array([at]))
             else:

@@ -29,13 +29,13 @@ from mcap.records import (
 )
 
 from hil.archive import container
-from hil.archive.chunk import Messages
+from hil.archive.chunk import ChunkMessages
 from hil.archive.container import MAGIC, encode
 
 _ENTRY = np.dtype([("stamp", "<u8"), ("offset", "<u8")])
 _MESSAGE_INDEX = struct.Struct("<BQHI")
 
-ByChannel: TypeAlias = Mapping[int, Messages]
+ByChannel: TypeAlias = Mapping[int, ChunkMessages]
 """The messages of a chunk, by channel in order of first occurrence."""
 
 
@@ -138,7 +138,7 @@ class FileIndex:
         return end + covered + struct.pack("<I", crc32(covered)) + MAGIC
 
 
-def _message_index(channel: int, messages: Messages) -> bytes:
+def _message_index(channel: int, messages: ChunkMessages) -> bytes:
     entries = np.empty(len(messages), _ENTRY)
     entries["stamp"] = messages.of_heads("log_time")
     entries["offset"] = np.concatenate(messages.places)

@@ -25,8 +25,8 @@ from hil.archive.schema import (
     CYCLE,
     EVENT_CHANNEL,
     MEASURED,
+    ArchiveChannel,
     ArchivedEvent,
-    Channel,
     cycle_messages,
     profile,
 )
@@ -191,7 +191,7 @@ def _serve(view: LiveView) -> tuple[WebSocketServer, foxglove.Context]:
     return server, context
 
 
-def _channel(channel: Channel, context: foxglove.Context) -> foxglove.Channel:
+def _channel(channel: ArchiveChannel, context: foxglove.Context) -> foxglove.Channel:
     import foxglove
 
     schema = foxglove.Schema(

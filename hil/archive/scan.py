@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 from hil.archive import container, schema
 from hil.archive.cdr import LayoutError, MessageLayout, Rows
-from hil.archive.chunk import ChunkParser, Content, Messages
+from hil.archive.chunk import ChunkMessages, ChunkParser, Content
 from hil.archive.container import Damage, Head, Record
 from hil.archive.header import (
     METADATA,
@@ -364,7 +364,7 @@ class Scan:
         self._append({topic: by_topic[topic] for topic in wanted if topic != schema.EVENTS})
 
     def _check_layouts(
-        self, by_topic: Mapping[str, Messages], offset: int
+        self, by_topic: Mapping[str, ChunkMessages], offset: int
     ) -> dict[str, MessageLayout]:
         """Return the layouts of messages of numbers; `Damage` if messages of one differ."""
         assert self.header is not None
@@ -385,7 +385,7 @@ class Scan:
         return layouts
 
     @staticmethod
-    def _decode_events(by_topic: Mapping[str, Messages], offset: int) -> list[ArchivedEvent]:
+    def _decode_events(by_topic: Mapping[str, ChunkMessages], offset: int) -> list[ArchivedEvent]:
         if schema.EVENTS not in by_topic:
             return []
         try:
@@ -394,7 +394,7 @@ class Scan:
             problem = f"(chunk) has an event that cannot be read: {error}"
             raise Damage(offset, problem) from error
 
-    def _append(self, by_topic: Mapping[str, Messages]) -> None:
+    def _append(self, by_topic: Mapping[str, ChunkMessages]) -> None:
         """Copy verified messages of the wanted channels and times into the columns."""
         if not by_topic:
             return
@@ -432,7 +432,9 @@ class Scan:
                 for raw, start in columns:
                     raw[now] = rows[:, start : start + raw.itemsize].view(raw.dtype)[:, 0]
 
-    def _missing_messages(self, by_topic: Mapping[str, Messages], offset: int) -> dict[str, int]:
+    def _missing_messages(
+        self, by_topic: Mapping[str, ChunkMessages], offset: int
+    ) -> dict[str, int]:
         """Return how many messages of topics are missing before these; `Damage` if some repeat."""
         missing = {}
         for topic, messages in by_topic.items():
@@ -448,7 +450,7 @@ class Scan:
                 missing[topic] = gap
         return missing
 
-    def _check_times(self, by_topic: Mapping[str, Messages], offset: int) -> int:
+    def _check_times(self, by_topic: Mapping[str, ChunkMessages], offset: int) -> int:
         """Check that cycles increase, and that all channels have the same times without cycles.
 
         Returns:

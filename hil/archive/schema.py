@@ -123,7 +123,7 @@ uint32 line
 
 
 @dataclass(frozen=True)
-class Channel:
+class ArchiveChannel:
     """One topic and the ros2msg schema of its messages, with all its dependencies."""
 
     topic: str
@@ -141,12 +141,12 @@ def _text(message: str, *dependencies: str) -> str:
     return "".join([message, *(f"{_SEPARATOR}\n{part}" for part in dependencies)])
 
 
-EVENT_CHANNEL = Channel(EVENTS, "rcl_interfaces/msg/Log", _text(_LOG, _TIME))
-DESCRIPTION_CHANNEL = Channel(DESCRIPTION, "std_msgs/msg/String", _DESCRIPTION)
+EVENT_CHANNEL = ArchiveChannel(EVENTS, "rcl_interfaces/msg/Log", _text(_LOG, _TIME))
+DESCRIPTION_CHANNEL = ArchiveChannel(DESCRIPTION, "std_msgs/msg/String", _DESCRIPTION)
 
 
 @lru_cache(maxsize=16)
-def profile(n_joints: int) -> Mapping[str, Channel]:
+def profile(n_joints: int) -> Mapping[str, ArchiveChannel]:
     """Return the channels of the profile by topic, for a number of joints."""
     state = "sensor_msgs/msg/JointState", _text(_JOINT_STATE, _HEADER, _TIME)
     cycle, current, commanded = (
@@ -154,11 +154,11 @@ def profile(n_joints: int) -> Mapping[str, Channel]:
         for text in (_CYCLE, _MOTOR_CURRENT, _COMMANDED_POSITION)
     )
     channels = (
-        Channel(CYCLE, f"hil_msgs/msg/Cycle{n_joints}", cycle),
-        Channel(MEASURED, *state),
-        Channel(COMMANDED, *state),
-        Channel(MOTOR_CURRENT, f"hil_msgs/msg/MotorCurrent{n_joints}", current),
-        Channel(COMMANDED_POSITION, f"hil_msgs/msg/CommandedPosition{n_joints}", commanded),
+        ArchiveChannel(CYCLE, f"hil_msgs/msg/Cycle{n_joints}", cycle),
+        ArchiveChannel(MEASURED, *state),
+        ArchiveChannel(COMMANDED, *state),
+        ArchiveChannel(MOTOR_CURRENT, f"hil_msgs/msg/MotorCurrent{n_joints}", current),
+        ArchiveChannel(COMMANDED_POSITION, f"hil_msgs/msg/CommandedPosition{n_joints}", commanded),
         EVENT_CHANNEL,
         DESCRIPTION_CHANNEL,
     )
@@ -241,7 +241,7 @@ def _stamp(records: Rows, period: float) -> NDArray[np.int64]:
 
 
 def _numbers(
-    channel: Channel, stamp: NDArray[np.int64], columns: Mapping[str, NDArray[Any]]
+    channel: ArchiveChannel, stamp: NDArray[np.int64], columns: Mapping[str, NDArray[Any]]
 ) -> Rows:
     return _filled(fixed_layout(channel.definition), stamp, columns)
 

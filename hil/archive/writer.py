@@ -36,9 +36,9 @@ from hil.archive.schema import (
     MEASURED,
     OTHERS,
     PROFILE,
+    ArchiveChannel,
     ArchivedEvent,
     Batch,
-    Channel,
     Level,
     cycle_messages,
     description_message,
@@ -169,7 +169,7 @@ class ArchiveFile:
                 sync_folder(path.parent)
         self._numbers = {channel.topic: self._registered(channel) for channel in channels}
 
-    def _registered(self, channel: Channel) -> int:
+    def _registered(self, channel: ArchiveChannel) -> int:
         """Define a channel and the schema of its messages; return the channel's number."""
         definition = channel.definition.encode()
         number = self._writer.register_schema(channel.schema, "ros2msg", definition)

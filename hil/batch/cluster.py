@@ -98,7 +98,7 @@ class ClusterError(HilError):
 
 
 @dataclass(frozen=True, eq=False)
-class Task(Generic[T_co]):
+class ClusterTask(Generic[T_co]):
     """A call in a worker."""
 
     path: str  #: file or folder that names the task in errors
@@ -238,7 +238,7 @@ class Cluster:
 
     # Tasks
 
-    def submit(self, task: Task[Any], *, archives: int) -> AnyFuture:
+    def submit(self, task: ClusterTask[Any], *, archives: int) -> AnyFuture:
         """Submit a task whose work reads so many archives."""
         arguments = (code_digest(), task.path, task.function, *task.arguments)
         client = self.client(archives)
@@ -317,7 +317,7 @@ class Cluster:
 
     def results(
         self,
-        tasks: Sequence[Task[T]],
+        tasks: Sequence[ClusterTask[T]],
         done: Callable[[int], None] | None = None,
         *,
         archives: int | None = None,
@@ -358,7 +358,7 @@ class Cluster:
             results[number] = self._alone(tasks[number], count)
         return [results[number] for number in range(len(tasks))]
 
-    def _alone(self, task: Task[T], archives: int) -> T | SkippedArchive:
+    def _alone(self, task: ClusterTask[T], archives: int) -> T | SkippedArchive:
         (future,) = self.completed(iter([self.submit(task, archives=archives)]))
         result: T | SkippedArchive | Death = self.outcome_of(future)
         if isinstance(result, Death):

@@ -28,7 +28,7 @@ from hil.pipeline.prepared import stated_delay
 from identification.selection.settings import Settings
 
 from .cache import BESIDE, JSON, CacheError, CacheLocation, code_digest
-from .cluster import Cluster, SkippedArchive, Task, reason_of
+from .cluster import Cluster, ClusterTask, SkippedArchive, reason_of
 from .places import (
     SUFFIX,
     Stamp,
@@ -187,7 +187,7 @@ def _inspected(
     """Return what workers find in archives; those of a task that fails are tried one by one."""
     refs: dict[str, ArchiveRef | SkippedArchive] = {}
     chunks = [places[k : k + _CHUNK] for k in range(0, len(places), _CHUNK)]
-    tasks = [Task(chunk[0], inspect_archives, (chunk, cache)) for chunk in chunks]
+    tasks = [ClusterTask(chunk[0], inspect_archives, (chunk, cache)) for chunk in chunks]
     failed: list[str] = []
     results = cluster.results(tasks, lambda n: advance(n * _CHUNK), archives=len(places))
     for chunk, result in zip(chunks, results, strict=True):
@@ -195,7 +195,7 @@ def _inspected(
             failed += chunk
         else:
             refs.update(zip(chunk, result, strict=True))
-    singles = [Task(place, inspect_archive, (place, cache)) for place in failed]
+    singles = [ClusterTask(place, inspect_archive, (place, cache)) for place in failed]
     refs.update(zip(failed, cluster.results(singles), strict=True))
     return refs
 

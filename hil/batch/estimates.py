@@ -48,7 +48,7 @@ _NAMED: Final = 12  # different warnings that are listed
 
 
 @dataclass(frozen=True, eq=False)
-class Arm:
+class BatchArm:
     """A robot by its digest, see :class:`GroupKey`, with one of its cells."""
 
     digest: str
@@ -95,7 +95,7 @@ class ArmModel:
 
 
 @dataclass(frozen=True, eq=False)
-class Group:
+class EstimateGroup:
     """Archives that are fitted together: the sums that predict and are predicted."""
 
     refs: tuple[ArchiveRef, ...] = ()  #: archives that were fitted
@@ -108,7 +108,7 @@ class Group:
     setups: frozenset[str] = frozenset()  #: payloads and delays that the cells state
 
     @classmethod
-    def of(cls, reduced: ReducedArchives, settings: Settings) -> Group:
+    def of(cls, reduced: ReducedArchives, settings: Settings) -> EstimateGroup:
         """Return the group of one campaign, without the estimates from each archive."""
         fitted = [summary for summary in reduced.summaries if summary.ref.use == "excitation"]
         group = cls(
@@ -123,9 +123,9 @@ class Group:
                 group = replace(group, unseen=plus(group.unseen, summary.total))
         return group
 
-    def __add__(self, other: Group) -> Group:
+    def __add__(self, other: EstimateGroup) -> EstimateGroup:
         """Return both groups together."""
-        return Group(
+        return EstimateGroup(
             refs=self.refs + other.refs,
             total=plus(self.total, other.total),
             values=self.values + other.values,
@@ -154,14 +154,14 @@ def estimate_campaign(
     arm: ArmModel,
     settings: Settings,
     campaign: str,
-) -> tuple[CampaignResult, Group]:
+) -> tuple[CampaignResult, EstimateGroup]:
     """Estimate one campaign from its reduced archives; return also what a pooled estimate needs.
 
     `settings` are those of the campaign, with its own noise.
     """
     reduced = added(part for part in parts if isinstance(part, ReducedArchives))
     estimator = Estimator(arm)
-    group = Group.of(reduced, settings)
+    group = EstimateGroup.of(reduced, settings)
     estimates: list[BatchEstimate] = []
     broken = [*reduced.broken, *(part for part in parts if isinstance(part, SkippedArchive))]
     if group.total is not None:
@@ -189,7 +189,7 @@ def estimate_cached(
     arm: ArmModel,
     settings: Settings,
     campaign: str,
-) -> tuple[CampaignResult, Group]:
+) -> tuple[CampaignResult, EstimateGroup]:
     """Estimate one campaign from its archives, of which each partition has a cached sum.
 
     Reading a sum takes less time than a task of its own.
@@ -202,13 +202,15 @@ def estimate_cached(
 
 
 def result_of(
-    pair: tuple[CampaignResult, Group] | SkippedArchive,
+    pair: tuple[CampaignResult, EstimateGroup] | SkippedArchive,
 ) -> CampaignResult | SkippedArchive:
     """Return what the client receives of a campaign."""
     return pair if isinstance(pair, SkippedArchive) else pair[0]
 
 
-def group_of(pairs: Sequence[tuple[CampaignResult, Group] | SkippedArchive]) -> Group:
+def group_of(
+    pairs: Sequence[tuple[CampaignResult, EstimateGroup] | SkippedArchive],
+) -> EstimateGroup:
     """Return the campaigns with an excitation as one group."""
     groups = [pair[1] for pair in pairs if not isinstance(pair, SkippedArchive)]
     fitted = (
@@ -216,12 +218,14 @@ def group_of(pairs: Sequence[tuple[CampaignResult, Group] | SkippedArchive]) -> 
         for group in groups
         if group.total is not None
     )
-    return sum(fitted, Group())
+    return sum(fitted, EstimateGroup())
 
 
-def estimate_arm(parts: Sequence[Group], arm: ArmModel) -> BatchEstimate | SkippedArchive | None:
+def estimate_arm(
+    parts: Sequence[EstimateGroup], arm: ArmModel
+) -> BatchEstimate | SkippedArchive | None:
     """Estimate an arm from sums over its campaigns; None if there is no excitation."""
-    group = sum(parts, Group())
+    group = sum(parts, EstimateGroup())
     if group.total is None:
         return None
     notes: list[str] = []
@@ -295,7 +299,7 @@ class Estimator:
         )
 
     def of_group(
-        self, group: Group, posterior: Posterior, recordings: Sequence[Factor]
+        self, group: EstimateGroup, posterior: Posterior, recordings: Sequence[Factor]
     ) -> Estimate:
         """Return the estimate from a sum over archives, with the posterior of that sum.
 
@@ -348,7 +352,7 @@ class Estimator:
     def sum(
         self,
         level: Level,
-        group: Group,
+        group: EstimateGroup,
         posterior: Posterior,
         warnings: Sequence[str],
         recordings: Sequence[Factor] = (),

@@ -24,7 +24,7 @@ from hil.pipeline.sources import Source, all_fitted
 from identification.selection.settings import Settings
 
 from .cache import CacheLocation, code_digest
-from .cluster import AnyFuture, Cluster, Death, SkippedArchive, Task, error_of, reason_of
+from .cluster import AnyFuture, Cluster, ClusterTask, Death, SkippedArchive, error_of, reason_of
 from .discovery import (
     ArchiveRef,
     CellTexts,
@@ -37,8 +37,8 @@ from .discovery import (
     open_ref,
 )
 from .estimates import (
-    Arm,
     ArmModel,
+    BatchArm,
     BatchEstimate,
     BatchEstimator,
     CampaignResult,
@@ -141,7 +141,7 @@ class BatchResult:
     """Result of a batch."""
 
     estimator: str
-    arms: Mapping[str, Arm]  #: by digest
+    arms: Mapping[str, BatchArm]  #: by digest
     repetitions: tuple[BatchEstimate, ...]  #: of all campaigns, in the order of `ArchiveRef.order`
     campaigns: tuple[BatchEstimate, ...]  #: in the same order
     pooled: tuple[BatchEstimate, ...]  #: one per arm
@@ -276,13 +276,13 @@ class _Batch:
             campaign.settings = cached_settings(refs, self.options, arm_settings, self.cache)
             if campaign.settings is None:
                 asked.append((campaign, (refs, self.options, arm_settings, self.cache)))
-        tasks = [Task(c.key.campaign, decide_settings, arguments) for c, arguments in asked]
+        tasks = [ClusterTask(c.key.campaign, decide_settings, arguments) for c, arguments in asked]
         again = []
         archives = sum(len(refs) for _, (refs, *_) in asked)
         results = self._results(tasks, "deciding settings", archives)
         for (campaign, (refs, *_)), decision in zip(asked, results, strict=True):
             if isinstance(decision, SkippedArchive):  # perhaps an archive ends its process
-                alone = [Task(ref.location, open_only, (ref,)) for ref in refs]
+                alone = [ClusterTask(ref.location, open_only, (ref,)) for ref in refs]
                 opened = self._results(alone, "opening archives one by one", len(alone))
                 broken = [other for other in opened if other is not None]
                 reason = decision.reason
@@ -299,7 +299,7 @@ class _Batch:
                 self.broken.append(SkippedArchive(campaign.key.campaign, reason))
         return again
 
-    def _results(self, tasks: Sequence[Task[Any]], title: str, archives: int) -> list[Any]:
+    def _results(self, tasks: Sequence[ClusterTask[Any]], title: str, archives: int) -> list[Any]:
         if not tasks:
             return []
         with self.reporter.task(title, len(tasks)) as progress:
@@ -386,7 +386,7 @@ class _Batch:
         """Submit the graph of an arm; yield the futures to wait for, with their receivers."""
 
         def submit(path: str, function: Callable[..., Any], *arguments: Any) -> AnyFuture:
-            return self.cluster.submit(Task(path, function, arguments), archives=archives)
+            return self.cluster.submit(ClusterTask(path, function, arguments), archives=archives)
 
         arm.results.clear()
         campaigns: list[AnyFuture] = []
@@ -448,7 +448,7 @@ class _Batch:
     def _remove_deadly(self, campaign: _Campaign) -> None:
         """Remove the archives of a campaign that end the process that reduces them."""
         tasks = [
-            Task(one.ref.location, ensure_reduced, (one, campaign.ready, self.cache))
+            ClusterTask(one.ref.location, ensure_reduced, (one, campaign.ready, self.cache))
             for wanted in campaign.partitions
             for one in wanted
         ]
@@ -487,9 +487,11 @@ def _by_arm(campaigns: Sequence[_Campaign]) -> list[tuple[str, list[_Campaign]]]
     return [(digest, list(members)) for digest, members in groups]
 
 
-def _arm_of(model: ArmModel) -> Arm:
+def _arm_of(model: ArmModel) -> BatchArm:
     """Return an arm with its cell."""
-    return Arm(model.digest, cell_from(model.cell, model.urdf, *model.settings.friction.items()))
+    return BatchArm(
+        model.digest, cell_from(model.cell, model.urdf, *model.settings.friction.items())
+    )
 
 
 def _advance(

@@ -33,7 +33,7 @@ from .dry_run import OVERRIDE, SIMULATED, yes_or_no
 from .errors import RepetitionsRejectedError
 from .folder import CampaignFolder
 from .operator import ExpectedMotion, RunWatch
-from .quality import ArchiveReview, Problem
+from .quality import ArchiveReview, QualityProblem
 from .state import CampaignState
 
 
@@ -136,7 +136,7 @@ class Warmth(Protocol):
     def rewarm(self, runner: Runner) -> None:
         """Warm up again if the joints have cooled down."""
 
-    def cold_start(self, began: float) -> Problem | None:
+    def cold_start(self, began: float) -> QualityProblem | None:
         """Return the problem of a repetition that began cold [s since 1970]."""
 
     def motion_ended(self) -> None:

@@ -65,7 +65,7 @@ class Reached:
 
 
 @dataclass(frozen=True)
-class Look:
+class PrecisionLook:
     """Precision after some repetitions."""
 
     repetitions: int
@@ -96,7 +96,7 @@ class PrecisionRecord:
 
     plan_hash: str
     requirements: tuple[str, ...]
-    looks: tuple[Look, ...] = ()
+    looks: tuple[PrecisionLook, ...] = ()
     outcome: Literal["going on", "met", "out of reach", "limit"] = "going on"
     unit: Literal["repetition", "pair"] = "repetition"
 
@@ -110,7 +110,7 @@ class PrecisionRecord:
         """Write the file (OutputError if the disk refuses)."""
         save_record(path, self, _VERSION)
 
-    def with_look(self, look: Look, limit: int) -> PrecisionRecord:
+    def with_look(self, look: PrecisionLook, limit: int) -> PrecisionRecord:
         """Return the record after another repetition, of at most `limit`."""
         before = tuple(each for each in self.looks if each.repetitions < look.repetitions)
         reached = tuple(
@@ -171,7 +171,7 @@ class PrecisionRecord:
         return text
 
 
-def _is_overdue(before: Sequence[Look], look: Look, index: int) -> bool:
+def _is_overdue(before: Sequence[PrecisionLook], look: PrecisionLook, index: int) -> bool:
     """Return whether a requirement is unmet `OVERDUE` times as long as was predicted."""
     if look.reached[index].ratio <= 1.0:
         return False

@@ -57,7 +57,7 @@ Motion = PiecewiseCubic | FourierSeries
 
 
 @dataclass(frozen=True)
-class Problem:
+class QualityProblem:
     """Why a motion is rejected.
 
     Attributes:
@@ -110,13 +110,13 @@ class Executed:
         )
 
 
-def problem_of(executed: Executed, trajectory: Motion, cell: Cell) -> Problem | None:
+def problem_of(executed: Executed, trajectory: Motion, cell: Cell) -> QualityProblem | None:
     """Return the problem of a single motion, None for none."""
     if (problem := incomplete_or_slowed(executed, trajectory, cell)) is not None:
         return problem
     wanted = int(np.ceil(trajectory.duration / cell.period - 1e-6))
     if executed.missed > MISSED_SHARE * wanted:
-        return Problem(
+        return QualityProblem(
             f"{executed.missed} of {wanted} packets were missed; {percentage(MISSED_SHARE)} are "
             "allowed"
         )
@@ -125,7 +125,7 @@ def problem_of(executed: Executed, trajectory: Motion, cell: Cell) -> Problem | 
         standstill = stuck(executed.position[:, joint], executed.commanded[:, joint])
         if standstill is not None:
             start, travel = standstill
-            return Problem(
+            return QualityProblem(
                 f"{name} is stuck: its position stays the same from {start * cell.period:.2f} s "
                 f"after the start on while it is commanded to move by {travel:.3g} rad"
             )
@@ -134,29 +134,31 @@ def problem_of(executed: Executed, trajectory: Motion, cell: Cell) -> Problem | 
         longest = int((edges[1::2] - edges[::2]).max(initial=0))
         if longest >= SATURATED_CYCLES:
             lasted = f"{longest * cell.period * 1e3:.0f} ms"
-            return Problem(f"the current of {name} was at its limit for {lasted}")
+            return QualityProblem(f"the current of {name} was at its limit for {lasted}")
     return None
 
 
-def incomplete_or_slowed(executed: Executed, trajectory: Motion, cell: Cell) -> Problem | None:
+def incomplete_or_slowed(
+    executed: Executed, trajectory: Motion, cell: Cell
+) -> QualityProblem | None:
     """Return the problem of a motion that is incomplete, or was held or slowed; None for none."""
     wanted = int(np.ceil(trajectory.duration / cell.period - 1e-6))
     rows = len(executed.commanded)
     if rows < wanted - 1:
-        return Problem(f"{rows} of its {wanted} cycles are archived")
+        return QualityProblem(f"{rows} of its {wanted} cycles are archived")
     times = np.minimum(np.arange(rows) * cell.period, trajectory.duration)
     off = executed.commanded - trajectory.sample(times)[0]
     off = np.abs(off - off[0]).max(axis=1)
     if off.max() <= OFF_PATH:
         return None
     at = int(np.argmax(off > OFF_PATH)) * cell.period
-    return Problem(
+    return QualityProblem(
         f"it was held or slowed about {at:.1f} s after its start, so it is no repetition; leave "
         "the override at 100 %"
     )
 
 
-def moving_arm(executed: Executed, _trajectory: Motion, cell: Cell) -> Problem | None:
+def moving_arm(executed: Executed, _trajectory: Motion, cell: Cell) -> QualityProblem | None:
     """Return the problem of a recording of the arm at rest, in which it moved; None for none."""
     rows = min(round(STANDSTILL_WINDOW / cell.period), len(executed.position) - 1)
     moved = np.abs(executed.position[rows:] - executed.position[:-rows]).max(axis=0)
@@ -165,7 +167,7 @@ def moving_arm(executed: Executed, _trajectory: Motion, cell: Cell) -> Problem |
     joint = int(np.argmax(speed / allowed))
     if speed[joint] <= allowed[joint]:
         return None
-    return Problem(
+    return QualityProblem(
         f"{cell.joint_names[joint]} moved at {speed[joint]:.2g} rad/s while the arm was to stand "
         f"still; at most {allowed[joint]:.2g} rad/s are allowed"
     )
@@ -200,7 +202,7 @@ class RepetitionCheck:
             self._differences.append(self._difference(executed))
         self._earlier.append(executed)
 
-    def problem(self, executed: Executed) -> Problem | None:
+    def problem(self, executed: Executed) -> QualityProblem | None:
         """Return the problem of a repetition, None for none."""
         problem = problem_of(executed, self._trajectory, self._cell)
         if problem is not None or not self._earlier:
@@ -216,7 +218,7 @@ class RepetitionCheck:
                 bound = np.maximum(usual, least)
             joint = int(np.argmax(new[row] / bound))
             if new[row, joint] > bound[joint]:
-                return Problem(
+                return QualityProblem(
                     f"the {what} of {self._cell.joint_names[joint]} differs from that of the "
                     f"{len(self._earlier)} repetitions before by {percentage(new[row, joint], 2)} "
                     f"of {scale} (rms); {percentage(bound[joint], 2)} are allowed",
@@ -279,8 +281,8 @@ class ArchiveReview:
         self.notes: list[str] = []
 
     def enter(
-        self, motion: CampaignMotion, name: str, stated_problem: Problem | None = None
-    ) -> Problem | None:
+        self, motion: CampaignMotion, name: str, stated_problem: QualityProblem | None = None
+    ) -> QualityProblem | None:
         """Judge the complete archive of a motion and enter it; return its problem or None."""
         problem = stated_problem
         executed = None
@@ -320,9 +322,9 @@ class ArchiveReview:
             if archive.complete and completed and made(archive.header):
                 self.adopted.append(name)
                 slip = slip_of(self._folder.archives / name)
-                self.enter(motion, name, Problem(slip) if slip else None)
+                self.enter(motion, name, QualityProblem(slip) if slip else None)
 
-    def _judged(self, executed: Executed) -> Problem | None:
+    def _judged(self, executed: Executed) -> QualityProblem | None:
         """Return the problem of a repetition, None for none.
 
         Where enough later attempts agree with each other and not with the only accepted one, that

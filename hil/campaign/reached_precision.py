@@ -46,14 +46,14 @@ from identification.factor.factor import Factor
 from identification.reduction.reduction import ALIKE, Reduction
 from identification.signals.samples import Samples
 
-from .precision_record import IN_A_ROW, Look, PrecisionRecord, Reached
+from .precision_record import IN_A_ROW, PrecisionLook, PrecisionRecord, Reached
 from .state import CampaignState
 
 _REFERENCE_PERIOD: Final = 0.04  # s
 
 
 @dataclass(frozen=True, eq=False)
-class Measured:
+class MeasuredMotion:
     """Required quantities (k,) by some repetitions, with halves of their 95 % intervals."""
 
     wanted: Wanted
@@ -94,7 +94,7 @@ class PrecisionMeter:
         self._first: Path | None = None  # repetition that the settings were chosen from
         self.earlier = len(self._given)  #: number of earlier recordings
 
-    def measure(self, paths: Sequence[Path]) -> Look:
+    def measure(self, paths: Sequence[Path]) -> PrecisionLook:
         """Return the precision that some repetitions give together; archives are read once."""
         measured = self.estimate(paths)
         ratios = measured.half / measured.wanted.quantities.allowed
@@ -110,9 +110,9 @@ class PrecisionMeter:
             most = max(counts) if len(counts) == len(more) else None
             half = float(ratios[worst]) * requirement.value
             reached.append(Reached(str(requirement), measured.wanted.labels[worst], half, most))
-        return Look(len(paths), tuple(reached))
+        return PrecisionLook(len(paths), tuple(reached))
 
-    def estimate(self, paths: Sequence[Path]) -> Measured:
+    def estimate(self, paths: Sequence[Path]) -> MeasuredMotion:
         """Return what some repetitions together say of the required quantities."""
         if self._first != paths[0]:
             self._choose(paths[0])
@@ -153,7 +153,7 @@ class PrecisionMeter:
         longest = max(factor.block for factor in of_repetitions)
         of_repetitions = [factor.of_blocks(longest) for factor in of_repetitions]
         earlier = [recording.reduction.factor for recording in self._earlier]
-        return Measured(
+        return MeasuredMotion(
             wanted=wanted,
             values=directions @ values,
             half=stated.interval_factor * np.sqrt(variance),

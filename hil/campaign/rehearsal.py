@@ -30,7 +30,7 @@ CRITERIA: Final = (
 """All criteria of a rehearsal."""
 
 
-class Criterion(Frozen):
+class RehearsalCriterion(Frozen):
     """One criterion of a rehearsal."""
 
     name: str
@@ -51,7 +51,7 @@ class Rehearsal(Frozen):
     seed: int
     """Of the simulated parameters, the noise and the link faults."""
     passed: StrictBool
-    criteria: list[Criterion]
+    criteria: list[RehearsalCriterion]
     assumed: list[str]
     """Assumed properties of the simulated arm, in sentences."""
     not_seen: list[str]

@@ -25,7 +25,7 @@ from identification.validation.prediction import pooled_error, prediction_error
 
 from .folder import CampaignFolder
 from .oscillation import growing_oscillation
-from .rehearsal import EFFECTS, Criterion
+from .rehearsal import EFFECTS, RehearsalCriterion
 from .twin import Twin
 
 MOST_SIGMA: Final = 4.0
@@ -39,15 +39,17 @@ SATURATED: Final = 0.99  # Share of the current limit from which a motor is satu
 
 def criterion(
     name: str, value: float | None, bound: float, text: str, remedy: str = ""
-) -> Criterion:
+) -> RehearsalCriterion:
     """Return a criterion that is met by a finite value up to `bound`; else with a remedy."""
     finite = None if value is None or not np.isfinite(value) else value
     passed = finite is not None and finite <= bound
     sentence = text if passed or not remedy else f"{text}: {remedy}"
-    return Criterion(name=name, value=finite, bound=bound, passed=passed, sentence=sentence)
+    return RehearsalCriterion(
+        name=name, value=finite, bound=bound, passed=passed, sentence=sentence
+    )
 
 
-def of_currents(cell: Cell, folder: CampaignFolder, name: str, bound: float) -> Criterion:
+def of_currents(cell: Cell, folder: CampaignFolder, name: str, bound: float) -> RehearsalCriterion:
     """Judge the largest current of any motor, as a share of its limit.
 
     The two cycles after a lost packet, in which the controller comes back from its extrapolation to
@@ -90,7 +92,7 @@ _CORRECT = (
 )
 
 
-def of_motions(cell: Cell, folder: CampaignFolder, name: str, failure: str) -> Criterion:
+def of_motions(cell: Cell, folder: CampaignFolder, name: str, failure: str) -> RehearsalCriterion:
     """Judge whether all motions were completed (`failure` is ""), within the speed limits."""
     entries = folder.manifest()
     if failure:
@@ -172,7 +174,7 @@ def _motion_remedy(cell: Cell, name: str, path: Path, joint: int | None, remedy:
     return f"{remedy}; see `{shlex.join(command)}`"
 
 
-def of_estimate(twin: Twin, folder: CampaignFolder, reporter: Reporter) -> list[Criterion]:
+def of_estimate(twin: Twin, folder: CampaignFolder, reporter: Reporter) -> list[RehearsalCriterion]:
     """Judge an identification from the archives: determined, correct, predictive."""
     bounds = {"excitation": 0.0, "parameters": MOST_SIGMA, "unseen motion": MOST_ERROR}
     kinds = ("excitation", "validation", "standstill")

@@ -23,7 +23,7 @@ from sim_fixtures import SimulationError
 from .errors import RepetitionsRejectedError
 from .motion_runner import RunOptions
 from .operator import RunWatch
-from .rehearsal import AS_MODELLED, CRITERIA, EFFECTS, Criterion, Rehearsal
+from .rehearsal import AS_MODELLED, CRITERIA, EFFECTS, Rehearsal, RehearsalCriterion
 from .run import run_motions
 from .state import CampaignState
 
@@ -70,7 +70,7 @@ def _rehearsed(
     twin = Twin.of(campaign.cell, seed=seed, repetitions=REPETITIONS)
     for sentence in twin.assumed:
         reporter.say(f"assumed: {sentence}")
-    criteria: list[Criterion] = []
+    criteria: list[RehearsalCriterion] = []
     seconds = 0.0
     for name, where, effects in ((AS_MODELLED, "plain", False), (EFFECTS, "effects", True)):
         # One repetition shows the effects that the model leaves out.

@@ -13,7 +13,7 @@ from hil.control.motions import CampaignMotion
 from .dry_run import OVERRIDE, DryRunRecord, DryRunState, is_from, not_accepted
 from .motion_runner import RunArchives, Runner, RunOptions
 from .operator import ExpectedMotion, RunWatch
-from .quality import Problem
+from .quality import QualityProblem
 from .state import CampaignState
 from .warmup import FrictionMeter, WarmUpRecord, drift_wanted
 
@@ -195,12 +195,12 @@ class WarmUpStage:
         if self._cold(time.time()) is not None:
             self.run(runner)
 
-    def cold_start(self, began: float) -> Problem | None:
+    def cold_start(self, began: float) -> QualityProblem | None:
         """Return the problem of a repetition that began cold [s since 1970], as after a hold."""
         record = self._cold(began)
         if record is None:
             return None
-        return Problem(f"{record.rested(began)} when it began and was assumed to be cold")
+        return QualityProblem(f"{record.rested(began)} when it began and was assumed to be cold")
 
     def motion_ended(self) -> None:
         """Record that a motion that warms the joints has ended."""

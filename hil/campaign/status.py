@@ -28,7 +28,7 @@ NOT_REQUIRED: Final = "not required (warmup_drift)"
 
 
 @dataclass(frozen=True)
-class Step:
+class CampaignStep:
     """One step of a campaign.
 
     Attributes:
@@ -66,7 +66,7 @@ class CampaignStatus:
 
     root: str
     plan_hash: str
-    steps: tuple[Step, ...]
+    steps: tuple[CampaignStep, ...]
     weighed: tuple[str, ...] = ()
     weighing: tuple[tuple[str, str], ...] = ()
     only_weighs: bool = False
@@ -97,7 +97,7 @@ def status_of(campaign: CampaignState) -> CampaignStatus:
     at = typed(folder.root)
     # With the command that recreates the file of a step, should it be damaged: none does for the
     # cell or the plan of recordings, nor for an acceptance.
-    evaluations: list[tuple[str, Callable[[], Step], str]] = [
+    evaluations: list[tuple[str, Callable[[], CampaignStep], str]] = [
         ("design", lambda: _design(campaign), ""),
         ("rehearse", lambda: _gate(campaign, _rehearsal(folder), folder.rehearsal), again),
         ("dry run", lambda: _gate(campaign, _dry_run(campaign), folder.dry_run), ""),
@@ -107,7 +107,7 @@ def status_of(campaign: CampaignState) -> CampaignStatus:
         ("identify", lambda: _identified(folder), "identify {}"),
         ("report", lambda: _reported(folder), "report {}"),
     ]
-    steps: list[Step] = []
+    steps: list[CampaignStep] = []
     first = ""
     for name, evaluate, repair in evaluations:
         step = replace(_step(evaluate, repair), name=name)
@@ -144,30 +144,32 @@ def _weighings(
     return tuple(weighed), tuple(weighing)
 
 
-def _step(evaluate: Callable[[], Step], repair: str = "") -> Step:
+def _step(evaluate: Callable[[], CampaignStep], repair: str = "") -> CampaignStep:
     try:
         return evaluate()
     except HilError as error:  # a damaged file of one step does not affect the others
-        return Step("next", str(error).rstrip("."), repair)
+        return CampaignStep("next", str(error).rstrip("."), repair)
 
 
-def _design(campaign: CampaignState) -> Step:
+def _design(campaign: CampaignState) -> CampaignStep:
     excitation = campaign.plan.excitation
     folder = campaign.folder
     if folder.manifest():  # before the first recording a rehearsal accepts changes
         folder.require_unchanged()
     motions = plural(len(campaign.plan.validation), "validation motion")
-    return Step("done", f"an excitation of {excitation.trajectory.duration:.1f} s and {motions}")
+    return CampaignStep(
+        "done", f"an excitation of {excitation.trajectory.duration:.1f} s and {motions}"
+    )
 
 
-def _rehearsal(folder: CampaignFolder) -> Step:
+def _rehearsal(folder: CampaignFolder) -> CampaignStep:
     rehearsal = Rehearsal.load(folder)
     if rehearsal is None:
-        return Step("next", "not rehearsed on the simulated arm", "rehearse {}")
+        return CampaignStep("next", "not rehearsed on the simulated arm", "rehearse {}")
     if rehearsal.plan_hash != folder.plan_hash:
         message = "rehearsed with another cell, URDF or plan than it has now"
-        return Step("next", message, "rehearse {}")
-    return Step(
+        return CampaignStep("next", message, "rehearse {}")
+    return CampaignStep(
         "done" if rehearsal.passed else "next",
         rehearsal.line,
         "rehearse {}",
@@ -178,7 +180,7 @@ def _rehearsal(folder: CampaignFolder) -> Step:
     )
 
 
-def _dry_run(campaign: CampaignState) -> Step:
+def _dry_run(campaign: CampaignState) -> CampaignStep:
     folder = campaign.folder
     record = DryRunRecord.load_valid(
         folder,
@@ -188,21 +190,23 @@ def _dry_run(campaign: CampaignState) -> Step:
     )
     if record is None and folder.dry_run.exists():
         problem = "of another plan or kind of arm, or its archives are missing"
-        return Step("next", f"the recorded one is not valid: {problem}", "run {} --dry-run")
+        return CampaignStep("next", f"the recorded one is not valid: {problem}", "run {} --dry-run")
     return _accepted(record)
 
 
-def _accepted(record: DryRunRecord | None) -> Step:
+def _accepted(record: DryRunRecord | None) -> CampaignStep:
     if record is None:
-        return Step("next", "not done: every motion at 20 % of its speed", "run {} --dry-run")
+        return CampaignStep(
+            "next", "not done: every motion at 20 % of its speed", "run {} --dry-run"
+        )
     if record.accepted is None:
         names = "".join(f" --accept-torque {joint}" for joint in record.against_gravity)
         but = "".join(f"; {warning}" for warning in record.warnings)
         message = f"done ({record.duration:.0f} s), but not accepted{but}"
-        return Step("next", message, f"run {{}} --accept-dry-run{names}")
+        return CampaignStep("next", message, f"run {{}} --accept-dry-run{names}")
     shares = zip(record.joint_names, record.current_share, strict=True)
     currents = ", ".join(f"{joint} {percentage(share)}" for joint, share in shares)
-    return Step(
+    return CampaignStep(
         "done",
         f"accepted by {record.accepted.by} at {record.accepted.at}",
         details=(
@@ -215,72 +219,72 @@ def _accepted(record: DryRunRecord | None) -> Step:
     )
 
 
-def _gate(campaign: CampaignState, step: Step, record: Path) -> Step:
+def _gate(campaign: CampaignState, step: CampaignStep, record: Path) -> CampaignStep:
     """Return a step, done if a simulated arm has left it out and run everything at full speed."""
     if step.done or record.exists() or not campaign.cell.only_simulated:
         return step
     if all(_motions(campaign, kind, kind).done for kind in ("excitation", "validation")):
-        return Step("done", "left out, as a simulated arm allows")
+        return CampaignStep("done", "left out, as a simulated arm allows")
     return step
 
 
-def _warmed(campaign: CampaignState) -> Step:
+def _warmed(campaign: CampaignState) -> CampaignStep:
     if not drift_wanted(campaign.cell):
-        return Step("done", NOT_REQUIRED)
+        return CampaignStep("done", NOT_REQUIRED)
     warm = WarmUpRecord.load(campaign.folder.warmup, campaign.folder.plan_hash)
     if warm is None and _motions(campaign, "excitation", "repetitions").done:
-        return Step("done", "left out")
+        return CampaignStep("done", "left out")
     over = warm is not None and warm.outcome != "going on"
     return replace(_warm_up(warm), state="done" if over else "next")
 
 
-def _warm_up(record: WarmUpRecord | None) -> Step:
+def _warm_up(record: WarmUpRecord | None) -> CampaignStep:
     """Return the step for the report: done if the arm was warm."""
     if record is None:
-        return Step("next", "not done", "run {}")
+        return CampaignStep("next", "not done", "run {}")
     message = f"{record.outcome} after {plural(len(record.motions), 'motion')}"
     cold = record.outcome == "not warm" and bool(record.motions)
     state: State = "done" if record.outcome == "warm" else "next"
     details = (record.sentence,) if cold else ()
-    return Step(state, message, "run {}", details, warning=record.outcome == "not warm")
+    return CampaignStep(state, message, "run {}", details, warning=record.outcome == "not warm")
 
 
-def _conducted_warm_up(folder: CampaignFolder) -> Step:
+def _conducted_warm_up(folder: CampaignFolder) -> CampaignStep:
     """Return the step for the report: done if the arm was warm, or no warm-up was wanted."""
     warm = WarmUpRecord.load(folder.warmup, folder.plan_hash)
     if warm is None and not drift_wanted(Cell.load(folder.cell)):
-        return Step("done", NOT_REQUIRED)
+        return CampaignStep("done", NOT_REQUIRED)
     return _warm_up(warm)
 
 
-def _motions(campaign: CampaignState, kind: str, plural_kind: str) -> Step:
+def _motions(campaign: CampaignState, kind: str, plural_kind: str) -> CampaignStep:
     whole, total = campaign.progress(kind)
     state: State = "done" if whole >= total else "next"
     precision = campaign.precision if kind == "excitation" else None
     details = () if precision is None else (precision.message,)
-    return Step(state, f"{whole} of {total} {plural_kind} complete", "run {}", details)
+    return CampaignStep(state, f"{whole} of {total} {plural_kind} complete", "run {}", details)
 
 
-def _identified(folder: CampaignFolder) -> Step:
+def _identified(folder: CampaignFolder) -> CampaignStep:
     if not path_exists(folder.results):
-        return Step("next", "not identified yet", "identify {}")
+        return CampaignStep("next", "not identified yet", "identify {}")
     results = Results.load(folder.results)
     used = {*results.repetitions, *(prediction.archive for prediction in results.validation)}
     kinds = ("excitation", "validation")
     new = [path.name for kind in kinds for path in folder.completed(kind) if path.name not in used]
     if new:
         message = f"identified without {len(new)} of the archives ({new[0]})"
-        return Step("next", message, "identify {}")
-    return Step("done", results.verdict.line)
+        return CampaignStep("next", message, "identify {}")
+    return CampaignStep("done", results.verdict.line)
 
 
-def _reported(folder: CampaignFolder) -> Step:
+def _reported(folder: CampaignFolder) -> CampaignStep:
     if not folder.report.exists():
-        return Step("next", "no report yet", "report {}")
+        return CampaignStep("next", "no report yet", "report {}")
     written = folder.report.stat().st_mtime
     if folder.results.exists() and folder.results.stat().st_mtime > written + 1.0:
-        return Step("next", "older than the results", "report {}")
-    return Step("done", str(folder.report))
+        return CampaignStep("next", "older than the results", "report {}")
+    return CampaignStep("done", str(folder.report))
 
 
 def conduct_of(folder: CampaignFolder) -> ConductResult:
@@ -352,7 +356,7 @@ def _end_of_killed(path: Path) -> str:
     return f"the program ended before it checked the motion ({outcome.outcome}: {outcome.reason})"
 
 
-def _recorded(folder: CampaignFolder, kind: str) -> Step:
+def _recorded(folder: CampaignFolder, kind: str) -> CampaignStep:
     """Return how many motions of a kind are complete, with the reasons of the others."""
     entries = [entry for entry in folder.manifest() if entry.kind == kind]
     bad = [f"{e.name} {e.outcome}: {e.reason}" for e in entries if e.outcome != "completed"]
@@ -364,4 +368,6 @@ def _recorded(folder: CampaignFolder, kind: str) -> Step:
         if parsed is not None and parsed.kind == kind:
             bad.append(f"{name} killed: {_end_of_killed(folder.archives / name)}")
     rejected = f"; {len(bad)} rejected or ended early" if bad else ""
-    return Step("done" if good else "next", f"{good} complete{rejected}", details=(*sorted(bad),))
+    return CampaignStep(
+        "done" if good else "next", f"{good} complete{rejected}", details=(*sorted(bad),)
+    )

@@ -59,7 +59,7 @@ def compare(
         raise typer.Exit(CHANGED)
 
 
-def _lines(comparison: comparing.Comparison) -> list[str]:
+def _lines(comparison: comparing.ArmComparison) -> list[str]:
     """Return the changes, the most significant first, and what limits the comparison."""
     changes = [
         f"{change.parameter} in {change.campaign}:"

@@ -13,7 +13,7 @@ from hil.base.errors import InputError
 from hil.cli.arguments import ESTIMATION
 from hil.pipeline.estimators import ESTIMATORS, Estimator
 from hil.pipeline.options import Options, friction_from
-from identification.rollout.servo import Servo
+from identification.rollout.servo import PositionServo
 
 LONGEST_DELAY: Final = 0.5
 """Largest delay accepted, s."""
@@ -113,7 +113,7 @@ def delay_from(text: str | None) -> float | Literal["auto", "stated"] | None:
     return value
 
 
-def servo_from(text: str | None) -> Servo | str | None:
+def servo_from(text: str | None) -> PositionServo | str | None:
     """Parse the value of `--servo`; InputError if it is neither gains and delay nor a word."""
     if text is None or text == "identified":
         return text
@@ -124,7 +124,7 @@ def servo_from(text: str | None) -> Servo | str | None:
     if not 0.0 <= figures[2] <= LONGEST_DELAY:
         remedy = f"give a delay of 0 to {LONGEST_DELAY:g} s"
         raise InputError(None, f"{text!r} is not a servo", field="--servo", remedy=remedy)
-    return Servo(np.array(figures[0]), np.array(figures[1]), figures[2])
+    return PositionServo(np.array(figures[0]), np.array(figures[1]), figures[2])
 
 
 def _bandwidth(text: str, option: str) -> float | Literal["auto"]:

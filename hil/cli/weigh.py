@@ -22,8 +22,8 @@ from hil.precision.requirements import Requirement
 from hil.weighing.payload_campaign import (
     CENTRE,
     Execute,
-    Mounting,
     PayloadCampaign,
+    PayloadMounting,
     assumed_payload,
 )
 from identification.model.payload import Payload
@@ -136,7 +136,7 @@ def weigh(
         with stop_on_interrupt() as stop:
             return confirmed(Console(), f"{demand} {_ANSWER}", "yes", stop)
 
-    mounting = Mounting(
+    mounting = PayloadMounting(
         weighed,
         reporter,
         ask=ask if asks else None,

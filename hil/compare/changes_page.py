@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 from hil.base.version import software
-from hil.compare.comparison import FALSE_ALARMS, LEAST, MIN_REPETITIONS, Comparison
+from hil.compare.comparison import FALSE_ALARMS, LEAST, MIN_REPETITIONS, ArmComparison
 from hil.report.rendering import environment, page_bytes
 
 
-def comparison_page(comparison: Comparison) -> bytes:
+def comparison_page(comparison: ArmComparison) -> bytes:
     """Return the comparison as one HTML file; the same input gives the same bytes."""
     rules = {"alarms": FALSE_ALARMS, "least": LEAST, "repetitions": MIN_REPETITIONS}
     template = environment().get_template("changes.html.j2")

@@ -24,7 +24,7 @@ from hil.base.progress import Reporter
 from hil.batch import graph as run
 from hil.batch.cluster import Cluster
 from hil.batch.discovery import ArchiveRef, Discovery, cell_in, open_ref
-from hil.batch.estimates import Arm, BatchEstimate
+from hil.batch.estimates import BatchArm, BatchEstimate
 from hil.pipeline.options import Options
 from hil.pipeline.sources import arm_differences
 from identification import RobotModel
@@ -53,7 +53,7 @@ class Figure(NamedTuple):
     freedom: float
 
 
-class Quantity(NamedTuple):
+class ComparedQuantity(NamedTuple):
     """What is compared: an inertial parameter, or the friction of an axis."""
 
     name: str
@@ -64,7 +64,7 @@ class Quantity(NamedTuple):
 
 
 @dataclass(frozen=True)
-class Change:
+class QuantityChange:
     """A quantity in a campaign against the first one; NaN if unknown."""
 
     parameter: str
@@ -83,7 +83,7 @@ class Change:
 
 
 @dataclass(frozen=True, eq=False)
-class Comparison:
+class ArmComparison:
     """Changes of the campaigns of one arm from the first."""
 
     arm: str  #: name
@@ -92,11 +92,11 @@ class Comparison:
     verdict: str  #: one line
     campaigns: tuple[BatchEstimate, ...]
     names: tuple[str, ...]  #: of the campaigns, with their days if known
-    changes: tuple[Change, ...]  #: of all quantities, by campaign
+    changes: tuple[QuantityChange, ...]  #: of all quantities, by campaign
     warnings: tuple[str, ...]
 
     @property
-    def changed(self) -> tuple[Change, ...]:
+    def changed(self) -> tuple[QuantityChange, ...]:
         """Significant and relevant changes."""
         return tuple(change for change in self.changes if change.changed)
 
@@ -127,7 +127,7 @@ class Comparison:
         }
 
 
-def compare(places: Sequence[str], cluster: Cluster, reporter: Reporter) -> Comparison:
+def compare(places: Sequence[str], cluster: Cluster, reporter: Reporter) -> ArmComparison:
     """Identify campaigns, given as folders or `results.json`, by unregularised least squares.
 
     They are compared in chronological order if the times of all are known, else as given.
@@ -184,7 +184,7 @@ def _require_campaigns_of_one_arm(discovery: Discovery) -> None:
     first = next(iter(campaigns.values()))
     for campaign in campaigns.values():
         if campaign.arm != first.arm:
-            here, there = (Arm(ref.arm, cell_in(open_ref(ref))) for ref in (campaign, first))
+            here, there = (BatchArm(ref.arm, cell_in(open_ref(ref))) for ref in (campaign, first))
             other = ["simulation or the controller's drive train"]
             differing = arm_differences(here.cell, there.cell) or other
             raise InputError(
@@ -205,8 +205,10 @@ def _require_campaigns_of_one_arm(discovery: Discovery) -> None:
 
 
 def compare_campaigns(
-    arm: Arm, campaigns: Sequence[BatchEstimate], repetitions: Sequence[Sequence[BatchEstimate]]
-) -> Comparison:
+    arm: BatchArm,
+    campaigns: Sequence[BatchEstimate],
+    repetitions: Sequence[Sequence[BatchEstimate]],
+) -> ArmComparison:
     """Compare the parameters of campaigns of one arm, with their repetitions, with the first."""
     names = _names(campaigns)
     compared = quantities(arm.cell.model, campaigns[0])
@@ -216,7 +218,7 @@ def compare_campaigns(
     change, half, p_value = against_first(figures)
     std = np.sqrt(variance)
     changes = tuple(
-        Change(
+        QuantityChange(
             parameter=quantity.name,
             axis=quantity.axis,
             kind=quantity.kind,
@@ -236,7 +238,7 @@ def compare_campaigns(
         for c in range(1, len(campaigns))
         for k, quantity in enumerate(compared)
     )
-    return Comparison(
+    return ArmComparison(
         arm=arm.name,
         simulated=False,
         dated=all(campaign.when for campaign in campaigns),
@@ -248,7 +250,7 @@ def compare_campaigns(
     )
 
 
-def quantities(model: RobotModel, first: BatchEstimate) -> list[Quantity]:
+def quantities(model: RobotModel, first: BatchEstimate) -> list[ComparedQuantity]:
     """Return what is compared: all parameters but friction, and the friction of each axis.
 
     That is the mean of both directions at the speed at which the first campaign determines it best:
@@ -265,7 +267,8 @@ def quantities(model: RobotModel, first: BatchEstimate) -> list[Quantity]:
     names = model.parameter_names
     units = model.units
     compared = [
-        Quantity(names[k], axes.get(names[k], ""), "inertia", units[k], single[k]) for k in rows
+        ComparedQuantity(names[k], axes.get(names[k], ""), "inertia", units[k], single[k])
+        for k in rows
     ]
     table = np.zeros((len(_SPEEDS), model.n_joints, model.n_parameters))
     for k, term in enumerate(terms):
@@ -281,7 +284,7 @@ def quantities(model: RobotModel, first: BatchEstimate) -> list[Quantity]:
             best = int(np.argmax(np.nan_to_num(np.abs(value) / np.sqrt(variance))))
         unit, speed = ("N·m", "rad/s") if turns else ("N", "m/s")
         name = f"friction of {joint} at {_SPEEDS[best]:.2g} {speed}"
-        compared.append(Quantity(name, joint, "friction", unit, table[best, j]))
+        compared.append(ComparedQuantity(name, joint, "friction", unit, table[best, j]))
     return compared
 
 
@@ -296,7 +299,7 @@ def _projected(level: BatchEstimate, weights: Array) -> tuple[Array, Array]:
     return value, np.where(determined, variance, np.nan)
 
 
-def _verdict(changed: Sequence[Change]) -> str:
+def _verdict(changed: Sequence[QuantityChange]) -> str:
     """Return one line: what changed, friction by axis."""
     names = dict.fromkeys(
         f"friction of {change.axis}" if change.kind == "friction" else change.parameter
@@ -355,7 +358,9 @@ def freedom_of(level: BatchEstimate) -> float:
 
 
 def _figures(
-    compared: Sequence[Quantity], campaign: BatchEstimate, repetitions: Sequence[BatchEstimate]
+    compared: Sequence[ComparedQuantity],
+    campaign: BatchEstimate,
+    repetitions: Sequence[BatchEstimate],
 ) -> list[Figure]:
     """Return the figure of each quantity of a campaign."""
     weights = np.array([each.weights for each in compared])

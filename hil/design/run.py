@@ -261,7 +261,7 @@ def run_search(
             done += count
             task.advance(count, note)
 
-        def update(progress: excitation.Progress) -> None:
+        def update(progress: excitation.SearchProgress) -> None:
             """Report a generation, whose scores may be from the journal."""
             nonlocal note
             note = _note(progress)
@@ -297,7 +297,7 @@ def _without_motion(
     return OperatorStopError(f"stopped before a feasible motion was found: {text}")
 
 
-def _note(progress: excitation.Progress) -> str:
+def _note(progress: excitation.SearchProgress) -> str:
     where = {
         "search": f"generation {progress.generation} of {progress.generations}",
         "gradient": "improving by the gradient",

@@ -19,7 +19,7 @@ from drivers.transports.base import CanBus, DirectRoute, FreePort, TransportSpec
 from hil.archive.process import STALL_LIMIT
 
 
-class Status(StrEnum):
+class CheckStatus(StrEnum):
     """Result of a check: works, may cost latency, fails, is not known."""
 
     OK = "ok"
@@ -33,7 +33,7 @@ class DoctorCheck:
     """The result of one check: status, facts, shell commands as remedy."""
 
     name: str
-    status: Status
+    status: CheckStatus
     facts: str
     remedy: tuple[str, ...] = ()
 
@@ -108,12 +108,12 @@ def scheduling(given: RealTimeReport, limit: int) -> DoctorCheck:
     name = "real-time priority"
     limited = "no limit" if limit < 0 else f"rtprio limit {limit}"
     if "FIFO" in given.scheduling.upper():
-        return DoctorCheck(name, Status.OK, f"{given.scheduling} given ({limited})")
+        return DoctorCheck(name, CheckStatus.OK, f"{given.scheduling} given ({limited})")
     message = f"refused, its scheduling is {given.scheduling or 'ordinary'}; {limited}"
     remedy = _limit_lines("rtprio", "98")
     if not 0 <= limit < RealTimeSettings().priority:
         remedy += ("cat /proc/sys/kernel/sched_rt_runtime_us   # 0 forbids real-time programs",)
-    return DoctorCheck(name, Status.BAD, message, remedy)
+    return DoctorCheck(name, CheckStatus.BAD, message, remedy)
 
 
 def memory_lock(given: RealTimeReport, limit: int) -> DoctorCheck:
@@ -122,12 +122,12 @@ def memory_lock(given: RealTimeReport, limit: int) -> DoctorCheck:
     name = "memory lock"
     remedy = _limit_lines("memlock", "unlimited")
     if given.memory_locked:
-        return DoctorCheck(name, Status.OK, f"given ({limited})")
+        return DoctorCheck(name, CheckStatus.OK, f"given ({limited})")
     if given.memory_in_use_locked:
         return DoctorCheck(
-            name, Status.WARN, f"only what is in use at the start; {limited}", remedy
+            name, CheckStatus.WARN, f"only what is in use at the start; {limited}", remedy
         )
-    return DoctorCheck(name, Status.BAD, f"refused; {limited}", remedy)
+    return DoctorCheck(name, CheckStatus.BAD, f"refused; {limited}", remedy)
 
 
 _CPU = "/sys/devices/system/cpu"
@@ -141,17 +141,17 @@ def governor(system: System) -> DoctorCheck:
     )
     if governors in ([], ["performance"]):
         return DoctorCheck(
-            name, Status.OK, "".join(governors) or "no frequency scaling on this machine"
+            name, CheckStatus.OK, "".join(governors) or "no frequency scaling on this machine"
         )
     setting = f"echo performance | sudo tee {_CPU}/cpu*/cpufreq/scaling_governor"
-    return DoctorCheck(name, Status.WARN, ", ".join(governors), (setting,))
+    return DoctorCheck(name, CheckStatus.WARN, ", ".join(governors), (setting,))
 
 
 def idle_states(*, cpu_awake: bool) -> DoctorCheck:
     """Check that an exchange can exclude the idle states, by /dev/cpu_dma_latency."""
     name = "idle states"
     if cpu_awake:
-        return DoctorCheck(name, Status.OK, "not entered during an exchange")
+        return DoctorCheck(name, CheckStatus.OK, "not entered during an exchange")
     rule = f'KERNEL=="cpu_dma_latency", GROUP="{GROUP}", MODE="0660"'
     remedy = (
         _JOIN,
@@ -159,14 +159,14 @@ def idle_states(*, cpu_awake: bool) -> DoctorCheck:
         "sudo udevadm control --reload && sudo udevadm trigger --name-match=cpu_dma_latency",
         "# log out and in again, then: ls -l /dev/cpu_dma_latency; groups",
     )
-    return DoctorCheck(name, Status.WARN, "/dev/cpu_dma_latency may not be written", remedy)
+    return DoctorCheck(name, CheckStatus.WARN, "/dev/cpu_dma_latency may not be written", remedy)
 
 
 def computer_checks(given: RealTimeReport | None, system: System) -> list[DoctorCheck]:
     """Check permissions and processor; `given` is None if the probe failed."""
     if given is None:
         command = ("python -m hil.doctor.probe permissions   # prints the error",)
-        rights = [DoctorCheck("permissions", Status.BAD, "the probe failed", command)]
+        rights = [DoctorCheck("permissions", CheckStatus.BAD, "the probe failed", command)]
     else:
         limits = [
             resource.getrlimit(limit)[0]
@@ -199,9 +199,9 @@ def disk_checks(place: Path, trial: DiskTrial | None) -> list[DoctorCheck]:
     """Check free space and write time; `trial` is None if the disk did not respond."""
     if trial is None:
         message = f"the disk of {place} does not respond"
-        return [DoctorCheck("disk write", Status.BAD, message, (f"df -h {place}", _MOVE))]
+        return [DoctorCheck("disk write", CheckStatus.BAD, message, (f"df -h {place}", _MOVE))]
     hours = trial.free / (BYTES_PER_CYCLE * 3_600_000)
-    status = Status.OK if hours >= 2 else Status.WARN if hours >= 0.5 else Status.BAD
+    status = CheckStatus.OK if hours >= 2 else CheckStatus.WARN if hours >= 0.5 else CheckStatus.BAD
     message = (
         f"{trial.free / 1e9:.1f} GB free at {trial.folder}: {hours:.1f} h of recording at 1 ms"
     )
@@ -210,10 +210,16 @@ def disk_checks(place: Path, trial: DiskTrial | None) -> list[DoctorCheck]:
     if not trial.seconds:
         refused = f"cannot write to {trial.folder}: {trial.error or 'no result'}"
         look = (f"ls -ld {trial.folder}; id", _MOVE)
-        return [space, DoctorCheck("disk write", Status.BAD, refused, look)]
+        return [space, DoctorCheck("disk write", CheckStatus.BAD, refused, look)]
     worst = max(trial.seconds)
     middle = sorted(trial.seconds)[len(trial.seconds) // 2]
-    status = Status.OK if worst < _SLOW else Status.WARN if worst < _TOO_SLOW else Status.BAD
+    status = (
+        CheckStatus.OK
+        if worst < _SLOW
+        else CheckStatus.WARN
+        if worst < _TOO_SLOW
+        else CheckStatus.BAD
+    )
     message = f"64 KiB written in {1e3 * middle:.1f} ms, at most {1e3 * worst:.1f} ms"
     return [space, DoctorCheck("disk write", status, message, () if worst < _SLOW else (_MOVE,))]
 
@@ -227,29 +233,31 @@ def can_check(bus: CanBus, system: System) -> DoctorCheck:
     name = f"CAN {bus.interface} {bus.channel}"
     if bus.interface != "socketcan":
         message = "not a kernel device; it is opened by the exchange only"
-        return DoctorCheck(name, Status.UNKNOWN, message)
+        return DoctorCheck(name, CheckStatus.UNKNOWN, message)
     folder = f"/sys/class/net/{bus.channel}"
     if system.text(f"{folder}/type") != _ARPHRD_CAN:
         look = ("ip -brief link show type can", "sudo modprobe can_raw   # and the card's driver")
-        return DoctorCheck(name, Status.BAD, "is not a CAN interface", look)
+        return DoctorCheck(name, CheckStatus.BAD, "is not a CAN interface", look)
     rates = f"bitrate {bus.bitrate or 1_000_000} dbitrate {bus.data_bitrate or 5_000_000} fd on"
     bring_up = f"sudo ip link set {bus.channel} up txqueuelen 100 type can {rates}"
     if system.text(f"{folder}/operstate") == "down":
-        return DoctorCheck(name, Status.BAD, "down", (bring_up,))
+        return DoctorCheck(name, CheckStatus.BAD, "down", (bring_up,))
     shown = system.ip("-details", "link", "show", bus.channel) or [{}]
     details = shown[0].get("linkinfo", {})
     if details.get("info_kind") == "vcan":
-        return DoctorCheck(name, Status.OK, "virtual bus, no bit rate")
+        return DoctorCheck(name, CheckStatus.OK, "virtual bus, no bit rate")
     timings = details.get("info_data", {})
     nominal, data = (timings.get(of, {}).get("bitrate") for of in ("bittiming", "data_bittiming"))
     if not nominal:
         remedy = (f"ip -details link show {bus.channel}",)
-        return DoctorCheck(name, Status.UNKNOWN, "bit rate not stated", remedy)
+        return DoctorCheck(name, CheckStatus.UNKNOWN, "bit rate not stated", remedy)
     message = f"up, {nominal} bit/s" + (f", data {data} bit/s" if data else "")
     if nominal == (bus.bitrate or nominal) and data and data == (bus.data_bitrate or data):
-        return DoctorCheck(name, Status.OK, message)
+        return DoctorCheck(name, CheckStatus.OK, message)
     down = f"sudo ip link set {bus.channel} down"
-    return DoctorCheck(name, Status.BAD, f"{message}; the cell needs {rates}", (down, bring_up))
+    return DoctorCheck(
+        name, CheckStatus.BAD, f"{message}; the cell needs {rates}", (down, bring_up)
+    )
 
 
 def try_port(wanted: FreePort) -> int:
@@ -269,7 +277,7 @@ def port_check(wanted: FreePort, error: int) -> DoctorCheck:
     port = wanted.port
     name = f"{wanted.protocol} port {port}"
     if error == 0:
-        return DoctorCheck(name, Status.OK, f"can be bound on {bind}")
+        return DoctorCheck(name, CheckStatus.OK, f"can be bound on {bind}")
     message = f"cannot be bound ({errno.errorcode.get(error, f'error {error}')})"
     remedy: tuple[str, ...] = ()
     if error == errno.EADDRINUSE:
@@ -285,7 +293,7 @@ def port_check(wanted: FreePort, error: int) -> DoctorCheck:
             f"echo '{setting}' | sudo tee /etc/sysctl.d/90-hil.conf && sudo sysctl --system",
             "# once; hil then needs no privilege for this port",
         )
-    return DoctorCheck(name, Status.BAD, message, remedy)
+    return DoctorCheck(name, CheckStatus.BAD, message, remedy)
 
 
 def _address_of(host: str, system: System) -> str | None:
@@ -306,37 +314,39 @@ def route_check(host: str, system: System) -> DoctorCheck:
     if address is None:
         message = f"{host!r} is neither an IPv4 address nor in /etc/hosts"
         remedy = (f"# write an address in the cell file: host = 10.2.12.150, not {host}",)
-        return DoctorCheck(name, Status.BAD, message, remedy)
+        return DoctorCheck(name, CheckStatus.BAD, message, remedy)
     routes = system.ip("route", "get", address)
     if routes is None:
         return DoctorCheck(
-            name, Status.UNKNOWN, "ip is not installed", ("sudo apt install iproute2",)
+            name, CheckStatus.UNKNOWN, "ip is not installed", ("sudo apt install iproute2",)
         )
     head, last = address.rsplit(".", 1)
     pc_address = f"{head}.{int(last) - 1 if int(last) > 1 else int(last) + 1}"
     add = f"sudo ip addr add {pc_address}/24 dev CARD   # CARD: the one cabled to the controller"
     if not routes:
-        return DoctorCheck(name, Status.BAD, f"none to {address}", ("ip -brief link", add))
+        return DoctorCheck(name, CheckStatus.BAD, f"none to {address}", ("ip -brief link", add))
     route = routes[0]
     if route.get("type") == "local":
         message = f"{address} is this PC itself (a simulated controller)"
-        return DoctorCheck(name, Status.OK, message)
+        return DoctorCheck(name, CheckStatus.OK, message)
     if "gateway" in route:
         message = f"over gateway {route['gateway']} on {route['dev']}"
-        return DoctorCheck(name, Status.BAD, message, (add,))
+        return DoctorCheck(name, CheckStatus.BAD, message, (add,))
     device = route.get("dev", "")
     if system.text(f"/sys/class/net/{device}/carrier") == "0":
         bring_up = (f"sudo ip link set {device} up", "# check the cable")
-        return DoctorCheck(name, Status.BAD, f"{device} has no carrier", bring_up)
-    return DoctorCheck(name, Status.OK, f"{address} directly on {device}")
+        return DoctorCheck(name, CheckStatus.BAD, f"{device} has no carrier", bring_up)
+    return DoctorCheck(name, CheckStatus.OK, f"{address} directly on {device}")
 
 
 def link_checks(link: TransportSpec | None, system: System) -> list[DoctorCheck]:
     """Check what a link needs of this PC; None without a cell, or with a simulated one."""
     if link is None:
-        return [DoctorCheck("controller link", Status.OK, "none: no cell, or a simulated one")]
+        return [DoctorCheck("controller link", CheckStatus.OK, "none: no cell, or a simulated one")]
     if not link.needs:
-        return [DoctorCheck("controller link", Status.UNKNOWN, f"not checked: {link.description}")]
+        return [
+            DoctorCheck("controller link", CheckStatus.UNKNOWN, f"not checked: {link.description}")
+        ]
     return [_check_of(need, system) for need in link.needs]
 
 

@@ -23,9 +23,9 @@ from hil.base.progress import Reporter
 from hil.base.terminal_text import printable
 
 from .checks import (
+    CheckStatus,
     DiskTrial,
     DoctorCheck,
-    Status,
     System,
     computer_checks,
     disk_checks,
@@ -192,7 +192,7 @@ class Diagnosis:
 
     @property
     def _bad(self) -> list[str]:
-        return [check.name for check in self.checks if check.status is Status.BAD]
+        return [check.name for check in self.checks if check.status is CheckStatus.BAD]
 
     @property
     def provisional(self) -> bool:
@@ -236,7 +236,7 @@ def examine(
     measured = {name: measure(name, each, seconds, reporter) for name, each in periods.items()}
     command = ("python -m hil.doctor.probe permissions   # prints the error",)
     checks += [
-        DoctorCheck(f"{name} latency", Status.BAD, "the probe failed", command)
+        DoctorCheck(f"{name} latency", CheckStatus.BAD, "the probe failed", command)
         for name, latency in measured.items()
         if latency is None
     ]
@@ -245,7 +245,12 @@ def examine(
     return Diagnosis(tuple(checks), latencies, cycles, cycle_ms, seconds)
 
 
-_COLOUR = {Status.OK: "green", Status.WARN: "yellow", Status.BAD: "red", Status.UNKNOWN: "blue"}
+_COLOUR = {
+    CheckStatus.OK: "green",
+    CheckStatus.WARN: "yellow",
+    CheckStatus.BAD: "red",
+    CheckStatus.UNKNOWN: "blue",
+}
 _OTHERWISE = (
     "switch off C-states, frequency stepping and hyper-threading in the firmware set-up (BIOS); "
     "isolate a processor; {}use another PC."
@@ -287,7 +292,7 @@ def show(diagnosis: Diagnosis, console: Console) -> None:
 def summary(diagnosis: Diagnosis) -> list[str]:
     """Return the verdict, the checks that are not passed with their first remedy, and latencies."""
     worst_first = sorted(diagnosis.checks, key=lambda check: _ORDER.index(check.status))
-    failed = [check for check in worst_first if check.status is not Status.OK]
+    failed = [check for check in worst_first if check.status is not CheckStatus.OK]
     lines = [diagnosis.line]
     for check in failed:
         lines.append(f"{check.status}: {check.name}: {check.facts}")
@@ -302,17 +307,17 @@ def summary(diagnosis: Diagnosis) -> list[str]:
         f"{verdict.cycle_ms} ms: {'fit' if verdict.fit else 'not fit'}; {verdict.reason}"
         for verdict in diagnosis.cycles
     ]
-    passed = [check.name for check in diagnosis.checks if check.status is Status.OK]
+    passed = [check.name for check in diagnosis.checks if check.status is CheckStatus.OK]
     return [*lines, *([f"ok: {', '.join(passed)}"] if passed else [])]
 
 
-_ORDER: Final = (Status.BAD, Status.WARN, Status.UNKNOWN, Status.OK)
+_ORDER: Final = (CheckStatus.BAD, CheckStatus.WARN, CheckStatus.UNKNOWN, CheckStatus.OK)
 
 
 def remedies(checks: Sequence[DoctorCheck]) -> Iterator[str]:
     """Yield the commands of each check with a remedy, worst first, each command once."""
     given: set[str] = set()
-    for status in (Status.BAD, Status.WARN, Status.UNKNOWN):
+    for status in (CheckStatus.BAD, CheckStatus.WARN, CheckStatus.UNKNOWN):
         for check in checks:
             if check.status is status and check.remedy:
                 yield f"\n{check.name} ({status}):"

@@ -18,7 +18,7 @@ from hil.base.arrays import Array
 from hil.base.errors import InputError
 from hil.base.files import make_folder, write_files
 from hil.pipeline.identified_model import IdentifiedModel
-from identification.export.arm import Arm
+from identification.export.arm import ExportedArm
 from identification.export.controller.c_source import CSource, Precision, c_source
 from identification.export.controller.reference import reference_torque
 from identification.export.controller.structured_text import structured_text
@@ -166,7 +166,9 @@ def default_code_output(sources: Sequence[Path], to: CodeName) -> Path:
     return folder / f"arm.{to}"
 
 
-def checked(code: CSource, name: str, arm: Arm, precision: Precision) -> CompiledCheck | str:
+def checked(
+    code: CSource, name: str, arm: ExportedArm, precision: Precision
+) -> CompiledCheck | str:
     """Compile code in a temporary folder, and compare its torque with pinocchio's.
 
     Returns:

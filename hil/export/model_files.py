@@ -21,8 +21,8 @@ from identification.export.simulators import (
     FORMATS,
     MISSING,
     STATES,
-    Comparison,
-    Format,
+    ModelFormat,
+    SimulatorComparison,
     compare,
     pinocchio_arm,
     read_back,
@@ -43,7 +43,7 @@ class Exported:
     path: Path
     joint_names: tuple[str, ...]
     units: tuple[str, ...]  # of torque per joint
-    comparison: Comparison | str  # or why there is none
+    comparison: SimulatorComparison | str  # or why there is none
     verdict: str
     origin: str = ""  # of the parameters, where they were not identified for this file
 
@@ -108,7 +108,9 @@ def export_model(
     make_folder(output.parent)
     text = form.write(arm, model.name, remarks_of(model))
     try:
-        comparison: Comparison | str = compare(text, form, arm, _motion(model.prepared.held_out))
+        comparison: SimulatorComparison | str = compare(
+            text, form, arm, _motion(model.prepared.held_out)
+        )
     except MISSING as error:
         comparison = str(error)
     write_files(output.parent, {output.name: text})
@@ -209,7 +211,7 @@ def export_ensemble(
 
 
 def _ensemble_texts(
-    model: IdentifiedModel, ensemble: Ensemble, form: Format, seed: int
+    model: IdentifiedModel, ensemble: Ensemble, form: ModelFormat, seed: int
 ) -> tuple[dict[str, str], float | str]:
     """Return the files of the arms, and their largest difference when read back."""
     texts = dict[str, str]()

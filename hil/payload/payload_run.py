@@ -42,7 +42,7 @@ from identification.validation.facts.faults import MOUNTING_STEP
 from identification.validation.finding import Thresholds
 from identification.validation.gravity import find_gravity
 
-from .payload_settings import NOT_DETERMINED, Load, controller_settings
+from .payload_settings import NOT_DETERMINED, ControllerLoad, controller_settings
 
 _FLANGES: Final = ("tool0", "flange")  # flange frames of controllers, by their ROS-Industrial names
 _LEAST_DISTANCE: Final = 0.5  # m, of a hand tool on an arm that is shorter itself
@@ -207,7 +207,7 @@ class PayloadFound:
             return {}
         with_centre = self.determines(*NAMES[1:4])
         with_inertia = self.determines(*NAMES[4:])
-        return controller_settings(Load(self.body, with_centre, with_inertia))
+        return controller_settings(ControllerLoad(self.body, with_centre, with_inertia))
 
     def lines(
         self,

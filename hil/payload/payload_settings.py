@@ -23,7 +23,7 @@ KGF_CM_S2: Final = 0.0980665
 """1 kgf·cm·s² in kg·m²: 9.80665 N times 0.01 m·s²."""
 
 
-class Load(NamedTuple):
+class ControllerLoad(NamedTuple):
     """A payload, in the flange frame of a controller, and what of it is determined."""
 
     body: Body
@@ -40,7 +40,7 @@ class Load(NamedTuple):
         return [f"{part / unit:.{digits}f}" for part in self.body.centre]
 
 
-def controller_settings(load: Load) -> dict[str, str]:
+def controller_settings(load: ControllerLoad) -> dict[str, str]:
     """Return the lines that set a payload, by controller."""
     return {name: form(load) for name, form in _FORMS.items()}
 
@@ -67,7 +67,7 @@ def principal_axes(inertia: Array) -> tuple[Array, Rotation]:
     return best_moments, Rotation.from_matrix(best_axes)
 
 
-def _comau(load: Load) -> str:
+def _comau(load: ControllerLoad) -> str:
     lines = [f"$TOOL_MASS := {load.mass}"]
     if load.with_centre:
         lines.append(f"$TOOL_CNTR := POS({', '.join(load.centre(1e-3, 2))}, 0, 0, 0, '')")
@@ -79,7 +79,7 @@ def _comau(load: Load) -> str:
     return "\n".join([*lines, *(f"$TOOL_INERTIA[{k}] := {figure}" for k, figure in figures)])
 
 
-def _ur(load: Load) -> str:
+def _ur(load: ControllerLoad) -> str:
     if not load.with_centre:
         return f"# centre of mass {NOT_DETERMINED}"
     centre = ", ".join(load.centre(1.0, 5))
@@ -88,7 +88,7 @@ def _ur(load: Load) -> str:
     return f"set_target_payload({load.mass}, [{centre}], [{', '.join(_six(load))}])"
 
 
-def _franka(load: Load) -> str:
+def _franka(load: ControllerLoad) -> str:
     if not load.with_centre:
         return f"// centre {NOT_DETERMINED}"
     call = f"robot.setLoad({load.mass}, {{{', '.join(load.centre(1.0, 5))}}}, "
@@ -99,7 +99,7 @@ def _franka(load: Load) -> str:
     return f"{call}{{{nine}}});"
 
 
-def _kuka(load: Load) -> str:
+def _kuka(load: ControllerLoad) -> str:
     """Return an entry of `$config.dat`: principal moments, axes by Rz(A) Ry(B) Rx(C)."""
     if not load.with_centre:
         return f"; centre of mass {NOT_DETERMINED}"
@@ -116,7 +116,7 @@ def _kuka(load: Load) -> str:
     return f"LOAD_DATA[1]={{M {load.mass},CM {{{place},{turned}}},J {{{three}}}}}"
 
 
-def _abb(load: Load) -> str:
+def _abb(load: ControllerLoad) -> str:
     """Return loaddata of RAPID: principal moments, and their axes as a quaternion, real first."""
     if not load.with_centre:
         return f"! cog {NOT_DETERMINED}"
@@ -131,7 +131,7 @@ def _abb(load: Load) -> str:
     return f"{frame}\n{begin}[{four}], {', '.join(_figures(moments))}];"
 
 
-def _fanuc(load: Load) -> str:
+def _fanuc(load: ControllerLoad) -> str:
     """Return the lines of the screen MOTION, DETAIL; it takes no products of inertia."""
     lines = [f"PAYLOAD          [kg]        {load.mass}"]
     if not load.with_centre:
@@ -158,13 +158,13 @@ def _figures(moments: Array) -> list[str]:
     return [f"{part:.5f}" for part in moments.tolist()]
 
 
-def _six(load: Load) -> list[str]:
+def _six(load: ControllerLoad) -> list[str]:
     """Return Ixx, Iyy, Izz, Ixy, Ixz, Iyz as text [kg·m²]."""
     tensor = load.body.inertia
     return [f"{part:.5f}" for part in (*np.diag(tensor), tensor[0, 1], tensor[0, 2], tensor[1, 2])]
 
 
-_FORMS: Final[Mapping[str, Callable[[Load], str]]] = {
+_FORMS: Final[Mapping[str, Callable[[ControllerLoad], str]]] = {
     "COMAU": _comau,
     "UR": _ur,
     "Franka": _franka,

@@ -42,7 +42,7 @@ from identification import Estimate, Factor, Samples
 from identification.errors import IdentificationError
 from identification.estimators.consistent import ConsistentEstimate
 from identification.estimators.ensemble import Ensemble, draw_ensemble
-from identification.export.arm import Arm, Ranges
+from identification.export.arm import ExportedArm, Ranges
 from identification.export.friction import median_load
 from identification.export.parameters import estimate_in
 from identification.factor.blocks import FINE_BLOCK, fine_blocks
@@ -64,7 +64,7 @@ class IdentifiedModel:
     """
 
     cell: Cell  #: with the friction law that was chosen
-    arm: Arm  #: physically consistent
+    arm: ExportedArm  #: physically consistent
     estimate: Estimate  #: in units of the torque of this arm, as its simulations need it
     estimator: str  #: of `hil.pipeline.options.Estimator`
     prepared: Prepared
@@ -170,7 +170,7 @@ def model_of(identification: Identification) -> IdentifiedModel:
     )
 
 
-def arm_with(cell: Cell, standard: Array, values: Array, fitted: Sequence[Samples]) -> Arm:
+def arm_with(cell: Cell, standard: Array, values: Array, fitted: Sequence[Samples]) -> ExportedArm:
     """Return an arm of parameters, standard (s,) and all (p,), with the limits of its cell or URDF.
 
     Friction that grows with the load is that of the fitted motion.
@@ -184,7 +184,7 @@ def arm_with(cell: Cell, standard: Array, values: Array, fitted: Sequence[Sample
         )
     limits = described if cell.file.limits is None else cell.joint_limits
     ranges = Ranges(limits.lower, limits.upper, limits.velocity, efforts)
-    return Arm(
+    return ExportedArm(
         cell.urdf, cell.model, standard, values, ranges, median_load(cell.model, values, fitted)
     )
 

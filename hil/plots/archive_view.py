@@ -45,7 +45,7 @@ _MOST_GAPS: Final = 200
 
 
 @dataclass(frozen=True, eq=False)
-class Trace:
+class PlottedTrace:
     """One quantity of one joint."""
 
     time: Array  #: (k,) s since the first sample of the archive; NaN interrupts the line
@@ -61,11 +61,11 @@ class Trace:
 
 
 @dataclass(frozen=True, eq=False)
-class Quantity:
+class PlottedQuantity:
     """One quantity of all displayed joints."""
 
     title: str
-    traces: tuple[Trace, ...]
+    traces: tuple[PlottedTrace, ...]
 
 
 @dataclass(frozen=True, eq=False)
@@ -76,7 +76,7 @@ class ArchiveView:
     joint_names: tuple[str, ...]  #: displayed joints
     start: float  #: s since the first sample
     stop: float  #: s since the first sample
-    quantities: tuple[Quantity, ...]  #: those in the archive
+    quantities: tuple[PlottedQuantity, ...]  #: those in the archive
     #: (time [s], name, text, whether a warning or worse)
     events: tuple[tuple[float, str, str, bool], ...] = ()
     gaps: Array | None = None  #: times of missed packets [s]; None in an imported recording
@@ -126,8 +126,10 @@ def view_of(
     with np.errstate(over="ignore", invalid="ignore"):
         for title, values, limits in scales.shown(columns):
             bounds = np.zeros((0, len(head.joint_names))) if limits is None else limits
-            traces = (Trace(*_reduced(time, values[:, j]), tuple(bounds[:, j])) for j in shown)
-            quantities.append(Quantity(title, tuple(traces)))
+            traces = (
+                PlottedTrace(*_reduced(time, values[:, j]), tuple(bounds[:, j])) for j in shown
+            )
+            quantities.append(PlottedQuantity(title, tuple(traces)))
     events = [
         (event.time - origin, event.name, event.text, event.level >= 30) for event in head.events
     ]
@@ -266,7 +268,7 @@ def _reduced(time: Array, values: Array) -> tuple[Array, Array]:
     return reduced_time, reduced
 
 
-def _share(recorded: Trace) -> str:
+def _share(recorded: PlottedTrace) -> str:
     share = recorded.peak_share
     return "" if share is None else "< 1" if share < 0.01 else f"{100.0 * share:.0f}"
 

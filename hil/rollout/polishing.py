@@ -6,15 +6,20 @@ import numpy as np
 
 from hil.base.progress import Reporter
 from hil.results.rollout_result import ArmErrors, PolishedParameter, PolishResult
-from identification.export.arm import Arm
-from identification.rollout.comparison import Errors, errors_of, horizon_rows
+from identification.export.arm import ExportedArm
+from identification.rollout.comparison import RolloutErrors, errors_of, horizon_rows
 from identification.rollout.polish import Driven, polished
 from identification.text import percentage
 
 
 def polish(
-    fitted: Driven, held_out: Driven, identified: Errors, reporter: Reporter, *, in_sample: bool
-) -> tuple[PolishResult, Arm]:
+    fitted: Driven,
+    held_out: Driven,
+    identified: RolloutErrors,
+    reporter: Reporter,
+    *,
+    in_sample: bool,
+) -> tuple[PolishResult, ExportedArm]:
     """Polish an arm on fitted windows, and judge it on held-out ones by the `identified` errors.
 
     It is used if the geometric mean of the held-out errors is lower and no more windows are
@@ -42,7 +47,12 @@ def polish(
 
 
 def _reason(
-    change: float, errors: Errors, identified: Errors, *, accepted: bool, in_sample: bool
+    change: float,
+    errors: RolloutErrors,
+    identified: RolloutErrors,
+    *,
+    accepted: bool,
+    in_sample: bool,
 ) -> str:
     """Return why a polished arm is used or not."""
     if in_sample:

@@ -29,12 +29,12 @@ from hil.rollout.torque_rollout import (
     with_commands,
 )
 from identification import IdentificationError, Samples
-from identification.export.arm import Arm
+from identification.export.arm import ExportedArm
 from identification.model.flange import flange_name
 from identification.rollout.comparison import (
     HORIZONS,
-    Errors,
     RecordedMotion,
+    RolloutErrors,
     continued,
     errors_of,
     horizon_rows,
@@ -127,14 +127,14 @@ def _driven(
     return Driven(fit.arm, motion, Feedback(fit.servo.kp, fit.servo.kd))
 
 
-def _errors(driven: Driven) -> Errors:
+def _errors(driven: Driven) -> RolloutErrors:
     windows = driven.motion.windows
     measured = windows.reached[:, horizon_rows(windows)]
     return errors_of(driven.positions(), measured, driven.arm.model.chain)
 
 
 def _result(
-    sources: Sources, cell: Cell, fit: ServoFit, driven: Driven, bodies: Arm
+    sources: Sources, cell: Cell, fit: ServoFit, driven: Driven, bodies: ExportedArm
 ) -> RolloutResult:
     """Return the errors of the arm with its servo and of the bodies alone on the same servo."""
     arm = driven.arm

@@ -28,14 +28,14 @@ from hil.results.rollout_result import JUDGED, ROLLOUT, ArmErrors, PolishResult,
 from hil.rollout.polishing import polish
 from identification import IdentificationError, Samples
 from identification.estimators.ensemble import Ensemble
-from identification.export.arm import Arm
+from identification.export.arm import ExportedArm
 from identification.export.simulators import FORMATS, read_back
 from identification.model.flange import flange_name
 from identification.rollout.comparison import (
     HORIZONS,
-    Errors,
     RecordedMotion,
     ResidualTorque,
+    RolloutErrors,
     continued,
     coverage,
     errors_of,
@@ -47,7 +47,7 @@ from identification.rollout.comparison import (
     variants,
 )
 from identification.rollout.polish import Driven
-from identification.rollout.servo import NoServoError, Servo, identify_servo, lead_of
+from identification.rollout.servo import NoServoError, PositionServo, identify_servo, lead_of
 from identification.rollout.simulation import LARGEST_ERROR, Feedback
 from identification.rollout.windows import STEP, Stretch, windows_of
 
@@ -68,7 +68,8 @@ class RolloutOptions:
     samples: int = 50  #: arms drawn from the posterior
     seed: int = 1
     feedback: float = 1.0  #: natural frequency of the feedback that keeps the arm near [Hz]
-    servo: Servo | str | None = None  #: in place of the recorded torque; "identified" from the log
+    #: in place of the recorded torque; "identified" from the log
+    servo: PositionServo | str | None = None
     polish: bool = False  #: fit friction, rotors, servo and delay to windows of the fitted motion
 
 
@@ -76,7 +77,7 @@ class Rollout(NamedTuple):
     """A rollout, and the arm that was polished on the way."""
 
     result: RolloutResult
-    polished: Arm | None  #: if it predicts held-out windows better
+    polished: ExportedArm | None  #: if it predicts held-out windows better
     remarks: tuple[str, ...]  #: for its file
 
 
@@ -167,15 +168,17 @@ def _motion_of(
     return RecordedMotion(windows, tuple(owners), servo), feedback, drive
 
 
-def _servo_of(model: IdentifiedModel, options: RolloutOptions) -> tuple[Servo | None, str]:
+def _servo_of(model: IdentifiedModel, options: RolloutOptions) -> tuple[PositionServo | None, str]:
     arm = model.arm
     prepared = model.prepared
     if options.servo is None:
         return None, ""
-    if isinstance(options.servo, Servo):
+    if isinstance(options.servo, PositionServo):
         n = arm.model.n_joints
         stated = options.servo
-        servo = Servo(np.broadcast_to(stated.kp, n), np.broadcast_to(stated.kd, n), stated.delay)
+        servo = PositionServo(
+            np.broadcast_to(stated.kp, n), np.broadcast_to(stated.kd, n), stated.delay
+        )
         return servo, f"a servo as stated, delay {1e3 * servo.delay:.3g} ms"
     fitted = with_commands(prepared.sources.training, prepared.fitted)
     stretches, _ = recorded_stretches(arm.model, fitted, STEP)
@@ -196,7 +199,7 @@ def _stretches(
     model: IdentifiedModel,
     sources: Sequence[Source],
     samples: Sequence[Samples],
-    servo: Servo | None,
+    servo: PositionServo | None,
 ) -> tuple[list[Stretch], list[Samples]]:
     """Return stretches and their samples; on a servo those whose command is known."""
     recordings: list[tuple[Samples, Array | None]] = [(part, None) for part in samples]
@@ -223,7 +226,7 @@ def with_commands(
 
 def _nominal(
     cell: Cell,
-    arm: Arm,
+    arm: ExportedArm,
     motion: RecordedMotion,
     feedback: Feedback,
     measured: Array,
@@ -246,7 +249,7 @@ def _nominal(
     return ArmErrors.of(errors_of(positions, measured, arm.model.chain)), "", notes
 
 
-def nominal_arm(cell: Cell, arm: Arm) -> Arm | None:
+def nominal_arm(cell: Cell, arm: ExportedArm) -> ExportedArm | None:
     """Return an arm with the URDF's bodies and what the cell states; None without masses."""
     nominal = nominal_of(cell)
     if nominal is None:
@@ -287,8 +290,8 @@ def _simulated_ensemble(
 
 
 def _polish(
-    model: IdentifiedModel, driven: Driven, identified: Errors, reporter: Reporter
-) -> tuple[PolishResult, Arm]:
+    model: IdentifiedModel, driven: Driven, identified: RolloutErrors, reporter: Reporter
+) -> tuple[PolishResult, ExportedArm]:
     """Fit to windows of the fitted motion, and judge on the held-out ones."""
     sources = model.prepared.sources
     servo = driven.motion.servo
@@ -303,7 +306,7 @@ def _polish(
 
 
 def leading_effect(
-    arm: Arm,
+    arm: ExportedArm,
     motion: RecordedMotion,
     feedback: Feedback,
     positions: Array,

@@ -10,7 +10,7 @@ from typing import Any, Final, TypeVar
 
 from hil.base.errors import ExecutionError, HilError
 from hil.base.progress import Reporter, Silent
-from hil.batch.cluster import Cluster, SkippedArchive, Task
+from hil.batch.cluster import Cluster, ClusterTask, SkippedArchive
 from hil.campaign import Campaign, CampaignFolder, CampaignPlan, Stop
 from hil.campaign.errors import RepetitionsRejectedError
 from hil.campaign.plan import moves_of, plan_around
@@ -130,7 +130,7 @@ def chosen(searches: Sequence[Search]) -> dict[str, Search]:
 
 
 @dataclass(frozen=True, eq=False)
-class Execution:
+class StudyExecution:
     """One campaign of the study."""
 
     root: Path  #: its folder
@@ -151,7 +151,7 @@ class Execution:
 
 def plan_study(
     folder: StudyFolder, cell: Cell, settings: StudySettings, best: Mapping[str, Search]
-) -> dict[str, dict[str, Execution]]:
+) -> dict[str, dict[str, StudyExecution]]:
     """Return the campaigns by condition and method; the held-out motions are in those of B.
 
     These are random motions through as many via points as its excitation has, with its fly.
@@ -168,7 +168,7 @@ def plan_study(
     held_out = {B: plan_around(random, excitation, MotionChecks.of(cell)).validation}
     return {
         condition: {
-            key: Execution(
+            key: StudyExecution(
                 folder.campaign(condition, key),
                 main,
                 CampaignPlan(excitation, tuple(held_out.get(key, ())), moves_of(cell, excitation)),
@@ -181,7 +181,7 @@ def plan_study(
     }
 
 
-def execute(execution: Execution) -> None:
+def execute(execution: StudyExecution) -> None:
     """Run or resume one campaign.
 
     Raises:
@@ -224,7 +224,7 @@ def in_children(
     Raises:
         StudyError: a call failed, crashed or timed out.
     """
-    tasks = [Task(str(place), function, arguments) for place, arguments in calls]
+    tasks = [ClusterTask(str(place), function, arguments) for place, arguments in calls]
     values: list[T] = []
     with reporter.task(title, len(tasks)) as task:
         results = cluster.results(tasks, task.advance)

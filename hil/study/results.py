@@ -122,7 +122,7 @@ class HeldOut(Frozen):
     predicted: dict[str, list[list[float]]]
 
 
-class Comparison(Frozen):
+class StudyComparison(Frozen):
     """Errors with B over errors with A, motion by motion.
 
     The interval treats motions and repetitions as random samples; the verdict follows from it.
@@ -144,7 +144,7 @@ class ConditionResult(Frozen):
     effects: list[str]
     methods: list[MethodResult]
     held_out: HeldOut
-    comparison: Comparison
+    comparison: StudyComparison
 
 
 class StudyResults(Frozen):
@@ -396,7 +396,7 @@ def _rounded(values: Array) -> list[float]:
 # Comparison and conclusion
 
 
-def compared(forms: Array, first: Array, second: Array) -> Comparison:
+def compared(forms: Array, first: Array, second: Array) -> StudyComparison:
     """Compare the errors of the mean estimates of A (r, p) and B (s, p) on motions (see above).
 
     The noise of an estimate acts on all motions that it predicts, so repetitions are resampled
@@ -421,7 +421,9 @@ def compared(forms: Array, first: Array, second: Array) -> Comparison:
         width = stats.t.ppf(0.975, min(fewest, motions) - 1) * draws.std(ddof=1)
         low, high = (float(bound) for bound in ratio * np.exp([-width, width]))
     verdict = verdict_of(ratio, low, high)
-    return Comparison(ratio=ratio, wins=wins, motions=motions, low=low, high=high, verdict=verdict)
+    return StudyComparison(
+        ratio=ratio, wins=wins, motions=motions, low=low, high=high, verdict=verdict
+    )
 
 
 def _blocks(values: Array) -> Array:
@@ -460,7 +462,7 @@ def conclusion_of(conditions: Sequence[ConditionResult], *, quick: bool) -> list
     return sentences
 
 
-def _outcome(row: Comparison) -> str:
+def _outcome(row: StudyComparison) -> str:
     """Format whose error is smaller, by how much, and how certain that is."""
     if row.verdict == "too few":
         return "too few repetitions or motions for a conclusion"

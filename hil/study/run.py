@@ -107,7 +107,7 @@ def _is_quick(settings: StudySettings) -> bool:
 
 
 def _condition(
-    cell: Cell, key: str, executions: Mapping[str, campaigns.Execution], truth: Array
+    cell: Cell, key: str, executions: Mapping[str, campaigns.StudyExecution], truth: Array
 ) -> tuple[str, str, Any, dict[str, Path], Array]:
     """Return the arguments of `results.condition_result`."""
     effects = json.loads(simulated_provenance(cell, key == campaigns.EFFECTS)["effects"])

@@ -30,7 +30,7 @@ from hil.campaign.errors import RepetitionsRejectedError
 from hil.campaign.folder import PAYLOAD_RESULT, PAYLOADS, SIDES, CampaignFolder
 from hil.campaign.gates import require_rehearsed
 from hil.campaign.plan import CampaignPlan
-from hil.campaign.precision_record import Look, PrecisionRecord, Reached
+from hil.campaign.precision_record import PrecisionLook, PrecisionRecord, Reached
 from hil.campaign.reached_precision import further
 from hil.campaign.run import RunResult
 from hil.cell import Cell
@@ -63,7 +63,7 @@ class MountingError(UnsafeError):
     """The payload has to be mounted or removed, and there is nobody to confirm it."""
 
 
-class Mounting:
+class PayloadMounting:
     """Whether the payload is mounted, as the operator confirms it.
 
     Args:
@@ -233,7 +233,7 @@ class PayloadCampaign:
             side.rehearse(reporter=reporter, stop=stop)
 
     def dry_run(
-        self, execute: Execute, mounting: Mounting, choices: Mapping[str, Any]
+        self, execute: Execute, mounting: PayloadMounting, choices: Mapping[str, Any]
     ) -> RunResult:
         """Run the dry run of the side whose repetition is the next one that is missing."""
         missing = (
@@ -249,7 +249,7 @@ class PayloadCampaign:
     def run(
         self,
         execute: Execute,
-        mounting: Mounting,
+        mounting: PayloadMounting,
         reporter: Reporter,
         *,
         requirements: Sequence[Requirement] = (),
@@ -312,7 +312,7 @@ class PayloadCampaign:
         loaded: bool,
         wanted: int,
         execute: Execute,
-        mounting: Mounting,
+        mounting: PayloadMounting,
         choices: Mapping[str, Any],
         links: Links,
     ) -> None:
@@ -501,9 +501,9 @@ def _bare_file(cell: Cell) -> CellFile:
     return cell.file.model_copy(update={"robot": robot, "cell": described})
 
 
-def _look(result: PayloadFound, pairs: int, requirement: Requirement) -> Look:
+def _look(result: PayloadFound, pairs: int, requirement: Requirement) -> PrecisionLook:
     """Return the precision of the mass after some pairs."""
     low, high = result.estimate.intervals[0].tolist()
     half = (high - low) / 2.0 / (result.body.mass if requirement.relative else 1.0)
     more = further(pairs, half / requirement.value, 1.0 - result.estimate.scale_share)
-    return Look(pairs, (Reached(str(requirement), "mass", half, more),))
+    return PrecisionLook(pairs, (Reached(str(requirement), "mass", half, more),))

@@ -48,7 +48,7 @@ from identification.excitation.searches.population import (
 from identification.excitation.searches.run import (
     RESCORE_PERIOD,
     Design,
-    Progress,
+    SearchProgress,
     most_evaluations,
     search,
 )

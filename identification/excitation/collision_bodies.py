@@ -54,7 +54,7 @@ class Hull(NamedTuple):
 
 
 @dataclass(frozen=True, eq=False)
-class Body:
+class CollisionBody:
     """A convex shape that moves with a link, or an obstacle."""
 
     name: str  # of the link or obstacle
@@ -79,7 +79,7 @@ def described_shapes(model: pin.Model, urdf: str, mesh_folders: Sequence[str]) -
     return shapes
 
 
-def link_bodies(model: pin.Model, urdf: str, mesh_folders: Sequence[str]) -> list[Body]:
+def link_bodies(model: pin.Model, urdf: str, mesh_folders: Sequence[str]) -> list[CollisionBody]:
     """Return the collision bodies of a robot description by joint, meshes as convex hulls.
 
     Raises:
@@ -110,7 +110,7 @@ def link_bodies(model: pin.Model, urdf: str, mesh_folders: Sequence[str]) -> lis
         joint = item.parentJoint - 1
         pose = coal.Transform3s(rotation, translation)
         hull = _hull(shape, rotation, translation)
-        bodies.append(Body(link, item.name, joint, shape, pose, hull))
+        bodies.append(CollisionBody(link, item.name, joint, shape, pose, hull))
     if not any(body.joint >= 0 for body in bodies):
         raise CollisionModelError("no moving link of the robot description has a collision shape")
     return sorted(bodies, key=lambda body: body.joint)
@@ -136,7 +136,7 @@ def _convex(shape: coal.CollisionGeometry, link: str) -> coal.CollisionGeometry:
     return shape
 
 
-def obstacles(workspace: Workspace) -> list[Body]:
+def obstacles(workspace: Workspace) -> list[CollisionBody]:
     """Return floor and boxes as bodies."""
     bodies = []
     if workspace.floor is not None:
@@ -144,7 +144,7 @@ def obstacles(workspace: Workspace) -> list[Body]:
         hull = Hull(normal * workspace.floor, normal, 0.0, 0.0, 0.0, exact=True)
         shape = coal.Halfspace(normal, workspace.floor)
         pose = coal.Transform3s.Identity()
-        bodies.append(Body("floor", "floor", -1, shape, pose, hull, normal=normal))
+        bodies.append(CollisionBody("floor", "floor", -1, shape, pose, hull, normal=normal))
     for i, box in enumerate(workspace.boxes):
         lower = np.array(box.lower, dtype=float)
         upper = np.array(box.upper, dtype=float)
@@ -154,7 +154,7 @@ def obstacles(workspace: Workspace) -> list[Body]:
         # separations use the half sides
         hull = Hull(middle, np.array([0.0, 0.0, 1.0]), 0.0, 0.0, 0.0, exact=False)
         pose = coal.Transform3s(np.eye(3), middle)
-        bodies.append(Body(f"box {i}", f"box {i}", -1, shape, pose, hull, half_sides=half))
+        bodies.append(CollisionBody(f"box {i}", f"box {i}", -1, shape, pose, hull, half_sides=half))
     return bodies
 
 

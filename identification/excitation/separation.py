@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from identification.arrays import Array, Indices
-from identification.excitation.collision_bodies import Body
+from identification.excitation.collision_bodies import CollisionBody
 from identification.model.kinematics import Chain, skew
 
 _CROSSING = 1e-9  # axes closer than this [m] intersect
@@ -64,7 +64,7 @@ def frames(chain: Chain, q: Array) -> Frames:
     return Frames(rotation, translation)
 
 
-def placed(bodies: Sequence[Body], at: Frames) -> Bodies:
+def placed(bodies: Sequence[CollisionBody], at: Frames) -> Bodies:
     """Return the positions of the hulls of bodies, which are sorted by joint."""
     centre, axis = np.empty((2, 3, len(bodies), at.translation.shape[2]))
     joints = np.array([body.joint for body in bodies])
@@ -94,7 +94,7 @@ class Separation:
         exact: (p,) whether the bounds are the distances themselves.
     """
 
-    def __init__(self, bodies: Sequence[Body], pairs: Sequence[tuple[int, int]]) -> None:
+    def __init__(self, bodies: Sequence[CollisionBody], pairs: Sequence[tuple[int, int]]) -> None:
         kinds = [
             2 if bodies[b].normal is not None else 1 if bodies[b].half_sides is not None else 0
             for _, b in pairs
@@ -215,7 +215,9 @@ def _norm(vectors: Array) -> Array:
     return np.asarray(np.sqrt(_dot(vectors, vectors)))
 
 
-def reaches(chain: Chain, bodies: Sequence[Body], pairs: Separation, slides: Array) -> Array:
+def reaches(
+    chain: Chain, bodies: Sequence[CollisionBody], pairs: Separation, slides: Array
+) -> Array:
     """Return how far a step of each joint moves a pair's bodies against each other, (p, n).
 
     No distance changes by more than ``reaches @ |steps|`` [m]: a point's derivative by a revolute

@@ -24,7 +24,7 @@ class Ranges(NamedTuple):
 
 
 @dataclass(frozen=True, eq=False)
-class Arm:
+class ExportedArm:
     """An arm with physically consistent parameters."""
 
     urdf: str  # text that the model was created from

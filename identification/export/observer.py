@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike
 
 from identification.arrays import Array
 from identification.errors import ModelError, ShapeError
-from identification.export.arm import Arm
+from identification.export.arm import ExportedArm
 from identification.export.controller.reference import pinocchio_bodies
 from identification.export.controller.tables import (
     FRICTION_COLUMNS,
@@ -38,7 +38,7 @@ class MomentumObserver:
         ModelError: gain or dt is not positive.
     """
 
-    def __init__(self, arm: Arm, gain: float, dt: float) -> None:
+    def __init__(self, arm: ExportedArm, gain: float, dt: float) -> None:
         if not (gain > 0.0 and dt > 0.0):
             raise ModelError(f"an observer needs a positive gain and dt, not {gain:g} and {dt:g}")
         self.gain = gain

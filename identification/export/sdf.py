@@ -12,7 +12,7 @@ import pinocchio as pin
 
 from identification.arrays import Array
 from identification.errors import IdentificationError
-from identification.export.arm import Arm
+from identification.export.arm import ExportedArm
 from identification.export.friction import load_remarks
 from identification.export.urdf import TENSOR, WriteBackError, as_text, comment_text
 from identification.model.motion import Motion
@@ -28,7 +28,7 @@ class MissingDrakeError(IdentificationError):
     """Drake is needed and not installed."""
 
 
-def sdf(arm: Arm, name: str, remarks: Sequence[str] = ()) -> str:
+def sdf(arm: ExportedArm, name: str, remarks: Sequence[str] = ()) -> str:
     """Return the arm as SDF 1.9: links in the frames of their joints, fixed to the world."""
     model = arm.model
     ranges = arm.ranges
@@ -68,7 +68,7 @@ def sdf(arm: Arm, name: str, remarks: Sequence[str] = ()) -> str:
     return ElementTree.tostring(root, encoding="unicode") + "\n"
 
 
-def drake_torque(text: str, arm: Arm, motion: Motion) -> Array:
+def drake_torque(text: str, arm: ExportedArm, motion: Motion) -> Array:
     """Return the torques (m, n) of the bodies and damping of an SDF, by Drake.
 
     Raises:

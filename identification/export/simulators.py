@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from identification.arrays import Array
 from identification.errors import IdentificationError
-from identification.export.arm import Arm
+from identification.export.arm import ExportedArm
 from identification.export.friction import load_remarks
 from identification.export.sdf import MissingDrakeError, drake_torque, sdf
 from identification.export.urdf import WriteBackError, as_text, comment_text, rnea, write_urdf
@@ -57,7 +57,9 @@ class MissingMujocoError(IdentificationError):
     """MuJoCo is needed and not installed."""
 
 
-def mjcf(arm: Arm, name: str, remarks: Sequence[str] = (), *, step: float = _TIMESTEP) -> str:
+def mjcf(
+    arm: ExportedArm, name: str, remarks: Sequence[str] = (), *, step: float = _TIMESTEP
+) -> str:
     """Return the arm as MuJoCo's XML with a time step [s]; motors are controlled by torque."""
     model = arm.model
     ranges = arm.ranges
@@ -91,9 +93,7 @@ def mjcf(arm: Arm, name: str, remarks: Sequence[str] = (), *, step: float = _TIM
             # A negative one would accelerate a joint that is faster than the recorded motion.
             *(max(0.0, friction["f2"]) if third == kind else 0.0 for kind in _OF_SPEED),
         ]
-        lower = ranges.lower[j]
-        upper = ranges.upper[j]
-        most = ranges.effort[j]
+        lower, upper, most = (bound[j] for bound in (ranges.lower, ranges.upper, ranges.effort))
         limited = math.isfinite(lower) and math.isfinite(upper) and lower < upper
         effort = as_text([-most, most]) if math.isfinite(most) else None
         _add(
@@ -119,14 +119,14 @@ def mjcf(arm: Arm, name: str, remarks: Sequence[str] = (), *, step: float = _TIM
     return _text(root)
 
 
-def urdf(arm: Arm, name: str, remarks: Sequence[str] = ()) -> str:
+def urdf(arm: ExportedArm, name: str, remarks: Sequence[str] = ()) -> str:
     """Return the URDF with the arm's bodies and friction; see `write_urdf`."""
     del name
     friction = arm.values[arm.model.friction_part]
     return write_urdf(arm.urdf, arm.model, arm.standard, friction, remarks, arm.load)
 
 
-def pinocchio_arm(arm: Arm, name: str) -> pin.Model:
+def pinocchio_arm(arm: ExportedArm, name: str) -> pin.Model:
     """Return the arm as pinocchio's model, with armature, damping and dry friction.
 
     It is read from the arm's URDF, so that limits and frames are those of the user's file.
@@ -143,7 +143,7 @@ def pinocchio_arm(arm: Arm, name: str) -> pin.Model:
     return model
 
 
-def pinocchio_archive(arm: Arm, name: str, remarks: Sequence[str] = ()) -> str:
+def pinocchio_archive(arm: ExportedArm, name: str, remarks: Sequence[str] = ()) -> str:
     """Return :func:`pinocchio_arm` as the text archive of a model, which has no place for remarks.
 
     ``model = pinocchio.Model(); model.loadFromString(text)`` reads it.
@@ -152,20 +152,20 @@ def pinocchio_archive(arm: Arm, name: str, remarks: Sequence[str] = ()) -> str:
     return str(pinocchio_arm(arm, name).saveToString())
 
 
-class Format(NamedTuple):
+class ModelFormat(NamedTuple):
     """A file format and the parts of the model that it supports."""
 
     suffix: str  # of its files
-    write: Callable[[Arm, str, Sequence[str]], str]  # text of an arm, its name and remarks
+    write: Callable[[ExportedArm, str, Sequence[str]], str]  # text of an arm, its name and remarks
     # torques (m, n) of bodies, rotors, springs and speed-dependent friction, from text, arm, motion
-    read: Callable[[str, Arm, Motion], Array]
+    read: Callable[[str, ExportedArm, Motion], Array]
     friction: tuple[FrictionTerm, ...] = (COULOMB, TANH, VISCOUS)
     # rotor inertias, inertia and friction of coupled motors, torsion springs, a stated payload
     drives: bool = False
     rotors: bool = False  # rotor inertias alone
 
 
-class Comparison(NamedTuple):
+class SimulatorComparison(NamedTuple):
     """Comparison of a text with the model."""
 
     # largest torque difference of the supported parts at `STATES` random states, relative to the
@@ -175,7 +175,7 @@ class Comparison(NamedTuple):
     left_out: Mapping[str, Array]  # that of each unsupported part (n,), by description
 
 
-def compare(text: str, form: Format, arm: Arm, motion: Motion) -> Comparison:
+def compare(text: str, form: ModelFormat, arm: ExportedArm, motion: Motion) -> SimulatorComparison:
     """Read a text back, compare it with the arm, and compute the torque of parts left out.
 
     Raises:
@@ -190,10 +190,10 @@ def compare(text: str, form: Format, arm: Arm, motion: Motion) -> Comparison:
         dry = _mujoco_torque(text, arm, motion, friction=True) - _supported(form, arm, motion)
         left[_REVERSALS] = _rms(dry - _dry(arm, motion))
     whole = arm.model.torque(arm.values, motion.without_load()) + arm.model.load_torque(motion)
-    return Comparison(difference, _rms(whole), {k: v for k, v in left.items() if v.any()})
+    return SimulatorComparison(difference, _rms(whole), {k: v for k, v in left.items() if v.any()})
 
 
-def read_back(text: str, form: Format, arm: Arm, count: int = STATES) -> float:
+def read_back(text: str, form: ModelFormat, arm: ExportedArm, count: int = STATES) -> float:
     """Return the largest difference of a text's torque from the arm's, see :class:`Comparison`.
 
     Raises:
@@ -219,7 +219,7 @@ MISSING: Final = (MissingMujocoError, MissingDrakeError)
 """Errors of formats whose reader is not installed."""
 
 
-def random_states(arm: Arm, count: int = STATES) -> Motion:
+def random_states(arm: ExportedArm, count: int = STATES) -> Motion:
     """Return random states within the limits of an arm."""
     ranges = arm.ranges
     n = arm.model.n_joints
@@ -246,7 +246,7 @@ Part = tuple[str, Callable[[], Array], bool]
 """Description of a part of the model, its torque (m, n), and whether a format supports it."""
 
 
-def _parts(form: Format, arm: Arm, motion: Motion) -> Iterator[Part]:
+def _parts(form: ModelFormat, arm: ExportedArm, motion: Motion) -> Iterator[Part]:
     """Yield the parts of the model along a motion."""
     model = arm.model
     q = motion.position
@@ -284,7 +284,7 @@ def _parts(form: Format, arm: Arm, motion: Motion) -> Iterator[Part]:
         yield description, partial(_element_torque, arm, motion, placed), supported
 
 
-def _brakes(arm: Arm) -> NDArray[np.bool_]:
+def _brakes(arm: ExportedArm) -> NDArray[np.bool_]:
     """Return whether each friction term is no power of the speed with a negative coefficient."""
     terms = arm.model.friction.terms
     values = arm.values[arm.model.friction_part]
@@ -294,13 +294,15 @@ def _brakes(arm: Arm) -> NDArray[np.bool_]:
     return np.asarray(~(of_speed & (values < 0.0)))
 
 
-def _friction_of(arm: Arm, motion: Motion, kind: FrictionTerm, chosen: NDArray[np.bool_]) -> Array:
+def _friction_of(
+    arm: ExportedArm, motion: Motion, kind: FrictionTerm, chosen: NDArray[np.bool_]
+) -> Array:
     """Return the torque (m, n) of friction terms of a kind, beyond that at the load."""
     torque = _friction(arm, motion, chosen.tolist())
     return torque - _at_load(arm, motion) if kind.of_load else torque
 
 
-def _element_torque(arm: Arm, motion: Motion, placed: PlacedElement) -> Array:
+def _element_torque(arm: ExportedArm, motion: Motion, placed: PlacedElement) -> Array:
     """Return the torque (m, n) of a passive element."""
     torque = np.zeros(motion.position.shape)
     values = arm.values[arm.model.element_part][placed.part]
@@ -310,7 +312,7 @@ def _element_torque(arm: Arm, motion: Motion, placed: PlacedElement) -> Array:
     return torque
 
 
-def _left_out(form: Format, arm: Arm, motion: Motion) -> dict[str, Array]:
+def _left_out(form: ModelFormat, arm: ExportedArm, motion: Motion) -> dict[str, Array]:
     """Return the torque (m, n) of each part of the model that a format does not support.
 
     Without dry friction at reversals, which every simulator has in its own way.
@@ -326,7 +328,7 @@ def _left_out(form: Format, arm: Arm, motion: Motion) -> dict[str, Array]:
     return left
 
 
-def _rounding(arm: Arm, motion: Motion) -> tuple[Array, Array]:
+def _rounding(arm: ExportedArm, motion: Motion) -> tuple[Array, Array]:
     """Return the torque (m, n) by which links and rotors differ from the base parameters', and it.
 
     Base parameters are those of a URDF with rounded angles.
@@ -337,7 +339,7 @@ def _rounding(arm: Arm, motion: Motion) -> tuple[Array, Array]:
     return whole - rigid_torque(arm, motion) - motion.acceleration @ arm.rotors, whole
 
 
-def unsupported_torque(arm: Arm, motion: Motion, form: str = "mjcf") -> Array:
+def unsupported_torque(arm: ExportedArm, motion: Motion, form: str = "mjcf") -> Array:
     """Return the torque (m, n) of all parts that a format does not support, along a motion.
 
     Without dry friction at reversals, which every simulator has in its own way.
@@ -346,20 +348,22 @@ def unsupported_torque(arm: Arm, motion: Motion, form: str = "mjcf") -> Array:
     return np.asarray(np.sum([np.zeros(motion.position.shape), *parts], axis=0))
 
 
-def _supported(form: Format, arm: Arm, motion: Motion) -> Array:
+def _supported(form: ModelFormat, arm: ExportedArm, motion: Motion) -> Array:
     """Return the torque (m, n) of the parts that a format supports, without dry friction."""
     parts = [torque() for _, torque, supported in _parts(form, arm, motion) if supported]
     return np.asarray(np.sum(parts, axis=0))
 
 
-def rigid_torque(arm: Arm, motion: Motion) -> Array:
+def rigid_torque(arm: ExportedArm, motion: Motion) -> Array:
     """Return the torque (m, n) of the links, without the payload."""
     model = arm.model
     plan = RegressorPlan.of_bodies(model.chain, model.gravity)
     return plan.torque(arm.standard[model.layout.links].reshape(-1), motion.kinematics())
 
 
-def _friction(arm: Arm, motion: Motion, chosen: Sequence[bool], load: Array | None = None) -> Array:
+def _friction(
+    arm: ExportedArm, motion: Motion, chosen: Sequence[bool], load: Array | None = None
+) -> Array:
     """Return the torque (m, n) of some friction terms, at a load (m, n), by default the arm's."""
     model = arm.model
     if load is None and model.friction.has_load:
@@ -370,13 +374,13 @@ def _friction(arm: Arm, motion: Motion, chosen: Sequence[bool], load: Array | No
     return model.torque(values, replace(motion, load=load))
 
 
-def _at_load(arm: Arm, motion: Motion) -> Array:
+def _at_load(arm: ExportedArm, motion: Motion) -> Array:
     """Return the torque (m, n) of load-dependent friction at the load for which it is written."""
     shares = [friction_term.term.label == LOAD.label for friction_term in arm.model.friction.terms]
     return _friction(arm, motion, shares, np.tile(arm.written_load, (motion.n_samples, 1)))
 
 
-def _dry(arm: Arm, motion: Motion, *, jumps: bool = False) -> Array:
+def _dry(arm: ExportedArm, motion: Motion, *, jumps: bool = False) -> Array:
     """Return the torque (m, n) of dry friction of the model, or with a jump at zero speed."""
     if not jumps:
         terms = arm.model.friction.terms
@@ -392,14 +396,14 @@ def _dry(arm: Arm, motion: Motion, *, jumps: bool = False) -> Array:
     return np.asarray(torque + (f0[n:] * np.sign(motion.velocity @ shares.T)) @ shares)
 
 
-def _pinocchio_torque(text: str, arm: Arm, motion: Motion) -> Array:
+def _pinocchio_torque(text: str, arm: ExportedArm, motion: Motion) -> Array:
     """Return the torques of a URDF's bodies and damping."""
     model = pinocchio_model(text, arm.model.locked)
     model.gravity.linear = arm.model.gravity
     return rnea(model, motion) + np.asarray(model.damping) * motion.velocity
 
 
-def _archive_torque(text: str, arm: Arm, motion: Motion) -> Array:
+def _archive_torque(text: str, arm: ExportedArm, motion: Motion) -> Array:
     """Return the torques of bodies, armature and damping of a pinocchio archive."""
     del arm
     model = pin.Model()
@@ -407,7 +411,7 @@ def _archive_torque(text: str, arm: Arm, motion: Motion) -> Array:
     return rnea(model, motion) + np.asarray(model.damping) * motion.velocity
 
 
-def _mujoco_torque(text: str, arm: Arm, motion: Motion, *, friction: bool = False) -> Array:
+def _mujoco_torque(text: str, arm: ExportedArm, motion: Motion, *, friction: bool = False) -> Array:
     """Return the torques of MuJoCo's inverse dynamics."""
     mujoco = load_mujoco()
     try:
@@ -443,22 +447,22 @@ def load_mujoco() -> Any:
     return mujoco
 
 
-FORMATS: Final[Mapping[str, Format]] = {
-    "mjcf": Format(
+FORMATS: Final[Mapping[str, ModelFormat]] = {
+    "mjcf": ModelFormat(
         ".xml",
         mjcf,
         _mujoco_torque,
         friction=(COULOMB, TANH, VISCOUS, QUADRATIC, CUBIC),
         drives=True,
     ),
-    "urdf": Format(".urdf", urdf, _pinocchio_torque),
-    "sdf": Format(".sdf", sdf, drake_torque),
-    "pinocchio": Format(".pinocchio", pinocchio_archive, _archive_torque, rotors=True),
+    "urdf": ModelFormat(".urdf", urdf, _pinocchio_torque),
+    "sdf": ModelFormat(".sdf", sdf, drake_torque),
+    "pinocchio": ModelFormat(".pinocchio", pinocchio_archive, _archive_torque, rotors=True),
 }
 """Formats by name."""
 
 
-def _tendons(root: Node, arm: Arm, coupled: NDArray[np.bool_], step: float) -> None:
+def _tendons(root: Node, arm: ExportedArm, coupled: NDArray[np.bool_], step: float) -> None:
     """Add inertia and friction of coupled motors as fixed tendons."""
     names = arm.model.joint_names
     friction = arm.model.friction

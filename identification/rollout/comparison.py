@@ -12,14 +12,14 @@ from numpy.typing import NDArray
 
 from identification.arrays import Array
 from identification.distributions import student_limit
-from identification.export.arm import Arm
+from identification.export.arm import ExportedArm
 from identification.export.simulators import unsupported_torque
 from identification.model.flange import flange_motion
 from identification.model.kinematics import Chain
 from identification.model.regressor import RegressorPlan
 from identification.model.robot import RobotModel
-from identification.rollout.servo import Servo, command_of
-from identification.rollout.simulation import LARGEST_ERROR, Feedback, SimulatedArm
+from identification.rollout.servo import PositionServo, command_of
+from identification.rollout.simulation import LARGEST_ERROR, Feedback, RolloutArm
 from identification.rollout.windows import Stretch, Windows, stretches_of
 from identification.signals.samples import Samples
 
@@ -33,10 +33,10 @@ class RecordedMotion:
 
     windows: Windows
     samples: tuple[Samples, ...]  #: of each stretch
-    servo: Servo | None = None  #: in place of the recorded torque
+    servo: PositionServo | None = None  #: in place of the recorded torque
     delay: float = 0.0  #: by which the recorded torque is applied later [s]
 
-    def force(self, arm: Arm, simulated: SimulatedArm) -> Array:
+    def force(self, arm: ExportedArm, simulated: RolloutArm) -> Array:
         """Return what acts on the joints of an arm in MuJoCo (w, K, n).
 
         What MuJoCo cannot simulate acts as along the measured motion, as does the part of the
@@ -59,7 +59,7 @@ class RecordedMotion:
         force = windows.cut(parts)
         return force if servo is None else force + self._held(servo)
 
-    def _held(self, servo: Servo) -> Array:
+    def _held(self, servo: PositionServo) -> Array:
         """Return the constant torque beside a servo in each window (w, 1, n)."""
         torque = []
         for stretch in self.windows.stretches:
@@ -83,14 +83,14 @@ def recorded_stretches(
     return stretches, owners
 
 
-def joint_inertia(arm: Arm, step: float) -> Array:
+def joint_inertia(arm: ExportedArm, step: float) -> Array:
     """Return the inertia that each joint turns at its zero position (n,) [kg·m² or kg]."""
     none = np.zeros(arm.model.n_joints)
-    simulated = SimulatedArm.of(arm, step, Feedback(none, none))
+    simulated = RolloutArm.of(arm, step, Feedback(none, none))
     return np.asarray(simulated.model.dof_M0[simulated.order])
 
 
-def light_feedback(arm: Arm, step: float, frequency: float) -> Feedback:
+def light_feedback(arm: ExportedArm, step: float, frequency: float) -> Feedback:
     """Return a critically damped feedback of some natural frequency [Hz] for each joint alone."""
     inertia = joint_inertia(arm, step)
     rate = 2.0 * np.pi * frequency
@@ -98,7 +98,7 @@ def light_feedback(arm: Arm, step: float, frequency: float) -> Feedback:
 
 
 def simulate(
-    arm: Arm, motion: RecordedMotion, feedback: Feedback, extra: Array | float = 0.0
+    arm: ExportedArm, motion: RecordedMotion, feedback: Feedback, extra: Array | float = 0.0
 ) -> Array:
     """Return the positions of an arm at the horizons (w, h, n), not finite where it is unstable.
 
@@ -106,7 +106,7 @@ def simulate(
         NotSimulatedError: MuJoCo does not accept the arm.
     """
     windows = motion.windows
-    simulated = SimulatedArm.of(arm, windows.step, feedback)
+    simulated = RolloutArm.of(arm, windows.step, feedback)
     force = motion.force(arm, simulated) + extra
     positions = simulated.simulate(windows.position[:, 0], windows.start, force, windows.position)
     return positions[:, horizon_rows(windows)]
@@ -123,7 +123,7 @@ def continued(windows: Windows) -> Array:
     return np.asarray(windows.position[:, :1] + moved)
 
 
-def _removed(stretch: Stretch, samples: Samples, arm: Arm) -> Array:
+def _removed(stretch: Stretch, samples: Samples, arm: ExportedArm) -> Array:
     """Return the part of an arm's torque (g, n) that the low-pass of the record removed."""
     if samples.torque_bandwidth is None:
         return np.zeros_like(stretch.motion.position)
@@ -133,7 +133,7 @@ def _removed(stretch: Stretch, samples: Samples, arm: Arm) -> Array:
     return stretch.mean_about_instants(removed[stretch.part])
 
 
-def _late(stretch: Stretch, arm: Arm) -> Array:
+def _late(stretch: Stretch, arm: ExportedArm) -> Array:
     """Return what centrifugal torques (g, n) lack, which MuJoCo computes half a step early."""
     model = arm.model
     motion = stretch.motion
@@ -165,7 +165,7 @@ def _delayed(stretch: Stretch, delay: float) -> Array:
 
 
 @dataclass(frozen=True, eq=False)
-class Errors:
+class RolloutErrors:
     """Root mean square errors of an arm at the horizons."""
 
     joints: Array  #: position (h, n) [rad or m]; where unstable, `LARGEST_ERROR`
@@ -174,7 +174,7 @@ class Errors:
     unstable_joints: NDArray[np.intp]  #: of these, by the joint that left first (n,)
 
 
-def errors_of(positions: Array, measured: Array, chain: Chain) -> Errors:
+def errors_of(positions: Array, measured: Array, chain: Chain) -> RolloutErrors:
     """Return the errors of simulated positions (w, h, n)."""
     stable = np.isfinite(positions)
     difference = np.where(stable, positions - measured, LARGEST_ERROR)
@@ -188,7 +188,7 @@ def errors_of(positions: Array, measured: Array, chain: Chain) -> Errors:
             distances[k] = np.sqrt(np.mean(np.sum(away**2, axis=1)))
     rms = np.sqrt(np.mean(difference**2, axis=0))
     first = np.count_nonzero(np.isinf(positions[:, -1]), axis=0)
-    return Errors(rms, distances, int(np.count_nonzero(~whole[:, -1])), first)
+    return RolloutErrors(rms, distances, int(np.count_nonzero(~whole[:, -1])), first)
 
 
 def leading_joint(positions: Array, measured: Array, chain: Chain) -> int:
@@ -260,14 +260,16 @@ class ResidualTorque:
 # What would lessen the error
 
 _DELAY_CHANGE: Final = 5e-3  # s
-Variant = tuple[str, Callable[[Arm, RecordedMotion], tuple[Arm, RecordedMotion]]]
+Variant = tuple[str, Callable[[ExportedArm, RecordedMotion], tuple[ExportedArm, RecordedMotion]]]
 
 
 def variants(joint: int) -> list[Variant]:
     """Return changes of the friction of a joint, and of the delay of all, by the effect's name."""
 
-    def scaled(symbols: Sequence[str], factor: float) -> Callable[..., tuple[Arm, RecordedMotion]]:
-        def change(arm: Arm, motion: RecordedMotion) -> tuple[Arm, RecordedMotion]:
+    def scaled(
+        symbols: Sequence[str], factor: float
+    ) -> Callable[..., tuple[ExportedArm, RecordedMotion]]:
+        def change(arm: ExportedArm, motion: RecordedMotion) -> tuple[ExportedArm, RecordedMotion]:
             values = arm.values.copy()
             model = arm.model
             part = model.friction_part
@@ -280,8 +282,8 @@ def variants(joint: int) -> list[Variant]:
 
         return change
 
-    def delayed(later: float) -> Callable[..., tuple[Arm, RecordedMotion]]:
-        def change(arm: Arm, motion: RecordedMotion) -> tuple[Arm, RecordedMotion]:
+    def delayed(later: float) -> Callable[..., tuple[ExportedArm, RecordedMotion]]:
+        def change(arm: ExportedArm, motion: RecordedMotion) -> tuple[ExportedArm, RecordedMotion]:
             if motion.servo is None:
                 return arm, replace(motion, delay=motion.delay + later)
             delay = max(0.0, motion.servo.delay + later)

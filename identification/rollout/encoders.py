@@ -28,14 +28,14 @@ import scipy
 from numpy.typing import NDArray
 
 from identification.arrays import Array
-from identification.export.arm import Arm
+from identification.export.arm import ExportedArm
 from identification.export.simulators import rigid_torque
 from identification.model.motion import Motion
 from identification.rollout.servo import (
     BLOCK,
     LONGEST_DELAY,
     NoServoError,
-    Servo,
+    PositionServo,
     best_delay,
     command_of,
     without_means,
@@ -51,8 +51,8 @@ _DETERMINED: Final = 2.0  # standard deviations that a determined parameter is l
 class ServoFit(NamedTuple):
     """Servo and drives of an arm with given bodies."""
 
-    arm: Arm  #: with friction and rotor inertias
-    servo: Servo
+    arm: ExportedArm  #: with friction and rotor inertias
+    servo: PositionServo
     values: Array  #: `NAMES` of each joint (n, 5)
     deviations: Array  #: their standard deviations (n, 5), infinite where nothing is determined
     delay_deviation: float  #: standard deviation of the delay [s]
@@ -63,7 +63,7 @@ class ServoFit(NamedTuple):
         return np.asarray(self.values > _DETERMINED * self.deviations)
 
 
-def fit_servo(arm: Arm, stretches: Sequence[Stretch], step: float) -> ServoFit:
+def fit_servo(arm: ExportedArm, stretches: Sequence[Stretch], step: float) -> ServoFit:
     """Fit servo, friction and rotor inertias of an arm whose bodies are given.
 
     Its friction law has to have `f0` and `f1`; other terms are set to zero.
@@ -99,7 +99,7 @@ def fit_servo(arm: Arm, stretches: Sequence[Stretch], step: float) -> ServoFit:
         )
     return ServoFit(
         _with_drives(bare, values),
-        Servo(values[:, 0], values[:, 1], delay),
+        PositionServo(values[:, 0], values[:, 1], delay),
         values,
         deviations,
         sum(joint.delay_variance(delay) ** -1.0 for joint in joints) ** -0.5,
@@ -189,7 +189,7 @@ def _sizes(columns: Array) -> Array:
     return np.asarray(size)
 
 
-def _joints_of(arm: Arm, stretches: Sequence[Stretch], step: float) -> list[_Joint]:
+def _joints_of(arm: ExportedArm, stretches: Sequence[Stretch], step: float) -> list[_Joint]:
     """Return the equations of each joint of an arm without rotors."""
     rows = round(BLOCK / step)
     count = arm.model.n_joints
@@ -245,13 +245,13 @@ def _joints_of(arm: Arm, stretches: Sequence[Stretch], step: float) -> list[_Joi
     ]
 
 
-def _without_rotors(arm: Arm) -> Array:
+def _without_rotors(arm: ExportedArm) -> Array:
     standard = arm.standard.copy()
     standard[arm.model.layout.rotors] = 0.0
     return standard
 
 
-def _with_drives(arm: Arm, values: Array) -> Arm:
+def _with_drives(arm: ExportedArm, values: Array) -> ExportedArm:
     """Return an arm with rotor inertias and friction of each joint."""
     model = arm.model
     standard = arm.standard.copy()

@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from identification.arrays import Array
-from identification.export.arm import Arm
+from identification.export.arm import ExportedArm
 from identification.export.simulators import load_mujoco
 from identification.rollout.comparison import (
     RecordedMotion,
@@ -46,7 +46,7 @@ _VISCOUS = ("f1", "f2")
 class Driven:
     """An arm and what drives it along a motion."""
 
-    arm: Arm
+    arm: ExportedArm
     motion: RecordedMotion
     feedback: Feedback
 
@@ -69,7 +69,7 @@ class Driven:
         return np.where(np.isfinite(simulated), simulated - measured, LARGEST_ERROR)
 
 
-class Quantity(NamedTuple):
+class PolishedQuantity(NamedTuple):
     """What a polish changes, by a number in its unit."""
 
     change: Callable[[Driven, float], Driven]
@@ -113,19 +113,19 @@ def polished(start: Driven) -> Driven:
     return _changed(start, quantities, np.asarray(best).ravel())
 
 
-def _changed(start: Driven, quantities: list[Quantity], changes: Array) -> Driven:
+def _changed(start: Driven, quantities: list[PolishedQuantity], changes: Array) -> Driven:
     driven = start
     for quantity, change in zip(quantities, changes.tolist(), strict=True):
         driven = quantity.change(driven, change)
     return driven
 
 
-def _quantities(start: Driven) -> list[Quantity]:
+def _quantities(start: Driven) -> list[PolishedQuantity]:
     """Return what a polish changes; friction that was identified as none stays so."""
     arm = start.arm
     servo = start.motion.servo
     model = arm.model
-    quantities = list[Quantity]()
+    quantities = list[PolishedQuantity]()
     for joint in range(model.n_joints):
         for symbols in (_DRY, _VISCOUS):
             chosen = [
@@ -134,7 +134,7 @@ def _quantities(start: Driven) -> list[Quantity]:
             ]
             rows = model.friction_part.start + np.flatnonzero(chosen)
             if arm.values[rows].any():
-                quantities.append(Quantity(partial(_with_friction, rows)))
+                quantities.append(PolishedQuantity(partial(_with_friction, rows)))
     if model.layout.rotor_inertia:
         rotors = arm.standard[model.layout.rotors].tolist()
         inertias = joint_inertia(arm, start.motion.windows.step).tolist()
@@ -143,13 +143,13 @@ def _quantities(start: Driven) -> list[Quantity]:
             others = max((inertia - rotor) / inertia, np.exp(-_LARGEST_ROTOR * _ROTOR_UNIT))
             change = partial(_with_rotor, joint, inertia)
             least = float(np.log(others)) / _ROTOR_UNIT
-            quantities.append(Quantity(change, least, _LARGEST_ROTOR))
+            quantities.append(PolishedQuantity(change, least, _LARGEST_ROTOR))
     if servo is None:
-        return [*quantities, Quantity(_with_delay)]
+        return [*quantities, PolishedQuantity(_with_delay)]
     for joint in range(model.n_joints):
-        quantities += [Quantity(partial(_with_gain, name, joint)) for name in ("kp", "kd")]
+        quantities += [PolishedQuantity(partial(_with_gain, name, joint)) for name in ("kp", "kd")]
     ends = (np.array([0.0, LONGEST_DELAY]) - servo.delay) / _DELAY_UNIT
-    return [*quantities, Quantity(_with_delay, *ends.tolist())]
+    return [*quantities, PolishedQuantity(_with_delay, *ends.tolist())]
 
 
 def _with_friction(rows: NDArray[np.intp], driven: Driven, change: float) -> Driven:

@@ -23,7 +23,7 @@ class NoServoError(IdentificationError):
     """The recordings do not show a servo."""
 
 
-class Servo(NamedTuple):
+class PositionServo(NamedTuple):
     """Joint torque ``kp (q_c(t - delay) - q) + kd (v_c(t - delay) - v)`` beside a constant."""
 
     kp: Array  # (n,) [N·m/rad or N/m]
@@ -31,7 +31,7 @@ class Servo(NamedTuple):
     delay: float  # of the command [s]
 
 
-def lead_of(servo: Servo | None) -> float:
+def lead_of(servo: PositionServo | None) -> float:
     """Return how long before a window the command of a servo has to be known [s]."""
     return 0.0 if servo is None else max(servo.delay, LONGEST_DELAY)
 
@@ -55,7 +55,9 @@ def command_of(stretch: Stretch, delay: float) -> tuple[Array, Array]:
     return position, (later - earlier) / (2.0 * half)
 
 
-def identify_servo(stretches: Sequence[Stretch], step: float, joint_names: Sequence[str]) -> Servo:
+def identify_servo(
+    stretches: Sequence[Stretch], step: float, joint_names: Sequence[str]
+) -> PositionServo:
     """Return the servo of some stretches, by least squares for each delay; `step` is theirs [s].
 
     Raises:
@@ -83,7 +85,9 @@ def best_delay(error: Callable[[float], float]) -> float:
     return float(fine.x)
 
 
-def _gains_at(stretches: Sequence[Stretch], delay: float, step: float) -> tuple[float, Servo]:
+def _gains_at(
+    stretches: Sequence[Stretch], delay: float, step: float
+) -> tuple[float, PositionServo]:
     """Return the share of the torque's variance that is left over, and the gains."""
     rows = round(BLOCK / step)
     errors = []
@@ -113,7 +117,7 @@ def _gains_at(stretches: Sequence[Stretch], delay: float, step: float) -> tuple[
         kd[joint] = max(0.0, float(gains[1]))
         residual = torque[:, joint] - columns @ gains
         left += float(residual @ residual) / max(float(torque[:, joint] @ torque[:, joint]), 1e-300)
-    return left, Servo(kp, kd, delay)
+    return left, PositionServo(kp, kd, delay)
 
 
 def without_means(values: Array, rows: int) -> list[Array]:

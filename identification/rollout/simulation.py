@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from identification.arrays import Array
 from identification.errors import IdentificationError
-from identification.export.arm import Arm
+from identification.export.arm import ExportedArm
 from identification.export.simulators import load_mujoco, mjcf
 
 LARGEST_ERROR: Final = np.pi
@@ -38,7 +38,7 @@ class Feedback(NamedTuple):
 
 
 @dataclass(frozen=True, eq=False)
-class SimulatedArm:
+class RolloutArm:
     r"""An arm in MuJoCo without limits, contacts and motors; torques act on its joints.
 
     The stiffness k of the feedback acts on the mean of the positions before and after a step,
@@ -55,7 +55,7 @@ class SimulatedArm:
     feedback: Feedback
 
     @classmethod
-    def of(cls, arm: Arm, step: float, feedback: Feedback) -> SimulatedArm:
+    def of(cls, arm: ExportedArm, step: float, feedback: Feedback) -> RolloutArm:
         """Compile an arm.
 
         Raises:

@@ -22,9 +22,9 @@ from identification.selection.scores import (
     MEANINGLESS,
     TRANSFER,
     WORTHWHILE,
-    Decision,
     Known,
     Ready,
+    SettingDecision,
     Trial,
 )
 from identification.selection.settings import Choice, Hedge, Settings
@@ -223,7 +223,7 @@ def _choose_prior(
     return compared, now, choices
 
 
-def _friction_terms(trial: Trial, now: Settings) -> Decision:
+def _friction_terms(trial: Trial, now: Settings) -> SettingDecision:
     """Choose the terms beside Coulomb and viscous friction, the stated ones first.
 
     A term must also predict fast motion from slower one no worse, and leave friction in a faster
@@ -246,7 +246,7 @@ def _friction_terms(trial: Trial, now: Settings) -> Decision:
     return trial.decide(FRICTION_AT_SPEED, candidates, TERM_WORTHWHILE, possible=possible)
 
 
-def _load_friction(trial: Trial, now: Settings) -> Decision:
+def _load_friction(trial: Trial, now: Settings) -> SettingDecision:
     """Choose whether dry friction grows with the transmitted torque, as in strain-wave gears.
 
     A stated term comes first. Shares that no gear has are refused.
@@ -261,7 +261,7 @@ def _load_friction(trial: Trial, now: Settings) -> Decision:
     )
 
 
-def _torsion_springs(trial: Trial, now: Settings, joints: Sequence[str]) -> list[Decision]:
+def _torsion_springs(trial: Trial, now: Settings, joints: Sequence[str]) -> list[SettingDecision]:
     """Choose the joints with a torsion spring, such as a hose that their motion twists.
 
     Bodies that cannot exist, with a negative inertia, predict the torque of a spring as well; so
@@ -345,7 +345,7 @@ def _compare_low_passes(
     delayed = now.preprocessing.torque_delay != now.stated_delay
     certainty = CERTAIN if delayed else 1.0
 
-    def compare(first: Settings, other: Settings) -> Decision:
+    def compare(first: Settings, other: Settings) -> SettingDecision:
         return trial.decide(
             LOW_PASS, [first, other], LOW_PASS_WORTHWHILE, by_joint=True, certainty=certainty
         )
@@ -376,7 +376,7 @@ def _compare_low_passes(
     return now, [*choices, decision.choice]
 
 
-def _smooth_reversal(trial: Trial, now: Settings, filtered: Settings) -> Decision:
+def _smooth_reversal(trial: Trial, now: Settings, filtered: Settings) -> SettingDecision:
     """Choose friction of ``tanh(v / v_t)`` in place of a low-pass if it predicts clearly better."""
     best = trial.best([_with_tanh(now, speed) for speed in REVERSAL_SPEEDS])
     for step in REVERSAL_STEPS:
@@ -424,7 +424,9 @@ def _sweep(
     return now, choices
 
 
-def _rows_for_motion(trial: Trial, now: Settings, candidates: Sequence[Settings]) -> Decision:
+def _rows_for_motion(
+    trial: Trial, now: Settings, candidates: Sequence[Settings]
+) -> SettingDecision:
     """Choose among the candidates that predict all rows as well by the rows in motion.
 
     Static friction holds a joint at rest with any torque: its rows cannot be predicted, and decide

@@ -76,7 +76,7 @@ Known = Mapping[str, tuple[float, float]]
 """Mean and standard deviation of parameters that are known beforehand."""
 
 
-class Decision(NamedTuple):
+class SettingDecision(NamedTuple):
     """The settings that were chosen of some candidates."""
 
     settings: Settings
@@ -161,7 +161,7 @@ class Trial:
         possible: Callable[[Settings], bool] | None = None,
         certainty: float = 1.0,
         transfer: float = 0.0,
-    ) -> Decision:
+    ) -> SettingDecision:
         """Return the first candidate, or the best one if it is clearly better, and `possible`.
 
         Better by a share (`WORTHWHILE`), and by more than the standard error of the difference over
@@ -206,7 +206,7 @@ class Trial:
         change, std = _change(theirs, ours, transfer)
         return math.exp(-0.5 * (max(0.0, change) / std) ** 2)
 
-    def decide_last(self, name: str, candidates: Sequence[Settings]) -> Decision:
+    def decide_last(self, name: str, candidates: Sequence[Settings]) -> SettingDecision:
         """Return the last candidate up to which none predicts worse than the first.
 
         For candidates in the order of what is safer where nothing is predicted, which therefore
@@ -225,9 +225,9 @@ class Trial:
 
     def _decision(
         self, name: str, candidates: Sequence[Settings], means: Sequence[float], chosen: int
-    ) -> Decision:
+    ) -> SettingDecision:
         described = _differences([_description(self.model(each), each) for each in candidates])
-        return Decision(candidates[chosen], Choice(name, described, tuple(means), chosen))
+        return SettingDecision(candidates[chosen], Choice(name, described, tuple(means), chosen))
 
     def knows_bodies(self, settings: Settings) -> bool:
         """Return whether the description has the masses of this arm."""

@@ -18,7 +18,7 @@ from distributed import WorkerPlugin
 
 from hil.base.errors import ArchiveError
 from hil.batch import discovery
-from hil.batch.cluster import Cluster, SkippedArchive, Task
+from hil.batch.cluster import Cluster, ClusterTask, SkippedArchive
 
 NOTHING_OPEN: Final = (
     *("--bandwidth", "40", "--velocity", "position", "--friction", "coulomb,viscous"),
@@ -150,7 +150,7 @@ def crash(_):
 
 
 def task(function, argument):
-    return Task(f"{function.__name__}-{argument}.mcap", function, (argument,))
+    return ClusterTask(f"{function.__name__}-{argument}.mcap", function, (argument,))
 
 
 def check_unused(result, name, reason):

@@ -12,7 +12,7 @@ from hil.base.progress import Silent
 from hil.campaign import Campaign
 from hil.campaign.folder import CampaignFolder
 from hil.campaign.plan import design
-from hil.campaign.rehearsal import CRITERIA, Criterion, Rehearsal
+from hil.campaign.rehearsal import CRITERIA, Rehearsal, RehearsalCriterion
 from hil.cell import Cell
 from hil.cell.text import with_values
 from planner import PiecewiseCubic
@@ -137,7 +137,7 @@ def pass_rehearsal(folder: CampaignFolder, *, passed: bool = True) -> None:
         seed=1,
         passed=passed,
         criteria=[
-            Criterion(name=name, value=0.0, bound=1.0, passed=passed, sentence=name)
+            RehearsalCriterion(name=name, value=0.0, bound=1.0, passed=passed, sentence=name)
             for name in CRITERIA
         ],
         assumed=[],

@@ -25,9 +25,9 @@ from hypothesis import strategies as st
 from pyarrow import parquet
 
 from hil.batch.cache import HEADER, JSON, NPZ, NUMBERS, CacheError, CacheLocation, code_digest
-from hil.batch.cluster import Cluster, SkippedArchive, Task, error_of
+from hil.batch.cluster import Cluster, ClusterTask, SkippedArchive, error_of
 from hil.batch.discovery import ArchiveRef, arm_digest
-from hil.batch.estimates import Arm
+from hil.batch.estimates import BatchArm
 from hil.batch.graph import PARTITION, BatchResult, _Campaign
 from hil.batch.reduction import (
     ToReduce,
@@ -92,18 +92,19 @@ class TestThread:
         """Which takes half a second."""
         program = (
             "import sys\n"
-            "from hil.batch.cluster import Cluster, Task\n"
+            "from hil.batch.cluster import Cluster, ClusterTask\n"
             "with Cluster() as cluster:\n"
-            "    print(cluster.results([Task('a', abs, (-3,))]), 'distributed' in sys.modules)"
+            "    results = cluster.results([ClusterTask('a', abs, (-3,))])\n"
+            "print(results, 'distributed' in sys.modules)"
         )
         ran = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True)
         assert ran.stdout == "[3] False\n", ran.stderr
 
     def test_executes_in_order_and_passes_results_on(self):
         with Cluster() as cluster:
-            three, five = (cluster.submit(Task("", abs, (-n,)), archives=1) for n in (3, 5))
-            most = cluster.submit(Task("", max, ([three, five, 4],)), archives=1)
-            power = cluster.submit(Task("", pow, (three, most)), archives=1)
+            three, five = (cluster.submit(ClusterTask("", abs, (-n,)), archives=1) for n in (3, 5))
+            most = cluster.submit(ClusterTask("", max, ([three, five, 4],)), archives=1)
+            power = cluster.submit(ClusterTask("", pow, (three, most)), archives=1)
             assert power.result() == 243
             assert error_of(power) is None
 
@@ -112,16 +113,18 @@ class TestThread:
             raise CacheError(None, "it is full")
 
         with Cluster() as cluster:
-            failed = cluster.submit(Task("", refused, ()), archives=1)
-            for future in (failed, cluster.submit(Task("", abs, (failed,)), archives=1)):
+            failed = cluster.submit(ClusterTask("", refused, ()), archives=1)
+            for future in (failed, cluster.submit(ClusterTask("", abs, (failed,)), archives=1)):
                 assert isinstance(error_of(future), CacheError)
 
     def test_is_waited_for_when_closed_and_begins_no_other_task(self):
         begun = threading.Event()
         go = threading.Event()
         with Cluster() as cluster:
-            first = cluster.submit(Task("", lambda: begun.set() or go.wait(), ()), archives=1)
-            second = cluster.submit(Task("", abs, (1,)), archives=1)
+            first = cluster.submit(
+                ClusterTask("", lambda: begun.set() or go.wait(), ()), archives=1
+            )
+            second = cluster.submit(ClusterTask("", abs, (1,)), archives=1)
             begun.wait()
             threading.Timer(0.05, go.set).start()
         assert (first.done(), second.cancelled()) == (True, True)
@@ -378,7 +381,7 @@ def result():
     pooled = replace(first, level="pooled", campaign="", unseen_rms=0.1 * first.torque_rms)
     return BatchResult(
         estimator="wls",
-        arms={"digest": Arm("digest", cell())},
+        arms={"digest": BatchArm("digest", cell())},
         repetitions=(repetition,),
         campaigns=(first, other),
         pooled=(replace(pooled, unseen_torque_rms=first.torque_rms),),

@@ -17,7 +17,7 @@ from typer.testing import CliRunner
 from hil.base.errors import InputError
 from hil.base.progress import Silent
 from hil.batch.cluster import Cluster
-from hil.batch.estimates import Arm
+from hil.batch.estimates import BatchArm
 from hil.campaign import Campaign
 from hil.campaign.plan import design
 from hil.cell import Cell
@@ -154,7 +154,7 @@ def judged(levels, repetitions=equal):
         ]
         for level in levels
     ]
-    return compare_campaigns(Arm("digest", arm_histories.cell()), levels, single)
+    return compare_campaigns(BatchArm("digest", arm_histories.cell()), levels, single)
 
 
 def in_memory(friction=1.0, *, load=0.0, repetitions=equal):

@@ -20,7 +20,7 @@ from hil.export.controller_code import AGREES, STRICT, CompiledArm, checked, poi
 from hil.importers.recording import ImportOptions
 from hil.pipeline.identified_model import model_of
 from identification.errors import ModelError, ShapeError
-from identification.export.arm import Arm
+from identification.export.arm import ExportedArm
 from identification.export.controller.c_source import Precision, c_source
 from identification.export.controller.reference import pinocchio_bodies, reference_torque
 from identification.export.controller.structured_text import structured_text
@@ -54,7 +54,7 @@ EVERY_TERM = FrictionLaw(
 )
 
 
-def a_whole_arm() -> Arm:
+def a_whole_arm() -> ExportedArm:
     """Six joints with a coupled wrist, every friction term, a payload and every element."""
     return an_arm(
         urdf_text(),
@@ -88,14 +88,14 @@ ARMS = {
 }
 
 
-def compiled(arm: Arm, folder: Path, precision: Precision = "double") -> CompiledArm:
+def compiled(arm: ExportedArm, folder: Path, precision: Precision = "double") -> CompiledArm:
     assert COMPILER is not None
     code = c_source(control_tables(arm), "arm", ["a remark */ with an end"], precision)
     return CompiledArm.of(code, "arm", folder, COMPILER, precision)
 
 
 @pytest.fixture(scope="module")
-def whole(tmp_path_factory: pytest.TempPathFactory) -> tuple[Arm, CompiledArm]:
+def whole(tmp_path_factory: pytest.TempPathFactory) -> tuple[ExportedArm, CompiledArm]:
     arm = a_whole_arm()
     return arm, compiled(arm, tmp_path_factory.mktemp("code"))
 
@@ -142,7 +142,7 @@ def called(arm: CompiledArm, name: str, size: int, *arguments: Any) -> Array:
     return out
 
 
-def test_gravity_and_mass_matrix(whole: tuple[Arm, CompiledArm]) -> None:
+def test_gravity_and_mass_matrix(whole: tuple[ExportedArm, CompiledArm]) -> None:
     arm, code = whole
     n = arm.model.n_joints
     states = random_states(arm, 20)
@@ -159,7 +159,7 @@ def test_gravity_and_mass_matrix(whole: tuple[Arm, CompiledArm]) -> None:
         np.testing.assert_allclose(mass, inertia, atol=1e-11 * np.abs(inertia).max())
 
 
-def an_offset(arm: Arm) -> Array:
+def an_offset(arm: ExportedArm) -> Array:
     """Friction at rest: offsets alone."""
     table = arm.model.friction.table(arm.values[arm.model.friction_part])
     return np.array([row.get("fo", 0.0) for row in table[: arm.model.n_joints]])
@@ -180,7 +180,9 @@ def test_payload_and_gravity_are_set_at_run_time(tmp_path: Path) -> None:
     np.testing.assert_allclose(torque, expected, atol=1e-12 * np.abs(expected).max())
 
 
-def test_dry_friction_follows_the_motion_as_identified(whole: tuple[Arm, CompiledArm]) -> None:
+def test_dry_friction_follows_the_motion_as_identified(
+    whole: tuple[ExportedArm, CompiledArm],
+) -> None:
     """Presliding of joints and coupled motors over reversals between two cycles."""
     arm, code = whole
     n = arm.model.n_joints
@@ -217,7 +219,7 @@ class TestObserver:
     GAIN = 25.0
     DT = 0.001
 
-    def a_push(self, arm: Arm) -> tuple[Motion, Array, Array]:
+    def a_push(self, arm: ExportedArm) -> tuple[Motion, Array, Array]:
         """A motion, the torque of its drives, and a torque from outside in its second half."""
         times = np.arange(0.0, 1.0, self.DT)
         n = arm.model.n_joints
@@ -234,7 +236,7 @@ class TestObserver:
         outside[len(times) // 2 :] = 0.1 * np.abs(torque).max(axis=0)
         return motion, torque - outside, outside
 
-    def seen(self, arm: Arm) -> tuple[Array, Array]:
+    def seen(self, arm: ExportedArm) -> tuple[Array, Array]:
         motion, torque, outside = self.a_push(arm)
         observer = MomentumObserver(arm, self.GAIN, self.DT)
         rows = zip(motion.position, motion.velocity, torque, strict=True)
@@ -260,7 +262,9 @@ class TestObserver:
             seen = observer.step(q, np.zeros(len(q)), torque)
         assert np.abs(seen).max() < 1e-9 * np.abs(torque).max()
 
-    def test_the_compiled_observer_is_this_one(self, whole: tuple[Arm, CompiledArm]) -> None:
+    def test_the_compiled_observer_is_this_one(
+        self, whole: tuple[ExportedArm, CompiledArm]
+    ) -> None:
         arm, code = whole
         motion, torque, _ = self.a_push(arm)
         observer = MomentumObserver(arm, self.GAIN, self.DT)
@@ -349,7 +353,7 @@ class TestStructuredText:
             np.testing.assert_allclose(torque.tau.values, row, atol=1e-12 * np.abs(expected).max())
 
     def test_every_block_agrees_with_the_compiled_code(
-        self, whole: tuple[Arm, CompiledArm]
+        self, whole: tuple[ExportedArm, CompiledArm]
     ) -> None:
         arm, code = whole
         n = arm.model.n_joints

@@ -29,9 +29,9 @@ from hil.cli import app
 from hil.doctor import checks as system_checks
 from hil.doctor import probe
 from hil.doctor.checks import (
+    CheckStatus,
     DiskTrial,
     DoctorCheck,
-    Status,
     System,
     disk_checks,
     route_check,
@@ -95,7 +95,7 @@ def test_cycles_are_judged_by_late_and_by_usual_latency() -> None:
     assert "55 % of the cycle" in slow.reason
 
 
-PORT = DoctorCheck("UDP port 1000", Status.BAD, "in use [by] a", ("sudo ss -lunp",))
+PORT = DoctorCheck("UDP port 1000", CheckStatus.BAD, "in use [by] a", ("sudo ss -lunp",))
 
 
 def diagnosis(
@@ -124,7 +124,7 @@ def test_a_cycle_of_2_ms_is_advised_only_where_it_is_fit(fit_at_1: bool, fit_at_
 
 def test_the_last_remedy_follows_others_only_where_some_are() -> None:
     assert "If it is still not fit" not in page(diagnosis(fit=False))
-    bad = DoctorCheck("disk", Status.BAD, "slow", ("use another disk",))
+    bad = DoctorCheck("disk", CheckStatus.BAD, "slow", ("use another disk",))
     assert "If it is still not fit after that: switch off C-states" in page(
         diagnosis(bad, fit=False)
     )
@@ -132,7 +132,7 @@ def test_the_last_remedy_follows_others_only_where_some_are() -> None:
 
 def test_a_bad_check_makes_a_fast_pc_unfit_and_is_named() -> None:
     assert diagnosis(
-        *(DoctorCheck("x", status, "y") for status in Status if status is not Status.BAD)
+        *(DoctorCheck("x", status, "y") for status in CheckStatus if status is not CheckStatus.BAD)
     ).fit
     unfit = diagnosis(PORT)
     assert not unfit.fit
@@ -154,7 +154,7 @@ def test_the_exit_status_is_0_only_for_a_reliable_fit(
 
 
 def test_page_and_json_agree_and_remedies_come_worst_first() -> None:
-    slow = DoctorCheck("slow", Status.WARN, "", ("make it fast",))
+    slow = DoctorCheck("slow", CheckStatus.WARN, "", ("make it fast",))
     made = diagnosis(slow, PORT, PORT)
     text = page(made)
     document = json.loads(json.dumps(as_json(made)))
@@ -219,7 +219,7 @@ def test_the_disk_of_the_archives_is_measured(tmp_path: Path) -> None:
     assert len(trial.seconds) > 0
     assert list(tmp_path.iterdir()) == []
     checks = disk_checks(Path("/proc"), disk_trial(Path("/proc")))
-    assert checks[-1].status is Status.BAD
+    assert checks[-1].status is CheckStatus.BAD
 
 
 # --- the command -----------------------------------------------------------------------------
@@ -309,8 +309,8 @@ def rates(nominal: int, data: int | None) -> dict[str, str]:
 
 
 Judge = Callable[[System], DoctorCheck]
-Case = tuple[Judge, dict[str, str], dict[str, str], Status, str]
-OK, WARN, BAD, UNKNOWN = Status
+Case = tuple[Judge, dict[str, str], dict[str, str], CheckStatus, str]
+OK, WARN, BAD, UNKNOWN = CheckStatus
 
 
 def of(judge: Judge, *cases: tuple[Any, ...]) -> list[Case]:
@@ -385,7 +385,7 @@ def test_what_is_found_is_judged(
     judge: Judge,
     files: dict[str, str],
     commands: dict[str, str],
-    status: Status,
+    status: CheckStatus,
     word: str,
 ) -> None:
     check = judge(MadeUp(tmp_path, files, commands))
@@ -404,7 +404,7 @@ def test_what_is_found_is_judged(
     ],
 )
 def test_room_and_write_time_are_judged_apart(
-    trial: DiskTrial | None, statuses: list[Status]
+    trial: DiskTrial | None, statuses: list[CheckStatus]
 ) -> None:
     assert [check.status for check in disk_checks(Path("/d"), trial)] == statuses
 

@@ -31,9 +31,9 @@ from hil.control.virtual_link import VirtualLink
 from hil.payload.payload_run import find_payload
 from hil.precision.requirements import requirements_from
 from hil.weighing.payload_campaign import (
-    Mounting,
     MountingError,
     PayloadCampaign,
+    PayloadMounting,
     Weighed,
     assumed_payload,
     loaded_cell,
@@ -89,7 +89,7 @@ def execute(side: Campaign, choices: Mapping[str, Any]) -> RunResult:
 
 def run(weighed: PayloadCampaign, execute=execute, reporter=None, **more: Any) -> Weighed:
     reporter = reporter or Silent()
-    mounting = Mounting(weighed, reporter)
+    mounting = PayloadMounting(weighed, reporter)
     return weighed.run(
         execute, mounting, reporter, links=true_link, choices={"unrehearsed": True}, **more
     )
@@ -312,7 +312,7 @@ class TestMounting:
         return begun(fast_campaign(tmp_path / "weigh", cell))
 
     def test_without_a_terminal_it_names_the_next_command(self, real) -> None:
-        mounting = Mounting(real, Silent(), mounted=False)
+        mounting = PayloadMounting(real, Silent(), mounted=False)
         mounting.require(False)
         command = r"Mount weight.*--payload weight --mounted yes --dry-run`"
         with pytest.raises(MountingError, match=command):
@@ -322,7 +322,7 @@ class TestMounting:
     @pytest.mark.parametrize(("asks", "ending"), [(False, "weight --mounted no"), (True, "weight")])
     def test_messages_of_a_side_confirm_what_nobody_is_asked(self, real, asks, ending) -> None:
         ask = (lambda _: True) if asks else None
-        mounting = Mounting(real, Silent(), ask=ask, mounted=None if asks else False)
+        mounting = PayloadMounting(real, Silent(), ask=ask, mounted=None if asks else False)
         commands: list[str] = []
         real.dry_run(
             lambda side, _: commands.append(side.folder.run_command),  # type: ignore[arg-type]
@@ -338,13 +338,13 @@ class TestMounting:
             asked.append(demand)
             return True
 
-        mounting = Mounting(real, Silent(), ask=ask)
+        mounting = PayloadMounting(real, Silent(), ask=ask)
         for loaded in (False, True, True, False):
             mounting.require(loaded)
         assert [one.split()[0] for one in asked] == ["Remove", "Mount", "Remove"]
 
     def test_another_answer_stops_and_names_the_command(self, real) -> None:
-        mounting = Mounting(real, Silent(), ask=lambda _: False)
+        mounting = PayloadMounting(real, Silent(), ask=lambda _: False)
         with pytest.raises(OperatorStopError, match=r"resume with `hil run .* --payload weight`"):
             mounting.require(True)
 
@@ -419,7 +419,7 @@ class TestChanged:
         real = weighed.loaded.cell.with_values(link)
         mixed = replace(weighed, loaded=replace(weighed.loaded, cell=real))
         with pytest.raises(MountingError, match="Mount weight"):
-            Mounting(mixed, Silent()).require(True)
+            PayloadMounting(mixed, Silent()).require(True)
 
 
 def invoke(root: Path, *words: str):
@@ -450,7 +450,7 @@ class TestCommand:
     def test_without_a_terminal_each_printed_command_leads_on(self, tmp_path, monkeypatch) -> None:
         """Typed as it is printed, from the first dry run to the weighed payload."""
 
-        class OfRealArm(Mounting):
+        class OfRealArm(PayloadMounting):
             def __init__(self, *arguments, **options) -> None:
                 super().__init__(*arguments, **options)
                 self._virtual = False

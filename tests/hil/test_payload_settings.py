@@ -9,7 +9,12 @@ import pinocchio as pin
 import pytest
 from numpy.typing import NDArray
 
-from hil.payload.payload_settings import NOT_DETERMINED, Load, controller_settings, principal_axes
+from hil.payload.payload_settings import (
+    NOT_DETERMINED,
+    ControllerLoad,
+    controller_settings,
+    principal_axes,
+)
 from identification.model.pseudo_inertia import Body
 
 Array = NDArray[np.float64]
@@ -35,7 +40,7 @@ BALL = Body(3.0, np.array([0.01, 0.0, 0.2]), np.eye(3) * 0.01)
 
 
 def lines(body: Body, *, with_centre: bool = True, with_inertia: bool = True) -> dict[str, str]:
-    return controller_settings(Load(body, with_centre, with_inertia))
+    return controller_settings(ControllerLoad(body, with_centre, with_inertia))
 
 
 def about(axis: int, degrees: float) -> Array:

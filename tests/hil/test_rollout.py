@@ -28,7 +28,7 @@ from hil.report.rollout_section import overview_charts, overview_legends
 from hil.results.provenance import PARAMETERS_JSON
 from hil.results.rollout_result import ROLLOUT, ArmErrors, RolloutResult
 from hil.rollout.torque_rollout import POLISHED
-from identification.rollout.servo import Servo
+from identification.rollout.servo import PositionServo
 from identification.text import percentage
 from tests import messages
 from tests.identification.two_link import MODEL, URDF, four_sines, truth
@@ -260,9 +260,9 @@ def test_a_servo_needs_gains_and_a_delay(folder: Path, servo: str, problem: str)
 def test_gains_of_an_identified_servo_are_named(
     folder: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    def stiff(_stretches: object, _step: float, joint_names: Sequence[str]) -> Servo:
+    def stiff(_stretches: object, _step: float, joint_names: Sequence[str]) -> PositionServo:
         n = len(joint_names)
-        return Servo(np.full(n, 2e4), np.full(n, 200.0), 0.004)
+        return PositionServo(np.full(n, 2e4), np.full(n, 200.0), 0.004)
 
     monkeypatch.setattr("hil.rollout.torque_rollout.identify_servo", stiff)
     done = run("rollout", folder, "--servo", "identified", "--samples", "3")

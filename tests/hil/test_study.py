@@ -21,10 +21,10 @@ from hil.cli import app
 from hil.control.simulation import planted_values
 from hil.design.messages import NoExcitationError
 from hil.study import StudyResults, StudySettings, run_study, study_settings
-from hil.study.campaigns import SINES, Execution, chosen, execute
+from hil.study.campaigns import SINES, StudyExecution, chosen, execute
 from hil.study.results import (
     MIN_UNITS,
-    Comparison,
+    StudyComparison,
     compared,
     conclusion_of,
     parameters_of,
@@ -144,7 +144,7 @@ class TestCompared:
     ) -> None:
         """The conclusion says the same in words, and names the better method."""
         assert verdict_of(ratio, low, high) == verdict
-        row = Comparison(ratio=ratio, wins=3, motions=9, low=low, high=high, verdict=verdict)
+        row = StudyComparison(ratio=ratio, wins=3, motions=9, low=low, high=high, verdict=verdict)
         methods = [SimpleNamespace(values=[[0.0]] * 3, duration=size) for size in (20.0, 8.0)]
         made = SimpleNamespace(words="with effects", comparison=row, methods=methods)
         first, second = conclusion_of([cast(Any, made)], quick=False)
@@ -212,7 +212,9 @@ def whole(tmp_path_factory: pytest.TempPathFactory, small: StudySettings, arm: C
     """A study that Ctrl-C ended after its first campaign, and that was then started again."""
     root = tmp_path_factory.mktemp("first") / "study"
 
-    def one_and_ctrl_c(_: object, calls: Sequence[tuple[Path, tuple[Execution]]], *__: Any) -> None:
+    def one_and_ctrl_c(
+        _: object, calls: Sequence[tuple[Path, tuple[StudyExecution]]], *__: Any
+    ) -> None:
         execute(*calls[0][1])
         raise KeyboardInterrupt
 

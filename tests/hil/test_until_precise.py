@@ -13,7 +13,7 @@ from hil.base.progress import Silent
 from hil.campaign import Campaign
 from hil.campaign.identified import identify_campaign
 from hil.campaign.plan import design
-from hil.campaign.precision_record import Look, PrecisionRecord, Reached
+from hil.campaign.precision_record import PrecisionLook, PrecisionRecord, Reached
 from hil.campaign.reached_precision import PrecisionMeter, further, noise_shares, requirements_of
 from hil.cli import app
 from hil.control.motion_watch import Stop
@@ -167,35 +167,37 @@ class TestRecord:
     def test_outcomes(self, halves, more, outcome) -> None:
         record = PrecisionRecord("hash", ("parameters 5 %",))
         for count, (half, further_) in enumerate(zip(halves, more, strict=True), 1):
-            record = record.with_look(Look(count, (reached(half, further_),)), limit=10)
+            record = record.with_look(PrecisionLook(count, (reached(half, further_),)), limit=10)
         assert record.outcome == outcome
 
     def test_the_limit_ends_it(self) -> None:
         record = PrecisionRecord("hash", ("parameters 5 %",))
         for count in range(1, 5):
-            record = record.with_look(Look(count, (reached(0.06, 1),)), limit=4)
+            record = record.with_look(PrecisionLook(count, (reached(0.06, 1),)), limit=4)
         assert record.outcome == "limit"
 
     def test_what_is_overdue_is_not_promised_again(self) -> None:
         """Twice as many repetitions as were predicted did not meet it: more of them will not."""
         record = PrecisionRecord("hash", ("parameters 5 %",))
         for count in (2, 3, 4):
-            record = record.with_look(Look(count, (reached(0.051, 1),)), limit=30)
+            record = record.with_look(PrecisionLook(count, (reached(0.051, 1),)), limit=30)
         assert "which repeating this motion does not improve enough" in record.message
         assert "another motion" in record.message
 
     def test_one_requirement_in_reach_continues(self) -> None:
         """The one that repetitions do not meet is no reason to leave the other unmet."""
-        look = Look(3, (reached(0.07, None), reached(3.0, 2, "torque 2 N·m")))
+        look = PrecisionLook(3, (reached(0.07, None), reached(3.0, 2, "torque 2 N·m")))
         assert PrecisionRecord("hash", ()).with_look(look, limit=10).outcome == "going on"
 
     def test_the_message_names_the_worst(self) -> None:
-        look = Look(4, (reached(0.071, 6), reached(1.0, 0, "torque 2 N·m")))
+        look = PrecisionLook(4, (reached(0.071, 6), reached(1.0, 0, "torque 2 N·m")))
         record = PrecisionRecord("hash", ()).with_look(look, limit=30)
         assert record.message == "precision after 4 repetitions: I2m 7.1 % of 5 %, about 6 more"
 
     def test_it_survives_its_file(self, tmp_path) -> None:
-        record = PrecisionRecord("hash", ("parameters 5 %",), (Look(1, (reached(0.07, None),)),))
+        record = PrecisionRecord(
+            "hash", ("parameters 5 %",), (PrecisionLook(1, (reached(0.07, None),)),)
+        )
         record.save(tmp_path / "precision.json")
         assert PrecisionRecord.load(tmp_path / "precision.json", "hash") == record
         assert PrecisionRecord.load(tmp_path / "precision.json", "other") is None

@@ -6,11 +6,11 @@ import numpy as np
 import pytest
 import scipy
 
-from identification.export.arm import Arm, Ranges
+from identification.export.arm import ExportedArm, Ranges
 from identification.export.simulators import mjcf
 from identification.model.motion import Motion
 from identification.rollout.encoders import NAMES, fit_servo
-from identification.rollout.servo import NoServoError, Servo
+from identification.rollout.servo import NoServoError, PositionServo
 from identification.rollout.windows import Stretch, stretches_of
 from tests.identification.two_link import MODEL, URDF, as_samples, four_sines
 
@@ -28,7 +28,7 @@ TRUE = np.column_stack([KP, KD, ROTORS, DRY, VISCOUS])
 STEP = 0.005
 
 
-def an_arm(rotors=ROTORS, dry=DRY, factor: float = 1.0) -> Arm:
+def an_arm(rotors=ROTORS, dry=DRY, factor: float = 1.0) -> ExportedArm:
     """The arm with its friction; `factor` is that of its masses."""
     standard = factor * MODEL.nominal
     standard[MODEL.layout.rotors] = rotors
@@ -36,22 +36,22 @@ def an_arm(rotors=ROTORS, dry=DRY, factor: float = 1.0) -> Arm:
     friction = [by_symbol[t.symbol][t.owner] if t.symbol in by_symbol else 0.0
                 for t in MODEL.friction.terms]  # fmt: skip
     values = np.concatenate([MODEL.base.grouping @ standard, friction])
-    return Arm(URDF, MODEL, standard, values, NO_LIMITS)
+    return ExportedArm(URDF, MODEL, standard, values, NO_LIMITS)
 
 
 def on_its_servo(
-    arm: Arm,
+    arm: ExportedArm,
     disturbance: float = 0.0,
     seed: int = 1,
     duration: float = 20.0,
     step: float = 0.001,
-    servo: Servo | None = None,
+    servo: PositionServo | None = None,
 ):
     """Time, positions, velocities and command of an arm that MuJoCo moves, each `step` [s].
 
     A coloured disturbance [N·m] with a time constant of 20 ms acts beside the servo.
     """
-    servo = servo or Servo(KP, KD, DELAY)
+    servo = servo or PositionServo(KP, KD, DELAY)
     model = mujoco.MjModel.from_xml_string(mjcf(arm, "arm", step=step))
     model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_LIMIT
     data = mujoco.MjData(model)
@@ -79,7 +79,7 @@ def on_its_servo(
     return time[settled], position[settled], velocity[settled], command.position[settled]
 
 
-def stretches(arm: Arm, disturbance: float = 0.0, seed: int = 1) -> list[Stretch]:
+def stretches(arm: ExportedArm, disturbance: float = 0.0, seed: int = 1) -> list[Stretch]:
     time, position, velocity, command = on_its_servo(arm, disturbance, seed)
     motion = Motion(time, position, velocity, np.gradient(velocity, time, axis=0))
     nothing = np.zeros_like(position)

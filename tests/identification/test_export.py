@@ -18,7 +18,7 @@ from identification.errors import ModelError, ShapeError
 from identification.estimators.consistent import consistent_estimate
 from identification.excitation.collision import CollisionChecker
 from identification.excitation.errors import CollisionModelError
-from identification.export.arm import Arm, Ranges
+from identification.export.arm import ExportedArm, Ranges
 from identification.export.friction import friction_curve, median_load
 from identification.export.parameters import parameters_csv, parameters_json
 from identification.export.simulators import AGREES, FORMATS, compare, mjcf, random_states
@@ -567,7 +567,9 @@ def an_arm(urdf, **options):
     others = np.random.default_rng(1).uniform(0.5, 2.5, model.n_parameters - model.base.rank)
     values = np.concatenate([model.base.grouping @ standard, others])
     infinite = np.full(n, np.inf)
-    return Arm(urdf, model, standard, values, Ranges(-infinite, infinite, infinite, infinite))
+    return ExportedArm(
+        urdf, model, standard, values, Ranges(-infinite, infinite, infinite, infinite)
+    )
 
 
 def compared(form, arm, remarks=(), samples=20):

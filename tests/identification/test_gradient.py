@@ -20,7 +20,7 @@ from identification.excitation.criteria import (
 from identification.excitation.precision import Precision, Quantities
 from identification.excitation.searches import run
 from identification.excitation.searches.bundle_method import Ascent, _Cut, _step, improve
-from identification.excitation.searches.local_change import Change
+from identification.excitation.searches.local_change import LocalChange
 from identification.excitation.searches.population import Population, Scores, SearchSettings
 from identification.excitation.searches.run import search
 from identification.excitation.searches.sensitivity import Linearisation, gene_slopes
@@ -177,7 +177,7 @@ def test_a_part_that_takes_longer_counts_more_often(population, start):
     step = sensitivity.duration / count
     enter, left = part.start * step, part.stop * step
 
-    class Longer(Change):
+    class Longer(LocalChange):
         """The same states, as if a gene changed nothing but the time."""
 
         def states(self, time):

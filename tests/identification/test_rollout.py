@@ -6,7 +6,7 @@ from functools import partial
 import numpy as np
 import pytest
 
-from identification.export.arm import Arm, Ranges
+from identification.export.arm import ExportedArm, Ranges
 from identification.export.simulators import FORMATS, compare, mjcf
 from identification.model.friction import FrictionLaw
 from identification.model.motion import Motion
@@ -24,8 +24,8 @@ from identification.rollout.comparison import (
     simulate,
 )
 from identification.rollout.polish import Driven, polished
-from identification.rollout.servo import NoServoError, Servo, identify_servo, lead_of
-from identification.rollout.simulation import LARGEST_ERROR, Feedback, SimulatedArm
+from identification.rollout.servo import NoServoError, PositionServo, identify_servo, lead_of
+from identification.rollout.simulation import LARGEST_ERROR, Feedback, RolloutArm
 from identification.rollout.windows import (
     NoWindowError,
     mean_about,
@@ -43,15 +43,15 @@ NO_LIMITS = Ranges(*(np.full(N, limit) for limit in (-np.inf, np.inf, np.inf, np
 NOTHING = Feedback(np.zeros(N), np.zeros(N))
 
 
-def an_arm(coulomb: float = 0.0) -> Arm:
+def an_arm(coulomb: float = 0.0) -> ExportedArm:
     standard = MODEL.nominal
     standard[MODEL.layout.rotors] = (0.4, 0.1)
     friction = [{"f0": coulomb, "f1": 2.0}.get(term.symbol, 0.0) for term in MODEL.friction.terms]
     values = np.concatenate([MODEL.base.grouping @ standard, friction])
-    return Arm(URDF, MODEL, standard, values, NO_LIMITS)
+    return ExportedArm(URDF, MODEL, standard, values, NO_LIMITS)
 
 
-def a_recording(arm: Arm, step: float, duration: float = 3.0):
+def a_recording(arm: ExportedArm, step: float, duration: float = 3.0):
     """Torque of an arm along sines, and its windows at a time step [s]."""
     motion = four_sines(np.arange(0.0, duration, 0.001), 0.5)
     samples = simulated(MODEL, arm.values, motion)
@@ -59,7 +59,7 @@ def a_recording(arm: Arm, step: float, duration: float = 3.0):
     return RecordedMotion(windows_of(stretches, step, 1.0, 0.2), tuple(owners))
 
 
-def final_errors(arm: Arm, motion: RecordedMotion, feedback: Feedback = NOTHING):
+def final_errors(arm: ExportedArm, motion: RecordedMotion, feedback: Feedback = NOTHING):
     measured = motion.windows.reached[:, horizon_rows(motion.windows)]
     return errors_of(simulate(arm, motion, feedback), measured, arm.model.chain)
 
@@ -98,7 +98,7 @@ def test_the_solver_of_dry_friction_changes_no_position() -> None:
     arm = an_arm(coulomb=3.0)
     motion = a_recording(arm, 0.005)
     windows = motion.windows
-    simulated = SimulatedArm.of(arm, windows.step, NOTHING)
+    simulated = RolloutArm.of(arm, windows.step, NOTHING)
     force = motion.force(arm, simulated)
     run = partial(simulated.simulate, windows.position[:, 0], windows.start, force)
     positions = run(windows.position)
@@ -133,7 +133,7 @@ def test_a_polish_finds_friction_rotor_and_delay() -> None:
 
 @pytest.mark.long
 def test_a_polish_finds_a_heavy_rotor() -> None:
-    def with_rotor(inertia: float) -> Arm:
+    def with_rotor(inertia: float) -> ExportedArm:
         arm = an_arm()
         standard = arm.standard.copy()
         standard[MODEL.layout.rotors] = (0.4, inertia)
@@ -152,7 +152,7 @@ def test_friction_that_accelerates_acts_as_measured() -> None:
     standard[model.layout.rotors] = (0.4, 0.1)
     friction = [{"f0": 0.1, "f1": 0.1, "f2": -3.0}.get(t.symbol, 0.0) for t in model.friction.terms]
     values = np.concatenate([model.base.grouping @ standard, friction])
-    arm = Arm(URDF, model, standard, values, NO_LIMITS)
+    arm = ExportedArm(URDF, model, standard, values, NO_LIMITS)
     motion = four_sines(np.arange(0.0, 3.0, 0.001), 0.5)
     stretches, owners = recorded_stretches(model, [(simulated(model, values, motion), None)], 0.005)
     recorded = RecordedMotion(windows_of(stretches, 0.005, 1.0, 0.2), tuple(owners))
@@ -257,7 +257,7 @@ class TestServo:
 class TestStepOnServo:
     """At 5 ms arms on servos of any stiffness move as at 0.2 ms."""
 
-    def errors(self, arm: Arm, servo: Servo, moved, step: float):
+    def errors(self, arm: ExportedArm, servo: PositionServo, moved, step: float):
         """Errors of an arm on a servo, in windows of a motion on it."""
         time, position, velocity, command = moved
         motion = Motion(time, position, velocity, np.gradient(velocity, time, axis=0))
@@ -278,7 +278,7 @@ class TestStepOnServo:
         arm = an_arm(coulomb=1.0)
         inertia = joint_inertia(arm, 0.005)
         rate = phase / 0.005
-        servo = Servo(rate**2 * inertia, 0.4 * rate * inertia, 0.012)
+        servo = PositionServo(rate**2 * inertia, 0.4 * rate * inertia, 0.012)
         moved = on_its_servo(arm, duration=3.5, step=2e-4, servo=servo)
         errors = self.errors(arm, servo, moved, 0.005)
         assert errors.unstable == 0
@@ -287,7 +287,7 @@ class TestStepOnServo:
     def test_a_stiff_servo_makes_no_light_arm_unstable(self) -> None:
         """Such as a nominal arm without rotor inertias, on the servo of the real one."""
         arm = an_arm(coulomb=1.0)
-        servo = Servo(np.array([2e6, 5e5]), np.array([0.0, 0.0]), 0.012)
+        servo = PositionServo(np.array([2e6, 5e5]), np.array([0.0, 0.0]), 0.012)
         moved = on_its_servo(arm, duration=3.5, step=1e-4, servo=servo)
         light = replace(arm, standard=1e-3 * arm.standard, values=1e-3 * arm.values)
         errors = self.errors(light, servo, moved, 0.005)

@@ -23,7 +23,7 @@ from sim_fixtures import (
     UnmodelledEffects,
     ns16,
 )
-from sim_fixtures.arm import FrictionDrift, TorqueRipple
+from sim_fixtures.arm import SimulatedDrift, SimulatedRipple
 from sim_fixtures.plant import TOLERANCE, resolve_dry_friction
 from sim_fixtures.servo import CurrentLoop, NominalModel, Servo
 from tests.sim_fixtures.bench import CELL, DRIVE, FRICTIONLESS, TRUTH, frictionless, motor_matrix
@@ -150,7 +150,7 @@ def test_the_cell_file_has_the_default_sizes_of_effects() -> None:
 
 
 def test_ripple_has_two_periods_per_motor_turn() -> None:
-    ripple = TorqueRipple(np.array([5.0, 2.0]), np.random.default_rng(1))
+    ripple = SimulatedRipple(np.array([5.0, 2.0]), np.random.default_rng(1))
     turns = np.linspace(0.0, 1.0, 401)
     torque = np.array([ripple.torque([t, t]) for t in turns])
     np.testing.assert_allclose(np.abs(torque).max(axis=0), [5.0, 2.0], rtol=1e-3)
@@ -159,7 +159,7 @@ def test_ripple_has_two_periods_per_motor_turn() -> None:
 
 
 def test_friction_falls_from_cold_to_hot_by_the_stated_share() -> None:
-    drift = FrictionDrift(0.08, 2)
+    drift = SimulatedDrift(0.08, 2)
     cold = drift.scale(np.zeros(2), 0.001)
     np.testing.assert_allclose(cold, 1.04, rtol=1e-6)
     previous = cold

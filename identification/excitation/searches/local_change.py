@@ -65,7 +65,7 @@ class PlannedMoves:
 
     def changed(
         self, genome: ViaPointGenome, genes: Array, which: NDArray[np.intp]
-    ) -> Iterator[Change | None]:
+    ) -> Iterator[LocalChange | None]:
         """Yield the change of the motion with each row of genes (k, n_genes).
 
         In each row one gene of `which` (k,), a coordinate of a via point, differs from those of the
@@ -92,10 +92,10 @@ class PlannedMoves:
             if b == point + _REACH:
                 end -= 0.5 * float(self.lengths[b - 1])
                 left = float(self.middles[b - 1])
-            yield Change(part, begin, enter, left, end - left)
+            yield LocalChange(part, begin, enter, left, end - left)
 
 
-class Change(NamedTuple):
+class LocalChange(NamedTuple):
     """Change of a motion in a part of it; what follows is only later."""
 
     motion: PiecewiseCubic | FourierSeries  #: planned instead of the part, and of some before it

@@ -29,7 +29,7 @@ Phase = Literal["search", "gradient"]
 Fitness = Callable[[Scores], Array]
 
 
-class Progress(NamedTuple):
+class SearchProgress(NamedTuple):
     """Progress of a search."""
 
     phase: Phase  #: the genetic search, or the steps along the gradient after it
@@ -184,7 +184,7 @@ def search(
     settings: SearchSettings,
     *,
     journal: Journal | None = None,
-    progress: Callable[[Progress], None] | None = None,
+    progress: Callable[[SearchProgress], None] | None = None,
     scored: Callable[[int], None] | None = None,
     stop: Callable[[], bool] = lambda: False,
 ) -> Design:
@@ -213,7 +213,7 @@ class _Search:
         population: Population,
         settings: SearchSettings,
         journal: Journal | None,
-        progress: Callable[[Progress], None] | None,
+        progress: Callable[[SearchProgress], None] | None,
         scored: Callable[[int], None] | None,
         stop: Callable[[], bool],
     ) -> None:
@@ -357,7 +357,7 @@ class _Search:
         if len(front) > 0:
             best = front.measures[self._goal.choice(front)]
         self._progress(
-            Progress(
+            SearchProgress(
                 self._phase,
                 self._generations,
                 self._settings.generations,

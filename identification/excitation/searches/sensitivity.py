@@ -20,12 +20,12 @@ from identification.excitation.collision import CollisionChecker
 from identification.excitation.constraints import Constraints, CurrentModel, midpoints, sampled
 from identification.excitation.criteria import Objective
 from identification.excitation.genomes import Genome, ViaPointGenome
-from identification.excitation.searches.local_change import Change, PlannedMoves
+from identification.excitation.searches.local_change import LocalChange, PlannedMoves
 from identification.model.motion import Motion
 from planner import PlannerError
 
 
-class Problem(Protocol):
+class SensitivityProblem(Protocol):
     """What a sensitivity needs of a search's problem."""
 
     @property
@@ -98,7 +98,7 @@ class Sensitivity:
     left: Array  #: (1 + c,) to the longest duration [s], then of the margins; negative if violated
     moves: PlannedMoves | None  #: of the motion; None where a gene changes all of it
 
-    def slopes(self, change: Change, step: float) -> Array:
+    def slopes(self, change: LocalChange, step: float) -> Array:
         """Return the slopes (2 + c,) of criterion, duration's and other margins for one gene.
 
         `change` is that of the motion with the gene changed by `step`. States keep their places in
@@ -130,7 +130,7 @@ class Linearisation(NamedTuple):
     left: Array  #: the margins (1 + c,); negative if violated
 
 
-def sensitivity_of(problem: Problem, genes: Array, weights: Array | None) -> Sensitivity:
+def sensitivity_of(problem: SensitivityProblem, genes: Array, weights: Array | None) -> Sensitivity:
     """Return the slopes of `weights` (d,) times the criteria, and of the margins, by the states.
 
     Without weights the criterion is minus the logarithm of that of the wanted precision.
@@ -176,7 +176,7 @@ def gene_steps(genes: Array) -> Array:
 
 
 def gene_slopes(
-    problem: Problem, sensitivity: Sensitivity, genes: Array, which: NDArray[np.intp]
+    problem: SensitivityProblem, sensitivity: Sensitivity, genes: Array, which: NDArray[np.intp]
 ) -> Array:
     """Return the slopes (k, 2 + c) for some genes (k,), in ascending order.
 
@@ -195,7 +195,7 @@ def gene_slopes(
 
 def _changes(
     genome: Genome, sensitivity: Sensitivity, rows: Array, which: NDArray[np.intp]
-) -> Iterator[Change | None]:
+) -> Iterator[LocalChange | None]:
     """Yield the change of the motion with each row of genes, of which one is changed."""
     local = 0
     if sensitivity.moves is not None and isinstance(genome, ViaPointGenome):
@@ -206,7 +206,7 @@ def _changes(
         if isinstance(motion, PlannerError):
             yield None
         else:
-            yield Change(motion, 0.0, 0.0, duration, motion.duration - duration)
+            yield LocalChange(motion, 0.0, 0.0, duration, motion.duration - duration)
 
 
 def _steps(states: Array) -> Array:

@@ -8,13 +8,13 @@ import numpy as np
 import pinocchio as pin
 
 from identification.arrays import Array
-from identification.export.arm import Arm
+from identification.export.arm import ExportedArm
 from identification.export.urdf import rnea
 from identification.model.kinematics import FROM_PINOCCHIO, pinocchio_model
 from identification.model.motion import Motion
 
 
-def pinocchio_bodies(arm: Arm) -> pin.Model:
+def pinocchio_bodies(arm: ExportedArm) -> pin.Model:
     """Return pinocchio's model of an arm's bodies and payload, every number as identified."""
     model = pinocchio_model(arm.urdf, arm.model.locked)
     model.gravity.linear = arm.model.gravity
@@ -31,7 +31,7 @@ def pinocchio_bodies(arm: Arm) -> pin.Model:
     return model
 
 
-def reference_torque(arm: Arm, motion: Motion, *, presliding: bool = False) -> Array:
+def reference_torque(arm: ExportedArm, motion: Motion, *, presliding: bool = False) -> Array:
     """Return the torque (m, n) of an arm along a motion: bodies by pinocchio, and the rest.
 
     Without `presliding` dry friction has the sign of the speed.
@@ -42,7 +42,7 @@ def reference_torque(arm: Arm, motion: Motion, *, presliding: bool = False) -> A
     return rigid + known + _friction_and_elements(arm, motion, presliding=presliding)
 
 
-def _friction_and_elements(arm: Arm, motion: Motion, *, presliding: bool) -> Array:
+def _friction_and_elements(arm: ExportedArm, motion: Motion, *, presliding: bool) -> Array:
     model = arm.model
     load = model.gear_torque(arm.values, motion) if model.friction.has_load else None
     direction = model.friction.direction(motion) if presliding else None

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from identification.arrays import Array, Indices
-from identification.export.arm import Arm
+from identification.export.arm import ExportedArm
 from identification.model.elements import (
     Anchors,
     Coefficient,
@@ -118,7 +118,7 @@ class ControlTables:
         return bool(self.friction[:, FRICTION_COLUMNS.index("FRICTION_LOAD")].any())
 
 
-def control_tables(arm: Arm) -> ControlTables:
+def control_tables(arm: ExportedArm) -> ControlTables:
     """Return the tables of an identified arm.
 
     Raises:
