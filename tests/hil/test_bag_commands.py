@@ -22,7 +22,9 @@ from hil.base.errors import InputError
 from hil.cli import app
 from hil.importers.bag_map import BagMap
 from hil.importers.ros_messages import CONTROLLER_STATE, definitions_of
+from hil.results.provenance import RESULTS
 from hil.results.rollout_result import ROLLOUT, RolloutResult
+from hil.results.servo_result import ServoResults
 from tests.hil.test_importers_rosbag2 import bag
 from tests.identification.test_encoders import DELAY, KD, KP, an_arm, on_its_servo
 from tests.identification.two_link import MODEL, URDF, four_sines
@@ -522,15 +524,26 @@ class TestServo:
         assert result.identified.unstable == 0
         assert result.identified.overall(2) < 0.02
 
-    def test_an_identification_names_the_way(self, tmp_path, moved) -> None:
+    @pytest.mark.long
+    def test_a_bag_is_identified_in_one_command(self, tmp_path, moved) -> None:
+        self.imported(tmp_path, moved)
+        bag_path = tmp_path / "bag.db3"
+        urdf = tmp_path / "robot.urdf"
+        done = CliRunner().invoke(
+            app, ["identify", str(bag_path), "--urdf", str(urdf), "-o", str(tmp_path / "out")]
+        )
+        assert done.exit_code in (0, 5), done.exception
+        results = ServoResults.load(tmp_path / "out" / RESULTS)
+        gains = [row.value for row in results.servo if row.name == "kp"]
+        assert gains == pytest.approx(KP, rel=0.05)
+
+    def test_a_look_finds_no_torque(self, tmp_path, moved) -> None:
         self.imported(tmp_path, moved._replace(**{
             name: values[:500] for name, values in moved._asdict().items()
         }))  # fmt: skip
-        bag_path = tmp_path / "bag.db3"
-        urdf = tmp_path / "robot.urdf"
-        refused = CliRunner().invoke(app, ["identify", str(bag_path), "--urdf", str(urdf)])
-        assert "has neither joint torques nor motor currents" in str(refused.exception)
-        assert "`hil import log` and `hil rollout --polish`" in str(refused.exception)
-        look = CliRunner().invoke(app, ["look", str(bag_path), "--urdf", str(urdf)])
+        look = CliRunner().invoke(
+            app,
+            ["look", str(tmp_path / "bag.db3"), "--urdf", str(tmp_path / "robot.urdf")],
+        )
         assert look.exit_code == 0, look.exception
         assert "none, and no motor current" in " ".join(look.output.split())

@@ -18,7 +18,7 @@ from hil.servo.messages import screen
 from identification.servo.parameters import PLACE
 from tests import servo_arm as arm
 
-SO101 = Path("/work/shared/data/so101")
+SO101 = Path(__file__).resolve().parents[3] / "shared" / "data" / "so101"
 MICROSECONDS = 1e6
 
 

@@ -8,9 +8,11 @@ import pytest
 from typer.testing import CliRunner
 
 from hil.archive.recordings import open_recording
-from hil.base.errors import HilError, InputError
+from hil.base.errors import InputError
 from hil.cli import app
+from hil.results.provenance import RESULTS
 from hil.results.rollout_result import ROLLOUT, RolloutResult
+from hil.results.servo_result import ServoResults
 from tests import messages
 from tests.identification.test_encoders import DELAY, KP, TRUE, URDF, an_arm, on_its_servo
 
@@ -76,11 +78,17 @@ def test_the_servo_is_identified_as_far_as_determined(archive: Path, tmp_path: P
     assert "nan" not in (tmp_path / ROLLOUT).read_text().lower()
 
 
-def test_an_identification_names_the_way_without_torque(log: Path, archive: Path) -> None:
-    refused = run("identify", archive)
-    assert isinstance(refused.exception, HilError)
-    assert "contains neither joint torques nor motor currents" in str(refused.exception)
-    assert "`hil rollout --polish` identifies servo and friction" in str(refused.exception)
+@pytest.mark.long
+def test_an_identification_finds_the_servo(archive: Path, tmp_path: Path) -> None:
+    done = run("identify", archive, "-o", tmp_path / "out")
+    assert done.exit_code in (0, 5), done.exception
+    results = ServoResults.load(tmp_path / "out" / RESULTS)
+    gains = {row.joint: row for row in results.servo if row.name == "kp"}
+    for joint, planted in zip(results.joint_names, KP, strict=True):
+        assert gains[joint].lower < planted < gains[joint].upper
+
+
+def test_an_identification_of_a_log_asks_for_the_commands(log: Path) -> None:
     refused = run("identify", log, "--urdf", log.with_name("robot.urdf"))
     assert "commanded positions (--columns 'commanded_position=NAME{}')" in str(refused.exception)
 
