@@ -24,11 +24,11 @@ from hil.look.run import SETTINGS, look_at_joints, mountings
 from hil.pipeline.sources import cell_of, source_of
 from identification.errors import IdentificationError
 from identification.estimators.torque_channel import possible_low_passes
+from identification.hypotheses.scores import Score, compare, score_of
+from identification.hypotheses.search import SURE
 from identification.signals.recording import STUCK_MOVEMENT
 from identification.signals.samples import Samples, prepare
 from identification.text import percentage
-from identification.validation.reading_scores import Score, compare, score_of
-from identification.validation.readings import SURE
 
 _SUSPECT: Final = 0.15
 """Error of the torque, predicted from other parts, above which a log is looked at closely. Right

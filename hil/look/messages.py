@@ -78,9 +78,9 @@ from hil.look.readings import (
     Wrapped,
 )
 from hil.look.result import ChangedReading, Choice, Look, Row
+from identification.hypotheses.changes import IN_ORDER, Meaning
+from identification.hypotheses.faults import COUPLED
 from identification.text import percentage
-from identification.validation.faults import COUPLED
-from identification.validation.reading_changes import IN_ORDER, Meaning
 
 _FACTS: Final[Mapping[Fact, str]] = {
     Fact.EVERY_JOINT_MOVES: "every joint moves",

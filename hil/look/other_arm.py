@@ -32,10 +32,10 @@ from hil.look.readings import (
     UnexplainedTorque,
 )
 from hil.look.result import Row
+from identification.hypotheses.scores import Comparison, Score, compare, score_of
+from identification.hypotheses.search import EXPLAINED, SEPARATE, SURE
 from identification.model.robot import RobotModel
 from identification.signals.samples import Samples
-from identification.validation.reading_scores import Comparison, Score, compare, score_of
-from identification.validation.readings import EXPLAINED, SEPARATE, SURE
 
 _MOST: Final = 0.99  # quantile of the rows, so that single spikes are no evidence
 _BEYOND: Final = 0.17  # rad or m beyond a range; zeros of the same arm differ by less

@@ -56,15 +56,15 @@ from hil.look.result import Aspect, Choice, Group, Row
 from identification.estimators.delay import DelayEstimate
 from identification.estimators.prior import LEARNED, body_prior, fit_posterior
 from identification.factor.factor import Factor
+from identification.hypotheses.changes import IN_ORDER, Axes, Change, Meaning
+from identification.hypotheses.faults import COUPLED
+from identification.hypotheses.search import EXPLAINED, SEPARATE, Readings, Step
 from identification.model.link_wrenches import LINK_SYMBOLS
 from identification.model.motion import Motion
 from identification.model.robot import RobotModel
 from identification.signals.recording import Recording
 from identification.signals.samples import Preprocessing, Samples
-from identification.validation.faults import COUPLED
 from identification.validation.nominal_scale import nominal_scale
-from identification.validation.reading_changes import IN_ORDER, Axes, Change, Meaning
-from identification.validation.readings import EXPLAINED, SEPARATE, Readings, Step
 
 MOUNTINGS: Final = {
     "": (0.0, 0.0, 0.0),

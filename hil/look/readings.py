@@ -18,9 +18,9 @@ from hil.importers.conclusions import (
     RecordedArm,
     StatedUnit,
 )
+from identification.hypotheses.changes import Change
 from identification.signals.clock import SampleTimes, TimeBase
 from identification.signals.row_faults import RowFault
-from identification.validation.reading_changes import Change
 
 Vector = tuple[float, ...]
 

@@ -25,11 +25,11 @@ from hil.pipeline.sources import Source, cell_of, source_of
 from identification.errors import IdentificationError
 from identification.estimators.delay import DelayEstimate, estimate_delay
 from identification.estimators.torque_channel import possible_low_passes
+from identification.hypotheses.changes import Axes
+from identification.hypotheses.search import Readings, find_readings
 from identification.model.robot import RobotModel
 from identification.signals.recording import Recording, RecordingError
 from identification.signals.samples import Preprocessing, prepare
-from identification.validation.reading_changes import Axes
-from identification.validation.readings import Readings, find_readings
 
 SETTINGS: Final = Preprocessing(14.0, left_out="rests")
 """Preparation of a recording whose readings are compared."""

@@ -18,6 +18,15 @@ import numpy as np
 
 from identification.arrays import Array
 from identification.factor.factor import Factor, joined
+from identification.hypotheses.faults import (
+    COUPLED,
+    OF_MOTION,
+    Fault,
+    Kind,
+    Part,
+    corrected,
+    coupled_pairs,
+)
 from identification.model.robot import RobotModel
 from identification.signals.recording import STUCK_MOVEMENT
 from identification.signals.samples import Samples
@@ -31,15 +40,6 @@ from identification.validation.fault_scores import (
 )
 from identification.validation.fault_sizes import estimated_size
 from identification.validation.fault_tables import BLOCKS, FaultTables, columns_of_fault, row_step
-from identification.validation.faults import (
-    COUPLED,
-    OF_MOTION,
-    Fault,
-    Kind,
-    Part,
-    corrected,
-    coupled_pairs,
-)
 from identification.validation.physical_signs import SIGMAS, friction_at
 from identification.validation.prediction import noise_floor
 

@@ -13,10 +13,11 @@ from identification.estimators.consistent import ConsistentEstimate, consistent_
 from identification.estimators.prior import BodyPrior
 from identification.factor.estimate import Estimate
 from identification.factor.factor import Factor
+from identification.hypotheses.little_torque import little_torque
 from identification.model.motion import Motion
 from identification.model.pseudo_inertia import pseudo_inertia, reference_bodies
 from identification.model.robot import RobotModel
-from identification.validation.finding import joined, little_torque
+from identification.validation.finding import joined
 from identification.validation.physical_signs import SIGMAS
 
 # Smallest second moment of a link relative to the nominal body's at which a bound counts as active.

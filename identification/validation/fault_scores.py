@@ -10,9 +10,9 @@ import numpy as np
 from identification.arrays import Array
 from identification.estimators.prior import GaussianPrior
 from identification.factor.normal_equations import solve_with_ridge
+from identification.hypotheses.faults import Fault
 from identification.model.link_wrenches import LINK_SYMBOLS
 from identification.validation.fault_tables import FOLDS, FaultTables, folded
-from identification.validation.faults import Fault
 
 _SIGMAS: Final = 3.0  # standard errors over the blocks of a significant correction
 # Ratio of the fit's error on the affected joints, with the correction over that without: 0.55 is

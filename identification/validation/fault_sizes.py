@@ -24,10 +24,10 @@ from numpy.typing import NDArray
 from identification.arrays import Array
 from identification.estimators.covariance import cluster_covariance, solve_with_prior
 from identification.factor.normal_equations import NormalEquations
+from identification.hypotheses.faults import Fault
 from identification.model.robot import RobotModel
 from identification.validation.fault_scores import MASS, ScorePrior
 from identification.validation.fault_tables import FaultTables, columns_of_fault
-from identification.validation.faults import Fault
 
 _SCALING: Final = ("gain", "changed gain", "changed friction")
 _SIZED: Final = (*_SCALING, "delay", "load friction", "payload")

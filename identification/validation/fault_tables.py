@@ -12,11 +12,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from identification.arrays import Array
+from identification.hypotheses.faults import Fault
 from identification.model.link_wrenches import LINK_SYMBOLS
 from identification.model.regressor import RegressorPlan
 from identification.model.robot import RobotModel
 from identification.signals.samples import Samples
-from identification.validation.faults import Fault
 
 _MOST_ROWS: Final = 3000  # of all recordings together
 BLOCKS: Final = 10  # of all recordings together

@@ -9,7 +9,7 @@ from typing import Literal, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from identification.arrays import Array
+from identification.hypotheses.little_torque import MINOR
 
 Mask = NDArray[np.bool_]
 Level = Literal["good", "information", "doubtful", "wrong"]
@@ -90,9 +90,8 @@ class Thresholds:
     #: error on unseen over error on fitted motion, as shares of the torque; wrong if also above
     #: half of `axis`, above `unexplained` if the torque error itself has grown by a half
     generalisation: float = 2.5
-    #: torque of an axis as a share of that of all axes below which it alone does not decide: an
-    #: eighth of `overall`, so that losing it entirely adds 0.1 points to the error over all axes
-    minor: float = 0.015
+    #: torque of an axis as a share of that of all axes below which it alone does not decide
+    minor: float = MINOR
     #: the same as a share of its own limit; sensors resolve some thousandths of their range
     minor_of_limit: float = 0.005
     nominal: float = 0.005  #: overall error above that of the nominal or controller's model
@@ -116,16 +115,3 @@ class Thresholds:
     #: accurate to 0.2 cycles
     delay: float = 0.6
     condition: float = 100.0  #: condition number with unit columns; designed NS 16 motions: 30
-
-
-def little_torque(
-    torque: Array,
-    slides: Mask,
-    limit: Thresholds = Thresholds(),
-) -> Mask:
-    """Return the axes whose torque (n,) is too small against the others' to decide alone (n,).
-
-    Axes that slide are compared with each other, and those that turn.
-    """
-    power = np.where(slides[:, None] == slides, torque**2, 0.0).sum(axis=1)
-    return np.asarray(torque < limit.minor * np.sqrt(power))

@@ -12,9 +12,9 @@ from numpy.typing import NDArray
 from identification.arrays import Array
 from identification.factor.estimate import Estimate
 from identification.factor.factor import Factor
+from identification.hypotheses.little_torque import little_torque
 from identification.model.friction import COULOMB
 from identification.model.robot import RobotModel
-from identification.validation.finding import little_torque
 
 SIGMAS: Final = 3.0  # standard deviations of a significant wrong sign or change
 # Masses, rotor inertias, moments of inertia about an axis.

@@ -46,10 +46,10 @@ from hil.look.result import Aspect, Choice
 from hil.look.run import SETTINGS
 from hil.pipeline.sources import cell_of, source_of
 from identification.estimators.delay import DelayEstimate
+from identification.hypotheses.changes import Axes, Change
+from identification.hypotheses.scores import Score, compare, score_of
 from identification.model.robot import RobotModel
 from identification.signals.samples import prepare
-from identification.validation.reading_changes import Axes, Change
-from identification.validation.reading_scores import Score, compare, score_of
 from tests.hil.simulated_logs import write_log, write_moving_log
 from tests.hil.test_importers_rosbag2 import STATE, bag, state, states
 from tests.hil.test_log_kinds import JOINTS, URDF

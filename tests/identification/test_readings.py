@@ -13,15 +13,15 @@ from identification import Recording, RobotModel
 from identification.estimators.prior import TorqueSums, body_prior, body_priors
 from identification.factor.columns import every_torque_factor
 from identification.factor.factor import Factor
-from identification.model.motion import Motion
-from identification.signals.samples import Preprocessing, prepare
-from identification.validation.reading_changes import (
+from identification.hypotheses.changes import (
     Axes,
     Change,
     change_of_motion,
     changed_samples,
 )
-from identification.validation.readings import Step, find_readings, of_torques
+from identification.hypotheses.search import Step, find_readings, of_torques
+from identification.model.motion import Motion
+from identification.signals.samples import Preprocessing, prepare
 
 Floats = NDArray[np.float64]
 NAMES = ("hip", "knee", "ankle")

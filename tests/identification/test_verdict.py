@@ -13,6 +13,7 @@ from identification.estimators.least_squares import estimate_repetitions
 from identification.estimators.prior import body_prior
 from identification.factor.estimate import Estimate, estimate
 from identification.factor.factor import Factor
+from identification.hypotheses.faults import Fault, Kind, Part
 from identification.model.payload import Payload
 from identification.model.robot import RobotModel
 from identification.text import percentage
@@ -24,7 +25,6 @@ from identification.validation.facts.errors import LEFT_OPEN
 from identification.validation.fault_scores import ScorePrior
 from identification.validation.fault_sizes import estimated_size
 from identification.validation.fault_tables import FaultTables
-from identification.validation.faults import Fault, Kind, Part
 from identification.validation.finding import Thresholds
 from identification.validation.gravity import CarriedLoad
 from identification.validation.nominal_scale import NominalScale

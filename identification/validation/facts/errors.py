@@ -9,10 +9,11 @@ from typing import Final
 import numpy as np
 
 from identification.arrays import Array
+from identification.hypotheses.little_torque import little_torque
 from identification.text import percentage
 from identification.validation.consistency import ELEMENTS
 from identification.validation.evidence import Evidence
-from identification.validation.finding import Finding, Mask, Naming, Thresholds, little_torque
+from identification.validation.finding import Finding, Mask, Naming, Thresholds
 
 UNEXPLAINED: Final = "unexplained error"
 """Name of the check whether any fault explains the error."""
@@ -50,7 +51,7 @@ def _minor(evidence: Evidence, limits: Thresholds) -> Mask:
     error = evidence.held_out
     torque = error.torque_rms
     slides = np.isin(np.arange(len(torque)), evidence.prismatic)
-    minor = little_torque(torque, slides, limits) | _lost_in_noise(evidence, limits)
+    minor = little_torque(torque, slides, limits.minor) | _lost_in_noise(evidence, limits)
     if (most := evidence.context.torque_limit) is not None:
         minor |= torque < limits.minor_of_limit * np.nan_to_num(most)
     return np.asarray(minor & (error.rows > 0))

@@ -9,11 +9,11 @@ from typing import Final, NamedTuple, assert_never
 import numpy as np
 
 from identification.arrays import Array
+from identification.hypotheses.faults import Kind
 from identification.text import percentage
 from identification.validation.causes import Cause
 from identification.validation.evidence import Evidence
 from identification.validation.facts.scale import SignFacts
-from identification.validation.faults import Kind
 from identification.validation.finding import Finding, Mask, Naming, Thresholds
 
 MOUNTING_STEP: Final = (

@@ -10,10 +10,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from identification.arrays import Array
+from identification.hypotheses.faults import COUPLED, Fault, corrected
 from identification.model.robot import RobotModel
 from identification.signals.recording import Recording
 from identification.signals.samples import Samples
-from identification.validation.faults import COUPLED, Fault, corrected
 
 Meaning = Literal[
     "torque sign",

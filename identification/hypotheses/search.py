@@ -20,11 +20,7 @@ import numpy as np
 from identification.estimators.prior import TorqueSums, body_priors
 from identification.factor.columns import every_torque_factor
 from identification.factor.factor import SMALLEST_NOISE, Factor
-from identification.model.robot import RobotModel
-from identification.signals.samples import Samples
-from identification.validation.faults import COUPLED, coupled_pairs
-from identification.validation.finding import little_torque
-from identification.validation.reading_changes import (
+from identification.hypotheses.changes import (
     DEGREE,
     GRAVITIES,
     IN_ORDER,
@@ -41,7 +37,9 @@ from identification.validation.reading_changes import (
     order_change,
     whole_order,
 )
-from identification.validation.reading_scores import (
+from identification.hypotheses.faults import COUPLED, coupled_pairs
+from identification.hypotheses.little_torque import little_torque
+from identification.hypotheses.scores import (
     DISSIPATES,
     ROWS_PER_FACT,
     Comparison,
@@ -51,6 +49,8 @@ from identification.validation.reading_scores import (
     score_of,
     sigmas_of,
 )
+from identification.model.robot import RobotModel
+from identification.signals.samples import Samples
 
 SURE: Final = 4.5
 """Standard errors over the blocks of a reading that is sure, whatever the number tried: with 19

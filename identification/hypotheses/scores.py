@@ -11,10 +11,10 @@ from numpy.typing import NDArray
 from identification.arrays import Array
 from identification.estimators.prior import body_prior, posterior_values
 from identification.factor.factor import Factor
+from identification.hypotheses.little_torque import little_torque
 from identification.model.motion import Motion
 from identification.model.robot import RobotModel
 from identification.signals.samples import Samples
-from identification.validation.finding import little_torque
 
 DISSIPATES: Final = 4.0  # standard errors of a friction that drives a joint
 _LEAST_FRICTION: Final = 0.02  # of the torque of a joint

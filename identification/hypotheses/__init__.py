@@ -1,0 +1,1 @@
+"""What a recording may be other than stated, and how certain that is."""
