@@ -1,0 +1,49 @@
+"""Outputs of a controller that are recorded; see the maker's RTDE guide for each of them.
+
+Units are rad, rad/s, A, N·m, °C, kg, m and kg·m², joint side.
+"""
+
+from __future__ import annotations
+
+from typing import Final
+
+N_JOINTS: Final = 6
+REQUIRED: Final = (
+    "timestamp",
+    "target_q",
+    "target_qd",
+    "target_qdd",
+    "target_current",
+    "target_moment",
+    "actual_q",
+    "actual_qd",
+    "actual_current",
+    "joint_temperatures",
+    "joint_mode",
+    "robot_mode",
+    "safety_mode",
+    "speed_scaling",
+    "runtime_state",
+    "robot_status_bits",
+)
+"""Outputs of every version of the software that is supported."""
+OPTIONAL: Final = (
+    "joint_control_output",
+    "target_speed_fraction",
+    "safety_status_bits",
+    "payload",
+    "payload_cog",
+    "payload_inertia",
+    "joint_position_deviation_ratio",
+    "collision_detection_ratio",
+    "actual_current_as_torque",
+)
+"""Outputs that only some versions have."""
+ROBOT_RUNNING: Final = 7
+"""`robot_mode` with power on and brakes released."""
+POWER_MODES: Final = (4, 5)
+"""`robot_mode` with power on and brakes engaged."""
+FREEDRIVE_BIT: Final = 2
+"""Of `robot_status_bits`: the button with which a person moves the arm by hand."""
+SAFETY_NORMAL: Final = 1
+"""`safety_mode` without a stop or a reduced speed."""

@@ -1,0 +1,193 @@
+"""The simulated Universal Robots arm: what it reports follows from what it is."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+
+import numpy as np
+import pinocchio as pin
+import pytest
+
+from sim_fixtures.plant import Carried, build_model
+from sim_fixtures.ur import (
+    UR5E_URDF,
+    SimulatedUr,
+    UrArmTruth,
+    UrFault,
+    UrProgram,
+    UrSettings,
+)
+from sim_fixtures.ur.controller import UrPayload
+
+
+def run_of(robot: SimulatedUr, cycles: int) -> dict[str, np.ndarray]:
+    """The outputs of some cycles, by name."""
+    rows = []
+    for _ in range(cycles):
+        robot.step()
+        rows.append(robot.outputs())
+    return {name: np.array([row[name] for row in rows]) for name in rows[0]}
+
+
+@pytest.fixture(scope="module")
+def moving() -> dict[str, np.ndarray]:
+    """The outputs of a whole program."""
+    robot = SimulatedUr(program=UrProgram())
+    outputs = run_of(robot, round(UrProgram().duration / robot.period) + 10)
+    assert robot.finished
+    return outputs
+
+
+def test_the_program_moves_every_joint_and_ends_at_rest(moving: dict[str, np.ndarray]) -> None:
+    assert np.all(np.ptp(moving["actual_q"], axis=0) > 0.5)
+    assert np.all(moving["target_qd"][[0, -1]] == 0.0)
+    np.testing.assert_allclose(np.diff(moving["timestamp"]), 0.002)
+    assert np.abs(moving["target_q"] - moving["actual_q"]).max() < 3e-3
+
+
+def test_targets_are_derivatives_of_one_another(moving: dict[str, np.ndarray]) -> None:
+    for lower, upper in (("target_q", "target_qd"), ("target_qd", "target_qdd")):
+        slope = np.gradient(moving[lower], 0.002, axis=0)[2:-2]
+        # Where the motion has faded in, its jerk jumps by that of the fade times the amplitude.
+        jump = 60.0 / (0.1 * UrProgram().period) ** 3
+        np.testing.assert_allclose(slope, moving[upper][2:-2], atol=0.25 * 0.002 * jump)
+
+
+def test_at_rest_the_arm_states_its_torque_constants(moving: dict[str, np.ndarray]) -> None:
+    """Of the joints that gravity loads; others have no torque there."""
+    truth = UrArmTruth()
+    moment, current = (moving[name][100] for name in ("target_moment", "target_current"))
+    loaded = np.abs(moment) > 1e-3
+    assert loaded.tolist() == [False, True, True, True, True, False]
+    np.testing.assert_allclose(moment[loaded] / current[loaded], truth.stated_constant[loaded])
+
+
+def test_currents_are_those_of_the_true_arm(moving: dict[str, np.ndarray]) -> None:
+    """Torque, by another model of the dynamics than the plant's own steps, and true friction."""
+    truth = UrArmTruth()
+    model = build_model(
+        UR5E_URDF, (0.0, 0.0, -9.81), truth.plant.rotor_inertia, truth.plant.inertia_scale
+    )
+    data = model.createData()
+    chosen = range(2000, 6000, 50)
+    targets = [moving[name] for name in ("target_q", "target_qd", "target_qdd")]
+    torque = np.array([pin.rnea(model, data, *(t[k] for t in targets)) for k in chosen])
+    torque += truth.plant.rotor_inertia * targets[2][chosen]
+    torque += truth.plant.friction(targets[1][chosen])
+    fast = np.abs(targets[1][chosen]) > 0.1
+    measured = truth.torque_constant * moving["actual_current"][chosen]
+    error = np.where(fast, measured - torque, 0.0)
+    assert np.all(np.sqrt((error**2).mean(axis=0)) < 0.06 * np.abs(torque).max(axis=0))
+
+
+def test_the_controller_knows_another_arm_than_it_has(moving: dict[str, np.ndarray]) -> None:
+    """Its model current is not the measured one, and its constants are not the true ones."""
+    difference = moving["actual_current"] - moving["target_current"]
+    assert np.all(np.std(difference, axis=0) > 0.02)
+    truth = UrArmTruth()
+    assert np.all(np.abs(truth.torque_constant / truth.stated_constant - 1.0) > 0.01)
+
+
+def test_only_a_payload_that_is_entered_is_in_the_model() -> None:
+    def moment(settings: UrSettings | None = None, load: Carried | None = None) -> np.ndarray:
+        return run_of(SimulatedUr(settings, load=load), 20)["target_moment"][-1]
+
+    bare = moment()
+    entered = moment(UrSettings(payload=UrPayload(3.0, (0.0, 0.0, 0.05))))
+    unknown = moment(load=Carried(5, 3.0, np.array([0.0, 0.0, 0.15]), np.zeros((3, 3))))
+    assert np.abs(entered - bare)[1] > 10.0
+    np.testing.assert_array_equal(unknown, bare)
+
+
+def test_joints_warm_up_by_moving(moving: dict[str, np.ndarray]) -> None:
+    rise = moving["joint_temperatures"][-1] - moving["joint_temperatures"][0]
+    assert np.all(rise > 0.0) and np.all(rise < 1.0)
+
+
+def test_a_slider_slows_the_motion() -> None:
+    full, half = (
+        run_of(SimulatedUr(UrSettings(slider=share), UrProgram()), 3000) for share in (1.0, 0.5)
+    )
+    np.testing.assert_allclose(half["target_q"][2001], full["target_q"][1000], atol=1e-9)
+    assert set(half["speed_scaling"]) == {0.5}
+
+
+def test_a_protective_stop_stops_the_arm() -> None:
+    outputs = run_of(SimulatedUr(program=UrProgram(), faults=[UrFault("stop", 2500)]), 3000)
+    assert outputs["safety_mode"][2499] == 1 and outputs["safety_mode"][2500] == 3
+    assert outputs["runtime_state"][-1] == 4
+    assert np.abs(outputs["actual_qd"][2800:]).max() < 0.01
+    slope = np.gradient(outputs["target_q"], 0.002, axis=0)
+    np.testing.assert_allclose(slope[2510:2590], outputs["target_qd"][2510:2590], atol=5e-3)
+
+
+def test_without_power_nothing_flows() -> None:
+    outputs = run_of(SimulatedUr(faults=[UrFault("power-off", 50)]), 100)
+    assert outputs["robot_mode"][[49, 50]].tolist() == [7, 3]
+    assert not outputs["actual_current"][50:].any()
+
+
+def test_a_seed_is_a_run() -> None:
+    first, second, other = (run_of(SimulatedUr(seed=seed), 50)["actual_q"] for seed in (1, 1, 2))
+    np.testing.assert_array_equal(first, second)
+    assert (first != other).any()
+
+
+SERVER = """
+from sim_fixtures.ur import SimulatedUr, UrProgram, UrServer
+server = UrServer(SimulatedUr(program=UrProgram(), repeats=True), rtde=30004)
+print("ready", flush=True)
+server.run()
+"""
+
+
+@pytest.fixture
+def served() -> Iterator[None]:
+    """A controller in another process: ur-rtde does not release the interpreter as it connects."""
+    with subprocess.Popen([sys.executable, "-c", SERVER], stdout=subprocess.PIPE) as process:
+        assert process.stdout is not None
+        try:
+            if process.stdout.readline() != b"ready\n":
+                pytest.skip("port 30004, the only one that ur-rtde connects to, is not free")
+            yield
+        finally:
+            process.kill()
+
+
+def test_another_client_reads_the_same(served: None) -> None:
+    """The receiver of ur-rtde (SDU), which asks for every output that it knows."""
+    receive = pytest.importorskip("rtde_receive", reason="ur-rtde is not installed (extra `ur`)")
+    client = receive.RTDEReceiveInterface("127.0.0.1")
+    try:
+        deadline = time.monotonic() + 20.0
+        stamps = set[float]()
+        while len(stamps) < 10 and time.monotonic() < deadline:
+            stamps.add(client.getTimestamp())
+            time.sleep(0.01)
+        assert len(stamps) == 10
+        assert client.getRobotMode() == 7
+        assert np.all(np.abs(np.array(client.getActualQ()) - UrProgram().centre) < 2.0)
+        assert client.getTargetMoment()[1] < -10.0
+    finally:
+        client.disconnect()
+
+
+def test_the_makers_client_reads_the_same(served: None) -> None:
+    """That of Universal Robots, in Python, which is not in the package index."""
+    rtde = pytest.importorskip("rtde.rtde", reason="UR's RTDE_Python_Client_Library is not there")
+    client = rtde.RTDE("127.0.0.1", 30004)
+    client.connect()
+    try:
+        assert client.get_controller_version() == (5, 15, 2, 0)
+        names = ["timestamp", "actual_q", "robot_mode", "joint_mode"]
+        types = ["DOUBLE", "VECTOR6D", "INT32", "VECTOR6INT32"]
+        assert client.send_output_setup(names, types, frequency=500)
+        assert client.send_start()
+        state = client.receive()
+        assert state.robot_mode == 7 and state.joint_mode == [253] * 6
+        assert np.all(np.abs(np.array(state.actual_q) - UrProgram().centre) < 2.0)
+    finally:
+        client.disconnect()
