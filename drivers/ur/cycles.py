@@ -1,4 +1,4 @@
-"""OutputFrames of a controller as cycle records, and as states that other controllers do not send."""
+"""Frames of a controller as cycle records, and as states that other controllers do not send."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""OutputFrames of RTDE, the real-time data exchange of Universal Robots (TCP port 30004).
+"""Frames of RTDE, the real-time data exchange of Universal Robots (TCP port 30004).
 
 A frame is a big-endian ``uint16`` with its length (header included), a ``uint8`` with its type, and
 a payload. TCP splits and joins frames as it likes. Values of a data frame are packed without
@@ -94,7 +94,7 @@ def frame(kind: FrameType, payload: bytes = b"") -> bytes:
 
 
 class FrameSplitter:
-    """OutputFrames of a stream that arrives in pieces of any size."""
+    """Frames of a stream that arrives in pieces of any size."""
 
     def __init__(self) -> None:
         self._rest = b""

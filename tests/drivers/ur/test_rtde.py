@@ -1,4 +1,4 @@
-"""OutputFrames of RTDE: what is packed is unpacked, however the network cuts it."""
+"""Frames of RTDE: what is packed is unpacked, however the network cuts it."""
 
 from __future__ import annotations
 
@@ -12,12 +12,12 @@ from hypothesis import strategies as st
 from drivers.errors import PacketError
 from drivers.ur.rtde import (
     ControllerText,
-    RtdeFrame,
     FrameSplitter,
     FrameType,
     OutputRecipe,
     OutputsMissingError,
     RtdeError,
+    RtdeFrame,
     accepted,
     controller_text,
     controller_version,
