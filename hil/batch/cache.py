@@ -180,10 +180,17 @@ def _new_file(path: Path) -> Iterator[BinaryIO]:
     Raises:
         CacheError: the file cannot be written.
     """
-    try:
+    with cache_errors(path):
         path.parent.mkdir(parents=True, exist_ok=True)
         with replace_file(path) as temporary, temporary.open("xb") as file:
             yield file
+
+
+@contextmanager
+def cache_errors(path: Path) -> Iterator[None]:
+    """Convert the errors of writing a file of the cache to `CacheError`."""
+    try:
+        yield
     except OSError as error:
         problem = f"cannot be written ({error.strerror})"
         remedy = "make room, or name another folder with --cache, or none"

@@ -3,16 +3,15 @@
 from __future__ import annotations
 
 import json
-import os
 import re
 import time
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, replace
 from functools import lru_cache
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import Any, Final, NamedTuple
+from typing import Any, Final, NamedTuple, Protocol
 
 from hil.archive import Archive, ArchiveName, ArchiveOutcome, open_archive
 from hil.archive.check import recording_date
@@ -21,18 +20,16 @@ from hil.archive.recorded_campaign import Entry, RecordedCampaign
 from hil.base.errors import ArchiveError, CampaignFolderError, InputError
 from hil.base.files import digest, file_digest, json_digest
 from hil.base.progress import Reporter
-from hil.base.safe_input import remedy_for_missing
 from hil.base.terminal_text import typed
 from hil.cell import Cell
 from hil.pipeline.prepared import stated_delay
 from identification.selection.settings import Settings
 
-from .cache import BESIDE, JSON, CacheError, CacheLocation, code_digest
+from .cache import JSON, CacheError, CacheLocation, code_digest
 from .cluster import Cluster, ClusterTask, SkippedArchive, reason_of
 from .places import (
     SUFFIX,
     Stamp,
-    archives_at,
     as_file,
     folder_of,
     is_url,
@@ -40,6 +37,7 @@ from .places import (
     stamp_of,
     text_at,
 )
+from .search import KindsOfLogs, find_recordings
 
 USES: Final = ("excitation", "validation", "standstill")
 """Uses of archives in a batch; archives of other kinds are skipped."""
@@ -95,16 +93,22 @@ class ArchiveRef:
     outcome: str = "completed"  #: how the recording ended
     record: str = ""  #: digest of the metadata
     simulated: bool = False  #: whether only a simulated arm moved
+    source: str = ""  #: the log or bag that it was imported from by a batch; "" for none
+
+    @property
+    def origin(self) -> str:
+        """What the user named: the log or bag, or the archive itself."""
+        return self.source or self.location
 
     @property
     def name(self) -> str:
         """File name."""
-        return name_of(self.location)
+        return name_of(self.origin)
 
     @property
     def folder(self) -> str:
         """Folder of the file."""
-        return folder_of(self.location)
+        return folder_of(self.origin)
 
     @property
     def key(self) -> GroupKey:
@@ -145,10 +149,21 @@ class Discovery(NamedTuple):
     skipped: tuple[SkippedArchive, ...]  #: archives that are not intended for fitting
 
 
+class LogImport(KindsOfLogs, Protocol):
+    """Finds logs and bags, and imports them."""
+
+    def imported(self, logs: Sequence[str]) -> Mapping[str, ArchiveRef | SkippedArchive]:
+        """Return the archive of each log, or why there is none."""
+
+
 def discover(
-    roots: Sequence[str], cache: CacheLocation, cluster: Cluster, reporter: Reporter
+    roots: Sequence[str],
+    cache: CacheLocation,
+    cluster: Cluster,
+    reporter: Reporter,
+    importing: LogImport | None = None,
 ) -> Discovery:
-    """Find every archive at or below some places.
+    """Find every archive at or below some places, and import logs and bags if that is stated.
 
     Workers hash each archive and read its metadata. One whose file has not changed since the last
     search is not opened.
@@ -158,13 +173,15 @@ def discover(
         ClusterError: the cluster cannot be used.
         CacheError: the cache cannot be written.
     """
-    places, refused = find_archives(roots)
-    if not places:
+    found = find_recordings(roots, importing)
+    places = found.archives
+    if not (places or found.logs):
         reasons = [
-            "there is no archive (*.mcap) in it",
-            *(f"{unused.path} {unused.message}" for unused in refused[:1]),
+            f"there is no archive (*{SUFFIX}){'' if importing is None else ', log or bag'} in it",
+            *(f"{unused.path} {unused.message}" for unused in found.refused[:1]),
         ]
         raise InputError(", ".join(roots), "; ".join(reasons), remedy="name others")
+    imported = {} if importing is None else importing.imported(found.logs)
     refs: dict[str, ArchiveRef | SkippedArchive] = {}
     with reporter.task("reading the metadata of archives", len(places)) as task:
         for place in places:
@@ -174,8 +191,8 @@ def discover(
         task.advance(len(refs))
         new = [place for place in places if place not in refs]
         refs.update(_inspected(new, cache, cluster, task.advance))
-    selected = _select({place: refs[place] for place in places})
-    return selected._replace(broken=(*refused, *selected.broken))
+    selected = _select({place: refs[place] for place in places} | {**imported})
+    return selected._replace(broken=(*found.refused, *selected.broken))
 
 
 def _inspected(
@@ -200,55 +217,6 @@ def _inspected(
     return refs
 
 
-def find_archives(roots: Sequence[str]) -> tuple[list[str], list[SkippedArchive]]:
-    """Return the paths or URLs of archives at or below some folders or archives, sorted.
-
-    Further, folders and files that cannot be read. Links are followed; a folder reached by several
-    links is searched once, under its own name.
-
-    Raises:
-        InputError: a place does not exist, or a URL cannot be reached.
-    """
-    archives: set[str] = set()
-    refused: list[SkippedArchive] = []
-    visited: set[Path] = set()
-
-    def refuse(error: OSError) -> None:
-        folder = Path(os.fsdecode(error.filename)).as_posix()
-        refused.append(SkippedArchive(folder, f"cannot be read: {error.strerror}"))
-
-    def walk(root: Path) -> None:
-        for name, folders, files in os.walk(root, followlinks=True, onerror=refuse):
-            folder = Path(name).resolve()
-            if folder in visited:
-                folders.clear()
-                continue
-            visited.add(folder)
-            folders[:] = [subfolder for subfolder in folders if subfolder != BESIDE]
-            for path in (folder / file for file in files):
-                if path.suffix != SUFFIX:
-                    continue
-                if os.path.isfile(path):  # noqa: PTH113 - False where it cannot be reached
-                    archives.add(path.as_posix())
-                else:
-                    refused.append(
-                        SkippedArchive(path.as_posix(), "is no regular file that can be read")
-                    )
-
-    for root in roots:
-        path = Path(root)
-        if is_url(root):
-            archives.update(archives_at(root))
-        elif path.is_file():
-            archives.add(path.resolve().as_posix())
-        elif path.is_dir():
-            walk(path.resolve())
-        else:
-            remedy = remedy_for_missing(path, "name a folder with archives below it")
-            raise InputError(root, "does not exist", remedy=remedy)
-    return sorted(archives), refused
-
-
 # An archive
 
 
@@ -258,16 +226,29 @@ def open_ref(ref: ArchiveRef) -> Archive:
     Raises:
         ArchiveError: it cannot be read, is damaged, or has changed since it was found.
     """
-    _require_same(ref)
-    try:
-        with as_file(ref.location) as path:
-            archive = open_archive(path, fields=_FIELDS)
-            if archive.header.by_controller_program:
-                archive = open_archive(path, fields=(*_FIELDS, "target_position", "status"))
-    finally:  # an error may be due to a change
+    with errors_of_origin(ref):
         _require_same(ref)
-    require_complete(archive, ref.location)
+        try:
+            with as_file(ref.location) as path:
+                archive = open_archive(path, fields=_FIELDS)
+                if archive.header.by_controller_program:
+                    archive = open_archive(path, fields=(*_FIELDS, "target_position", "status"))
+        finally:  # an error may be due to a change
+            _require_same(ref)
+        require_complete(archive, ref.location)
     return archive
+
+
+@contextmanager
+def errors_of_origin(ref: ArchiveRef) -> Iterator[None]:
+    """Let errors about the archive of a log name the log."""
+    try:
+        yield
+    except InputError as error:
+        if not ref.source or error.path != Path(ref.location):
+            raise
+        source = Path(ref.source)
+        raise ArchiveError(source, error.problem, field=error.field, remedy=error.remedy) from error
 
 
 def open_only(ref: ArchiveRef) -> None:
@@ -390,6 +371,27 @@ def inspect_archive(place: str, cache: CacheLocation) -> ArchiveRef:
     if (cached := _cached_ref(place, cache)) is not None:
         return cached
     begun = time.time_ns()
+    ref = described_archive(place, cache)
+    if is_untouched(ref.stamp, begun):
+        cache.put(place, _key(place), _Note(code_digest(), ref))
+    return ref
+
+
+def is_untouched(stamp: Stamp, begun: int) -> bool:
+    """Return whether a stamp will show the next change of a file that was read at `begun` [ns]."""
+    return bool(stamp.text) and begun - stamp.changed > _UNTOUCHED
+
+
+def described_archive(place: str, cache: CacheLocation, source: str = "") -> ArchiveRef:
+    """Hash an archive, read its metadata, and cache the texts of its cell.
+
+    That of a log, its `source`, belongs to the folder of the log.
+
+    Raises:
+        HilError: it cannot be read, is damaged, or was changed meanwhile.
+        CacheError: the cache cannot be written.
+    """
+    origin = source or place
     stamp = stamp_of(place)
     with as_file(place) as path:
         sha256 = digest_of(path)
@@ -402,14 +404,14 @@ def inspect_archive(place: str, cache: CacheLocation) -> ArchiveRef:
     index = header.index
     attempt = header.attempt
     if index is None or attempt is None:  # else as stated in the archive, even if renamed
-        name = ArchiveName.parse(name_of(place))
+        name = ArchiveName.parse(name_of(origin))
         index, attempt = (0, 0) if name is None else (name.index, name.attempt)
     ref = ArchiveRef(
         location=place,
         sha256=sha256,
         use=header.purpose,
         arm="",
-        campaign=_campaign_of(place),
+        campaign=campaign_of(origin),
         index=index,
         cell="",
         motion="" if plan is None else digest(plan),
@@ -420,19 +422,18 @@ def inspect_archive(place: str, cache: CacheLocation) -> ArchiveRef:
         outcome=(archive.outcome or ArchiveOutcome()).outcome,
         record=json_digest(dict(header.entries)),
         simulated=header.only_simulated,
+        source=source,
     )
     if ref.use in USES:
         cell = cell_in(archive)
         drives = archive.attachments.get("drive_train.json")
         key = json_digest([cell.text, cell.urdf])
-        if not cache.has(place, key, JSON):
-            cache.put(place, key, CellTexts(cell.text, cell.urdf))
+        if not cache.has(origin, key, JSON):
+            cache.put(origin, key, CellTexts(cell.text, cell.urdf))
         arm = arm_digest(cell, drives, simulated=ref.simulated)
         ref = replace(ref, arm=arm, cell=key, setup=describe_setup(cell))
     if stamp_of(place) != stamp:
         raise changed_error(place)
-    if stamp.text and begun - stamp.changed > _UNTOUCHED:
-        cache.put(place, _key(place), _Note(code_digest(), ref))
     return ref
 
 
@@ -441,14 +442,14 @@ def _cached_ref(place: str, cache: CacheLocation) -> ArchiveRef | None:
     note = cache.get(place, _key(place), _Note)
     if note is None or note.code != code_digest() or stamp_of(place) != note.ref.stamp:
         return None
-    return replace(note.ref, location=place, campaign=_campaign_of(place))
+    return replace(note.ref, location=place, campaign=campaign_of(place))
 
 
 def _key(place: str) -> str:
     return digest(f"archive {name_of(place)}".encode("utf-8", "surrogateescape"))
 
 
-def _campaign_of(place: str) -> str:
+def campaign_of(place: str) -> str:
     """Return the folder of the campaign of an archive: that of the archives, or the one above."""
     folder = folder_of(place)
     return folder.removesuffix(_ARCHIVES) or folder
@@ -496,7 +497,7 @@ def _select(inspected: dict[str, ArchiveRef | SkippedArchive]) -> Discovery:
     refs: list[ArchiveRef] = []
     for ref in read:
         if reason := _exclusion(ref, latest):
-            skipped.append(SkippedArchive(ref.location, reason))
+            skipped.append(SkippedArchive(ref.origin, reason))
         elif (copy := _copy(ref, seen)) is not None:
             skipped.append(copy)
         else:
@@ -509,7 +510,7 @@ def _manifests(places: Iterable[str]) -> tuple[dict[str, dict[str, Entry]], list
     """Return the manifest entries by name of each folder of archives, and damaged manifests."""
     by_folder: dict[str, dict[str, Entry]] = {}
     broken = []
-    for folder, campaign in {folder_of(place): _campaign_of(place) for place in places}.items():
+    for folder, campaign in {folder_of(place): campaign_of(place) for place in places}.items():
         if folder == campaign:
             continue
         try:
@@ -550,9 +551,9 @@ def _exclusion(ref: ArchiveRef, latest: _Attempts) -> str:
     """Return why an archive is not to be fitted, "" if it is unless it is a copy."""
     if ref.use not in USES:
         return f"is a {ref.use}"
-    if ref.simulated and _REHEARSAL in ref.location:
+    if ref.simulated and _REHEARSAL in ref.origin:
         return "belongs to a rehearsal"
-    if _LOADED.search(ref.location):
+    if _LOADED.search(ref.origin):
         return "was recorded with a payload that was to be weighed"
     if ref.outcome != _COMPLETED:
         return f"ended {ref.outcome}"
@@ -563,10 +564,10 @@ def _exclusion(ref: ArchiveRef, latest: _Attempts) -> str:
 def _copy(ref: ArchiveRef, seen: dict[str, str]) -> SkippedArchive | None:
     """Return an archive that is a copy of one `seen`; else None, and add it to those."""
     if ref.sha256 in seen and ref.use != "standstill":
-        return SkippedArchive(ref.location, "is a copy", seen[ref.sha256])
+        return SkippedArchive(ref.origin, "is a copy", seen[ref.sha256])
     if ref.attempt:
         first = seen.setdefault(f"{ref.folder} {ref.record}", ref.name)
         if first != ref.name:
-            return SkippedArchive(ref.location, "is a copy or a repaired version", first)
-    seen[ref.sha256] = ref.location
+            return SkippedArchive(ref.origin, "is a copy or a repaired version", first)
+    seen[ref.sha256] = ref.origin
     return None

@@ -345,7 +345,7 @@ class Estimator:
             settings=settings,
             warnings=summary.warnings,
             setup=ref.setup,
-            archive=ref.location,
+            archive=ref.origin,
             sha256=ref.sha256,
         )
 

@@ -30,6 +30,7 @@ from .discovery import (
     CellTexts,
     Discovery,
     GroupKey,
+    LogImport,
     cell_from,
     cell_in,
     discover,
@@ -94,7 +95,7 @@ def cached_settings(
     """Return the settings that were decided from these archives before."""
     if not refs:
         return None
-    return cache.get(refs[0].location, decision_digest(options, arms, refs), Settings)
+    return cache.get(refs[0].origin, decision_digest(options, arms, refs), Settings)
 
 
 def decide_settings(
@@ -119,7 +120,7 @@ def decide_settings(
             elif standstill is None:
                 standstill = load_source(ref, to_fit=False)[1]
         except Exception as error:
-            broken.append(SkippedArchive(ref.location, reason_of(error)))
+            broken.append(SkippedArchive(ref.origin, reason_of(error)))
     if not fitted:
         return None, broken
     noise = None if standstill is None else standstill.recording
@@ -129,7 +130,7 @@ def decide_settings(
     else:
         settings = carried_over(arms, sources, options)
     if not broken:
-        cache.put(refs[0].location, decision_digest(options, arms, refs), settings)
+        cache.put(refs[0].origin, decision_digest(options, arms, refs), settings)
     return settings, broken
 
 
@@ -160,6 +161,7 @@ def reidentify(
     reporter: Reporter,
     *,
     cache: CacheLocation = CacheLocation(),  # noqa: B008 - frozen
+    importing: LogImport | None = None,
     check: Callable[[Discovery], None] = lambda _: None,
 ) -> BatchResult:
     """Identify every arm from all its archives: by repetition, by campaign, and pooled.
@@ -167,8 +169,9 @@ def reidentify(
     The numbers are those of `hil identify` on the archives of a campaign with the same held out.
     They depend neither on the order in which archives are found nor on the workers.
 
-    The roots are folders, archives, or URLs of either. A single recording is never split. `check`
-    receives the archives found, before samples are read, and may raise.
+    The roots are folders, files, patterns or URLs. A single recording is never split. `importing`
+    imports logs and bags, which count only with it. `check` receives the archives found, before
+    samples are read, and may raise.
 
     Raises:
         InputError: a place does not exist, no archive can be fitted, or the estimator is not one of
@@ -180,7 +183,7 @@ def reidentify(
         problem = f"{options.estimator!r} reads samples"
         remedy = f"use {', '.join(estimators)}"
         raise InputError(None, problem, field="estimator", remedy=remedy)
-    discovery = discover(roots, cache, cluster, reporter)
+    discovery = discover(roots, cache, cluster, reporter, importing)
     check(discovery)
     batch = _Batch(options, cluster, cache, reporter, [*discovery.broken])
     campaigns = batch.with_settings(
@@ -282,7 +285,7 @@ class _Batch:
         results = self._results(tasks, "deciding settings", archives)
         for (campaign, (refs, *_)), decision in zip(asked, results, strict=True):
             if isinstance(decision, SkippedArchive):  # perhaps an archive ends its process
-                alone = [ClusterTask(ref.location, open_only, (ref,)) for ref in refs]
+                alone = [ClusterTask(ref.origin, open_only, (ref,)) for ref in refs]
                 opened = self._results(alone, "opening archives one by one", len(alone))
                 broken = [other for other in opened if other is not None]
                 reason = decision.reason
@@ -292,7 +295,7 @@ class _Batch:
                 reason = "" if some else "it holds no excitation"
             self.broken += broken
             paths = {other.path for other in broken}
-            campaign.refs = [ref for ref in campaign.refs if ref.location not in paths]
+            campaign.refs = [ref for ref in campaign.refs if ref.origin not in paths]
             if campaign.settings is None and broken and campaign.refs:
                 again.append(campaign)
             elif campaign.settings is None and reason:
@@ -320,7 +323,7 @@ class _Batch:
             waiting = arms
             while waiting:
                 waiting = self._estimate(waiting, progress.advance)
-        results = [result for arm in arms for result in arm.results.values()]
+        results = [arm.results[campaign.key] for arm in arms for campaign in arm.campaigns]
         estimates = [estimate for result in results for estimate in result.estimates]
         pooled = [estimate for arm in arms for estimate in self._pooled(arm)]
         lost = [unused for result in results for unused in result.broken]
@@ -443,12 +446,12 @@ class _Batch:
         return count
 
     def _has(self, wanted: Sequence[ToReduce], campaign: _Campaign) -> bool:
-        return self.cache.has(wanted[0].ref.location, reduction_key(wanted, campaign.ready))
+        return self.cache.has(wanted[0].ref.origin, reduction_key(wanted, campaign.ready))
 
     def _remove_deadly(self, campaign: _Campaign) -> None:
         """Remove the archives of a campaign that end the process that reduces them."""
         tasks = [
-            ClusterTask(one.ref.location, ensure_reduced, (one, campaign.ready, self.cache))
+            ClusterTask(one.ref.origin, ensure_reduced, (one, campaign.ready, self.cache))
             for wanted in campaign.partitions
             for one in wanted
         ]
@@ -456,12 +459,12 @@ class _Batch:
         deadly = [result for result in results if result is not None]
         self.broken += deadly
         paths = {unused.path for unused in deadly}
-        campaign.refs = [ref for ref in campaign.refs if ref.location not in paths]
+        campaign.refs = [ref for ref in campaign.refs if ref.origin not in paths]
 
     def _model(self, digest: str, members: Sequence[_Campaign]) -> ArmModel:
         """Return what the estimates of an arm need beside factors."""
         ref = members[0].refs[0]
-        texts = self.cache.get(ref.location, ref.cell, CellTexts)
+        texts = self.cache.get(ref.origin, ref.cell, CellTexts)
         if texts is None:
             cell = cell_in(open_ref(ref))
             texts = CellTexts(cell.text, cell.urdf)

@@ -29,7 +29,7 @@ from identification.selection.settings import Settings
 
 from .cache import Arrays, CacheLocation, code_digest
 from .cluster import SkippedArchive, reason_of
-from .discovery import ArchiveRef, cell_in, open_ref
+from .discovery import ArchiveRef, cell_in, errors_of_origin, open_ref
 
 Term = TypeVar("Term", Factor, Reduction)
 
@@ -105,10 +105,11 @@ def load_source(ref: ArchiveRef, *, to_fit: bool = True) -> tuple[Archive, Sourc
         HilError: it cannot be read, is damaged, was changed, or cannot be identified from.
     """
     archive = open_ref(ref)
-    source = source_of(archive, cell_in(archive), to_fit=to_fit)
+    with errors_of_origin(ref):
+        source = source_of(archive, cell_in(archive), to_fit=to_fit)
     if to_fit and source.recording.torque is None:
         raise ArchiveError(
-            ref.location,
+            ref.origin,
             "has motor currents and no torques",
             remedy="find the torque constants with `hil torque-constants` and import it again",
         )
@@ -175,7 +176,7 @@ def _reduce_archive(wanted: ToReduce, settings: Settings, cache: CacheLocation) 
     try:
         summary, reduction = reduced_archive(wanted, settings)
     except Exception as error:
-        return ReducedArchives(broken=(SkippedArchive(ref.location, reason_of(error)),), read=1)
+        return ReducedArchives(broken=(SkippedArchive(ref.origin, reason_of(error)),), read=1)
     total = reduction if ref.use == "excitation" else None
     result = ReducedArchives((summary,), total, read=1)
     _write((wanted,), result, settings, cache)
@@ -225,7 +226,7 @@ def cached_reduction(
 ) -> ReducedArchives | None:
     """Return the cached reduction of exactly these archives; None if there is none."""
     refs = [one.ref for one in wanted]
-    entry = cache.read(refs[0].location, reduction_key(wanted, settings))
+    entry = cache.read(refs[0].origin, reduction_key(wanted, settings))
     if entry is None:
         return None
     try:
@@ -240,7 +241,7 @@ def _write(
     settings: Settings,
     cache: CacheLocation,
 ) -> None:
-    place = wanted[0].ref.location
+    place = wanted[0].ref.origin
     cache.write(place, reduction_key(wanted, settings), *_packed(reduced))
 
 

@@ -4,14 +4,17 @@ from __future__ import annotations
 
 import math
 from collections import Counter
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Annotated, Any, Final
 
 import typer
 
 from hil.base.files import convert_write_errors, make_folder
 from hil.base.one_screen import brief
+from hil.base.progress import Reporter
 from hil.base.progress import reporter as make_reporter
 from hil.base.terminal_text import plural, printable
 from hil.batch import graph as run
@@ -22,6 +25,8 @@ from hil.batch.graph import BatchResult
 from hil.batch.table import write_tables
 from hil.cli.arguments import JsonOption, QuietOption, VerboseOption, print_json, with_options
 from hil.cli.identify_options import Identifying
+from hil.cli.imports import Described, Reading
+from hil.fleet.logs import LogMap, LogReading, LogsOfBatch, write_maps
 from identification.text import percentage
 
 SOME_BROKEN: Final = 5
@@ -31,30 +36,39 @@ _MOST_LINES: Final = 20
 
 
 @with_options(Identifying, "how")
+@with_options(Described, "arm", but=("friction", "standstill"))
+@with_options(Reading, "reading")
 def batch(
-    places: Annotated[list[str], typer.Argument(metavar="FOLDER")],
+    places: Annotated[list[str], typer.Argument(metavar="RECORDING")],
     output: Annotated[Path | None, typer.Option("--output", "-o")] = None,
     estimator: BatchEstimator = "auto",
     workers: Annotated[int | None, typer.Option(min=1)] = None,
     scheduler: Annotated[str | None, typer.Option(metavar="ADDRESS")] = None,
     cache: Annotated[str | None, typer.Option(metavar="FOLDER|none")] = None,
     *,
+    arm: Described,
+    reading: Reading,
     how: Identifying,
     quiet: QuietOption = False,
     verbose: VerboseOption = False,
     json: JsonOption = False,
 ) -> None:
-    """Identify every arm from all archives below given folders, campaign by campaign.
+    """Identify every arm from all recordings below given folders, campaign by campaign.
 
-    The factor of each archive is cached, so another run with other estimators or more archives
+    Recordings are archives, and with --urdf also logs and bags. One column map describes all logs
+    with the same channels: --map, or what is concluded from the first of them as by `hil identify`.
+    The factor of each recording is cached, so another run with other estimators or more recordings
     reads only new ones. The cache survives Ctrl-C.
 
-    Exit status: 0 all archives to be fitted were used, 5 some could not be (each is reported with
+    Exit status: 0 all recordings to be fitted were used, 5 some could not be (each is reported with
     its reason), 2 there is nothing to fit. Archives that are not for fitting, such as moves,
     stopped motions and copies, are skipped and counted by reason.
 
+    **Example:** `hil batch 'line3/robot*/*.csv' --urdf arm.urdf -o line3-tables`
+
     Options:
-        places: Folders with archives at any depth, archives, or URLs of either.
+        places: Folders with recordings at any depth, files, patterns such as 'robot*/*.csv', or
+            URLs of archives.
         output: Folder for the tables (CSV and Parquet). Default: none.
         estimator: Estimator that needs no samples: see `hil identify --estimator`.
         workers: Number of processes. Default: one per core, and none if few archives are read.
@@ -67,25 +81,19 @@ def batch(
     if output is not None:
         make_folder(output)
     options = how.options(estimator=estimator)
-    keep = cache != "none"
-    location = CacheLocation(str(Path(cache).resolve()) if keep and cache else None, keep)
-    with Cluster(workers, scheduler=scheduler, reporter=reporter) as cluster:
-        result = run.reidentify(places, options, cluster, reporter, cache=location)
-    written = _tables(output, result)
+    if not arm.is_given:
+        reading.refuse_without_robot()
+    with (
+        Cluster(workers, scheduler=scheduler, reporter=reporter) as cluster,
+        cache_of(cache, for_logs=arm.is_given) as location,
+    ):
+        logs = _logs(arm, reading, location, cluster, reporter)
+        result = run.reidentify(places, options, cluster, reporter, cache=location, importing=logs)
+    written = _tables(output, result, logs)
     if json:
         print_json(as_dict(result, written))
     else:
-        lines = [] if quiet else [*result_lines(result)]
-        if written and not quiet:
-            names = ", ".join(path.name for path in written)
-            lines.append(f"written to {written[0].parent}: {names}")
-        for line in _last(_broken_lines(result.broken)):
-            typer.echo(printable(line), err=True)
-        if result.skipped and not quiet:
-            lines.append(skipped_line(result.skipped))
-        lines.append(_counts(result))
-        for line in lines if verbose else brief(lines, last=_TAIL):
-            typer.echo(printable(line))
+        _print(result, logs, written, quiet=quiet, verbose=verbose)
     if result.broken:
         raise typer.Exit(SOME_BROKEN)
 
@@ -93,20 +101,77 @@ def batch(
 _TAIL: Final = 3  # lines at the end: files, what was skipped, counts
 
 
+def _print(
+    result: BatchResult,
+    logs: LogsOfBatch | None,
+    written: Sequence[Path],
+    *,
+    quiet: bool,
+    verbose: bool,
+) -> None:
+    """Print the arms and what was written; what could not be used goes to standard error."""
+    lines: list[str] = []
+    if not quiet:
+        maps = {} if logs is None else logs.maps
+        lines = [*map_lines(maps, verbose=verbose), *result_lines(result)]
+        if written:
+            names = ", ".join(path.name for path in written)
+            lines.append(f"written to {written[0].parent}: {names}")
+    for line in _last(_broken_lines(result.broken)):
+        typer.echo(printable(line), err=True)
+    if result.skipped and not quiet:
+        lines.append(skipped_line(result.skipped))
+    lines.append(_counts(result))
+    for line in lines if verbose else brief(lines, last=_TAIL):
+        typer.echo(printable(line))
+
+
 def _counts(result: BatchResult) -> str:
     return (
         f"{plural(len(result.repetitions), 'repetition')} in "
         f"{plural(len(result.campaigns), 'campaign')} of {plural(len(result.arms), 'arm')}; "
-        f"{plural(result.read, 'archive')} read, {result.cached} cached, "
+        f"{plural(result.read, 'recording')} read, {result.cached} cached, "
         f"{len(result.skipped)} skipped, {len(result.broken)} failed"
     )
 
 
-def _tables(folder: Path | None, result: BatchResult) -> list[Path]:
+@contextmanager
+def cache_of(cache: str | None, *, for_logs: bool) -> Iterator[CacheLocation]:
+    """Provide the cache of an option; archives of logs need one, which goes with the batch."""
+    if cache != "none":
+        yield CacheLocation(str(Path(cache).resolve()) if cache else None)
+    elif for_logs:
+        with TemporaryDirectory(prefix="hil-") as folder:
+            yield CacheLocation(folder)
+    else:
+        yield CacheLocation(keep=False)
+
+
+def _logs(
+    arm: Described, reading: Reading, cache: CacheLocation, cluster: Cluster, reporter: Reporter
+) -> LogsOfBatch | None:
+    """Return the import of logs, None without a description of their robot."""
+    if not arm.is_given:
+        return None
+    how = LogReading.of(arm.robot, reading.options, repr(arm))
+    return LogsOfBatch(how, cache, cluster, reporter)
+
+
+def map_lines(maps: Mapping[LogMap, int], *, verbose: bool) -> Iterator[str]:
+    """Name the map of each kind of logs; with `verbose` also what it says of the channels."""
+    for log_map, count in maps.items():
+        source = f"concluded from {log_map.first}" if log_map.first else "given by --map"
+        yield f"{plural(count, 'log')} read by the column map {source}"
+        if verbose:
+            yield from (f"  {meaning}" for meaning in log_map.meanings)
+
+
+def _tables(folder: Path | None, result: BatchResult, logs: LogsOfBatch | None) -> list[Path]:
     if folder is None:
         return []
     with convert_write_errors(folder):
-        return write_tables(folder, result)
+        written = write_tables(folder, result)
+    return [*written, *([] if logs is None else write_maps(folder, logs.maps))]
 
 
 def result_lines(result: BatchResult) -> Iterator[str]:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Final
+from typing import Any, Final
 
 from pydantic import BaseModel, ConfigDict, ValidationError
 
@@ -49,6 +49,17 @@ class BagMap(BaseModel):
         return to_text({"bag": bag, **({"arm": arm} if arm else {})}, {"": _COMMENT})
 
     @classmethod
+    def of(cls, tables: Mapping[str, Any]) -> BagMap | None:
+        """Return the table of a parsed map; None if the map has none.
+
+        Raises:
+            ValidationError: it is not valid.
+        """
+        if "bag" not in tables:
+            return None
+        return cls.model_validate({**tables["bag"], "arm": tables.get("arm", {})})
+
+    @classmethod
     def load(cls, path: Path) -> BagMap | None:
         """Read the table of a map; None if the map has none.
 
@@ -56,10 +67,7 @@ class BagMap(BaseModel):
             SourceError: it is not valid.
         """
         try:
-            tables = parse_toml(map_text(path))
-            if "bag" not in tables:
-                return None
-            return cls.model_validate({**tables["bag"], "arm": tables.get("arm", {})})
+            return cls.of(parse_toml(map_text(path)))
         except ValidationError as error:
             wrong = first_error(path, error, cls, documentation=_DOCUMENTATION)
             field = f"bag.{wrong.field}"

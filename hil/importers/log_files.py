@@ -9,15 +9,15 @@ from hil.importers.arrays import READERS, ArrayFile
 from hil.importers.column_map import Format
 from hil.importers.text_table import Table
 
-_TEXTS: Final = (".csv", ".txt", ".dat", ".tsv", ".asc", ".log")
+TEXTS: Final = (".csv", ".txt", ".dat", ".tsv", ".asc", ".log")
 _ARRAYS: Final = tuple(suffix for suffix in READERS if suffix not in (".mcap", ".m"))
-_MARKS: Final = ("manifest.json", "metadata.yaml", "cell.toml", "plan.json", "results.json")
+MARKS: Final = ("manifest.json", "metadata.yaml", "cell.toml", "plan.json", "results.json")
 """Files of a campaign, a bag or a folder of results."""
 
 
 def files_in(folder: Path) -> list[Path]:
     """Return the files of a folder that may be tables or arrays, in order of their names."""
-    suffixes = (*_TEXTS, *_ARRAYS)
+    suffixes = (*TEXTS, *_ARRAYS)
     return sorted(
         path for path in folder.iterdir() if path.suffix.lower() in suffixes and path.is_file()
     )
@@ -28,7 +28,7 @@ def is_folder_of_logs(path: Path) -> bool:
     try:
         names = {file.name for file in path.iterdir()}
         of_others = any(path.glob("*.mcap")) or any(path.glob("*.db3*")) or any(path.glob("*.bag"))
-        return not (names & {*_MARKS} or of_others) and bool(files_in(path))
+        return not (names & {*MARKS} or of_others) and bool(files_in(path))
     except OSError:
         return False
 

@@ -254,11 +254,35 @@ def read_again(
     Raises:
         SourceError: the map leaves a quantity open.
     """
-    columns = ColumnMap.model_validate(parse_toml(text))
+    place = imported.archive.path
+    return read_by_map(source, robot_of, text, place=place, use=use, files=imported.files)
+
+
+def read_by_map(
+    source: Path,
+    robot_of: RobotOf,
+    text: str,
+    *,
+    place: Path,
+    use: Use = "excitation",
+    outside_limits: bool = False,
+    files: LogFiles | None = None,
+) -> ImportedRecording:
+    """Read a log or a bag by the text of its map, TOML; see :func:`read_recording`.
+
+    Raises:
+        SourceError: it cannot be read, or the map leaves a quantity open.
+    """
+    tables = parse_toml(text)
     request = _Request(
-        source, imported.archive.path, (), use, coupled=True, outside_limits=False,
-        files=imported.files,
+        source, place, (), use, coupled=True, outside_limits=outside_limits,
+        files=files or LogFiles(),
     )  # fmt: skip
+    if (bag := BagMap.of(tables)) is not None:
+        return _of_recorded_joints(
+            lambda robots: _read_bag(request, robots, bag, None), robot_of, source
+        )
+    columns = ColumnMap.model_validate(tables)
 
     def read(robots: RobotOf) -> ImportedRecording:
         robot = robots(lambda: _joints_of(columns, source))

@@ -83,6 +83,7 @@ NOT_TYPED = {
     "hil run runs/next": "typed in precision.md",
     "hil identify ur10": "needs a recording; tests/hil/test_one_command.py reads it",
     "hil batch /data": "needs other people's archives",
+    "hil batch 'logs/": "needs logs; tests/hil/test_batch_logs.py types it",
     "hil study --quick": "minutes; tests/hil/test_study.py runs a shorter one",
     "hil study --output": "an hour; tests/hil/test_study.py runs a short one",
 }  # Beginnings of commands that are read and not run, and why

@@ -384,7 +384,7 @@ def test_the_command_exits_with_5_if_archives_are_broken(folder, tmp_path):
     command += NOTHING_OPEN
     ran = CliRunner().invoke(app, command)
     assert ran.exit_code == 0, ran.output
-    assert "3 repetitions in 1 campaign of 1 arm; 5 archives read" in ran.output
+    assert "3 repetitions in 1 campaign of 1 arm; 5 recordings read" in ran.output
     assert re.search(r"^skipped, not for fitting: .*\d is a move", ran.output, re.MULTILINE)
     (folder / "archives" / "bad.mcap").write_bytes(b"")
     ran = CliRunner().invoke(app, [*command, "--json"])
@@ -422,7 +422,7 @@ class TestWarnings:
         record(tmp_path / "bare", 2, first=0)
         findings = json.dumps({"lines": [], "doubts": [CLOCK]})
         record(tmp_path / "warned", 2, first=2, findings=findings)
-        command = ["batch", str(tmp_path), "--workers", "1", "-o", str(tmp_path / "out")]
+        command = ["batch", str(tmp_path), "-v", "--workers", "1", "-o", str(tmp_path / "out")]
         ran = CliRunner().invoke(app, [*command, "--cache", "none", *NOTHING_OPEN])
         assert ran.exit_code == 0, ran.output
         assert f"note: {ASSUMED}" in ran.output
@@ -647,8 +647,9 @@ class TestMetadata:
 
         monkeypatch.setattr(discovery, "open_archive", counting)
         first = found_in(path, cache=CacheLocation())
+        count = len(opened)
         assert found_in(path, cache=CacheLocation()) == first
-        assert len(opened) == 1
+        assert len(opened) == count
         monkeypatch.setattr(discovery, "code_digest", lambda: "other programs")
         monkeypatch.setattr(discovery, "arm_digest", lambda *_, **__: "another digest")
         (ref,) = found_in(path, cache=CacheLocation()).refs

@@ -1,0 +1,1 @@
+"""Fleets: many robots, each with many recordings, of archives and logs alike."""
