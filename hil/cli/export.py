@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated, Literal
 
@@ -25,6 +26,14 @@ from hil.export.controller_code import (
     default_code_output,
     export_code,
 )
+from hil.export.drive_files import (
+    ExportedDrives,
+    WhatToExport,
+    default_drive_output,
+    export_drives,
+    patch_drives,
+    write_ranges,
+)
 from hil.export.model_files import (
     Exported,
     ExportedEnsemble,
@@ -33,11 +42,17 @@ from hil.export.model_files import (
     export_ensemble,
     export_model,
 )
-from hil.pipeline.identified_model import read_or_identify
+from hil.export.servo_files import (
+    ExportedServo,
+    ServoFormatName,
+    export_servo,
+    servo_folder,
+)
+from hil.pipeline.identified_model import IdentifiedModel, read_or_identify
 from hil.pipeline.options import Options
 from identification.export.controller.c_source import Precision
 
-ExportName = Literal[FormatName, CodeName]
+ExportName = Literal[FormatName, CodeName, ServoFormatName]
 
 
 @with_options(Identifying, "how", but=FEW)
@@ -49,8 +64,10 @@ def export(
     *,
     how: Identifying,
     again: bool = False,
+    ranges: bool = False,
     ensemble: Annotated[int | None, typer.Option(min=1, max=10000, metavar="N")] = None,
     seed: Annotated[int, typer.Option(min=0)] = 1,
+    into: Annotated[Path | None, typer.Option(exists=True, dir_okay=False, metavar="FILE")] = None,
     precision: Precision = "double",
     quiet: QuietOption = False,
     json: JsonOption = False,
@@ -65,42 +82,76 @@ def export(
     controller has every effect; C is compiled, where a compiler is found, and compared with
     pinocchio likewise. Exit status 5 if the model is not good.
 
+    Results of recordings without torque give position servos, which MuJoCo plays back.
+
     **Example:** `hil export runs/demo --to mjcf`, `hil export runs/demo --to c -o arm.c`
 
     Options:
-        to: For a simulator mjcf (MuJoCo), urdf, sdf or pinocchio; for a controller c (C99) or st
-            (structured text).
+        to: For a simulator mjcf (MuJoCo), isaaclab, genesis, urdf, sdf or pinocchio; for a
+            controller c (C99) or st (structured text).
         output: File to write; with --ensemble a folder, or an .npz file of all parameters.
             Default: identified.*, arm.c or arm.st in the campaign folder or working directory.
-        ensemble: Write so many arms drawn from the posterior, all of them physically consistent.
+        ranges: Also write NAME.ranges.json for domain randomisation: value and 95 % interval of
+            each field of the simulator, and whether data or prior decide.
+        ensemble: Write so many arms drawn from the posterior, all of them physically consistent;
+            for isaaclab and genesis in NAME.ranges.json.
         seed: Of the draws.
+        into: Your own MJCF or URDF: change its friction, armature and servos in place.
         precision: Of the numbers in code for a controller.
-        again: Identify again even if results.json and parameters.json are there.
+        again: Identify again even if results are there.
     """
     reporter = make_reporter(quiet=quiet or json)
     options = how.options(estimator=estimator)
-    as_usual = options == Options() and not again
-    arm = read_or_identify(archives, options, reporter, reuse=as_usual)
-    exported: Exported | ExportedEnsemble | ExportedCode
-    if to == "c" or to == "st":
-        if ensemble is not None:
-            problem = "is for files of simulators"
-            raise InputError(None, problem, field="--ensemble", remedy="leave it out")
-        exported = export_code(arm, output or default_code_output(archives, to), to, precision)
+    what = WhatToExport(output, ranges, ensemble, seed, into).checked(to)
+    folder = servo_folder(archives)
+    if folder is not None:
+        servo, good = export_servo(folder, to, what)
+        print_export(servo, json=json, quiet=quiet)
     else:
-        target = output or default_output(archives, to, ensemble=ensemble is not None)
-        exported = (
-            export_model(arm, target, to)
-            if ensemble is None
-            else export_ensemble(arm, target, to, ensemble, seed)
-        )
-    print_export(exported, json=json, quiet=quiet)
-    if not arm.good:
+        reuse = options == Options() and not again
+        arm = read_or_identify(archives, options, reporter, reuse=reuse)
+        good = arm.good
+        print_export(_exported(arm, archives, to, what, precision), json=json, quiet=quiet)
+    if not good:
         raise typer.Exit(NOT_GOOD)
 
 
+def _exported(
+    arm: IdentifiedModel,
+    archives: Sequence[Path],
+    to: ExportName,
+    what: WhatToExport,
+    precision: Precision,
+) -> Exported | ExportedEnsemble | ExportedCode | ExportedDrives:
+    """Write an arm with torque."""
+    if to == "c" or to == "st":
+        if what.count is not None or what.ranges:
+            field = "--ranges" if what.ranges else "--ensemble"
+            raise InputError(None, "is for files of simulators", field=field, remedy="leave it out")
+        target = what.output or default_code_output(archives, to)
+        return export_code(arm, target, to, precision)
+    if what.into is not None:
+        return patch_drives(arm, what.into, what)
+    if to == "isaaclab" or to == "genesis":
+        return export_drives(arm, what.output or default_drive_output(archives, to), to, what)
+    ensemble = what.count is not None
+    target = what.output or default_output(archives, to, ensemble=ensemble)
+    if what.count is not None:
+        exported: Exported | ExportedEnsemble = export_ensemble(
+            arm, target, to, what.count, what.seed
+        )
+    else:
+        exported = export_model(arm, target, to)
+    if what.ranges:
+        say(f"written: {write_ranges(arm, target, to, what)}", err=True)
+    return exported
+
+
 def print_export(
-    exported: Exported | ExportedEnsemble | ExportedCode, *, json: bool, quiet: bool
+    exported: Exported | ExportedEnsemble | ExportedCode | ExportedDrives | ExportedServo,
+    *,
+    json: bool,
+    quiet: bool,
 ) -> None:
     """Print the summary of written files."""
     if json:

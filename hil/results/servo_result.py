@@ -71,6 +71,14 @@ class ServoPosterior(Frozen):
     covariance: list[list[float]]  #: of them by joint, and of the delay of the bus
 
 
+class SimulatorServo(Frozen):
+    """Servo with the terms of a simulator alone, fitted to the same motion."""
+
+    servo: list[ServoValue]
+    validation: list[ServoPrediction]
+    posterior: ServoPosterior
+
+
 class ServoResults(Frozen):
     """Results of an identification without torque."""
 
@@ -94,6 +102,8 @@ class ServoResults(Frozen):
     term_choices: list[ServoTermChoice]
     verdict: ServoVerdict
     posterior: ServoPosterior
+    simulators: dict[str, SimulatorServo]  #: by engine: mujoco, physx
+    split: float  #: fraction of a single recording that was fitted
     notes: list[str]
 
     @classmethod

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 from hil.base.arrays import Array
@@ -15,6 +16,7 @@ class ServoSeries:
         archive: its name.
         time: (m,) [s].
         measured, commanded, identified: (m, n).
+        simulators: with the terms of an engine alone (m, n), by its name.
         compared: of the parameters to compare with, None without.
     """
 
@@ -23,4 +25,5 @@ class ServoSeries:
     measured: Array
     commanded: Array
     identified: Array
+    simulators: Mapping[str, Array]
     compared: Array | None

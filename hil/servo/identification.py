@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
@@ -26,15 +26,18 @@ from hil.results.servo_result import (
     ServoTermChoice,
     ServoValue,
     ServoVerdict,
+    SimulatorServo,
 )
 from hil.results.servo_series import ServoSeries
 from hil.servo.maker_file import maker_parameters
 from hil.servo.messages import verdict_of
 from identification.servo.choice import ServoFit, fit_servos, steps_of_a_fit
-from identification.servo.intervals import ServoIntervals, intervals_of
+from identification.servo.fit import ServoEstimate
+from identification.servo.intervals import intervals_of
 from identification.servo.motion import Grid, ServoMotion, motions_of
-from identification.servo.parameters import TERMS
+from identification.servo.parameters import TERMS, in_units
 from identification.servo.prediction import predicted
+from identification.servo.simulators import ENGINES, ITERATIONS, Engine, fits_in_simulators
 
 _FINEST: Final = 1e-5  # rad or m, least resolution of positions
 _MILLI: Final = 1e3
@@ -62,7 +65,6 @@ class ServoIdentification:
     paths: tuple[Path, ...]
     cell: Cell
     fit: ServoFit
-    intervals: ServoIntervals
     results: ServoResults
     series: tuple[ServoSeries, ...]
 
@@ -100,24 +102,31 @@ def identify_servos(
         problem = "has no part in which the commanded positions are known"
         remedy = "record the commanded positions, or name them (--columns)"
         raise InputError(first, problem, field="commanded_position", remedy=remedy)
+    resolution = _resolution(sources)
     started = time.process_time()
-    with reporter.task("servos", steps_of_a_fit()) as task:
-        fit = fit_servos(fitted, _resolution(sources), done=lambda: task.advance(1))
-    seconds = time.process_time() - started
-    intervals = intervals_of(fit)
+    with reporter.task("servos", steps_of_a_fit() + len(ENGINES) * ITERATIONS) as task:
+        fit = fit_servos(fitted, resolution, done=lambda: task.advance(1))
+        simulators = fits_in_simulators(fitted, fit, resolution, done=lambda: task.advance(1))
+    found = _Found(fit, simulators, time.process_time() - started)
     with reporter.task("held-out motions", len(sources.held_out)) as task:
         series = []
         for source in sources.held_out:
             motions = _motions(source, cell, bodies, grid)
-            series += _series(source.name, motions, cell, bodies, intervals.values, compared)
+            series += _series(source.name, motions, cell, bodies, found, compared)
             task.advance(1)
-    predictions = [_prediction(each) for each in series]
-    results = _results(name or first.stem, sources, fit, intervals, predictions, seconds)
-    if options.compare is not None:
-        results = results.model_copy(update={"compared": options.compare.name})
+    results = _results(name or first.stem, sources, found, series, options)
     results = results.model_copy(update={"verdict": verdict_of(results)})
     paths = tuple(map(place_of, (*archives, *predict)))
-    return ServoIdentification(paths, cell, fit, intervals, results, tuple(series))
+    return ServoIdentification(paths, cell, fit, results, tuple(series))
+
+
+@dataclass(frozen=True, eq=False)
+class _Found:
+    """What was fitted: with all terms, and with those of each engine; processor time [s]."""
+
+    fit: ServoFit
+    simulators: Mapping[Engine, ServoFit]
+    seconds: float
 
 
 def _bodies(cell: Cell, path: Path) -> Array:
@@ -153,29 +162,34 @@ def _series(
     motions: Sequence[ServoMotion],
     cell: Cell,
     bodies: Array,
-    values: Array,
+    found: _Found,
     compared: Array | None,
 ) -> list[ServoSeries]:
     """Return the motions of a recording as they were simulated from their commands."""
-    sets = [values] if compared is None else [values, compared]
+    fits = [found.fit, *(found.simulators[engine] for engine in ENGINES)]
+    sets = [in_units(fit.estimate.values) for fit in fits]
+    if compared is not None:
+        sets.append(compared)
     series = []
     for motion in motions:
-        positions = predicted(cell.model, bodies, motion, sets)
+        identified, *others = predicted(cell.model, bodies, motion, sets)
+        simulators = dict(zip(ENGINES, others, strict=False))
         series.append(
             ServoSeries(
                 name,
                 np.asarray(motion.step * np.arange(len(motion.position)), np.float64),
                 motion.position,
                 motion.command,
-                positions[0],
-                positions[1] if compared is not None else None,
+                identified,
+                simulators,
+                others[-1] if compared is not None else None,
             )
         )
     return series
 
 
-def _prediction(series: ServoSeries) -> ServoPrediction:
-    """Return the errors of a simulated motion."""
+def _prediction(series: ServoSeries, engine: Engine | None = None) -> ServoPrediction:
+    """Return the errors of a simulated motion, or with the terms of an engine."""
 
     def errors(simulated: Array) -> list[float]:
         mean = np.sqrt(np.mean((simulated - series.measured) ** 2, axis=0))
@@ -184,7 +198,7 @@ def _prediction(series: ServoSeries) -> ServoPrediction:
     def overall(each: list[float]) -> float:
         return float(np.sqrt(np.mean(np.square(each))))
 
-    own = errors(series.identified)
+    own = errors(series.identified if engine is None else series.simulators[engine])
     command = errors(series.commanded)
     other = None if series.compared is None else errors(series.compared)
     return ServoPrediction(
@@ -202,15 +216,14 @@ def _prediction(series: ServoSeries) -> ServoPrediction:
 def _results(
     name: str,
     sources: Sources,
-    fit: ServoFit,
-    intervals: ServoIntervals,
-    predictions: Sequence[ServoPrediction],
-    seconds: float,
+    found: _Found,
+    series: Sequence[ServoSeries],
+    options: ServoOptions,
 ) -> ServoResults:
     """Return the results, without a verdict."""
     cell = sources.cell
-    turning = [bool(turns) for turns in cell.model.chain.revolute]
-    estimate = fit.estimate
+    turning = cell.model.chain.revolute
+    estimate = found.fit.estimate
     names = cell.joint_names
     placeholder = ServoVerdict(good=False, line="", warnings=[], next_steps=[])
     return ServoResults(
@@ -221,26 +234,14 @@ def _results(
         joint_units=["rad" if turns else "m" for turns in turning],
         software=software(),
         archives=[source.name for source in sources.training],
-        windows=fit.windows,
-        seconds=seconds,
+        windows=found.fit.windows,
+        seconds=found.seconds,
         delay=estimate.bus_delay,
-        servo=[
-            ServoValue(
-                name=term.name,
-                joint=joint,
-                unit=term.unit if turning[j] else term.unit_along,
-                value=float(intervals.values[j, k]),
-                lower=float(intervals.lower[j, k]),
-                upper=float(intervals.upper[j, k]),
-                determined=bool(intervals.determined[j, k]),
-                present=bool(estimate.present[j, k]),
-            )
-            for j, joint in enumerate(names)
-            for k, term in enumerate(TERMS)
-        ],
-        validation=list(predictions),
+        servo=_values(found.fit, cell),
+        validation=[_prediction(each) for each in series],
         in_sample=sources.in_sample,
         tested_on=sources.tested_on,
+        compared=None if options.compare is None else options.compare.name,
         term_choices=[
             ServoTermChoice(
                 terms=list(choice.terms),
@@ -248,13 +249,46 @@ def _results(
                 present=choice.present,
                 gain=choice.gain,
             )
-            for choice in fit.choices
+            for choice in found.fit.choices
         ],
         verdict=placeholder,
-        posterior=ServoPosterior(
-            coordinates=estimate.coordinates.tolist(),
-            present=estimate.present.tolist(),
-            covariance=estimate.covariance.tolist(),
-        ),
+        posterior=_posterior(estimate),
+        simulators={
+            engine: SimulatorServo(
+                servo=_values(fit, cell),
+                validation=[_prediction(each, engine) for each in series],
+                posterior=_posterior(fit.estimate),
+            )
+            for engine, fit in found.simulators.items()
+        },
+        split=options.split,
         notes=list(sources.warnings),
+    )
+
+
+def _values(fit: ServoFit, cell: Cell) -> list[ServoValue]:
+    """Return all parameters of all joints with their intervals."""
+    intervals = intervals_of(fit)
+    turning = cell.model.chain.revolute
+    return [
+        ServoValue(
+            name=term.name,
+            joint=joint,
+            unit=term.unit if turning[j] else term.unit_along,
+            value=float(intervals.values[j, k]),
+            lower=float(intervals.lower[j, k]),
+            upper=float(intervals.upper[j, k]),
+            determined=bool(intervals.determined[j, k]),
+            present=bool(fit.estimate.present[j, k]),
+        )
+        for j, joint in enumerate(cell.joint_names)
+        for k, term in enumerate(TERMS)
+    ]
+
+
+def _posterior(estimate: ServoEstimate) -> ServoPosterior:
+    return ServoPosterior(
+        coordinates=estimate.coordinates.tolist(),
+        present=estimate.present.tolist(),
+        covariance=estimate.covariance.tolist(),
     )

@@ -122,9 +122,10 @@ def _errors(results: ServoResults, shown: Sequence[ServoPrediction]) -> list[lis
     if not shown:
         return [["no motion was held out"]]
     other = [] if results.compared is None else [results.compared]
-    rows = [[f"rms [{unit_of(results)}]", "all", "command", *other, *results.joint_names]]
-    for each in shown:
-        overall = [each.position_error_mrad, each.command_error_mrad]
+    unit = f"rms [{unit_of(results)}]"
+    rows = [[unit, "all", "MuJoCo's terms", "command", *other, *results.joint_names]]
+    for each, simple in zip(shown, results.simulators["mujoco"].validation, strict=False):
+        overall = [each.position_error_mrad, simple.position_error_mrad, each.command_error_mrad]
         if other:
             overall.append(each.compared_error_mrad or 0.0)
         numbers = [*overall, *each.joint_errors_mrad]

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from identification.arrays import Array
 from identification.errors import IdentificationError
+from identification.export.actuators import Actuators
 from identification.export.arm import ExportedArm
 from identification.export.friction import load_remarks
 from identification.export.sdf import MissingDrakeError, drake_torque, sdf
@@ -49,6 +50,7 @@ _DRY_LABELS: Final = tuple(term.label for term in _DRY)
 _OF_SPEED: Final = (QUADRATIC, CUBIC)
 _TIMESTEP: Final = 1e-3  # s
 _FRICTION_STEPS: Final = 2.0  # time constant of MuJoCo's dry friction, at least 2 steps
+_STILL: Final = 0.9999  # impedance of MuJoCo's dry friction at which a joint rests
 _THICKNESS: Final = 0.03  # m, radius of the capsules that show the arm
 _SHORTEST: Final = 1e-3  # m, length of a capsule
 
@@ -58,11 +60,23 @@ class MissingMujocoError(IdentificationError):
 
 
 def mjcf(
-    arm: ExportedArm, name: str, remarks: Sequence[str] = (), *, step: float = _TIMESTEP
+    arm: ExportedArm,
+    name: str,
+    remarks: Sequence[str] = (),
+    *,
+    step: float = _TIMESTEP,
+    servos: Actuators | None = None,
 ) -> str:
-    """Return the arm as MuJoCo's XML with a time step [s]; motors are controlled by torque."""
+    """Return the arm as MuJoCo's XML; motors are controlled by torque.
+
+    Args:
+        arm: bodies, rotors, friction and limits.
+        name: of the model.
+        remarks: lines of a comment.
+        step: time step [s].
+        servos: position servos in place of the motors.
+    """
     model = arm.model
-    ranges = arm.ranges
     rotors = arm.rotors
     coupled = np.array((rotors != np.diag(np.diag(rotors))).any(axis=1))
     root = Node("mujoco", model=name)
@@ -73,7 +87,7 @@ def mjcf(
          integrator="implicitfast")  # fmt: skip
     places = {-1: _add(root, "worldbody")}
     motors = Node("actuator")
-    for j, (joint_name, mass) in enumerate(zip(model.joint_names, arm.bodies, strict=True)):
+    for j, mass in enumerate(arm.bodies):
         parent = places[int(model.chain.parents[j])]
         rotation = model.chain.rotation[j]
         translation = model.chain.translation[j]
@@ -85,38 +99,89 @@ def mjcf(
         six = mass.inertia[[0, 1, 2, 0, 0, 1], [0, 1, 2, 1, 2, 2]]
         _add(link, "inertial", pos=as_text(mass.centre), mass=as_text(mass.mass),
              fullinertia=as_text(six))  # fmt: skip
-        friction = arm.friction[j]
-        (stiffness, rest_angle) = arm.spring(j)
-        third = {term.symbol: term for term in model.friction.laws[j].terms}.get("f2")
-        damping = [  # of v, v |v| and v³
-            friction.get("f1", 0.0),
-            # A negative one would accelerate a joint that is faster than the recorded motion.
-            *(max(0.0, friction["f2"]) if third == kind else 0.0 for kind in _OF_SPEED),
-        ]
-        lower, upper, most = (bound[j] for bound in (ranges.lower, ranges.upper, ranges.effort))
-        limited = math.isfinite(lower) and math.isfinite(upper) and lower < upper
-        effort = as_text([-most, most]) if math.isfinite(most) else None
-        _add(
-            link,
-            "joint",
-            name=joint_name,
-            type="hinge" if model.chain.revolute[j] else "slide",
-            axis=as_text(model.chain.axis[j]),
-            armature=as_text(0.0 if coupled[j] else rotors[j, j]),
-            damping=as_text(damping),
-            frictionloss=as_text(max(0.0, friction.get("f0", 0.0))),
-            solreffriction=as_text([_FRICTION_STEPS * step, 1.0]),
-            stiffness=as_text(stiffness) if stiffness else None,
-            springref=as_text(rest_angle) if stiffness else None,
-            range=as_text([lower, upper]) if limited else None,
-            actuatorfrcrange=effort,
-        )
-        _add(motors, "motor", name=joint_name, joint=joint_name, ctrlrange=effort)
+        _joint(link, motors, arm, j, coupled=bool(coupled[j]), step=step, servos=servos)
         for frame, place in arm.fixed(j).items():
             _add(link, "site", name=frame, **_pose(*place))
     _tendons(root, arm, coupled, step)
     root.append(motors)
     return _text(root)
+
+
+def _joint(
+    link: Node,
+    motors: Node,
+    arm: ExportedArm,
+    joint: int,
+    *,
+    coupled: bool,
+    step: float,
+    servos: Actuators | None,
+) -> None:
+    """Add a joint to a link, and what drives it."""
+    model = arm.model
+    ranges = arm.ranges
+    name = model.joint_names[joint]
+    friction = arm.friction[joint]
+    stiffness, rest_angle = arm.spring(joint)
+    third = {term.symbol: term for term in model.friction.laws[joint].terms}.get("f2")
+    damping = [  # of v, v |v| and v³
+        friction.get("f1", 0.0),
+        # A negative one would accelerate a joint that is faster than the recorded motion.
+        *(max(0.0, friction["f2"]) if third == kind else 0.0 for kind in _OF_SPEED),
+    ]
+    lower, upper, most = (bound[joint] for bound in (ranges.lower, ranges.upper, ranges.effort))
+    limited = math.isfinite(lower) and math.isfinite(upper) and lower < upper
+    effort = as_text([-most, most]) if math.isfinite(most) else None
+    _add(
+        link,
+        "joint",
+        name=name,
+        type="hinge" if model.chain.revolute[joint] else "slide",
+        axis=as_text(model.chain.axis[joint]),
+        armature=as_text(0.0 if coupled else arm.rotors[joint, joint]),
+        damping=as_text(damping),
+        frictionloss=as_text(max(0.0, friction.get("f0", 0.0))),
+        **(_dry_friction(step) if servos is None else still_friction(step)),
+        stiffness=as_text(stiffness) if stiffness else None,
+        springref=as_text(rest_angle) if stiffness else None,
+        range=as_text([lower, upper]) if limited else None,
+        actuatorfrcrange=effort if servos is None else None,
+    )
+    if servos is None:
+        _add(motors, "motor", name=name, joint=name, ctrlrange=effort)
+    else:
+        figures = {"forcerange": effort, **position_attributes(servos, joint, step)}
+        _add(motors, "position", name=name, joint=name, **figures)
+
+
+def _dry_friction(step: float) -> dict[str, str]:
+    """Return the attributes of dry friction as a constraint at a time step [s]."""
+    return {"solreffriction": as_text([_FRICTION_STEPS * step, 1.0])}
+
+
+def still_friction(step: float) -> dict[str, str]:
+    """Return these of a joint that friction holds against gravity for minutes.
+
+    With the default impedance (0.9 to 0.95) a held joint creeps by milliradians a second.
+    """
+    return {**_dry_friction(step), "solimpfriction": as_text([_STILL, _STILL, 0.001, 0.5, 2.0])}
+
+
+def position_attributes(servos: Actuators, joint: int, step: float) -> dict[str, str]:
+    """Return the attributes of a position actuator at a time step [s].
+
+    All braking is in the joint's damping. The command is delayed by MuJoCo's own history of
+    controls, which holds one for each step.
+    """
+    limit = float(servos.value("limit")[joint])
+    delay = float(servos.value("delay")[joint])
+    attributes = {"kp": as_text(servos.value("stiffness")[joint]), "kv": "0"}
+    if math.isfinite(limit):
+        attributes["forcerange"] = as_text([-limit, limit])
+    if delay >= 0.5 * step:
+        samples = math.ceil(delay / step) + 2
+        attributes |= {"delay": as_text(delay), "nsample": str(samples), "interp": "linear"}
+    return attributes
 
 
 def urdf(arm: ExportedArm, name: str, remarks: Sequence[str] = ()) -> str:

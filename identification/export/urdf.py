@@ -113,12 +113,12 @@ def write_urdf(
         if values:
             figures = {attribute: as_text(value) for attribute, value in values.items()}
             _child(tree.joints[joint], "dynamics").attrib.update(figures)
-    text = _joined(urdf, root, remarks)
+    text = joined_text(urdf, root, remarks)
     _compare(text, model, inertial)
     return text
 
 
-def _joined(urdf: str, root: Element, remarks: Sequence[str]) -> str:
+def joined_text(urdf: str, root: Element, remarks: Sequence[str] = ()) -> str:
     """Return a text with another root element, and a comment before it."""
     prolog = _PROLOG.match(urdf)
     assert prolog is not None

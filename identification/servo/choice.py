@@ -104,10 +104,10 @@ def fit_servos(
         windows, prior, chosen, best.coordinates, resolution, iterations=ITERATIONS,
         bus=best.bus_delay, done=done,
     )  # fmt: skip
-    return ServoFit(final, choices, windows.count, _shown(windows, final))
+    return ServoFit(final, choices, windows.count, shown_terms(windows, final))
 
 
-def _shown(windows: Windows, estimate: ServoEstimate) -> NDArray[np.bool_]:
+def shown_terms(windows: Windows, estimate: ServoEstimate) -> NDArray[np.bool_]:
     """Return whether the cost without a term is higher, by more than chance (n, P)."""
     shown = np.ones_like(estimate.present)
     before = data_cost(windows, estimate, estimate.present)

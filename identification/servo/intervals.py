@@ -65,15 +65,24 @@ def intervals_of(fit: ServoFit) -> ServoIntervals:
     return ServoIntervals(values, lower, upper, determined)
 
 
-def sampled(estimate: ServoEstimate, count: int, seed: int) -> Array:
-    """Return parameters in SI units (count, n, P) drawn from the posterior, correlated."""
+def sampled(
+    coordinates: Array, present: NDArray[np.bool_], covariance: Array, count: int, seed: int
+) -> Array:
+    """Return parameters in SI units (count, n, P) drawn from the posterior, correlated.
+
+    Args:
+        coordinates: of the estimate (n, P).
+        present: terms of the model (n, P).
+        covariance: of the coordinates and of the delay of the bus (n P + 1, n P + 1).
+        count: number of draws.
+        seed: of them.
+    """
     generator = np.random.default_rng(seed)
-    covariance = estimate.covariance
     values, vectors = np.linalg.eigh(0.5 * (covariance + covariance.T))
     root = vectors * np.sqrt(np.maximum(values, 0.0))
     shifts = generator.standard_normal((count, len(values))) @ root.T
-    coordinates = estimate.coordinates + shifts[:, :-1].reshape(count, *estimate.coordinates.shape)
-    return in_units(without_absent(natural(coordinates), estimate.present))
+    samples = coordinates + shifts[:, :-1].reshape(count, *coordinates.shape)
+    return in_units(without_absent(natural(samples), present))
 
 
 def _spread(estimate: ServoEstimate) -> Array:

@@ -60,10 +60,11 @@ def start_of(prior: Prior, start: dict[str, float]) -> Array:
 
 
 def _compliance(motions: Sequence[ServoMotion], errors: Array) -> Array:
-    """Return position error per torque of the bodies (n,), one for all joints.
+    """Return position error per torque of the bodies (n,).
 
-    Of the joints whose errors follow that torque beside friction and a constant; where none does,
-    that at which the bodies alone would make the servo's time constant.
+    Of the joints whose errors follow that torque with friction and a constant, the median; where
+    none does, that at which the bodies alone would make the servo's time constant. At most the size
+    of the errors over that of the torque: a softer servo would not have held the arm.
     """
     bodies = [motion.bodies for motion in motions]
     torque = np.concatenate([part.bias for part in bodies])
@@ -81,4 +82,10 @@ def _compliance(motions: Sequence[ServoMotion], errors: Array) -> Array:
         if solution[0] > _DETERMINED * deviation:
             known.append(solution[0])
     alone = _TIME_CONSTANT**2 / np.maximum(inertia, 1e-9)
-    return np.full(len(alone), np.median(known) if known else np.median(alone))
+    softest = _rms(errors) / np.maximum(_rms(torque), 1e-9)
+    common = float(np.median(known) if known else np.median(alone))
+    return np.asarray(np.minimum(common, softest))
+
+
+def _rms(values: Array) -> Array:
+    return np.asarray(np.sqrt((values**2).mean(axis=0)))

@@ -3,7 +3,12 @@
 from __future__ import annotations
 
 import json
+import sys
 from pathlib import Path
+from types import ModuleType, SimpleNamespace
+from typing import Any
+from unittest.mock import Mock
+from xml.etree import ElementTree
 
 import numpy as np
 import pytest
@@ -108,6 +113,212 @@ class TestCommand:
         assert len(lines) <= 24
         assert max(map(len, lines)) <= 100
         assert any(line.startswith("slow.mcap") for line in lines)
+
+
+def exported(folder: Path, *options: object) -> tuple[int, str]:
+    """Return status of an export of results, and its output or why it was refused."""
+    done = CliRunner().invoke(app, ["export", str(folder), *map(str, options)])
+    return done.exit_code, f"{done.output}{done.exception or ''}"
+
+
+def identified_values(folder: Path, engine: str, name: str) -> dict[str, float]:
+    """Return a parameter with the terms of an engine by joint."""
+    servo = ServoResults.load(folder / "results.json").simulators[engine].servo
+    return {value.joint: value.value for value in servo if value.name == name}
+
+
+def executed(path: Path) -> dict[str, Any]:
+    """Return what a Python file defines."""
+    space: dict[str, Any] = {}
+    exec(compile(path.read_text(), str(path), "exec"), space)
+    return space
+
+
+class TestExports:
+    def test_mujoco_plays_the_held_out_motion_back(
+        self, identified: tuple[Path, str, int], tmp_path: Path
+    ) -> None:
+        folder, _, _ = identified
+        path = tmp_path / "arm.xml"
+        done = CliRunner().invoke(
+            app, ["export", str(folder), "--to", "mjcf", "-o", str(path), "--json"]
+        )
+        assert done.exit_code == 0, done.output
+        (played,) = json.loads(done.stdout)["played_back"]
+        simple = ServoResults.load(folder / "results.json").simulators["mujoco"].validation[0]
+        # MuJoCo is an integrator of its own, and moves all joints at once.
+        assert played["error"] == pytest.approx(simple.position_error_mrad, rel=0.15)
+        assert played["error"] < 0.2 * played["command"]
+
+    def test_an_mjcf_has_position_actuators_with_delay(
+        self, identified: tuple[Path, str, int], tmp_path: Path
+    ) -> None:
+        mujoco = pytest.importorskip("mujoco")
+        folder, _, _ = identified
+        path = tmp_path / "arm.xml"
+        assert exported(folder, "--to", "mjcf", "-o", path)[0] == 0
+        model = mujoco.MjModel.from_xml_path(str(path))
+        for name in arm.NAMES:
+            actuator = model.actuator(name).id
+            dof = model.joint(name).dofadr[0]
+            kp = identified_values(folder, "mujoco", "kp")[name]
+            assert model.actuator_gainprm[actuator, 0] == pytest.approx(kp)
+            assert model.actuator_biasprm[actuator, 1] == pytest.approx(-kp)
+            delay = identified_values(folder, "mujoco", "delay")[name]
+            assert model.actuator_delay[actuator] == pytest.approx(delay)
+            for term, attribute in (
+                ("coulomb", model.dof_frictionloss),
+                ("viscous", model.dof_damping),
+                ("armature", model.dof_armature),
+            ):
+                value = identified_values(folder, "mujoco", term)[name]
+                assert attribute[dof] == pytest.approx(value, rel=1e-6)
+
+    def test_isaac_lab_gets_drives_with_friction_and_delay_in_steps(
+        self,
+        identified: tuple[Path, str, int],
+        tmp_path: Path,
+        monkeypatch: pytest.MonkeyPatch,
+    ) -> None:
+        folder, _, _ = identified
+        path = tmp_path / "arm.py"
+        assert exported(folder, "--to", "isaaclab", "-o", path)[0] == 0
+        isaaclab = ModuleType("isaaclab.actuators")
+        isaaclab.DelayedPDActuatorCfg = SimpleNamespace  # type: ignore[attr-defined]
+        monkeypatch.setitem(sys.modules, "isaaclab", ModuleType("isaaclab"))
+        monkeypatch.setitem(sys.modules, "isaaclab.actuators", isaaclab)
+        drives = executed(path)["actuators"](physics_dt=0.005)
+        assert list(drives) == list(arm.NAMES)
+        for name, drive in drives.items():
+            assert drive.joint_names_expr == [name]
+            kp = identified_values(folder, "physx", "kp")[name]
+            assert drive.stiffness == pytest.approx(kp, rel=1e-5)
+            assert drive.dynamic_friction <= drive.friction
+            delay = identified_values(folder, "physx", "delay")[name]
+            assert drive.min_delay == drive.max_delay == round(delay / 0.005)
+
+    def test_genesis_gets_the_values_of_each_dof(
+        self, identified: tuple[Path, str, int], tmp_path: Path
+    ) -> None:
+        folder, _, _ = identified
+        path = tmp_path / "arm.py"
+        assert exported(folder, "--to", "genesis", "-o", path)[0] == 0
+        entity = Mock()
+        places = dict(zip(arm.NAMES, (2, 0, 1), strict=True))
+        entity.get_joint = lambda name: SimpleNamespace(dofs_idx_local=[places[name]])
+        executed(path)["apply"](entity)
+        values, dofs = entity.set_dofs_kp.call_args.args
+        kp = identified_values(folder, "mujoco", "kp")
+        assert dofs == [2, 0, 1]
+        assert values == pytest.approx([kp[name] for name in arm.NAMES], rel=1e-5)
+        for setter in ("armature", "damping", "frictionloss", "force_range"):
+            assert getattr(entity, f"set_dofs_{setter}").called
+
+    def test_ranges_contain_the_values_and_say_where_they_are_from(
+        self, identified: tuple[Path, str, int], tmp_path: Path
+    ) -> None:
+        folder, _, _ = identified
+        path = tmp_path / "arm.xml"
+        assert exported(folder, "--to", "mjcf", "-o", path, "--ranges", "--ensemble", 4)[0] == 0
+        document = json.loads((tmp_path / "arm.ranges.json").read_text())
+        fields = document["ranges"]
+        assert set(fields) == {
+            "kp", "forcerange", "delay", "frictionloss", "damping", "armature", "offset"
+        }  # fmt: skip
+        for field in fields.values():
+            for entry in field.values():
+                infinite = entry["high"] is None
+                assert entry["low"] <= entry["value"] and (
+                    infinite or entry["value"] <= entry["high"]
+                )
+                assert entry["from"] in ("data", "prior")
+        assert {entry["from"] for entry in fields["kp"].values()} == {"data"}
+        assert fields["kp"]["lift"]["unit"] == "N·m/rad"
+        assert np.shape(document["draws"]["kp"]) == (4, 3)
+        mujoco = pytest.importorskip("mujoco")
+        for k in range(4):
+            model = mujoco.MjModel.from_xml_path(str(tmp_path / f"arm_{k + 1}.xml"))
+            kp = document["draws"]["kp"][k]
+            assert model.actuator_gainprm[:, 0] == pytest.approx(kp, rel=1e-5)
+
+    def test_what_moves_together_is_sampled_together(
+        self, identified: tuple[Path, str, int], tmp_path: Path
+    ) -> None:
+        """All torques of a joint grow with its gain: positions show their ratios best."""
+        folder, _, _ = identified
+        path = tmp_path / "arm.py"
+        assert exported(folder, "--to", "genesis", "-o", path, "--ensemble", 400)[0] == 0
+        draws = json.loads((tmp_path / "arm.ranges.json").read_text())["draws"]
+        kp, viscous = (np.log(draws[name]) for name in ("KP", "DAMPING"))
+        for joint in range(3):
+            assert np.corrcoef(kp[:, joint], viscous[:, joint])[0, 1] > 0.5
+
+    def test_an_own_mjcf_is_changed_in_place(
+        self, identified: tuple[Path, str, int], tmp_path: Path
+    ) -> None:
+        folder, _, _ = identified
+        path = tmp_path / "own.xml"
+        path.write_text(OWN)
+        status, output = exported(folder, "--to", "mjcf", "--into", path)
+        assert status == 0, output
+        text = path.read_text()
+        assert "not read back" in output  # its mesh is not there
+        assert "<!-- my arm -->" in text and 'mesh file="hand.stl"' in text
+        root = ElementTree.fromstring(text)
+        finger = root.find(".//joint[@name='finger']")
+        assert finger is not None and finger.attrib == {"name": "finger", "damping": "9"}
+        kp = identified_values(folder, "mujoco", "kp")
+        by_joint = {node.get("joint"): node for node in root.iter("position")}
+        assert set(by_joint) == set(arm.NAMES)
+        for name, node in by_joint.items():
+            assert float(node.attrib["kp"]) == pytest.approx(kp[name])
+        assert by_joint["pan"].get("name") == "m1" and by_joint["pan"].get("ctrlrange") == "-1 1"
+        assert "dampratio" not in by_joint["pan"].attrib
+
+    def test_a_file_without_the_joints_is_left_as_it_is(
+        self, identified: tuple[Path, str, int], tmp_path: Path
+    ) -> None:
+        folder, _, _ = identified
+        path = tmp_path / "other.xml"
+        path.write_text(OWN.replace('"elbow"', '"other"'))
+        before = path.read_text()
+        status, output = exported(folder, "--to", "mjcf", "--into", path)
+        assert status != 0 and "there is no joint elbow" in output
+        assert path.read_text() == before
+
+    def test_an_own_urdf_gets_friction(
+        self, identified: tuple[Path, str, int], tmp_path: Path
+    ) -> None:
+        folder, _, _ = identified
+        path = tmp_path / "own.urdf"
+        path.write_text(arm.urdf())
+        assert exported(folder, "--to", "urdf", "--into", path)[0] == 0
+        root = ElementTree.fromstring(path.read_text())
+        coulomb = identified_values(folder, "mujoco", "coulomb")
+        for joint in root.findall("joint"):
+            dynamics = joint.find("dynamics")
+            assert dynamics is not None
+            friction = float(dynamics.attrib["friction"])
+            assert friction == pytest.approx(coulomb[joint.attrib["name"]])
+
+    def test_a_format_without_servos_is_refused(self, identified: tuple[Path, str, int]) -> None:
+        folder, _, _ = identified
+        status, output = exported(folder, "--to", "sdf")
+        assert status != 0 and "which --to sdf does not express" in output
+
+
+OWN = """<?xml version="1.0"?>
+<!-- my arm -->
+<mujoco><asset><mesh file="hand.stl"/></asset><worldbody>
+  <body><inertial mass="1" pos="0 0 0" diaginertia="1 1 1"/><joint name="pan"/>
+  <body><inertial mass="1" pos="0 0 0" diaginertia="1 1 1"/><joint name="lift" damping="7"/>
+  <body><inertial mass="1" pos="0 0 0" diaginertia="1 1 1"/><joint name="elbow"/>
+  <body><joint name="finger" damping="9"/><geom type="mesh" mesh="hand"/>
+  </body></body></body></body>
+  </worldbody>
+  <actuator><position name="m1" joint="pan" kp="3" dampratio="1" ctrlrange="-1 1"/>
+  <motor name="m2" joint="lift" ctrlrange="-9 9"/></actuator></mujoco>
+"""
 
 
 class TestMakerFile:

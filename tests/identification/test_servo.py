@@ -142,7 +142,8 @@ def test_a_limit_that_no_motion_reaches_is_not_determined(planted):
 
 def test_draws_scatter_as_the_intervals_say(planted):
     _, fit, intervals, *_ = planted
-    draws = sampled(fit.estimate, 400, 1)
+    estimate = fit.estimate
+    draws = sampled(estimate.coordinates, estimate.present, estimate.covariance, 400, 1)
     kp = PLACE["kp"]
     inside = (draws[:, :, kp] > intervals.lower[:, kp]) & (draws[:, :, kp] < intervals.upper[:, kp])
     assert 0.9 < inside.mean() < 1.0

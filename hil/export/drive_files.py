@@ -1,0 +1,236 @@
+"""Friction, rotors and limits of an identified arm for simulators, with ranges of them."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Final, Literal
+
+import numpy as np
+
+from hil.base.arrays import Array
+from hil.base.errors import InputError
+from hil.base.files import make_folder, write_files
+from hil.base.safe_input import read_text
+from hil.pipeline.identified_model import IdentifiedModel, ensemble_of, remarks_of
+from identification.export.actuators import Actuators, FieldRange, Quantity, ranges_of
+from identification.export.arm import ExportedArm
+from identification.export.patching import PatchError, patched
+from identification.export.python_files import (
+    GENESIS,
+    ISAAC_LAB,
+    genesis,
+    isaac_lab,
+    require_values,
+)
+
+DriveName = Literal["isaaclab", "genesis"]
+MJCF: Final[Mapping[str, Quantity]] = {
+    "forcerange": "limit",
+    "frictionloss": "friction",
+    "damping": "viscous",
+    "armature": "armature",
+}
+URDF: Final[Mapping[str, Quantity]] = {"friction": "friction", "damping": "viscous"}
+_FIELDS: Final[Mapping[str, Mapping[str, Quantity]]] = {
+    "mjcf": MJCF,
+    "urdf": URDF,
+    "sdf": URDF,
+    "pinocchio": {**URDF, "armature": "armature"},
+    "isaaclab": ISAAC_LAB,
+    "genesis": GENESIS,
+}
+_DRAWS: Final = 100  # arms of which ranges are estimated
+_LEARNT: Final = 0.5  # of the prior's deviation, above which the motion says little
+
+
+@dataclass(frozen=True)
+class WhatToExport:
+    """What is written.
+
+    Attributes:
+        output: file; None for one named `identified` in the folder of the results.
+        ranges: whether a file of ranges is written next to it.
+        count: of draws from the posterior, None for none.
+        seed: of the draws.
+        into: MJCF or URDF that is changed in place, None for a new file.
+    """
+
+    output: Path | None = None
+    ranges: bool = False
+    count: int | None = None
+    seed: int = 1
+    into: Path | None = None
+
+    def checked(self, to: str) -> WhatToExport:
+        """Return this if it goes together with a format, else raise InputError."""
+        if self.into is not None and (to not in ("mjcf", "urdf") or self.count is not None):
+            problem = "is changed as an MJCF or URDF"
+            remedy = "use --to mjcf or --to urdf without --ensemble"
+            raise InputError(self.into, problem, field="--into", remedy=remedy)
+        return self
+
+
+@dataclass(frozen=True)
+class ExportedDrives:
+    """Summary of the written files."""
+
+    paths: tuple[Path, ...]
+    read_back: str
+    verdict: str
+    origin: str = ""  #: of the parameters, where they were not identified for these files
+
+    def lines(self) -> list[str]:
+        """Return the summary as lines of text."""
+        lines = [*([f"parameters: {self.origin}"] if self.origin else [])]
+        return [
+            *lines, f"written: {', '.join(map(str, self.paths))}", self.read_back, self.verdict
+        ]  # fmt: skip
+
+    def to_dict(self) -> dict[str, object]:
+        """Return the summary for JSON."""
+        return {
+            "paths": [*map(str, self.paths)],
+            "read_back": self.read_back,
+            "verdict": self.verdict,
+            "parameters_from": self.origin or None,
+        }
+
+
+def export_drives(
+    model: IdentifiedModel, output: Path, to: DriveName, what: WhatToExport
+) -> ExportedDrives:
+    """Write a Python file for Isaac Lab or Genesis, and ranges next to it.
+
+    Args:
+        model: the identified arm.
+        output: the file.
+        to: simulator.
+        what: whether ranges are written, with how many draws.
+
+    Raises:
+        InputError: the estimator has no posterior.
+        WriteBackError: the file reads back with other values.
+    """
+    actuators = drives_of(model, what.count or 0, what.seed)
+    write = isaac_lab if to == "isaaclab" else genesis
+    text = write(actuators, model.name, remarks_of(model))
+    require_values(text, actuators, _FIELDS[to])
+    files = {output.name: text}
+    if what.ranges or what.count:
+        files |= _ranges_file(actuators, model, output, to)
+    make_folder(output.parent)
+    write_files(output.parent, files)
+    paths = tuple(output.parent / name for name in files)
+    said = "read back: parsed, its values are those written"
+    return ExportedDrives(paths, said, model.verdict, model.origin)
+
+
+def patch_drives(model: IdentifiedModel, into: Path, what: WhatToExport) -> ExportedDrives:
+    """Write friction and rotors into a user's own MJCF or URDF, whose bodies stay.
+
+    Raises:
+        InputError: the file cannot be patched, or the estimator has no posterior.
+    """
+    actuators = drives_of(model, 0, what.seed)
+    try:
+        text = patched(read_text(into), actuators)
+    except PatchError as error:
+        remedy = "give an MJCF or URDF with the joints of the arm by name"
+        raise InputError(into, str(error), field="--into", remedy=remedy) from error
+    files = {into.name: text}
+    if what.ranges:
+        files |= _ranges_file(actuators, model, into, "urdf" if into.suffix == ".urdf" else "mjcf")
+    write_files(into.parent, files)
+    paths = tuple(into.parent / name for name in files)
+    said = "not read back: the bodies of the file stay, and are not known here"
+    return ExportedDrives(paths, said, model.verdict, model.origin)
+
+
+def default_drive_output(sources: Sequence[Path], to: DriveName) -> Path:
+    """Return the default path: in the campaign folder, or in the working directory."""
+    folder = sources[0] if sources[0].is_dir() else Path()
+    return folder / f"identified_{to}.py"
+
+
+def write_ranges(model: IdentifiedModel, beside: Path, to: str, what: WhatToExport) -> Path:
+    """Write the ranges of a file's fields next to it, and return their path."""
+    files = _ranges_file(drives_of(model, what.count or 0, what.seed), model, beside, to)
+    write_files(beside.parent, files)
+    (name,) = files
+    return beside.parent / name
+
+
+def _ranges_file(
+    actuators: Actuators, model: IdentifiedModel, beside: Path, to: str
+) -> dict[str, str]:
+    """Return the file of ranges by its name."""
+    document = ranges_of(actuators, _FIELDS[to], remarks_of(model))
+    return {f"{beside.stem}.ranges.json": json.dumps(document, indent=1) + "\n"}
+
+
+def drives_of(model: IdentifiedModel, count: int, seed: int) -> Actuators:
+    """Return friction, rotors and limits of an arm, with intervals and draws of the posterior.
+
+    Raises:
+        InputError: the estimator has no posterior.
+    """
+    arm = model.arm
+    ensemble = ensemble_of(model, max(count, _DRAWS), seed)
+    by_arm = [
+        _quantities(replace(arm, standard=standard, values=values))
+        for standard, values in zip(ensemble.standard, ensemble.values, strict=True)
+    ]
+    draws = {name: np.stack([each[name] for each in by_arm]) for name in by_arm[0]}
+    known = _prior_deviations(model)
+    reach = model.estimate.interval_factor
+    fields: dict[Quantity, FieldRange] = {}
+    for name, value in _quantities(arm).items():
+        deviation = draws[name].std(axis=0)
+        low = np.maximum(value - reach * deviation, 0.0)
+        fields[name] = FieldRange(
+            value, low, value + reach * deviation, deviation <= _LEARNT * known[name]
+        )
+    fields["limit"] = FieldRange.exact(np.asarray(arm.ranges.effort))
+    turning = np.asarray(arm.model.chain.revolute, np.bool_)
+    some = {name: values[:count] for name, values in draws.items()} if count else {}
+    return Actuators(arm.model.joint_names, turning, fields, some)
+
+
+def _quantities(arm: ExportedArm) -> dict[Quantity, Array]:
+    """Return friction and rotors (n,) of an arm, none of which drives a joint."""
+    rows = arm.friction[: arm.model.n_joints]
+
+    def coefficients(symbol: str) -> Array:
+        return np.maximum([row.get(symbol, 0.0) for row in rows], 0.0)
+
+    friction = coefficients("f0")
+    return {
+        "friction": friction,
+        "static": friction + coefficients("fs"),
+        "viscous": coefficients("f1"),
+        "armature": np.diag(arm.rotors).copy(),
+    }
+
+
+def _prior_deviations(model: IdentifiedModel) -> dict[Quantity, Array]:
+    """Return standard deviations (n,) that the prior gives each quantity, infinite if none."""
+    robot = model.arm.model
+    deviations = model.posterior.prior.belief.std
+    friction = deviations[robot.layout.size :][: len(robot.friction.terms)]
+    by_symbol = robot.friction.table(friction)[: robot.n_joints]
+
+    def of(symbol: str) -> Array:
+        return np.array([row.get(symbol, 0.0) for row in by_symbol])
+
+    rotors = np.zeros(robot.n_joints)
+    if robot.layout.rotor_inertia:
+        rotors = deviations[robot.layout.rotors]
+    return {
+        "friction": of("f0"),
+        "static": np.hypot(of("f0"), of("fs")),
+        "viscous": of("f1"),
+        "armature": rotors,
+    }

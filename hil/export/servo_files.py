@@ -1,0 +1,357 @@
+"""Files of an arm without torque for simulators: its servo, friction and ranges of both."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Final, Literal, NamedTuple
+
+import numpy as np
+
+from hil.base.errors import InputError
+from hil.base.files import make_folder, write_files
+from hil.base.safe_input import path_exists, read_text
+from hil.cell import Cell
+from hil.export.drive_files import URDF, WhatToExport
+from hil.pipeline.identified_model import arm_with, impossible_bodies
+from hil.pipeline.options import friction_from
+from hil.pipeline.sources import Source, gather_sources
+from hil.results.provenance import RESULTS
+from hil.results.servo_result import ServoResults, SimulatorServo, is_servo_result
+from identification.export.actuators import Actuators, FieldRange, Quantity, ranges_of
+from identification.export.arm import ExportedArm
+from identification.export.patching import PatchError, patched
+from identification.export.playback import played_back
+from identification.export.python_files import (
+    GENESIS,
+    ISAAC_LAB,
+    genesis,
+    isaac_lab,
+    require_values,
+)
+from identification.export.simulators import (
+    FORMATS,
+    MISSING,
+    MissingMujocoError,
+    mjcf,
+    read_back,
+)
+from identification.export.urdf import WriteBackError
+from identification.servo.intervals import sampled
+from identification.servo.parameters import NAMES, PLACE
+
+ServoFormatName = Literal["mjcf", "urdf", "isaaclab", "genesis"]
+
+MJCF: Final[Mapping[str, Quantity]] = {
+    "kp": "stiffness",
+    "forcerange": "limit",
+    "delay": "delay",
+    "frictionloss": "friction",
+    "damping": "viscous",
+    "armature": "armature",
+    "offset": "offset",
+}
+"""Quantities of the fields of an MJCF; the offset is no field of it: it is added to commands."""
+
+_TERMS: Final[Mapping[Quantity, str]] = {
+    "stiffness": "kp",
+    "limit": "limit",
+    "friction": "coulomb",
+    "viscous": "viscous",
+    "armature": "armature",
+    "delay": "delay",
+    "offset": "offset",
+}
+_DRAWS: Final = 2000  # for the interval of a sum
+_MILLI: Final = 1e3
+
+
+class _Form(NamedTuple):
+    """A format: suffix of its files, engine whose terms it has, quantities by field."""
+
+    suffix: str
+    engine: str
+    names: Mapping[str, Quantity]
+
+
+SERVO_FORMATS: Final[Mapping[str, _Form]] = {
+    "mjcf": _Form(".xml", "mujoco", MJCF),
+    "urdf": _Form(".urdf", "mujoco", URDF),
+    "isaaclab": _Form("_isaaclab.py", "physx", ISAAC_LAB),
+    "genesis": _Form("_genesis.py", "mujoco", GENESIS),
+}
+
+
+class PlayedBack(NamedTuple):
+    """Errors of a held-out recording in MuJoCo, from its commands alone [mrad or mm]."""
+
+    archive: str
+    error: float
+    identified: float  #: of the model with all terms
+    command: float
+
+
+@dataclass(frozen=True)
+class ExportedServo:
+    """Summary of the written files."""
+
+    paths: tuple[Path, ...]
+    read_back: str  #: how, or why not
+    played: tuple[PlayedBack, ...]
+    verdict: str
+
+    def lines(self) -> list[str]:
+        """Return the summary as lines of text."""
+        rows = [
+            f"played back in MuJoCo, {each.archive}: {each.error:.3g} mrad or mm from its commands"
+            f" with their offsets (identified model {each.identified:.3g}, command itself"
+            f" {each.command:.3g})"
+            for each in self.played
+        ]
+        written = f"written: {', '.join(map(str, self.paths))}"
+        return [written, self.read_back, *rows, self.verdict]
+
+    def to_dict(self) -> dict[str, object]:
+        """Return the summary for JSON."""
+        return {
+            "paths": [*map(str, self.paths)],
+            "read_back": self.read_back,
+            "played_back": [each._asdict() for each in self.played],
+            "verdict": self.verdict,
+        }
+
+
+def servo_folder(paths: Sequence[Path]) -> Path | None:
+    """Return the folder of results of an arm without torque, None if this is none."""
+    if len(paths) == 1 and paths[0].is_dir() and is_servo_result(paths[0] / RESULTS):
+        return paths[0]
+    return None
+
+
+def export_servo(folder: Path, to: str, export: WhatToExport) -> tuple[ExportedServo, bool]:
+    """Write an arm without torque for a simulator; also return whether its verdict is good.
+
+    Args:
+        folder: of the results.
+        to: format, one of `SERVO_FORMATS`.
+        export: what is written.
+
+    Raises:
+        InputError: the format has no servos, archives of the results are missing, or a file cannot
+            be patched.
+        WriteBackError: a file reads back with other values.
+    """
+    results = ServoResults.load(folder / RESULTS)
+    if to not in SERVO_FORMATS:
+        problem = f"has servos, which --to {to} does not express"
+        remedy = f"use one of {', '.join(SERVO_FORMATS)}"
+        raise InputError(folder, problem, field="--to", remedy=remedy)
+    form = SERVO_FORMATS[to]
+    servo = results.simulators[form.engine]
+    cell, held_out = _archives(folder, results)
+    actuators = actuators_of(servo, cell, export.count or 0, export.seed)
+    remarks = _remarks(results)
+    target = export.into or export.output or folder / f"identified{form.suffix}"
+    files: dict[str, str | bytes | None] = {}
+    played: tuple[PlayedBack, ...] = ()
+    if to in ("mjcf", "urdf"):
+        text, checked = _description(cell, actuators, remarks, to, export.into)
+        if to == "mjcf":
+            place = None if export.into is None else target.parent
+            played, checked = _played(text, actuators, held_out, results, place, checked)
+        if export.into is None:
+            files |= _sampled_arms(cell, actuators, remarks, to, export, target)
+    else:
+        write = isaac_lab if to == "isaaclab" else genesis
+        text = write(actuators, results.cell, remarks)
+        require_values(text, actuators, form.names)
+        checked = "read back: parsed, its values are those written"
+    files[target.name] = text
+    if export.ranges or export.count is not None:
+        document = ranges_of(actuators, form.names, remarks)
+        files[f"{target.stem}.ranges.json"] = json.dumps(document, indent=1) + "\n"
+    make_folder(target.parent)
+    write_files(target.parent, files)
+    paths = tuple(target.parent / name for name in files)
+    return ExportedServo(paths, checked, played, results.verdict.line), results.verdict.good
+
+
+def actuators_of(servo: SimulatorServo, cell: Cell, count: int, seed: int) -> Actuators:
+    """Return the servo with the terms of an engine as fields of simulators, with draws."""
+    names = cell.joint_names
+    rows = {(value.name, value.joint): value for value in servo.servo}
+
+    def field(term: str) -> FieldRange:
+        values = [rows[term, joint] for joint in names]
+        return FieldRange(
+            np.array([value.value for value in values]),
+            np.array([value.lower for value in values]),
+            np.array([value.upper for value in values]),
+            np.array([value.determined for value in values]),
+        )
+
+    fields = {quantity: field(term) for quantity, term in _TERMS.items()}
+    posterior = servo.posterior
+    posterior_samples = sampled(
+        np.array(posterior.coordinates),
+        np.array(posterior.present),
+        np.array(posterior.covariance),
+        max(count, _DRAWS),
+        seed,
+    )
+    delays = posterior_samples[:, :, PLACE["delay"]]
+    np.maximum(delays, 0.0, out=delays)
+    by_term = dict(zip(NAMES, np.moveaxis(posterior_samples, 2, 0), strict=True))
+    draws = {quantity: by_term[term][:count] for quantity, term in _TERMS.items()}
+    above = field("static")
+    resting = by_term["coulomb"] + by_term["static"]
+    lower, upper = np.quantile(resting, [0.025, 0.975], axis=0)
+    fields["static"] = FieldRange(
+        fields["friction"].value + above.value,
+        lower,
+        upper,
+        fields["friction"].from_data & (above.from_data | (above.value == 0.0)),
+    )
+    draws["static"] = resting[:count]
+    turning = np.asarray(cell.model.chain.revolute, np.bool_)
+    return Actuators(tuple(names), turning, fields, draws if count else {})
+
+
+def _archives(folder: Path, results: ServoResults) -> tuple[Cell, tuple[Source, ...]]:
+    """Return the cell of the archives of a result, and its held-out recordings."""
+    fitted = [folder / name for name in results.archives]
+    predicted = [
+        folder / name
+        for name in dict.fromkeys(each.archive for each in results.validation)
+        if name not in results.archives
+    ]
+    for path in (*fitted, *predicted):
+        if not path_exists(path):
+            remedy = "leave archives and results in one folder, or identify again"
+            raise InputError(path, "is missing: the results are of it", remedy=remedy)
+    sources = gather_sources(
+        fitted, results.split, predicted, in_sample=results.in_sample, with_torque=False
+    )
+    return sources.cell, sources.held_out
+
+
+def servo_arm(cell: Cell, actuators: Actuators) -> ExportedArm:
+    """Return the arm with the URDF's bodies, and with friction and rotors of actuators."""
+    cell = cell.with_friction(**friction_from("coulomb,viscous"))
+    model = cell.model
+    standard = model.nominal.copy()
+    standard[model.layout.rotors] = actuators.value("armature")
+    values = np.zeros(model.n_parameters)
+    values[: model.base.rank] = model.base.grouping @ standard
+    friction = {"f0": actuators.value("friction"), "f1": actuators.value("viscous")}
+    values[model.friction_part] = [
+        friction[term.symbol][term.owner] if term.symbol in friction else 0.0
+        for term in model.friction.terms
+    ]
+    arm = arm_with(cell, standard, values, [])
+    return replace(arm, balanced=bool(impossible_bodies(model, standard)))
+
+
+def _description(
+    cell: Cell, actuators: Actuators, remarks: Sequence[str], to: str, into: Path | None
+) -> tuple[str, str]:
+    """Return the text of an MJCF or URDF, and how it was read back."""
+    if into is not None:
+        try:
+            text = patched(read_text(into), actuators)
+        except PatchError as error:
+            remedy = "give an MJCF or URDF with the joints of the results by name"
+            raise InputError(into, str(error), field="--into", remedy=remedy) from error
+        return text, "not read back: the bodies of the file stay, and are not known here"
+    arm = servo_arm(cell, actuators)
+    form = FORMATS[to]
+    if to == "mjcf":
+        text = mjcf(arm, cell.name, remarks, servos=actuators)
+    else:
+        text = form.write(arm, cell.name, remarks)
+    try:
+        difference = read_back(text, form, arm)
+    except MISSING as error:
+        return text, f"warning: not read back: {error}"
+    said = "torque of bodies, armature and damping differs by"
+    return text, f"read back: {said} {difference:.1e} of the largest at most"
+
+
+def _sampled_arms(
+    cell: Cell,
+    actuators: Actuators,
+    remarks: Sequence[str],
+    to: str,
+    export: WhatToExport,
+    target: Path,
+) -> dict[str, str]:
+    """Return the files of the drawn arms by name."""
+    count = export.count or 0
+    digits = len(str(count))
+    files = {}
+    for k in range(count):
+        remark = f"Arm {k + 1} of {count} drawn from the posterior with seed {export.seed}."
+        text, _ = _description(cell, actuators.sample(k), (remark, *remarks), to, None)
+        files[f"{target.stem}_{k + 1:0{digits}}{target.suffix}"] = text
+    return files
+
+
+def _played(
+    text: str,
+    actuators: Actuators,
+    held_out: Sequence[Source],
+    results: ServoResults,
+    folder: Path | None,
+    checked: str,
+) -> tuple[tuple[PlayedBack, ...], str]:
+    """Return errors of the held-out recordings in MuJoCo, and how the file was read back."""
+    by_archive = {each.archive: each for each in results.validation}
+    played = []
+    for source in held_out:
+        recording = source.recording
+        commanded = recording.commanded_position
+        if commanded is None or source.name not in by_archive:
+            continue
+        rows = np.isfinite(commanded).all(axis=1)
+        time, command, measured = (
+            part[rows] for part in (recording.time, commanded, recording.position)
+        )
+        wanted = command + actuators.value("offset")
+        try:
+            simulated = played_back(text, actuators.joint_names, time, wanted, measured[0], folder)
+        except MissingMujocoError as missing:
+            return (), f"warning: not read back: {missing}"
+        except WriteBackError as problem:
+            if folder is None:
+                raise
+            return (), f"warning: not read back: {problem}"
+        stated = by_archive[source.name]
+        error = _MILLI * float(np.sqrt(np.mean((simulated - measured) ** 2)))
+        played.append(
+            PlayedBack(source.name, error, stated.position_error_mrad, stated.command_error_mrad)
+        )
+    if folder is not None and played:
+        checked = "read back: MuJoCo reads the file, its bodies stay"
+    return tuple(played), checked
+
+
+def _remarks(results: ServoResults) -> tuple[str, ...]:
+    unknown = ", ".join(
+        dict.fromkeys(
+            value.joint for value in results.servo if value.name == "kp" and not value.determined
+        )
+    )
+    return (
+        "Servo and friction identified by hil from commanded and measured positions; bodies are"
+        " those of the URDF.",
+        f"Verdict: {results.verdict.line}",
+        *(
+            [f"The torque scale of {unknown} is not determined: gains and friction hold together."]
+            if unknown
+            else []
+        ),
+        "Values are those with which the terms of this simulator come closest to the motion.",
+        f"archives: {', '.join(results.archives)}",
+    )

@@ -1,0 +1,61 @@
+"""Servos with the terms of a simulator alone, fitted to the same windows.
+
+A simulator without friction that grows with the load, static friction or a rate of the command gets
+the values with which it comes closest to the motion, not those of a model that has these terms.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from typing import Final, Literal, get_args
+
+import numpy as np
+
+from identification.arrays import Array
+from identification.servo.choice import ServoFit, shown_terms
+from identification.servo.fit import Windows, fit
+from identification.servo.motion import ServoMotion
+from identification.servo.parameters import NAMES
+
+Engine = Literal["mujoco", "physx"]
+ENGINES: Final[tuple[Engine, ...]] = get_args(Engine)
+ITERATIONS: Final = 12
+
+_COMMON: Final = ("kp", "armature", "viscous", "coulomb", "delay", "offset", "limit")
+HAS: Final[Mapping[Engine, tuple[str, ...]]] = {
+    "mujoco": _COMMON,
+    "physx": (*_COMMON, "static", "speed"),
+}
+"""Terms of an engine. Damping of the motor and of the joint brake alike, so that both are
+`viscous`; PhysX has static friction above the dynamic one, MuJoCo (and Genesis) has not."""
+
+
+def fits_in_simulators(
+    motions: Sequence[ServoMotion],
+    found: ServoFit,
+    resolution: Array,
+    *,
+    done: Callable[[], None] = lambda: None,
+) -> dict[Engine, ServoFit]:
+    """Return the fit with the terms of each engine, from a fit with all terms.
+
+    Args:
+        motions: that are fitted.
+        found: fit with all terms, from which these start.
+        resolution: standard deviation of the measured positions (n,).
+        done: called after each iteration.
+    """
+    windows = Windows.of(motions)
+    best = found.estimate
+    fits = dict[Engine, ServoFit]()
+    for engine in ENGINES:
+        present = best.present & np.isin(NAMES, HAS[engine])
+        if (present == best.present).all():
+            fits[engine] = found
+            continue
+        estimate = fit(
+            windows, best.prior, present, best.coordinates, resolution, iterations=ITERATIONS,
+            bus=best.bus_delay, done=done,
+        )  # fmt: skip
+        fits[engine] = ServoFit(estimate, (), found.windows, shown_terms(windows, estimate))
+    return fits
