@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import codecs
 import errno
+import gzip
 import json
 import os
 import re
 import stat
 import tomllib
+import zlib
 from datetime import UTC, datetime
 from difflib import get_close_matches
 from io import BufferedReader
@@ -34,6 +36,9 @@ _MARKS: Final = {  # those of UTF-32 begin as those of UTF-16
 _DECLARATION: Final = re.compile(r"^(<\?xml[^>]*?encoding\s*=\s*[\"'])([\w.-]+)([\"'])")
 _DECLARED: Final = re.compile(_DECLARATION.pattern.encode())
 _PROBED: Final = 1000  # bytes
+_BLOCK: Final = 1 << 20  # bytes
+GZIP: Final = b"\x1f\x8b"
+"""First bytes of what gzip compressed."""
 _NO_FILE: Final = "it is a pipe or a device, not a file"
 _ABSENT: Final = frozenset(
     {
@@ -41,6 +46,10 @@ _ABSENT: Final = frozenset(
         errno.EINVAL,  # a pipe or a device, or no path
     }
 )
+
+
+class CompressionError(OSError):
+    """A compressed file that is cut off or damaged."""
 
 
 def parse_time(when: str) -> datetime | None:
@@ -91,19 +100,40 @@ def read_text(
     encoding: str | None = None,
     or_latin: bool = False,
 ) -> str:
-    """Return the text of a file, with line feeds as line ends.
+    """Return the text of a file, compressed by gzip or not, with line feeds as line ends.
 
     It is in `encoding`, or in that of its byte-order mark, or in UTF-8; where it cannot be, in that
     of its XML declaration or, with `or_latin`, in Windows-1252 or UTF-16.
 
-    OSError: as `open_file`, or more bytes than `longest`. UnicodeDecodeError: it is in none of
-    these. LookupError: there is no such encoding.
+    OSError: as `open_file`, more bytes than `longest`, or damaged by compression.
+    UnicodeDecodeError: it is in none of these. LookupError: there is no such encoding.
     """
+    data = read_bytes(path, longest)
+    return _decoded(data, encoding, or_latin=or_latin).replace("\r\n", "\n").replace("\r", "\n")
+
+
+def read_bytes(path: Path, longest: int = LONGEST_TEXT) -> bytes:
+    """Return the bytes of a file, without their compression by gzip.
+
+    OSError: as `open_file`, more than `longest`, or compressed bytes that are cut off or damaged.
+    """
+    too_large = OSError(errno.EFBIG, f"it has more than {longest} bytes", str(path))
     with open_file(path) as stream:
         if os.fstat(stream.fileno()).st_size > longest:
-            raise OSError(errno.EFBIG, f"it has more than {longest} bytes", str(path))
-        data = stream.read()
-    return _decoded(data, encoding, or_latin=or_latin).replace("\r\n", "\n").replace("\r", "\n")
+            raise too_large
+        if not stream.peek(len(GZIP)).startswith(GZIP):
+            return stream.read()
+        data = bytearray()
+        try:
+            with gzip.GzipFile(fileobj=stream) as unpacked:
+                while block := unpacked.read(_BLOCK):
+                    data += block
+                    if len(data) > longest:
+                        raise too_large
+        except (EOFError, zlib.error, gzip.BadGzipFile) as error:
+            problem = f"its compressed bytes are cut off or damaged: {error}"
+            raise CompressionError(errno.EIO, problem, str(path)) from error
+    return bytes(data)
 
 
 def _decoded(data: bytes, encoding: str | None, *, or_latin: bool) -> str:

@@ -369,7 +369,7 @@ def log(
         coupled=not uncoupled,
         force=force,
     )
-    proposed = reading.columns is None and recording.text is not None
+    proposed = not recording.is_stated and recording.text is not None
     if proposed:
         write_output(recording.archive.path.with_suffix(".map.toml"), recording.text or "")
     _print(recording, json=json)

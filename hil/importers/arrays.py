@@ -19,10 +19,13 @@ from hil.base.errors import SourceError
 from hil.base.safe_input import open_file
 from hil.importers import mcap_messages
 from hil.importers.column_map import Column
-from hil.importers.conclusions import LeftOut
+from hil.importers.conclusions import LeftOut, Omitted
 from hil.importers.document_messages import ENCODINGS, columns_of_trees, trees
+from hil.importers.json_samples import SUFFIXES as JSON
+from hil.importers.json_samples import read_json
 from hil.importers.matlab import NUMBERS, lost_bytes, mat_array, mat_shapes, script_matrices
 from hil.importers.ros_messages import MessageError, columns_of, decoded, typestore_of
+from hil.importers.units import without_unit
 
 MOST_NUMBERS: Final = 2**28
 """Elements of one array: 2 GiB of doubles, hours of an arm at 5 kHz."""
@@ -37,10 +40,24 @@ class Stored(NamedTuple):
     load: Callable[[], NDArray[Any]]
 
 
+class Contents(NamedTuple):
+    """What a file holds."""
+
+    arrays: dict[str, Stored]
+    left_out: tuple[LeftOut, ...] = ()
+
+
+def format_of(path: Path) -> str:
+    """Return the suffix that determines the format of a file, of JSON also below ``.gz``."""
+    suffix = path.suffix.lower()
+    below = Path(path.stem).suffix.lower()
+    return below if suffix == ".gz" and below in JSON else suffix
+
+
 class ArrayFile:
     """Arrays of numbers with one or two dimensions, each read on first use.
 
-    The suffix of the file determines its format.
+    The suffix of the file determines its format, see `format_of`.
 
     Raises:
         SourceError: it cannot be read, or has no array of numbers.
@@ -50,10 +67,11 @@ class ArrayFile:
         self.path = path
         with _readable(path):
             open_file(path).close()  # raises for a pipe, which would block
-            arrays = READERS[path.suffix.lower()](path)
+            contents = READERS[format_of(path)](path)
+        self.left_out = contents.left_out
         self._stored = {
             name: array
-            for name, array in arrays.items()
+            for name, array in contents.arrays.items()
             if len(array.shape) in (1, 2) and math.prod(array.shape) > 0
         }
         if not self._stored:
@@ -61,14 +79,13 @@ class ArrayFile:
         self.names = tuple(self._stored)
         self._loaded: dict[str, NDArray[Any]] = {}
 
-    left_out: tuple[LeftOut, ...] = ()
-
     def has(self, name: str) -> bool:
         """Return whether an array has this name."""
         return name in self._stored
 
-    def unit(self, _column: Column) -> None:
-        """Return no unit: arrays do not state theirs."""
+    def unit(self, column: Column) -> str | None:
+        """Return the unit in the name of an array, None without one."""
+        return without_unit(column)[1] if isinstance(column, str) else None
 
     def shape(self, name: str) -> tuple[int, ...]:
         """Return the shape of an array."""
@@ -190,18 +207,19 @@ def _readable(path: Path) -> Iterator[None]:
         raise SourceError(path, problem, remedy=remedy) from error
 
 
-def _npz(path: Path) -> dict[str, Stored]:
+def _npz(path: Path) -> Contents:
     with zipfile.ZipFile(path) as archive:
         members = [name for name in archive.namelist() if name.endswith(".npy")]
         heads = {}
         for name in members:
             with archive.open(name) as stream:
                 heads[name] = _head(stream)
-    return {
+    stored = {
         name.removesuffix(".npy"): Stored(head[0], partial(_member, path, name))
         for name, head in heads.items()
         if head is not None and head[1].kind in NUMBERS
     }
+    return Contents(stored)
 
 
 def _member(path: Path, name: str) -> NDArray[Any]:
@@ -209,7 +227,7 @@ def _member(path: Path, name: str) -> NDArray[Any]:
         return np.asarray(npy.read_array(stream, allow_pickle=False))
 
 
-def _npy(path: Path) -> dict[str, Stored]:
+def _npy(path: Path) -> Contents:
     array = np.load(path, mmap_mode="r", allow_pickle=False)
     if array.dtype.names:  # a structured array: one column per field
         return _in_memory({name: array[name] for name in array.dtype.names})
@@ -226,17 +244,18 @@ def _head(stream: IO[bytes]) -> tuple[tuple[int, ...], np.dtype[Any]] | None:
     return shape, dtype
 
 
-def _mat(path: Path) -> dict[str, Stored]:
+def _mat(path: Path) -> Contents:
     if lost := lost_bytes(path):
         problem = (
             f"its data are lost: of MATLAB 7.3 it has the header, and then {lost} bytes that are "
             "all zero, as after an interrupted copy or on a full disk"
         )
         raise SourceError(path, problem, remedy="copy it again, or save it again in MATLAB")
-    return {
+    stored = {
         name: Stored(shape, partial(mat_array, path, name))
         for name, shape in mat_shapes(path).items()
     }
+    return Contents(stored)
 
 
 def read_mcap(path: Path) -> dict[str, NDArray[Any]]:
@@ -294,7 +313,7 @@ def _columns(
     return columns_of(stamps, [decoded(store, topic.kind, data) for _, data in received])
 
 
-def _parquet(path: Path) -> dict[str, Stored]:
+def _parquet(path: Path) -> Contents:
     """Return the columns of a table; lists of numbers, as LeRobot's, are matrices."""
     from pyarrow import parquet
 
@@ -336,20 +355,36 @@ def _as_numbers(values: NDArray[Any]) -> NDArray[Any]:
     return numbers if np.isfinite(numbers).mean() > 0.5 else values
 
 
-def _in_memory(arrays: Mapping[str, NDArray[Any]]) -> dict[str, Stored]:
-    return {
+def _json(path: Path) -> Contents:
+    try:
+        arrays, is_cut = read_json(path)
+    except ValueError as error:
+        problem = f"cannot be read ({error})"
+        remedy = (
+            "write an object with the same names for each sample, on a line of its own: "
+            '{"t": 0.0, "q": [...], "tau": [...]}'
+        )
+        raise SourceError(path, problem, remedy=remedy) from error
+    stored = _in_memory(arrays).arrays
+    return Contents(stored, (LeftOut(Omitted.CUT_ROW, 1),) if is_cut else ())
+
+
+def _in_memory(arrays: Mapping[str, NDArray[Any]]) -> Contents:
+    stored = {
         name: Stored(array.shape, partial(np.asarray, array))
         for name, array in arrays.items()
         if array.dtype.kind in NUMBERS
     }
+    return Contents(stored)
 
 
-READERS: Mapping[str, Callable[[Path], dict[str, Stored]]] = {
+READERS: Mapping[str, Callable[[Path], Contents]] = {
     ".npz": _npz,
     ".npy": _npy,
     ".mat": _mat,
     ".m": lambda path: _in_memory(script_matrices(path)),
     ".parquet": _parquet,
     ".mcap": lambda path: _in_memory(read_mcap(path)),
+    **dict.fromkeys(JSON, _json),
 }
 """Readers of files of arrays by suffix; every other file is text in columns."""

@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hil.base.errors import SourceError
-from hil.importers.arrays import READERS, ArrayFile
+from hil.importers.arrays import READERS, ArrayFile, format_of
 from hil.importers.bags import SUFFIXES, open_bag
 from hil.importers.column_map import Format
 from hil.importers.commands import as_joint_state, measured_topics
@@ -118,7 +118,7 @@ def channels_of(
         if bag or suffix != ".mcap":
             return bag
     files = files or LogFiles()
-    if suffix in READERS:
+    if format_of(path) in READERS:
         return tuple(_of_arrays(files.arrays(path)))
     return tuple(_of_table(files.table(path, form or Format())))
 

@@ -25,7 +25,7 @@ KINEMATIC: Final = ("position", "velocity", "commanded_position")
 Vector = tuple[FiniteFloat, ...]
 Column = Annotated[int, Field(ge=0)] | str
 _Number = Annotated[int, Field(ge=1)]
-_DOCUMENTATION = "the column map in docs/archive-format.md"
+DOCUMENTATION: Final = "the column map in docs/archive-format.md"
 _ONE_OR_EACH = "a number, or a list of one per joint"
 _Share = Annotated[FiniteFloat, Field(ge=0.0, lt=1.0)]
 _PerJoint = Annotated[Vector | None, Field(description="a list of numbers, one per joint")]
@@ -144,11 +144,13 @@ class Format(_Table):
 
     Attributes:
         thousands: the mark between groups of three digits, where the column does not prove it.
+        sheet: of a spreadsheet, where two are about equally large; by default the largest.
         encoding: of the text, such as ``utf-16`` or ``cp1252``.
         skip_rows: lines before the header, or before the data.
         header: whether a line of column names comes first.
         transposed: whether the lines of the file are channels instead of samples.
-        skip_empty: ignore empty lines between the rows, which are refused otherwise.
+        skip_empty: empty lines between the rows mean nothing. By default those of a log without
+            times are refused, as rows may be missing there.
         missing: ``refuse`` a log with a number that is missing or not finite, ``drop`` such rows
             from all quantities, or ``interpolate`` quantities that were recorded in rows of their
             own, as of two topics in one table, to the times of the one with the fewest samples.
@@ -161,6 +163,7 @@ class Format(_Table):
     thousands: Annotated[str, Field(min_length=1, max_length=1)] | None = Field(
         default=None, description="a single character"
     )
+    sheet: str | None = None
     encoding: str | None = None
     skip_rows: Annotated[int, Field(ge=0, description="a number of lines")] = 0
     header: bool | None = None
@@ -242,7 +245,7 @@ class ColumnMap(_Table):
         try:
             return cls.model_validate(parse_toml(map_text(path)))
         except ValidationError as error:
-            wrong = first_error(path, error, cls, documentation=_DOCUMENTATION)
+            wrong = first_error(path, error, cls, documentation=DOCUMENTATION)
             problem = wrong.problem
             field = wrong.field
             remedy = wrong.remedy

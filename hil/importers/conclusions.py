@@ -164,6 +164,8 @@ class Omitted(Enum):
     ZERO_TIMES = auto()  #: rows before the clock was there
     NO_STAMPS = auto()  #: the same of messages
     HEADERS = auto()  #: lines of a header that was written again
+    EMPTY_LINES = auto()  #: between the rows
+    CUT_ROW = auto()  #: the last, of a log that was cut off in it
     SOME_JOINTS = auto()  #: messages with some of the joints only
 
 

@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from hil.importers.ros_messages import MessageError
 
 ENCODINGS: Final = ("json", "protobuf")
+Number = int | float
 _SECONDS: Final = ("sec", "secs", "seconds")
 _NANOSECONDS: Final = ("nanosec", "nsec", "nsecs", "nanos")
 _STAMPS: Final = ("stamp", "timestamp", "time")
@@ -73,11 +74,11 @@ def columns_of_trees(
     Raises:
         MessageError: fields or names change from message to message, or there is no number.
     """
-    rows = [dict(_numbers(message, "")) for message in messages]
+    rows = [dict(numbers_of(message)) for message in messages]
     names = list(rows[0])
     if any(row.keys() != rows[0].keys() for row in rows):
         raise MessageError("have other fields or names from message to message")
-    stamps = [_stamp(message) for message in messages]
+    stamps = [stamp_of(message) for message in messages]
     are_stamped = all(stamp is not None for stamp in stamps) and any(stamps)
     arrays: dict[str, NDArray[Any]] = {
         "stamp": np.array(stamps if are_stamped else received, dtype=np.int64)
@@ -93,46 +94,52 @@ def columns_of_trees(
     return arrays
 
 
-def _numbers(tree: Mapping[str, Any], above: str) -> Iterator[tuple[str, float | list[float]]]:
-    """Yield numbers and lists of numbers by field, without stamps."""
+def numbers_of(
+    tree: Mapping[str, Any], above: str = "", *, times: bool = False
+) -> Iterator[tuple[str, Number | list[Number]]]:
+    """Yield numbers and lists of numbers by field, of stamps with `times` those that are numbers.
+
+    `above` begins the name of each field.
+    """
     labels: list[str] = next((value for value in tree.values() if _are_names(value)), [])
     for key, value in tree.items():
         name = f"{above}{key}"
-        if key in (*_STAMPS, "header") or isinstance(value, bool):
+        is_number = isinstance(value, int | float) and not isinstance(value, bool)
+        if key == "header" or (key in _STAMPS and not (times and is_number)):
             continue
-        if isinstance(value, int | float):
-            yield name, float(value)
+        if is_number:
+            yield name, value
         elif isinstance(value, dict):
-            yield from _numbers(value, f"{name}.")
-        elif isinstance(value, list) and 0 < len(value) <= _LONGEST and _are_numbers(value):
+            yield from numbers_of(value, f"{name}.", times=times)
+        elif isinstance(value, list) and 0 < len(value) <= _LONGEST and are_numbers(value):
             if len(labels) == len(value):
-                yield from (
-                    (f"{name}/{label}", float(x)) for label, x in zip(labels, value, strict=True)
-                )
+                yield from ((f"{name}/{label}", x) for label, x in zip(labels, value, strict=True))
             else:
-                yield name, [float(x) for x in value]
+                yield name, list(value)
 
 
 def _are_names(value: Any) -> bool:
     return isinstance(value, list) and bool(value) and all(isinstance(x, str) for x in value)
 
 
-def _are_numbers(value: Sequence[Any]) -> bool:
+def are_numbers(value: Sequence[Any]) -> bool:
+    """Return whether all of a list are numbers."""
     return all(isinstance(x, int | float) and not isinstance(x, bool) for x in value)
 
 
-def _stamp(tree: Mapping[str, Any]) -> int | None:
+def stamp_of(tree: Mapping[str, Any]) -> int | None:
     """Return the time of a message [ns], None without one."""
     header = tree.get("header")
     places = [header, tree] if isinstance(header, dict) else [tree]
     for place in places:
         for key in _STAMPS:
             if key in place:
-                return _nanoseconds(place[key])
+                return nanoseconds_of(place[key])
     return None
 
 
-def _nanoseconds(value: Any) -> int | None:
+def nanoseconds_of(value: Any) -> int | None:
+    """Return a stamp of seconds and their parts, or a date as text [ns]; None of another one."""
     if isinstance(value, dict):
         seconds = next((value[key] for key in _SECONDS if key in value), None)
         part = next((value[key] for key in _NANOSECONDS if key in value), 0)

@@ -153,7 +153,7 @@ def are_in_rows_of_their_own(
     """
     log = _Log(source, columns, robot, files)
     finite = [np.asarray(np.isfinite(log.read(name)).all(axis=1)) for name in columns.quantities()]
-    return are_interleaved(finite)
+    return len(set(map(len, finite))) == 1 and are_interleaved(finite)
 
 
 class _Clock(NamedTuple):
@@ -247,9 +247,23 @@ class _Log:
         position = self._map.position
         if time is None:
             assert rate is not None
+            self._refuse_interrupted()
             stamps = np.rint(np.arange(count) * (1e9 / rate)).astype(np.int64)
             return _Clock(stamps, np.ones(count, np.bool_), 0, self.path)
         return self._clock_of(time, position, "position")
+
+    def _refuse_interrupted(self) -> None:
+        """Raise SourceError for an empty line in a log that has no times: rows may be missing."""
+        for file in self.files.values():
+            line = file.interrupted if isinstance(file, Table) else None
+            if line is None:
+                continue
+            problem = f"line {line} is empty, and no time tells whether rows are missing there"
+            remedy = (
+                "cut the log there; where empty lines mean nothing: --drop-missing, or with a map "
+                "[format] skip_empty = true; to skip lines of a header: [format] skip_rows"
+            )
+            raise SourceError(file.path, problem, field="time", remedy=remedy)
 
     def _clock_of(self, time: TimeColumn, quantity: Quantity, name: str) -> _Clock:
         """Return the stamps of a quantity by its column of times."""

@@ -5,12 +5,12 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Final
 
-from hil.importers.arrays import READERS, ArrayFile
+from hil.importers.arrays import READERS, ArrayFile, format_of
 from hil.importers.column_map import Format
 from hil.importers.text_table import Table
 
-TEXTS: Final = (".csv", ".txt", ".dat", ".tsv", ".asc", ".log")
-_ARRAYS: Final = tuple(suffix for suffix in READERS if suffix not in (".mcap", ".m"))
+TEXTS: Final = (".csv", ".txt", ".dat", ".tsv", ".asc", ".log", ".gz")
+_ARRAYS: Final = tuple(suffix for suffix in READERS if suffix not in (".mcap", ".m", ".json"))
 MARKS: Final = ("manifest.json", "metadata.yaml", "cell.toml", "plan.json", "results.json")
 """Files of a campaign, a bag or a folder of results."""
 
@@ -63,4 +63,4 @@ class LogFiles:
 
     def file(self, path: Path, form: Format) -> Table | ArrayFile:
         """Return arrays or a table, by the suffix of the file; see both."""
-        return self.arrays(path) if path.suffix.lower() in READERS else self.table(path, form)
+        return self.arrays(path) if format_of(path) in READERS else self.table(path, form)

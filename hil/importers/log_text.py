@@ -2,14 +2,25 @@
 
 from __future__ import annotations
 
+import errno
 import re
+import zipfile
+import zlib
 from pathlib import Path
 from typing import Final
 
 from hil.base.errors import SourceError
-from hil.base.safe_input import open_file, read_text, remedy_for_missing
+from hil.base.safe_input import (
+    GZIP,
+    CompressionError,
+    open_file,
+    read_text,
+    remedy_for_missing,
+)
+from hil.base.terminal_text import typed
 from hil.importers.arrays import READERS
 from hil.importers.column_map import Format
+from hil.importers.spreadsheet import is_spreadsheet, text_of_sheet
 
 _ROSTOPIC = "%time,"  # of `rostopic echo -p`
 _LONGEST: Final = 1 << 31  # bytes; several times as many in memory
@@ -18,9 +29,10 @@ _OTHER_QUOTES: Final = re.compile(r"""(?<![^\s,;|])(?:'([^'"\n]*)'|="([^"\n]*)")
 _LONGEST_MARK: Final = 100  # bytes that are read for a mark
 _OF_PANDAS: Final = "save its table with pandas: {}(FILE).to_parquet('log.parquet')"
 _BINARY: Final = {
-    b"PK\x03\x04": ("a spreadsheet or a zip file", "save the sheet as CSV, or unpack the file"),
-    b"\xd0\xcf\x11\xe0": ("an Excel file", "save the sheet as CSV"),
-    b"\x1f\x8b": ("compressed by gzip", "unpack it: gunzip FILE"),
+    b"PK\x03\x04": (
+        "a zip file",
+        "unpack it: unzip FILE; if it is a spreadsheet, it is cut off: copy it again",
+    ),
     b"\x28\xb5\x2f\xfd": ("compressed by zstd", "unpack it: unzstd FILE"),
     b"\x89HDF\r\n": (
         "HDF5",
@@ -46,12 +58,11 @@ def _not_a_table(path: Path, text: str) -> SourceError:
     """Return the error for XML, JSON or YAML in place of rows."""
     start = text.lstrip("\ufeff \t\r\n")
     if not start.startswith("<"):
-        is_json = start[0] in "{["
-        problem = f"is {'JSON' if is_json else 'YAML of messages'}, not a table of numbers"
-        remedy = "give a table of numbers (CSV), .npz, .mat, .parquet or a bag"
-        if not is_json:
-            remedy = "give the bag, or a table of its joint states (CSV)"
-        return SourceError(path, problem, remedy=remedy)
+        if start[0] in "{[":
+            remedy = f"let its name end in .json: mv {typed(path.name)} {typed(path.stem)}.json"
+            return SourceError(path, "is JSON, not a table of numbers", remedy=remedy)
+        remedy = "give the bag, or a table of its joint states (CSV)"
+        return SourceError(path, "is YAML of messages, not a table of numbers", remedy=remedy)
     if "<robot" in text:
         remedy = f"give the recording first: LOG --urdf {path.name}"
         return SourceError(path, "is a robot description (URDF), not a recording", remedy=remedy)
@@ -59,33 +70,57 @@ def _not_a_table(path: Path, text: str) -> SourceError:
     return SourceError(path, "is XML, not a table of numbers", remedy=remedy)
 
 
-def _refuse_binary(path: Path) -> None:
-    """Raise SourceError for a file of a format that is no text, whatever its suffix."""
+def _head_of(path: Path) -> bytes:
+    """Return the first bytes of a file, without its compression by gzip."""
     with open_file(path) as stream:
         start = stream.read(_LONGEST_MARK)
+        if not start.startswith(GZIP):
+            return start
+    try:
+        return zlib.decompressobj(wbits=31).decompress(start, _LONGEST_MARK)
+    except zlib.error as error:
+        problem = f"its compressed bytes are cut off or damaged: {error}"
+        raise CompressionError(errno.EIO, problem, str(path)) from error
+
+
+def _refuse_binary(path: Path, start: bytes) -> None:
+    """Raise SourceError for a file of a format that is no text, whatever its suffix."""
     for mark, (kind, remedy) in _BINARY.items():
         if start.startswith(mark):
+            remedy = remedy.replace("FILE", typed(path.name))
             raise SourceError(path, f"is {kind}, not text", remedy=remedy)
 
 
 def text_of(path: Path, form: Format) -> str:
-    """Return the text of a file in any usual encoding.
+    """Return the text of a file in any usual encoding, or of a sheet of a spreadsheet.
 
     Raises:
         SourceError: it cannot be read, or has another format than a table.
     """
     try:
-        _refuse_binary(path)
+        start = _head_of(path)
+        if is_spreadsheet(path, start):
+            return text_of_sheet(path, form)
+        _refuse_binary(path, start)
         text = read_text(path, _LONGEST, encoding=form.encoding, or_latin=True)
-    except (OSError, ValueError, LookupError) as error:
-        reason = error.strerror if isinstance(error, OSError) else error
-        problem = f"cannot be read ({reason})"
-        remedy = f"name a text file, or one that ends in {', '.join(READERS)}"
-        if isinstance(error, FileNotFoundError):
-            remedy = remedy_for_missing(path, remedy)
-        raise SourceError(path, problem, remedy=remedy) from error
+    except SourceError:
+        raise
+    except (OSError, ValueError, LookupError, zipfile.BadZipFile) as error:
+        raise _unreadable(path, error) from error
     text = text.removeprefix("%") if text.startswith(_ROSTOPIC) else text  # a header there
     text = _OTHER_QUOTES.sub(r'"\1\2"', text) if "'" in text or '="' in text else text
     if _MARKUP.match(text):
         raise _not_a_table(path, text)
-    return text
+    return text.rstrip("\0")  # of blocks that a disk had not yet written
+
+
+def _unreadable(path: Path, error: Exception) -> SourceError:
+    """Return the error for a file whose bytes are no text."""
+    problem = f"cannot be read ({error.strerror if isinstance(error, OSError) else error})"
+    remedy = f"name a text file, or one that ends in {', '.join(READERS)}"
+    if isinstance(error, FileNotFoundError):
+        remedy = remedy_for_missing(path, remedy)
+    elif isinstance(error, CompressionError):
+        name = typed(path.name)
+        remedy = f"copy it again, or take what is there: zcat {name} > part.csv"
+    return SourceError(path, problem, remedy=remedy)

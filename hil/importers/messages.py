@@ -73,6 +73,8 @@ _OMITTED: Final[Mapping[Omitted, str]] = {
     Omitted.ZERO_TIMES: "rows at the start with the time 0",
     Omitted.NO_STAMPS: "messages at the start without a stamp",
     Omitted.HEADERS: "lines that repeat the header",
+    Omitted.EMPTY_LINES: "empty lines between the rows",
+    Omitted.CUT_ROW: "last row, which is cut off",
     Omitted.SOME_JOINTS: "messages with some of the joints only",
 }
 _MAP_CHECK: Final = "check unit, sign and zero in the column map"

@@ -68,7 +68,7 @@ def proposed_map(
     chosen: Mapping[str, str] | None = None,
     *,
     sample_rate: float | None = None,
-    drop_missing: bool = False,
+    form: Format | None = None,
     files: LogFiles | None = None,
 ) -> Proposal:
     """Return the column map that the channels of a log suggest for a robot.
@@ -76,15 +76,14 @@ def proposed_map(
     A ready map whose columns the log has comes first, then the names of
     :data:`hil.importers.channels.CHANNEL_NAMES`. `chosen` are channels by quantity that are given:
     a name with ``{}`` for the joint, or names separated by commas. `sample_rate` [Hz] replaces the
-    time; `drop_missing` leaves out rows in which a number is missing; `files` are those that were
-    parsed before.
+    time; `form` is how texts are written, where that is stated; `files` are those that were parsed
+    before.
 
     Raises:
         SourceError: the log cannot be read, or its channels leave a quantity open.
     """
     chosen = dict(chosen or {})
     joints = robot.joint_names
-    form = Format(missing="drop") if drop_missing else None
     channels = channels_of(log, form, files)
     _refuse_row_for_each_joint(log, channels, joints)
     groups = grouped([channel for channel in channels if not channel.is_repeated], joints)

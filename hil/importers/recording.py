@@ -14,7 +14,6 @@ from hil.base.safe_input import parse_toml
 from hil.base.toml_text import to_text
 from hil.cell.arms import Arm, Links, arms_of, recorded_arms
 from hil.cell.text import with_values
-from hil.importers.arrays import READERS
 from hil.importers.bag_map import BagMap
 from hil.importers.bags import open_bag
 from hil.importers.channels import channels_of
@@ -31,9 +30,11 @@ from hil.importers.conclusions import (
 from hil.importers.folder import proposed_map_of_folder
 from hil.importers.log import are_in_rows_of_their_own, read_log
 from hil.importers.log_files import LogFiles, is_folder_of_logs
+from hil.importers.partial_map import PartialMap
 from hil.importers.proposal import Proposal, proposed_map
 from hil.importers.robot import RecordingContent, Robot, Use, require_writable, write_to
 from hil.importers.rosbag2 import Effort, joint_state_topics, read_rosbag2, recorded_joints
+from hil.importers.text_table import Table
 from hil.importers.units import UNITS, Kind
 
 _BAGS: Final = (".db3", ".bag", ".mcap", ".zstd", ".zst")
@@ -46,7 +47,8 @@ class ImportOptions:
     """How recordings are read where it is not concluded from them.
 
     Attributes:
-        columns: file of a column map or the name of a ready one; None to propose one.
+        columns: file of a column map, of some entries of one, or the name of a ready one; what it
+            does not state is proposed.
         chosen: channels by quantity, see :func:`hil.importers.proposal.proposed_map`.
         sample_rate: of a log without a time [Hz].
         topic: of the joint states of a bag.
@@ -75,6 +77,7 @@ class ImportedRecording:
         sources: the files that it was read from.
         map_text: the column map, TOML; None for joint states of a bag, which need none.
         bag: how those were read; None for a log.
+        is_stated: whether a whole column map was given.
         concluded: the meaning of each group of channels, what was fixed for it, and what the motion
             and the torque say, in this order.
         examined: what was found in its samples, and warnings.
@@ -86,6 +89,7 @@ class ImportedRecording:
     concluded: tuple[Conclusion, ...]
     examined: Examined
     bag: BagMap | None = None
+    is_stated: bool = False
     #: of a log, parsed
     files: LogFiles = field(default_factory=LogFiles, compare=False, repr=False)
 
@@ -169,7 +173,7 @@ class _Request:
             outside_limits=self.outside_limits,
         )
         return ImportedRecording(
-            archive, content.source, text, concluded, examined, bag, self.files
+            archive, content.source, text, concluded, examined, bag, files=self.files
         )
 
 
@@ -427,43 +431,50 @@ def _imported(request: _Request, robot_of: RobotOf, *, options: ImportOptions) -
     path = options.columns
     stated = None if path is None else BagMap.load(path)
     if stated is not None:
-        return _read_bag(request, robot_of, stated, path)
+        return replace(_read_bag(request, robot_of, stated, path), is_stated=True)
     if path is None and has_joint_states(source) and not _read_as_log(source, options):
         return _read_bag(request, robot_of, _bag_map(options), None)
-    if path is not None:
+    some = None if path is None or has_joint_states(source) else PartialMap.load(path)
+    if path is not None and some is None:
         robot = robot_of(lambda: _joints_of(ColumnMap.load(path), path))
         columns = ColumnMap.load(path)
-        return _of_map(request, _arm_of_map(robot, columns.arm, path), columns, map_text(path))
+        robot = _arm_of_map(robot, columns.arm, path)
+        imported = _of_map(request, robot, columns, map_text(path))
+        return replace(imported, is_stated=True)
     robot = robot_of(partial(_no_joints, source))
-    if source.is_dir():
-        proposal = proposed_map_of_folder(
-            source,
-            robot,
-            options.chosen,
-            sample_rate=options.sample_rate,
-            form=Format(missing="drop") if options.drop_missing else None,
-            files=request.files,
-        )
-        return _of_map(request, robot, proposal.columns, proposal.text, proposal.concluded)
-    proposal = proposed_map(
-        source,
-        robot,
-        options.chosen,
-        sample_rate=options.sample_rate,
-        drop_missing=options.drop_missing,
-        files=request.files,
-    )
-    proposal = _with_own_rows(request, robot, proposal)
+    if some is not None:
+        robot = _arm_of_map(robot, some.stated.arm, path)
+    proposal = _proposed(request, robot, options, some)
     return _of_map(request, robot, proposal.columns, proposal.text, proposal.concluded)
+
+
+def _proposed(
+    request: _Request, robot: Robot, options: ImportOptions, some: PartialMap | None
+) -> Proposal:
+    """Return the map that a log or a folder suggests, with the entries that some map states."""
+    form = Format(missing="drop") if options.drop_missing else None
+    chosen = options.chosen
+    rate = options.sample_rate
+    if some is not None:
+        chosen = some.channels
+        rate = some.sample_rate
+        form = some.stated.format if "format" in some.entries else None
+    source = request.source
+    propose = proposed_map_of_folder if source.is_dir() else proposed_map
+    proposal = propose(source, robot, chosen, sample_rate=rate, form=form, files=request.files)
+    if not source.is_dir():
+        proposal = _with_own_rows(request, robot, proposal)
+    return proposal if some is None else some.completed(proposal)
 
 
 def _with_own_rows(request: _Request, robot: Robot, proposal: Proposal) -> Proposal:
     """Return a proposal that interpolates, where quantities are in rows of their own."""
     columns = proposal.columns
     source = request.source
-    if source.is_dir() or source.suffix.lower() in READERS:
+    if columns.format.missing != "refuse":
         return proposal
-    if not request.files.table(source, columns.format).lacks_numbers:
+    file = request.files.file(source, columns.format)
+    if isinstance(file, Table) and not file.lacks_numbers:
         return proposal
     text = with_values(proposal.text, {"format.missing": "interpolate"})
     interpolating = ColumnMap.model_validate(parse_toml(text))

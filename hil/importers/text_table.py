@@ -56,6 +56,7 @@ class _Layout(NamedTuple):
     units: tuple[str, ...]
     rows: list[tuple[int, str]]
     repeated: int  #: lines that repeat the header between the rows
+    empty: list[int]  #: lines between the rows that are empty
 
 
 @dataclass(frozen=True, eq=False)
@@ -71,6 +72,7 @@ class Table:
     dialect: Dialect
     gaps: bool  #: whether rows may lack numbers
     left_out: tuple[LeftOut, ...] = ()
+    interrupted: int | None = None  #: first empty line at which rows may be missing
     _converted: dict[tuple[int, ...], Array] = field(default_factory=dict, compare=False)
     _times: dict[tuple[int, int], Sequence[int | None]] = field(default_factory=dict, compare=False)
 
@@ -93,21 +95,29 @@ class Table:
         filled = [line for _, line in numbered if line.strip()]
         if not filled:
             raise SourceError(path, "has no row of numbers", remedy=_EMPTY)
-        dialect = dialect_of(filled[:_PROBED], form)
+        dialect = dialect_of(filled[-_PROBED:], form)  # notes are above the rows
         if form.transposed:
             numbered = _transposed([entry for entry in numbered if entry[1].strip()], dialect, path)
-        names, units, rows, repeated = _layout(numbered, dialect, path, form)
+        names, units, rows, repeated, empty = _layout(numbered, dialect, path, form)
         if FORTRAN.search(rows[0][1]):
             rows = [(number, FORTRAN.sub("e", line)) for number, line in rows]
         width = _width(names, dialect.cells(rows[0][1]), path)
         if not names and form.header is None and comments:
             commented = dialect.cells(comments[-1].lstrip().lstrip("#%/"))
             names = tuple(commented) if len(commented) == width > 1 else ()
-        left_out = (LeftOut(Omitted.HEADERS, repeated),) if repeated else ()
+        is_cut = not form.transposed and _is_cut(rows, dialect, width, text)
+        rows = rows[:-1] if is_cut else rows
+        omitted = {
+            Omitted.HEADERS: repeated,
+            Omitted.EMPTY_LINES: len(empty),
+            Omitted.CUT_ROW: int(is_cut),
+        }
+        left_out = tuple(LeftOut(what, count) for what, count in omitted.items() if count)
         numbers = [number for number, _ in rows]
         lines = [line for _, line in rows]
         gaps = form.missing != "refuse"
-        return cls(path, names, units, width, lines, numbers, dialect, gaps, left_out)
+        interrupted = None if gaps or form.skip_empty else _interruption(numbers, empty)
+        return cls(path, names, units, width, lines, numbers, dialect, gaps, left_out, interrupted)
 
     def unit(self, column: Column) -> str | None:
         """Return the unit that the file states for a column: below its name, or in brackets."""
@@ -358,17 +368,32 @@ def _layout(numbered: list[tuple[int, str]], dialect: Dialect, path: Path, form:
     repeats = sum(line.strip() in above for _, line in rows)
     if repeats:
         rows = _without_heads(rows, above)
-    if form.skip_empty:
-        rows = [entry for entry in rows if entry[1].strip()]
-    empty = next((number for number, line in rows if not line.strip()), None)
-    if empty is not None:
-        problem = f"line {empty} is empty"
-        remedy = (
-            "remove it, or cut the log there; where empty lines mean nothing: [format] "
-            "skip_empty = true; to skip lines of a header: [format] skip_rows"
-        )
-        raise SourceError(path, problem, remedy=remedy)
-    return _Layout(tuple(names), tuple(units), rows, repeats)
+    empty = [number for number, line in rows if not line.strip()]
+    rows = [entry for entry in rows if entry[1].strip()]
+    return _Layout(tuple(names), tuple(units), rows, repeats, empty)
+
+
+def _interruption(numbers: Sequence[int], empty: Sequence[int]) -> int | None:
+    """Return the first empty line between rows; None if one follows each row, or there is none."""
+    every_row = len(empty) > 1 and len(set(np.diff(numbers))) == 1
+    return None if every_row or not empty else empty[0]
+
+
+def _is_cut(rows: Sequence[tuple[int, str]], dialect: Dialect, width: int, text: str) -> bool:
+    """Return whether the last row ends too early, as of a logger that was killed.
+
+    It has fewer cells than the row before it; or the file does not end with its line, and the last
+    number has fewer digits than in any other row.
+    """
+    if len(rows) < 2 or width < 2:
+        return False
+    last = dialect.cells(rows[-1][1])
+    if len(last) < width:
+        return len(dialect.cells(rows[-2][1])) >= width
+    if text.endswith("\n"):
+        return False
+    others = min(len(dialect.cells(line)[-1]) for _, line in rows[-_PROBED:-1])
+    return len(last[-1]) < others
 
 
 def _without_heads(rows: Sequence[tuple[int, str]], head: Collection[str]) -> list[tuple[int, str]]:

@@ -62,7 +62,7 @@ def concluded(
     Raises:
         SourceError: two readings fit alike, or the URDF is that of another arm.
     """
-    if options.columns is not None or "torque" not in imported.archive.columns:
+    if imported.is_stated or "torque" not in imported.archive.columns:
         return imported
     may_be_load = (
         "commanded_position" in imported.archive.columns and "torque" not in options.chosen

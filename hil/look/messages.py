@@ -13,6 +13,7 @@ from hil.importers import messages as import_messages
 from hil.importers.conclusions import (
     ChannelMeaning,
     ConcludedUnit,
+    Conclusion,
     FixedFingers,
     JointOrder,
     OutsideLimits,
@@ -448,6 +449,11 @@ def _(meaning: ChannelMeaning) -> str:
     if meaning.kind in ("position", "velocity") and meaning.unit_basis is UnitBasis.NUMBERS:
         return import_messages.basis_of(meaning)
     return import_messages.reason_of(meaning)
+
+
+@_worded.register
+def _(conclusion: Conclusion) -> str:
+    return import_messages.sentence(conclusion)
 
 
 @_worded.register

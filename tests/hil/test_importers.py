@@ -626,7 +626,7 @@ class TestTextMatrices:
     def test_empty_lines_are_named_or_skipped_on_request(self, tmp_path, robot):
         lines = [" ".join(map(repr, row)) for row in Q.tolist()]
         (tmp_path / "q.txt").write_text("\n".join([*lines[:9], "", *lines[9:]]))
-        with pytest.raises(SourceError, match=r"line 10 is empty; .*skip_empty = true.*skip_rows"):
+        with pytest.raises(SourceError, match=r"line 10 is empty.*skip_empty = true.*skip_rows"):
             read_arrays(tmp_path / "q.txt", robot)
         (tmp_path / "q.txt").write_text("\n\n".join(["", "q1 q2 q3", *lines, " "]))
         arrays = read_arrays(tmp_path / "q.txt", robot, format={"skip_empty": True})

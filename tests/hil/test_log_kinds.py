@@ -140,6 +140,10 @@ PREAMBLE = "Recorder;V2.1\nDate;12.11.2026\nRate;250\n\n"
 HEAD = ",".join(NAMES)
 READ: dict[str, tuple[str | bytes, dict[str, Any]]] = {
     "as it should be": (text(), {}),
+    "an empty line": (with_lines(50, ""), {}),
+    "an empty line below each": (text().replace("\n", "\n\n"), {}),
+    "zeros at the end, as a disk leaves them": (text() + 512 * "\0", {}),
+    "notes above": ("".join(f"a {k} b\n" for k in range(300)) + "\n" + text(), {}),
     "units in the second line": (text(head=UNITS_BELOW), {}),
     "units in the second line that are not those of the SI": (
         text(IN_DEGREES, head=DEGREES_BELOW), {},
@@ -332,9 +336,7 @@ HOLES = {cell: with_row(50, f"0.196,{cell},1,1,1,1,1") for cell in NOT_A_NUMBER}
 }
 GROUPED = text(rows(time=[f"{1000 + 4 * k:,}" for k in range(COUNT)]), delimiter=";")
 OTHER_REMEDIES: dict[str, tuple[str, dict[str, Any], str]] = {
-    "an empty line": (with_lines(50, ""), {}, "skip_empty"),
     "thousands that are not certain": (GROUPED, {"time": MILLISECONDS}, "thousands"),
-    "lines that are no table": ("a b\n" * 300 + text(), {}, "skip_rows"),
 }
 TYPED = re.compile(r'\[(\w+)\] (\w+) = ("[^"]*"|true|\d+)')
 
@@ -361,7 +363,19 @@ class TestRemedies:
             for line in archive.header.findings.lines
         )
 
-    @pytest.mark.parametrize("kind", ["an empty line", "thousands that are not certain"])
+    @pytest.mark.parametrize("cut", [1, 3, 9, 20])
+    def test_a_last_row_that_is_cut_off_is_left_out(
+        self, tmp_path: Path, urdf: Path, cut: int
+    ) -> None:
+        """In its cells, or within its last number: no line end follows."""
+        archive = imported(tmp_path / "log.csv", text()[: -1 - cut], urdf)
+        assert_right(archive, without=(COUNT - 1,))
+        assert any("last row, which is cut off" in line for line in archive.header.findings.lines)
+
+    def test_a_last_row_without_a_line_end_is_whole(self, tmp_path: Path, urdf: Path) -> None:
+        assert_right(imported(tmp_path / "log.csv", text()[:-1], urdf))
+
+    @pytest.mark.parametrize("kind", OTHER_REMEDIES)
     def test_entries_of_the_map(self, tmp_path: Path, urdf: Path, kind: str) -> None:
         content, changes, key = OTHER_REMEDIES[kind]
         with pytest.raises(SourceError) as refused:

@@ -135,14 +135,6 @@ def with_entries(refused: str, **values: str) -> str:
 
 
 class TestLogs:
-    def test_lines_before_an_empty_one(self, urdf: Path) -> None:
-        """Of the two entries that are printed, the one for lines of a header."""
-        content = "".join(f"a {k} b\n" for k in range(300)) + "\n" + text()
-        refused = log(urdf, content)
-        assert "[format] skip_rows" in refused
-        assert log(urdf, content, "[format]\nskip_rows = 301\n" + MAP) == ""
-        assert_right(urdf.with_name("log.csv"))
-
     def test_fewer_names_than_columns(self, urdf: Path) -> None:
         content = text(head=[NAMES[:5]])
         refused = log(urdf, content)
@@ -179,11 +171,17 @@ class TestLogs:
         assert log(urdf, content, columns) == ""
         assert_right(urdf.with_name("log.csv"))
 
-    def test_an_empty_line(self, urdf: Path) -> None:
+    def test_an_empty_line_where_no_time_tells_what_is_missing(self, urdf: Path) -> None:
         content = text().replace("\n", "\n\n", 5)
-        refused = log(urdf, content).split(";")
-        line = next(part for part in refused if "skip_empty" in part)
-        assert log(urdf, content, with_entries(line)) == ""
+        columns = MAP.replace('[time]\ncolumn = "t"\n', f"sample_rate = {RATE}\n")
+        refused = log(urdf, content, columns)
+        assert "line 4 is empty" in refused
+        assert "[format] skip_empty = true" in refused
+        assert log(urdf, content, f"{columns}[format]\nskip_empty = true\n") == ""
+        assert_right(urdf.with_name("log.csv"))
+        assert "--drop-missing" in refused
+        without_map = ["--sample-rate", str(RATE), "--drop-missing"]
+        assert typed("log", urdf.with_name("log.csv"), urdf, *without_map) == ""
         assert_right(urdf.with_name("log.csv"))
 
     def test_an_output_that_exists(self, urdf: Path) -> None:

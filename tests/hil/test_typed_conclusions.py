@@ -21,7 +21,7 @@ from hil.importers.recording import ImportOptions
 from hil.importers.robot import Robot
 from hil.look import Look, Row, look_at
 from hil.look import messages as look_messages
-from hil.look.readings import Channels, NextBest
+from hil.look.readings import Channels, Decider, Evidence, NextBest, Reading, Setting
 from hil.look.result import Aspect
 from identification.validation import verdict
 from identification.validation.finding import Facts, Finding, Naming
@@ -101,6 +101,12 @@ class TestNamesOfChannels:
         assert row_of(looked, "position").reading == Channels(name)
         text = look_messages.row_text(row_of(looked, "position"))
         assert text[:2] == (name, "as given with --columns")
+
+
+@pytest.mark.parametrize("kind", get_args(Reading | Evidence | Decider | Setting))
+def test_what_a_row_of_a_look_may_have_has_words(kind: type) -> None:
+    words = look_messages._worded.dispatch
+    assert words(kind) is not words(object)
 
 
 ASPECTS = frozenset(get_args(Aspect))
