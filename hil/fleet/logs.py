@@ -45,7 +45,7 @@ from hil.look.before_identification import concluded
 
 _ARCHIVE: Final = ".recording"
 """Suffix of an archive in the cache, which no search takes for one of the user's."""
-_LOG_SUFFIXES: Final = frozenset((*TEXTS, *READERS, *BAGS)) - {SUFFIX}
+_LOG_SUFFIXES: Final = frozenset((*TEXTS, *READERS, *BAGS)) - {SUFFIX, ".json"}  # else settings
 _PACKED: Final = (".zst", ".zstd")
 _TABLES: Final = ("parameters", "axes", "not_used")  # that a batch writes
 _TRIED: Final = 3

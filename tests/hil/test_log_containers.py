@@ -148,9 +148,7 @@ def test_a_compressed_table(tmp_path: Path, urdf: Path) -> None:
     check(source)
 
 
-def test_of_a_compressed_table_that_is_cut_off_the_rest_can_be_read(
-    tmp_path: Path, urdf: Path
-) -> None:
+def test_a_compressed_table_that_is_cut_off(tmp_path: Path, urdf: Path) -> None:
     source = tmp_path / "log.csv.gz"
     data = gzip.compress(text().encode(), mtime=0)
     source.write_bytes(data[: len(data) // 2])
