@@ -7,11 +7,11 @@ import re
 import time
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import lru_cache
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import Any, Final, NamedTuple, Protocol
+from typing import Any, Final, Literal, NamedTuple, Protocol
 
 from hil.archive import Archive, ArchiveName, ArchiveOutcome, open_archive
 from hil.archive.check import recording_date
@@ -62,6 +62,10 @@ _FIELDS: Final = (
 _UNKNOWN: Final = Stamp("")
 
 
+DatedBy = Literal["", "clock", "name", "file"]
+"""Where the date of a recording is from: "" for its archive, or an unknown one."""
+
+
 class GroupKey(NamedTuple):
     """Key of archives that are fitted together."""
 
@@ -94,6 +98,11 @@ class ArchiveRef:
     record: str = ""  #: digest of the metadata
     simulated: bool = False  #: whether only a simulated arm moved
     source: str = ""  #: the log or bag that it was imported from by a batch; "" for none
+    robot: str = ""  #: name or serial number; "" if all with one `arm` are one robot
+    arm_type: str = ""  #: digest that robots of one type share; "" without a robot
+    dated_by: DatedBy = ""
+    #: what a log has beside its motion: means of columns, and texts, by name
+    facts: Mapping[str, float | str] = field(default_factory=dict, hash=False)
 
     @property
     def origin(self) -> str:
@@ -111,14 +120,19 @@ class ArchiveRef:
         return folder_of(self.origin)
 
     @property
+    def type_key(self) -> str:
+        """Digest that robots of one type share."""
+        return self.arm_type or self.arm
+
+    @property
     def key(self) -> GroupKey:
         """Group of the archive."""
         return GroupKey(self.arm, self.campaign, self.setup)
 
     @property
-    def order(self) -> tuple[str, str, str, int, str, str]:
+    def order(self) -> tuple[str, str, str, str, str, int, str, str]:
         """Sort key: sums are added in this order."""
-        return *self.key, self.index, self.name, self.sha256
+        return self.type_key, self.robot, *self.key, self.index, self.name, self.sha256
 
 
 @dataclass(frozen=True)
@@ -162,8 +176,11 @@ def discover(
     cluster: Cluster,
     reporter: Reporter,
     importing: LogImport | None = None,
+    place: Callable[[ArchiveRef], ArchiveRef] = lambda ref: ref,
 ) -> Discovery:
     """Find every archive at or below some places, and import logs and bags if that is stated.
+
+    `place` adds what is known of the robot and the date of each.
 
     Workers hash each archive and read its metadata. One whose file has not changed since the last
     search is not opened.
@@ -184,15 +201,28 @@ def discover(
     imported = {} if importing is None else importing.imported(found.logs)
     refs: dict[str, ArchiveRef | SkippedArchive] = {}
     with reporter.task("reading the metadata of archives", len(places)) as task:
-        for place in places:
+        for location in places:
             with suppress(ArchiveError):  # it has disappeared: the worker reports it
-                if (ref := _cached_ref(place, cache)) is not None:
-                    refs[place] = ref
+                if (ref := _cached_ref(location, cache)) is not None:
+                    refs[location] = ref
         task.advance(len(refs))
-        new = [place for place in places if place not in refs]
+        new = [location for location in places if location not in refs]
         refs.update(_inspected(new, cache, cluster, task.advance))
-    selected = _select({place: refs[place] for place in places} | {**imported})
+    inspected = {location: refs[location] for location in places} | {**imported}
+    selected = _select({location: _placed(ref, place) for location, ref in inspected.items()})
     return selected._replace(broken=(*found.refused, *selected.broken))
+
+
+def _placed(
+    ref: ArchiveRef | SkippedArchive, place: Callable[[ArchiveRef], ArchiveRef]
+) -> ArchiveRef | SkippedArchive:
+    """Return what was inspected with robot and date, or why these are unknown."""
+    if isinstance(ref, SkippedArchive):
+        return ref
+    try:
+        return place(ref)
+    except InputError as error:
+        return SkippedArchive(ref.origin, str(error))
 
 
 def _inspected(
@@ -416,6 +446,7 @@ def described_archive(place: str, cache: CacheLocation, source: str = "") -> Arc
         cell="",
         motion="" if plan is None else digest(plan),
         when=when,
+        dated_by="clock" if when and archive.kind == "imported" else "",
         stamp=stamp,
         kind=archive.kind,
         attempt=attempt,

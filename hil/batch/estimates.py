@@ -53,11 +53,14 @@ class BatchArm:
 
     digest: str
     cell: Cell
+    robot: str = ""  #: name or serial number; "" if it is the only one of its type
+    arm_type: str = ""  #: digest that robots of one type share
 
     @property
     def name(self) -> str:
         """The cell's name with the begin of the digest, since names may be equal."""
-        return f"{self.cell.name}-{self.digest[:8]}"
+        kind = f"{self.cell.name}-{(self.arm_type or self.digest)[:8]}"
+        return f"{self.robot} ({kind})" if self.robot else kind
 
 
 @dataclass(frozen=True, eq=False)
@@ -92,6 +95,8 @@ class ArmModel:
     urdf: str
     settings: Settings
     estimator: BatchEstimator
+    robot: str = ""  #: see :class:`BatchArm`, also the following
+    arm_type: str = ""
 
 
 @dataclass(frozen=True, eq=False)

@@ -162,6 +162,7 @@ def reidentify(
     *,
     cache: CacheLocation = CacheLocation(),  # noqa: B008 - frozen
     importing: LogImport | None = None,
+    place: Callable[[ArchiveRef], ArchiveRef] = lambda ref: ref,
     check: Callable[[Discovery], None] = lambda _: None,
 ) -> BatchResult:
     """Identify every arm from all its archives: by repetition, by campaign, and pooled.
@@ -170,7 +171,8 @@ def reidentify(
     They depend neither on the order in which archives are found nor on the workers.
 
     The roots are folders, files, patterns or URLs. A single recording is never split. `importing`
-    imports logs and bags, which count only with it. `check` receives the archives found, before
+    imports logs and bags, which count only with it; `place` adds what is known of the robot and the
+    date of a recording. `check` receives the archives found, before
     samples are read, and may raise.
 
     Raises:
@@ -183,7 +185,7 @@ def reidentify(
         problem = f"{options.estimator!r} reads samples"
         remedy = f"use {', '.join(estimators)}"
         raise InputError(None, problem, field="estimator", remedy=remedy)
-    discovery = discover(roots, cache, cluster, reporter, importing)
+    discovery = discover(roots, cache, cluster, reporter, importing, place)
     check(discovery)
     batch = _Batch(options, cluster, cache, reporter, [*discovery.broken])
     campaigns = batch.with_settings(
@@ -199,6 +201,11 @@ class _Campaign:
     key: GroupKey
     refs: list[ArchiveRef]
     settings: Settings | None = None  #: None until decided
+
+    @property
+    def arm_type(self) -> str:
+        """Digest that robots of one type share."""
+        return self.refs[0].type_key
 
     @property
     def ready(self) -> Settings:
@@ -248,16 +255,17 @@ class _Batch:
     def with_settings(self, campaigns: Sequence[_Campaign]) -> list[_Campaign]:
         """Decide the settings of campaigns; return those that have some.
 
-        Those of an arm are decided on its first readable campaign; the others use them with their
-        own noise: comparisons need one friction law, and sums the same columns.
+        Those of a type of arm are decided on its first readable campaign; the others use them with
+        their own noise: comparisons need one friction law, and sums the same columns.
         """
         arms: dict[str, Settings] = {}
+        types = {campaign.key: campaign.arm_type for campaign in campaigns}
         waiting = list(campaigns)
         while waiting:
             first = {
-                campaign.key.arm: campaign
+                types[campaign.key]: campaign
                 for campaign in reversed(waiting)
-                if campaign.key.arm not in arms
+                if types[campaign.key] not in arms
             }
             asked = list(first.values()) or waiting
             waiting = [campaign for campaign in waiting if campaign not in asked]
@@ -274,7 +282,7 @@ class _Batch:
         """Decide settings; return the campaigns to repeat without archives that are unusable."""
         asked = []
         for campaign in campaigns:
-            arm_settings = arms.get(campaign.key.arm)
+            arm_settings = arms.get(campaign.arm_type)
             refs = archives_for_settings(campaign.refs, arm_settings)
             campaign.settings = cached_settings(refs, self.options, arm_settings, self.cache)
             if campaign.settings is None:
@@ -469,7 +477,10 @@ class _Batch:
             cell = cell_in(open_ref(ref))
             texts = CellTexts(cell.text, cell.urdf)
         estimator = cast(BatchEstimator, self.options.estimator)
-        return ArmModel(digest, texts.cell, texts.urdf, members[0].ready, estimator)
+        settings = members[0].ready
+        return ArmModel(
+            digest, texts.cell, texts.urdf, settings, estimator, ref.robot, ref.type_key
+        )
 
     def _pooled(self, arm: _ArmWork) -> list[BatchEstimate]:
         """Return the pooled estimate of an arm; that of its only campaign, if it has one."""
@@ -492,9 +503,8 @@ def _by_arm(campaigns: Sequence[_Campaign]) -> list[tuple[str, list[_Campaign]]]
 
 def _arm_of(model: ArmModel) -> BatchArm:
     """Return an arm with its cell."""
-    return BatchArm(
-        model.digest, cell_from(model.cell, model.urdf, *model.settings.friction.items())
-    )
+    cell = cell_from(model.cell, model.urdf, *model.settings.friction.items())
+    return BatchArm(model.digest, cell, model.robot, model.arm_type)
 
 
 def _advance(

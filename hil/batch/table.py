@@ -18,7 +18,7 @@ from .estimates import BatchEstimate, relative_error
 
 Row = dict[str, Any]
 
-_ESTIMATE: Final = "level arm arm_digest campaign setup archive archive_sha256 when"
+_ESTIMATE: Final = "level arm arm_digest robot arm_type campaign setup archive archive_sha256 when"
 COLUMNS: Final = {
     "parameters": (
         f"{_ESTIMATE} parameter kind axis unit value std low high determined archives samples"
@@ -115,6 +115,8 @@ def _levels(result: BatchResult) -> Iterator[tuple[BatchEstimate, Row]]:
             "level": level.level,
             "arm": result.arms[level.arm].name,
             "arm_digest": level.arm,
+            "robot": result.arms[level.arm].robot,
+            "arm_type": result.arms[level.arm].arm_type or level.arm,
             "campaign": level.campaign,
             "setup": level.setup,
             "archive": level.archive,

@@ -27,8 +27,18 @@ from hil.cli.arguments import JsonOption, QuietOption, VerboseOption, print_json
 from hil.cli.identify_options import Identifying
 from hil.cli.imports import Described, Reading
 from hil.fleet.logs import LogMap, LogReading, LogsOfBatch, write_maps
+from hil.fleet.naming import Naming
 from identification.text import percentage
 
+RobotOption = Annotated[
+    str | None,
+    typer.Option(
+        "--robot",
+        metavar="WHERE",
+        help="Where robots are named: folder, column=NAME, metadata=KEY, or a path's pattern such "
+        "as '{robot}/{date}.csv'. Default: one robot.",
+    ),
+]
 SOME_BROKEN: Final = 5
 """Exit status if some archives could not be used."""
 
@@ -41,6 +51,7 @@ _MOST_LINES: Final = 20
 def batch(
     places: Annotated[list[str], typer.Argument(metavar="RECORDING")],
     output: Annotated[Path | None, typer.Option("--output", "-o")] = None,
+    robot: RobotOption = None,
     estimator: BatchEstimator = "auto",
     workers: Annotated[int | None, typer.Option(min=1)] = None,
     scheduler: Annotated[str | None, typer.Option(metavar="ADDRESS")] = None,
@@ -81,14 +92,18 @@ def batch(
     if output is not None:
         make_folder(output)
     options = how.options(estimator=estimator)
+    naming = Naming.parse(robot)
     if not arm.is_given:
         reading.refuse_without_robot()
     with (
         Cluster(workers, scheduler=scheduler, reporter=reporter) as cluster,
         cache_of(cache, for_logs=arm.is_given) as location,
     ):
-        logs = _logs(arm, reading, location, cluster, reporter)
-        result = run.reidentify(places, options, cluster, reporter, cache=location, importing=logs)
+        logs = logs_of(arm, reading, naming, location, cluster, reporter)
+        result = run.reidentify(
+            places, options, cluster, reporter,
+            cache=location, importing=logs, place=naming.place,
+        )  # fmt: skip
     written = _tables(output, result, logs)
     if json:
         print_json(as_dict(result, written))
@@ -147,13 +162,18 @@ def cache_of(cache: str | None, *, for_logs: bool) -> Iterator[CacheLocation]:
         yield CacheLocation(keep=False)
 
 
-def _logs(
-    arm: Described, reading: Reading, cache: CacheLocation, cluster: Cluster, reporter: Reporter
+def logs_of(
+    arm: Described,
+    reading: Reading,
+    naming: Naming,
+    cache: CacheLocation,
+    cluster: Cluster,
+    reporter: Reporter,
 ) -> LogsOfBatch | None:
     """Return the import of logs, None without a description of their robot."""
     if not arm.is_given:
         return None
-    how = LogReading.of(arm.robot, reading.options, repr(arm))
+    how = LogReading.of(arm.robot, reading.options, repr(arm), naming.facts)
     return LogsOfBatch(how, cache, cluster, reporter)
 
 

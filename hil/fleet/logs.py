@@ -24,6 +24,7 @@ from hil.batch.cluster import Cluster, ClusterTask, SkippedArchive, reason_of
 from hil.batch.discovery import ArchiveRef, campaign_of, described_archive, is_untouched
 from hil.batch.places import SUFFIX, Stamp, name_of, stamp_of
 from hil.cell import Cell
+from hil.fleet.facts import WantedFacts, facts_of
 from hil.importers.arrays import READERS
 from hil.importers.bag_map import BagMap
 from hil.importers.bags import SUFFIXES as BAGS
@@ -118,21 +119,30 @@ class LogReading:
         robot_of: the robot of all logs.
         options: how they are read where it is not concluded.
         robot: digest of its description, for the cache.
+        facts: columns, and entries of the metadata, that are read beside the motion.
     """
 
     robot_of: RobotOf
     options: ImportOptions
     robot: str
+    facts: WantedFacts = field(default_factory=WantedFacts)
 
     @classmethod
-    def of(cls, robot_of: RobotOf, options: ImportOptions, description: str) -> LogReading:
+    def of(
+        cls,
+        robot_of: RobotOf,
+        options: ImportOptions,
+        description: str,
+        facts: WantedFacts = WantedFacts(),  # noqa: B008 - frozen
+    ) -> LogReading:
         """Return how logs are read of a robot, described by this text beside its files.
 
         Raises:
             InputError: the description of the robot or a stated map is invalid.
         """
         robot = robot_of(lambda: None)
-        reading = cls(robot_of, options, json_digest([robot.cell, robot.urdf, description]))
+        described = json_digest([robot.cell, robot.urdf, description])
+        reading = cls(robot_of, options, described, facts)
         _ = reading.stated
         return reading
 
@@ -141,7 +151,7 @@ class LogReading:
         """Digest of everything that decides how a log is read, but the log."""
         options = replace(self.options, columns=None)
         stated = self.stated.text if self.stated is not None else ""
-        return json_digest([repr(options), self.robot, stated])
+        return json_digest([repr(options), self.robot, stated, self.facts])
 
     @cached_property
     def stated(self) -> LogMap | None:
@@ -179,7 +189,7 @@ def read_log(log: str, maps: Sequence[LogMap], reading: LogReading, cache: Cache
                 recording = _by_map(source, place, reading, log_map, files)
                 _require_usable(recording, source)
                 _write(recording, place)
-            return ReadLog(described_archive(place.as_posix(), cache, log), log_map)
+            return _read(log, place, log_map, reading, cache, files)
         except CacheError:
             raise
         except Exception as error:
@@ -215,7 +225,21 @@ def conclude_map(log: str, reading: LogReading, cache: CacheLocation) -> ReadLog
     )
     place = _place_of(source, reading, log_map, cache)
     _write(recording, place)
-    return ReadLog(described_archive(place.as_posix(), cache, log), log_map)
+    return _read(log, place, log_map, reading, cache, recording.files)
+
+
+def _read(
+    log: str,
+    place: Path,
+    log_map: LogMap,
+    reading: LogReading,
+    cache: CacheLocation,
+    files: LogFiles,
+) -> ReadLog:
+    """Return a log that was read, with its archive and the facts that are wanted of it."""
+    ref = described_archive(place.as_posix(), cache, log)
+    facts = facts_of(Path(log), reading.facts, files)
+    return ReadLog(replace(ref, facts=facts), log_map)
 
 
 def _by_map(
@@ -346,7 +370,7 @@ class LogsOfBatch:
                     done[log] = note
             task.advance(len(done))
             new = [log for log in logs if log not in done]
-            read = self._read(new, _new_maps(done), task.advance)
+            read = self._imported(new, _new_maps(done), task.advance)
             for log, result in read.items():
                 if isinstance(result, ReadLog):
                     self._remember(log, result, begun)
@@ -354,7 +378,7 @@ class LogsOfBatch:
         self.maps = dict(Counter(each.by for each in done.values() if isinstance(each, ReadLog)))
         return {log: each.ref if isinstance(each, ReadLog) else each for log, each in done.items()}
 
-    def _read(
+    def _imported(
         self, logs: Sequence[str], maps: Sequence[LogMap], advance: Callable[[float], None]
     ) -> dict[str, ReadLog | SkippedArchive]:
         """Read logs by known maps, and conclude maps for those that none of them describes."""
