@@ -47,6 +47,7 @@ FOREIGN: Final[Mapping[str, str]] = {
     "hil.importers.text_table": "logs",
     "hil.new.cell_text": "URDFs",
     "hil.base.safe_input": "files",
+    "hil.fleet.naming": "patterns that the user writes, and names of files",
     "hil.control.simulator_on_link": "addresses that the user writes",
     "identification.excitation.collision_bodies": "errors of pinocchio",
     "identification.export.urdf": "URDFs",

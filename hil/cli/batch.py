@@ -5,40 +5,27 @@ from __future__ import annotations
 import math
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager
 from pathlib import Path
-from tempfile import TemporaryDirectory
 from typing import Annotated, Any, Final
 
 import typer
 
 from hil.base.files import convert_write_errors, make_folder
 from hil.base.one_screen import brief
-from hil.base.progress import Reporter
 from hil.base.progress import reporter as make_reporter
 from hil.base.terminal_text import plural, printable
 from hil.batch import graph as run
-from hil.batch.cache import CacheLocation
-from hil.batch.cluster import Cluster, SkippedArchive
+from hil.batch.cluster import SkippedArchive
 from hil.batch.estimates import BatchEstimate, BatchEstimator, relative_error
 from hil.batch.graph import BatchResult
 from hil.batch.table import write_tables
 from hil.cli.arguments import JsonOption, QuietOption, VerboseOption, print_json, with_options
+from hil.cli.fleet_options import Fleet, RecordingsArgument, last, map_lines
 from hil.cli.identify_options import Identifying
 from hil.cli.imports import Described, Reading
-from hil.fleet.logs import LogMap, LogReading, LogsOfBatch, write_maps
-from hil.fleet.naming import Naming
+from hil.fleet.logs import LogMap, write_maps
 from identification.text import percentage
 
-RobotOption = Annotated[
-    str | None,
-    typer.Option(
-        "--robot",
-        metavar="WHERE",
-        help="Where robots are named: folder, column=NAME, metadata=KEY, or a path's pattern such "
-        "as '{robot}/{date}.csv'. Default: one robot.",
-    ),
-]
 SOME_BROKEN: Final = 5
 """Exit status if some archives could not be used."""
 
@@ -48,15 +35,13 @@ _MOST_LINES: Final = 20
 @with_options(Identifying, "how")
 @with_options(Described, "arm", but=("friction", "standstill"))
 @with_options(Reading, "reading")
+@with_options(Fleet, "fleet")
 def batch(
-    places: Annotated[list[str], typer.Argument(metavar="RECORDING")],
+    places: RecordingsArgument,
     output: Annotated[Path | None, typer.Option("--output", "-o")] = None,
-    robot: RobotOption = None,
     estimator: BatchEstimator = "auto",
-    workers: Annotated[int | None, typer.Option(min=1)] = None,
-    scheduler: Annotated[str | None, typer.Option(metavar="ADDRESS")] = None,
-    cache: Annotated[str | None, typer.Option(metavar="FOLDER|none")] = None,
     *,
+    fleet: Fleet,
     arm: Described,
     reading: Reading,
     how: Identifying,
@@ -82,33 +67,21 @@ def batch(
             URLs of archives.
         output: Folder for the tables (CSV and Parquet). Default: none.
         estimator: Estimator that needs no samples: see `hil identify --estimator`.
-        workers: Number of processes. Default: one per core, and none if few archives are read.
-        scheduler: Address of a running Dask scheduler, such as tcp://host:8786. Its workers need
-            this version of hil and these paths.
-        cache: Folder of cached factors, or none. Default: .hil-cache next to the archives, or in
-            the user's cache folder if those are read-only.
     """
     reporter = make_reporter(quiet=quiet or json, messages=verbose)
     if output is not None:
         make_folder(output)
     options = how.options(estimator=estimator)
-    naming = Naming.parse(robot)
-    if not arm.is_given:
-        reading.refuse_without_robot()
-    with (
-        Cluster(workers, scheduler=scheduler, reporter=reporter) as cluster,
-        cache_of(cache, for_logs=arm.is_given) as location,
-    ):
-        logs = logs_of(arm, reading, naming, location, cluster, reporter)
+    with fleet.opened(arm, reading, reporter) as work:
         result = run.reidentify(
-            places, options, cluster, reporter,
-            cache=location, importing=logs, place=naming.place,
+            places, options, work.cluster, reporter,
+            cache=work.cache, importing=work.logs, place=work.naming.place,
         )  # fmt: skip
-    written = _tables(output, result, logs)
+    written = _tables(output, result, work.maps)
     if json:
         print_json(as_dict(result, written))
     else:
-        _print(result, logs, written, quiet=quiet, verbose=verbose)
+        _print(result, work.maps, written, quiet=quiet, verbose=verbose)
     if result.broken:
         raise typer.Exit(SOME_BROKEN)
 
@@ -118,7 +91,7 @@ _TAIL: Final = 3  # lines at the end: files, what was skipped, counts
 
 def _print(
     result: BatchResult,
-    logs: LogsOfBatch | None,
+    maps: Mapping[LogMap, int],
     written: Sequence[Path],
     *,
     quiet: bool,
@@ -127,12 +100,11 @@ def _print(
     """Print the arms and what was written; what could not be used goes to standard error."""
     lines: list[str] = []
     if not quiet:
-        maps = {} if logs is None else logs.maps
         lines = [*map_lines(maps, verbose=verbose), *result_lines(result)]
         if written:
             names = ", ".join(path.name for path in written)
             lines.append(f"written to {written[0].parent}: {names}")
-    for line in _last(_broken_lines(result.broken)):
+    for line in last(_broken_lines(result.broken), _MOST_LINES, "--output and --json"):
         typer.echo(printable(line), err=True)
     if result.skipped and not quiet:
         lines.append(skipped_line(result.skipped))
@@ -150,48 +122,11 @@ def _counts(result: BatchResult) -> str:
     )
 
 
-@contextmanager
-def cache_of(cache: str | None, *, for_logs: bool) -> Iterator[CacheLocation]:
-    """Provide the cache of an option; archives of logs need one, which goes with the batch."""
-    if cache != "none":
-        yield CacheLocation(str(Path(cache).resolve()) if cache else None)
-    elif for_logs:
-        with TemporaryDirectory(prefix="hil-") as folder:
-            yield CacheLocation(folder)
-    else:
-        yield CacheLocation(keep=False)
-
-
-def logs_of(
-    arm: Described,
-    reading: Reading,
-    naming: Naming,
-    cache: CacheLocation,
-    cluster: Cluster,
-    reporter: Reporter,
-) -> LogsOfBatch | None:
-    """Return the import of logs, None without a description of their robot."""
-    if not arm.is_given:
-        return None
-    how = LogReading.of(arm.robot, reading.options, repr(arm), naming.facts)
-    return LogsOfBatch(how, cache, cluster, reporter)
-
-
-def map_lines(maps: Mapping[LogMap, int], *, verbose: bool) -> Iterator[str]:
-    """Name the map of each kind of logs; with `verbose` also what it says of the channels."""
-    for log_map, count in maps.items():
-        source = f"concluded from {log_map.first}" if log_map.first else "given by --map"
-        yield f"{plural(count, 'log')} read by the column map {source}"
-        if verbose:
-            yield from (f"  {meaning}" for meaning in log_map.meanings)
-
-
-def _tables(folder: Path | None, result: BatchResult, logs: LogsOfBatch | None) -> list[Path]:
+def _tables(folder: Path | None, result: BatchResult, maps: Mapping[LogMap, int]) -> list[Path]:
     if folder is None:
         return []
     with convert_write_errors(folder):
-        written = write_tables(folder, result)
-    return [*written, *([] if logs is None else write_maps(folder, logs.maps))]
+        return [*write_tables(folder, result), *write_maps(folder, maps)]
 
 
 def result_lines(result: BatchResult) -> Iterator[str]:
@@ -199,7 +134,9 @@ def result_lines(result: BatchResult) -> Iterator[str]:
     for digest, arm in result.arms.items():
         campaigns = [estimate for estimate in result.campaigns if estimate.arm == digest]
         yield f"{arm.name}: {plural(len(campaigns), 'campaign')}"
-        yield from _last([_line(estimate) for estimate in campaigns])
+        yield from last(
+            [_line(estimate) for estimate in campaigns], _MOST_LINES, "--output and --json"
+        )
         pooled = [estimate for estimate in result.pooled if estimate.arm == digest]
         for warning in dict.fromkeys(text for estimate in pooled for text in estimate.warnings):
             yield f"  note: {warning}"
@@ -217,13 +154,6 @@ def _line(campaign: BatchEstimate) -> str:
     held_out = "" if math.isnan(unseen) else f", held out {percentage(unseen, 1)}"
     repetitions = plural(campaign.repetitions, "repetition")
     return f"  {named}: {repetitions}, torque error {percentage(error, 1)}{held_out}"
-
-
-def _last(lines: Sequence[str]) -> Iterator[str]:
-    """Yield the last lines, after the number of the others."""
-    if (more := len(lines) - _MOST_LINES) > 0:
-        yield f"  {more} more: see --output and --json"
-    yield from lines[-_MOST_LINES:]
 
 
 def _broken_lines(broken: Sequence[SkippedArchive]) -> list[str]:

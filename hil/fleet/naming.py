@@ -34,7 +34,7 @@ _DAY_FIRST: Final = re.compile(
 
 
 @dataclass(frozen=True)
-class Naming:
+class RobotNaming:
     """How the robot of a recording is found.
 
     Attributes:
@@ -47,7 +47,7 @@ class Naming:
     name: str = ""
 
     @classmethod
-    def parse(cls, text: str | None) -> Naming:
+    def parse(cls, text: str | None) -> RobotNaming:
         """Parse the value of ``--robot``.
 
         Raises:

@@ -16,7 +16,7 @@ from hil.batch.discovery import ArchiveRef
 from hil.batch.graph import reidentify
 from hil.fleet.facts import WantedFacts, facts_of
 from hil.fleet.logs import LogReading, LogsOfBatch
-from hil.fleet.naming import Naming, date_in
+from hil.fleet.naming import RobotNaming, date_in
 from hil.importers.log_files import LogFiles
 from hil.importers.recording import ImportOptions
 from hil.importers.robot import Robot
@@ -34,7 +34,7 @@ def ref(origin, **known):
 
 
 def placed(spec, origin, **known):
-    return Naming.parse(spec).place(ref(origin, **known))
+    return RobotNaming.parse(spec).place(ref(origin, **known))
 
 
 class TestRobot:
@@ -71,7 +71,7 @@ class TestRobot:
     @pytest.mark.parametrize("spec", ["robot", "column=", "{robot}{serial}", "{robot}/{robot}"])
     def test_that_nothing_names_is_refused(self, spec):
         with pytest.raises(InputError, match="--robot"):
-            Naming.parse(spec)
+            RobotNaming.parse(spec)
 
 
 class TestDate:
@@ -106,7 +106,7 @@ class TestDate:
             path.parent.mkdir(parents=True)
             path.touch()
         os.utime(unnamed, (1_700_000_000, 1_700_000_000))
-        naming = Naming()
+        naming = RobotNaming()
         assert naming.place(ref(str(named))).when == "2026-03-15T00:00:00+00:00"
         by_file = naming.place(ref(str(unnamed)))
         changed = datetime.fromtimestamp(1_700_000_000, UTC).isoformat()
@@ -139,7 +139,7 @@ def test_robots_of_one_type_have_estimates_of_their_own(tmp_path):
     reading = LogReading.of(lambda _: Robot.from_urdf(urdf()), ImportOptions(), "")
     cache = CacheLocation(str(tmp_path / "cache"))
     logs = LogsOfBatch(reading, cache, Here(), Silent())
-    naming = Naming.parse("robot{robot}/{date}.csv")
+    naming = RobotNaming.parse("robot{robot}/{date}.csv")
     result = reidentify(
         [str(tmp_path)], FIXED, Here(), Silent(), cache=cache, importing=logs, place=naming.place
     )
