@@ -17,6 +17,7 @@ Archives and other recordings:
 - `import_log`, `import_rosbag2`: convert text, arrays and bags to archives.
 - `Robot`, `ColumnMap`: robot and columns of an imported recording.
 - `identify`: from a log and a URDF to an `IdentifiedArm`: verdict, parameters, prediction, model.
+- `load`: the `IdentifiedArm` in a folder of `hil identify`, without identifying it again.
 - `identify_servo`: the same of an arm without torque, to an `IdentifiedServo`.
 - `identify_archives`, `identify_campaign`: estimate, predict and judge.
 - `Options`: settings of the estimation; `ImportOptions`: what the channels of a recording are.
@@ -38,7 +39,6 @@ from typing import TYPE_CHECKING, Any
 from hil.base import errors
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
     from os import PathLike
 
     from hil.archive import open_archive
@@ -54,7 +54,12 @@ if TYPE_CHECKING:
     from hil.control.move import plan_move, send
     from hil.control.simulation import simulated_controller
     from hil.export.model_files import export_model
-    from hil.identified.identified_arm import IdentifiedArm, identify_servo
+    from hil.identified.identified_arm import (
+        IdentifiedArm,
+        Recordings,
+        identify_servo,
+        load,
+    )
     from hil.identified.identified_servo import IdentifiedServo
     from hil.importers.column_map import ColumnMap
     from hil.importers.log import import_log
@@ -85,6 +90,7 @@ _HOME = {
     "identify_archives": "pipeline.run",
     "identify_campaign": "campaign.identified",
     "identify_servo": "identified.identified_arm",
+    "load": "identified.identified_arm",
     "import_log": "importers.log",
     "import_rosbag2": "importers.rosbag2",
     "open_archive": "archive",
@@ -117,6 +123,7 @@ __all__ = [
     "identify_servo",
     "import_log",
     "import_rosbag2",
+    "load",
     "open_archive",
     "open_recording",
     "plan_move",
@@ -130,11 +137,11 @@ __all__ = [
 
 
 def identify(
-    recordings: str | PathLike[str] | Sequence[str | PathLike[str]],
+    recordings: Recordings,
     *,
     urdf: str | PathLike[str] | None = None,
     robot: Robot | RobotOf | None = None,
-    predict: str | PathLike[str] | Sequence[str | PathLike[str]] = (),
+    predict: Recordings = (),
     reading: ImportOptions | None = None,
     options: Options | None = None,
     reporter: Reporter | None = None,
@@ -142,8 +149,8 @@ def identify(
     """Identify an arm from recordings, as `hil identify` does; nothing is written before `save`.
 
     Args:
-        recordings: logs or bags, with the `urdf` or `robot` of their arm; or archives, or a
-            campaign folder.
+        recordings: logs, bags or pandas DataFrames, with the `urdf` or `robot` of their arm; or
+            archives, or a campaign folder.
         urdf: description of the arm.
         robot: in place of `urdf`, with gravity, friction law or joints that were not recorded: see
             :meth:`hil.Robot.from_urdf`.

@@ -31,7 +31,7 @@ from identification.estimators.prior import (
     with_prior,
 )
 from identification.estimators.robust import RobustEstimate, robust_estimate
-from identification.export.parameters import parameters_csv, parameters_json
+from identification.export.parameters import covariance_csv, parameters_csv, parameters_json
 from identification.export.urdf import write_urdf
 from identification.factor.columns import instrument_factor
 from identification.factor.estimate import Estimate, estimate

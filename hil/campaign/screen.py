@@ -364,7 +364,7 @@ class Screen:
     def of(cls, cell: Cell, stop: Stop, *, title: str = "", quiet: bool = False) -> Screen:
         """Return the screen of a run on a cell's own link; `title` is by default its name."""
         spec = cell.link_spec
-        link = SIMULATED if spec is None or spec.is_local else spec.description
+        link = SIMULATED if spec is None or cell.only_simulated else spec.description
         name = title or cell.name
         return cls(cell.joint_names, stop, title=name, controller=link, quiet=quiet)
 

@@ -268,9 +268,15 @@ class Cell:
 
     @property
     def only_simulated(self) -> bool:
-        """Whether the link can reach only a simulated controller on this computer."""
-        spec = self.link_spec
-        return spec is None or spec.is_local
+        """Whether the link can reach only a simulated controller."""
+        return self.simulates(self.link_spec)
+
+    def simulates(self, spec: TransportSpec | None) -> bool:
+        """Whether a transport leads to a simulated controller: on this computer, by `[simulation]`.
+
+        Without that table a program on this computer may be a bridge to a real controller.
+        """
+        return spec is None or (spec.is_local and self.file.simulation is not None)
 
     def session_settings(self, *, only_axis: int | None = None) -> dict[str, Any]:
         """Keyword arguments of `drivers.Session`."""

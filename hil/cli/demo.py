@@ -27,8 +27,9 @@ from hil.cli.verdict import finish
 from hil.control.errors import stopped
 from hil.control.simulation import simulated_link, simulated_provenance
 from hil.design import load_design
-from hil.report.output_files import FILES, REPORT, SERIES
+from hil.report.output_files import FILES, REPORT
 from hil.results.provenance import RESULTS
+from hil.results.series import SERIES
 from sim_fixtures.ns16 import CELL_PATH
 
 

@@ -48,8 +48,9 @@ from hil.export.servo_files import (
     export_servo,
     servo_folder,
 )
-from hil.pipeline.identified_model import IdentifiedModel, read_or_identify
+from hil.pipeline.identified_model import IdentifiedModel
 from hil.pipeline.options import Options
+from hil.pipeline.stored_identification import read_or_identify
 from identification.export.controller.c_source import Precision
 
 ExportName = Literal[FormatName, CodeName, ServoFormatName]

@@ -37,6 +37,7 @@ from hil.importers.robot import STANDARD_GRAVITY, Robot, Use
 from hil.importers.rosbag2 import Clock, Effort
 from hil.pipeline.options import friction_from
 from identification import FrictionLaw
+from identification.model.kinematics import MOST_JOINTS
 
 app = typer.Typer(
     help="Convert recordings of other formats to archives that `hil identify` reads.",
@@ -223,7 +224,8 @@ class Reading:
         list[str] | None,
         typer.Option(
             metavar="RECORDED=URDF",
-            help="Joint whose name in a bag differs from the URDF (repeatable).",
+            help="Joint whose name in a bag differs from the URDF (repeatable); {} is its number: "
+            "fer_joint{}=panda_joint{}.",
             rich_help_panel=CHANNELS,
         ),
     ] = None
@@ -311,7 +313,8 @@ def rosbag2(
         clock: Stamps to use: header (of the messages), bag (time of receipt) or auto.
         command_topic: Topic of the commanded positions, or none; by default the state of a
             controller, else a topic of commands that the positions follow.
-        rename: Joint whose name in the bag differs from the URDF (repeatable).
+        rename: Joint whose name in the bag differs from the URDF (repeatable); {} is its number:
+            fer_joint{}=panda_joint{}.
     """
     names = _names(rename or [])
     recording = import_bag(
@@ -417,13 +420,21 @@ def _print(recording: ImportedRecording, *, json: bool) -> None:
 
 
 def _names(renamed: list[str]) -> dict[str, str]:
-    """Parse RECORDED=URDF pairs."""
-    names = dict(text.partition("=")[::2] for text in renamed)
-    for recorded, name in names.items():
-        if not (recorded and name):
-            problem = f"{recorded or '=' + name!r} is not a pair"
-            raise InputError(None, problem, field="--rename", remedy="give RECORDED=URDF")
+    """Parse RECORDED=URDF pairs; {} is a number in both."""
+    names: dict[str, str] = {}
+    for text in renamed:
+        recorded, _, name = text.partition("=")
+        if not (recorded and name) or recorded.count("{}") != name.count("{}"):
+            problem = f"{text!r} is not a pair"
+            remedy = "give RECORDED=URDF, or a {} for the number in both: fer_joint{}=panda_joint{}"
+            raise InputError(None, problem, field="--rename", remedy=remedy)
+        numbers = range(MOST_JOINTS + 1) if "{}" in recorded else (0,)
+        names |= {_numbered(recorded, k): _numbered(name, k) for k in numbers}
     return names
+
+
+def _numbered(name: str, number: int) -> str:
+    return name.replace("{}", str(number))
 
 
 def _chosen(texts: Sequence[str]) -> dict[str, str]:

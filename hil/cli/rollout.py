@@ -23,8 +23,8 @@ from hil.cli.arguments import (
 )
 from hil.cli.identify_options import EstimatorOption, Identifying, servo_from
 from hil.cli.verdict import NOT_GOOD
-from hil.pipeline.identified_model import read_or_identify
 from hil.pipeline.options import Options
+from hil.pipeline.stored_identification import read_or_identify
 from hil.plots.chart_picture import draw_charts
 from hil.plots.plan_picture import save
 from hil.report.output_files import REPORT

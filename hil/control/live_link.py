@@ -513,7 +513,7 @@ class LiveLink(MotionLink):
             if isinstance(error, OSError):
                 raise ControllerError(f"the archive process cannot be started: {error}") from error
             raise
-        port = LivePort(cell, exchange, archive, heart, finish, only_simulated=spec.is_local)
+        port = LivePort(cell, exchange, archive, heart, finish, only_simulated=cell.simulates(spec))
         if live is not None:
             try:
                 port._serve(live)

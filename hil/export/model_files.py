@@ -9,7 +9,6 @@ from pathlib import Path
 from typing import Final, Literal
 
 import numpy as np
-import pinocchio as pin
 
 from hil.base.arrays import Array
 from hil.base.files import make_folder, write_files
@@ -24,7 +23,6 @@ from identification.export.simulators import (
     ModelFormat,
     SimulatorComparison,
     compare,
-    pinocchio_arm,
     read_back,
 )
 from identification.model.motion import Motion
@@ -81,16 +79,6 @@ class Exported:
             "verdict": self.verdict,
             "parameters_from": self.origin or None,
         }
-
-
-def pinocchio_of(identification: Identification) -> pin.Model:
-    """Return the arm of an identification as pinocchio's model, with armature and friction.
-
-    Raises:
-        InputError: there are no physically consistent parameters.
-    """
-    model = model_of(identification)
-    return pinocchio_arm(model.arm, model.name)
 
 
 def export_model(

@@ -17,6 +17,7 @@ from hil.base.arrays import Array
 from hil.base.files import file_digest, make_folder, write_files
 from hil.pipeline.run import Identification
 from hil.pipeline.sources import stamps_of
+from hil.pipeline.stored_identification import StoredIdentification
 
 PREDICTED: Final = "/joint_states_predicted"
 RESIDUAL: Final = "/joint_states_residual"
@@ -24,7 +25,7 @@ FOLDER: Final = "annotated"
 _ANNOTATION: Final = "annotation"  # metadata record of an annotated archive
 
 
-def annotate(identification: Identification, output: Path) -> list[Path]:
+def annotate(identification: Identification | StoredIdentification, output: Path) -> list[Path]:
     """Write a copy of each archive with its predicted torque and residual, in a new folder.
 
     The copies are for viewers: they lack the seals of an archive, and `hil identify` refuses them.
@@ -33,7 +34,7 @@ def annotate(identification: Identification, output: Path) -> list[Path]:
         ArchiveError: an archive cannot be read again.
     """
     prepared = identification.prepared
-    values = identification.estimate.pooled.values
+    values = identification.values
     sources = prepared.sources
     model = identification.cell.model
     held_out = () if sources.in_sample else zip(sources.held_out, prepared.held_out, strict=True)

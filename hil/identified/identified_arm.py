@@ -4,13 +4,12 @@ from __future__ import annotations
 
 import base64
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass, replace
 from functools import cached_property, partial
 from html import escape
-from io import BytesIO
 from os import PathLike
 from pathlib import Path
-from typing import TYPE_CHECKING, Final
+from typing import TYPE_CHECKING, TypeAlias
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -22,61 +21,73 @@ from hil.base.errors import InputError
 from hil.base.files import make_folder, write_output
 from hil.base.output_folder import SOURCES, folder_beside, sources_text
 from hil.base.progress import Reporter, Silent
+from hil.base.safe_input import path_exists
 from hil.base.threads import one_thread
-from hil.export.model_files import pinocchio_of
 from hil.identified.annotate import annotate as write_annotated
+from hil.identified.data_frames import as_logs
 from hil.identified.identified_servo import (
     IdentifiedServo,
     are_servos,
     identified_servo,
     refuse_comparison,
 )
+from hil.identified.recordings_read import recording_results
 from hil.identified.staging import Staging, require_torques, staged
+from hil.identified.torque_plot import TorquePlot, torque_plot
 from hil.importers.messages import sentence
 from hil.importers.recording import ImportOptions, RobotOf, is_archive
 from hil.importers.robot import Robot
-from hil.pipeline.identified_model import model_of
+from hil.pipeline.identified_model import IdentifiedModel, model_of
 from hil.pipeline.identify_folder import identify_paths
 from hil.pipeline.options import Options
 from hil.pipeline.run import Identification
-from hil.report.figures import MEASURED, NOMINAL, PREDICTED, RESIDUAL, joints_of, torque_charts
-from hil.report.output_files import write_outcome
+from hil.pipeline.stored_identification import (
+    NotReusableError,
+    StoredIdentification,
+    stored_identification,
+)
+from hil.report.output_files import copy_outcome, write_outcome
 from hil.results.results import Results
 from hil.rollout.servo_rollout import without_torque
+from identification.errors import ModelError
 from identification.export.observer import MomentumObserver
+from identification.export.parameter_table import parameter_table
+from identification.export.simulators import pinocchio_arm
 from identification.model.motion import Motion
+from identification.model.single_state import SingleStateTorque
 from identification.text import percentage
 from identification.validation.verdict import Verdict
 
 if TYPE_CHECKING:
     import pandas
     import pinocchio
-    from matplotlib.figure import Figure
+    from matplotlib.axes import Axes
 
-PathOrPaths = str | PathLike[str] | Sequence[str | PathLike[str]]
-
-_DOTS: Final = 100  # per inch, of a picture in a notebook
+Recording: TypeAlias = "str | PathLike[str] | pandas.DataFrame"
+Recordings: TypeAlias = "Recording | Sequence[Recording]"
 
 
 @dataclass(frozen=True, eq=False, repr=False)
 class IdentifiedArm:
-    """An identified arm, not written anywhere yet.
+    """An identified arm, of :func:`hil.identify` or :func:`hil.load`; it can be pickled.
 
     A notebook shows its verdict, its errors by joint, and measured and predicted torque.
 
     Attributes:
         recordings: files that were fitted, or a folder of archives.
         predicted: recordings that were predicted and not fitted.
-        identification: the estimate, and everything that it was computed from.
+        identification: the estimate, and everything that it was computed from or read from.
         channels: a line for each group of channels of imported recordings: what it is, and why.
         staging: imported recordings, whose archives are written with the result.
+        sources: content of `sources.json`, None of a folder of archives.
     """
 
     recordings: tuple[Path, ...]
     predicted: tuple[Path, ...]
-    identification: Identification
+    identification: Identification | StoredIdentification
     channels: tuple[str, ...]
     staging: Staging | None = None
+    sources: str | None = None
 
     def __repr__(self) -> str:
         return f"<IdentifiedArm {self.results.cell}: {self.verdict.line}>"
@@ -93,30 +104,18 @@ class IdentifiedArm:
 
     @cached_property
     def parameters(self) -> pandas.DataFrame:
-        """Base parameters, friction and elements by name.
+        """Base parameters, friction and elements by name, as in `parameters.csv`.
 
-        Estimate, ends of its 95 % interval and standard deviation in the unit of the row, as
-        measured by the torque of this arm; the standard deviation with the uncertainty of the scale
-        of that torque; whether the motion leaves the parameter undetermined; and its expression in
-        parameters of the bodies.
+        Meaning, body and joint; estimate and ends of its 95 % interval; unit; whether it is known
+        (yes: to a tenth; roughly: to a half; no); standard deviation, in units of the torque of
+        this arm and with the uncertainty of its scale; expression in parameters of the bodies.
         """
         import pandas  # only for this table
 
-        parameters = self.results.parameters
-        factor = self.results.uncertainty.interval_factor
-        return pandas.DataFrame(
-            {
-                "estimate": [parameter.estimate for parameter in parameters],
-                "lower": [parameter.estimate - factor * parameter.std for parameter in parameters],
-                "upper": [parameter.estimate + factor * parameter.std for parameter in parameters],
-                "std": [parameter.std for parameter in parameters],
-                "absolute_std": [parameter.absolute_std for parameter in parameters],
-                "unit": [parameter.unit for parameter in parameters],
-                "undetermined": [parameter.undetermined for parameter in parameters],
-                "expression": [parameter.expression for parameter in parameters],
-            },
-            index=pandas.Index([parameter.name for parameter in parameters], name="parameter"),
-        )
+        source = self.identification
+        stated = source.estimation.stated if isinstance(source, Identification) else source.estimate
+        rows = parameter_table(source.cell.model, stated)
+        return pandas.DataFrame([asdict(row) for row in rows]).set_index("name")
 
     def predict(self, q: ArrayLike, v: ArrayLike, a: ArrayLike) -> Array:
         """Return the torque [N·m, N] at positions, velocities and accelerations.
@@ -128,12 +127,23 @@ class IdentifiedArm:
         Raises:
             ShapeError: an array has another shape.
         """
-        model = self.identification.cell.model
         states = [np.asarray(values, dtype=np.float64) for values in (q, v, a)]
+        shape = states[0].shape
+        single = self._single_state
+        if single is not None and all(values.shape == single.shape for values in states):
+            return single(*states)
+        model = self.identification.cell.model
         motion = Motion.of_states(*map(np.atleast_2d, states))
-        values = self.identification.estimate.pooled.values
-        torque = model.torque(values, motion) + model.load_torque(motion)
-        return torque.reshape(states[0].shape)
+        torque = model.torque(self.identification.values, motion) + model.load_torque(motion)
+        return torque.reshape(shape)
+
+    @cached_property
+    def _single_state(self) -> SingleStateTorque | None:
+        """Torque of one state; None of an arm whose parameters no bodies with masses have."""
+        try:
+            return SingleStateTorque(self.identification.cell.model, self.identification.values)
+        except ModelError:
+            return None
 
     @property
     def model(self) -> pinocchio.Model:
@@ -142,7 +152,19 @@ class IdentifiedArm:
         Raises:
             InputError: there are no physically consistent parameters.
         """
-        return pinocchio_of(self.identification)
+        model = self._model
+        return pinocchio_arm(model.arm, model.name)
+
+    @property
+    def _model(self) -> IdentifiedModel:
+        source = self.identification
+        if isinstance(source, Identification):
+            return model_of(source)
+        try:
+            return source.model()
+        except NotReusableError as error:
+            remedy = "see the verdict of `hil identify`"
+            raise InputError(source.folder, str(error), remedy=remedy) from error
 
     def observer(self, gain: float, dt: float) -> MomentumObserver:
         """Return an observer of the torque from outside, such as that of a contact.
@@ -155,14 +177,29 @@ class IdentifiedArm:
             InputError: there are no physically consistent parameters.
             ModelError: gain or dt is not positive.
         """
-        return MomentumObserver(model_of(self.identification).arm, gain, dt)
+        return MomentumObserver(self._model.arm, gain, dt)
 
-    def plot(self) -> Figure:
-        """Draw measured torque of the held-out motion, and that of identified and nominal model."""
-        from hil.plots.chart_picture import draw_charts  # only for this picture
+    def plot(
+        self,
+        joints: Sequence[str | int] | str | int | None = None,
+        *,
+        size: tuple[float, float] | None = None,
+        axes: Axes | Sequence[Axes] | None = None,
+    ) -> TorquePlot:
+        """Draw measured torque of the held-out motion, and that of identified and nominal model.
 
-        charts = torque_charts(self.identification.series, joints_of(self.results))
-        return draw_charts([charts], [MEASURED, PREDICTED, NOMINAL, RESIDUAL])
+        Args:
+            joints: names, or numbers from 0; None: all.
+            size: of the figure [inch]; None: by the number of joints.
+            axes: of somebody's own figure, one for each joint, for the torque without its error.
+
+        Returns:
+            figure and series: `plot.figure`, `plot.savefig(...)`, `plot.series["measured"]`.
+
+        Raises:
+            InputError: there is no such joint, or another number of axes than of joints.
+        """
+        return torque_plot(self.results, self.identification.series, joints, size, axes)
 
     def save(
         self,
@@ -208,9 +245,7 @@ class IdentifiedArm:
         table = shown.to_html(
             index=False, border=0, float_format=partial(percentage, decimals=1), na_rep="-"
         )
-        picture = BytesIO()
-        self.plot().savefig(picture, format="png", dpi=_DOTS)
-        source = base64.b64encode(picture.getvalue()).decode("ascii")
+        source = base64.b64encode(self.plot().png()).decode("ascii")
         alternative = "Measured torque, and that of the identified and the nominal model"
         lines = (*self.verdict.warnings, *(f"next: {step}" for step in self.verdict.next_steps))
         remarks = "".join(f"<li>{escape(line)}</li>" for line in lines)
@@ -228,10 +263,10 @@ class IdentifiedArm:
 
 @one_thread()
 def arm_from(
-    recordings: PathOrPaths,
+    recordings: Recordings,
     urdf: str | PathLike[str] | None,
     robot: Robot | RobotOf | None,
-    predict: PathOrPaths,
+    predict: Recordings,
     reading: ImportOptions | None,
     options: Options | None,
     reporter: Reporter | None,
@@ -244,14 +279,15 @@ def arm_from(
             raise InputError(None, problem, field="urdf and robot", remedy=remedy)
         robot = Robot.from_urdf(urdf)
     robot_of = (lambda _: robot) if isinstance(robot, Robot) else robot
-    identified = identify_recordings(
-        _paths(recordings),
-        _paths(predict),
-        robot_of,
-        reading or ImportOptions(),
-        options or Options(),
-        reporter or Silent(),
-    )
+    with as_logs(recordings, predict) as (fitted, predicted):
+        identified = identify_recordings(
+            fitted,
+            predicted,
+            robot_of,
+            reading or ImportOptions(),
+            options or Options(),
+            reporter or Silent(),
+        )
     if isinstance(identified, IdentifiedServo):
         problem = "has no torque, so that servo and friction can be identified, not an arm"
         remedy = "use hil.identify_servo(...)"
@@ -261,10 +297,10 @@ def arm_from(
 
 @one_thread()
 def identify_servo(
-    recordings: PathOrPaths,
+    recordings: Recordings,
     *,
     urdf: str | PathLike[str],
-    predict: PathOrPaths = (),
+    predict: Recordings = (),
     compare: str | PathLike[str] | None = None,
     reading: ImportOptions | None = None,
     reporter: Reporter | None = None,
@@ -272,7 +308,7 @@ def identify_servo(
     """Identify servo and friction of an arm without torque; nothing is written before `save`.
 
     Args:
-        recordings: logs, bags or folders with commanded and measured positions.
+        recordings: logs, bags or folders with commanded and measured positions, or DataFrames.
         urdf: description of the arm, with masses.
         predict: recordings to predict from their commands alone, and not to fit.
         compare: MJCF whose servo parameters are compared.
@@ -283,19 +319,47 @@ def identify_servo(
         InputError: a recording or the URDF cannot be read, or nothing can be identified from it.
     """
     robot = Robot.from_urdf(urdf)
-    identified = identify_recordings(
-        _paths(recordings),
-        _paths(predict),
-        lambda _: robot,
-        reading or ImportOptions(),
-        Options(),
-        reporter or Silent(),
-        compare=None if compare is None else Path(compare),
-    )
+    with as_logs(recordings, predict) as (fitted, predicted):
+        identified = identify_recordings(
+            fitted,
+            predicted,
+            lambda _: robot,
+            reading or ImportOptions(),
+            Options(),
+            reporter or Silent(),
+            compare=None if compare is None else Path(compare),
+        )
     if isinstance(identified, IdentifiedArm):
-        remedy = "use hil.identify(...)"
-        raise InputError(_paths(recordings)[0], "has torques", field="torque", remedy=remedy)
+        problem = "has torques"
+        raise InputError(
+            identified.recordings[0], problem, field="torque", remedy="use hil.identify(...)"
+        )
     return identified
+
+
+@one_thread()
+def load(folder: str | PathLike[str]) -> IdentifiedArm:
+    """Return the arm in a folder of `hil identify` or `save`, without identifying it again.
+
+    Raises:
+        InputError: the folder has no result, or its archives are not those that were identified.
+    """
+    place = Path(folder)
+    try:
+        stored = stored_identification(place, Silent())
+    except NotReusableError as error:
+        problem = f"cannot be loaded: {error}"
+        raise InputError(place, problem, remedy=f"identify again: hil identify {place}") from error
+    settings = stored.results.settings
+    assert settings is not None
+    fitted, predicted = (
+        tuple(path for path in stored.paths if (path.name in settings.predicted) is held_out)
+        for held_out in (False, True)
+    )
+    channels = tuple(
+        f"{each.file}: {line}" for each in stored.results.recordings for line in each.channels
+    )
+    return IdentifiedArm(fitted, predicted, stored, channels)
 
 
 def identify_recordings(
@@ -330,13 +394,7 @@ def identify_recordings(
     if not recordings:
         raise InputError(None, "there is no recording", remedy="name a log, a bag or an archive")
     if robot_of is None:
-        _require_archives((*recordings, *predict))
-        if _lack_torque((*recordings, *predict)):
-            staging = Staging(list(recordings), list(predict))
-            return identified_servo(staging, recordings, predict, options, compare, (), reporter)
-        refuse_comparison(compare)
-        identification = _identified(recordings, predict, options, reporter)
-        return IdentifiedArm(tuple(recordings), tuple(predict), identification, ())
+        return _of_archives(recordings, predict, options, compare, reporter)
     with staged(recordings, predict, robot_of, reading, reporter) as staging:
         if output is not None:
             staging.check_places(output)
@@ -348,9 +406,36 @@ def identify_recordings(
         refuse_comparison(compare)
         require_torques(staging)
         identification = _identified(staging.fitted, staging.predicted, options, reporter)
+    read = recording_results(staging, predict)
+    results = identification.results.model_copy(update={"recordings": read})
     return IdentifiedArm(
-        tuple(recordings), tuple(predict), identification, _channels(staging), staging
+        tuple(recordings),
+        tuple(predict),
+        replace(identification, results=results),
+        _channels(staging),
+        staging,
+        sources_text(recordings, predict),
     )
+
+
+def _of_archives(
+    recordings: Sequence[Path],
+    predict: Sequence[Path],
+    options: Options,
+    compare: Path | None,
+    reporter: Reporter,
+) -> IdentifiedArm | IdentifiedServo:
+    """Identify from archives, see :func:`identify_recordings`."""
+    _require_archives((*recordings, *predict))
+    if _lack_torque((*recordings, *predict)):
+        staging = Staging(list(recordings), list(predict))
+        return identified_servo(staging, recordings, predict, options, compare, (), reporter)
+    refuse_comparison(compare)
+    identification = _identified(recordings, predict, options, reporter)
+    first = recordings[0]
+    is_folder = first.is_dir() and is_archive(first)
+    sources = None if is_folder else sources_text(recordings, predict)
+    return IdentifiedArm(tuple(recordings), tuple(predict), identification, (), sources=sources)
 
 
 def _lack_torque(archives: Sequence[Path]) -> bool:
@@ -388,12 +473,20 @@ def write_arm(
     first = arm.recordings[0]
     staging = arm.staging
     identification = arm.identification
-    is_folder = first.is_dir() and is_archive(first)
-    sources = None if is_folder else sources_text(arm.recordings, arm.predicted)
+    sources = arm.sources
+    if isinstance(identification, StoredIdentification):
+        place = Path(folder or identification.folder)
+        make_folder(place)
+        copy_outcome(identification.folder, place, identification.paths)
+        if annotate:
+            write_annotated(identification, place)
+        return place, identification.results
     if folder is not None:
         place = Path(folder)
     else:
-        place = first if sources is None else folder_beside(first, sources)
+        place = first
+        if sources is not None:  # a DataFrame has no place of its own
+            place = folder_beside(first if path_exists(first) else Path(first.name), sources)
     if staging is not None:
         staging.check_places(place)
     make_folder(place)
@@ -421,7 +514,3 @@ def _channels(staging: Staging) -> tuple[str, ...]:
         for archive, recording in staging.recordings.items()
         for conclusion in recording.concluded
     )
-
-
-def _paths(paths: PathOrPaths) -> tuple[Path, ...]:
-    return (Path(paths),) if isinstance(paths, str | PathLike) else tuple(map(Path, paths))

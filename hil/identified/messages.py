@@ -9,35 +9,12 @@ from typing import Final
 from hil.base.terminal_text import plural
 from hil.identified.identified_arm import IdentifiedArm
 from hil.identified.identified_servo import IdentifiedServo
-from hil.importers.conclusions import (
-    ChannelMeaning,
-    ConcludedUnit,
-    Conclusion,
-    JointOrder,
-    JointRange,
-    KnownCommands,
-    LockedJoints,
-    RecordedClock,
-    StatedUnit,
-)
+from hil.identified.recordings_read import content
 from hil.importers.messages import sentence
-from hil.importers.recording import ImportedRecording
 from hil.look.readings import DoubtfulArm
 from hil.look.result import ChangedReading
 from hil.pipeline.sources import Source
 
-_USUAL: Final = (
-    ChannelMeaning,
-    ConcludedUnit,
-    JointOrder,
-    JointRange,
-    KnownCommands,
-    LockedJoints,
-    RecordedClock,
-    StatedUnit,
-    ChangedReading,
-    DoubtfulArm,
-)
 _MOST: Final = 3
 
 
@@ -107,22 +84,6 @@ def _imported(arm: IdentifiedArm) -> Iterator[tuple[str, str]]:
         if shared:
             text = f"{text}; the end is predicted, not fitted"
         yield use, f"{source.name}: {text}"
-
-
-def content(recording: ImportedRecording) -> str:
-    """Return joints, duration and rate of a recording, and what is unusual about it."""
-    found = (*recording.concluded, *recording.examined.found)
-    clock = next((each.base for each in found if isinstance(each, RecordedClock)), None)
-    joints = sum(isinstance(each, JointRange) for each in found)
-    parts = [plural(joints, "joint")]
-    if clock is not None:
-        parts = [f"{parts[0]}, {clock.duration:.3g} s at {clock.rate:.4g} Hz"]
-        parts += clock.describe()[1:]
-    return "; ".join([*parts, *map(sentence, _unusual(found, recording.examined.warnings))])
-
-
-def _unusual(found: Sequence[Conclusion], warnings: Sequence[Conclusion]) -> list[Conclusion]:
-    return [*warnings, *(each for each in found if not isinstance(each, _USUAL))]
 
 
 def _archives(sources: Sequence[Source]) -> str:

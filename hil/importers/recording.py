@@ -541,7 +541,7 @@ def _read_bag(
     entries = content.metadata
     keys = ("topic", "clock", "effort", "command_topic")
     read = {key: entries[key] for key in keys if key in entries}
-    bag = BagMap.model_validate({**read, "rename": dict(names), "arm": robot.links})
+    bag = BagMap.model_validate({**read, "rename": _used(names, robot), "arm": robot.links})
     basis = NameBasis.MESSAGE, UnitBasis.MESSAGE
     concluded = tuple(
         ChannelMeaning(channel.name, kind, basis[0], next(iter(UNITS[kind])), basis[1])
@@ -556,6 +556,11 @@ def _read_bag(
         meaning = ChannelMeaning(topic, "commanded_position", commands[0], None, commands[1], how)
         concluded = (*concluded, meaning)
     return request.imported(content, None, concluded, bag)
+
+
+def _used(names: Mapping[str, str], robot: Robot) -> dict[str, str]:
+    """Return the changed names of the joints of a robot."""
+    return {recorded: name for recorded, name in names.items() if name in robot.joint_names}
 
 
 def _content(kind: Kind | None, effort: Effort) -> Kind | None:

@@ -8,6 +8,7 @@ from functools import cached_property
 from pathlib import Path
 
 from hil.archive import Archive, place_of
+from hil.base.arrays import Array
 from hil.base.progress import Reporter
 from hil.base.threads import one_thread
 from hil.cell import Cell
@@ -46,6 +47,11 @@ class Identification:
     def estimate(self) -> RepeatedEstimate:
         """Pooled and per repetition."""
         return self.estimation.result
+
+    @property
+    def values(self) -> Array:
+        """Identified parameters (p,)."""
+        return self.estimate.pooled.values
 
     @property
     def consistency(self) -> ConsistencyCheck | str:

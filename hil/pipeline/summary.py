@@ -125,6 +125,7 @@ def _consistency(model: RobotModel, check: ConsistencyCheck) -> results.Consiste
             mass=inertial[:, 9],
             centre=inertial[:, 6:9] / inertial[:, 9:],
             rotor_inertia=[standard.get(f"I{k + 1}m") for k in range(model.n_joints)],
+            rotor_at_bound=model.layout.rotors_at_bound(consistent.standard).tolist(),
             room=check.room,
             reference=consistent.reference,
         ),

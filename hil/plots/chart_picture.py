@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import Final
 
 from matplotlib.artist import Artist
@@ -22,18 +23,22 @@ _POINTS: Final = 0.75  # per pixel
 
 
 def draw_charts(
-    columns: Sequence[Sequence[Chart]], legends: Sequence[Legend] = (), *, enlarged: float = 1.0
+    columns: Sequence[Sequence[Chart]],
+    legends: Sequence[Legend] = (),
+    *,
+    enlarged: float = 1.0,
+    size: tuple[float, float] | None = None,
 ) -> Figure:
     """Draw columns of charts side by side, with the legends of the lines that they contain.
 
     The legend of a single column is above it, those of several are in their charts. Plots are
-    `enlarged` in height over those of a page.
+    `enlarged` in height over those of a page, unless the `size` of the figure is given, in inches.
     """
     heights = [[plot.height for chart in column for plot in chart.plots] for column in columns]
     rows = max(map(len, heights))
-    size = _WIDTH, (enlarged * max(map(sum, heights)) + rows * _FRAME + _FRAME) / _PIXELS
+    height = (enlarged * max(map(sum, heights)) + rows * _FRAME + _FRAME) / _PIXELS
     with style.page():
-        figure = Figure(size, layout="constrained")
+        figure = Figure(size or (_WIDTH, height), layout="constrained")
         grid = figure.add_gridspec(1, len(columns))
         for k, (column, ratios) in enumerate(zip(columns, heights, strict=True)):
             cells = grid[k].subgridspec(len(ratios), 1, height_ratios=ratios)
@@ -51,6 +56,16 @@ def draw_charts(
                 fontsize=style.SMALL,
             )
     return figure
+
+
+def draw_torque(axes: Axes, chart: Chart, legends: Sequence[Legend]) -> None:
+    """Draw the first plot of a chart into axes of somebody's own figure."""
+    plot = chart.plots[0]
+    _draw_plot(axes, plot, chart)
+    axes.set_title(chart.caption.title)
+    axes.set_xlabel(chart.foot)
+    axes.set_ylabel(plot.heading)
+    axes.legend(*_entries([replace(chart, plots=[plot])], legends))
 
 
 def _entries(charts: Sequence[Chart], legends: Sequence[Legend]) -> tuple[list[Artist], list[str]]:

@@ -2,13 +2,11 @@
 
 from __future__ import annotations
 
-import zipfile
+import shutil
 from collections.abc import Collection, Mapping
 from dataclasses import dataclass
 from datetime import UTC, datetime
-from io import BytesIO
 from pathlib import Path
-from typing import Any, Final
 
 import numpy as np
 
@@ -16,26 +14,24 @@ from hil.archive import open_archive
 from hil.archive.check import recording_date
 from hil.base.arrays import Array
 from hil.base.errors import InputError
-from hil.base.files import file_digest, write_files
+from hil.base.files import convert_write_errors, file_digest, write_files
+from hil.base.output_folder import SOURCES
 from hil.base.progress import Reporter
-from hil.base.safe_input import open_file, path_exists
+from hil.base.safe_input import path_exists
 from hil.cell import Cell
 from hil.pipeline.run import Identification
 from hil.report.page import report_bytes
 from hil.results.provenance import PARAMETERS_JSON, RESULTS, provenance_of, single_line
 from hil.results.results import ExportResult, OccasionResult, Results, SettingsResult
 from hil.results.rollout_result import ROLLOUT, RolloutResult
-from hil.results.series import ReportSeries
+from hil.results.series import SERIES, load_series
 from identification import Estimate, IdentificationError
 from identification.estimators.consistent import ConsistentEstimate
 from identification.export.friction import median_load
-from identification.export.parameters import parameters_csv, parameters_json
+from identification.export.parameters import covariance_csv, parameters_csv, parameters_json
 from identification.export.urdf import write_urdf
 
 REPORT = "report.html"
-SERIES = "report_series.npz"
-_LARGEST: Final = 1 << 30
-"""Maximum size of series in bytes, a hundred times that of a campaign of 30 repetitions."""
 
 
 def write_outcome(folder: Path, identification: Identification, reporter: Reporter) -> Results:
@@ -66,7 +62,7 @@ def write_outcome(folder: Path, identification: Identification, reporter: Report
     files = {
         **exports.contents,
         RESULTS: results.to_json(),
-        SERIES: _series_bytes(identification.series),
+        SERIES: identification.series.to_bytes(),
         REPORT: report_bytes(results, identification.series),
     }
     write_files(folder, files)
@@ -75,6 +71,22 @@ def write_outcome(folder: Path, identification: Identification, reporter: Report
     reporter.say(f"written to {folder}: {RESULTS}, {', '.join(exports.result.written)}")
     reporter.say(f"report: {folder / REPORT}")
     return results
+
+
+def copy_outcome(folder: Path, place: Path, archives: Collection[Path]) -> None:
+    """Copy results, report, exports and archives to another folder.
+
+    Raises:
+        OutputError: it cannot be written to.
+    """
+    if folder.resolve() == place.resolve():
+        return
+    names = (RESULTS, SERIES, REPORT, *FILES, SOURCES, "map.toml")
+    paths = [folder / name for name in names]
+    write_files(place, {path.name: path.read_bytes() for path in paths if path_exists(path)})
+    with convert_write_errors(place):
+        for archive in archives:
+            shutil.copyfile(archive, place / archive.name)
 
 
 def occasion_of(identification: Identification) -> OccasionResult:
@@ -131,7 +143,7 @@ def rewrite_report(folder: Path) -> Results:
         OutputError: the report cannot be written.
     """
     results = Results.load(folder / RESULTS)
-    series = _load_series(folder / SERIES, len(results.joint_names))
+    series = load_series(folder, len(results.joint_names))
     rollout = _rollout_in(folder)
     try:
         page = report_bytes(results, series, rollout)
@@ -144,35 +156,10 @@ def rewrite_report(folder: Path) -> Results:
     return results
 
 
-def _series_bytes(series: ReportSeries) -> bytes:
-    """Return the series of the figures as a `.npz` file."""
-    content = BytesIO()
-    arrays: dict[str, Any] = {"example_archive": series.example_archive, **series.arrays}
-    np.savez_compressed(content, **arrays)
-    return content.getvalue()
-
-
-def _load_series(path: Path, n_joints: int) -> ReportSeries:
-    try:
-        with open_file(path) as stream:
-            with zipfile.ZipFile(stream) as members:
-                size = sum(member.file_size for member in members.infolist())
-            if size > _LARGEST:
-                raise ValueError(f"it would take {size} bytes")
-            stream.seek(0)
-            with np.load(stream, allow_pickle=False) as archive:
-                arrays: dict[str, Any] = {name: archive[name] for name in archive.files}
-        arrays["example_archive"] = str(arrays["example_archive"])
-        return ReportSeries.from_arrays(arrays).checked_for(n_joints)
-    except Exception as error:  # readers of a corrupt file may raise anything
-        problem = f"does not contain the series of a report ({error})"
-        remedy = "identify again from the archives (`hil identify`)"
-        raise InputError(path, problem, remedy=remedy) from error
-
-
 URDF = "identified.urdf"
 PARAMETERS_CSV = "parameters.csv"
-FILES = (PARAMETERS_JSON, PARAMETERS_CSV, URDF)
+COVARIANCE_CSV = "parameters_covariance.csv"
+FILES = (PARAMETERS_JSON, PARAMETERS_CSV, COVARIANCE_CSV, URDF)
 """Exports of an identification."""
 
 
@@ -214,6 +201,7 @@ def exports_of(
             model, estimate, consistent=possible, essential=essential, provenance=origin
         ),
         PARAMETERS_CSV: parameters_csv(model, estimate, provenance=origin),
+        COVARIANCE_CSV: covariance_csv(estimate, provenance=origin),
     }
     withheld = {}
     if possible is None:

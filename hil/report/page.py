@@ -36,7 +36,8 @@ _USES: Final = {
     "identified.urdf": "the arm for pinocchio, MuJoCo, Gazebo and controllers; other formats:"
     " hil export FOLDER --to mjcf",
     "parameters.json": "parameters with covariance and the bodies of the links, for programs",
-    "parameters.csv": "the same as a table, for spreadsheets, MATLAB and R",
+    "parameters.csv": "a row for each parameter, for spreadsheets, MATLAB and R",
+    "parameters_covariance.csv": "their covariance",
     RESULTS: "every number of this page",
 }
 _PICTURES: Final = {

@@ -19,6 +19,7 @@ from hil.base.errors import InputError
 from hil.base.safe_input import parse_json, read_text
 from hil.base.type_adapter import adapter_of
 from identification.excitation.criteria import Criteria
+from identification.factor.estimate import KNOWN
 from identification.purposes.thresholds import ContactThreshold
 from identification.selection.essential import EliminationStep
 from identification.selection.settings import Choice, Settings
@@ -210,6 +211,7 @@ class LinkResult(Frozen):
     mass: float
     centre: list[float]  #: Centre of mass in the joint's frame, m
     rotor_inertia: float | None
+    rotor_at_bound: bool = False  #: Whether that is zero because no torque shows a rotor
     room: float
     """Smallest second moment over that of the nominal body; 0 at the limit of consistency."""
     reference: str  #: Origin of its nominal body
@@ -237,6 +239,16 @@ class ExportResult(Frozen):
 
     written: list[str]
     withheld: dict[str, str]  #: Files that were not written, with the reason
+
+
+class RecordingResult(Frozen):
+    """What was read of a log or a bag."""
+
+    file: str
+    use: Literal["fitted", "predicted"]
+    content: str  #: Joints, duration and rate
+    changes: list[str]  #: What is not as the file has it: signs, order, units, rows
+    channels: list[str]  #: Meaning of each group of channels, and why
 
 
 class OccasionResult(Frozen):
@@ -342,10 +354,8 @@ class ParameterResult(Frozen):
         """Accuracy: 10 % or better, 50 % or better, worse, or undetermined."""
         if self.undetermined or not math.isfinite(self.std):
             return "undetermined"
-        size = abs(self.estimate)
-        if self.std <= 0.1 * size:
-            return "within 10 %"
-        return "within 50 %" if self.std <= 0.5 * size else "not identified"
+        well, roughly = (self.std <= share * abs(self.estimate) for share in KNOWN)
+        return "within 10 %" if well else "within 50 %" if roughly else "not identified"
 
     def deviation_of(self, estimate: float, std: float) -> float | None:
         """Return the deviation of another estimate of this parameter."""
@@ -530,6 +540,7 @@ class Results(Frozen):
     exports: ExportResult | None = None
     judgement: JudgementResult
     conduct: ConductResult | None = None  #: Null without a campaign folder
+    recordings: list[RecordingResult] = []  #: Imported ones; empty of archives
     occasion: OccasionResult | None = None  #: Null in files of earlier versions
     settings: SettingsResult | None = None  #: Likewise
 

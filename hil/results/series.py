@@ -2,18 +2,27 @@
 
 from __future__ import annotations
 
+import zipfile
 from collections.abc import Mapping
 from dataclasses import dataclass, fields, replace
+from io import BytesIO
+from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
 
 from hil.base.arrays import Array
+from hil.base.errors import InputError
+from hil.base.safe_input import open_file
 from identification import RobotModel
 from identification.signals.samples import Samples
 from identification.signals.spectrum import power_density
 from identification.validation.prediction import for_figure
 
+SERIES: Final = "report_series.npz"
+"""File of the series in a folder of results."""
+_LARGEST: Final = 1 << 30
+"""Most bytes of the series in a file, a hundred times those of a campaign of 30 repetitions."""
 _TOO_LARGE: Final = 1e100
 _ROWS: Final = 30_000
 """Most rows of the example that a file holds."""
@@ -98,6 +107,13 @@ class ReportSeries:
         """All arrays that are known, by name."""
         return {name: value for name, value in vars(self).items() if isinstance(value, np.ndarray)}
 
+    def to_bytes(self) -> bytes:
+        """Return the content of a `.npz` file."""
+        content = BytesIO()
+        arrays: dict[str, Any] = {"example_archive": self.example_archive, **self.arrays}
+        np.savez_compressed(content, **arrays)
+        return content.getvalue()
+
     def checked_for(self, n_joints: int) -> ReportSeries:
         """Return the series, or raise SeriesError unless they have `n_joints`."""
         columns = self.excitation_position.shape[1]
@@ -107,6 +123,30 @@ class ReportSeries:
 
 
 _OPTIONAL: Final = tuple(field.name for field in fields(ReportSeries) if field.default is None)
+
+
+def load_series(folder: Path, n_joints: int) -> ReportSeries:
+    """Read the series in a folder of results.
+
+    Raises:
+        InputError: there are none, or of another number of joints.
+    """
+    path = folder / SERIES
+    try:
+        with open_file(path) as stream:
+            with zipfile.ZipFile(stream) as members:
+                size = sum(member.file_size for member in members.infolist())
+            if size > _LARGEST:
+                raise ValueError(f"it would take {size} bytes")
+            stream.seek(0)
+            with np.load(stream, allow_pickle=False) as archive:
+                arrays: dict[str, Any] = {name: archive[name] for name in archive.files}
+        arrays["example_archive"] = str(arrays["example_archive"])
+        return ReportSeries.from_arrays(arrays).checked_for(n_joints)
+    except Exception as error:  # readers of a corrupt file may raise anything
+        problem = f"does not contain the series of a report ({error})"
+        remedy = "identify again from the archives (`hil identify`)"
+        raise InputError(path, problem, remedy=remedy) from error
 
 
 def example_series(

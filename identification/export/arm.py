@@ -79,8 +79,7 @@ class ExportedArm:
 
     def link(self, joint: int) -> str:
         """Return the name of the link that a joint moves, different from that of any joint."""
-        frames = self.model.chain.frames
-        name = next((name for name, frame in frames.items() if frame.joint == joint), "link")
+        name = self.model.chain.link(joint) or "link"
         return f"{name}_link" if name in self.model.joint_names else name
 
     def fixed(self, joint: int) -> dict[str, tuple[Array, Array]]:

@@ -13,9 +13,9 @@ from typing import Any, Final
 
 import numpy as np
 
-from identification.errors import IdentificationError
 from identification.estimators.consistent import ConsistentEstimate
 from identification.estimators.torque_scale import absolute
+from identification.export.parameter_table import ParameterRow, parameter_table
 from identification.export.urdf import not_in_urdf
 from identification.factor.estimate import Estimate
 from identification.model.link_wrenches import LINK_SYMBOLS
@@ -70,16 +70,16 @@ def parameters_json(
         "undetermined": list(estimate.undetermined),
         "parameters": [
             {
-                "name": name,
-                "expression": expression,
-                "unit": unit,
-                "value": value,
-                "std": std,
-                "absolute_std": absolute_std,
-                "determined": name not in estimate.undetermined,
-                "essential": None if essential is None else name in essential,
+                "name": row.name,
+                "expression": row.expression,
+                "unit": row.unit,
+                "value": row.estimate,
+                "std": row.std,
+                "absolute_std": row.absolute_std,
+                "determined": row.name not in estimate.undetermined,
+                "essential": None if essential is None else row.name in essential,
             }
-            for name, expression, unit, value, std, absolute_std in _rows(model, estimate)
+            for row in parameter_table(model, estimate)
         ],
         "covariance": estimate.covariance.tolist(),
         "absolute_covariance": absolute(estimate).covariance.tolist(),
@@ -92,24 +92,29 @@ def parameters_json(
 def parameters_csv(
     model: RobotModel, estimate: Estimate, *, provenance: Mapping[str, str] | None = None
 ) -> str:
-    """Return a table with one row per parameter, its row of the covariance matrix last.
+    """Return a table with one row per parameter, see :class:`ParameterRow`.
 
-    Standard deviation and covariance are in units of the torque of the arm; `absolute_std` has the
-    uncertainty of the scale of that torque as well. Provenance is in lines at the beginning that
-    start with # (pandas: ``comment="#"``).
+    Provenance is in lines at the beginning that start with # (pandas: ``comment="#"``).
 
     Raises:
         IdentificationError: the estimate is of other parameters.
     """
-    remarks = {**(provenance or {}), "method": estimate.method, "convention": CONVENTION}
-    covariances = [f"cov({name})" for name in estimate.names]
-    rows: list[list[object]] = [
-        ["name", "unit", "value", "std", "expression", "absolute_std", *covariances]
+    columns = [field.name for field in dataclasses.fields(ParameterRow)]
+    rows = map(dataclasses.astuple, parameter_table(model, estimate))
+    return _table(_remarks(estimate, provenance), [columns, *rows])
+
+
+def covariance_csv(estimate: Estimate, *, provenance: Mapping[str, str] | None = None) -> str:
+    """Return the covariance in units of the torque of the arm, a row and column per parameter."""
+    rows: list[list[object]] = [["name", *estimate.names]]
+    rows += [
+        [name, *row] for name, row in zip(estimate.names, estimate.covariance.tolist(), strict=True)
     ]
-    for line, row in zip(_rows(model, estimate), estimate.covariance.tolist(), strict=True):
-        name, expression, unit, value, std, absolute_std = line
-        rows.append([name, unit, value, std, expression, absolute_std, *row])
-    return _table(remarks, rows)
+    return _table(_remarks(estimate, provenance), rows)
+
+
+def _remarks(estimate: Estimate, provenance: Mapping[str, str] | None) -> dict[str, str]:
+    return {**(provenance or {}), "method": estimate.method, "convention": CONVENTION}
 
 
 def _table(remarks: Mapping[str, str], rows: Iterable[Sequence[object]]) -> str:
@@ -123,21 +128,13 @@ def _table(remarks: Mapping[str, str], rows: Iterable[Sequence[object]]) -> str:
     return out.getvalue()
 
 
-def _rows(model: RobotModel, estimate: Estimate) -> list[tuple[str, str, str, float, float, float]]:
-    """Return name, expression, unit, value, standard deviation, and the absolute one of each."""
-    if estimate.names != model.parameter_names:
-        raise IdentificationError("the estimate is not of the model's parameters")
-    expressions = model.expressions()
-    numbers = estimate.values.tolist(), estimate.std.tolist(), absolute(estimate).std.tolist()
-    return list(zip(estimate.names, expressions, estimate.units, *numbers, strict=True))
-
-
 def _standard(model: RobotModel, consistent: ConsistentEstimate) -> dict[str, Any]:
     """Return the consistent standard parameters and friction, joint by joint."""
     layout = model.layout
     standard = consistent.standard
     inertial = standard[layout.links].tolist()
     rotors = standard[layout.rotors].tolist()
+    at_bound = layout.rotors_at_bound(standard)
     terms = list(zip(model.friction.terms, consistent.friction.tolist(), strict=True))
     elements = consistent.estimate.values[model.element_part].tolist()
     return {
@@ -147,6 +144,7 @@ def _standard(model: RobotModel, consistent: ConsistentEstimate) -> dict[str, An
                 "joint": name,
                 **dict(zip(LINK_SYMBOLS, inertial[joint], strict=True)),
                 "rotor_inertia": rotors[joint] if rotors else None,
+                "rotor_at_bound": bool(at_bound[joint]),
                 "friction": {
                     term.symbol: value
                     for term, value in terms

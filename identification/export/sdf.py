@@ -104,9 +104,7 @@ def _drake() -> tuple[Any, Any, Any]:
     try:
         from pydrake.multibody import parsing, plant, tree  # optional dependency
     except ImportError as error:
-        raise MissingDrakeError(
-            "Drake is not installed; install hil with its extra: pip install 'hil[sdf]'"
-        ) from error
+        raise MissingDrakeError("Drake is not installed: pip install drake") from error
     return parsing, tree, plant
 
 

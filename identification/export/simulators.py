@@ -506,9 +506,7 @@ def load_mujoco() -> Any:
     try:
         import mujoco  # optional dependency
     except ImportError as error:
-        raise MissingMujocoError(
-            "MuJoCo is not installed; install hil with its extra: pip install 'hil[mujoco]'"
-        ) from error
+        raise MissingMujocoError("MuJoCo is not installed: pip install mujoco") from error
     return mujoco
 
 

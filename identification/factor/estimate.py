@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Final, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,6 +13,10 @@ from identification.arrays import Array, Indices
 from identification.factor.factor import Factor, require_rows
 from identification.factor.normal_equations import Solution
 from identification.model.robot import RobotModel
+
+Known = Literal["yes", "roughly", "no"]
+KNOWN: Final = (0.1, 0.5)
+"""Standard deviations, as shares of the estimate, up to which a parameter is known, or roughly."""
 
 
 def residual_variance(factor: Factor, values: Array, root: Array, weights: Array) -> Array:
@@ -66,6 +71,15 @@ class Estimate:
     def std(self) -> Array:
         """Standard deviations (p,)."""
         return np.sqrt(np.diag(self.covariance))
+
+    @property
+    def known(self) -> tuple[Known, ...]:
+        """How well each parameter is known (p,), by :data:`KNOWN`."""
+        well, roughly = (self.std <= share * np.abs(self.values) for share in KNOWN)
+        return tuple(
+            "no" if name in self.undetermined or not rough else "yes" if good else "roughly"
+            for name, good, rough in zip(self.names, well, roughly, strict=True)
+        )
 
     def value(self, name: str) -> float:
         """Return one parameter by name."""

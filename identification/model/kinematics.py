@@ -142,6 +142,10 @@ class Chain:
             raise ModelError(f"the payload's frame {name!r} is fixed to the base")
         return self.frames[name]
 
+    def link(self, joint: int) -> str:
+        """Return the name of the link that a joint moves, "" without frames."""
+        return next((name for name, frame in self.frames.items() if frame.joint == joint), "")
+
     def ancestors(self, joint: int) -> tuple[int, ...]:
         """Return the joints that move link `joint`, from the base to the joint itself."""
         path = [joint]

@@ -25,6 +25,7 @@ from identification.model.regressor import Regressor, RegressorPlan
 
 _N_LINK = len(LINK_SYMBOLS)
 _N_SINGLE_DIGITS = 9
+_NO_ROTOR = 1e-7  # of the largest parameter of the link: what a solver leaves of zero
 
 
 @dataclass(frozen=True)
@@ -90,6 +91,14 @@ class StandardLayout:
         links = [[k for k in range(_N_LINK) if start + k in there] for start in joints]
         rotors = [self.rotor_inertia and start + _N_LINK in there for start in joints]
         return links, rotors, sorted(k - first for k in there if k >= first)
+
+    def rotors_at_bound(self, standard: Array) -> NDArray[np.bool_]:
+        """Return whose rotor inertia is zero (n,) except for rounding, as no torque shows one."""
+        values = self.checked(standard)
+        if not self.rotor_inertia:
+            return np.zeros(self.n_joints, dtype=np.bool_)
+        inertia = np.abs(values[self.links]).max(axis=1)
+        return np.asarray(values[self.rotors] <= _NO_ROTOR * inertia)
 
     def rotor_matrix(self, standard: Array) -> Array:
         """Return the inertia matrix of the rotors in joint coordinates (n, n)."""

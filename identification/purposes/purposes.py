@@ -20,7 +20,7 @@ from identification.purposes.thresholds import ContactThreshold, contact_thresho
 from identification.signals.samples import Samples
 from identification.validation.evidence import Evidence
 from identification.validation.finding import Thresholds
-from identification.validation.purpose import KNOWN, Purpose, PurposeLimits
+from identification.validation.purpose import Purpose, PurposeLimits
 
 
 @dataclass(frozen=True, eq=False)
@@ -165,10 +165,7 @@ def simulation(arm: Application, limits: PurposeLimits) -> Purpose:
 
 
 def single_parameters(estimate: Estimate) -> Purpose:
-    """Return how many parameters are known, to each of the shares `KNOWN` of themselves."""
-    std = np.where(np.isfinite(estimate.std), estimate.std, np.inf)
-    well, roughly = (
-        int(np.count_nonzero(std <= share * np.abs(estimate.values))) for share in KNOWN
-    )
-    references = {"roughly": float(roughly - well), "not": float(len(std) - roughly)}
-    return Purpose("parameters", None, float(well), references=references)
+    """Return how many parameters are known, roughly, and not."""
+    known = estimate.known
+    references = {"roughly": float(known.count("roughly")), "not": float(known.count("no"))}
+    return Purpose("parameters", None, float(known.count("yes")), references=references)

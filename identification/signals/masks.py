@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from types import MappingProxyType
 from typing import Final, Literal
 
 import numpy as np
@@ -73,7 +72,7 @@ class RowMask:
         """Return the mask of some rows."""
         reasons = {reason: rows[part] for reason, rows in self.reasons.items()}
         length = len(range(*part.indices(self.shape[0])))
-        return RowMask(MappingProxyType(reasons), (length, self.shape[1]), self.moving[part])
+        return RowMask(reasons, (length, self.shape[1]), self.moving[part])
 
     @property
     def counts(self) -> dict[str, NDArray[np.intp]]:
@@ -138,7 +137,7 @@ def mask_rows(
         reasons |= {STANDSTILL: still, REVERSAL: reversal}
     reasons[SATURATED] = saturated
     moving = ~(reasons[EDGE] | saturated | still | reversal)
-    return RowMask(MappingProxyType(reasons), (shape[0], shape[1]), moving)
+    return RowMask(reasons, (shape[0], shape[1]), moving)
 
 
 def long_rests(time: Array, still: Rows) -> Rows:

@@ -19,9 +19,6 @@ NoFigure = Literal[
 ]
 """Why a purpose has no figure, or no limit that it can be held against."""
 
-KNOWN: Final = (0.1, 0.5)
-"""Standard deviations, as shares of the estimate, to which a parameter counts as known."""
-
 
 @dataclass(frozen=True)
 class PurposeLimits:

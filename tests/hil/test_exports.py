@@ -14,16 +14,18 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pinocchio as pin
 import pytest
 from numpy.typing import NDArray
 from pydantic import BaseModel
 from typer.testing import CliRunner
 
+import hil
 from hil.cli import app
 from hil.importers.column_map import ColumnMap
 from hil.importers.log import import_log
 from hil.importers.robot import Robot
-from hil.pipeline import identified_model
+from hil.pipeline import stored_identification
 from hil.pipeline.run import Identification
 from hil.report.output_files import FILES, Exports
 from hil.results.results import Results
@@ -39,6 +41,7 @@ from .identified_arm import (
     identified_arm,
     write_exports,
 )
+from .simulated_logs import simulate, urdf_path, write_log
 
 Array = NDArray[np.float64]
 
@@ -52,7 +55,8 @@ SLIDER = """<robot name="slider"><link name="base"/>
 <link name="arm"><inertial><origin xyz="0 0.01 -0.3"/><mass value="1.5"/>
 <inertia ixx="0.02" iyy="0.02" izz="0.004" ixy="0" ixz="0" iyz="0"/></inertial></link></robot>
 """
-ALL = {"parameters.json", "parameters.csv", "identified.urdf"}
+ALL = {"parameters.json", "parameters.csv", "parameters_covariance.csv", "identified.urdf"}
+FINGERS = ("panda_finger_joint1", "panda_finger_joint2")
 PROVENANCE = {"robot": "arm", "archives": "run_1.mcap sha256 0a1b", "verdict": "good: 1.1%"}
 
 
@@ -205,6 +209,29 @@ def test_the_python_example_predicts_the_torque_of_the_model(
     np.testing.assert_allclose(shown, expected, rtol=1e-6)
 
 
+def test_the_python_example_fixes_a_gripper(text: str, tmp_path: Path) -> None:
+    """Verbatim, of an arm whose fingers were not recorded."""
+    folder = tmp_path / "runs" / "demo"
+    motion = simulate("panda.urdf", np.arange(0.0, 8.0, 0.02), locked=FINGERS)
+    log = write_log(
+        tmp_path / "log.csv",
+        ["t", "q{}", "v{}", "tau{}"],
+        *(motion.time, motion.position, motion.velocity, motion.torque),
+    )
+    hil.identify(log, urdf=urdf_path("panda.urdf")).save(folder)
+    (program,) = (code for language, code in CODE.findall(text) if language == "python")
+    command_line = [sys.executable, "-I", "-c", program]
+    done = subprocess.run(command_line, cwd=tmp_path, capture_output=True, text=True, check=True)
+    shown = np.fromstring(" ".join(done.stdout.split()).strip("[]"), sep=" ")
+    arm = hil.load(folder)
+    model = arm.model
+    rest, speed = np.zeros(7), np.full(7, 0.5)
+    rigid = pin.rnea(model, model.createData(), rest, speed, rest)
+    dry = np.asarray(model.upperDryFrictionLimit) + np.asarray(model.damping) * speed
+    assert arm.results.joint_names == list(motion.joint_names)
+    np.testing.assert_allclose(shown, rigid + dry, atol=0.03 * np.abs(rigid + dry).max())
+
+
 @pytest.fixture(scope="module")
 def log(arm: IdentifiedArm, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A recording of the arm, imported."""
@@ -282,7 +309,7 @@ class TestReuse:
         def identify(*_: object, **__: object) -> Identification:
             raise AssertionError("the parameters are there")
 
-        monkeypatch.setattr(identified_model, "identify_paths", identify)
+        monkeypatch.setattr(stored_identification, "identify_paths", identify)
         reused = command("export", folder, "--to", "urdf", "-o", stored)
         assert f"parameters: from {folder}/results.json and parameters.json" in reused.stdout
         assert stored.read_text() == new.read_text()

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import inspect
+import pickle
+import shutil
 import subprocess
 import sys
 from pathlib import Path
@@ -12,6 +14,7 @@ from typing import Any
 import numpy as np
 import pinocchio as pin
 import pytest
+from matplotlib.figure import Figure
 from typer.testing import CliRunner
 
 import hil
@@ -50,11 +53,12 @@ class TestResult:
     def test_parameters_are_a_table_with_intervals(self, result: Any) -> None:
         """Coulomb friction of 0.4 N·m and viscous friction of 0.2 N·m·s/rad were planted."""
         table = result.parameters
-        assert list(table.columns[:4]) == ["estimate", "lower", "upper", "std"]
+        columns = ["meaning", "body", "joint", "estimate", "low", "high", "unit", "known"]
+        assert list(table.columns[:8]) == columns
         friction = table.loc[["f0_1", "f0_2", "f0_3", "f1_1", "f1_2", "f1_3"]]
         truth = np.repeat([0.4, 0.2], 3)
-        assert ((friction["lower"] < truth) & (truth < friction["upper"])).all()
-        assert table.loc["f0_1", "unit"] == "N·m"
+        assert ((friction["low"] < truth) & (truth < friction["high"])).all()
+        assert list(table.loc["f0_1", ["unit", "joint", "known"]]) == ["N·m", "hip", "yes"]
         assert [*table.index] == [parameter.name for parameter in result.results.parameters]
 
     def test_prediction_is_the_torque_that_was_simulated(self, result: Any) -> None:
@@ -67,7 +71,8 @@ class TestResult:
         truth = rigid + 0.4 * np.sign(v) + 0.2 * v
         error = result.predict(q, v, a) - truth
         assert np.linalg.norm(error) < 0.01 * np.linalg.norm(truth)
-        assert np.allclose(result.predict(q[3], v[3], a[3]), result.predict(q, v, a)[3])
+        single = [result.predict(*row) for row in zip(q, v, a, strict=True)]
+        np.testing.assert_allclose(single, result.predict(q, v, a), rtol=0.0, atol=1e-9)
 
     def test_prediction_of_another_number_of_joints_is_refused(self, result: Any) -> None:
         with pytest.raises(ValueError, match="shape"):
@@ -96,6 +101,36 @@ class TestResult:
         assert len(drawn) == 3 * (3 + 2)  # measured, identified, nominal; two errors
         for values, line in zip(described, drawn, strict=True):
             np.testing.assert_array_equal(line, values)
+
+    def test_a_plot_is_of_some_joints_at_a_size_with_its_series(self, result: Any) -> None:
+        plot = result.plot(["knee", 2], size=(6.0, 3.0))
+        assert [*plot.figure.get_size_inches()] == [6.0, 3.0]
+        assert [panel.get_title() for panel in plot.axes[::2]] == ["knee", "ankle"]
+        assert [*plot.series["measured"].columns] == ["knee", "ankle"]
+        drawn = plot.axes[0].lines[0].get_ydata()
+        np.testing.assert_array_equal(plot.series["measured", "knee"], drawn)
+        assert plot.png().startswith(b"\x89PNG")
+
+    def test_a_plot_goes_into_somebody_elses_axes(self, result: Any) -> None:
+        figure = Figure()
+        left, right = figure.subplots(1, 2)
+        plot = result.plot(["hip", "knee"], axes=[left, right])
+        assert plot.figure is figure
+        assert len(left.lines) == len(right.lines) == 3
+        assert left.get_ylabel() == "torque [N·m]"
+
+    @pytest.mark.parametrize("joints", ["wrist", 3, [0, -1]])
+    def test_a_plot_of_another_joint_is_refused(self, result: Any, joints: Any) -> None:
+        with pytest.raises(InputError, match="there is no joint"):
+            result.plot(joints)
+
+    def test_it_can_be_pickled(self, result: Any) -> None:
+        again = pickle.loads(pickle.dumps(result))
+        state = [0.1, 0.2, 0.3]
+        assert again.verdict == result.verdict
+        np.testing.assert_array_equal(
+            again.predict(state, state, state), result.predict(state, state, state)
+        )
 
     def test_a_notebook_shows_it(self, result: Any, tmp_path: Path) -> None:
         page = tmp_path / "cell.html"
@@ -172,6 +207,88 @@ class TestSaved:
         )
         hil.identify(folder / "a.csv", urdf=folder / "three.urdf")
         assert parsed == [folder / "a.csv"]
+
+
+@pytest.fixture(scope="module")
+def saved(result: Any, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder of results."""
+    return result.save(tmp_path_factory.mktemp("saved") / "arm")
+
+
+@pytest.fixture(scope="module")
+def loaded(saved: Path) -> Any:
+    return hil.load(saved)
+
+
+class TestLoaded:
+    """A folder of `hil identify`, without identifying again."""
+
+    def test_it_is_what_was_identified(self, result: Any, loaded: Any) -> None:
+        assert isinstance(loaded, hil.IdentifiedArm)
+        assert repr(loaded) == repr(result)
+        assert loaded.parameters.equals(result.parameters)
+        assert loaded.verdict.findings == result.verdict.findings
+        assert loaded.verdict.next_steps == result.verdict.next_steps
+        assert loaded.channels == result.channels
+        q, v, a = np.random.default_rng(1).uniform(-1.0, 1.0, (3, 20, 3))
+        np.testing.assert_array_equal(loaded.predict(q, v, a), result.predict(q, v, a))
+        rigid = [pin.rnea(each.model, each.model.createData(), q[0], v[0], a[0])
+                 for each in (loaded, result)]  # fmt: skip
+        np.testing.assert_allclose(*rigid, rtol=1e-9)
+
+    def test_its_plot_and_its_page_are_the_same(self, result: Any, loaded: Any) -> None:
+        assert loaded.plot().series.equals(result.plot().series)
+        assert loaded._repr_html_() == result._repr_html_()
+
+    def test_nothing_is_estimated(self, saved: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+        monkeypatch.delattr("hil.pipeline.run.estimate_with")
+        assert hil.load(saved).verdict.good
+
+    def test_its_files_can_be_saved_elsewhere(
+        self, saved: Path, loaded: Any, tmp_path: Path
+    ) -> None:
+        place = loaded.save(tmp_path / "copy")
+        assert {file.name for file in place.iterdir()} == {file.name for file in saved.iterdir()}
+        assert hil.load(place).parameters.equals(loaded.parameters)
+
+    def test_an_archive_that_was_exchanged_is_refused(self, saved: Path, tmp_path: Path) -> None:
+        place = tmp_path / "arm"
+        shutil.copytree(saved, place)
+        shutil.copyfile(place / "b.mcap", place / "a.mcap")
+        with pytest.raises(InputError, match="its archives are others"):
+            hil.load(place)
+
+    def test_a_folder_without_results_is_refused(self, tmp_path: Path) -> None:
+        with pytest.raises(InputError, match=r"there is no results.json.*hil identify"):
+            hil.load(tmp_path)
+
+
+class TestDataFrame:
+    """A table in memory is a log."""
+
+    @pytest.mark.parametrize("indexed", [False, True])
+    def test_it_gives_what_its_file_gives(
+        self, folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, indexed: bool
+    ) -> None:
+        import pandas
+
+        frame = pandas.read_csv(folder / "a.csv")
+        if indexed:
+            frame = frame.set_index(frame.columns[0])
+        identified = hil.identify(frame, urdf=folder / "three.urdf")
+        log = hil.identify(folder / "a.csv", urdf=folder / "three.urdf")
+        assert identified.verdict == log.verdict
+        assert identified.parameters.equals(log.parameters)
+        monkeypatch.chdir(tmp_path)
+        assert identified.save().resolve() == tmp_path / "recording"
+        assert hil.load(tmp_path / "recording").verdict.good
+
+    def test_one_may_be_predicted_from_another(self, folder: Path) -> None:
+        import pandas
+
+        frames = [pandas.read_csv(folder / name) for name in ("a.csv", "b.csv")]
+        identified = hil.identify(frames[0], urdf=folder / "three.urdf", predict=frames[1])
+        assert [path.name for path in identified.predicted] == ["recording-2.csv"]
 
 
 class TestRefused:

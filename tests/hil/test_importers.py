@@ -35,15 +35,18 @@ from hil.base.errors import ArchiveWriteError, InputError, SourceError
 from hil.cell import Cell
 from hil.cell.nominal import nominal_of
 from hil.cli import app
+from hil.cli.imports import _names
 from hil.importers import arrays as array_files
 from hil.importers import matlab
 from hil.importers.arrays import ArrayFile
+from hil.importers.bag_map import BagMap
 from hil.importers.column_map import UNITS, ColumnMap, Format, ready_map, ready_maps
 from hil.importers.conclusions import StoppedJoint
 from hil.importers.dh import Convention, urdf_of_dh
 from hil.importers.findings import examine
 from hil.importers.log import import_log
 from hil.importers.messages import sentence as worded
+from hil.importers.recording import import_bag
 from hil.importers.robot import Robot, _cell_text
 from hil.importers.stamps import check_clock
 from hil.importers.text_table import Table
@@ -1251,6 +1254,29 @@ class TestRobotOptions:
         result = self.run(place, "rosbag2", *self.LOCKED, "--rename", "j2=elbow")
         assert result.exit_code == 0, result.exception
         assert open_archive(place / "o.mcap").joint_names == ("elbow",)
+
+    def test_a_number_in_both_names_renames_all_joints(self, place: Path) -> None:
+        """And only joints of the URDF stand in the map that is kept."""
+        (place / "bag.db3").unlink()
+        text = Path(self.URDF[1]).read_text()
+        text = text.replace('"shoulder"', '"arm_joint1"').replace('"elbow"', '"arm_joint2"')
+        (place / "arm.urdf").write_text(text)
+        names = ["fer_joint1", "fer_joint2"]
+        messages = [state(10**7 * k, [0.1 * k, 0.2 * k], names=names) for k in range(9)]
+        bag(place / "bag.db3", {"/js": (STATE, messages)})
+        imported = import_bag(
+            place / "bag.db3",
+            place / "o.mcap",
+            lambda _: Robot.from_urdf(place / "arm.urdf"),
+            BagMap(rename=_names(["fer_joint{}=arm_joint{}"])),
+        )
+        assert imported.archive.joint_names == ("arm_joint1", "arm_joint2")
+        assert imported.bag.rename == {"fer_joint1": "arm_joint1", "fer_joint2": "arm_joint2"}
+
+    @pytest.mark.parametrize("pair", ["fer_joint{}=arm_joint", "fer{}=", "fer"])
+    def test_a_pair_of_names_needs_its_number_in_both(self, pair: str) -> None:
+        with pytest.raises(InputError, match=r"is not a pair.*fer_joint\{\}=panda_joint\{\}"):
+            _names([pair])
 
     def test_locking_others_needs_joint_names_in_the_map(self, place: Path) -> None:
         text = (place / "map.toml").read_text()

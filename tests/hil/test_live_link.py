@@ -7,6 +7,7 @@ import socket
 import threading
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -353,6 +354,16 @@ def test_a_real_transport_makes_a_simulated_cell_a_real_one(cell: Cell) -> None:
     spec = UdpSpec("192.0.2.1", free_port(), "127.0.0.1")
     with LiveLink.open(cell, transport=spec) as link:
         assert not link.only_simulated
+
+
+@pytest.mark.parametrize("stated", [True, False])
+def test_a_local_link_is_simulated_where_the_cell_says_so(cell: Cell, stated: bool) -> None:
+    """Otherwise the program at its end may be a bridge to a controller."""
+    local = on_loopback(cell)
+    if not stated:
+        file = local.file.model_copy(update={"simulation": None})
+        local = replace(local, file=file)
+    assert local.only_simulated is stated
 
 
 def test_a_live_view_that_cannot_be_served_is_refused(cell: Cell, tmp_path: Path) -> None:

@@ -20,7 +20,7 @@ from hil.base.errors import HilError, InputError
 from hil.campaign import Campaign
 from hil.cli import app
 from hil.identified.annotate import FOLDER, PREDICTED, RESIDUAL
-from hil.pipeline import identified_model
+from hil.pipeline import stored_identification
 from hil.pipeline.identified_model import predicted_parts
 from hil.plots.chart_picture import draw_charts
 from hil.report.output_files import REPORT
@@ -79,7 +79,7 @@ def test_it_reads_what_was_identified(folder: Path, monkeypatch: pytest.MonkeyPa
     def identify(*_: object, **__: object) -> None:
         raise AssertionError("the parameters are there")
 
-    monkeypatch.setattr(identified_model, "identify_paths", identify)
+    monkeypatch.setattr(stored_identification, "identify_paths", identify)
     done = run("rollout", folder, "--samples", "3", "--json")
     assert done.exit_code in (0, 5), done.exception
     read = json.loads(done.stdout)
@@ -145,7 +145,7 @@ class TestSectionOfTheReport:
         assert "Simulated motion" not in (folder / REPORT).read_text()
 
     def test_an_arm_of_the_rollout_is_not_that_of_the_report(self, folder: Path) -> None:
-        done = run("rollout", folder, "--samples", "3", "--again")
+        done = run("rollout", folder, "--samples", "3", "--again", "-v")
         assert messages.NOT_IN_REPORT in done.output
         assert "Simulated motion" not in (folder / REPORT).read_text()
 
@@ -194,7 +194,7 @@ def test_parameters_of_no_possible_arm_are_named(folder: Path) -> None:
     """Without a physically consistent arm in the files it is identified again, and says why."""
     path = folder / PARAMETERS_JSON
     path.write_text(json.dumps(json.loads(path.read_text()) | {"standard": None}))
-    done = run("rollout", folder, "--samples", "3")
+    done = run("rollout", folder, "--samples", "3", "-v")
     assert "identified again" in done.output
     assert "it has no physically consistent parameters" in done.output
 
@@ -213,7 +213,7 @@ def test_bodies_that_cannot_exist_are_named(folder: Path, tmp_path: Path) -> Non
     with_links(folder, lambda link: link.update(Izz=-0.5) if link["joint"] == "joint_5" else None)
     reason = "parameters.json cannot be used (the body of joint_5 cannot exist)"
     commands = {
-        "rollout": ("--samples", "3", "-o", tmp_path / "out"),
+        "rollout": ("--samples", "3", "-v", "-o", tmp_path / "out"),
         "export": ("--to", "urdf", "-o", tmp_path / "arm.urdf"),
         "export ": ("--to", "mjcf", "--ensemble", "3", "-o", tmp_path / "arms"),
     }
@@ -232,7 +232,7 @@ def test_an_arm_that_explodes_is_counted(folder: Path) -> None:
             link[name] *= 1e-6
 
     with_links(folder, lighten)
-    done = run("rollout", folder, "--samples", "3")
+    done = run("rollout", folder, "--samples", "3", "-v")
     assert done.exit_code in (0, 5), done.exception
     result = RolloutResult.load(folder / ROLLOUT)
     assert result.identified.unstable == result.windows

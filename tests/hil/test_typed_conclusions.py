@@ -170,6 +170,7 @@ def say_keys(patch: pytest.MonkeyPatch) -> None:
 MESSAGES = frozenset(
     {
         *("words", "next_step", "next_steps", "reservation", "line", "reasons", "warnings"),
+        *("content", "changes", "channels"),
         *("findings", "reading", "reason", "decide", "options", "identified_at"),
     }
 )

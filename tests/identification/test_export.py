@@ -20,7 +20,8 @@ from identification.excitation.collision import CollisionChecker
 from identification.excitation.errors import CollisionModelError
 from identification.export.arm import ExportedArm, Ranges
 from identification.export.friction import friction_curve, median_load
-from identification.export.parameters import parameters_csv, parameters_json
+from identification.export.parameter_table import parameter_table
+from identification.export.parameters import covariance_csv, parameters_csv, parameters_json
 from identification.export.simulators import AGREES, FORMATS, compare, mjcf, random_states
 from identification.export.urdf import NotConsistentError, WriteBackError, not_in_urdf, write_urdf
 from identification.factor.estimate import estimate
@@ -532,15 +533,49 @@ class TestParameters:
         assert read["parameters"][0]["std"] == read["condition"] == "Infinity"
         assert (read["undetermined"], read["standard"]) == (["I1yy"], None)
 
-    def test_csv_restores_values_and_covariance(self, fit):
+    def test_csv_restores_values_and_intervals(self, fit):
         model, estimated, _ = fit
         text = parameters_csv(model, estimated, provenance=PROVENANCE)
         assert "# recording: run_1.mcap sha256 0a1b" in text.splitlines()
         rows = table(text)
         assert [row["name"] for row in rows] == list(estimated.names)
-        assert [float(row["value"]) for row in rows] == estimated.values.tolist()
-        covariance = [[float(row[f"cov({name})"]) for name in estimated.names] for row in rows]
+        assert [float(row["estimate"]) for row in rows] == estimated.values.tolist()
+        half = estimated.interval_factor * estimated.std
+        for column, ends in (("low", estimated.values - half), ("high", estimated.values + half)):
+            np.testing.assert_allclose([float(row[column]) for row in rows], ends, rtol=1e-15)
+
+    def test_covariance_has_a_file_of_its_own(self, fit):
+        _, estimated, _ = fit
+        rows = table(covariance_csv(estimated, provenance=PROVENANCE))
+        assert [row["name"] for row in rows] == list(estimated.names)
+        covariance = [[float(row[name]) for name in estimated.names] for row in rows]
         np.testing.assert_array_equal(covariance, estimated.covariance)
+
+    def test_a_row_says_what_its_parameter_is_and_of_what(self, fit):
+        model, estimated, _ = fit
+        rows = {row.name: row for row in parameter_table(model, estimated)}
+        inertia = rows["I1yy"]
+        assert inertia.meaning == "moment of inertia about y and what moves like it"
+        assert (inertia.body, inertia.joint) == (model.chain.link(0), "shoulder")
+        friction = rows["f0_2"]
+        assert friction.meaning == "Coulomb (dry) friction f0"
+        assert (friction.body, friction.joint) == ("", "elbow")
+
+    @pytest.mark.parametrize(
+        ("share", "known"), [(0.1, "yes"), (0.11, "roughly"), (0.5, "roughly"), (0.51, "no")]
+    )
+    def test_known_is_a_standard_deviation_of_a_tenth(self, fit, share, known):
+        model, estimated, _ = fit
+        covariance = np.diag((share * estimated.values) ** 2)
+        rows = parameter_table(model, replace(estimated, covariance=covariance))
+        assert {row.known for row in rows} == {known}
+
+    def test_what_is_not_determined_is_not_known(self, fit):
+        model, estimated, _ = fit
+        exact = replace(estimated, covariance=0.0 * estimated.covariance, undetermined=("I1yy",))
+        rows = {row.name: row.known for row in parameter_table(model, exact)}
+        assert rows.pop("I1yy") == "no"
+        assert set(rows.values()) == {"yes"}
 
     def test_no_remark_is_a_formula_or_breaks_its_row(self, fit):
         model, estimated, _ = fit

@@ -43,8 +43,9 @@ from hil.importers.arrays import READERS, ArrayFile
 from hil.importers.bags import bag_files, open_bag
 from hil.importers.column_map import Format
 from hil.importers.text_table import Table
-from hil.report.output_files import SERIES, _load_series, rewrite_report
+from hil.report.output_files import rewrite_report
 from hil.results.results import Results
+from hil.results.series import SERIES, load_series
 from hil.study.results import StudyResults
 from identification import IdentificationError
 from identification.excitation import Journal
@@ -295,9 +296,9 @@ MEMBERS = {
 
 def test_series_of_a_report_are_read_as_written(folder: Path) -> None:
     (folder / SERIES).write_bytes(series(MEMBERS))
-    assert _load_series(folder / SERIES, 2).example_archive == "one.mcap"
+    assert load_series(folder, 2).example_archive == "one.mcap"
     with pytest.raises(InputError, match="2 columns, not 3"):
-        _load_series(folder / SERIES, 3)
+        load_series(folder, 3)
 
 
 class Opens:

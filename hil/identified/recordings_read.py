@@ -1,0 +1,78 @@
+"""What was read of logs and bags: their content, and what is not as the file has it."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Final
+
+from hil.base.terminal_text import plural
+from hil.identified.staging import Staging
+from hil.importers.conclusions import (
+    ChannelMeaning,
+    ConcludedUnit,
+    Conclusion,
+    JointOrder,
+    JointRange,
+    KnownCommands,
+    LockedJoints,
+    RecordedClock,
+    StatedUnit,
+)
+from hil.importers.messages import sentence
+from hil.importers.recording import ImportedRecording
+from hil.look.readings import DoubtfulArm
+from hil.look.result import ChangedReading
+from hil.results.results import RecordingResult
+
+_USUAL: Final = (
+    ChannelMeaning,
+    ConcludedUnit,
+    JointOrder,
+    JointRange,
+    KnownCommands,
+    LockedJoints,
+    RecordedClock,
+    StatedUnit,
+    ChangedReading,
+    DoubtfulArm,
+)
+
+
+def recording_results(staging: Staging, predicted: Sequence[Path]) -> list[RecordingResult]:
+    """Return what was read of each imported recording, for `results.json` and the report."""
+    return [
+        RecordingResult(
+            file=staging.sources[place].name,
+            use="predicted" if staging.sources[place] in predicted else "fitted",
+            content=content(recording),
+            changes=[
+                sentence(found)
+                for found in recording.concluded
+                if isinstance(found, ChangedReading | DoubtfulArm | ConcludedUnit | JointOrder)
+            ]
+            + [sentence(found) for found in _unusual(recording)],
+            channels=[sentence(conclusion) for conclusion in recording.concluded],
+        )
+        for place, recording in staging.recordings.items()
+    ]
+
+
+def content(recording: ImportedRecording) -> str:
+    """Return joints, duration and rate of a recording, and what is unusual about it."""
+    found = (*recording.concluded, *recording.examined.found)
+    clock = next((each.base for each in found if isinstance(each, RecordedClock)), None)
+    joints = sum(isinstance(each, JointRange) for each in found)
+    parts = [plural(joints, "joint")]
+    if clock is not None:
+        parts = [f"{parts[0]}, {clock.duration:.3g} s at {clock.rate:.4g} Hz"]
+        parts += clock.describe()[1:]
+    return "; ".join([*parts, *map(sentence, _unusual(recording))])
+
+
+def _unusual(recording: ImportedRecording) -> list[Conclusion]:
+    found = (*recording.concluded, *recording.examined.found)
+    return [
+        *recording.examined.warnings,
+        *(conclusion for conclusion in found if not isinstance(conclusion, _USUAL)),
+    ]
