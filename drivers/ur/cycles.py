@@ -98,6 +98,7 @@ class CycleCounter:
         self._period = period
         self._newest: float | None = None
         self._cycle = -1
+        self._fault: RtdeError | None = None
 
     def records(self, frames: OutputFrames) -> CycleFrames:
         """Return records and states of frames, in their order.
@@ -105,8 +106,8 @@ class CycleCounter:
         Raises:
             RtdeError: time stamps that do not increase by whole cycles.
         """
-        values = frames.values
-        steps = self._steps(values["timestamp"])
+        steps = self._steps(frames.values["timestamp"])
+        values = frames.values[: len(steps)]
         cycle = self._cycle + np.cumsum(steps)
         if len(cycle):
             self._cycle = int(cycle[-1])
@@ -114,7 +115,7 @@ class CycleCounter:
         records["cycle"] = cycle
         records["number"] = cycle % (1 << 31)
         records["gap"] = steps - 1
-        records["arrival"] = frames.arrival
+        records["arrival"] = frames.arrival[: len(steps)]
         records["interval"] = -1
         records["state"] = _states(values["robot_mode"])
         records["status"] = np.where(values["robot_mode"] == ROBOT_RUNNING, DRIVE_ON, 0)
@@ -131,19 +132,30 @@ class CycleCounter:
         return CycleFrames(records, self._arm_states(values))
 
     def _steps(self, stamps: Array) -> NDArray[np.int64]:
-        """Return the cycles since the frame before (k,); 1 for the first frame of all."""
+        """Return the cycles since the frame before, of those before a fault; 1 for the first."""
+        if self._fault is not None:
+            raise self._fault
         if not len(stamps):
             return np.zeros(0, np.int64)
         before = stamps[0] - self._period if self._newest is None else self._newest
         cycles = np.diff(stamps, prepend=before) / self._period
         steps = np.rint(cycles)
-        if not np.all(steps >= 1):
-            raise RtdeError("the controller's time stamps go back: it was started again")
-        if not np.all(np.abs(cycles - steps) <= _MOST_OFF_GRID):
-            problem = f"the controller's time stamps are not {1e3 * self._period:g} ms apart"
-            raise RtdeError(f"{problem}: correct controller.cycle_ms")
+        wrong = np.flatnonzero(~((steps >= 1) & (np.abs(cycles - steps) <= _MOST_OFF_GRID)))
+        if wrong.size:
+            first = int(wrong[0])
+            self._fault = self._fault_of(cycles[first])
+            if first == 0:
+                raise self._fault
+            stamps, steps = stamps[:first], steps[:first]
         self._newest = float(stamps[-1])
         return steps.astype(np.int64)
+
+    def _fault_of(self, cycles: float) -> RtdeError:
+        """Return why a time stamp cannot follow so many cycles after another."""
+        if not cycles >= 1 - _MOST_OFF_GRID:
+            return RtdeError("the controller's time stamps go back: it was started again")
+        problem = f"the controller's time stamps are not {1e3 * self._period:g} ms apart"
+        return RtdeError(f"{problem}: correct controller.cycle_ms")
 
     def _arm_states(self, values: NDArray[np.void]) -> NDArray[np.void]:
         states = np.zeros(len(values), STATE_DTYPE)

@@ -39,6 +39,42 @@ OPTIONAL: Final = (
     "actual_current_as_torque",
 )
 """Outputs that only some versions have."""
+ROBOT_MODES: Final = {
+    -1: "no controller",
+    0: "disconnected",
+    1: "confirm safety",
+    2: "booting",
+    3: "power off",
+    4: "power on",
+    5: "idle",
+    6: "backdrive",
+    7: "running",
+    8: "updating firmware",
+}
+"""Names of `robot_mode`."""
+SAFETY_MODES: Final = {
+    1: "normal",
+    2: "reduced",
+    3: "protective stop",
+    4: "recovery",
+    5: "safeguard stop",
+    6: "system emergency stop",
+    7: "robot emergency stop",
+    8: "violation",
+    9: "fault",
+    10: "validate joint",
+    11: "undefined",
+}
+"""Names of `safety_mode`."""
+RUNTIME_STATES: Final = {
+    0: "stopping",
+    1: "stopped",
+    2: "playing",
+    3: "pausing",
+    4: "paused",
+    5: "resuming",
+}
+"""Names of `runtime_state`, the program's."""
 ROBOT_RUNNING: Final = 7
 """`robot_mode` with power on and brakes released."""
 POWER_MODES: Final = (4, 5)

@@ -29,10 +29,10 @@ TIMEOUT: Final = 5.0
 SILENCE: Final = 2.0
 """Time without a frame after which the controller is lost, s."""
 _FASTEST: Final = {3: 125.0}
-"""OutputFrames per second by major version of the software (CB3)."""
+"""Frames per second by major version of the software (CB3)."""
 _E_SERIES: Final = 500.0
 _MOST_WAITING: Final = 200_000
-"""OutputFrames that may wait to be fetched, 400 s at 500 Hz."""
+"""Frames that may wait to be fetched, 400 s at 500 Hz."""
 _PIECE: Final = 1 << 16
 
 
@@ -167,15 +167,17 @@ class RtdeReader:
         self._thread = threading.Thread(target=self._read, name="rtde", daemon=True)
         self._thread.start()
 
-    def fetch(self, timeout: float) -> OutputFrames:
-        """Return all frames that arrived, waiting up to `timeout` s for the first.
+    def fetch(self, timeout: float, at_least: int = 1) -> OutputFrames:
+        """Return all frames that arrived, waiting up to `timeout` s for so many.
 
         Raises:
             TransportClosed: the connection has ended, and all its frames were fetched.
             RtdeError, PacketError: the controller sent something else.
         """
         with self._news:
-            self._news.wait_for(lambda: self._frames or self._ended is not None, timeout)
+            self._news.wait_for(
+                lambda: len(self._frames) >= at_least or self._ended is not None, timeout
+            )
             fetched = [*self._frames]
             self._frames.clear()
             ended = self._ended

@@ -108,6 +108,7 @@ class ArchiveSpec:
     metadata: Mapping[str, str]
     attachments: Mapping[str, bytes] = field(default_factory=dict)
     durable: bool = True
+    states: tuple[str, ...] = ()
 
     def open(self) -> ArchiveWriter:
         """Create the file; ArchiveWriteError if it exists or cannot be written."""

@@ -32,7 +32,11 @@ from hil.archive.header import (
 )
 from hil.archive.schema import ArchivedEvent
 
-NUMBERS = (schema.CYCLE, schema.MEASURED, schema.COMMANDED, *schema.OTHERS.values())
+NUMBERS = (
+    *(schema.CYCLE, schema.MEASURED, schema.COMMANDED),
+    *schema.STATES,
+    *schema.OTHERS.values(),
+)
 """Channels with one message per sample."""
 ALWAYS: Final = -(1 << 63), 1 << 63  # ns, before and after every stamp
 _BATCH: Final = 1 << 20  # bytes of chunks decoded at once: few calls, and all in the cache
@@ -122,7 +126,8 @@ class Scan:
     def topics(self) -> Collection[str]:
         """The channels of the samples and the events."""
         recorded = schema.CYCLE in self.parser.topics
-        samples = (schema.CYCLE,) if recorded else (schema.MEASURED, *schema.OTHERS.values())
+        cycles = (schema.CYCLE, *schema.STATES)
+        samples = cycles if recorded else (schema.MEASURED, *schema.OTHERS.values())
         return (*samples, schema.EVENTS)
 
     @property
@@ -457,7 +462,9 @@ class Scan:
             The newest stamp [ns], -1 without cycles.
         """
         samples = [topic for topic in by_topic if topic in NUMBERS]
-        timed = [schema.CYCLE] if schema.CYCLE in samples else samples
+        # Those of viewers are not read, and need no check.
+        cycles = (schema.CYCLE, *schema.STATES)
+        timed = [t for t in cycles if t in samples] if schema.CYCLE in samples else samples
         if not timed:
             return -1
         stamps = [by_topic[topic].stamps for topic in timed]

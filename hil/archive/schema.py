@@ -42,6 +42,7 @@ COMMANDED_POSITION = "/hil/commanded_position"
 MOTOR_CURRENT = "/motor_currents"
 EVENTS = "/hil/events"
 DESCRIPTION = "/robot_description"
+UR_STATE = "/hil/ur_state"
 
 _STAMP_TYPES = {"sec": (np.dtype("<i4"),), "nanosec": (np.dtype("<u4"),)}
 
@@ -106,6 +107,30 @@ std_msgs/Header header
 float64[{n}] commanded_position   # rad
 """
 
+_UR_STATE = """\
+# State of a Universal Robots controller in the cycle with the same stamp. Joints as in
+# /hil/cycle; NaN, and -1 of integers, where this version of the controller does not send it.
+std_msgs/Header header
+float64 controller_time              # s, since the start of the controller
+float64[{n}] target_acceleration       # rad/s2, of its set-points
+float64[{n}] target_moment             # N.m, of its rigid-body model with payload, no friction
+float64[{n}] control_current           # A, of its current loops
+float64[{n}] current_as_torque         # N.m, as it sends it; its meaning is not documented
+float64[{n}] joint_temperature         # degrees Celsius
+float64 speed_scaling                # fraction of the program's speed
+float64 speed_fraction               # speed slider, 0 to 1
+float64 position_deviation_ratio     # 1: protective stop
+float64 collision_ratio              # 1: protective stop
+float64 payload_mass                 # kg, as set at the controller
+float64[3] payload_centre            # m, in the frame of its flange
+float64[6] payload_inertia           # kg.m2, about the centre: xx, xy, xz, yy, yz, zz
+int32 robot_mode                     # 7: running
+int32 safety_mode                    # 1: normal
+int32 runtime_state                  # 2: a program is playing
+int32 robot_status                   # bits; 2: freedrive
+int32 safety_status                  # bits
+"""
+
 _LOG = """\
 byte DEBUG=10
 byte INFO=20
@@ -149,9 +174,9 @@ DESCRIPTION_CHANNEL = ArchiveChannel(DESCRIPTION, "std_msgs/msg/String", _DESCRI
 def profile(n_joints: int) -> Mapping[str, ArchiveChannel]:
     """Return the channels of the profile by topic, for a number of joints."""
     state = "sensor_msgs/msg/JointState", _text(_JOINT_STATE, _HEADER, _TIME)
-    cycle, current, commanded = (
+    cycle, current, commanded, ur_state = (
         _text(text.format(n=n_joints), _HEADER, _TIME)
-        for text in (_CYCLE, _MOTOR_CURRENT, _COMMANDED_POSITION)
+        for text in (_CYCLE, _MOTOR_CURRENT, _COMMANDED_POSITION, _UR_STATE)
     )
     channels = (
         ArchiveChannel(CYCLE, f"hil_msgs/msg/Cycle{n_joints}", cycle),
@@ -159,6 +184,7 @@ def profile(n_joints: int) -> Mapping[str, ArchiveChannel]:
         ArchiveChannel(COMMANDED, *state),
         ArchiveChannel(MOTOR_CURRENT, f"hil_msgs/msg/MotorCurrent{n_joints}", current),
         ArchiveChannel(COMMANDED_POSITION, f"hil_msgs/msg/CommandedPosition{n_joints}", commanded),
+        ArchiveChannel(UR_STATE, f"hil_msgs/msg/UrState{n_joints}", ur_state),
         EVENT_CHANNEL,
         DESCRIPTION_CHANNEL,
     )
@@ -170,6 +196,8 @@ OTHERS: Final[Mapping[str, str]] = {
     "commanded_position": COMMANDED_POSITION,
 }
 """Topics of what an imported recording has beside joint states."""
+STATES: Final = (UR_STATE,)
+"""Topics of what a controller sends in each cycle beyond `/hil/cycle`."""
 
 
 class Batch(NamedTuple):
@@ -179,21 +207,35 @@ class Batch(NamedTuple):
     messages: Mapping[str, Rows]
 
 
-def cycle_messages(names: Sequence[str], period: float, records: Rows, torque: Array) -> Batch:
+def cycle_messages(
+    names: Sequence[str],
+    period: float,
+    records: Rows,
+    torque: Array,
+    states: Mapping[str, Rows] | None = None,
+) -> Batch:
     """Return the messages of k cycles: `/hil/cycle` and two JointState channels for viewers.
 
-    `period` [s] of the controller, joint `torque` (k, n) [N·m].
+    `period` [s] of the controller, joint `torque` (k, n) [N·m]; `states` (k,) by topic (`STATES`)
+    have the fields of its messages.
     """
     stamp = _stamp(records, period)
     columns = {name: records[name] for name in records.dtype.names or ()}
     measured = {"position": records["position"], "velocity": records["velocity"], "effort": torque}
     commanded = {name: set_points(records, name) for name in ("position", "velocity")}
+    channels = profile(len(names))
     return Batch(
         stamp,
         {
-            CYCLE: _numbers(profile(len(names))[CYCLE], stamp, {**columns, "torque": torque}),
+            CYCLE: _numbers(channels[CYCLE], stamp, {**columns, "torque": torque}),
             MEASURED: joint_states(names, stamp, measured),
             COMMANDED: joint_states(names, stamp, commanded),
+            **{
+                topic: _numbers(
+                    channels[topic], stamp, {f: rows[f] for f in rows.dtype.names or ()}
+                )
+                for topic, rows in (states or {}).items()
+            },
         },
     )
 
@@ -279,7 +321,7 @@ def message_layout(
     layout = fixed_layout(record.data.decode(errors="replace"))
     types: Mapping[str, Any] = layout.dtype.fields or {}
     expected: Mapping[str, Any] = _STAMP_TYPES
-    if topic in (CYCLE, MOTOR_CURRENT):
+    if topic in (CYCLE, MOTOR_CURRENT, *STATES):
         expected = fixed_layout(profile(n)[topic].definition).dtype.fields or {}
     for name, (kind, *_) in expected.items():
         if name not in types:

@@ -28,7 +28,6 @@ from .robot import robot_model
 from .schema import (
     LINKS,
     CampaignTable,
-    CanTable,
     CellFile,
     ControllerTable,
     DriveTrainTable,
@@ -36,6 +35,7 @@ from .schema import (
     JointFrictionTable,
     NominalTable,
     SimulationTable,
+    Table,
 )
 from .text import urdf_limits, with_values
 
@@ -339,11 +339,19 @@ class Cell:
             }
         )
 
-    def with_link(self, *, can: CanTable | None = None, **controller: Any) -> Cell:
-        """Return the cell with changed entries of `[controller]`; None changes nothing."""
-        bus = {} if can is None else can.model_dump(exclude_none=True)
-        values = {f"controller.{key}": value for key, value in controller.items()}
-        return self.with_values(values | {f"controller.can.{k}": v for k, v in bus.items()})
+    def with_link(self, **controller: Any) -> Cell:
+        """Return the cell with changed entries of `[controller]`; None changes nothing.
+
+        Tables in it are given as such, or by the entries to change.
+        """
+        values: dict[str, Any] = {}
+        for key, value in controller.items():
+            entries = value.model_dump(exclude_none=True) if isinstance(value, Table) else value
+            if isinstance(entries, Mapping):
+                values |= {f"controller.{key}.{name}": entry for name, entry in entries.items()}
+            else:
+                values[f"controller.{key}"] = entries
+        return self.with_values(values)
 
     def with_urdf(self, path: Path, name: str) -> Cell:
         """Return the cell for a file `path` with the URDF `name`; mesh folders are adapted."""

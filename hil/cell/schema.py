@@ -22,6 +22,9 @@ from pydantic import (
 
 from drivers.transports.base import TransportSpec
 from drivers.transports.udp import UdpSpec
+from drivers.ur.identity import DASHBOARD_PORT, PRIMARY_PORT
+from drivers.ur.reader import RtdeSpec
+from drivers.ur.rtde import PORT as RTDE_PORT
 from hil.base.safe_input import parse_port
 from hil.cell.field_error import FieldError
 
@@ -393,16 +396,38 @@ class CanTable(Table):
         return profile
 
 
+class RtdeTable(Table):
+    """`[controller.rtde]`: a Universal Robots arm for transport = "rtde" (`docs/i-have-a-ur.md`).
+
+    What it states of the arm is compared with what the arm states, where both do.
+    """
+
+    port: Whole = field("TCP port of RTDE", RTDE_PORT, gt=0, lt=65536)
+    primary_port: Whole = field("TCP port of the primary interface", PRIMARY_PORT, gt=0, lt=65536)
+    dashboard_port: Whole = field(
+        "TCP port of the dashboard server", DASHBOARD_PORT, gt=0, lt=65536
+    )
+    model: str = field('type of the arm, such as "UR5e"; nothing for any', "", max_length=80)
+    calibration: str = field(
+        "checksum of the kinematic calibration, hexadecimal; nothing for any", "", max_length=80
+    )
+
+
 class ControllerTable(Table):
     """`[controller]`: the link to the controller."""
 
-    transport: Literal["simulated", "udp", "can"] = field('"simulated", "udp" or "can"')
-    cycle_ms: Literal[1, 2, 4] = field("the controller's cycle, 1, 2 or 4 ms")
+    transport: Literal["simulated", "udp", "can", "rtde"] = field(
+        '"simulated", "udp", "can" or "rtde" (Universal Robots, recorded only)'
+    )
+    cycle_ms: Literal[1, 2, 4, 8] = field(
+        "the controller's cycle, 1, 2 or 4 ms; with rtde 2, or 8 of a CB3"
+    )
     mode: Literal[4] = field("the open mode of campaigns: 4 (absolute position)", 4)
     host: str = field("address of the controller", "10.2.12.150")
     port: Whole = field("UDP port, 1 to 65535", 1000, gt=0, lt=65536)
     bind: str = field("local address to listen on, 0.0.0.0 for all", "0.0.0.0")
     can: CanTable | None = field("a table of the CAN adapter", None)
+    rtde: RtdeTable = field("a table of the Universal Robots arm", RtdeTable())
     arm: Whole = field("arm of the controller, 1 to 4", 1, ge=1, le=4)
     max_gap: Whole = field(
         "consecutive missed packets that a motion tolerates, 0 to 5", 2, ge=0, le=5
@@ -423,6 +448,16 @@ class ControllerTable(Table):
             raise FieldError(problem, 'add it, or write "udp"')
         return self
 
+    @model_validator(mode="after")
+    def _possible_cycle(self) -> ControllerTable:
+        possible = (2, 8) if self.transport == "rtde" else (1, 2, 4)
+        if self.cycle_ms not in possible:
+            problem = (
+                f'cycle_ms = {self.cycle_ms} is not possible with transport = "{self.transport}"'
+            )
+            raise FieldError(problem, f"write {' or '.join(map(str, possible))}")
+        return self
+
 
 @dataclass(frozen=True)
 class LinkType:
@@ -434,7 +469,7 @@ class LinkType:
             FieldError for one that is not supported any more.
         form: what such an address is, and how it is written with an example.
         controller: module whose `open_controller_link(spec, mode)` opens the controller's end; a
-            name, because `sim_fixtures` is slow to load.
+            name, because `sim_fixtures` is slow to load. "" for a link that carries no motions.
     """
 
     spec: Callable[[ControllerTable, int], TransportSpec]
@@ -473,11 +508,24 @@ def _can_address(text: str) -> dict[str, Any] | None:
     return {"can": {"interface": interface, "channel": channel}}
 
 
+def _rtde(table: ControllerTable, n_axes: int) -> TransportSpec:
+    del n_axes
+    return RtdeSpec(table.host, table.rtde.port)
+
+
+def _rtde_address(text: str) -> dict[str, Any] | None:
+    host, separator, port_text = text.partition(":")
+    port = parse_port(port_text) if separator else RTDE_PORT
+    return {"host": host, "rtde": {"port": port}} if host and port is not None else None
+
+
+ARM_HOST: Final = ("an address", "HOST or HOST:PORT, for instance 192.168.0.10")
 HOST_PORT: Final = ("an address", "HOST:PORT, for instance 127.0.0.1:2001")
 BUS: Final = ("a bus", "INTERFACE:CHANNEL or INTERFACE:CHANNEL:fd, for instance socketcan:can0")
 LINKS: Final[Mapping[str, LinkType]] = {
     "udp": LinkType(_udp, _udp_address, HOST_PORT, "sim_fixtures.serve"),
     "can": LinkType(_can, _can_address, BUS, "sim_fixtures.can_link"),
+    "rtde": LinkType(_rtde, _rtde_address, ARM_HOST, ""),
 }
 """Every value of `controller.transport` but "simulated"."""
 

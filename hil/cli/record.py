@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Mapping
+from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, Final, Literal
 
 import numpy as np
 import typer
@@ -14,19 +14,31 @@ from rich.console import Console
 
 from hil.archive.live import LiveView
 from hil.archive.recorder import Recorded
-from hil.base.errors import ControllerError, HilError, OperatorStopError
+from hil.base.errors import ControllerError, HilError, InputError, OperatorStopError
 from hil.base.progress import put, say
 from hil.base.progress_lines import LINE_PERIOD, progress_console
 from hil.campaign import Progress, stop_on_interrupt
 from hil.cell import AngleFrame, Cell
+from hil.cell.schema import LINKS
 from hil.cli.arguments import JsonOption, QuietOption, print_json
 from hil.control.live_link import LiveLink
 from hil.control.record import archive_path
 from hil.control.record import record as record_motion
+from hil.control.ur_recording import listening, record_arm
 
 Kind = Annotated[Literal["excitation", "validation", "standstill"], typer.Option(metavar="USE")]
 LINE_EVERY = 5.0
 """Time between two lines, s."""
+
+
+@dataclass(frozen=True)
+class RecordRequest:
+    """What is to be recorded of an arm; times in s."""
+
+    output: Path
+    kind: str
+    duration: float | None
+    wait: float | None
 
 
 def record(
@@ -34,6 +46,7 @@ def record(
     output: Annotated[Path, typer.Option("--output", "-o")] = Path("runs/record"),
     duration: Annotated[float | None, typer.Option(min=0.001)] = None,
     wait: Annotated[float | None, typer.Option(min=0.0)] = None,
+    link: Annotated[str | None, typer.Option(metavar="rtde:HOST[:PORT]")] = None,
     kind: Kind = "excitation",
     live: Annotated[str | None, typer.Option(metavar="HOST:PORT")] = None,
     quiet: QuietOption = False,
@@ -56,27 +69,42 @@ def record(
     REFUSED), no controller came within --wait, or the session ended before --duration; 130 Ctrl-C
     ended the recording before --duration, or the wait for the controller.
 
+    A Universal Robots arm (transport rtde, or --link) is only listened to: in any mode, beside a
+    running program and beside other clients. Nothing is claimed, and nothing waits for this PC.
+    Each of its outputs is archived, and a frame that did not come is a gap by its time stamps.
+
     Options:
         cell: The cell file.
         output: The archive (*.mcap), or a folder for numbered archives.
         duration: Time to record, s. Default: until Ctrl-C.
-        wait: Time to wait for the controller, s. Default: unlimited.
+        wait: Time to wait for the controller, s. Default: unlimited; with rtde one attempt.
+        link: Listen to the Universal Robots arm at this address, in place of the cell's link.
         kind: excitation (fitted), validation (predicted) or standstill (noise).
         live: Stream to Foxglove at this address, such as 127.0.0.1:8765.
     """
-    loaded = Cell.load(cell)
-    path = archive_path(output, kind)
+    loaded = with_rtde(Cell.load(cell), link)
+    how = RecordRequest(output, kind, duration, wait)
+    if loaded.controller.transport == "rtde":
+        if live is not None:
+            problem = "is not served while an arm is only listened to"
+            raise InputError(None, problem, field="--live", remedy="leave it out")
+        record_listening(loaded, how, quiet=quiet, json=json)
+    else:
+        view = None if live is None else LiveView.parse(live)
+        record_replying(loaded, how, view, quiet=quiet, json=json)
+
+
+def record_replying(
+    cell: Cell, how: RecordRequest, live: LiveView | None, *, quiet: bool, json: bool
+) -> None:
+    """Record the cycles of a controller that waits for replies; as `record`."""
+    path = archive_path(how.output, how.kind)
     report = partial(say, err=True)
     with (
         stop_on_interrupt(twice=True) as stop,
-        LiveLink.open(
-            loaded,
-            live=None if live is None else LiveView.parse(live),
-            report=report,
-            stop=stop,
-        ) as link,
+        LiveLink.open(cell, live=live, report=report, stop=stop) as link,
     ):
-        view = View(loaded, quiet=quiet or json)
+        view = View(cell, quiet=quiet or json)
         link.connection.report = report
         view.say(f"waiting for the controller; recording to {path}. Ctrl-C to stop")
         if link.live is not None:
@@ -84,13 +112,65 @@ def record(
         for note in link.notes():
             view.say(f"note: {note}")
         done = record_motion(
-            link, loaded, path,
-            kind=kind, stop=stop, duration=duration, wait=wait, watch=view.show,
+            link, cell, path,
+            kind=how.kind, stop=stop, duration=how.duration, wait=how.wait, watch=view.show,
         )  # fmt: skip
-    early = _early_end(path, done, duration, by_operator=stop.requested)
-    figures = _figures(path, done, loaded)
+    _finish(path, done, cell, how.duration, by_operator=stop.requested, line=LINE, json=json)
+
+
+def with_rtde(cell: Cell, link: str | None) -> Cell:
+    """Return the cell with the link rtde:HOST[:PORT], if one is given.
+
+    Raises:
+        InputError: it is another kind of link, or none.
+    """
+    if link is None:
+        return cell
+    name, _, address = link.partition(":")
+    fields = LINKS["rtde"].parse(address) if name == "rtde" else None
+    if fields is None:
+        remedy = "write rtde:HOST or rtde:HOST:PORT; other links are those of the cell file"
+        problem = f"{link!r} is no link that is only listened to"
+        raise InputError(None, problem, field="--link", remedy=remedy)
+    table = cell.file.controller
+    cycle_ms = 2 if table is None or table.transport != "rtde" else table.cycle_ms
+    return cell.with_link(transport="rtde", cycle_ms=cycle_ms, **fields)
+
+
+def record_listening(cell: Cell, how: RecordRequest, *, quiet: bool, json: bool) -> None:
+    """Record an arm that is only listened to; as `record`."""
+    path = archive_path(how.output, how.kind)
+    view = View(cell, quiet=quiet or json, replies=False)
+    warn = partial(say, err=True)
+    with (
+        stop_on_interrupt() as stop,
+        listening(cell, stop=stop, wait=how.wait, report=warn) as arm,
+    ):
+        view.say(f"listening to {cell.controller.host}; recording to {path}. Ctrl-C to stop")
+        for note in arm.notes:
+            view.say(f"note: {note}")
+        done = record_arm(
+            arm, cell, path,
+            kind=how.kind, stop=stop, duration=how.duration, watch=view.show, report=warn,
+        )  # fmt: skip
+    _finish(path, done, cell, how.duration, by_operator=stop.requested, line=HEARD_LINE, json=json)
+
+
+def _finish(
+    path: Path,
+    done: Recorded,
+    cell: Cell,
+    duration: float | None,
+    *,
+    by_operator: bool,
+    line: str,
+    json: bool,
+) -> None:
+    """Print how a recording ended, or raise how it ended early."""
+    early = _early_end(path, done, duration, by_operator=by_operator)
+    figures = _figures(path, done, cell)
     if not json:
-        say(_line(figures))
+        say(line.format_map(figures))
     elif early is None:
         print_json(figures)
     if early is not None:
@@ -126,24 +206,27 @@ def _figures(path: Path, done: Recorded, cell: Cell) -> dict[str, object]:
     }
 
 
-def _line(figures: Mapping[str, object]) -> str:
-    return (
-        "{archive}: {duration:.1f} s in {cycles} cycles, {missed} packets missed, {late} replies "
-        "late, {not_accepted} not accepted, {records_lost} records and {events_lost} events lost; "
-        "{outcome}: {reason}"
-    ).format_map(figures)
+LINE: Final = (
+    "{archive}: {duration:.1f} s in {cycles} cycles, {missed} packets missed, {late} replies "
+    "late, {not_accepted} not accepted, {records_lost} records and {events_lost} events lost; "
+    "{outcome}: {reason}"
+)
+HEARD_LINE: Final = (
+    "{archive}: {duration:.1f} s in {cycles} frames, {missed} missed; {outcome}: {reason}"
+)
 
 
 class View:
     """Progress of a recording: a line every 5 s, and one when it is over.
 
     Progress is shown on a terminal: standard output, else standard error. Without one it goes to
-    standard error, less often.
+    standard error, less often. `replies` says whether there are any to be late.
     """
 
-    def __init__(self, cell: Cell, *, quiet: bool) -> None:
+    def __init__(self, cell: Cell, *, quiet: bool, replies: bool = True) -> None:
         self._cell = cell
         self._quiet = quiet
+        self._replies = replies
         console = progress_console()
         self._progress = None if quiet else console or Console(stderr=True)
         self._period = LINE_EVERY if console is not None else LINE_PERIOD
@@ -171,9 +254,10 @@ class View:
             return progress.waiting
         text = (
             f"{progress.state.name.lower().replace('_', ' ')}  "
-            f"{progress.cycles * self._cell.period:.1f} s  {progress.missed} missed, "
-            f"{progress.late} late, {progress.not_accepted} not accepted"
+            f"{progress.cycles * self._cell.period:.1f} s  {progress.missed} missed"
         )
+        if self._replies:
+            text += f", {progress.late} late, {progress.not_accepted} not accepted"
         if progress.position is None or not np.isfinite(progress.position).all():
             return text
         return f"{text}  {AngleFrame.pendant(self._cell).text_of_angles(progress.position)}"

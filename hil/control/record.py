@@ -57,11 +57,13 @@ def archive_spec(
     plan: Mapping[str, Any] | None = None,
     *,
     durable: bool,
+    states: tuple[str, ...] = (),
 ) -> ArchiveSpec:
     """Return the specification of an archive with cell, URDF, drive train and plan attached.
 
     A motion of the controller's own program has no plan. The name of the cell is added to the
-    metadata. With `durable` each flush waits for the disk.
+    metadata. With `durable` each flush waits for the disk. `states` are topics of what the
+    controller sends beyond cycle records.
     """
     attachments = {
         "cell.toml": cell.text.encode(),
@@ -77,6 +79,7 @@ def archive_spec(
         metadata={"cell": cell.name, **metadata},
         attachments=attachments,
         durable=durable,
+        states=states,
     )
 
 

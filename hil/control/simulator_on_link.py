@@ -43,9 +43,10 @@ def open_controller_link(
     address = text
     if option == "--link":
         name, _, address = text.partition(":")
+    carrying = [link for link, each in LINKS.items() if each.controller]
     kind = LINKS.get(name)
-    if kind is None:
-        remedy = f"write NAME:ADDRESS; names are {', '.join(LINKS)}"
+    if kind is None or not kind.controller:
+        remedy = f"write NAME:ADDRESS; names are {', '.join(carrying)}"
         raise InputError(None, f"{option} {text!r} names no transport", remedy=remedy)
     try:
         fields = kind.parse(address)

@@ -9,12 +9,15 @@ from typing import Final
 
 import numpy as np
 
-from hil.base.errors import SourceError
+from hil.archive import open_archive
+from hil.archive.schema import CYCLE
+from hil.base.errors import ArchiveError, SourceError
 from hil.cell import Cell
-from hil.importers.conclusions import Certainty, ChannelMeaning, UnitBasis
+from hil.importers.conclusions import Certainty, ChannelMeaning, Examined, NameBasis, UnitBasis
 from hil.importers.log_files import LogFiles
 from hil.importers.recording import ImportedRecording, ImportOptions, RobotOf, read_recording
 from hil.importers.required_signals import require_motion
+from hil.importers.units import Kind
 from hil.look import physics, signals
 from hil.look.maps import with_entries
 from hil.look.other_arm import Contradictions
@@ -34,18 +37,30 @@ from identification.signals.samples import Preprocessing, prepare
 SETTINGS: Final = Preprocessing(14.0, left_out="rests")
 """Preparation of a recording whose readings are compared."""
 _DELAY_SAMPLES: Final = 20_000
+_COLUMNS: Final[tuple[tuple[str, Kind, str], ...]] = (
+    ("position", "position", "rad"),
+    ("torque", "torque", "N·m"),
+    ("target_current", "motor_current", "A"),
+)
+"""Columns of an archive of `hil` that are looked at: what they are, and their unit."""
 
 
 def look_at(source: Path, robot_of: RobotOf | None, options: ImportOptions) -> Look:
     """Return what a recording contains and, with its robot, what its torque can determine.
 
+    An archive of `hil` has its robot in it, unless another is given, and states what its channels
+    are.
+
     Raises:
         SourceError: it cannot be read, or its names leave a quantity open.
     """
-    files = LogFiles()
-    robot = robot_of or (lambda _: undescribed_robot(source, options, files))
-    lenient = replace(options, outside_limits=True)
-    imported = read_recording(source, robot, lenient, files=files)
+    imported = None if robot_of is not None else _archived(source)
+    described = robot_of is not None or imported is not None
+    if imported is None:
+        files = LogFiles()
+        robot = robot_of or (lambda _: undescribed_robot(source, options, files))
+        lenient = replace(options, outside_limits=True)
+        imported = read_recording(source, robot, lenient, files=files)
     require_motion(imported.archive, source)
     cell = cell_of(imported.archive)
     try:
@@ -53,11 +68,26 @@ def look_at(source: Path, robot_of: RobotOf | None, options: ImportOptions) -> L
         recorded.recording.checked(cell.joint_names)
     except (RecordingError, SourceError) as error:
         raise SourceError(source, str(error)) from error
-    rows = signals.rows(recorded, imported, None if robot_of is None else cell)
-    if robot_of is None:
+    rows = signals.rows(recorded, imported, cell if described else None)
+    if not described:
         rows.append(_without_robot(recorded.recording))
         return Look(source.name, tuple(rows), (), (), imported.map_text)
     return _with_torque(source, recorded, imported, cell, rows)
+
+
+def _archived(source: Path) -> ImportedRecording | None:
+    """Return an archive of `hil` as what an import would give; None of any other file."""
+    try:
+        archive = open_archive(source)
+    except ArchiveError:
+        return None  # the import says what it is, and whether it can be read
+    if archive.kind == "imported" or not {"cell.toml", "robot.urdf"} <= archive.attachments.keys():
+        return None
+    concluded = tuple(
+        ChannelMeaning(f"{CYCLE}/{column}", kind, NameBasis.MESSAGE, unit, UnitBasis.MESSAGE)
+        for column, kind, unit in _COLUMNS
+    )
+    return ImportedRecording(archive, (source,), None, concluded, Examined((), ()))
 
 
 def _without_robot(recording: Recording) -> Row:

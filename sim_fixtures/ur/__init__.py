@@ -6,11 +6,12 @@ of one side cannot cancel on the other; programs of others read it in the tests.
 
 from __future__ import annotations
 
-from sim_fixtures.ur.arm import UR5E_URDF, SimulatedUrArm, UrArmTruth
+from sim_fixtures.ur.arm import CELL_PATH, UR5E_URDF, SimulatedUrArm, UrArmTruth
 from sim_fixtures.ur.controller import SimulatedUr, UrFault, UrProgram, UrSettings
 from sim_fixtures.ur.server import UrServer
 
 __all__ = [
+    "CELL_PATH",
     "SimulatedUr",
     "SimulatedUrArm",
     "UR5E_URDF",

@@ -16,6 +16,8 @@ import pinocchio as pin
 from sim_fixtures.arrays import Array
 from sim_fixtures.plant import Carried, Plant, PlantTruth, build_model, carry
 
+CELL_PATH: Final = Path(__file__).with_name("cell.toml")
+"""A cell file of the simulated UR5e."""
 UR5E_URDF: Final = Path(__file__).with_name("ur5e.urdf").read_text("utf-8")
 _ROOM: Final = 25.0  # °C
 _HEATING: Final = 0.25  # °C per W of friction in the long run

@@ -53,6 +53,7 @@ class _Client:
     version: int = 1
     unread_since: float | None = None
     held_until: int = -1  # cycle before which nothing is sent
+    greeted: bool = False
     closing: bool = False
 
 
@@ -266,11 +267,17 @@ class UrServer:
 
     def _serve_primary(self, client: _Client) -> None:
         client.received.clear()
-        if not client.waiting:
-            client.waiting += wire.message_package("URControl")
+        if not client.greeted:
+            client.greeted = True
+            client.waiting += wire.message_package("URControl") + self._state()
+
+    def _state(self) -> bytes:
+        kind = self.controller.settings.kind
+        return wire.state_package(kind, _LIMITS, _RATES, _DH, _CHECKSUMS)
 
     def _serve_dashboard(self, client: _Client) -> None:
-        if not client.received and not client.waiting:
+        if not client.greeted:
+            client.greeted = True
             client.waiting += b"Connected: Universal Robots Dashboard Server\n"
         while b"\n" in client.received:
             line, _, rest = bytes(client.received).partition(b"\n")
@@ -297,10 +304,7 @@ class UrServer:
         outputs = None
         for client in [*self._clients]:
             if client.serve == self._serve_primary and controller.time >= self._next_state:
-                state = wire.state_package(
-                    controller.settings.kind, _LIMITS, _RATES, _DH, _CHECKSUMS
-                )
-                client.waiting += state
+                client.waiting += self._state()
             if not client.started or client.data is None or cycle % client.every:
                 continue
             outputs = outputs or controller.outputs()

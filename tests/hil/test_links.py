@@ -11,7 +11,7 @@ import pytest
 from drivers import Transport
 from drivers.transports.base import TransportSpec
 from hil.base.errors import InputError
-from hil.cell import Cell
+from hil.cell import Cell, CellError
 from hil.cell.schema import LINKS, CanTable, ControllerTable
 from hil.control.simulation import controller_settings
 from hil.control.simulator_on_link import open_controller_link
@@ -39,9 +39,17 @@ class Unjudged(TransportSpec):
 class TestLinks:
     def test_every_transport_has_a_row(self) -> None:
         names = get_args(ControllerTable.model_fields["transport"].annotation)
-        assert {*names} == {"simulated", *LINKS} == {"simulated", *HERE}
+        assert {*names} == {"simulated", *LINKS} == {"simulated", *HERE, "rtde"}
 
-    @pytest.mark.parametrize("name", LINKS)
+    def test_a_link_that_is_only_listened_to_refuses_motions(self) -> None:
+        here, away = (
+            CELL.with_link(transport="rtde", host=host) for host in ("127.0.0.1", "192.0.2.1")
+        )
+        assert here.only_simulated and not away.only_simulated
+        with pytest.raises(CellError, match=r"cannot be commanded yet; record .* `hil record`"):
+            away.transport_spec()
+
+    @pytest.mark.parametrize("name", HERE)
     def test_a_row_serves_cell_doctor_and_controller(self, name: str) -> None:
         """The settings reach the exchange process, and only a link on this computer is local."""
         here, away = (CELL.with_link(transport=name, **each[name]) for each in (HERE, AWAY))
@@ -61,7 +69,9 @@ class TestLinks:
         unknown = DoctorCheck("controller link", CheckStatus.UNKNOWN, "not checked: the controller")
         assert link_checks(cell.link_spec, System()) == [unknown]
 
-    @pytest.mark.parametrize("link", ["no-such:127.0.0.1:1", "", "udp:127.0.0.1", "can:x"])
+    @pytest.mark.parametrize(
+        "link", ["no-such:127.0.0.1:1", "", "udp:127.0.0.1", "can:x", "rtde:127.0.0.1"]
+    )
     def test_a_wrong_link_is_refused(self, link: str) -> None:
         with pytest.raises(InputError, match=r"--link .* write"):
             open_controller_link({"--link": link}, controller_settings(CELL), 6)

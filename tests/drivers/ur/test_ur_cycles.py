@@ -65,17 +65,25 @@ def test_missing_frames_are_gaps_and_never_a_shift(
     assert records["gap"].sum() == cycles[-1] - cycles[0] + 1 - len(cycles)
 
 
-@pytest.mark.parametrize("later", [0.0, -0.002, -50.0])
-def test_time_that_does_not_advance_is_a_restart(later: float) -> None:
+@pytest.mark.parametrize(
+    ("later", "fault"),
+    [
+        *((later, "started again") for later in (0.0, -0.002, -50.0)),
+        (0.003, r"not 2 ms apart: correct controller\.cycle_ms"),
+    ],
+)
+@pytest.mark.parametrize("together", [True, False])
+def test_frames_before_a_fault_of_time_are_recorded(
+    later: float, fault: str, together: bool
+) -> None:
+    """Whether it comes with them or later."""
     counter = CycleCounter(drives(), PERIOD)
-    counter.records(frames_at([100.0]))
-    with pytest.raises(RtdeError, match="started again"):
-        counter.records(frames_at([100.0 + later]))
-
-
-def test_stamps_of_another_cycle_are_refused() -> None:
-    with pytest.raises(RtdeError, match=r"not 2 ms apart: correct controller\.cycle_ms"):
-        CycleCounter(drives(), PERIOD).records(frames_at([5.0, 5.003]))
+    sound, wrong = [100.0, 100.002], [100.002 + later, 100.002 + later + 0.002]
+    frames = frames_at(sound + wrong) if together else frames_at(sound)
+    assert counter.records(frames).records["cycle"].tolist() == [0, 1]
+    for _ in range(2):
+        with pytest.raises(RtdeError, match=fault):
+            counter.records(frames_at(wrong))
 
 
 def test_angles_and_torques_are_those_of_the_urdf() -> None:
