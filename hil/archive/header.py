@@ -48,6 +48,7 @@ SEALS = (DESCRIPTION, CHUNKS)  # Entries of the outcome that only serve to verif
 CONTROLLER_PROGRAM = "controller"
 """Entry ``motion`` of an archive whose motion was made by a program of the controller."""
 REPLIES_LOST = "AnswersLost"  # Name of the event `drivers.events.RepliesLost`
+EPISODE = "episode"  # Entry of an imported recording: its number, where a file has several
 REJECTED = "rejected"  # Outcome of a motion that completed and failed its quality check
 MOST_JOINTS: Final = 256
 

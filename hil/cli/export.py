@@ -68,7 +68,7 @@ def export(
     ranges: bool = False,
     ensemble: Annotated[int | None, typer.Option(min=1, max=10000, metavar="N")] = None,
     seed: Annotated[int, typer.Option(min=0)] = 1,
-    into: Annotated[Path | None, typer.Option(exists=True, dir_okay=False, metavar="FILE")] = None,
+    into: Annotated[Path | None, typer.Option(metavar="FILE")] = None,
     precision: Precision = "double",
     quiet: QuietOption = False,
     json: JsonOption = False,

@@ -31,6 +31,7 @@ from hil.importers.bag_map import BagMap
 from hil.importers.channels import CHANNEL_NAMES
 from hil.importers.column_map import ready_map, ready_maps
 from hil.importers.dh import convention_of
+from hil.importers.lerobot import EpisodeUnit
 from hil.importers.messages import sentence
 from hil.importers.recording import ImportedRecording, ImportOptions, import_bag, import_recording
 from hil.importers.robot import STANDARD_GRAVITY, Robot, Use
@@ -229,6 +230,23 @@ class Reading:
             rich_help_panel=CHANNELS,
         ),
     ] = None
+    calibration: Annotated[
+        Path | None,
+        typer.Option(
+            metavar="FILE",
+            help="LeRobot's calibration of the arm (JSON), for a data set with joints -100 to 100.",
+            rich_help_panel=CHANNELS,
+        ),
+    ] = None
+    units: Annotated[
+        EpisodeUnit | None,
+        typer.Option(
+            metavar="UNIT",
+            help="Of the joints of a LeRobot data set: deg, or range for -100 to 100 of their "
+            "range. Default: concluded.",
+            rich_help_panel=CHANNELS,
+        ),
+    ] = None
     outside_limits: OutsideOption = False
     drop_missing: Annotated[
         bool,
@@ -260,6 +278,8 @@ class Reading:
             self.outside_limits,
             self.drop_missing,
             self.command_topic,
+            self.calibration,
+            self.units,
         )
 
     def refuse_without_robot(self) -> None:
@@ -271,6 +291,8 @@ class Reading:
             "--topic": self.topic,
             "--command-topic": self.command_topic,
             "--rename": self.rename,
+            "--calibration": self.calibration,
+            "--units": self.units,
             "--outside-limits": self.outside_limits,
             "--drop-missing": self.drop_missing,
         }

@@ -13,7 +13,7 @@ import numpy as np
 from hil.base.arrays import Array
 from hil.base.errors import InputError
 from hil.base.files import make_folder, write_files
-from hil.base.safe_input import read_text
+from hil.base.safe_input import read_input
 from hil.pipeline.identified_model import IdentifiedModel, ensemble_of, remarks_of
 from identification.export.actuators import Actuators, FieldRange, Quantity, ranges_of
 from identification.export.arm import ExportedArm
@@ -42,6 +42,8 @@ _FIELDS: Final[Mapping[str, Mapping[str, Quantity]]] = {
     "isaaclab": ISAAC_LAB,
     "genesis": GENESIS,
 }
+OWN_FILE: Final = "give an MJCF or URDF with the joints of the arm by name"
+"""Remedy for a file that cannot be changed."""
 _DRAWS: Final = 100  # arms of which ranges are estimated
 _LEARNT: Final = 0.5  # of the prior's deviation, above which the motion says little
 
@@ -136,10 +138,9 @@ def patch_drives(model: IdentifiedModel, into: Path, what: WhatToExport) -> Expo
     """
     actuators = drives_of(model, 0, what.seed)
     try:
-        text = patched(read_text(into), actuators)
+        text = patched(read_input(into, OWN_FILE), actuators)
     except PatchError as error:
-        remedy = "give an MJCF or URDF with the joints of the arm by name"
-        raise InputError(into, str(error), field="--into", remedy=remedy) from error
+        raise InputError(into, str(error), field="--into", remedy=OWN_FILE) from error
     files = {into.name: text}
     if what.ranges:
         files |= _ranges_file(actuators, model, into, "urdf" if into.suffix == ".urdf" else "mjcf")

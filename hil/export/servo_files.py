@@ -12,9 +12,9 @@ import numpy as np
 
 from hil.base.errors import InputError
 from hil.base.files import make_folder, write_files
-from hil.base.safe_input import path_exists, read_text
+from hil.base.safe_input import path_exists, read_input
 from hil.cell import Cell
-from hil.export.drive_files import URDF, WhatToExport
+from hil.export.drive_files import OWN_FILE, URDF, WhatToExport
 from hil.pipeline.identified_model import arm_with, impossible_bodies
 from hil.pipeline.options import friction_from
 from hil.pipeline.sources import Source, gather_sources
@@ -260,7 +260,7 @@ def _description(
     """Return the text of an MJCF or URDF, and how it was read back."""
     if into is not None:
         try:
-            text = patched(read_text(into), actuators)
+            text = patched(read_input(into, OWN_FILE), actuators)
         except PatchError as error:
             remedy = "give an MJCF or URDF with the joints of the results by name"
             raise InputError(into, str(error), field="--into", remedy=remedy) from error

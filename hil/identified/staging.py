@@ -15,12 +15,14 @@ from hil.archive import Archive, write_archive
 from hil.base.errors import InputError, SourceError
 from hil.base.files import convert_write_errors, replace_file, write_output
 from hil.base.progress import Reporter
+from hil.importers.lerobot import is_data_set
 from hil.importers.messages import sentence
 from hil.importers.recording import (
     ImportedRecording,
     ImportOptions,
     RobotOf,
     is_archive,
+    read_episodes,
     read_recording,
 )
 from hil.importers.required_signals import has_servo, require_motion, require_torque
@@ -113,21 +115,37 @@ def staged(
                 if is_archive(path):
                     archives.append(path)
                     continue
-                place = staging.unused(path)
-                staging.sources[place] = path
-                recording = read_recording(path, robot_of, options, place=place, use=use)
-                require_motion(recording.archive, path)
-                require_torque(recording.archive, path)
-                recording = concluded(recording, path, robot_of, options, use)
-                _report(recording, path, reporter)
-                archives.append(recording.archive)
-                staging.recordings[place] = recording
+                for source, place, recording in _read(path, robot_of, options, use, staging):
+                    require_motion(recording.archive, source)
+                    require_torque(recording.archive, source)
+                    recording = concluded(recording, source, robot_of, options, use)
+                    _report(recording, source, reporter)
+                    archives.append(recording.archive)
+                    staging.recordings[place] = recording
         yield staging
     except InputError as error:
         if error.path not in staging.sources:
             raise
         source = staging.sources[error.path]
         raise InputError(source, error.problem, field=error.field, remedy=error.remedy) from error
+
+
+def _read(
+    path: Path, robot_of: RobotOf, options: ImportOptions, use: Use, staging: Staging
+) -> Iterator[tuple[Path, Path, ImportedRecording]]:
+    """Yield the recordings of a file or folder, each with its name and the path of its archive."""
+
+    def place_of(source: Path) -> Path:
+        place = staging.unused(source)
+        staging.sources[place] = source
+        return place
+
+    if is_data_set(path):
+        for source, recording in read_episodes(path, robot_of, options, use=use, place_of=place_of):
+            yield source, recording.archive.path, recording
+    else:
+        place = place_of(path)
+        yield path, place, read_recording(path, robot_of, options, place=place, use=use)
 
 
 def require_torques(staging: Staging) -> None:

@@ -79,6 +79,18 @@ class ArrayFile:
         self.names = tuple(self._stored)
         self._loaded: dict[str, NDArray[Any]] = {}
 
+    @classmethod
+    def in_memory(cls, path: Path, arrays: Mapping[str, NDArray[Any]]) -> ArrayFile:
+        """Return arrays that were read already, as a file of this path would have them."""
+        file = cls.__new__(cls)
+        file.path = path
+        contents = _in_memory(arrays)
+        file.left_out = contents.left_out
+        file._stored = contents.arrays
+        file.names = tuple(file._stored)
+        file._loaded = {}
+        return file
+
     def has(self, name: str) -> bool:
         """Return whether an array has this name."""
         return name in self._stored

@@ -101,6 +101,28 @@ class FixedFingers(Conclusion):
     positions: Mapping[str, float]
 
 
+class UnitsFrom(Enum):
+    """From what the units of a data set of LeRobot are known."""
+
+    OPTION = auto()
+    CALIBRATION = auto()
+    BEYOND_RANGE = auto()  #: a number is above 100
+    BEYOND_LIMITS = auto()  #: a number would be outside the limits of the URDF in degrees
+
+
+@dataclass(frozen=True)
+class EpisodeUnits(Conclusion):
+    """Units of the joints of a data set of LeRobot.
+
+    Attributes:
+        unit: degrees, or -100 to 100 of the calibrated range.
+        basis: from what that is known.
+    """
+
+    unit: Literal["deg", "range"]
+    basis: UnitsFrom
+
+
 @dataclass(frozen=True)
 class RecordedArm(Conclusion):
     """The arm that was recorded, of several: its first and last joint.

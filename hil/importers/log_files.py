@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Final
 
@@ -34,10 +35,13 @@ def is_folder_of_logs(path: Path) -> bool:
 
 
 class LogFiles:
-    """Parsed files by path and format; a file is not read again when it changes."""
+    """Parsed files by path and format; a file is not read again when it changes.
 
-    def __init__(self) -> None:
-        self._arrays: dict[Path, ArrayFile] = {}
+    Some `arrays` may be given, such as those of an episode that shares a file with others.
+    """
+
+    def __init__(self, arrays: Mapping[Path, ArrayFile] | None = None) -> None:
+        self._arrays: dict[Path, ArrayFile] = dict(arrays or {})
         self._tables: dict[tuple[Path, str], Table] = {}
 
     def arrays(self, path: Path) -> ArrayFile:

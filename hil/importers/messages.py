@@ -18,6 +18,7 @@ from hil.importers.conclusions import (
     CopiedCommands,
     CounterContinued,
     DifferentCommands,
+    EpisodeUnits,
     Examined,
     FastJoint,
     FixedFingers,
@@ -50,6 +51,7 @@ from hil.importers.conclusions import (
     TooFewSamples,
     TorqueSize,
     UnitBasis,
+    UnitsFrom,
     UnrelatedVelocity,
     UnusedChannels,
     UnusualRate,
@@ -137,6 +139,21 @@ def _(unused: UnusedChannels) -> str:
 @worded.register
 def _(order: JointOrder) -> str:
     return f"joints in the order of the names in the rows: {', '.join(order.joints)}"
+
+
+_UNITS_FROM: Final[Mapping[UnitsFrom, str]] = {
+    UnitsFrom.OPTION: "as stated (--units)",
+    UnitsFrom.CALIBRATION: "by the calibration",
+    UnitsFrom.BEYOND_RANGE: "as numbers beyond 100 occur",
+    UnitsFrom.BEYOND_LIMITS: "as degrees would be outside the limits of the URDF",
+}
+
+
+@worded.register
+def _(units: EpisodeUnits) -> str:
+    ranges = "-100 to 100 of the calibrated range"
+    unit = "in degrees" if units.unit == "deg" else ranges
+    return f"joints {unit}, {_UNITS_FROM[units.basis]}; a gripper 0 to 100"
 
 
 @worded.register

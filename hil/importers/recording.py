@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
 from typing import Final
 
 from hil.archive import Archive, open_archive
+from hil.archive.header import EPISODE
 from hil.base.errors import ArchiveError, NotAnArchiveError, SourceError, UnrecordedJointError
 from hil.base.safe_input import parse_toml
 from hil.base.toml_text import to_text
@@ -28,6 +29,7 @@ from hil.importers.conclusions import (
     UnitBasis,
 )
 from hil.importers.folder import proposed_map_of_folder
+from hil.importers.lerobot import DataSet, Episode, EpisodeUnit, is_data_set
 from hil.importers.log import are_in_rows_of_their_own, read_log
 from hil.importers.log_files import LogFiles, is_folder_of_logs
 from hil.importers.partial_map import PartialMap
@@ -56,6 +58,8 @@ class ImportOptions:
         outside_limits: accept positions of which no row is within the limits of the URDF.
         drop_missing: leave out rows of a log in which a number is missing or is other text.
         command_topic: of the commanded positions of a bag, ``none`` for none; None to find it.
+        calibration: LeRobot's calibration of the arm of a data set, JSON.
+        units: of the joints of a data set of LeRobot; None to conclude them.
     """
 
     columns: Path | None = None
@@ -66,6 +70,8 @@ class ImportOptions:
     outside_limits: bool = False
     drop_missing: bool = False
     command_topic: str | None = None
+    calibration: Path | None = None
+    units: EpisodeUnit | None = None
 
 
 @dataclass(frozen=True)
@@ -110,6 +116,8 @@ class ImportedRecording:
 
 def is_archive(path: Path) -> bool:
     """Return whether a file is an archive of this software, or a folder of such or a campaign."""
+    if is_data_set(path):
+        return False
     if path.is_dir():
         is_bag = any(path.glob("*.db3*")) or (path / "metadata.yaml").exists()
         return not is_bag and not is_folder_of_logs(path)
@@ -425,9 +433,62 @@ def _arm_of_map(robot: Robot, links: Links, path: Path | None) -> Robot:
     return robot.between(links, path)
 
 
+def read_episodes(
+    source: Path,
+    robot_of: RobotOf,
+    options: ImportOptions = ImportOptions(),
+    *,
+    use: Use = "excitation",
+    place_of: Callable[[Path], Path],
+) -> Iterator[tuple[Path, ImportedRecording]]:
+    """Yield the episodes of a data set of LeRobot, with the path that names each.
+
+    Args:
+        source: folder of the data set.
+        robot_of: its robot, see :data:`RobotOf`.
+        options: how it is read.
+        use: what identification uses it for.
+        place_of: the path of an episode's archive.
+
+    Raises:
+        SourceError: it cannot be read, or joints or units are not clear.
+    """
+    data = DataSet.read(source)
+    for episode in data.episodes:
+        request = _Request(
+            episode.path, place_of(episode.path), (), use, coupled=True,
+            outside_limits=options.outside_limits,
+        )  # fmt: skip
+        read = partial(_of_episode, request, data=data, episode=episode, options=options)
+        yield episode.path, _of_recorded_joints(read, robot_of, source)
+
+
+def _of_episode(
+    request: _Request, robot_of: RobotOf, *, data: DataSet, episode: Episode, options: ImportOptions
+) -> ImportedRecording:
+    """Read an episode of a data set."""
+    robot = robot_of(lambda: data.joints)
+    text, units = data.map_for(robot, options.calibration, options.units)
+    columns = ColumnMap.model_validate(parse_toml(text))
+    content = read_log(
+        episode.path,
+        robot=robot,
+        columns=columns,
+        coupled=request.coupled,
+        files=episode.files,
+    )
+    request = replace(request, files=episode.files)
+    number = {EPISODE: str(episode.number)}
+    content = replace(content, source=(episode.source,), metadata={**content.metadata, **number})
+    return request.imported(content, with_arm(text, robot.links), (units,))
+
+
 def _imported(request: _Request, robot_of: RobotOf, *, options: ImportOptions) -> ImportedRecording:
     """Read with the robot as it is described; see :func:`read_recording`."""
     source = request.source
+    if is_data_set(source):
+        data = DataSet.read(source)
+        return _of_episode(request, robot_of, data=data, episode=data.longest, options=options)
     path = options.columns
     stated = None if path is None else BagMap.load(path)
     if stated is not None:

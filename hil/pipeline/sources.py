@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from drivers.packets import DRIVE_ON
 from hil.archive import Archive, ArchiveHeader, ArchiveName, open_archive, opened, place_of
-from hil.archive.header import REJECTED
+from hil.archive.header import EPISODE, REJECTED
 from hil.archive.recorded_campaign import RecordedCampaign
 from hil.archive.recordings import recording_of
 from hil.base.arrays import Array
@@ -301,14 +301,14 @@ def archives_in(paths: Sequence[Path]) -> Iterator[Path]:
 def refuse_duplicates(archives: Sequence[Path | Archive]) -> None:
     """Raise InputError if two are equal: fitted recordings must not be held out as well.
 
-    Files with the same bytes, or imports of these.
+    Files with the same bytes, or imports of these and of the same episode in them.
     """
     seen: dict[str, Path] = {}
     for archive in archives:
         path = place_of(archive)
         try:
             digest = (
-                archive.header.entries["source_sha256"]
+                archive.header.entries["source_sha256"] + archive.header.entries.get(EPISODE, "")
                 if isinstance(archive, Archive)
                 else file_digest(archive)
             )

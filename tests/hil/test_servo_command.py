@@ -14,6 +14,7 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
+from benchmarks import servo_arm as arm
 from hil.base.errors import InputError
 from hil.base.one_screen import one_screen
 from hil.cli import app
@@ -21,7 +22,6 @@ from hil.results.servo_result import ServoResults, is_servo_result
 from hil.servo.maker_file import maker_parameters
 from hil.servo.messages import screen
 from identification.servo.parameters import PLACE
-from tests import servo_arm as arm
 
 SO101 = Path(__file__).resolve().parents[3] / "shared" / "data" / "so101"
 MICROSECONDS = 1e6

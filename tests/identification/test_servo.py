@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 import scipy
 
+from benchmarks import servo_arm as arm
 from identification import RobotModel
 from identification.servo.choice import fit_servos
 from identification.servo.intervals import intervals_of, sampled
@@ -12,7 +13,6 @@ from identification.servo.parameters import NAMES, PLACE, TERMS, in_errors, in_u
 from identification.servo.prediction import predicted
 from identification.servo.simulation import JointInputs, simulate
 from identification.signals.recording import Recording
-from tests import servo_arm as arm
 
 STEP = 5e-3
 

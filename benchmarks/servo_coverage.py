@@ -1,0 +1,195 @@
+"""Whether 95 % intervals of servos identified without torque hold the truth of simulated arms.
+
+Run with ``python -m benchmarks.servo_coverage [--seeds N] [--first SEED] [--seconds S] [--json]``.
+Each seed is an arm of its own (`benchmarks.servo_arm`: gains, friction, static and load-dependent,
+torque limit, dead band, delay of the bus; joints move all at once by pinocchio's dynamics,
+at another step and with another integrator than what is fitted), a motion and encoder counts.
+
+- ``covered``: share of the 95 % intervals that hold the true value, of parameters that are called
+  determined, and of all that the model has; by parameter.
+- ``determined``: share of parameters that are called determined.
+- ``wrong``: parameters called determined whose value is off by more than a factor of 2, or whose
+  interval misses the truth by more than its own width.
+- ``error``: root mean square of a motion that was not fitted, simulated from its commands alone,
+  over that of the command itself; median over the seeds.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import time
+from collections import defaultdict
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import Any, Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from benchmarks import servo_arm as planted
+from identification import RobotModel
+from identification.servo.choice import fit_servos
+from identification.servo.intervals import intervals_of
+from identification.servo.motion import Grid, motions_of
+from identification.servo.parameters import PLACE
+from identification.servo.prediction import predicted
+from identification.signals.recording import Recording
+
+Array = NDArray[np.float64]
+PLANTED: Final = (
+    *("kp", "kd", "armature", "viscous", "coulomb", "static", "speed"),
+    *("load", "limit", "dead_band", "delay"),
+)
+_WRONG_FACTOR: Final = 2.0
+
+
+@dataclass(frozen=True)
+class Judged:
+    """One interval."""
+
+    seed: int
+    name: str
+    joint: int
+    true: float
+    value: float
+    lower: float
+    upper: float
+    present: bool
+    determined: bool
+
+    @property
+    def covers(self) -> bool:
+        """Whether the interval holds the truth."""
+        return self.lower <= self.true <= self.upper
+
+    @property
+    def wrong(self) -> bool:
+        """Whether it is called determined, and is not."""
+        ratio = max(self.value, 1e-12) / max(self.true, 1e-12)
+        far = not 1.0 / _WRONG_FACTOR <= ratio <= _WRONG_FACTOR
+        width = self.upper - self.lower
+        missed = max(self.lower - self.true, self.true - self.upper) > width
+        return self.determined and (far or missed)
+
+
+def judged(seed: int, seconds: float) -> tuple[list[Judged], float]:
+    """Return the intervals of an arm, and the error of an unseen motion over its command's."""
+    rng = np.random.default_rng(seed)
+    truth = planted.Planted.drawn(rng)
+    model, bodies = _model()
+    motions = []
+    for duration in (seconds, 12.0):
+        instants, command = planted.commands(rng, duration)
+        position = planted.simulated(truth, instants, command)
+        recording = Recording(
+            time=instants,
+            position=position,
+            joint_names=planted.NAMES,
+            commanded_position=command,
+        )
+        motions += motions_of(recording, model, bodies, Grid.of(recording))
+    fitted, unseen = motions
+    found = fit_servos([fitted], np.full(3, planted.COUNT / np.sqrt(12.0)))
+    intervals = intervals_of(found)
+    (simulated,) = predicted(model, bodies, unseen, [intervals.values])
+    error = np.sqrt(np.mean((simulated - unseen.position) ** 2))
+    command_error = np.sqrt(np.mean((unseen.command - unseen.position) ** 2))
+    rows = [
+        Judged(
+            seed,
+            name,
+            joint,
+            true=float(np.broadcast_to(getattr(truth, name), 3)[joint]),
+            value=float(intervals.values[joint, PLACE[name]]),
+            lower=float(intervals.lower[joint, PLACE[name]]),
+            upper=float(intervals.upper[joint, PLACE[name]]),
+            present=bool(found.estimate.present[joint, PLACE[name]]),
+            determined=bool(intervals.determined[joint, PLACE[name]]),
+        )
+        for name in PLANTED
+        for joint in range(3)
+    ]
+    return rows, float(error / command_error)
+
+
+def _model() -> tuple[RobotModel, Array]:
+    model = RobotModel.from_urdf(planted.urdf())
+    standard = model.nominal.copy()
+    standard[model.layout.rotors] = 0.0
+    bodies = np.zeros(model.n_parameters)
+    bodies[: model.base.rank] = model.base.grouping @ standard
+    return model, bodies
+
+
+def figures(rows: list[Judged], errors: list[float]) -> dict[str, Any]:
+    """Return the figures of all seeds."""
+
+    def share(chosen: Iterator[bool]) -> float | None:
+        values = list(chosen)
+        return round(float(np.mean(values)), 3) if values else None
+
+    by_name: dict[str, list[Judged]] = defaultdict(list)
+    for row in rows:
+        by_name[row.name].append(row)
+    return {
+        "covered_determined": share(row.covers for row in rows if row.determined),
+        "covered": share(row.covers for row in rows if row.present),
+        "determined": share(row.determined for row in rows),
+        "wrong": [
+            f"{row.name} of {planted.NAMES[row.joint]}, seed {row.seed}: {row.value:.3g}"
+            f" ({row.lower:.3g} to {row.upper:.3g}), true {row.true:.3g}"
+            for row in rows
+            if row.wrong
+        ],
+        "error": round(float(np.median(errors)), 4),
+        "by_parameter": {
+            name: {
+                "covered_determined": share(row.covers for row in group if row.determined),
+                "covered": share(row.covers for row in group if row.present),
+                "determined": share(row.determined for row in group),
+            }
+            for name, group in by_name.items()
+        },
+    }
+
+
+def main() -> None:
+    """Print the figures."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--seeds", type=int, default=40)
+    parser.add_argument("--first", type=int, default=1)
+    parser.add_argument("--seconds", type=float, default=40.0)
+    parser.add_argument("--json", action="store_true")
+    options = parser.parse_args()
+    rows: list[Judged] = []
+    errors: list[float] = []
+    started = time.process_time()
+    for seed in range(options.first, options.first + options.seeds):
+        more, error = judged(seed, options.seconds)
+        rows += more
+        errors.append(error)
+        if not options.json:
+            known = [row for row in more if row.determined]
+            held = sum(row.covers for row in known)
+            print(
+                f"seed {seed}: {held} of {len(known)} determined held, error {error:.3f}",
+                flush=True,
+            )
+    result = figures(rows, errors)
+    result["processor_seconds"] = round((time.process_time() - started) / options.seeds, 1)
+    if options.json:
+        print(json.dumps(result, indent=1))
+        return
+    for name, value in result.items():
+        if name == "by_parameter":
+            for parameter, group in value.items():
+                print(f"  {parameter:10} {group}")
+        elif name == "wrong":
+            print("wrong:", *value, sep="\n  ")
+        else:
+            print(f"{name}: {value}")
+
+
+if __name__ == "__main__":
+    main()

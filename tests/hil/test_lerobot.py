@@ -1,0 +1,240 @@
+"""Data sets of LeRobot: episodes as recordings, joints and units from the metadata."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pyarrow as pa
+import pytest
+from numpy.typing import NDArray
+from pyarrow import parquet
+from typer.testing import CliRunner
+
+from hil.base.errors import InputError, SourceError
+from hil.cli import app
+from hil.importers.conclusions import EpisodeUnits, UnitsFrom
+from hil.importers.lerobot import DataSet, is_data_set
+from hil.importers.recording import ImportOptions, read_episodes
+from hil.importers.robot import Robot
+from hil.pipeline.sources import refuse_duplicates
+
+Array = NDArray[np.float64]
+
+JOINTS = ("pan", "lift", "gripper")
+LOWER, UPPER = -0.2, 1.8  # rad, of the gripper
+REACH = 1.9  # rad, of the other joints
+URDF = """<robot name="arm"><link name="base"/>
+{}</robot>"""
+LINK = """<joint name="{name}" type="revolute"><parent link="{parent}"/><child link="{name}_link"/>
+<origin xyz="0 0 0.1"/><axis xyz="0 1 0"/>
+<limit lower="{lower}" upper="{upper}" effort="3" velocity="9"/></joint>
+<link name="{name}_link"><inertial><origin xyz="0 0 0.05"/><mass value="0.1"/>
+<inertia ixx="1e-4" iyy="1e-4" izz="1e-4" ixy="0" ixz="0" iyz="0"/></inertial></link>"""
+FPS = 50.0
+
+
+@pytest.fixture
+def urdf(tmp_path: Path) -> Path:
+    path = tmp_path / "arm.urdf"
+    parents = ("base", "pan_link", "lift_link")
+    ends = ((-REACH, REACH), (-REACH, REACH), (LOWER, UPPER))
+    path.write_text(
+        URDF.format(
+            "\n".join(
+                LINK.format(name=name, parent=parent, lower=lower, upper=upper)
+                for name, parent, (lower, upper) in zip(JOINTS, parents, ends, strict=True)
+            )
+        )
+    )
+    return path
+
+
+def motion(duration: float, phase: float) -> Array:
+    """Return positions (m, 3) [rad]."""
+    time = np.arange(0.0, duration, 1.0 / FPS)
+    turns = [1.5 * np.sin(time + phase), 0.8 * np.cos(0.7 * time), 0.8 + 0.5 * np.sin(1.3 * time)]
+    return np.column_stack(turns)
+
+
+def percent(gripper: Array) -> Array:
+    return 100.0 * (gripper - LOWER) / (UPPER - LOWER)
+
+
+def in_degrees(position: Array) -> Array:
+    return np.column_stack([np.degrees(position[:, :2]), percent(position[:, 2])])
+
+
+def in_range(position: Array, reach: float = REACH) -> Array:
+    return np.column_stack([100.0 * position[:, :2] / reach, percent(position[:, 2])])
+
+
+def written(
+    folder: Path,
+    episodes: list[tuple[Array, Array]],
+    *,
+    version: str = "v2.1",
+    names: Any = None,
+) -> Path:
+    """Write states and actions of episodes as LeRobot does."""
+    stated = [f"{name}.pos" for name in JOINTS] if names is None else names
+    feature = {"dtype": "float32", "shape": [3], "names": stated}
+    info = {
+        "codebase_version": version,
+        "fps": FPS,
+        "features": {"observation.state": feature, "action": feature},
+    }
+    (folder / "meta").mkdir(parents=True)
+    (folder / "meta" / "info.json").write_text(json.dumps(info))
+    chunk = folder / "data" / "chunk-000"
+    chunk.mkdir(parents=True)
+    tables = []
+    numbers = pa.list_(pa.float32())
+    for k, (state, action) in enumerate(episodes):
+        rows = np.arange(len(state))
+        tables.append(
+            pa.table(
+                {
+                    "observation.state": pa.array(state.tolist(), numbers),
+                    "action": pa.array(action.tolist(), numbers),
+                    "timestamp": pa.array(rows / FPS, pa.float32()),
+                    "frame_index": rows,
+                    "episode_index": np.full(len(rows), k),
+                    "task_index": np.zeros(len(rows), np.int64),
+                }
+            )
+        )
+    if version == "v3.0":
+        parquet.write_table(pa.concat_tables(tables), chunk / "file-000.parquet")
+    else:
+        for k, table in enumerate(tables):
+            parquet.write_table(table, chunk / f"episode_{k:06d}.parquet")
+    return folder
+
+
+def recordings(
+    folder: Path, urdf: Path, **options: Any
+) -> list[tuple[str, dict[str, Array], tuple[object, ...]]]:
+    """Return names, columns and conclusions of the episodes."""
+    robot = Robot.from_urdf(urdf)
+    read = read_episodes(
+        folder, lambda _: robot, ImportOptions(**options), place_of=lambda path: path
+    )
+    return [
+        (path.stem, dict(recording.archive.columns), recording.concluded)
+        for path, recording in read
+    ]
+
+
+@pytest.mark.parametrize("version", ["v2.1", "v3.0"])
+def test_episodes_of_every_version_are_recordings(tmp_path: Path, urdf: Path, version: str) -> None:
+    first, second = motion(4.0, 0.0), motion(3.0, 1.0)
+    lag = 0.02
+    episodes = [(in_degrees(q), in_degrees(q + lag)) for q in (first, second)]
+    folder = written(tmp_path / "pick", episodes, version=version)
+    assert is_data_set(folder)
+    found = recordings(folder, urdf, units="deg")
+    assert [name for name, _, _ in found] == ["pick_episode_000000", "pick_episode_000001"]
+    for (_, columns, _), position in zip(found, (first, second), strict=True):
+        np.testing.assert_allclose(columns["position"], position, atol=1e-5)
+        np.testing.assert_allclose(columns["commanded_position"], position + lag, atol=1e-5)
+        assert "torque" not in columns
+        stamps = columns["stamp"] - columns["stamp"][0]
+        np.testing.assert_allclose(1e-9 * stamps, np.arange(len(position)) / FPS, atol=1e-5)
+
+
+def test_numbers_beyond_100_are_degrees(tmp_path: Path, urdf: Path) -> None:
+    position = motion(4.0, 0.0) * np.array([1.2, 1.0, 1.0])
+    data = in_degrees(position)
+    assert np.abs(data[:, 0]).max() > 101.0
+    folder = written(tmp_path / "pick", [(data, data)])
+    ((_, columns, concluded),) = recordings(folder, urdf)
+    np.testing.assert_allclose(columns["position"], position, atol=1e-5)
+    assert EpisodeUnits("deg", UnitsFrom.BEYOND_RANGE) in concluded
+
+
+def test_a_calibration_gives_the_range_of_each_joint(tmp_path: Path, urdf: Path) -> None:
+    reach = 1.6
+    position = motion(4.0, 0.0)
+    data = in_range(position, reach)
+    folder = written(tmp_path / "pick", [(data, data)])
+    steps = 4095.0 / (2.0 * np.pi)
+    spans = {"pan": 2.0 * reach, "lift": 2.0 * reach, "gripper": UPPER - LOWER}
+    calibration = tmp_path / "arm.json"
+    calibration.write_text(
+        json.dumps(
+            {
+                name: {"id": k, "range_min": 900.0, "range_max": 900.0 + steps * span}
+                for k, (name, span) in enumerate(spans.items())
+            }
+        )
+    )
+    ((_, columns, concluded),) = recordings(folder, urdf, calibration=calibration)
+    np.testing.assert_allclose(columns["position"], position, atol=1e-5)
+    assert EpisodeUnits("range", UnitsFrom.CALIBRATION) in concluded
+
+
+def test_the_range_may_be_that_of_the_urdf(tmp_path: Path, urdf: Path) -> None:
+    position = motion(4.0, 0.0)
+    folder = written(tmp_path / "pick", [(in_range(position), in_range(position))])
+    ((_, columns, _),) = recordings(folder, urdf, units="range")
+    np.testing.assert_allclose(columns["position"], position, atol=1e-5)
+
+
+def test_units_that_may_be_either_are_asked_for(tmp_path: Path, urdf: Path) -> None:
+    data = in_degrees(0.5 * motion(4.0, 0.0))
+    folder = written(tmp_path / "pick", [(data, data)])
+    with pytest.raises(SourceError, match="degrees, or -100 to 100") as refused:
+        recordings(folder, urdf)
+    assert "--calibration" in str(refused.value.remedy)
+
+
+@pytest.mark.parametrize(
+    "names",
+    [["main_pan", "main_lift", "main_gripper"], {"motors": ["pan", "lift", "gripper"]}],
+    ids=["prefix", "motors"],
+)
+def test_names_of_earlier_versions_are_joints(tmp_path: Path, urdf: Path, names: Any) -> None:
+    data = in_degrees(motion(4.0, 0.0))
+    folder = written(tmp_path / "pick", [(data, data)], names=names)
+    assert DataSet.read(folder).joints == JOINTS
+    ((_, columns, _),) = recordings(folder, urdf, units="deg")
+    assert columns["position"].shape[1] == 3
+
+
+def test_a_calibration_of_other_joints_is_refused(tmp_path: Path, urdf: Path) -> None:
+    data = in_range(motion(4.0, 0.0))
+    folder = written(tmp_path / "pick", [(data, data)])
+    calibration = tmp_path / "arm.json"
+    calibration.write_text('{"other": {"range_min": 1, "range_max": 2}}')
+    with pytest.raises(SourceError, match="is no calibration of these joints") as refused:
+        recordings(folder, urdf, calibration=calibration)
+    assert refused.value.remedy
+
+
+def test_a_data_set_without_joints_is_refused(tmp_path: Path, urdf: Path) -> None:
+    data = in_degrees(motion(4.0, 0.0))
+    folder = written(tmp_path / "pick", [(data, data)], names=[0, 1, 2])
+    with pytest.raises(SourceError, match="names no numbers of observation"):
+        recordings(folder, urdf, units="deg")
+
+
+def test_episodes_of_one_file_are_no_copies(tmp_path: Path, urdf: Path) -> None:
+    episodes = [(in_degrees(q), in_degrees(q)) for q in (motion(3.0, 0.0), motion(5.0, 1.0))]
+    folder = written(tmp_path / "pick", episodes, version="v3.0")
+    robot = Robot.from_urdf(urdf)
+    options = ImportOptions(units="deg")
+    read = read_episodes(folder, lambda _: robot, options, place_of=lambda path: path)
+    archives = [recording.archive for _, recording in read]
+    refuse_duplicates(archives)
+    with pytest.raises(InputError, match="is a copy"):
+        refuse_duplicates([*archives, archives[0]])
+
+
+def test_a_look_reads_the_longest_episode(tmp_path: Path, urdf: Path) -> None:
+    episodes = [(in_degrees(q), in_degrees(q)) for q in (motion(3.0, 0.0), motion(5.0, 1.0))]
+    folder = written(tmp_path / "pick", episodes, version="v3.0")
+    done = CliRunner().invoke(app, ["look", str(folder), "--urdf", str(urdf), "--units", "deg"])
+    assert "250 samples" in done.output
