@@ -42,6 +42,7 @@ FOREIGN: Final[Mapping[str, str]] = {
     "hil.importers.dialect": "cells of a table",
     "hil.importers.list_cells": "cells of a table",
     "hil.importers.log_text": "logs",
+    "hil.importers.long_text": "logs",
     "hil.importers.matlab": "MATLAB scripts",
     "hil.importers.name_words": "names of channels",
     "hil.importers.text_table": "logs",

@@ -159,6 +159,20 @@ def _decoded(data: bytes, encoding: str | None, *, or_latin: bool) -> str:
     return data.decode("cp1252")
 
 
+def encoding_by_start(start: bytes) -> str:
+    """Return the encoding of a long text by its first bytes, as `read_text` finds it `or_latin`."""
+    for mark, name in _MARKS.items():
+        if start.startswith(mark):
+            return name
+    if b"\0" in start[:_PROBED]:
+        return "utf-16-le" if start[1:2] == b"\0" else "utf-16-be"
+    try:
+        codecs.getincrementaldecoder("utf-8")().decode(start)
+    except UnicodeDecodeError:
+        return "cp1252"
+    return "utf-8"
+
+
 def _declared_utf_8(text: str) -> str:
     """Return an XML text whose declaration names the encoding in which it is stored from now on."""
     return _DECLARATION.sub(r"\1UTF-8\3", text, count=1)

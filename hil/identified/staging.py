@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Final
 
@@ -15,7 +15,9 @@ from hil.archive import Archive, write_archive
 from hil.base.errors import InputError, SourceError
 from hil.base.files import convert_write_errors, replace_file, write_output
 from hil.base.progress import Reporter
+from hil.importers.excerpt import LONGEST
 from hil.importers.lerobot import is_data_set
+from hil.importers.log_files import LogFiles
 from hil.importers.messages import sentence
 from hil.importers.recording import (
     ImportedRecording,
@@ -116,10 +118,7 @@ def staged(
                     archives.append(path)
                     continue
                 for source, place, recording in _read(path, robot_of, options, use, staging):
-                    require_motion(recording.archive, source)
-                    require_torque(recording.archive, source)
-                    recording = concluded(recording, source, robot_of, options, use)
-                    _report(recording, source, reporter)
+                    recording = _concluded(recording, source, robot_of, options, use, reporter)
                     archives.append(recording.archive)
                     staging.recordings[place] = recording
         yield staging
@@ -145,7 +144,34 @@ def _read(
             yield source, recording.archive.path, recording
     else:
         place = place_of(path)
-        yield path, place, read_recording(path, robot_of, options, place=place, use=use)
+        # Nothing here may refer to the recording: its text is forgotten when it was concluded.
+        yield path, place, _read_one(path, robot_of, options, place, use)
+
+
+def _read_one(
+    path: Path, robot_of: RobotOf, options: ImportOptions, place: Path, use: Use
+) -> ImportedRecording:
+    files = LogFiles(longest=LONGEST)
+    return read_recording(path, robot_of, options, place=place, use=use, files=files)
+
+
+def _concluded(
+    recording: ImportedRecording,
+    source: Path,
+    robot_of: RobotOf,
+    options: ImportOptions,
+    use: Use,
+    reporter: Reporter,
+) -> ImportedRecording:
+    """Report what is concluded of a recording, and return it without the text of its log.
+
+    That takes more memory than its numbers.
+    """
+    require_motion(recording.archive, source)
+    require_torque(recording.archive, source)
+    recording = concluded(recording, source, robot_of, options, use)
+    _report(recording, source, reporter)
+    return replace(recording, files=LogFiles())
 
 
 def require_torques(staging: Staging) -> None:

@@ -200,6 +200,15 @@ class LeftOut(Conclusion):
 
 
 @dataclass(frozen=True)
+class Excerpt(Conclusion):
+    """Rows of a long recording that were read, and of how many."""
+
+    count: int
+    total: int
+    stretches: int
+
+
+@dataclass(frozen=True)
 class MissingNumbers(Conclusion):
     """Rows that were left out, as a number is missing in them."""
 

@@ -248,7 +248,7 @@ class _Log:
         if time is None:
             assert rate is not None
             self._refuse_interrupted()
-            stamps = np.rint(np.arange(count) * (1e9 / rate)).astype(np.int64)
+            stamps = np.rint(self._row_numbers(count) * (1e9 / rate)).astype(np.int64)
             return _Clock(stamps, np.ones(count, np.bool_), 0, self.path)
         return self._clock_of(time, position, "position")
 
@@ -264,6 +264,15 @@ class _Log:
                 "[format] skip_empty = true; to skip lines of a header: [format] skip_rows"
             )
             raise SourceError(file.path, problem, field="time", remedy=remedy)
+
+    def _row_numbers(self, count: int) -> NDArray[np.intp]:
+        """Return the place of each row of the positions in their file (m,), from 0."""
+        position = self._map.position
+        if position.files is not None:
+            file, *_ = self._file_per_joint(position.files, "position.files")
+        else:
+            file = self._file(position.file, "position.file")
+        return file.row_numbers if isinstance(file, Table) else np.arange(count)
 
     def _clock_of(self, time: TimeColumn, quantity: Quantity, name: str) -> _Clock:
         """Return the stamps of a quantity by its column of times."""
@@ -315,7 +324,7 @@ class _Log:
         """Return the times of a file [ns], None where one is missing."""
         if time.nanoseconds is None:
             unit = time.unit or self._unit_of_time(file, time)
-            if time.unit is not None and is_row_counter(file.times(time.column, 0, time.array)):
+            if time.unit is not None and is_row_counter(_unbroken(file, time, 0)):
                 counter = RowCounter(str(time.column), time.unit)
                 if counter not in self.concluded:
                     self.concluded.append(counter)
@@ -332,7 +341,7 @@ class _Log:
         stated = unit_of(file.unit(time.column) or "", "time")
         if stated is not None:
             return stated
-        times = file.times(time.column, TIMES["s"], time.array)
+        times = _unbroken(file, time, TIMES["s"])
         if is_row_counter(times):
             problem = f"column {time.column} counts the rows from {int((times[0] or 0) / 1e9)}"
             remedy = (
@@ -693,6 +702,12 @@ class _Log:
             problem = f"has {len(values)} entries"
             remedy = f"one for each of the joints {', '.join(self.joints)}"
             raise SourceError(self.path, problem, field=field, remedy=remedy)
+
+
+def _unbroken(file: Table | ArrayFile, time: TimeColumn, decimals: int) -> Sequence[int | None]:
+    """Return the times of the first rows, as far as no row was left out."""
+    times = file.times(time.column, decimals, time.array)
+    return times[: file.unbroken] if isinstance(file, Table) else times
 
 
 def _check_lengths(

@@ -38,9 +38,15 @@ class LogFiles:
     """Parsed files by path and format; a file is not read again when it changes.
 
     Some `arrays` may be given, such as those of an episode that shares a file with others.
+
+    Attributes:
+        longest: rows that are read of a recording, see :mod:`hil.importers.excerpt`; None for all.
     """
 
-    def __init__(self, arrays: Mapping[Path, ArrayFile] | None = None) -> None:
+    def __init__(
+        self, arrays: Mapping[Path, ArrayFile] | None = None, *, longest: int | None = None
+    ) -> None:
+        self.longest = longest
         self._arrays: dict[Path, ArrayFile] = dict(arrays or {})
         self._tables: dict[tuple[Path, str], Table] = {}
 
@@ -62,7 +68,7 @@ class LogFiles:
         """
         key = path, form.model_dump_json()
         if key not in self._tables:
-            self._tables[key] = Table.read(path, form)
+            self._tables[key] = Table.read(path, form, self.longest)
         return self._tables[key]
 
     def file(self, path: Path, form: Format) -> Table | ArrayFile:

@@ -22,6 +22,8 @@ from hil.importers.arrays import READERS
 from hil.importers.column_map import Format
 from hil.importers.spreadsheet import is_spreadsheet, text_of_sheet
 
+COMMENTS: Final = ("#", "%", "//")
+"""Starts of lines that are no rows."""
 _ROSTOPIC = "%time,"  # of `rostopic echo -p`
 _LONGEST: Final = 1 << 31  # bytes; several times as many in memory
 # Cells in apostrophes, or as spreadsheets protect text: ="0.5".
@@ -91,6 +93,16 @@ def _refuse_binary(path: Path, start: bytes) -> None:
             raise SourceError(path, f"is {kind}, not text", remedy=remedy)
 
 
+def is_readable_text(path: Path) -> bool:
+    """Return whether a file is text, which may be compressed, by its first bytes.
+
+    Raises:
+        OSError: it cannot be read.
+    """
+    start = _head_of(path)
+    return not (is_spreadsheet(path, start) or any(map(start.startswith, _BINARY)))
+
+
 def text_of(path: Path, form: Format) -> str:
     """Return the text of a file in any usual encoding, or of a sheet of a spreadsheet.
 
@@ -107,6 +119,15 @@ def text_of(path: Path, form: Format) -> str:
         raise
     except (OSError, ValueError, LookupError, zipfile.BadZipFile) as error:
         raise _unreadable(path, error) from error
+    return table_text(path, text)
+
+
+def table_text(path: Path, text: str) -> str:
+    """Return the text of a table with quotation marks as CSV has them, and a header as the others.
+
+    Raises:
+        SourceError: it is XML, JSON or YAML.
+    """
     text = text.removeprefix("%") if text.startswith(_ROSTOPIC) else text  # a header there
     text = _OTHER_QUOTES.sub(r'"\1\2"', text) if "'" in text or '="' in text else text
     if _MARKUP.match(text):

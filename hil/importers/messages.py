@@ -20,6 +20,7 @@ from hil.importers.conclusions import (
     DifferentCommands,
     EpisodeUnits,
     Examined,
+    Excerpt,
     FastJoint,
     FixedFingers,
     JointOrder,
@@ -208,6 +209,14 @@ def source_of(unit: StatedUnit | ConcludedUnit) -> str:
 @worded.register
 def _(left_out: LeftOut) -> str:
     return f"left out: {_OMITTED[left_out.what]} ({left_out.count})"
+
+
+@worded.register
+def _(excerpt: Excerpt) -> str:
+    return (
+        f"{excerpt.count} of {excerpt.total} rows are used, {excerpt.stretches} stretches over the "
+        "whole recording in which the arm moves (`hil import` reads every row)"
+    )
 
 
 @worded.register

@@ -174,6 +174,8 @@ class _Request:
         bag: BagMap | None = None,
     ) -> ImportedRecording:
         """Return what was read, with the text of its column map or the map of its bag."""
+        if self.files.longest is not None:
+            content = content.excerpt(self.files.longest)
         archive, examined = content.archive(
             self.place,
             held_joints=self.held_joints,

@@ -5,11 +5,11 @@ from __future__ import annotations
 import json
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from contextlib import contextmanager, nullcontext
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields, replace
 from functools import partial
 from os import PathLike
 from pathlib import Path
-from typing import Final, Literal
+from typing import Any, Final, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -24,8 +24,9 @@ from hil.cell.arms import Links, joints_outside
 from hil.cell.gripper import gripper_joints
 from hil.cell.nominal import nominal_of
 from hil.cell.text import urdf_limits, with_values
-from hil.importers.conclusions import Conclusion, Examined
+from hil.importers.conclusions import Conclusion, Examined, Excerpt, RecordedClock
 from hil.importers.dh import Convention, urdf_of_dh
+from hil.importers.excerpt import excerpt_of
 from hil.importers.findings import (
     NominalTorque,
     check_positions,
@@ -359,6 +360,22 @@ class RecordingContent:
         )
         return archive, found
 
+    def excerpt(self, longest: int) -> RecordingContent:
+        """Return stretches of a long recording; see :func:`hil.importers.excerpt.excerpt_of`."""
+        samples = self.samples
+        chosen = excerpt_of(samples.stamp, samples.position, longest)
+        if chosen is None:
+            return self
+        arrays = {each.name: getattr(samples, each.name) for each in fields(samples)}
+        excerpt: dict[str, Any] = {
+            name: None if values is None else values[chosen.rows] for name, values in arrays.items()
+        }
+        read = [each.total for each in self.concluded if isinstance(each, Excerpt)]
+        others = (each for each in self.concluded if not isinstance(each, Excerpt))
+        total = max([len(samples.stamp), *read])
+        said = Excerpt(len(chosen.rows), total, chosen.stretches)
+        return replace(self, samples=Samples(**excerpt), concluded=(*others, said))
+
     def _examined(self, held_joints: Sequence[str]) -> Examined:
         """Return the findings of an import, what was concluded first."""
         found = examine(
@@ -369,7 +386,17 @@ class RecordingContent:
             nominal=self.robot.nominal_torque(),
             held_joints=held_joints,
         )
-        return Examined((*self.concluded, *found.found), found.warnings)
+        findings = found.found
+        if any(isinstance(each, Excerpt) for each in self.concluded):
+            findings = tuple(map(_without_gaps, findings))
+        return Examined((*self.concluded, *findings), found.warnings)
+
+
+def _without_gaps(found: Conclusion) -> Conclusion:
+    """Return a finding of an excerpt; what was left out of it is no gap of the recording."""
+    if not isinstance(found, RecordedClock):
+        return found
+    return replace(found, base=replace(found.base, gaps=0, pauses=0))
 
 
 def write_to(output: Path, archive: Archive, *, force: bool) -> None:

@@ -5,19 +5,22 @@ from __future__ import annotations
 import csv
 import io
 import re
+from bisect import bisect_right
 from collections.abc import Collection, Sequence
 from dataclasses import dataclass, field
 from decimal import Decimal
 from functools import cached_property
+from itertools import count
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final, NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from hil.base.arrays import Array
 from hil.base.errors import SourceError
 from hil.importers.column_map import HOLE, Column, Format
-from hil.importers.conclusions import LeftOut, Omitted
+from hil.importers.conclusions import Excerpt, LeftOut, Omitted
 from hil.importers.date_stamps import nanoseconds_of_dates
 from hil.importers.dialect import (
     FORTRAN,
@@ -30,14 +33,14 @@ from hil.importers.dialect import (
     with_points,
 )
 from hil.importers.list_cells import spread_lists
-from hil.importers.log_text import text_of
+from hil.importers.log_text import COMMENTS, table_text, text_of
+from hil.importers.long_text import LongText, long_text
 from hil.importers.units import unit_of, without_unit
 
 if TYPE_CHECKING:
     import pandas as pd
 
 
-_COMMENTS = ("#", "%", "//")
 _EMPTY: Final = "record again, or name the file that has the samples"
 _PROBED: Final = 100  # lines
 _LONGEST_TIME: Final = 30  # digits before the point, more than of nanoseconds since 1970
@@ -71,27 +74,25 @@ class Table:
     numbered: Sequence[int]  #: line numbers in the file, from 1
     dialect: Dialect
     gaps: bool  #: whether rows may lack numbers
-    left_out: tuple[LeftOut, ...] = ()
+    left_out: tuple[LeftOut | Excerpt, ...] = ()
     interrupted: int | None = None  #: first empty line at which rows may be missing
+    unbroken: int | None = None  #: first rows, that follow each other in the file; None for all
     _converted: dict[tuple[int, ...], Array] = field(default_factory=dict, compare=False)
     _times: dict[tuple[int, int], Sequence[int | None]] = field(default_factory=dict, compare=False)
 
     @classmethod
-    def read(cls, path: Path, form: Format) -> Table:
+    def read(cls, path: Path, form: Format, longest: int | None = None) -> Table:
         """Read a file and detect its encoding, dialect, header and units.
+
+        Of one with more lines than `longest` stretches are read.
 
         Raises:
             SourceError: it cannot be read, or has no row of numbers.
         """
-        text = text_of(path, form)
-        text = spread_lists(path, text, drop=form.missing != "refuse")
-        numbered = [
-            (number, line)
-            for number, line in enumerate(text.splitlines(), 1)
-            if number > form.skip_rows
-        ]
-        comments = [line for _, line in numbered if line.lstrip().startswith(_COMMENTS)]
-        numbered = [entry for entry in numbered if not entry[1].lstrip().startswith(_COMMENTS)]
+        long = None if longest is None else long_text(path, form, longest)
+        numbered, text = _numbered_lines(path, form, long)
+        comments = [line for _, line in numbered if line.lstrip().startswith(COMMENTS)]
+        numbered = [entry for entry in numbered if not entry[1].lstrip().startswith(COMMENTS)]
         filled = [line for _, line in numbered if line.strip()]
         if not filled:
             raise SourceError(path, "has no row of numbers", remedy=_EMPTY)
@@ -112,12 +113,37 @@ class Table:
             Omitted.EMPTY_LINES: len(empty),
             Omitted.CUT_ROW: int(is_cut),
         }
-        left_out = tuple(LeftOut(what, count) for what, count in omitted.items() if count)
+        left_out: tuple[LeftOut | Excerpt, ...] = tuple(
+            LeftOut(what, lines) for what, lines in omitted.items() if lines
+        )
         numbers = [number for number, _ in rows]
         lines = [line for _, line in rows]
         gaps = form.missing != "refuse"
         interrupted = None if gaps or form.skip_empty else _interruption(numbers, empty)
-        return cls(path, names, units, width, lines, numbers, dialect, gaps, left_out, interrupted)
+        unbroken = None
+        if long is not None:
+            left_out = (*left_out, long.excerpt)
+            unbroken = bisect_right(numbers, long.unbroken)
+        return cls(
+            path,
+            names,
+            units,
+            width,
+            lines,
+            numbers,
+            dialect,
+            gaps,
+            left_out,
+            interrupted,
+            unbroken,
+        )
+
+    @property
+    def row_numbers(self) -> NDArray[np.intp]:
+        """Place of each row in the file (m,), from 0."""
+        if self.unbroken is None:
+            return np.arange(len(self.lines))
+        return np.asarray(self.numbered) - self.numbered[0]
 
     def unit(self, column: Column) -> str | None:
         """Return the unit that the file states for a column: below its name, or in brackets."""
@@ -342,6 +368,17 @@ class Table:
         problem = f"line {self.numbered[row]} has {shown} in column {name}, not a number"
         remedy = self._remedy(texts[row])
         raise SourceError(self.path, problem, field=field, remedy=remedy)
+
+
+def _numbered_lines(
+    path: Path, form: Format, long: LongText | None
+) -> tuple[list[tuple[int, str]], str]:
+    """Return the lines of a file, or those that are read of a long one, and their text."""
+    text = text_of(path, form) if long is None else table_text(path, long.text)
+    text = spread_lists(path, text, drop=form.missing != "refuse")
+    numbers = count(1) if long is None else long.numbers
+    every = zip(numbers, text.splitlines(), strict=False)
+    return [(number, line) for number, line in every if number > form.skip_rows], text
 
 
 def _layout(numbered: list[tuple[int, str]], dialect: Dialect, path: Path, form: Format) -> _Layout:

@@ -14,6 +14,7 @@ from hil.archive.schema import CYCLE
 from hil.base.errors import ArchiveError, SourceError
 from hil.cell import Cell
 from hil.importers.conclusions import Certainty, ChannelMeaning, Examined, NameBasis, UnitBasis
+from hil.importers.excerpt import LONGEST
 from hil.importers.log_files import LogFiles
 from hil.importers.recording import ImportedRecording, ImportOptions, RobotOf, read_recording
 from hil.importers.required_signals import require_motion
@@ -57,7 +58,7 @@ def look_at(source: Path, robot_of: RobotOf | None, options: ImportOptions) -> L
     imported = None if robot_of is not None else _archived(source)
     described = robot_of is not None or imported is not None
     if imported is None:
-        files = LogFiles()
+        files = LogFiles(longest=LONGEST)
         robot = robot_of or (lambda _: undescribed_robot(source, options, files))
         lenient = replace(options, outside_limits=True)
         imported = read_recording(source, robot, lenient, files=files)

@@ -28,8 +28,10 @@ from hil.cell.text import urdf_limits
 from hil.control.connection import Connection
 from hil.control.live_link import END_TIMEOUT, ExchangeMonitor
 from hil.control.motion_watch import Stop
-from identification.excitation import CollisionChecker, CollisionModelError, Workspace
+from identification.excitation import CollisionModelError, Workspace
 from planner import JointLimits
+
+from .found_shapes import THICKNESS, check_by_found_shapes
 
 _MOST_TURNED: Final = 3
 """Joints turned to find a clear home posture."""
@@ -135,8 +137,9 @@ def assumed_for_design(cell_values: CellValues, n_joints: int) -> CellValues:
 def clear_home(urdf: str, cell_values: CellValues, mesh_folders: Sequence[str]) -> CellValues:
     """Return the first clear posture with up to three joints turned by 90° from the home posture.
 
-    Where none is clear of the floor, no floor is assumed. Notes report this, and pairs that are not
-    checked or with less than the margin. Nothing is returned if shapes are missing or unreadable.
+    Where none is clear of the floor, no floor is assumed. Of links without shapes, or with a mesh
+    that is not found, only the height over the floor is checked. Notes report this, and pairs that
+    are not checked or with less than the margin.
     """
     lower, upper = (
         np.radians(cell_values.values[f"limits.{end}_deg"]) for end in ("lower", "upper")
@@ -146,13 +149,19 @@ def clear_home(urdf: str, cell_values: CellValues, mesh_folders: Sequence[str]) 
     for floor in (cell_values.values["workspace.floor"], None):
         workspace = Workspace(floor, margin=cell_values.values["workspace.margin"])
         try:
-            checker = CollisionChecker(urdf, workspace, limits, mesh_folders)
-        except CollisionModelError:
-            return CellValues()
-        clear = np.flatnonzero(checker.clear(postures))
+            check = check_by_found_shapes(urdf, postures, workspace, limits, mesh_folders)
+        except CollisionModelError as error:
+            return CellValues(notes=(f"campaign.home_deg was not checked for collisions: {error}",))
+        clear = np.flatnonzero(check.clear)
         if len(clear) > 0:
             values: dict[str, Any] = {"campaign.home_deg": _degrees(postures[clear[0]])}
-            notes = [] if checker.exceptions is None else [checker.exceptions]
+            notes = [] if check.exceptions is None else [check.exceptions]
+            if check.links:
+                notes.append(
+                    f"the collision shapes of {', '.join(check.links)} were not found: in "
+                    f"campaign.home_deg their frames are {THICKNESS * 100:g} cm off the floor, and "
+                    "nothing else was checked of them"
+                )
             if floor is None:
                 values["workspace.floor"] = "none"
                 notes.append("no posture tried is clear of a floor at 0 m: no floor is assumed")

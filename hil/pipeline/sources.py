@@ -26,6 +26,7 @@ from identification.signals.clock import SampleTimes, true_times
 from identification.signals.recording import (
     Recording,
     RecordingError,
+    cut_at_pauses,
     offsets_of_repetitions,
     without_repeats,
 )
@@ -413,6 +414,7 @@ def _usable(archive: Archive, cell: Cell, recording: Recording) -> Source:
             recording.check_finite()
             sound, faults = without_faulty_rows(recording)
             timed, times = true_times(sound)
+            timed = cut_at_pauses(timed)
         single = without_repeats(timed).checked(cell.joint_names)
     except RecordingError as error:
         raise ArchiveError(archive.path, str(error), remedy="leave it out") from error

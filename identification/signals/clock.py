@@ -16,7 +16,7 @@ import scipy
 from numpy.typing import NDArray
 
 from identification.arrays import Array
-from identification.signals.recording import GAP_STEPS, Recording, RecordingError
+from identification.signals.recording import GAP_STEPS, PAUSE, Recording, RecordingError
 from identification.text import percentage
 
 Rows = NDArray[np.bool_]
@@ -56,6 +56,8 @@ class TimeBase:
     backward: int  #: samples with an earlier time stamp than the one before
     dropped: int  #: missing samples in steps of up to `GAP_STEPS`
     gaps: int  #: longer steps and reported gaps
+    pauses: int = 0  #: of those, steps at which a recording is cut
+    longest_pause: float = 0.0  #: [s]
 
     @property
     def rate(self) -> float:
@@ -82,8 +84,13 @@ class TimeBase:
             lines.append(f"{self.backward} samples are older than the one before them")
         if self.dropped:
             lines.append(f"{self.dropped} samples are missing one by one")
-        if self.gaps:
-            lines.append(f"{self.gaps} gaps")
+        if gaps := self.gaps - self.pauses:
+            lines.append(f"{gaps} gap{'s' if gaps > 1 else ''}")
+        if self.pauses == 1:
+            lines.append(f"cut at a pause of {self.longest_pause:.4g} s")
+        elif self.pauses:
+            longest = f"{self.longest_pause:.4g} s"
+            lines.append(f"cut at {self.pauses} pauses, the longest of {longest}")
         return lines
 
 
@@ -123,6 +130,8 @@ def time_base(time: Array, gap_before: NDArray[np.bool_] | None = None) -> TimeB
         backward=int(np.count_nonzero(steps < 0.0)),
         dropped=int(missing.sum()),
         gaps=int(np.count_nonzero(gap)),
+        pauses=int(np.count_nonzero(steps > PAUSE)),
+        longest_pause=float(steps.max(initial=0.0, where=steps > PAUSE)),
     )
 
 
@@ -248,7 +257,9 @@ def _clock_of(recording: Recording, signals: Array) -> tuple[TimeBase, _EvenCloc
     base = time_base(time, gap)
     if not _are_late_in_bursts(time, signals, gap):
         return base, _even_clock(time, signals, recording.segments(), base)
-    reported = np.zeros(len(time), np.bool_) if gap is None else gap
+    reported = np.diff(time, prepend=time[0]) > PAUSE
+    if gap is not None:
+        reported |= gap
     numbered = replace(recording, time=np.arange(len(time), dtype=np.float64), gap_before=reported)
     segments = numbered.segments()
     base = replace(base, step=_mean_step(time, segments))
@@ -264,7 +275,7 @@ def _are_late_in_bursts(time: Array, signals: Array, reported: Rows | None) -> b
     forward = steps[steps > 0.0]
     if len(time) < _SHORTEST or not forward.size:
         return False
-    pause = steps > GAP_STEPS * float(np.median(forward))
+    pause = (steps > GAP_STEPS * float(np.median(forward))) & (steps <= PAUSE)
     if reported is not None:
         pause &= ~reported[1:]
     if not pause.any():

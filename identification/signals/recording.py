@@ -18,6 +18,9 @@ from identification.errors import IdentificationError, ShapeError
 STUCK_MOVEMENT: Final = 0.02  # rad or m
 LONGEST_PAUSE: Final = 600.0
 """Longest time without sample, s; empty blocks of time take memory."""
+PAUSE: Final = 10.0
+"""Time without sample [s] at which an imported recording is cut."""
+_BETWEEN_PARTS: Final = 1.0  # s, left of a pause; a gap at every rate
 UNWRAPPED: Final = "unwrapped"
 """Entry of the provenance: joints whose angles wrapped."""
 GAP_STEPS: Final = 5.0  # clock steps of a gap, in usual steps
@@ -200,6 +203,24 @@ class Recording:
                 f"the time step is {steps[sample - 1]:.6g} s at sample {sample}, limit "
                 f"{LONGEST_PAUSE:g} s: cut the recording there"
             )
+
+
+def cut_at_pauses(recording: Recording) -> Recording:
+    """Return the recording with a second between the parts that pauses above `PAUSE` separate.
+
+    Blocks of time take memory, empty ones too.
+    """
+    steps = np.diff(recording.time)
+    pauses = np.flatnonzero(steps > PAUSE) + 1
+    if not pauses.size:
+        return recording
+    excess = np.zeros(recording.n_samples)
+    excess[pauses] = steps[pauses - 1] - _BETWEEN_PARTS
+    gap = np.zeros(recording.n_samples, np.bool_)
+    if recording.gap_before is not None:
+        gap |= recording.gap_before
+    gap[pauses] = True
+    return replace(recording, time=recording.time - np.cumsum(excess), gap_before=gap)
 
 
 def in_succession(recordings: Sequence[Recording]) -> Recording:

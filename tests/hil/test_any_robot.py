@@ -130,7 +130,7 @@ def test_seven_axes_in_degrees_at_an_uneven_100_hz(tmp_path: Path) -> None:
     assert_found(identified, simulated)
     notes = " ".join(identified.prepared.notes)
     assert "uneven" in notes
-    assert "1 gaps" in notes
+    assert "1 gap" in notes
 
 
 def test_currents_without_torque_constants_are_refused(tmp_path: Path) -> None:

@@ -150,6 +150,41 @@ def test_a_design_begins_where_the_arm_is_clear(
     assert all(f"Note: {note}" in comments for note in summary["notes"])
 
 
+@pytest.mark.parametrize(
+    ("robot", "home"),
+    [(UR10, [0.0, -90.0, 0.0, 0.0, 0.0, 0.0]), (PANDA, [0.0, 0.0, 0.0, -90.0, 0.0, 0.0, 0.0])],
+)
+def test_an_arm_without_its_meshes_begins_above_the_floor(
+    robot: str, home: list[float], tmp_path: Path
+) -> None:
+    """And what could not be checked is said: at zero the arm of UR lies on the floor."""
+    urdf = tmp_path / "alone.urdf"
+    urdf.write_bytes(described_robot(robot).read_bytes())
+    summary = new(urdf, tmp_path / "cell.toml", "--design-only")
+    written = tomllib.loads((tmp_path / "cell.toml").read_text())
+    assert written["campaign"]["home_deg"] == home
+    assert summary["unknown"] == ["cell.mesh_folders"]
+    (note,) = [note for note in summary["notes"] if "collision shapes" in note]
+    assert "5 cm off the floor" in note
+    links = ("forearm_link", "wrist_3_link") if robot == UR10 else ("panda_link4", "panda_hand")
+    assert all(link in note for link in links)
+
+
+def test_shapes_that_are_there_are_checked_where_others_are_not(tmp_path: Path) -> None:
+    urdf = tmp_path / "two.urdf"
+    mesh = '<mesh filename="package://gone/lower.stl"/>'
+    urdf.write_text(
+        TWO_JOINTS.replace('<box size="0.06 0.06 0.2"/>', mesh).replace('0 0 1"', '0 0 0.3"')
+    )
+    summary = new(urdf, tmp_path / "cell.toml", "--design-only")
+    written = tomllib.loads((tmp_path / "cell.toml").read_text())
+    (note,) = [note for note in summary["notes"] if "collision shapes" in note]
+    assert "shapes of lower were not found" in note
+    assert written["workspace"]["floor"] == 0.0
+    # Upright the arm is clear; turned by 90° its box would reach below the floor.
+    assert written["campaign"]["home_deg"] == [0.0, 0.0]
+
+
 @pytest.mark.parametrize("joint", ["panda_finger_joint1", "panda_joint4"])
 def test_a_fixed_joint_has_the_dynamics_of_a_locked_one(joint: str) -> None:
     """Against pinocchio's own reduction of the whole model."""

@@ -347,7 +347,7 @@ class TestTimeBase:
         assert base.dropped == 3
         assert not base.uniform
         description = " ".join(base.describe())
-        for part in ("repeat", "older", "missing", "gaps"):
+        for part in ("repeat", "older", "missing", "gap"):
             assert part in description
         reported = np.arange(100) == 50  # without a time step
         assert time_base(np.arange(100) * 1e-3, reported).gaps == 1
