@@ -172,6 +172,12 @@ def main() -> None:
         if not options.json:
             known = [row for row in more if row.determined]
             held = sum(row.covers for row in known)
+            for row in known:
+                if not row.covers:
+                    print(
+                        f"  missed: {row.name} of {planted.NAMES[row.joint]} {row.value:.4g}"
+                        f" ({row.lower:.4g} to {row.upper:.4g}), true {row.true:.4g}"
+                    )
             print(
                 f"seed {seed}: {held} of {len(known)} determined held, error {error:.3f}",
                 flush=True,

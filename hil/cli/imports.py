@@ -230,6 +230,14 @@ class Reading:
             rich_help_panel=CHANNELS,
         ),
     ] = None
+    commands: Annotated[
+        Path | None,
+        typer.Option(
+            metavar="FILE",
+            help="Commanded positions of a log in a file of their own, joined by time stamps.",
+            rich_help_panel=CHANNELS,
+        ),
+    ] = None
     calibration: Annotated[
         Path | None,
         typer.Option(
@@ -278,6 +286,7 @@ class Reading:
             self.outside_limits,
             self.drop_missing,
             self.command_topic,
+            self.commands,
             self.calibration,
             self.units,
         )
@@ -291,6 +300,7 @@ class Reading:
             "--topic": self.topic,
             "--command-topic": self.command_topic,
             "--rename": self.rename,
+            "--commands": self.commands,
             "--calibration": self.calibration,
             "--units": self.units,
             "--outside-limits": self.outside_limits,

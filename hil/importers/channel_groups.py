@@ -15,6 +15,7 @@ from hil.importers.units import Kind, without_unit
 
 NUMBER: Final = re.compile(r"\d{1,2}(?=\D*$)")
 """The number of a joint in a name."""
+_REPEATED_MARK: Final = re.compile(r"([_.-])\1+")  # around the name of a joint
 
 
 @dataclass(frozen=True)
@@ -82,7 +83,7 @@ def grouped(channels: Iterable[Channel], joints: Sequence[str]) -> list[Group]:
             place = int(match[0])
         joint = _joint_in(bare, joints)
         if joint is not None:
-            quantity = bare.replace(joint, "").strip(" _.-/")
+            quantity = _REPEATED_MARK.sub(r"\1", bare.replace(joint, "")).strip(" _.-/")
             of_joint = kind_of(quantity, channel.unit)[0] or kind_by_words(quantity)
             if of_joint is not None and (kind in (None, of_joint) or "/" in bare):
                 kind = of_joint

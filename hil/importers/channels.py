@@ -60,7 +60,8 @@ CHANNEL_NAMES: Final[Mapping[Kind, tuple[str, ...]]] = {
         "motor_current", "motor_currents", "motorcurrent", "joint_current", "strom", "amp",
         "observation.current",
     ),
-    "commanded_position": (),  # stated by the user: names of commands differ too much
+    # LeRobot's; all others are stated by the user: names of commands differ too much
+    "commanded_position": ("action", "actions", "action.pos", "action.position"),
 }  # fmt: skip
 """Names of channels in the logs of the field, lower case, without number and unit."""
 _BY_NAME: Final = {name: kind for kind, names in CHANNEL_NAMES.items() for name in names}
@@ -137,7 +138,9 @@ def kind_of(name: str, unit: str | None = None) -> tuple[Kind | None, int | None
         if candidate in _BY_NAME:
             return _BY_NAME[candidate], number
     kinds: list[Kind] = [
-        kind for kind, names in CHANNEL_NAMES.items() if names and unit and unit_of(unit, kind)
+        kind
+        for kind in CHANNEL_NAMES
+        if kind != "commanded_position" and unit and unit_of(unit, kind)
     ]
     if len(kinds) != 1 or is_other(bare, kinds[0]):
         return None, number

@@ -290,6 +290,17 @@ class OneTimeBase(Conclusion):
 
 
 @dataclass(frozen=True)
+class OtherClock(Conclusion):
+    """Commands on another clock than the positions, to which the motion moved them.
+
+    Attributes:
+        offset: that was added to their times [s].
+    """
+
+    offset: float
+
+
+@dataclass(frozen=True)
 class PartialVelocity(Conclusion):
     """Joints without velocity, for which it was left out of all."""
 

@@ -20,6 +20,7 @@ from hil.base.errors import SourceError, UnrecordedJointError
 from hil.importers.arrays import ArrayFile
 from hil.importers.channel_groups import grouped
 from hil.importers.channels import named_channels
+from hil.importers.clock_offset import clock_offset
 from hil.importers.column_map import HOLE, KINEMATIC, ColumnMap, Quantity, TimeColumn
 from hil.importers.command_copies import copied_commands
 from hil.importers.conclusions import (
@@ -31,6 +32,7 @@ from hil.importers.conclusions import (
     MappedUnit,
     MissingNumbers,
     Omitted,
+    OtherClock,
     RowCounter,
     StatedUnit,
 )
@@ -315,10 +317,21 @@ class _Log:
             _check_lengths({name: array, "time": own.stamp}, self.path, "quantities")
             stamp = own.stamp[own.valid] + (own.origin - clock.origin)
             parts[name] = Timed(stamp, array[own.valid])
+        if "commanded_position" in clocks:
+            parts = self._with_commands_moved(parts)
         joined = on_one_base(parts, self.path)
         self.concluded.append(joined.conclusion)
         valid = np.ones(len(joined.stamp), np.bool_)
         return _Clock(joined.stamp, valid, clock.origin, clock.path), joined.values
+
+    def _with_commands_moved(self, parts: dict[str, Timed]) -> dict[str, Timed]:
+        """Return quantities with commands on the clock of the positions."""
+        command = parts["commanded_position"]
+        offset = clock_offset(parts["position"], command)
+        if offset is None:
+            return parts
+        self.concluded.append(OtherClock(1e-9 * offset))
+        return {**parts, "commanded_position": Timed(command.stamp + offset, command.values)}
 
     def _times(self, file: Table | ArrayFile, time: TimeColumn) -> Sequence[int | None]:
         """Return the times of a file [ns], None where one is missing."""

@@ -38,6 +38,7 @@ from hil.importers.conclusions import (
     NoTorque,
     Omitted,
     OneTimeBase,
+    OtherClock,
     OutsideLimits,
     PartialVelocity,
     RecordedArm,
@@ -294,6 +295,14 @@ def _(base: OneTimeBase) -> str:
     return (
         f"quantities at times of their own ({counts} samples) were interpolated to the times of "
         f"the {base.base.replace('_', ' ')}{some}"
+    )
+
+
+@worded.register
+def _(clock: OtherClock) -> str:
+    return (
+        f"commands are on another clock: moved by {clock.offset:.3f} s, at which their speeds agree"
+        " best with those of the positions; their delay is then not known"
     )
 
 

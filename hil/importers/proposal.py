@@ -226,6 +226,8 @@ class _Search:
         if len(groups) > 1:
             self._refuse_several(kind, groups)
         (group,) = groups
+        if kind == "commanded_position" and group.size != len(self._columns_of):
+            return None  # actions of something else
         if group.unit is not None and unit_of(group.unit, kind) is None:
             self._refuse_unit(kind, group)
         if kind == "time":

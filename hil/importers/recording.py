@@ -19,6 +19,7 @@ from hil.importers.bag_map import BagMap
 from hil.importers.bags import open_bag
 from hil.importers.channels import channels_of
 from hil.importers.column_map import ColumnMap, Format, map_text
+from hil.importers.command_file import CommandFile
 from hil.importers.conclusions import (
     ChannelMeaning,
     Conclusion,
@@ -58,6 +59,7 @@ class ImportOptions:
         outside_limits: accept positions of which no row is within the limits of the URDF.
         drop_missing: leave out rows of a log in which a number is missing or is other text.
         command_topic: of the commanded positions of a bag, ``none`` for none; None to find it.
+        commands: file of the commanded positions of a log, with times of its own.
         calibration: LeRobot's calibration of the arm of a data set, JSON.
         units: of the joints of a data set of LeRobot; None to conclude them.
     """
@@ -70,6 +72,7 @@ class ImportOptions:
     outside_limits: bool = False
     drop_missing: bool = False
     command_topic: str | None = None
+    commands: Path | None = None
     calibration: Path | None = None
     units: EpisodeUnit | None = None
 
@@ -523,8 +526,20 @@ def _proposed(
         rate = some.sample_rate
         form = some.stated.format if "format" in some.entries else None
     source = request.source
+    commands = None
+    if options.commands is not None:
+        if source.is_dir():
+            problem = "is for a single log: a folder has its commands in one of its files"
+            remedy = "state the file: --columns 'commanded_position=FILE'"
+            raise SourceError(options.commands, problem, field="--commands", remedy=remedy)
+        commands = CommandFile.of(options.commands, source, robot.joint_names, form, request.files)
+        chosen = {**chosen, "commanded_position": ",".join(commands.columns)}
     propose = proposed_map_of_folder if source.is_dir() else proposed_map
     proposal = propose(source, robot, chosen, sample_rate=rate, form=form, files=request.files)
+    if commands is not None:
+        text = with_values(proposal.text, commands.entries)
+        columns = ColumnMap.model_validate(parse_toml(text))
+        proposal = replace(proposal, text=text, columns=columns)
     if not source.is_dir():
         proposal = _with_own_rows(request, robot, proposal)
     return proposal if some is None else some.completed(proposal)
