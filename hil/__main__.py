@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import os
 
-from hil.base.startup_interrupt import leave_if_interrupted
+from hil.base.interrupt import leave_if_interrupted
 from hil.base.threads import VARIABLES
 
 

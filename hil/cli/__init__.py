@@ -26,8 +26,8 @@ from rich.text import Text
 from typer.core import TyperCommand, TyperGroup, TyperOption
 
 from hil.base.errors import DISK_REFUSES, HilError, InputError, OperatorStopError
+from hil.base.interrupt import leave_if_interrupted
 from hil.base.progress_lines import command_lines
-from hil.base.startup_interrupt import leave_if_interrupted
 from hil.base.terminal_text import printable
 from hil.base.version import software
 from hil.cli.suggestions import OTHER_COMMANDS, improve, with_present_names

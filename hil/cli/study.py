@@ -8,7 +8,7 @@ from typing import Annotated
 
 import typer
 
-from hil.base.errors import OperatorStopError
+from hil.base.interrupt import REQUESTS, leave_on
 from hil.base.progress import reporter as make_reporter
 from hil.cell import Cell
 from hil.cli.arguments import JsonOption, QuietOption, print_json
@@ -19,6 +19,7 @@ def study(
     output: Annotated[Path, typer.Option("--output", "-o")] = Path("runs/study"),
     quick: bool = False,
     cell: Annotated[Path | None, typer.Option(metavar="FILE")] = None,
+    searches: Annotated[int | None, typer.Option(min=2)] = None,
     repetitions: Annotated[int | None, typer.Option(min=2)] = None,
     motions: Annotated[int | None, typer.Option(min=5)] = None,
     seed: Annotated[int | None, typer.Option(min=0)] = None,
@@ -27,38 +28,41 @@ def study(
     quiet: QuietOption = False,
     json: JsonOption = False,
 ) -> None:
-    """Reproduce the paper: method A (sines) against B (via points) on the simulated COMAU NS 16.
+    """Compare the paper's methods A and B and the default of `hil design` on the simulated NS 16.
 
-    Searches and runs both excitations, and predicts held-out fly-by motions. Writes `report.html`,
-    `results.json` and all archives to OUTPUT. After Ctrl-C the same command resumes.
+    Searches several excitations by each, of equal duration, runs them and predicts held-out motions
+    under errors of the model. Writes `report.html`, `results.json` and all archives to OUTPUT.
+    After Ctrl-C or SIGTERM the same command resumes.
 
     **Examples:**
 
     - `hil study --quick --output runs/quick`: some minutes
-    - `hil study --output runs/study`: as in the paper, about 30 minutes on two processors
+    - `hil study --output runs/study`: ten searches of each, 20 minutes on two idle processors
 
     Options:
         output: Folder for the study.
         quick: Short searches, few repetitions and motions.
         cell: Cell file of a simulated arm other than the NS 16.
-        repetitions: Repetitions of each excitation. Default: 30, with --quick 4.
-        motions: Held-out motions. Default: 30, with --quick 10.
+        searches: Searches of each method. Default: 10, with --quick 3.
+        repetitions: Repetitions of each excitation. Default: 2.
+        motions: Held-out motions, half of each class. Default: 30, with --quick 8.
         seed: Seed of the study; the result depends on nothing else. Default: 1.
-        effects: Repeat everything with effects that the model does not contain.
+        effects: Add errors of the model, one by one and all together.
         workers: Number of processes. Default: one per processor.
     """
     reporter = make_reporter(quiet=quiet or json)
     count = workers or len(os.sched_getaffinity(0))
-    try:
-        settings = study_settings(
-            quick=quick, repetitions=repetitions, motions=motions, seed=seed, effects=effects
-        )
-        arm = None if cell is None else Cell.load(cell)
+    settings = study_settings(
+        quick=quick,
+        searches=searches,
+        repetitions=repetitions,
+        motions=motions,
+        seed=seed,
+        effects=effects,
+    )
+    arm = None if cell is None else Cell.load(cell)
+    with leave_on(REQUESTS, f"stopped: the same command resumes the study in {output}"):
         result = run_study(output, settings, reporter, workers=count, cell=arm)
-    except KeyboardInterrupt:
-        raise OperatorStopError(
-            f"stopped; the same command resumes the study in {output}"
-        ) from None
     if json:
         print_json(result.summary)
     else:

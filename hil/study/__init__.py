@@ -1,4 +1,4 @@
-"""The paper's study: design, execution, identification and comparison of methods A and B."""
+"""The paper's study: excitations of its methods and of the default, executed and compared."""
 
 from .results import StudyResults
 from .run import run_study

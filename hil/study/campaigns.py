@@ -1,142 +1,56 @@
-"""The searches of a study, and its campaigns, run in child processes on the simulated cell."""
+"""Campaigns of a study: every excitation and the held-out motions on the simulated cell."""
 
 from __future__ import annotations
 
 import shutil
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Final, TypeVar
+from typing import Final
 
-from hil.base.errors import ExecutionError, HilError
-from hil.base.progress import Reporter, Silent
-from hil.batch.cluster import Cluster, ClusterTask, SkippedArchive
+import numpy as np
+
+from hil.base.errors import ExecutionError
+from hil.base.progress import Silent
 from hil.campaign import Campaign, CampaignFolder, CampaignPlan, Stop
 from hil.campaign.errors import RepetitionsRejectedError
-from hil.campaign.plan import moves_of, plan_around
+from hil.campaign.plan import PlannedMotion, moves_of, validation_motions
 from hil.cell import Cell
 from hil.control.motion_checks import MotionChecks
 from hil.control.simulation import simulated_link, simulated_provenance
-from hil.design import DesignResult, DesignSettings, preset
 from hil.design.messages import NoExcitationError
-from hil.design.run import DesignFolder, run_design
-from identification.excitation import Excitation
+from identification.excitation import SineGenome
 
+from .children import StudyError
+from .searches import Search
 from .settings import StudyFolder, StudySettings
 
-A: Final = "a"
-B: Final = "b"
-LABELS: Final = {A: "A", B: "B"}
-NO_EFFECTS = "no-effects"
-EFFECTS = "effects"
-SINES: Final[dict[str, tuple[str, dict[str, str]]]] = {
-    "a-middle": ("about the middle of the ranges, frequencies as printed", {}),
-    "a-home": ("about the home posture, frequencies as printed", {"offset": "home"}),
-    "a-middle-fast": (
-        "about the middle of the ranges, frequencies up to the appendix's bound",
-        {"fastest": "from limits"},
-    ),
-    "a-home-fast": (
-        "about the home posture, frequencies up to the appendix's bound",
-        {"offset": "home", "fastest": "from limits"},
-    ),
+FLY_BY: Final = "fly-by"
+SINES: Final = "sines"
+CLASSES: Final = (FLY_BY, SINES)
+"""Classes of held-out motions: that of method B, and that of method A."""
+_CAMPAIGN: Final = {
+    "campaign.approach_speed": 1.0,
+    "campaign.settle_s": 0.2,
+    "campaign.standstill_s": 2.0,
 }
-"""Variants of method A where the paper is not specific; each is searched and the best is used."""
-_PRINTED_SINES: Final = ("a-middle", "a-home")
-"""Variants with the frequencies of the paper's Table 1, for six joints."""
-_PRINTED_JOINTS: Final = 6
-
-T = TypeVar("T")
-
-
-class StudyError(HilError):
-    """A study was not completed; a restart resumes it."""
-
-
-@dataclass(frozen=True, eq=False)
-class Search:
-    """One search."""
-
-    key: str  #: name of its folder
-    description: str
-    settings: DesignSettings
-    excitation: Excitation | None = None  #: None before the search, or if nothing was found
-
-
-def searches(settings: StudySettings, n_joints: int) -> list[Search]:
-    """Return all searches of a study."""
-    a, b = (
-        preset_settings.replaced(
-            seed=settings.seed,
-            search={
-                "population": effort.population,
-                "generations": effort.generations,
-            },
-        )
-        for preset_settings, effort in (
-            (preset(A), settings.effort_a),
-            (preset(B), settings.effort_b),
-        )
-    )
-    sines = [
-        Search(key, f"method A, sines {description}", a.replaced(sines=changes))
-        for key, (description, changes) in SINES.items()
-        if n_joints == _PRINTED_JOINTS or key not in _PRINTED_SINES
-    ]
-    return [*sines, Search(B, "method B", b)]
-
-
-def run_searches(
-    folder: StudyFolder, cell: Cell, wanted: Sequence[Search], reporter: Reporter, workers: int
-) -> list[Search]:
-    """Run the searches that are not complete; an interrupted search resumes from its journal."""
-    searches = []
-    for number, search in enumerate(wanted, 1):
-        place = DesignFolder(folder.design(search.key))
-        result = DesignResult.load(place.result) if place.result.exists() else None
-        if result is None or not result.complete or result.settings != search.settings:
-            reporter.step(f"search {number} of {len(wanted)}: {search.description}")
-            resume = place.settings.exists()
-            try:
-                result = run_design(
-                    place, cell, search.settings, reporter, workers=workers, resume=resume
-                ).result
-            except NoExcitationError as error:
-                reporter.say(f"no feasible motion: {error}")
-                result = None
-        searches.append(replace(search, excitation=None if result is None else result.excitation))
-    return searches
-
-
-def chosen(searches: Sequence[Search]) -> dict[str, Search]:
-    """Return the search of each method, of A that of largest determinant, its criterion.
-
-    Raises:
-        NoExcitationError: a method found no motion.
-    """
-
-    def score(search: Search) -> float:
-        return -float("inf") if search.excitation is None else search.excitation.criteria.log10_det
-
-    sines = max((search for search in searches if search.key != B), key=score)
-    best = {A: sines, B: next(search for search in searches if search.key == B)}
-    for search in best.values():
-        if search.excitation is None:
-            raise NoExcitationError(
-                f"{search.description} found no motion that satisfies all constraints of the cell;"
-                " search longer (without --quick), or with another --seed"
-            )
-    return best
+"""The arm is simulated and at home: it need not approach slowly."""
+_VIA_POINTS: Final = {"campaign.n_via": 6, "campaign.fly": 0.5}  # of the print's held-out motions
+_HELD_OUT_SHARE: Final = 0.5  # duration of held-out sines over that of the excitations
+_RAMP_SHARE: Final = 0.1  # of that duration
+_HELD_OUT: Final = 3  # first number of a random stream that no search and no fly-by motion uses
+_TRIES: Final = 100
 
 
 @dataclass(frozen=True, eq=False)
 class StudyExecution:
-    """One campaign of the study."""
+    """One campaign of the study, without effects."""
 
     root: Path  #: its folder
     cell: Cell
     plan: CampaignPlan
-    effects: bool  #: whether unmodelled effects are simulated
+    search: Search
+    held_out: str = ""  #: class of its held-out motions, if it has any
 
     @property
     def complete(self) -> bool:
@@ -150,35 +64,71 @@ class StudyExecution:
 
 
 def plan_study(
-    folder: StudyFolder, cell: Cell, settings: StudySettings, best: Mapping[str, Search]
-) -> dict[str, dict[str, StudyExecution]]:
-    """Return the campaigns by condition and method; the held-out motions are in those of B.
+    folder: StudyFolder, cell: Cell, settings: StudySettings, searches: Sequence[Search]
+) -> list[StudyExecution]:
+    """Return a campaign for each search; the first of A has the held-out sines, of B the fly-bys.
 
-    These are random motions through as many via points as its excitation has, with its fly.
+    Raises:
+        NoExcitationError: there are no held-out motions that satisfy all constraints.
     """
-    excitations = {key: search.excitation for key, search in best.items()}
-    main = cell.with_campaign(
-        repetitions=settings.repetitions,
-        validation_runs=settings.motions,
-        simulation_seed=settings.seed,
-    )
-    excitation = excitations[B]
-    assert excitation is not None  # see `chosen`
-    random = main.with_values({"campaign.fly": excitation.fly, "campaign.seed": settings.seed})
-    held_out = {B: plan_around(random, excitation, MotionChecks.of(cell)).validation}
-    return {
-        condition: {
-            key: StudyExecution(
-                folder.campaign(condition, key),
-                main,
-                CampaignPlan(excitation, tuple(held_out.get(key, ())), moves_of(cell, excitation)),
-                condition == EFFECTS,
-            )
-            for key, excitation in excitations.items()
-            if excitation is not None
-        }
-        for condition in ((NO_EFFECTS, EFFECTS) if settings.effects else (NO_EFFECTS,))
+    main = cell.with_values(
+        {**_CAMPAIGN, "simulation.initial_deg": cell.campaign.home_deg}
+    ).with_campaign(repetitions=settings.repetitions, simulation_seed=settings.seed)
+    held_out = {
+        next(search.key for search in searches if search.method == method): (kind, motions)
+        for method, kind, motions in (
+            ("a", SINES, sines(cell, settings)),
+            ("b", FLY_BY, fly_bys(cell, settings)),
+        )
     }
+    executions = []
+    for search in searches:
+        kind, motions = held_out.get(search.key, ("", ()))
+        excitation = search.excitation
+        plan = CampaignPlan(excitation, motions, moves_of(cell, excitation))
+        executions.append(StudyExecution(folder.campaign(search.key), main, plan, search, kind))
+    return executions
+
+
+def fly_bys(cell: Cell, settings: StudySettings) -> tuple[PlannedMotion, ...]:
+    """Return wide fly-by motions through six via points, as of the paper's Fig. 3."""
+    random = cell.with_values({**_VIA_POINTS, "campaign.seed": settings.seed}).with_campaign(
+        validation_runs=settings.motions // 2
+    )
+    motions = validation_motions(random, MotionChecks.of(cell))
+    return tuple(PlannedMotion(motion.trajectory, moves_of(cell, motion)) for motion in motions)
+
+
+def sines(cell: Cell, settings: StudySettings) -> tuple[PlannedMotion, ...]:
+    """Return random sums of three sines for each joint, about home and the middle in turn.
+
+    Their frequencies are up to the appendix's bound, their amplitudes up to that of eq. 8.
+
+    Raises:
+        NoExcitationError: none satisfies all constraints.
+    """
+    length = _HELD_OUT_SHARE * settings.duration
+    checks = MotionChecks.of(cell)
+    motions: list[PlannedMotion] = []
+    for number in range(settings.motions - settings.motions // 2):
+        genome = SineGenome(
+            cell.joint_limits,
+            length=length,
+            ramp=_RAMP_SHARE * length,
+            offset=cell.home if number % 2 else None,
+        )
+        for attempt in range(_TRIES):
+            random = np.random.default_rng([_HELD_OUT, settings.seed, number, attempt])
+            (motion,) = genome.motions(genome.sample(random, 1))
+            if not isinstance(motion, Exception) and checks.refusal(motion) is None:
+                motions.append(PlannedMotion(motion))
+                break
+        else:
+            raise NoExcitationError(
+                f"no sum of sines of {length:g} s to test the result with satisfies all"
+                f" constraints in {_TRIES} attempts"
+            )
+    return tuple(motions)
 
 
 def execute(execution: StudyExecution) -> None:
@@ -198,10 +148,10 @@ def execute(execution: StudyExecution) -> None:
         campaign = Campaign.create(root, execution.cell, execution.plan)
     try:
         campaign.run(
-            simulated_link(campaign.cell, effects=execution.effects),
+            simulated_link(campaign.cell),
             Stop(),
             Silent(),
-            provenance=simulated_provenance(campaign.cell, execution.effects),
+            provenance=simulated_provenance(campaign.cell, effects=False),
             durable=False,
             unrehearsed=True,
         )
@@ -210,26 +160,3 @@ def execute(execution: StudyExecution) -> None:
             f"the controller ended the excitation: {error}; search another one with --seed, in"
             " another folder"
         ) from error
-
-
-def in_children(
-    function: Callable[..., T],
-    calls: Sequence[tuple[Path, tuple[Any, ...]]],
-    title: str,
-    reporter: Reporter,
-    cluster: Cluster,
-) -> list[T]:
-    """Call a function in child processes with the arguments of each place; results in order.
-
-    Raises:
-        StudyError: a call failed, crashed or timed out.
-    """
-    tasks = [ClusterTask(str(place), function, arguments) for place, arguments in calls]
-    values: list[T] = []
-    with reporter.task(title, len(tasks)) as task:
-        results = cluster.results(tasks, task.advance)
-    for result in results:
-        if isinstance(result, SkippedArchive):
-            raise StudyError(f"{result.path}: {result.reason}; start the study again to resume")
-        values.append(result)
-    return values

@@ -1,13 +1,10 @@
-"""Run of a study: searches, campaigns, estimates, predictions; its page."""
+"""Run of a study: searches, campaigns, estimates, comparisons; its page."""
 
 from __future__ import annotations
 
-import json
-import math
-from collections.abc import Mapping, Sequence
-from itertools import chain
+from collections.abc import Sequence
 from pathlib import Path
-from typing import Any, Final
+from typing import Final, NamedTuple
 
 import numpy as np
 
@@ -18,23 +15,37 @@ from hil.base.threads import one_thread
 from hil.base.version import software
 from hil.batch.cluster import Cluster
 from hil.cell import Cell
-from hil.control.simulation import planted_values, simulated_link, simulated_provenance
-from hil.design import preset
-from hil.report import drawing
-from hil.report.chart import Caption, Chart, Plot, Trace
-from hil.report.numbers import significant
-from hil.report.rendering import environment, page_bytes
+from hil.control.simulation import planted_values, simulated_link
+from identification.excitation import Method
 from sim_fixtures.ns16 import CELL_PATH
 
-from . import campaigns, results
-from .campaigns import Search
-from .results import ConditionResult, MotionRow, StudyResults
-from .settings import StudyFolder, StudySettings
+from . import estimates
+from .campaigns import CLASSES, StudyExecution, execute, plan_study
+from .children import in_children
+from .comparison import compared
+from .estimates import DesignEstimates, HeldOutForms, quadratic
+from .messages import conclusion_of, effect_words
+from .model_errors import ALL, NONE, Condition, ModelErrors, conditions_of
+from .page import study_page
+from .relations import design_points, relations_of
+from .results import (
+    ConditionResult,
+    MotionRow,
+    ShownCondition,
+    StudyComparison,
+    StudyResults,
+)
+from .searches import LABELS, Search, run_searches, search_plans
+from .settings import FULL, StudyFolder, StudySettings
+from .shown import best_of, parameters_of, printed_rows, shown_condition
 
-_CONDITIONS: Final = {
-    campaigns.NO_EFFECTS: "without unmodelled effects",
-    campaigns.EFFECTS: "with unmodelled effects",
-}
+_PAIRS: Final[tuple[tuple[Method, Method], ...]] = (
+    ("a", "b"),
+    ("a", "gradient"),
+    ("b", "gradient"),
+    ("gradient", "b"),
+)
+"""First and second method of each comparison."""
 
 
 @one_thread()
@@ -46,7 +57,7 @@ def run_study(
     workers: int = 2,
     cell: Cell | None = None,
 ) -> StudyResults:
-    """Reproduce the paper on a simulated cell (default: the NS 16), and write results and page.
+    """Compare the paper's methods on a simulated cell (default: the NS 16); write results and page.
 
     An interrupted study resumes with the searches and campaigns that are not complete. Results do
     not depend on the number of workers.
@@ -64,178 +75,156 @@ def run_study(
     else:
         simulated_link(cell)  # raises for real hardware
         settings = settings.model_copy(update={"cell": digest(cell.text + cell.urdf)})
-    truth = planted_values(cell)
-    with folder.locked(), Cluster(workers, reporter=reporter) as processes:
+    conditions = conditions_of(cell, effects=settings.effects)
+    errors = ModelErrors(cell, settings.seed)
+    with folder.locked(), Cluster(workers, reporter=reporter) as cluster:
         folder.begin(settings)
-        wanted = campaigns.searches(settings, len(cell.joint_names))
-        searches = campaigns.run_searches(folder, cell, wanted, reporter, workers)
-        best = campaigns.chosen(searches)
-        plans = campaigns.plan_study(folder, cell, settings, best)
-        executions = chain.from_iterable(methods.values() for methods in plans.values())
+        plans = search_plans(settings, len(cell.joint_names))
+        searches = run_searches(folder, cell, plans, reporter, cluster)
+        executions = plan_study(folder, cell, settings, searches)
         runs = [(execution.root, (execution,)) for execution in executions]
-        campaigns.in_children(campaigns.execute, runs, "running campaigns", reporter, processes)
-        calls = [
-            (folder.campaign(key, ""), _condition(cell, key, methods, truth))
-            for key, methods in plans.items()
-        ]
-        conditions = campaigns.in_children(
-            results.condition_result, calls, "estimating and predicting", reporter, processes
-        )
-        quick = _is_quick(settings)
-        study = StudyResults(
-            name=root.resolve().name,
-            cell=cell.name,
-            quick=quick,
-            settings=settings,
-            software=software(),
-            joint_names=list(cell.joint_names),
-            n_base=len(cell.model.base.names),
-            parameters=results.parameters_of(cell, truth),
-            table1=[*_rows(searches, best, conditions), *results.printed_rows(cell)],
-            conditions=conditions,
-            conclusion=results.conclusion_of(conditions, quick=quick),
-        )
-        write_files(root, {"results.json": study.to_json(), "report.html": study_page(study)})
-        reporter.say(f"report: {root / 'report.html'}")
+        in_children(execute, runs, "running campaigns", reporter, cluster)
+        calls = [(execution.root, (execution, errors, conditions)) for execution in executions]
+        held_out = [call for call in calls if call[1][0].held_out]
+        designs = in_children(estimates.design_estimates, calls, "estimating", reporter, cluster)
+        forms = in_children(estimates.held_out_forms, held_out, "predicting", reporter, cluster)
+        shown = _shown(conditions, errors, executions, reporter, cluster)
+    parts = _Parts(conditions, searches, designs, forms, shown)
+    study = _results(root.resolve().name, cell, settings, parts)
+    study = study.model_copy(update={"conclusion": conclusion_of(study)})
+    write_files(root, {"results.json": study.to_json(), "report.html": study_page(study)})
+    reporter.say(f"report: {root / 'report.html'}")
     return study
 
 
+def _shown(
+    conditions: Sequence[Condition],
+    errors: ModelErrors,
+    executions: Sequence[StudyExecution],
+    reporter: Reporter,
+    cluster: Cluster,
+) -> list[ShownCondition]:
+    """Return tables and figures of the best excitation of each method, as in the paper."""
+    by_key = {execution.search.key: execution for execution in executions}
+    best = {
+        method: by_key[search.key]
+        for method, search in best_of([execution.search for execution in executions]).items()
+    }
+    fly_by = next(execution for execution in executions if execution.held_out == CLASSES[0])
+    truth = planted_values(errors.cell)
+    calls = [
+        (fly_by.root, (condition, errors, best, fly_by, truth))
+        for condition in (NONE, ALL)
+        if condition in conditions
+    ]
+    return in_children(shown_condition, calls, "drawing the best", reporter, cluster)
+
+
+class _Parts(NamedTuple):
+    """What the children of a study have made."""
+
+    conditions: tuple[Condition, ...]
+    searches: list[Search]
+    designs: list[DesignEstimates]
+    forms: list[HeldOutForms]
+    shown: list[ShownCondition]
+
+
+def _results(name: str, cell: Cell, settings: StudySettings, parts: _Parts) -> StudyResults:
+    """Compare the methods and relate the criteria, without a conclusion."""
+    values = {design.key: design.values for design in parts.designs}
+    every = np.concatenate([of_class.forms for of_class in parts.forms], axis=1)
+    errors = {
+        key: np.sqrt(quadratic(every, of_search).mean(axis=(2, 3)))
+        for key, of_search in values.items()
+    }
+    points = design_points(parts.searches, parts.conditions, values, errors)
+    return StudyResults(
+        name=name,
+        cell=cell.name,
+        quick=_is_quick(settings),
+        settings=settings,
+        software=software(),
+        joint_names=list(cell.joint_names),
+        n_base=len(cell.model.base.names),
+        parameters=parameters_of(cell, planted_values(cell)),
+        table1=[*_rows(parts.searches, parts.shown), *printed_rows(cell)],
+        conditions=_compared(parts),
+        designs=points,
+        relations=relations_of(points, parts.conditions),
+        shown=parts.shown,
+        effects=effect_words(cell) if settings.effects else [],
+        conclusion=[],
+    )
+
+
+def _compared(parts: _Parts) -> list[ConditionResult]:
+    """Compare the methods under each condition and on each class of motions."""
+    methods = {search.key: search.method for search in parts.searches}
+
+    def products(of_class: HeldOutForms, method: Method, *, few_rows: bool) -> Array:
+        """Return the products of errors of a method's searches (c, s, m, r, r)."""
+        return np.stack(
+            [
+                quadratic(of_class.forms, design.few_rows if few_rows else design.values)
+                for design in parts.designs
+                if methods[design.key] == method
+            ],
+            axis=1,
+        )
+
+    rows: list[list[StudyComparison]] = [[] for _ in parts.conditions]
+    for of_class in sorted(parts.forms, key=lambda one: CLASSES.index(one.motions)):
+        whole = {method: products(of_class, method, few_rows=False) for method in LABELS}
+        thinned = products(of_class, "a", few_rows=True)
+        pairs = [(first, second, whole[first], whole[second], False) for first, second in _PAIRS]
+        pairs.append(("a", "b", thinned, whole["b"], True))
+        for number, of_condition in enumerate(rows):
+            for first, second, before, after, printed_sizes in pairs:
+                ratio = compared(before[number], after[number])
+                of_condition.append(
+                    StudyComparison(
+                        first=first,
+                        second=second,
+                        motions=of_class.motions,
+                        printed_sizes=printed_sizes,
+                        **ratio.fields(),
+                    )
+                )
+    return [
+        ConditionResult(
+            key=condition.key, error=condition.error, size=condition.size, comparisons=comparisons
+        )
+        for condition, comparisons in zip(parts.conditions, rows, strict=True)
+    ]
+
+
 def _is_quick(settings: StudySettings) -> bool:
-    """Return whether less is searched than by the preset of method B."""
-    sizes = preset("b").search
-    return settings.effort_b.tried < sizes.population * sizes.generations
+    """Return whether less is searched than in the full study."""
+    return settings.searches < FULL.searches or settings.effort_b.tried < FULL.effort_b.tried
 
 
-def _condition(
-    cell: Cell, key: str, executions: Mapping[str, campaigns.StudyExecution], truth: Array
-) -> tuple[str, str, Any, dict[str, Path], Array]:
-    """Return the arguments of `results.condition_result`."""
-    effects = json.loads(simulated_provenance(cell, key == campaigns.EFFECTS)["effects"])
-    roots = {name: execution.root for name, execution in executions.items()}
-    return key, _CONDITIONS[key], effects, roots, truth
-
-
-def _rows(
-    searches: Sequence[Search], best: Mapping[str, Search], conditions: Sequence[ConditionResult]
-) -> list[MotionRow]:
+def _rows(searches: Sequence[Search], shown: Sequence[ShownCondition]) -> list[MotionRow]:
     """Return a row of Table 1 for each search, with what was executed of the best of a method."""
-    executed = {best[method.key].key: method for method in conditions[0].methods}
+    best = {search.key: method for method, search in best_of(searches).items()}
+    executed = {method.key: method for method in shown[0].methods}
     rows = []
     for search in searches:
-        excitation = search.excitation
-        method = executed.get(search.key)
-        row = MotionRow(key=search.key, words=search.description, executed=method is not None)
-        if excitation is not None:
-            row = MotionRow.of(
-                excitation.criteria,
-                **row.model_dump(exclude_defaults=True),
-                tried=excitation.tried,
-                duration=float(excitation.trajectory.duration),
-                executed_log10_det=None if method is None else method.log10_det,
-                executed_coupling_index=None if method is None else method.coupling_index,
-            )
+        criteria = search.excitation.criteria
+        method = executed[best[search.key]] if search.key in best else None
+        row = MotionRow(
+            key=search.key,
+            words=search.choice,
+            executed=method is not None,
+            tried=search.tried,
+            n_samples=criteria.n_samples,
+            duration=float(search.excitation.trajectory.duration),
+            log10_det=criteria.log10_det,
+            coupling_index=criteria.coupling_index,
+            condition=criteria.condition,
+            scaled_condition=criteria.scaled_condition,
+            executed_log10_det=None if method is None else method.log10_det,
+            executed_coupling_index=None if method is None else method.coupling_index,
+        )
         rows.append(row)
     return rows
-
-
-COLOURS: Final = (drawing.FIRST, drawing.SECOND)
-
-
-def study_page(results: StudyResults) -> bytes:
-    """Return the page as one HTML file; the same results give the same bytes."""
-    first = results.conditions[0]
-    n = results.n_base
-    names = [
-        f"{parameter.printed_id or ''} {parameter.name}".strip()
-        for parameter in results.parameters[:n]
-    ]
-    template = environment().get_template("study.html.j2")
-    text = template.render(
-        results=results,
-        labels={method.key: method.label for method in first.methods},
-        legend=[
-            *zip((method.label for method in first.methods), ("--first", "--second"), strict=True)
-        ],
-        parameters=sorted(
-            enumerate(results.parameters), key=lambda numbered: numbered[1].printed_id or math.inf
-        ),
-        trajectories=_trajectories(first, results.joint_names),
-        correlations=[
-            drawing.matrix_panel(np.array(method.correlation)[:n, :n], names, f"c{k}", method.label)
-            for k, method in enumerate(first.methods)
-        ],
-        boxes={
-            condition.key: _boxes(condition, results.joint_names)
-            for condition in results.conditions
-        },
-        examples={
-            condition.key: _examples(condition, results.joint_names)
-            for condition in results.conditions
-        },
-        quartiles=lambda values: 100.0 * np.percentile(values, (50.0, 25.0, 75.0)),
-    )
-    return page_bytes(text)
-
-
-def _trajectories(condition: ConditionResult, joint_names: list[str]) -> list[drawing.Panel]:
-    """Draw the position of each joint in each excitation, on common scales (Fig. 1)."""
-    panels: list[drawing.Panel] = []
-    for j, name in enumerate(joint_names):
-        spans = [
-            f"{method.label} {math.degrees(min(method.position[j])):.0f}° to"
-            f" {math.degrees(max(method.position[j])):.0f}°"
-            for method in condition.methods
-        ]
-        caption = Caption(f"x{j}", name, "; ".join(spans), "position in each excitation")
-        axes = drawing.single(170.0, "position [rad]", "time [s]", x_ticks=6)
-        for method, colour in zip(condition.methods, COLOURS, strict=True):
-            axes.line(np.array(method.time), np.array(method.position[j]), colour, 1.3)
-        panels.append(drawing.panel([axes], caption))
-    return panels
-
-
-def _boxes(condition: ConditionResult, joint_names: list[str]) -> list[drawing.Panel]:
-    """Draw mean |e| on the held-out motions, a box per estimate and a panel per joint (Fig. 3)."""
-    labels = [method.label for method in condition.methods]
-    errors = [np.array(condition.held_out.mean_abs[method.key]) for method in condition.methods]
-    panels = []
-    for j, name in enumerate(joint_names):
-        columns = [estimate_errors[:, j] for estimate_errors in errors]
-        medians = ", ".join(
-            f"{label} {significant(float(np.median(column)))}"
-            for label, column in zip(labels, columns, strict=True)
-        )
-        key = f"b{condition.key}{j}"
-        what = "mean |e| in N·m"
-        caption = Caption(key, name, f"medians {medians}", what)
-        panels.append(drawing.box_panel(caption, columns, COLOURS, "mean |e| [N·m]", labels))
-    return panels
-
-
-def _examples(condition: ConditionResult, joint_names: list[str]) -> list[drawing.Panel]:
-    """Draw one held-out motion in time: measured, predicted by each, and the errors (Fig. 4)."""
-    held_out = condition.held_out
-    time = np.array(held_out.time)
-    panels = []
-    for j, name in enumerate(joint_names):
-        measured = np.array(held_out.measured[j])
-        names = [method.label for method in condition.methods]
-        lines = [
-            Trace(np.array(held_out.predicted[method.key][j]), COLOURS[k], 1.1, dashed=k == 1)
-            for k, method in enumerate(condition.methods)
-        ]
-        errors = [measured - line.values for line in lines]
-        reach = 1.05 * max(float(np.abs(error).max()) for error in errors) or 1.0
-        both = [Trace(measured, drawing.WIDE, 4.0), *lines]
-        plots = [Plot(128.0, "torque [N·m]", both)]
-        rms = []
-        # A row for each error: where there is noise, one line over another would hide it.
-        for which, line, error in zip(names, lines, errors, strict=True):
-            trace = Trace(error, line.colour, 1.0)
-            plots.append(Plot(48.0, f"measured − {which} [N·m]", [trace], reach=reach))
-            rms.append(f"{which} {significant(float(np.sqrt(np.mean(error**2))))}")
-        note = f"RMS error {', '.join(rms)} N·m"
-        what = "measured and predicted torque"
-        caption = Caption(f"e{condition.key}{j}", name, note, what)
-        panels.append(drawing.chart_panel(Chart(caption, time, plots)))
-    return panels

@@ -5,7 +5,7 @@ from __future__ import annotations
 from contextlib import AbstractContextManager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Final
+from typing import Annotated, Any, Final
 
 from pydantic import Field
 
@@ -16,9 +16,14 @@ from hil.results.results import Frozen
 
 Count = Annotated[int, Field(strict=True, ge=1)]
 
+PRINTED_DURATION: Final = 16.0
+"""Duration of the print's motion of method B, 15 996 samples at 1 kHz, s."""
+PRINTED_REPETITIONS: Final = 30
+"""Executions of each excitation in the print."""
+
 
 class Effort(Frozen):
-    """Size of a search."""
+    """Size of a genetic search."""
 
     population: int = Field(ge=4)
     generations: Count
@@ -33,48 +38,56 @@ class StudySettings(Frozen):
     """Settings that determine the results of a study."""
 
     seed: int = Field(ge=0, description="of searches, held-out motions and the simulated cell")
+    searches: int = Field(ge=2, description="searches of each method")
     repetitions: int = Field(ge=2, description="executions of each excitation")
-    motions: int = Field(ge=2, description="held-out motions")
-    effects: bool = Field(description="whether to repeat it with unmodelled effects")
-    effort_a: Effort = Field(description="of each search of method A")
-    effort_b: Effort = Field(description="of the search of method B")
+    motions: int = Field(ge=4, description="held-out motions, half of each class")
+    duration: float = Field(gt=0.0, description="duration of every excitation, s")
+    shortest: float = Field(
+        gt=0.0, le=1.0, description="share of it that a motion through via points takes at least"
+    )
+    effects: bool = Field(description="whether to study errors of the model")
+    effort_a: Effort = Field(description="for each open choice of method A")
+    effort_b: Effort = Field(description="for each open choice of method B")
+    effort_gradient: Effort = Field(description="of the genetic search before the gradient")
+    gradient_steps: Count = Field(description="of method gradient")
     cell: str = Field(default="", description="digest of the cell, empty for the paper's NS 16")
 
 
 FULL: Final = StudySettings(
     seed=1,
-    repetitions=30,
+    searches=10,
+    repetitions=2,
     motions=30,
+    duration=PRINTED_DURATION,
+    shortest=0.97,
     effects=True,
-    # Sizes of the paper's Table 1; for method A, of each of its searches.
-    effort_a=Effort(population=100, generations=120),
-    effort_b=Effort(population=150, generations=120),
+    # Of about the same processor time for each method; that of the gradient is its preset.
+    effort_a=Effort(population=40, generations=16),
+    effort_b=Effort(population=64, generations=20),
+    effort_gradient=Effort(population=96, generations=4),
+    gradient_steps=180,
 )
-"""Sizes of the paper: 30 executions, 30 motions."""
+"""Ten searches of each method, 30 held-out motions as in the paper."""
 
 QUICK: Final = FULL.model_copy(
     update={
-        "repetitions": 4,
-        "motions": 10,
-        "effort_a": Effort(population=40, generations=12),
-        "effort_b": Effort(population=40, generations=12),
+        "searches": 3,
+        "motions": 8,
+        "effort_a": Effort(population=16, generations=4),
+        "effort_b": Effort(population=24, generations=6),
+        "effort_gradient": Effort(population=24, generations=4),
+        "gradient_steps": 16,
     }
 )
 """The same procedure in minutes, too small to draw conclusions about the methods."""
 
 
-def study_settings(
-    *,
-    quick: bool = False,
-    repetitions: int | None = None,
-    motions: int | None = None,
-    seed: int | None = None,
-    effects: bool = True,
-) -> StudySettings:
+def study_settings(*, quick: bool = False, effects: bool = True, **given: Any) -> StudySettings:
     """Return the settings of the full or quick study, with those replaced that are not None."""
-    given = {"repetitions": repetitions, "motions": motions, "seed": seed, "effects": effects}
     changes = {name: value for name, value in given.items() if value is not None}
-    return StudySettings.model_validate((QUICK if quick else FULL).model_dump() | changes)
+    return StudySettings.model_validate(
+        (QUICK if quick else FULL).model_dump() | {"effects": effects} | changes
+    )
 
 
 @dataclass(frozen=True)
@@ -83,13 +96,13 @@ class StudyFolder:
 
     root: Path
 
-    def design(self, key: str) -> Path:
-        """Return the folder of one search."""
-        return self.root / "designs" / key
+    def design(self, key: str, choice: str) -> Path:
+        """Return the folder of one search with one of the open choices of its method."""
+        return self.root / "designs" / key / choice
 
-    def campaign(self, condition: str, key: str) -> Path:
-        """Return the campaign folder of one excitation under one condition."""
-        return self.root / "campaigns" / condition / key
+    def campaign(self, key: str) -> Path:
+        """Return the campaign folder of the excitation that one search found."""
+        return self.root / "campaigns" / key
 
     @property
     def settings(self) -> Path:

@@ -1,0 +1,161 @@
+"""The conclusion of a study in sentences, and the sizes of the errors of the model in words."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Final, get_args
+
+from hil.cell import Cell
+from hil.report.numbers import capitalised, fixed, significant
+from identification.excitation import Method
+from identification.text import percentage
+
+from .campaigns import CLASSES
+from .model_errors import (
+    ALL,
+    CONSTANT_ERROR,
+    LENGTH_ERROR,
+    LOAD_FRICTION,
+    NONE,
+    STRIBECK,
+    STRIBECK_SPEED,
+)
+from .results import ConditionResult, Criterion, Quantity, StudyResults
+
+CRITERION_WORDS: Final[dict[Criterion, str]] = {
+    "coupling_index": "coupling index",
+    "log10_det": "log det",
+    "scaled_condition": "condition number",
+}
+QUANTITY_WORDS: Final[dict[Quantity, str]] = {
+    "variance": "scatter",
+    "bias": "bias",
+    "error": "error on unseen motion",
+}
+_OTHERS: Final[dict[str, Method]] = {"A": "a", "B": "b"}
+_BETTER: Final = ("better", "slightly better")
+_WORSE: Final = ("worse", "slightly worse")
+
+
+def condition_words(condition: ConditionResult) -> str:
+    """Name a condition."""
+    if condition.error == "none":
+        return "no error of the model"
+    if condition.error == "all":
+        return "all errors together"
+    return f"{condition.error} x {condition.size}"
+
+
+def effect_words(cell: Cell) -> list[str]:
+    """Describe the errors of the model at size 1."""
+    simulation = cell.simulation
+    ripple = percentage(simulation.torque_ripple)
+    drift = percentage(simulation.friction_drift)
+    elastic = ", ".join(f"{compliance:g}" for compliance in simulation.elasticity)
+    described = [
+        (simulation.torque_ripple, f"torque ripple {ripple} of the Coulomb torque"),
+        (simulation.friction_drift, f"friction falls by {drift} from cold to hot"),
+        (max(simulation.elasticity, default=0.0), f"elastic gears {elastic} rad/(N·m)"),
+        (simulation.delay, f"current {1e3 * simulation.delay:g} ms late"),
+    ]
+    slow = percentage(STRIBECK_SPEED)
+    return [
+        *(words for size, words in described if size > 0.0),
+        f"Stribeck friction {percentage(STRIBECK)} of the Coulomb torque, e-fold at {slow} of the"
+        " speed limit",
+        f"dry friction {percentage(LOAD_FRICTION)} of the load of a gear",
+        f"lengths ± {percentage(LENGTH_ERROR, 1)}",
+        f"torque constants ± {percentage(CONSTANT_ERROR)}",
+    ]
+
+
+def conclusion_of(results: StudyResults) -> list[str]:
+    """Return the conclusion in at most ten sentences of at most 100 characters."""
+    by_key = {condition.key: condition for condition in results.conditions}
+    none = by_key[NONE.key]
+    worst = by_key.get(ALL.key, none)
+    sentences = [f"Torque error of B over A, {condition_words(none)}: {_b_over_a(none)}."]
+    if worst is not none:
+        sentences.append(f"The same with {condition_words(worst)}: {_b_over_a(worst)}.")
+        sentences.append(_by_error(results.conditions))
+    printed = _b_over_a(worst, printed_sizes=True)
+    sentences.append(f"The same, A from 2000 rows as in the print: {printed}.")
+    sentences.append(_of_default(worst))
+    sentences += [_of_criterion(results, criterion) for criterion in get_args(Criterion)]
+    sentences.append(_for_design(results.conditions))
+    if results.quick:
+        sentences.append("The quick setting supports no conclusion about the methods.")
+    return sentences
+
+
+def _b_over_a(condition: ConditionResult, *, printed_sizes: bool = False) -> str:
+    texts = []
+    for motions in CLASSES:
+        row = condition.comparison("a", "b", motions, printed_sizes=printed_sizes)
+        interval = "too few searches"
+        if row.low is not None:
+            interval = f"{fixed(row.low, 2)} to {fixed(row.high, 2)}"
+        texts.append(f"{motions} {fixed(row.ratio, 2)} ({interval})")
+    return ", ".join(texts)
+
+
+def _by_error(conditions: Sequence[ConditionResult]) -> str:
+    """Say in how many cases of single errors B or A predicts better, and by how much at most."""
+    cases = [
+        condition.comparison("a", "b", motions)
+        for condition in conditions
+        if condition.error not in ("none", "all")
+        for motions in CLASSES
+    ]
+    b = [1.0 - row.ratio for row in cases if row.verdict in _BETTER]
+    a = [1.0 - 1.0 / row.ratio for row in cases if row.verdict in _WORSE]
+    return (
+        f"Errors of the model one by one: of {len(cases)} cases B is better in {len(b)}"
+        f"{_at_most(b)}, A in {len(a)}{_at_most(a)}."
+    )
+
+
+def _at_most(savings: Sequence[float]) -> str:
+    return f" (by up to {significant(100.0 * max(savings), 2)} %)" if savings else ""
+
+
+def _of_default(condition: ConditionResult) -> str:
+    over = {
+        label: ", ".join(
+            f"{motions} {fixed(condition.comparison(method, 'gradient', motions).ratio, 2)}"
+            for motions in CLASSES
+        )
+        for label, method in _OTHERS.items()
+    }
+    return f"The default of hil design over A: {over['A']}; over B: {over['B']}."
+
+
+def _of_criterion(results: StudyResults, criterion: Criterion) -> str:
+    worst = results.conditions[-1].key
+    parts = []
+    places: list[tuple[Quantity, str]] = [("variance", NONE.key)]
+    if worst != NONE.key:
+        places.append(("bias", worst))
+    for quantity, key in places:
+        relation = results.relation(criterion, quantity, key)
+        parts.append(f"{fixed(relation.correlation, 2)} with {QUANTITY_WORDS[quantity]}")
+    relation = results.relation(criterion, "error", worst)
+    interval = f"{fixed(relation.low, 2)} to {fixed(relation.high, 2)}"
+    parts.append(f"{fixed(relation.correlation, 2)} with error ({interval})")
+    return f"{capitalised(CRITERION_WORDS[criterion])}: rank correlation {', '.join(parts)}."
+
+
+def _for_design(conditions: Sequence[ConditionResult]) -> str:
+    """Say what it means for the default of `hil design`."""
+    helped = [
+        condition
+        for condition in conditions
+        if any(
+            condition.comparison("gradient", "b", motions).verdict in _BETTER for motions in CLASSES
+        )
+    ]
+    if not helped:
+        return "B is better than the default of hil design under no error of the model."
+    words = condition_words(helped[0])
+    more = f" and {len(helped) - 1} more" if len(helped) > 1 else ""
+    return f"B is better than the default of hil design with {words}{more}."

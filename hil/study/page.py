@@ -1,0 +1,210 @@
+"""The page of a study, and its figures."""
+
+from __future__ import annotations
+
+import math
+from typing import Final, get_args
+
+import numpy as np
+
+from hil.report import drawing
+from hil.report.chart import Caption, Chart, Plot, Trace
+from hil.report.numbers import fixed, significant
+from hil.report.rendering import environment, page_bytes
+from identification.excitation import Method
+
+from .campaigns import CLASSES
+from .messages import CRITERION_WORDS, condition_words
+from .model_errors import ALL, NONE
+from .results import Criterion, DesignPoint, Quantity, ShownCondition, StudyResults
+from .searches import LABELS
+
+COLOURS: Final = (drawing.FIRST, drawing.SECOND, drawing.INK)
+_VARIABLES: Final = ("--first", "--second", "--ink")
+_NAMES: Final = 150.0  # width of the names of conditions, px
+
+
+def study_page(results: StudyResults) -> bytes:
+    """Return the page as one HTML file; the same results give the same bytes."""
+    first = results.shown[0]
+    n = results.n_base
+    names = [
+        f"{parameter.printed_id or ''} {parameter.name}".strip()
+        for parameter in results.parameters[:n]
+    ]
+    template = environment().get_template("study.html.j2")
+    text = template.render(
+        results=results,
+        labels={method.key: method.label for method in first.methods},
+        legend=[*zip((method.label for method in first.methods), _VARIABLES, strict=True)],
+        parameters=sorted(
+            enumerate(results.parameters), key=lambda numbered: numbered[1].printed_id or math.inf
+        ),
+        trajectories=_trajectories(first, results.joint_names),
+        correlations=[
+            drawing.matrix_panel(np.array(method.correlation)[:n, :n], names, f"c{k}", method.label)
+            for k, method in enumerate(first.methods)
+        ],
+        boxes={shown.condition: _boxes(shown, results.joint_names) for shown in results.shown},
+        examples={
+            shown.condition: _examples(shown, results.joint_names) for shown in results.shown
+        },
+        words={condition.key: condition_words(condition) for condition in results.conditions},
+        ratios=[_ratios(results, motions) for motions in CLASSES],
+        ratio_legend=[(label, variable) for _, label, variable, _ in _RATIOS],
+        classes=CLASSES,
+        criteria=[
+            (words, [_points(results, criterion, *quantity) for quantity in _quantities(results)])
+            for criterion, words in CRITERION_WORDS.items()
+        ],
+        relation_rows=_relation_rows(results),
+        quartiles=lambda values: 100.0 * np.percentile(values, (50.0, 25.0, 75.0)),
+    )
+    return page_bytes(text)
+
+
+_RATIOS: Final[tuple[tuple[tuple[Method, Method], str, str, float], ...]] = (
+    (("a", "b"), "B / A", "--second", 0.15),
+    (("a", "gradient"), "gradient / A", "--ink", -0.15),
+)
+"""First and second method, label, colour, and place in the row of a condition."""
+
+
+def _ratios(results: StudyResults, motions: str) -> drawing.Panel:
+    """Draw the ratio of errors under each condition, with intervals, on one class of motions."""
+    conditions = results.conditions
+    rows = [(float(-k), condition_words(one)) for k, one in enumerate(conditions)]
+    axes = drawing.Axes(
+        _NAMES, 20.0, 560.0 - _NAMES, 22.0 * len(rows), "", f"error over that of A, {motions}",
+        y_limits=(0.6 - len(rows), 0.6), y_names=rows, x_ticks=6,
+    )  # fmt: skip
+    axes.segments(np.array([[1.0, 1.0]]), np.array([[-np.inf, np.inf]]), drawing.MUTED, 1.2)
+    for (first, second), _, variable, side in _RATIOS:
+        found = [one.comparison(first, second, motions) for one in conditions]
+        colour = f"var({variable})"
+        places = np.array([place + side for place, _ in rows])
+        ends = [(row.low or row.ratio, row.high or row.ratio) for row in found]
+        axes.segments(np.array(ends), np.column_stack([places, places]), colour, 1.6)
+        axes.dots(np.array([row.ratio for row in found]), places, colour, 6.0)
+    what = "error of torque with B and with the gradient over that with A, by error of the model"
+    return drawing.panel([axes], Caption(f"r{motions}", motions, "", what), 580.0)
+
+
+def _quantities(results: StudyResults) -> list[tuple[Quantity, str, str]]:
+    """Return what the pictures of criteria show: quantity, condition, heading."""
+    worst = results.conditions[-1].key
+    rows: list[tuple[Quantity, str, str]] = [("variance", NONE.key, "scatter, in units of its RMS")]
+    if worst == ALL.key:
+        rows.append(("bias", worst, "bias, all errors, in the same units"))
+    return [*rows, ("error", worst, "error on unseen motion [%]")]
+
+
+def _figure(point: DesignPoint, quantity: Quantity, condition: str) -> float:
+    if quantity == "variance":
+        return point.variance
+    return point.bias[condition] if quantity == "bias" else 100.0 * point.error[condition]
+
+
+def _points(
+    results: StudyResults, criterion: Criterion, quantity: Quantity, condition: str, heading: str
+) -> drawing.Panel:
+    """Draw a point for each design: a criterion and what it is meant to foretell."""
+    axes = drawing.single(240.0, heading, CRITERION_WORDS[criterion])
+    logs = []
+    for method, colour in zip(LABELS, COLOURS, strict=True):
+        points = [point for point in results.designs if point.method == method]
+        x = np.array([point.criteria[criterion] for point in points])
+        y = np.log10([_figure(point, quantity, condition) for point in points])
+        logs += y.tolist()
+        axes.dots(x, y, colour, 6.0, opacity=0.85)
+    low, high = min(logs), max(logs)
+    margin = 0.08 * (high - low) or 0.1
+    axes.y_limits = (low - margin, high + margin)
+    axes.y_names = drawing.decades(*axes.y_limits)
+    relation = results.relation(criterion, quantity, condition)
+    note = (
+        f"rank correlation {fixed(relation.correlation, 2)}"
+        f" ({fixed(relation.low, 2)} to {fixed(relation.high, 2)})"
+    )
+    key = f"q{criterion}{quantity}"
+    return drawing.panel([axes], Caption(key, "", note, f"{heading} against criterion"))
+
+
+def _relation_rows(
+    results: StudyResults,
+) -> list[tuple[Quantity, str, list[tuple[float, float, float, float]]]]:
+    """Return rank correlations by quantity and condition, one column per criterion."""
+    words = {condition.key: condition_words(condition) for condition in results.conditions}
+    rows = dict.fromkeys((row.quantity, row.condition) for row in results.relations)
+    table = []
+    for quantity, condition in rows:
+        cells = []
+        for criterion in get_args(Criterion):
+            row = results.relation(criterion, quantity, condition)
+            cells.append((row.correlation, row.low, row.high, row.within))
+        table.append((quantity, words[condition], cells))
+    return table
+
+
+def _trajectories(condition: ShownCondition, joint_names: list[str]) -> list[drawing.Panel]:
+    """Draw the position of each joint in each excitation, on common scales (Fig. 1)."""
+    panels: list[drawing.Panel] = []
+    for j, name in enumerate(joint_names):
+        spans = [
+            f"{method.label} {math.degrees(min(method.position[j])):.0f}° to"
+            f" {math.degrees(max(method.position[j])):.0f}°"
+            for method in condition.methods
+        ]
+        caption = Caption(f"x{j}", name, "; ".join(spans), "position in each excitation")
+        axes = drawing.single(170.0, "position [rad]", "time [s]", x_ticks=6)
+        for method, colour in zip(condition.methods, COLOURS, strict=True):
+            axes.line(np.array(method.time), np.array(method.position[j]), colour, 1.3)
+        panels.append(drawing.panel([axes], caption))
+    return panels
+
+
+def _boxes(condition: ShownCondition, joint_names: list[str]) -> list[drawing.Panel]:
+    """Draw mean |e| on the held-out motions, a box per estimate and a panel per joint (Fig. 3)."""
+    labels = [method.label for method in condition.methods]
+    errors = [np.array(condition.held_out.mean_abs[method.key]) for method in condition.methods]
+    panels = []
+    for j, name in enumerate(joint_names):
+        columns = [estimate_errors[:, j] for estimate_errors in errors]
+        medians = ", ".join(
+            f"{label} {significant(float(np.median(column)))}"
+            for label, column in zip(labels, columns, strict=True)
+        )
+        key = f"b{condition.condition}{j}"
+        what = "mean |e| in N·m"
+        caption = Caption(key, name, f"medians {medians}", what)
+        panels.append(drawing.box_panel(caption, columns, COLOURS, "mean |e| [N·m]", labels))
+    return panels
+
+
+def _examples(condition: ShownCondition, joint_names: list[str]) -> list[drawing.Panel]:
+    """Draw one held-out motion in time: measured, predicted by each, and the errors (Fig. 4)."""
+    held_out = condition.held_out
+    time = np.array(held_out.time)
+    panels = []
+    for j, name in enumerate(joint_names):
+        measured = np.array(held_out.measured[j])
+        names = [method.label for method in condition.methods]
+        lines = [
+            Trace(np.array(held_out.predicted[method.key][j]), COLOURS[k], 1.1, dashed=k > 0)
+            for k, method in enumerate(condition.methods)
+        ]
+        errors = [measured - line.values for line in lines]
+        reach = 1.05 * max(float(np.abs(error).max()) for error in errors) or 1.0
+        both = [Trace(measured, drawing.WIDE, 4.0), *lines]
+        plots = [Plot(128.0, "torque [N·m]", both)]
+        rms = []
+        # A row for each error: where there is noise, one line over another would hide it.
+        for which, line, error in zip(names, lines, errors, strict=True):
+            trace = Trace(error, line.colour, 1.0)
+            plots.append(Plot(48.0, f"measured − {which} [N·m]", [trace], reach=reach))
+            rms.append(f"{which} {significant(float(np.sqrt(np.mean(error**2))))}")
+        note = f"RMS error {', '.join(rms)} N·m"
+        what = "measured and predicted torque"
+        caption = Caption(f"e{condition.condition}{j}", name, note, what)
+        panels.append(drawing.chart_panel(Chart(caption, time, plots)))
+    return panels
