@@ -233,8 +233,8 @@ def friction_charts(series: ReportSeries, joints: Sequence[Joint]) -> list[Chart
     return charts
 
 
-def residual_panels(results: Results) -> dict[str, list[Panel]]:
-    """Draw the mean residual of each joint over speed and over position."""
+def residual_panels(results: Results, only: int | None = None) -> dict[str, list[Panel]]:
+    """Draw the mean residual of each joint, or of one, over speed and over position."""
     judgement = results.judgement
     panels_by_kind: dict[str, list[Panel]] = {"speed_panels": [], "position_panels": []}
     for what, per, profiles in (
@@ -245,11 +245,12 @@ def residual_panels(results: Results) -> dict[str, list[Panel]]:
         for j, (joint, profile) in enumerate(zip(judgement.joints, profiles, strict=True)):
             mean = np.array(profile.mean, np.float64)
             std = np.array(profile.std, np.float64)
-            if not np.isfinite(mean + std).any():
+            if only not in (None, j) or not np.isfinite(mean + std).any():
                 continue
             angle = "rad" if joint.unit == "N·m" else "m"
             note = f"RMS error {significant(joint.rms)} {joint.unit}"
-            caption = Caption(f"{what[0]}{j}", joint.joint, note, f"mean residual over {what}")
+            key = f"{'' if only is None else 'found-'}{what[0]}{j}"
+            caption = Caption(key, joint.joint, note, f"mean residual over {what}")
             heading = f"mean residual [{joint.unit}]"
             foot = f"{what} [{angle}{per}]"
             axes = single(170.0, heading, foot, x_ticks=6)

@@ -3,14 +3,16 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from functools import partial
 from typing import Final, NamedTuple
 
 import numpy as np
 
 from hil.report import figures
-from hil.report.drawing import chart_panel
+from hil.report.chart import Chart
+from hil.report.drawing import Panel, chart_panel
 from hil.report.interactive import chart_data, library
 from hil.report.numbers import capitalised
 from hil.report.rendering import environment, page_bytes, template_text
@@ -21,6 +23,7 @@ from hil.results.rollout_result import RolloutResult
 from hil.results.series import ReportSeries
 from identification.excitation import CRITERIA, METHODS
 from identification.selection.settings import Choice
+from identification.validation.finding import Level
 from identification.validation.purpose_messages import TITLES, figure, requirement
 
 _MOST_CANDIDATES: Final = 6
@@ -55,13 +58,8 @@ _PICTURES: Final = {
     "clock": "excitation",
 }
 """Section of the figure that shows what a check found."""
-_OF_MODEL: Final = "About the model and its prediction"
-_OF_RECORDING: Final = "About the recording"
-_RECORDING_CHECKS: Final = frozenset(
-    {"torque bandwidth", "sampling rate", "resolution", "whiteness", "saturation", "excitation",
-     "left open by the motion", "delay", "systematic error"}
-)  # fmt: skip
-"""Checks whose findings describe how it was recorded."""
+_CHARTS: Final = {"torque": "torques", "friction": "friction", "excitation": "excitation"}
+"""Charts of these sections, with one for each joint."""
 
 
 def report_bytes(
@@ -96,8 +94,12 @@ def report_bytes(
         "has_truth": any(p.truth is not None for p in results.parameters),
         "has_ids": any(p.table2_id is not None for p in results.parameters),
         "has_prior": any(p.data_share is not None for p in results.parameters),
-        "warnings": grouped_warnings(results),
-        "ranked": [warning for group in grouped_warnings(results).values() for warning in group],
+        "found": found_rows(results, charts, bins),
+        "passed": [
+            finding
+            for finding in results.judgement.worst_first
+            if finding.level in ("information", "good")
+        ],
         "has_absolute": any(p.absolute_std not in (None, p.std) for p in results.parameters),
         "has_repetitions": any(p.repetition_std is not None for p in results.parameters),
         "by_id": by_id,
@@ -165,14 +167,56 @@ def of_paper(place: str, *, is_of_paper: bool) -> str:
     return f" (paper, {place})" if is_of_paper else ""
 
 
-def grouped_warnings(results: Results) -> dict[str, list[str]]:
-    """Return the warnings of the verdict by what they are about, the most consequential first."""
-    groups: dict[str, list[str]] = {title: [] for title in (_OF_MODEL, _OF_RECORDING)}
-    for finding in results.judgement.doubtful:
-        title = _OF_RECORDING if finding.check in _RECORDING_CHECKS else _OF_MODEL
-        groups[title].append(finding.words)
-    groups[_OF_MODEL] += results.remarks
-    return groups if results.verdict.warnings else {}
+class FoundRow(NamedTuple):
+    """A finding of the page, with the figure that shows it."""
+
+    level: Level
+    words: str
+    step: str
+    section: str  #: whose figure shows it; empty without one
+    panel: Panel | None  #: of the joint with the largest error
+
+
+def found_rows(
+    results: Results, charts: Mapping[str, Sequence[Chart]], bins: int
+) -> list[FoundRow]:
+    """Return what is wrong or doubtful, the most consequential first; then remarks."""
+    worst = worst_joint(results)
+    rows: list[FoundRow] = []
+    for finding in results.judgement.worst_first:
+        if finding.level not in ("wrong", "doubtful"):
+            continue
+        section = picture_of(finding.check)
+        panel = None
+        shown = {row.section for row in rows}
+        if section not in shown:
+            panel = _panel_of(section, worst, results, charts, bins)
+        rows.append(FoundRow(finding.level, finding.words, finding.next_step, section, panel))
+    return rows + [FoundRow("doubtful", remark, "", "", None) for remark in results.remarks]
+
+
+def worst_joint(results: Results) -> int:
+    """Return the joint with the largest relative error, from 0."""
+    errors = [joint.relative or 0.0 for joint in results.judgement.joints]
+    return int(np.argmax(np.nan_to_num(errors)))
+
+
+def _panel_of(
+    section: str,
+    joint: int,
+    results: Results,
+    charts: Mapping[str, Sequence[Chart]],
+    bins: int,
+) -> Panel | None:
+    """Return a panel of a joint out of the figure of a section, None where it has no such."""
+    for chart in charts.get(_CHARTS.get(section, ""), ()):
+        if chart.joint == joint:
+            key = f"found-{chart.caption.key}"
+            return chart_panel(replace(chart, caption=chart.caption._replace(key=key)), bins)
+    if section == "residuals":
+        panels = figures.residual_panels(results, only=joint)["speed_panels"]
+        return panels[0] if panels else None
+    return None
 
 
 def joint_of(parameter: ParameterResult, joint_names: Sequence[str]) -> str:

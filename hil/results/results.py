@@ -160,12 +160,16 @@ class JudgementResult(Frozen):
 
     @property
     def worst_first(self) -> list[Finding]:
-        """Findings in descending order of severity: causes, then symptoms, then conditions."""
+        """Findings in descending order of severity.
+
+        Causes, the one that explains most of the error first, then symptoms, then conditions.
+        """
         levels = ("wrong", "doubtful", "information", "good")
         roles = ("cause", "symptom", "condition")
 
-        def rank(finding: Finding) -> tuple[int, int]:
-            return levels.index(finding.level), roles.index(finding.role)
+        def rank(finding: Finding) -> tuple[int, int, float]:
+            explained = finding.explains or 0.0
+            return levels.index(finding.level), roles.index(finding.role), -explained
 
         return sorted(self.findings, key=rank)
 

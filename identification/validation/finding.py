@@ -29,6 +29,8 @@ class Finding:
     role: Role = "condition"
     # what a model that predicts well must not be used for without care, for the verdict's sentence
     reservation: str = ""
+    # share of the squared error that is gone with this corrected, 0 to 1; None: not measured
+    explains: float | None = None
 
 
 def joined(names: Sequence[str], most: int = 6) -> str:

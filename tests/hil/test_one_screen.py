@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+import re
+import textwrap
+from collections import Counter
+from collections.abc import Callable, Mapping
 from pathlib import Path
 
 import numpy as np
@@ -10,17 +13,24 @@ import pytest
 from numpy.typing import NDArray
 from typer.testing import CliRunner
 
+from hil.base.errors import HilError
 from hil.base.one_screen import COLUMNS, LINES, Paragraph, brief, one_screen
 from hil.cli import app
+from tests.hil.fast_cell import QUICK_GRADIENT, fast_cell
 from tests.hil.simulated_logs import simulate, urdf_path, write_log
 
 Floats = NDArray[np.float64]
+_SENTENCE = 8  # words of what is no figure, name or title
 
 
 def require_one_screen(text: str) -> None:
+    """At most 24 lines of 100 columns, and nothing twice."""
     lines = text.rstrip("\n").split("\n")
     assert len(lines) <= LINES, text
     assert max(map(len, lines)) <= COLUMNS, max(lines, key=len)
+    clauses = [clause.strip() for clause in re.split(r"[;:.]\s", " ".join(text.split()))]
+    told = Counter(clause for clause in clauses if len(clause.split()) >= _SENTENCE)
+    assert not [clause for clause, times in told.items() if times > 1], text
 
 
 class TestText:
@@ -51,12 +61,16 @@ def arm() -> Mapping[str, Floats]:
     return {"t": motion.time, "q": motion.position, "v": motion.velocity, "tau": motion.torque}
 
 
-def scaled(name: str, factor: object) -> object:
+Table = Mapping[str, Floats]
+Change = Callable[[Table, np.random.Generator], Table]
+
+
+def scaled(name: str, factor: Floats | float) -> Change:
     return lambda table, rng: {**table, name: table[name] * factor}
 
 
-def noisy(size: float) -> object:
-    def change(table: Mapping[str, Floats], rng: np.random.Generator) -> Mapping[str, Floats]:
+def noisy(size: float) -> Change:
+    def change(table: Table, rng: np.random.Generator) -> Table:
         torque = table["tau"]
         noise = size * torque.std(axis=0) * rng.standard_normal(torque.shape)
         return {**table, "tau": torque + noise}
@@ -64,26 +78,26 @@ def noisy(size: float) -> object:
     return change
 
 
-def rows(part: object) -> object:
+def rows(part: slice | NDArray[np.intp]) -> Change:
     return lambda table, rng: {name: column[part] for name, column in table.items()}
 
 
-def permuted(name: str, order: list[int]) -> object:
+def permuted(name: str, order: list[int]) -> Change:
     return lambda table, rng: {**table, name: table[name][:, order]}
 
 
-def jumping(table: Mapping[str, Floats], rng: np.random.Generator) -> Mapping[str, Floats]:
+def jumping(table: Table, rng: np.random.Generator) -> Table:
     position = table["q"].copy()
     position[200:, 1] += 0.5
     return {**table, "q": position}
 
 
-def uneven(table: Mapping[str, Floats], rng: np.random.Generator) -> Mapping[str, Floats]:
+def uneven(table: Table, rng: np.random.Generator) -> Table:
     return {**table, "t": table["t"] + 0.004 * rng.random(len(table["t"]))}
 
 
 WRIST = np.array([1.0, 1.0, 1.0, 1.0, 1.0, -1.0])
-LOGS = {
+LOGS: Mapping[str, Change] = {
     "right": rows(slice(None)),
     "noisy": noisy(0.2),
     "drowned in noise": noisy(3.0),
@@ -113,14 +127,66 @@ LOGS = {
 def test_a_log_fills_one_screen(
     command: str, name: str, arm: Mapping[str, Floats], tmp_path: Path
 ) -> None:
-    table = LOGS[name](arm, np.random.default_rng(1))  # type: ignore[operator]
-    log = write_log(tmp_path / "log.csv", ["t", "q{}", "v{}", "tau{}"], *table.values())
-    result = CliRunner().invoke(
-        app, [command, str(log), "--urdf", str(urdf_path("ur5_robot.urdf"))]
-    )
-    if not isinstance(result.exception, SystemExit | None):
-        pytest.skip(f"refused in one sentence: {type(result.exception).__name__}")
-    require_one_screen(result.stdout)
+    log = written(tmp_path, name, arm)
+    require_one_screen(printed(command, log, "--urdf", urdf_path("ur5_robot.urdf")))
+
+
+def written(folder: Path, name: str, arm: Mapping[str, Floats]) -> Path:
+    """Write one of the `LOGS`."""
+    table = LOGS[name](arm, np.random.default_rng(1))
+    return write_log(folder / "log.csv", ["t", "q{}", "v{}", "tau{}"], *table.values())
+
+
+def printed(*words: object) -> str:
+    """What a command prints, or the text of its refusal."""
+    result = CliRunner().invoke(app, [*map(str, words)])
+    if isinstance(result.exception, HilError):
+        return "\n".join(textwrap.wrap(str(result.exception), COLUMNS))
+    assert isinstance(result.exception, SystemExit | None), result.exception
+    return result.stdout or result.output
+
+
+IDENTIFIED = ("right", "drowned in noise", "one torque negated", "with gaps")
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("name", IDENTIFIED)
+def test_what_follows_an_identification_fills_one_screen(
+    name: str, arm: Mapping[str, Floats], tmp_path: Path
+) -> None:
+    """Of good models and bad ones."""
+    folder = tmp_path / "result"
+    urdf = urdf_path("ur5_robot.urdf")
+    printed("identify", written(tmp_path, name, arm), "--urdf", urdf, "-o", folder)
+    archive = folder / "log.mcap"
+    for words in (
+        ("rollout", folder, "--samples", "2"),
+        ("export", folder, "--to", "mjcf", "-o", tmp_path / "arm.xml"),
+        ("report", folder),
+        ("batch", folder, "-o", tmp_path / "batch"),
+        ("compare", folder, folder),
+        ("payload", archive, "--loaded", archive),
+        ("identify", folder, "--quiet"),
+    ):
+        require_one_screen(printed(*words))
+
+
+@pytest.mark.long
+def test_a_campaign_fills_one_screen(tmp_path: Path) -> None:
+    """Design, rehearsal, run and what is left of it."""
+    cell = fast_cell(tmp_path).path
+    folder = tmp_path / "run"
+    settings = tmp_path / "search.toml"
+    settings.write_text(QUICK_GRADIENT)
+    for words in (
+        ("design", cell, "-o", folder, "--settings", settings),
+        ("rehearse", folder),
+        ("run", folder, "--accept-dry-run"),
+        ("status", folder),
+        ("identify", folder),
+        ("doctor", cell),
+    ):
+        require_one_screen(printed(*words))
 
 
 COMMANDS = "identify look design rehearse run batch payload rollout compare doctor demo"

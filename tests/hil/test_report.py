@@ -281,7 +281,13 @@ def many_choices():
 STEPS = [
     {"step": "rehearsal", "done": True, "words": "6 of 6 criteria passed", "details": []},
     {"step": "dry run", "done": True, "words": "accepted by ada", "details": ["2 late"]},
-    {"step": "warm-up", "done": False, "words": "not warm", "details": ["still 1.3%"]},
+    {
+        "step": "warm-up",
+        "done": False,
+        "words": "not warm",
+        "details": ["still 1.3%"],
+        "warning": True,
+    },
 ]
 """Conduct of a campaign."""
 
@@ -374,7 +380,8 @@ class TestPage:
         verdict = {"good": good, "line": "So it is.", "reasons": ["because"], "warnings": []}
         text = render(make_results(verdict=verdict))
         card = text[text.index('<section class="verdict') :].split("</section>")[0]
-        assert Page(card).text == f"{word} So it is. because"
+        first = "1 warning , by rank . First: not white."
+        assert Page(card).text == f"{word} So it is. because {first}"
         assert 'class="badge"' in card
 
     def test_names_what_was_simulated(self, whole):
@@ -482,32 +489,39 @@ class TestPage:
         assert Page(html).text.count("includes standstill and reversals") == 1
         assert "whole recording" in Page(html).text and "in motion" in Page(html).text
 
-    def test_groups_warnings_outside_the_box_of_the_verdict(self):
-        judgement = _judgement() | {"findings": [
-            {"check": "resolution", "level": "doubtful", "words": "few digits"}]}  # fmt: skip
-        verdict = {"good": True, "line": "Good.", "reasons": [],
-                   "warnings": ["few digits", "friction drifts"]}  # fmt: skip
-        html = render(make_results(judgement=judgement, verdict=verdict))
-        section = html[html.index('<section class="warnings"') :].split("</section>")[0]
-        assert Page(section).text == (
-            "2 warnings Ranked within each group: what explains an error of the model, then what"
-            " the error is, then conditions of the test. About the model and its prediction"
-            " friction drifts About the recording few digits"
-        )
+    def test_has_findings_with_next_step_and_figure(self):
+        """The figure is that of the joint with the largest error, and stands in its section."""
+        step = "fit a longer motion"
+        finding = {"check": "generalisation", "level": "wrong", "words": "it grew"}
+        passed = {"check": "saturation", "level": "good", "words": "none saturated"}
+        findings = [passed, finding | {"next_step": step, "role": "symptom"}]
+        html = render(make_results(judgement=_judgement() | {"findings": findings}))
+        section = html[html.index('<ol class="found">') :].split("</ol>")[0]
+        assert "✕ failed it grew Next: fit a longer motion." in Page(section).text
+        assert 'href="#torque"' in section and "<svg" in section
+        assert "none saturated" not in Page(section).text
+        assert html.count("it grew") == 1
+        assert [row["Finding"] for row in Page(html).table("Check")] == ["none saturated"]
 
-    def test_ranks_warnings_and_names_the_first_beside_the_verdict(self):
-        roles = {"few runs": "condition", "wrist off": "symptom", "negated": "cause"}
+    def test_ranks_findings_by_role_and_by_what_they_explain(self):
+        found = {
+            "few runs": ("condition", None),
+            "wrist off": ("symptom", None),
+            "late": ("cause", 0.3),
+            "negated": ("cause", 0.9),
+        }
         findings = [
-            {"check": "x", "level": "doubtful", "words": sentence, "role": role}
-            for sentence, role in roles.items()
+            {"check": "x", "level": "doubtful", "words": words, "role": role, "explains": share}
+            for words, (role, share) in found.items()
         ]
-        warnings = [*roles, "a note on the source"]
+        warnings = [*found, "a note on the source"]
         verdict = {"good": True, "line": "Good.", "reasons": [], "warnings": warnings}
         judgement = _judgement() | {"findings": findings}
-        page = render(make_results(judgement=judgement, verdict=verdict))
-        section = page[page.index('<section class="warnings"') :].split("</section>")[0]
-        assert re.findall(r"<li>(.*)</li>", section) == [*reversed(roles), "a note on the source"]
-        assert "4 warnings , by rank . First: negated." in Page(page).text
+        page = render(make_results(verdict=verdict, judgement=judgement))
+        section = page[page.index('<ol class="found">') :].split("</ol>")[0]
+        words = re.findall(r'<span class="words">(.*?)</span>', section)
+        assert words == [*reversed(found), "a note on the source"]
+        assert "5 warnings , by rank . First: negated." in Page(page).text
 
     def test_begins_with_what_the_model_is_good_for(self):
         purposes = [

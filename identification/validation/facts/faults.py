@@ -32,6 +32,7 @@ class OutlierFacts:
     share: Array  # of samples (n,)
     overall: float  # error without them, over all axes
     decide: bool  # whether the error exceeds its limit with them only
+    explains: float  # share of the squared error that they cause
 
     @classmethod
     def of(cls, evidence: Evidence, limits: Thresholds) -> OutlierFacts | None:
@@ -50,6 +51,7 @@ class OutlierFacts:
             share=outliers.share,
             overall=outliers.without.overall,
             decide=bool(few.any()) and (all_axes or bool(np.any(axis & few))),
+            explains=1.0 - (outliers.without.overall / max(error.overall, 1e-12)) ** 2,
         )
 
     def findings(self, naming: Naming) -> Iterator[Finding]:
@@ -65,6 +67,7 @@ class OutlierFacts:
             "check the recorded torques for spikes, damaged packets and collisions; remove them,"
             " or use a robust estimator (`hil identify --estimator tukey` or huber)",
             "cause",
+            explains=self.explains,
         )
 
 
@@ -104,6 +107,7 @@ class GravityFacts:
                 " the error",
                 f"{MOUNTING_STEP}; if it is right, check the zero positions of the joints",
                 "cause",
+                explains=1.0 - self.error**2,
             )
 
 
@@ -176,6 +180,7 @@ class FaultFacts:
                 f" fitted motion by {cause.ratio:.2f}",
                 text.step,
                 "cause",
+                explains=1.0 - cause.ratio**2,
             )
 
     def _ratio_of(self, cause: Cause) -> float:
