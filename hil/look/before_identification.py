@@ -24,11 +24,13 @@ from hil.look.run import SETTINGS, look_at_joints, mountings
 from hil.pipeline.sources import cell_of, source_of
 from identification.errors import IdentificationError
 from identification.estimators.torque_channel import possible_low_passes
+from identification.hypotheses.diagnosis import RigidTorque, diagnose
 from identification.hypotheses.scores import Score, compare, score_of
 from identification.hypotheses.search import SURE
 from identification.signals.recording import STUCK_MOVEMENT
 from identification.signals.samples import Samples, prepare
 from identification.text import percentage
+from identification.validation.facts.diagnosis import RECORD_ALL_TORQUE, without_bodies
 
 _SUSPECT: Final = 0.15
 """Error of the torque, predicted from other parts, above which a log is looked at closely. Right
@@ -74,7 +76,11 @@ def concluded(
         return imported
     cell, samples, score = few
     is_bag = imported.map_text is None  # its joints have names: no other order is searched
+    diagnosis = diagnose(cell.model, [samples])
+    if diagnosis.rigid.is_nothing:
+        raise _without_bodies(source, diagnosis.rigid)
     suspect = score.overall > _SUSPECT or bool(np.any(score.friction < _DRIVES))
+    suspect = suspect or any(step.sure for step in diagnosis.zeros)
     if is_bag or not (suspect or _hangs_otherwise(cell, samples, score)):
         contradictions = Contradictions.of(cell, cell.model, samples, score, score.overall)
         return _of_this_arm(imported, source, contradictions)
@@ -262,6 +268,14 @@ def undecided(
     if choices[0].aspect in _OF_AXES:
         remedy += "; if none of these is so, give the URDF of this arm"
     return SourceError(source, problem, field=choices[0].aspect, remedy=remedy)
+
+
+def _without_bodies(source: Path, rigid: RigidTorque) -> SourceError:
+    remedy = (
+        f"{RECORD_ALL_TORQUE}; to identify in spite of that, give the column map (`hil look LOG"
+        " --urdf ARM.urdf -o map.toml`, --map map.toml)"
+    )
+    return SourceError(source, without_bodies(rigid), field="torque", remedy=remedy)
 
 
 def _other_arm(source: Path, error: float) -> SourceError:

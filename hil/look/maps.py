@@ -40,11 +40,12 @@ def entries_of(
     same = bool(np.array_equal(axes.position_order, axes.torque_order))
     count = np.arange(len(joints))
     entries: dict[str, Any] = {}
+    scale = np.round(axes.torque_sign / axes.torque_scale, 4)
     quantities = {
         "position": (axes.position_order, axes.position_sign),
         "velocity": (axes.position_order, axes.position_sign),
-        "torque": (axes.torque_order, axes.torque_sign),
-        "motor_current": (axes.torque_order, axes.torque_sign),
+        "torque": (axes.torque_order, scale),
+        "motor_current": (axes.torque_order, scale),
     }
     place = np.argsort(axes.position_order)
     if same and not np.array_equal(axes.position_order, count):
@@ -57,7 +58,7 @@ def entries_of(
             if columns is not None:
                 entries[f"{name}.columns"] = [columns[int(column)] for column in order]
         by_column = sign[place] if same else sign
-        if np.any(sign < 0.0):
+        if np.any(sign != 1.0):
             entries[f"{name}.scale"] = by_column.tolist()
         if name in ("position", "velocity") and (terms := _terms(axes, place if same else count)):
             entries[f"{name}.coupled"] = terms

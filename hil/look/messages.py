@@ -44,6 +44,7 @@ from hil.look.readings import (
     ExplainedTorque,
     Fact,
     FilterShape,
+    FreeFit,
     GravityOption,
     LastBody,
     LateVelocity,
@@ -59,6 +60,7 @@ from hil.look.readings import (
     NotSlopes,
     OtherAxes,
     OtherLengths,
+    RigidShare,
     Rows,
     Setting,
     SizeRatio,
@@ -117,6 +119,8 @@ _FACTS: Final[Mapping[Fact, str]] = {
     Fact.NO_DELAY: "none",
     Fact.NO_DELAY_SEEN: "none seen",
     Fact.NO_LOW_PASS: "none in the torque",
+    Fact.NO_BODIES: "next to nothing of bodies: a model was subtracted from the torque",
+    Fact.NONE_FITS: "none of those that were tested fits; the nearest are above",
     Fact.OTHER_ARM: "may be another than that of the URDF",
 }
 _BASES: Final[Mapping[Basis, str]] = {
@@ -147,6 +151,7 @@ _BASES: Final[Mapping[Basis, str]] = {
     Basis.NO_ROW: "no usable row",
     Basis.NO_FILTER_BETTER: "none predicts it better",
     Basis.FREE_PARAMETERS: "with free parameters, before a fit of the friction law",
+    Basis.NO_BODIES: "torque of friction says nothing of it",
 }
 _STEPS: Final[Mapping[Step, str]] = {
     Step.STATE_UNIT_OR_GEARS: "state unit, sign or gears of both",
@@ -165,6 +170,8 @@ _STEPS: Final[Mapping[Step, str]] = {
     Step.MOVE_EACH_JOINT: "move the joints one by one",
     Step.PUSH_A_JOINT: "push one joint by hand and see its torque",
     Step.COMPARE_A_POSTURE: "compare a posture with the URDF's (viewer)",
+    Step.RECORD_ALL_TORQUE: "record the torque of motors or sensors, before that",
+    Step.WEIGH_A_LOAD: "hold a known load with and without it (`hil torque-constants`)",
     Step.TURN_ONE_JOINT: "turn one joint alone and see which angles change",
     Step.HOLD_STILL: "hold the arm still, stretched out, and see the torque",
     Step.RECORD_MEASURED: "record the measured ones",
@@ -272,6 +279,8 @@ def described(change: ArmChange) -> str:
         text = f"mounted {change.change.name}"
     elif meaning == "zero":
         text = f"zero moved by {np.degrees(change.change.size):.0f} deg"
+    elif meaning == "scale":
+        text = f"torque recorded {1.0 + change.change.size:.3g} times"
     else:
         text = _CHANGES[meaning]
     if meaning in COUPLED:
@@ -529,6 +538,19 @@ def _(unseen: UnseenFriction) -> str:
 @_worded.register
 def _(error: StillUnexplained) -> str:
     return f"but {percentage(error.error)} of the torque stays unexplained"
+
+
+@_worded.register
+def _(rigid: RigidShare) -> str:
+    return (
+        f"at most {percentage(rigid.over_friction)} of the friction of a joint, and "
+        f"{rigid.scale:.2g} times the torque of the URDF's masses"
+    )
+
+
+@_worded.register
+def _(fit: FreeFit) -> str:
+    return f"{fit.ratio:.2g} times the error of a fit of any masses, zeros and scales"
 
 
 @_worded.register

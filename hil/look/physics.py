@@ -31,6 +31,7 @@ from hil.look.readings import (
     Evidence,
     Fact,
     FilterShape,
+    FreeFit,
     GravityOption,
     LastBody,
     LowPassedTorque,
@@ -41,6 +42,7 @@ from hil.look.readings import (
     NearestZero,
     NextBest,
     Reading,
+    RigidShare,
     Setting,
     SizeRatio,
     StatedPayload,
@@ -57,6 +59,7 @@ from identification.estimators.delay import DelayEstimate
 from identification.estimators.prior import LEARNED, body_prior, fit_posterior
 from identification.factor.factor import Factor
 from identification.hypotheses.changes import IN_ORDER, Axes, Change, Meaning
+from identification.hypotheses.diagnosis import RigidTorque, rigid_torque
 from identification.hypotheses.faults import COUPLED
 from identification.hypotheses.search import EXPLAINED, SEPARATE, Readings, Step
 from identification.model.link_wrenches import LINK_SYMBOLS
@@ -86,6 +89,7 @@ _ASPECTS: Final[Mapping[Meaning, Aspect]] = {
     "degrees": "angle unit",
     "radians": "angle unit",
     "zero": "zero",
+    "scale": "scale",
     "angle sum": "coupling",
     "angle difference": "coupling",
     "no gravity": "gravity",
@@ -191,6 +195,11 @@ class Finding:
         """Measured torque over that which the arm needs."""
         return Size.of(self.cell, self.readings.model, self.readings.samples)
 
+    @cached_property
+    def rigid(self) -> RigidTorque:
+        """How much of the torque is that of bodies."""
+        return rigid_torque(self.readings.model, self.readings.samples)
+
     def rows(self, groups: Sequence[Group] = ()) -> list[Row]:
         """Return the rows of the table; `groups` are the parameters that are determined."""
         rows = [
@@ -198,13 +207,21 @@ class Finding:
             self._signs(),
             self._unit(),
             self._zero(),
+            *self._scale(),
             self._coupling(),
             self._gravity(),
             self._mounting(),
             self._size(),
             self._payload(groups),
         ]
+        if self.rigid.is_nothing:
+            rest = [row for row in rows if row.aspect != "side"]
+            rows = [self._no_bodies(), *map(_says_nothing, rest)]
         error = self.readings.score.overall
+        adequacy = self.readings.adequacy
+        if self.readings.steps and not adequacy.is_enough:
+            beside = FreeFit(adequacy.ratio)
+            rows.append(Row("explanation", Fact.NONE_FITS, Certainty.UNDETERMINED, (beside,)))
         if error > EXPLAINED:
             rows = [_no_longer_certain(row, error) for row in rows]
         as_read = ErrorAsRead(error)
@@ -308,6 +325,17 @@ class Finding:
         nearest = NearestZero(self._of_arm(change), against.ratio)
         return Row("zero", UnseenZeros(unseen), Certainty.UNDETERMINED, (nearest,), decider)
 
+    def _no_bodies(self) -> Row:
+        share = RigidShare(float(self.rigid.over_friction.max()), self.rigid.scale)
+        decider = Decide.RECORD_ALL_TORQUE
+        return Row("bodies", Fact.NO_BODIES, Certainty.CERTAIN, (share,), decider)
+
+    def _scale(self) -> Iterator[Row]:
+        """Yield the scales of torques, if some differ from the others."""
+        if steps := self.steps("scale"):
+            decider = Decide.WEIGH_A_LOAD
+            yield self._changed("scale", steps, self._changes(steps), decider)
+
     def _coupling(self) -> Row:
         steps = self.steps(*COUPLED)
         decider = Decide.TURN_ONE_JOINT
@@ -378,6 +406,8 @@ class Finding:
             shown = first[:_MOST_CHOICES] if len(first) > 1 else pairs[:2]
             choices.append(tuple(self._choice(step, *pair) for pair in shown))
         size = self.size
+        if self.rigid.is_nothing:
+            return tuple(choices)
         if size.is_off and not size.is_thousand and (size.factor or 1.0) < 1.0:
             choices.append(self._sides())
         return tuple(choices)
@@ -422,6 +452,13 @@ class Finding:
         if any(step.sure for step in self.steps("mounting")):
             return tuple(self.readings.model.gravity.tolist())
         return None
+
+
+def _says_nothing(row: Row) -> Row:
+    """Return a row that rests on the torque of bodies, of a torque without."""
+    if row.aspect == "payload":
+        return row
+    return replace(row, certainty=Certainty.UNDETERMINED, evidence=(Basis.NO_BODIES,), decider=None)
 
 
 def _no_longer_certain(row: Row, error: float) -> Row:

@@ -62,6 +62,8 @@ class Fact(Enum):
     NO_DELAY_SEEN = auto()
     NO_LOW_PASS = auto()
     OTHER_ARM = auto()
+    NO_BODIES = auto()
+    NONE_FITS = auto()  #: only the nearest of what was tested
 
 
 @dataclass(frozen=True)
@@ -261,6 +263,7 @@ class Basis(Enum):
     NO_ROW = auto()
     NO_FILTER_BETTER = auto()
     FREE_PARAMETERS = auto()
+    NO_BODIES = auto()
 
 
 @dataclass(frozen=True)
@@ -328,6 +331,21 @@ class UnseenFriction:
     """Joints in which friction is not seen."""
 
     joints: tuple[str, ...]
+
+
+@dataclass(frozen=True)
+class RigidShare:
+    """Torque of bodies over that of friction at most, and over that of the URDF's masses."""
+
+    over_friction: float
+    scale: float
+
+
+@dataclass(frozen=True)
+class FreeFit:
+    """Error over that of a fit that is free of masses, zeros and scales."""
+
+    ratio: float
 
 
 @dataclass(frozen=True)
@@ -466,6 +484,8 @@ Evidence = (
     | NearestZero
     | UnseenFriction
     | StillUnexplained
+    | FreeFit
+    | RigidShare
     | SizeRatio
     | LastBody
     | DelayInterval
@@ -493,6 +513,8 @@ class Step(Enum):
     MOVE_EACH_JOINT = auto()
     PUSH_A_JOINT = auto()
     COMPARE_A_POSTURE = auto()
+    WEIGH_A_LOAD = auto()
+    RECORD_ALL_TORQUE = auto()
     TURN_ONE_JOINT = auto()
     HOLD_STILL = auto()
     RECORD_MEASURED = auto()

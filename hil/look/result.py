@@ -27,6 +27,7 @@ Aspect = Literal[
     "signs",
     "angle unit",
     "zero",
+    "scale",
     "coupling",
     "gravity",
     "mounting",
@@ -36,6 +37,8 @@ Aspect = Literal[
     "delay",
     "low-pass",
     "arm",
+    "bodies",
+    "explanation",
 ]
 """What a row is about, as a person and a program read it."""
 

@@ -1,4 +1,4 @@
-"""What a reading changes in a recording: sign, order, unit and zero of joints, mounting."""
+"""What a reading changes in a recording: sign, order, unit, zero and scale of joints, mounting."""
 
 from __future__ import annotations
 
@@ -27,20 +27,24 @@ Meaning = Literal[
     "degrees",
     "radians",
     "zero",
+    "scale",
     "no gravity",
     "mounting",
 ]
 DEGREE: Final = np.pi / 180.0
 SIGNS: Final[tuple[Meaning, ...]] = ("torque sign", "position sign", "axis sign")
 IN_ORDER: Final[tuple[Meaning, ...]] = ("torque order", "position order", "joint order")
+SIZED: Final[tuple[Meaning, ...]] = ("zero", "scale")
+UNITS: Final[tuple[Meaning, ...]] = ("degrees", "radians")
 GRAVITIES: Final[tuple[Meaning, ...]] = ("mounting", "no gravity")
 
 
 class Change(NamedTuple):
     """One difference between a reading and what was recorded.
 
-    `size` is an angle [rad] to add to a position; `name` that of a mounting; `order` the recorded
-    place of each of the joints, by default those of a pair exchanged.
+    `size` is an angle [rad] to add to a position, or by how much more than once a torque is
+    recorded; `name` that of a mounting; `order` the recorded place of each of the joints, by
+    default those of a pair exchanged.
     """
 
     meaning: Meaning
@@ -61,7 +65,7 @@ _AS_READ: Final = Change("position order")
 
 def change_of_motion(change: Change) -> Change:
     """Return the change of the motion that is part of a change, or of a mounting."""
-    if change.meaning in ("torque sign", "torque order"):
+    if change.meaning in ("torque sign", "torque order", "scale"):
         return _AS_READ
     if change.meaning == "axis sign":
         return change._replace(meaning="position sign")
@@ -91,6 +95,10 @@ def changed_samples(model: RobotModel, samples: Samples, change: Change) -> Samp
     if meaning == "position sign":
         turned = corrected(model, samples, Fault("axis sign", joints))
         return corrected(model, turned, Fault("torque sign", joints))
+    if meaning == "scale":
+        torque = samples.torque.copy()
+        torque[:, list(joints)] /= 1.0 + change.size
+        return replace(samples, torque=torque)
     if meaning == "zero":
         position = motion.position.copy()
         position[:, list(joints)] += change.size
@@ -133,8 +141,8 @@ def whole_order(change: Change, joints: int) -> tuple[int, ...]:
 
 
 def differs(change: Change, other: Change) -> bool:
-    """Whether two changes are not angles of one zero."""
-    is_zero = change.meaning == other.meaning == "zero" and change.joints == other.joints
+    """Whether two changes are not sizes of one zero or scale."""
+    is_zero = change.meaning == other.meaning in SIZED and change.joints == other.joints
     return change != other and not is_zero
 
 
@@ -143,7 +151,7 @@ def kind_of(change: Change) -> tuple[Meaning, tuple[int, ...]]:
 
     All joints are one: an arm that hangs weighs as one that stands, all torques negated.
     """
-    return change.meaning, change.joints if change.meaning in (*SIGNS, "zero") else ()
+    return change.meaning, change.joints if change.meaning in (*SIGNS, *SIZED) else ()
 
 
 def alternatives_to(change: Change) -> Iterator[Change]:
@@ -158,6 +166,7 @@ class Axes(NamedTuple):
 
     A quantity as read is ``sign * recorded[:, order]``; positions are multiplied by `factor`, and
     `zero` [rad] is added: angles that may each contain that of other joints, ``coupling @ angles``.
+    Torques are divided by `torque_scale`.
     """
 
     position_order: NDArray[np.intp]
@@ -167,13 +176,14 @@ class Axes(NamedTuple):
     factor: float
     zero: Array
     coupling: Array  # (n, n)
+    torque_scale: Array
 
     @classmethod
     def of(cls, changes: Iterable[Change], joints: int) -> Axes:
         """Return the axes after changes, one after the other."""
         axes = cls(
             np.arange(joints), np.ones(joints), np.arange(joints), np.ones(joints), 1.0,
-            np.zeros(joints), np.eye(joints),
+            np.zeros(joints), np.eye(joints), np.ones(joints),
         )  # fmt: skip
         for change in changes:
             axes = axes._after(change)
@@ -198,7 +208,9 @@ class Axes(NamedTuple):
             )
         if meaning in ("torque order", "joint order", "torque sign", "axis sign"):
             axes = axes._replace(
-                torque_order=axes.torque_order[order], torque_sign=axes.torque_sign[order] * sign
+                torque_order=axes.torque_order[order],
+                torque_sign=axes.torque_sign[order] * sign,
+                torque_scale=axes.torque_scale[order],
             )
         if meaning in ("degrees", "radians"):
             factor = DEGREE if meaning == "degrees" else 1.0 / DEGREE
@@ -207,6 +219,10 @@ class Axes(NamedTuple):
             zero = np.zeros(len(self.zero))
             zero[joints] = change.size
             axes = axes._replace(zero=axes.zero + axes.coupling @ zero)
+        if meaning == "scale":
+            scale = np.ones(len(self.zero))
+            scale[joints] += change.size
+            axes = axes._replace(torque_scale=axes.torque_scale * scale)
         if meaning in COUPLED:
             with_other = np.eye(len(self.zero))
             with_other[change.joints] = 1.0 if meaning == "angle sum" else -1.0
@@ -219,11 +235,12 @@ class Axes(NamedTuple):
         uncoupled = np.linalg.inv(self.coupling).T
         velocity = recording.velocity
         torque = recording.torque
+        factor = self.torque_sign / self.torque_scale
         return replace(
             recording,
             position=(recording.position[:, self.position_order] * scale + self.zero) @ uncoupled,
             velocity=None
             if velocity is None
             else velocity[:, self.position_order] * scale @ uncoupled,
-            torque=None if torque is None else torque[:, self.torque_order] * self.torque_sign,
+            torque=None if torque is None else torque[:, self.torque_order] * factor,
         )

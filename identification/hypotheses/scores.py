@@ -68,6 +68,10 @@ class Score:
         """The joint that each recorded column of the torque is read as (n,)."""
         return np.argsort(self.columns)
 
+    def of_torque(self, scale: Array) -> Score:
+        """Return the errors in units of a torque that is so many times (n,) the one scored."""
+        return replace(self, squares=self.squares * scale**2, torque=self.torque * scale**2)
+
 
 class Comparison(NamedTuple):
     """Errors of one reading over those of another: mean over the recorded torques, and of each."""

@@ -11,12 +11,13 @@ it.
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import combinations
 from typing import Final
 
 import numpy as np
 
+from identification.arrays import Array
 from identification.estimators.prior import TorqueSums, body_priors
 from identification.factor.columns import every_torque_factor
 from identification.factor.factor import SMALLEST_NOISE, Factor
@@ -25,6 +26,8 @@ from identification.hypotheses.changes import (
     GRAVITIES,
     IN_ORDER,
     SIGNS,
+    SIZED,
+    UNITS,
     Axes,
     Change,
     Meaning,
@@ -38,6 +41,13 @@ from identification.hypotheses.changes import (
     whole_order,
 )
 from identification.hypotheses.faults import COUPLED, coupled_pairs
+from identification.hypotheses.joint_fit import (
+    JointFit,
+    candidates,
+    find_joints,
+    fit_joints,
+    starting_at,
+)
 from identification.hypotheses.little_torque import little_torque
 from identification.hypotheses.scores import (
     DISSIPATES,
@@ -72,9 +82,10 @@ _IMPROVES: Final = 0.98  # error ratio of one exchange from which a whole order 
 _ORDERS: Final = 2  # best orders of each kind that are compared
 _CLOSER: Final = 12  # changes of least error on fewer rows, which are compared
 _MOST_STEPS: Final = 6
+_NEEDED: Final = 2.0  # standard errors of one of several zeros and scales that its fit needs
+_ADEQUATE: Final = 1.2  # error ratio to a free fit, of a reading that explains the rows
 _AT_ONCE: Final = 24  # fits, so that their sums stay in the processor's cache
-_ZEROS: Final = (-135.0, -90.0, -45.0, -20.0, 20.0, 45.0, 90.0, 135.0, 180.0)  # deg
-_NEARER: Final = (-0.5, -0.25, 0.25, 0.5)  # of a zero, tried about it
+_ZEROS: Final = (-135.0, -90.0, -45.0, 45.0, 90.0, 135.0, 180.0)  # deg, near which a fit starts
 
 
 @dataclass(frozen=True, eq=False)
@@ -102,6 +113,7 @@ class Step:
     ratio: float
     sigmas: float
     alike: tuple[tuple[Change, float], ...] = ()
+    is_adequate: bool = True  # whether no free fit explains the rows much better
 
     @property
     def by_friction(self) -> bool:
@@ -110,13 +122,35 @@ class Step:
 
     @property
     def sure(self) -> bool:
-        """Whether nothing else fits alike, and the arm explains the torque.
+        """Whether nothing else fits alike, and the arm explains the torque as a free fit does.
 
         Friction, or a slightly smaller error, says it of a whole arm; of one joint a lag of the
         torque looks the same.
         """
         slight = self.ratio > 1.0 - _LARGE and len(self.change.joints) == 1
-        return not self.alike and self.error < EXPLAINED and not slight
+        if self.change.meaning in SIZED:
+            slight = self.sigmas > -SEPARATE
+        return not self.alike and self.error < EXPLAINED and not slight and self.is_adequate
+
+
+@dataclass(frozen=True)
+class Adequacy:
+    """How a reading compares with a free fit of the same rows.
+
+    The free fit has any zero and scale of each joint, and hardly believes the masses of the URDF.
+
+    Attributes:
+        ratio: error with the reading over that of the free fit, mean over the joints.
+        agrees: whether the free fit has the same zeros and scales.
+    """
+
+    ratio: float
+    agrees: bool
+
+    @property
+    def is_enough(self) -> bool:
+        """Whether the reading explains the rows about as well."""
+        return self.agrees and self.ratio < _ADEQUATE
 
 
 @dataclass(frozen=True, eq=False)
@@ -130,6 +164,7 @@ class Readings:
         score: of these.
         nearest: by meaning, the change that comes nearest to the reading found, compared with it.
         unseen_zeros: joints of which the torque shows no zero: others fit alike.
+        adequacy: whether nothing else explains the rows much better.
     """
 
     steps: tuple[Step, ...]
@@ -138,6 +173,7 @@ class Readings:
     score: Score
     nearest: Mapping[Meaning, tuple[Change, Comparison]]
     unseen_zeros: tuple[int, ...] = ()
+    adequacy: Adequacy = Adequacy(1.0, agrees=True)
 
 
 def find_readings(
@@ -154,28 +190,81 @@ def find_readings(
     """
     few = _thinned(samples, _ROWS)
 
-    def started() -> _Search:
-        return _Search(model, few, mountings or {}, unit_is_open=unit_is_open)
+    def started(changes: Sequence[Change] = ()) -> _Search:
+        search = _Search(model, few, mountings or {}, unit_is_open=unit_is_open)
+        search.change(changes)
+        return search
 
     search = started()
     as_recorded = search.tried()
     steps: list[Step] = []
     while len(steps) < _MOST_STEPS:
-        step = search.by_prediction() or search.by_friction()
-        if step is None:
+        found = search.by_prediction() or search.by_friction()
+        if not found:
             break
-        steps.append(step)
+        steps += found
     if len(steps) > 1:
         again = started()
         single = again.single_as_good_as(search.score, as_recorded)
         if single is not None:
             search = again
             steps = [single]
+    if sized := [step for step in steps if step.change.meaning in SIZED]:
+        # Found one after the other: now all at once, on the others.
+        others = [step for step in steps if step not in sized]
+        again = started([step.change for step in others])
+        if joint_steps := again.by_joint_fit(sized):
+            search = again
+            steps = [*others, *joint_steps]
     nearest = search.nearest()
     score = score_of(search.model, search.samples, search.score.columns)
+    # What a change explains shows beside the others.
+    steps = [step if step.alike else replace(step, error=search.score.overall) for step in steps]
+    adequacy = search.adequacy()
+    if steps and not adequacy.is_enough:
+        # A sign or an order is certain as well if no free fit without it comes near.
+        without = started().free_fit()
+        beyond = search.stated_fit().ratio_to(without) < 1.0 - _LARGE
+        steps = [
+            replace(
+                step,
+                is_adequate=beyond
+                and step.is_adequate
+                and step.change.meaning not in (*SIZED, *UNITS),
+            )
+            for step in steps
+        ]
     return Readings(
-        tuple(steps), search.model, search.samples, score, nearest, search.unseen_zeros()
+        tuple(steps),
+        search.model,
+        search.samples,
+        score,
+        nearest,
+        search.unseen_zeros(),
+        adequacy,
     )
+
+
+def find_zeros_and_scales(model: RobotModel, samples: Samples) -> Readings:
+    """Find zeros and scales of joints that are other than stated, with nothing else changed."""
+    few = _thinned(samples, _ROWS)
+    search = _Search(model, few, {}, unit_is_open=False)
+    steps = search.by_joint_fit(())
+    adequacy = search.adequacy() if steps else Adequacy(1.0, agrees=True)
+    steps = [replace(step, is_adequate=step.is_adequate and adequacy.is_enough) for step in steps]
+    return Readings(tuple(steps), model, search.samples, search.score, {}, (), adequacy)
+
+
+@dataclass(frozen=True, eq=False)
+class _Joints:
+    """Zeros and scales of several joints, tried at once."""
+
+    fit: JointFit
+    changes: tuple[Change, ...]
+    samples: Samples
+    score: Score
+    whole: Comparison  # with the reading before
+    against: tuple[Comparison, ...]  # of each change, with all but it
 
 
 class _Search:
@@ -193,15 +282,32 @@ class _Search:
         self.samples = samples
         self._mountings = mountings
         self._unit_is_open = unit_is_open
+        self._changes: list[Change] = []
         self.score = score_of(model, samples)
         self._trials: list[Trial] | None = None
         self._tries: dict[Change, Trial] = {}
 
-    def by_friction(self) -> Step | None:
-        """Adopt the sign of joints that friction would drive; None if it drives none."""
+    def change(self, changes: Sequence[Change]) -> None:
+        """Adopt changes as they are."""
+        for change in changes:
+            trial = self._try(change)
+            self._become(trial.model, trial.samples, trial.score, [change])
+
+    def _become(
+        self, model: RobotModel, samples: Samples, score: Score, changes: Sequence[Change]
+    ) -> None:
+        self.model = model
+        self.samples = samples
+        self.score = score
+        self._changes += changes
+        self._trials = None
+        self._tries.clear()
+
+    def by_friction(self) -> list[Step]:
+        """Adopt the sign of joints that friction would drive; none if it drives none."""
         joints = tuple(np.flatnonzero(self.score.driven).tolist())
         if not joints:
-            return None
+            return []
         friction = self.score.friction
         clear = friction[np.abs(friction) > DISSIPATES]
         kinds: tuple[Meaning, ...] = ("torque sign", "position sign")
@@ -218,25 +324,143 @@ class _Search:
         trials = [self._try(Change(kind, joints)) for kind in kinds]
         best = min(trials, key=lambda trial: trial.against.ratio)
         if not everywhere and (best.against.ratio > 1.0 + _ALIKE or best.against.sigmas > SURE):
-            return None
-        return self._adopt(best, trials)
+            return []
+        return [self._adopt(best, trials)]
 
-    def by_prediction(self) -> Step | None:
-        """Adopt the change that fits best; None if none is significant."""
+    def by_prediction(self) -> list[Step]:
+        """Adopt the change that fits best, or zeros and scales; none if none is significant."""
         trials = self.tried()
         better = [trial for trial in trials if trial.score.overall < self.score.overall]
-        zeros = [trial for trial in better if trial.change.meaning == "zero"]
-        if zeros:  # an angle between those tried may fit as well as another change
-            better.append(self._nearer(min(zeros, key=lambda trial: trial.against.ratio)))
         good = [
-            trial for trial in better if _is_better(trial.against) and not self._is_spoilt(trial)
+            trial
+            for trial in better
+            if trial.change.meaning not in SIZED
+            and _is_better(trial.against)
+            and not self._is_spoilt(trial)
         ]
+        joints = self._best_joints(better)
+        if joints is not None and all(
+            compare(joints.score, trial.score, self.model).ratio < 1.0 - _ALIKE for trial in good
+        ):
+            return self._adopt_joints(joints, [t for t in better if t.change.meaning not in SIZED])
         if not good:
-            return None
+            return []
         best = min(good, key=lambda trial: trial.against.ratio)
         close = [trial for trial in good if self._are_alike(trial, best)]
         best = min(close, key=lambda trial: (int(trial.score.driven.sum()), trial.against.ratio))
-        return self._adopt(best, better)
+        if joints is not None and len(joints.changes) == 1:
+            better.append(self._try(joints.changes[0]))
+        return [self._adopt(best, [t for t in better if t.change.meaning != "zero"])]
+
+    def by_joint_fit(self, near: Sequence[Step]) -> list[Step]:
+        """Adopt zeros and scales of all joints at once, near those found before, if any fit."""
+        n = self.model.n_joints
+        zero = np.zeros(n)
+        gain = np.ones(n)
+        for step in near:
+            places = list(step.change.joints)
+            if step.change.meaning == "zero":
+                zero[places] += step.change.size
+            else:
+                gain[places] *= 1.0 + step.change.size
+        joints = self._joints(starting_at(self.model, self.samples, zero, gain - 1.0))
+        if joints is None:
+            return []
+        found = self._adopt_joints(joints, [])
+        alike = {step.change[:2]: step.alike for step in near}
+        return [replace(step, alike=alike.get(step.change[:2], ())) for step in found]
+
+    def stated_fit(self) -> JointFit:
+        """Fit the rows as read."""
+        none = np.zeros(2 * self.model.n_joints, dtype=np.bool_)
+        return fit_joints(self.model, self.samples, none)
+
+    def free_fit(self) -> JointFit:
+        """Fit the rows with any zeros and scales, and hardly believe the masses."""
+        free = candidates(self.model, self.samples)
+        return fit_joints(self.model, self.samples, free, free_bodies=True)
+
+    def adequacy(self) -> Adequacy:
+        """Compare the reading found with a free fit."""
+        free = self.free_fit()
+        moved = [joint for each in self._changes if each.meaning == "zero" for joint in each.joints]
+        return Adequacy(self.stated_fit().ratio_to(free), free.is_zero_at(moved))
+
+    def _best_joints(self, trials: Sequence[Trial]) -> _Joints | None:
+        """Return zeros and scales that predict better; None if none do."""
+        best = self._joints(None)
+        zeros = [trial for trial in trials if trial.change.meaning == "zero"]
+        zeros = [trial for trial in zeros if trial.against.ratio < 1.0 - _LARGE]
+        if zeros:  # far from what is stated
+            far = min(zeros, key=lambda trial: trial.against.ratio)
+            if best is None or compare(far.score, best.score, self.model).ratio < 1.0 - _ALIKE:
+                zero = np.zeros(self.model.n_joints)
+                zero[list(far.change.joints)] = far.change.size
+                start = starting_at(self.model, self.samples, zero, np.zeros_like(zero))
+                other = self._joints(start)
+                if best is None or (other is not None and other.fit.cost < best.fit.cost):
+                    best = other
+        return best
+
+    def _joints(self, start: JointFit | None) -> _Joints | None:
+        """Return the zeros and scales of a joint fit that predict better; None if none do."""
+        fit = find_joints(self.model, self.samples, candidates(self.model, self.samples), start)
+        zeros = [Change("zero", (j,), float(fit.zero[j])) for j in fit.moved]
+        scales = [Change("scale", (j,), float(fit.gain[j])) for j in fit.scaled]
+        changes = [*zeros, *scales]
+        while changes:
+            samples, score = self._scored(changes)
+            without = [
+                self._scored([each for each in changes if each != one])[1] for one in changes
+            ]
+            against = [compare(score, other, self.model) for other in without]
+            needed = [
+                change
+                for change, each in zip(changes, against, strict=True)
+                if each.sigmas < -_NEEDED
+            ]
+            if len(needed) == len(changes):
+                whole = compare(score, self.score, self.model)
+                if whole.ratio > 1.0 - _LEAST_GAIN or whole.sigmas > -SEPARATE:
+                    return None
+                return _Joints(fit, tuple(changes), samples, score, whole, tuple(against))
+            changes = needed
+        return None
+
+    def _scored(self, changes: Sequence[Change]) -> tuple[Samples, Score]:
+        """Return samples with more zeros and scales, and their score."""
+        samples = self.samples
+        for change in changes:
+            samples = changed_samples(self.model, samples, change)
+        score = score_of(self.model, samples, self.score.columns)
+        return samples, score.of_torque(self._torque_scale(changes))
+
+    def _torque_scale(self, changes: Sequence[Change]) -> Array:
+        return Axes.of([*self._changes, *changes], self.model.n_joints).torque_scale
+
+    def _adopt_joints(self, joints: _Joints, others: Sequence[Trial]) -> list[Step]:
+        """Adopt zeros and scales, with other changes that fit alike."""
+        before = self.score.overall
+        alike = tuple(
+            (trial.change, trial.score.overall)
+            for trial in others
+            if compare(trial.score, joints.score, self.model).sigmas < SEPARATE
+            and trial.score.overall < (1.0 + _ALIKE) * joints.score.overall
+        )
+        steps = [
+            Step(
+                change,
+                joints.score.overall,
+                before,
+                each.ratio,
+                each.sigmas,
+                alike,
+                is_adequate=change.meaning == "zero" or joints.fit.is_scale_known,
+            )
+            for change, each in zip(joints.changes, joints.against, strict=True)
+        ]
+        self._become(self.model, joints.samples, joints.score, joints.changes)
+        return steps
 
     def single_as_good_as(self, score: Score, tried: Sequence[Trial]) -> Step | None:
         """Adopt the one change of `tried` that fits as well as several do; None if none does."""
@@ -320,20 +544,16 @@ class _Search:
             and other.score.driven.sum() <= best.score.driven.sum()
         }
         before = self.score.overall
-        self.model = best.model
-        self.samples = best.samples
-        self.score = best.score
-        self._trials = None
-        self._tries.clear()
         ratio, sigmas, _ = best.against
         ranked = sorted(alike.items(), key=lambda pair: pair[1])
+        self._become(best.model, best.samples, best.score, [best.change])
         return Step(best.change, best.score.overall, before, ratio, sigmas, tuple(ranked))
 
     def tried(self) -> list[Trial]:
         """Return the changes of least error, tried on all rows."""
         if self._trials is None:
             fits = _Fits(self.model, _thinned(self.samples, _FEWER_ROWS), self._mountings)
-            errors = fits.errors(list(self._changes()))
+            errors = fits.errors(list(self._to_try()))
             ranked = sorted(errors, key=lambda change: errors[change])
             closer = ranked[:_CLOSER]
             kinds = {kind_of(change) for change in closer}
@@ -345,15 +565,7 @@ class _Search:
             self._trials = [*trials, *self._orders(trials, fits)]
         return self._trials
 
-    def _nearer(self, best: Trial) -> Trial:
-        """Return the trial of a zero with an angle that fits better."""
-        for scale in (1.0, 0.25):
-            sizes = [best.change.size + 45.0 * DEGREE * scale * part for part in _NEARER]
-            trials = [self._try(best.change._replace(size=size)) for size in sizes]
-            best = min([best, *trials], key=lambda trial: trial.against.ratio)
-        return best
-
-    def _changes(self) -> Iterator[Change]:
+    def _to_try(self) -> Iterator[Change]:
         n = self.model.n_joints
         moved = np.flatnonzero(np.ptp(self.samples.motion.position, axis=0) > 0.0).tolist()
         if self._unit_is_open and all(self.model.chain.revolute):
@@ -380,6 +592,7 @@ class _Search:
             if change.meaning in ("torque order", "joint order"):
                 columns = columns[list(whole_order(change, self.model.n_joints))]
             score = score_of(model, samples, columns)
+            score = score.of_torque(self._torque_scale([change]))
             against = compare(score, self.score, self.model)
             self._tries[change] = Trial(change, model, samples, score, against)
         return self._tries[change]

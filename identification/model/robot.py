@@ -233,6 +233,17 @@ class RobotModel:
         """Return the model with these friction laws of its joints, in their order."""
         return self._with(replace(self.friction, laws=tuple(laws)), self.elements)
 
+    def under_gravity(self, gravity: Sequence[float]) -> RobotModel:
+        """Return the model with another acceleration of gravity (3,) in base axes [m/s²].
+
+        It may have other base parameters: without gravity fewer are determined.
+        """
+        down = np.array(gravity, dtype=np.float64)
+        base = _base_parameters(self.chain, down, self.layout, self.friction, self.elements)
+        load = None if self.payload is None else Load(self.chain, down, self.payload)
+        parts = _parameters(self.chain, down, self.layout, base, self.friction, self.elements)
+        return replace(self, base=base, _load=load, **{**parts, "gravity": down})
+
     def with_elements(self, more: Sequence[Element]) -> RobotModel:
         """Return the model with more elements, see :meth:`from_urdf`."""
         elements = JointElements.of(

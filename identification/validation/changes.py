@@ -126,17 +126,19 @@ def find_changes(
     training: Sequence[Samples],
     held_out: Sequence[Samples],
     held_out_factor: Factor,
+    moved: NDArray[np.bool_],
 ) -> tuple[Change, ...]:
     """Compare unseen with fitted motion under an estimate; return the joints that changed.
 
-    The factor is that of the usable held-out rows.
+    The factor is that of the usable held-out rows. A joint that the fitted motion has not `moved`
+    (n,) has no torque or friction that could have changed.
     """
     values = estimate.values
     fitted, unseen = (_Part.of(model, values, runs) for runs in (training, held_out))
     doubt = _Doubt.of(model, estimate, held_out_factor)
     usual = np.maximum(np.hypot(fitted.relative, doubt.relative), 1e-9)
     changes = []
-    for joint in np.flatnonzero(unseen.relative > _GROWN * usual).tolist():
+    for joint in np.flatnonzero(moved & (unseen.relative > _GROWN * usual)).tolist():
         beyond = unseen.relative[joint] ** 2 - usual[joint] ** 2
         trials = []
         for k, kind in enumerate(_KINDS):

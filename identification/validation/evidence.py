@@ -16,6 +16,7 @@ from identification.estimators.least_squares import RepeatedEstimate
 from identification.factor.columns import standard_factor
 from identification.factor.estimate import Estimate
 from identification.factor.factor import Factor, total_factor
+from identification.hypotheses.diagnosis import Diagnosis, diagnose
 from identification.model.robot import RobotModel
 from identification.signals.samples import Samples
 from identification.validation.causes import Cause, find_causes
@@ -127,6 +128,7 @@ class Evidence:
     changes: tuple[Change, ...] = ()
     #: joints that moved in one direction only on the fitted motion (n,); None if not tested
     one_way: NDArray[np.bool_] | None = None
+    diagnosis: Diagnosis | None = None  #: what the fitted recordings are; None if not asked
     gravity: GravityDirection | None = None  #: the direction of gravity that fits best
     load: CarriedLoad | None = None  #: body on the last link in unseen motion only
     #: error of the nominal (CAD) model on the same unseen motion
@@ -223,6 +225,8 @@ def gather(
     slow = None if noise is None else _slow_errors(model, result, held_out, error, unseen, noise)
     speed = np.abs(np.concatenate([run.motion.velocity for run in held_out])).max(axis=0)
     others, motors = (() if in_sample else held_out), context.motor_from_joint
+    fitted_time = np.sum([*map(_time_moved, training)], axis=0)
+    moved = fitted_time >= Thresholds().moved
     causes = find_causes(
         model, training, values, names, noise=floor, prior=prior, scale_std=context.scale_std
     )
@@ -232,13 +236,14 @@ def gather(
         training=fitted,
         systematic=None if slow is None else slow.beyond_noise,
         systematic_without_friction=None if slow is None else slow.without_friction,
-        friction_change=None if slow is None else slow.friction_change,
+        friction_change=None if slow is None else np.where(moved, slow.friction_change, 0.0),
         noise_floor=floor,
         open_share=None if in_sample else _open_share(pooled, unseen),
         disagreement=None if noise is None else _disagreement(result),
         causes=causes,
-        changes=find_changes(model, pooled, training, others, unseen) if others else (),
+        changes=find_changes(model, pooled, training, others, unseen, moved) if others else (),
         one_way=_one_way(training),
+        diagnosis=diagnose(model, training),
         gravity=gravity,
         load=load,
         nominal=None if nominal is None else _error(model, nominal, held_out),

@@ -28,6 +28,7 @@ _SAME_FIT: Final = 0.1  # difference of twice the log likelihood that is none
 # Of each column's information: combinations of standard parameters of a condition above 10^4.5
 # count as undetermined.
 _RIDGE: Final = 1e-9
+_FEWEST_ROWS: Final = 50  # of a joint whose usual error is known
 _GROWN: Final = 4.0  # power ratio beyond which a joint's error exceeds that of the fit
 
 
@@ -167,7 +168,9 @@ def find_load(
     # Squared error of the fit, scaled to as many rows.
     floor = 1e-12 * unseen.gram[:, -1, -1] + 1e-300
     usual = seen.squared_errors(values) * predicted.samples / np.maximum(fitted.samples, 1.0)
-    weights = predicted.samples / np.maximum(usual, floor)
+    # What the fitted motion did not move has no usual error.
+    fits = fitted.samples >= _FEWEST_ROWS
+    weights = np.where(fits, predicted.samples / np.maximum(usual, floor), 0.0)
     before = unseen.squared_errors(values)
     last = model.layout.links[-1]
     # Columns [last link | residual].
@@ -181,7 +184,7 @@ def find_load(
     load = CarriedLoad(
         mass=float(body[LINK_SYMBOLS.index("m")]),
         explained=float(weights @ (before - after) / beyond) if beyond > 0.0 else 0.0,
-        axes=int(np.count_nonzero(before > _GROWN * np.maximum(usual, floor))),
+        axes=int(np.count_nonzero(fits & (before > _GROWN * np.maximum(usual, floor)))),
     )
     if load.explained <= Thresholds().load:
         return load

@@ -10,6 +10,7 @@ import numpy as np
 
 from identification.text import percentage
 from identification.validation.evidence import Evidence
+from identification.validation.facts.diagnosis import ARM, ArmFacts, MeaningFacts
 from identification.validation.facts.errors import (
     UNEXPLAINED,
     ErrorFacts,
@@ -108,7 +109,11 @@ def judge(
         good = fault is None and good_for(purposes, asked)
     if wrong and (fault is not None or not purposes):
         error = "" if purposes else f"; {measure}"
-        line = f"The model must not be relied on: {(fault or wrong[0]).words}{error}."
+        is_other = fault is not None and fault.check in (ARM, IMPOSSIBLE)
+        if is_other and evidence.held_out.overall <= evidence.allowed(thresholds):
+            line = _of_no_arm(tested_on, fault or wrong[0], evidence, error)
+        else:
+            line = f"The model must not be relied on: {(fault or wrong[0]).words}{error}."
     elif purposes:
         line = purposes_in_a_sentence(purposes, naming.joints, asked)
         if tested_on != UNSEEN:
@@ -150,7 +155,8 @@ def facts_in_order(evidence: Evidence, limits: Thresholds) -> tuple[Facts, ...]:
     """Return all facts in the order of the verdict's reasons: its line has the first one."""
     outliers = OutlierFacts.of(evidence, limits)
     gravity = GravityFacts.of(evidence, limits)
-    scale = ScaleFacts.of(evidence)
+    meaning = MeaningFacts.of(evidence)
+    scale = None if meaning is not None and meaning.is_other else ScaleFacts.of(evidence)
     signs = SignFacts.of(evidence, scale)
     load = LoadFacts.of(evidence, limits)
     changes = ChangeFacts.of(evidence, limits, load, gravity)
@@ -159,9 +165,11 @@ def facts_in_order(evidence: Evidence, limits: Thresholds) -> tuple[Facts, ...]:
         JumpFacts.of(evidence),
         ExcitationFacts.of(evidence, limits),
         outliers,
+        meaning,
         gravity,
         signs,
         FaultFacts.of(evidence, limits, outliers, gravity, signs),
+        ArmFacts.of(evidence, meaning),
         scale,
         load,
         changes,
@@ -188,6 +196,14 @@ def facts_in_order(evidence: Evidence, limits: Thresholds) -> tuple[Facts, ...]:
         DriftFacts.of(evidence, limits),
     )
     return tuple(facts for facts in ordered if facts is not None)
+
+
+def _of_no_arm(tested_on: str, fault: Finding, evidence: Evidence, error: str) -> str:
+    share = percentage(evidence.held_out.overall, 1)
+    return (
+        f"The model must not be relied on: it predicts {tested_on} to {share} of the torque, but is"
+        f" not the arm of the URDF: {fault.words}{error}."
+    )
 
 
 def _without_explained(findings: Sequence[Finding]) -> list[Finding]:

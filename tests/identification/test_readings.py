@@ -64,6 +64,7 @@ def motion(factors: tuple[float, ...] = (1.0, 1.0, 1.0)) -> tuple[Floats, Floats
     return q, torque, robot.torque(values, Motion.at_rest(q))
 
 
+HIP = np.array([1.0, 0.0, 0.0])
 KNEE = np.array([0.0, 1.0, 0.0])
 ROTATED = [1, 2, 0]
 ANGLE = 0.6  # rad
@@ -77,6 +78,16 @@ CASES: dict[str, tuple[Change, ...]] = {
     "torques permuted": (Change("torque order", (0, 1, 2), order=(2, 0, 1)),),
     "joints permuted": (Change("joint order", (0, 1, 2), order=(2, 0, 1)),),
     "zero of the knee": (Change("zero", (1,), -ANGLE),),
+    "zeros of hip and knee": (Change("zero", (0,), 0.4), Change("zero", (1,), -ANGLE)),
+    "torque of the knee twice": (Change("scale", (1,), 1.0),),
+    "zero of the hip, and the ankle half": (
+        Change("zero", (0,), 0.4),
+        Change("scale", (2,), -0.5),
+    ),
+    "knee torque negated, zero of the hip": (
+        Change("torque sign", (1,)),
+        Change("zero", (0,), 0.4),
+    ),
     "gravity removed": (Change("no gravity"),),
     "knee to the ground": (Change("angle sum", (1, 0)),),
     "ankle less the knee": (Change("angle difference", (2, 1)),),
@@ -94,6 +105,10 @@ def planted(case: str) -> tuple[Floats, Floats]:
         "torques permuted": (q, torque[:, ROTATED]),
         "joints permuted": (q[:, ROTATED], torque[:, ROTATED]),
         "zero of the knee": (q + ANGLE * KNEE, torque),
+        "zeros of hip and knee": (q - 0.4 * HIP + ANGLE * KNEE, torque),
+        "torque of the knee twice": (q, torque * (1.0 + KNEE)),
+        "zero of the hip, and the ankle half": (q - 0.4 * HIP, torque * [1.0, 1.0, 0.5]),
+        "knee torque negated, zero of the hip": (q - 0.4 * HIP, torque * (1.0 - 2.0 * KNEE)),
         "gravity removed": (q, torque - weight),
         "knee to the ground": (q + np.roll(q, 1, axis=1) * KNEE, torque),
         "ankle less the knee": (q - np.roll(q, 1, axis=1) * [0.0, 0.0, 1.0], torque),

@@ -743,6 +743,9 @@ def as_it_is(_, torque):
     return torque
 
 
+EVERY = np.ones(MODEL.n_joints, dtype=bool)
+
+
 def with_friction(factor):
     friction = np.where(MODEL.friction_columns, truth(), 0.0)
 
@@ -752,11 +755,12 @@ def with_friction(factor):
     return measured
 
 
-def changes_between(fitted, unseen):
+def changes_between(fitted, unseen, moved=EVERY):
     training = [arm_with(fitted, 1)]
     held_out = [arm_with(unseen, 2)]
     estimate = estimate_repetitions(MODEL, training).pooled
-    return find_changes(MODEL, estimate, training, held_out, total_factor(MODEL, held_out))
+    unseen = total_factor(MODEL, held_out)
+    return find_changes(MODEL, estimate, training, held_out, unseen, moved)
 
 
 class TestChangesToUnseenMotion:
@@ -775,6 +779,10 @@ class TestChangesToUnseenMotion:
         )
         assert (change.kind, change.joint) == ("gain", 1)
         assert change.ratio == pytest.approx(ratio, abs=0.02)
+
+    def test_a_joint_that_the_fitted_motion_has_not_moved_has_not_changed(self):
+        more = with_friction(np.array([1.0, 2.0]))
+        assert changes_between(as_it_is, more, moved=np.array([True, False])) == ()
 
     @pytest.mark.parametrize("factor", [0.5, 2.0])
     def test_friction(self, factor):
@@ -815,9 +823,9 @@ class TestChangesToUnseenMotion:
         unseen = total_factor(MODEL, held_out)
         friction = np.diag(MODEL.friction_columns * (0.3 * estimate.values) ** 2)
         doubted = replace(estimate, covariance=estimate.covariance + friction)
-        (change,) = find_changes(MODEL, estimate, training, held_out, unseen)
+        (change,) = find_changes(MODEL, estimate, training, held_out, unseen, EVERY)
         assert change.joint == 1
-        assert find_changes(MODEL, doubted, training, held_out, unseen) == ()
+        assert find_changes(MODEL, doubted, training, held_out, unseen, EVERY) == ()
 
     def test_another_error_is_no_change(self):
         def waved(motion, torque):

@@ -1,0 +1,403 @@
+r"""Zeros and scales of all joints at once, by one nonlinear least-squares fit.
+
+.. math:: y_j = (1 + g_j)\,\tau_j(\pi, q + z) + e_j
+
+Bodies, drives and friction have the prior of :mod:`identification.estimators.prior`, except that
+the scale of all torques together is left open; zeros and scales have zero mean. Fitted by
+Gauss-Newton steps (Nocedal and Wright 2006, section 10.3) with joints weighted by their residuals.
+Few joints differ from what is stated: those that cost least are fixed one by one, by the sums of
+the last step (backward elimination), and the rest is fitted again.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Final, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from identification.arrays import Array
+from identification.estimators.prior import GaussianPrior, body_prior
+from identification.factor.factor import SMALLEST_NOISE, Factor
+from identification.factor.normal_equations import solve_positive
+from identification.model.robot import RobotModel
+from identification.signals.samples import Samples
+
+Mask = NDArray[np.bool_]
+
+ROWS_PER_FACT: Final = 10.0
+"""Rows that count as one beside the prior: residuals are coloured, and friction is not as its
+law."""
+ZERO_SPREAD: Final = np.radians(45.0)
+"""Standard deviation of the zero of a joint that is off [rad]."""
+GAIN_SPREAD: Final = 0.5
+"""Standard deviation of the relative error of a torque scale that is off."""
+_SPREADS: Final = (ZERO_SPREAD, GAIN_SPREAD)
+_FREE_SHARE: Final = 1e-2  # of the information on bodies, where a fit is free of their masses
+_COMMON_SPREAD: Final = 3.0  # relative deviation of a scale that all torques have in common
+_SIGNIFICANT: Final = 12.0  # twice the loss of log posterior of what is kept: 3.5 deviations
+LEAST_ZERO: Final = np.radians(1.0)
+"""Zeros up to which an arm is as stated [rad]: those of its assembly."""
+LEAST_GAIN: Final = 0.15
+"""Relative errors up to which a torque is as stated: those of torque constants."""
+_STEP: Final = 1e-5  # rad, of a numerical derivative
+_LARGEST_STEP: Final = (0.5, 0.3)  # rad, and share, of one iteration
+_ROUNDS: Final = 12
+_SETTLED: Final = 1e-2  # change of twice the log posterior
+_KNOWN_SCALE: Final = 0.1  # relative deviation of a scale that the motion shows
+_SAME_ZERO: Final = np.radians(3.0)  # difference of two fits that agree
+_SIGMAS: Final = 3.0  # the same, in standard deviations
+_HALVINGS: Final = 4
+_WEIGHINGS: Final = 6
+_SMALLEST_GAIN: Final = -0.95
+
+
+@dataclass(frozen=True, eq=False)
+class JointFit:
+    """Zeros and scales that explain a recording best.
+
+    Attributes:
+        zero: to add to the recorded positions (n,) [rad].
+        gain: factor of each measured torque over that of the arm, less one (n,).
+        zero_std: standard deviations (n,) [rad].
+        gain_std: likewise (n,).
+        values: parameters (p,) of the model.
+        error: of each joint as a share of its torque (n,), of the fitted rows.
+        cost: twice the negative log posterior, to compare fits of the same rows.
+        free: which zeros, then scales, were fitted (2 n,).
+        tied: joints whose torques the motion compares with each other, through their coupling.
+    """
+
+    zero: Array
+    gain: Array
+    zero_std: Array
+    gain_std: Array
+    values: Array
+    error: Array
+    cost: float
+    free: Mask
+    tied: tuple[int, ...] = ()
+
+    @property
+    def moved(self) -> tuple[int, ...]:
+        """The joints whose zero is other than stated."""
+        return tuple(np.flatnonzero(np.abs(self.zero) > LEAST_ZERO).tolist())
+
+    @property
+    def scaled(self) -> tuple[int, ...]:
+        """The joints whose torque has another scale."""
+        return tuple(np.flatnonzero(np.abs(self.gain) > LEAST_GAIN).tolist())
+
+    @property
+    def is_scale_known(self) -> bool:
+        """Whether most torques that the motion compares agree: the others are off, not these."""
+        off = [joint for joint in self.scaled if joint in self.tied]
+        return 2 * len(off) < len(self.tied)
+
+    def is_zero_at(self, joints: Sequence[int]) -> bool:
+        """Return whether the zeros of joints are as stated, within their uncertainty."""
+        tolerance = np.maximum(_SAME_ZERO, _SIGMAS * self.zero_std)
+        return bool((np.abs(self.zero) < tolerance)[list(joints)].all())
+
+    def ratio_to(self, other: JointFit) -> float:
+        """Return the error over that of another fit of the same torques: mean over the joints."""
+        both = (self.error > 0.0) & (other.error > 0.0)
+        ratios = np.log(self.error[both] / other.error[both])
+        return float(np.exp(ratios.mean())) if len(ratios) else 1.0
+
+
+def candidates(model: RobotModel, samples: Samples, *, gains: bool = True) -> Mask:
+    """Return which zeros and scales (2 n,) a recording can show: of joints that turn, and move."""
+    moves = samples.usable.any(axis=0) & (np.ptp(samples.motion.position, axis=0) > 0.0)
+    loaded = np.square(samples.torque).sum(axis=0) > 0.0
+    turns = np.asarray(model.chain.revolute, dtype=np.bool_)
+    return np.concatenate([turns, moves & loaded & gains])
+
+
+def starting_at(model: RobotModel, samples: Samples, zero: Array, gain: Array) -> JointFit:
+    """Return zeros and scales (n,) with the parameters that fit best with them."""
+    problem = _Problem.of(model, samples, 1.0)
+    none = np.zeros(2 * problem.n, dtype=np.bool_)
+    return _fitted(problem, none, problem.settled(zero, gain, problem.of_torque()))
+
+
+def fit_joints(
+    model: RobotModel,
+    samples: Samples,
+    free: Mask,
+    start: JointFit | None = None,
+    *,
+    free_bodies: bool = False,
+) -> JointFit:
+    """Fit the zeros and scales of `free` (2 n,) with all parameters.
+
+    Args:
+        model: of the arm.
+        samples: some hundred rows, as recorded.
+        free: which zeros, then scales.
+        start: from which the iteration starts; the others are fixed at its values.
+        free_bodies: hardly believe the masses of the description.
+    """
+    problem = _Problem.of(model, samples, _FREE_SHARE if free_bodies else 1.0)
+    return _fitted(problem, free, problem.start(start))
+
+
+def find_joints(
+    model: RobotModel, samples: Samples, free: Mask, start: JointFit | None = None
+) -> JointFit:
+    """Find the few zeros and scales of `free` (2 n,) that are other than stated."""
+    problem = _Problem.of(model, samples, 1.0)
+    point = problem.start(start)
+    fit = _fitted(problem, free, point)
+    # The scale that all torques have in common is that of the masses.
+    fit = replace(fit, gain=(1.0 + fit.gain) / np.median(1.0 + fit.gain) - 1.0)
+    tied = _tied(problem, fit)
+    while fit.free.any():
+        kept = _significant(problem, fit)
+        if np.array_equal(kept, fit.free):
+            break
+        states = np.where(kept, np.concatenate([fit.zero, fit.gain]), 0.0)
+        zero, gain = np.split(states, 2)
+        point = problem.settled(zero, gain, problem.weights(point.squares))
+        fit = _fitted(problem, kept, point)
+    return replace(fit, tied=tied)
+
+
+class _Point(NamedTuple):
+    """Zeros and scales, the parameters that fit with them, and the errors then."""
+
+    values: Array  # (p,)
+    zero: Array  # (n,)
+    gain: Array  # (n,)
+    residuals: Array  # of the usable rows (m, n)
+    squares: Array  # their sums (n,)
+    cost: float  # twice the negative log posterior
+
+    @property
+    def joints(self) -> Array:
+        """Zeros, then gains (2 n,)."""
+        return np.concatenate([self.zero, self.gain])
+
+
+class _Sums(NamedTuple):
+    """The problem linearised at a point."""
+
+    matrix: Array  # information of rows and prior (p + 2 n, p + 2 n)
+    gradient: Array  # of half the cost, downhill (p + 2 n,)
+
+
+@dataclass(frozen=True, eq=False)
+class _Problem:
+    """Rows and prior of a joint fit."""
+
+    model: RobotModel
+    samples: Samples
+    prior: GaussianPrior
+    information: Array  # of the prior (p, p), in rows
+    power: Array  # squared torque of the usable rows (n,)
+
+    @classmethod
+    def of(cls, model: RobotModel, samples: Samples, share: float) -> _Problem:
+        prior = body_prior(model, Factor.of(model, samples)).gaussian
+        power = np.where(samples.usable, samples.torque, 0.0)
+        information = ROWS_PER_FACT * share * _of_any_scale(prior)
+        return cls(model, samples, prior, information, np.square(power).sum(axis=0))
+
+    @property
+    def n(self) -> int:
+        """Number of joints."""
+        return self.model.n_joints
+
+    @property
+    def rows(self) -> Array:
+        """Usable rows of each joint (n,)."""
+        return np.asarray(self.samples.usable.sum(axis=0), dtype=np.float64)
+
+    def start(self, fit: JointFit | None) -> _Point:
+        """Return the point of another fit, or that of nothing changed."""
+        weights = self.of_torque()
+        zeros = np.zeros(self.n)
+        if fit is not None:
+            return self.settled(fit.zero, fit.gain, weights)
+        return self.settled(zeros, zeros, weights)
+
+    def at(self, zero: Array, gain: Array, weights: Array) -> _Point:
+        """Return the point of these zeros and scales, with the parameters fitted to them."""
+        motion = self.samples.motion
+        motion = replace(motion, position=motion.position + zero)
+        blocks, columns = self.model.regressor(motion)
+        matrix = self.information.copy()
+        right = self.information @ self.prior.mean
+        tables = []
+        for joint, (block, places) in enumerate(zip(blocks, columns, strict=True)):
+            usable = self.samples.usable[:, joint]
+            table = (1.0 + gain[joint]) * block[usable]
+            tables.append(table)
+            matrix[np.ix_(places, places)] += weights[joint] * (table.T @ table)
+            right[places] += weights[joint] * (table.T @ self.samples.torque[usable, joint])
+        values = _solved(matrix, right)
+        residuals = np.zeros_like(self.samples.torque)
+        for joint, (table, places) in enumerate(zip(tables, columns, strict=True)):
+            usable = self.samples.usable[:, joint]
+            residuals[usable, joint] = self.samples.torque[usable, joint] - table @ values[places]
+        squares = np.square(residuals).sum(axis=0)
+        least = SMALLEST_NOISE**2 * self.power + np.finfo(np.float64).tiny
+        squares = np.maximum(squares, least)
+        away = values - self.prior.mean
+        joints = np.concatenate([zero, gain]) / np.repeat(_SPREADS, self.n)
+        log = float((self.rows * np.log(squares)).sum()) / ROWS_PER_FACT
+        cost = log + float(away @ self.information @ away) / ROWS_PER_FACT + float(joints @ joints)
+        return _Point(values, zero, gain, residuals, squares, cost)
+
+    def weights(self, squares: Array) -> Array:
+        """Return the weights of the joints (n,) by their squared residuals."""
+        return np.asarray(np.where(self.power > 0.0, self.rows / squares, 0.0))
+
+    def of_torque(self) -> Array:
+        """Return the weights of the joints (n,) by their torque."""
+        return self.weights(np.maximum(self.power, np.finfo(np.float64).tiny))
+
+    def settled(self, zero: Array, gain: Array, weights: Array) -> _Point:
+        """Return the point with weights that are those of its own residuals."""
+        point = self.at(zero, gain, weights)
+        for _ in range(_WEIGHINGS):
+            before = point.cost
+            point = self.at(zero, gain, self.weights(point.squares))
+            if before - point.cost < _SETTLED:
+                break
+        return point
+
+    def linearised(self, point: _Point, free: Mask) -> _Sums:
+        """Return the sums at a point, with columns of zero for what is fixed."""
+        p = self.model.n_parameters
+        n = self.n
+        motion = self.samples.motion
+        motion = replace(motion, position=motion.position + point.zero)
+        torque = self.model.torque(point.values, motion)
+        factor = 1.0 + point.gain
+        weights = self.weights(point.squares)
+        matrix = np.zeros((p + 2 * n, p + 2 * n))
+        matrix[:p, :p] = self.information
+        own = ROWS_PER_FACT / np.repeat(_SPREADS, n) ** 2
+        matrix[range(p, p + 2 * n), range(p, p + 2 * n)] = own
+        gradient = np.zeros(p + 2 * n)
+        gradient[:p] = -self.information @ (point.values - self.prior.mean)
+        gradient[p:] = -own * point.joints
+        turned = self._turned(point, torque, free)
+        blocks, columns = self.model.regressor(motion)
+        fixed = np.concatenate([np.zeros(p, dtype=np.bool_), ~free])
+        for joint, (block, places) in enumerate(zip(blocks, columns, strict=True)):
+            usable = self.samples.usable[:, joint]
+            table = np.zeros((int(usable.sum()), p + 2 * n))
+            table[:, places] = factor[joint] * block[usable]
+            table[:, p : p + n] = factor[joint] * turned[:, usable, joint].T
+            table[:, p + n + joint] = torque[usable, joint]
+            table[:, fixed] = 0.0
+            matrix += weights[joint] * (table.T @ table)
+            gradient += weights[joint] * (table.T @ point.residuals[usable, joint])
+        gradient[fixed] = 0.0
+        return _Sums(matrix, gradient)
+
+    def _turned(self, point: _Point, torque: Array, free: Mask) -> Array:
+        """Return the derivative of the torque by each zero (n, m, n)."""
+        motion = self.samples.motion
+        derivative = np.zeros((self.n, *torque.shape))
+        for joint in np.flatnonzero(free[: self.n]):
+            position = motion.position + point.zero
+            position[:, joint] += _STEP
+            moved = self.model.torque(point.values, replace(motion, position=position))
+            derivative[joint] = (moved - torque) / _STEP
+        return derivative
+
+
+def _of_any_scale(prior: GaussianPrior) -> Array:
+    """Return the information of a prior (p, p) whose bodies have an open common scale."""
+    information = prior.information
+    along = information @ prior.mean
+    known = 1.0 / _COMMON_SPREAD**2 + float(prior.mean @ along)
+    return np.asarray(information - np.outer(along, along) / known)
+
+
+def _fitted(problem: _Problem, free: Mask, point: _Point) -> JointFit:
+    p = problem.model.n_parameters
+    n = problem.n
+    most = np.repeat(_LARGEST_STEP, n)
+    sums = problem.linearised(point, free)
+    for _ in range(_ROUNDS if free.any() else 0):
+        step = np.where(free, _solved(sums.matrix, sums.gradient)[p:], 0.0)
+        step /= max(1.0, float((np.abs(step) / most).max()))
+        for _ in range(_HALVINGS):
+            zero = point.zero + step[:n]
+            gain = np.maximum(point.gain + step[n:], _SMALLEST_GAIN)
+            moved = problem.at(zero, gain, problem.weights(point.squares))
+            if moved.cost < point.cost:
+                break
+            step *= 0.25
+        else:
+            break
+        before = point.cost
+        point = moved
+        sums = problem.linearised(point, free)
+        if before - point.cost < _SETTLED:
+            break
+    std = np.sqrt(ROWS_PER_FACT * _inverse(sums.matrix).diagonal()[p:])
+    power = np.where(problem.power > 0.0, problem.power, np.inf)
+    error = np.sqrt(point.squares / power)
+    return JointFit(point.zero, point.gain, std[:n], std[n:], point.values, error, point.cost, free)
+
+
+def _tied(problem: _Problem, fit: JointFit) -> tuple[int, ...]:
+    """Return the joints whose scales are known beside that of one of them, of which there are most.
+
+    The scale that all torques have in common is open.
+    """
+    n = problem.n
+    gains = problem.model.n_parameters + n
+    point = problem.settled(fit.zero, fit.gain, problem.weights(problem.power * fit.error**2))
+    covariance = (
+        ROWS_PER_FACT * _inverse(problem.linearised(point, fit.free).matrix)[gains:, gains:]
+    )
+    free = np.flatnonzero(fit.free[n:])
+    best: tuple[int, ...] = ()
+    for joint in free.tolist():
+        column = covariance[joint]
+        beside = covariance.diagonal() - column**2 / covariance[joint, joint]
+        known = np.sqrt(np.maximum(beside, 0.0)) < _KNOWN_SCALE * (1.0 + fit.gain)
+        tied = tuple(k for k in free.tolist() if known[k] or k == joint)
+        best = max(best, tied, key=len)
+    return best
+
+
+def _significant(problem: _Problem, fit: JointFit) -> Mask:
+    """Return which of the fitted zeros and scales are needed (2 n,), by the sums at the fit."""
+    p = problem.model.n_parameters
+    joints = np.concatenate([fit.zero, fit.gain])
+    point = problem.settled(fit.zero, fit.gain, problem.weights(problem.power * fit.error**2))
+    covariance = ROWS_PER_FACT * _inverse(problem.linearised(point, fit.free).matrix)[p:, p:]
+    kept = fit.free.copy()
+    while kept.any():
+        # What fixing one of them at zero costs, and where the others are then.
+        cost = np.where(kept, joints**2 / covariance.diagonal(), np.inf)
+        worst = int(cost.argmin())
+        if cost[worst] > _SIGNIFICANT:
+            break
+        column = covariance[:, worst].copy()
+        pivot = column[worst]
+        joints = joints - column * (joints[worst] / pivot)
+        covariance = covariance - np.outer(column, column) / pivot
+        covariance[worst, worst] = 1.0
+        kept[worst] = False
+    return kept
+
+
+def _solved(matrix: Array, right: Array) -> Array:
+    scale = np.sqrt(matrix.diagonal())
+    return solve_positive(matrix / np.outer(scale, scale), right / scale) / scale
+
+
+def _inverse(matrix: Array) -> Array:
+    scale = np.sqrt(matrix.diagonal())
+    both = np.outer(scale, scale)
+    return np.asarray(np.linalg.inv(matrix / both) / both)

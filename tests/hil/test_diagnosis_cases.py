@@ -1,0 +1,75 @@
+"""Logs whose torque or zeros are other than stated: named rightly, or called good by nothing."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from hil.base.errors import SourceError
+from hil.base.progress import Silent
+from hil.importers.conclusions import Certainty
+from hil.importers.recording import ImportOptions, RobotOf, import_recording
+from hil.importers.robot import Robot
+from hil.look import look_at
+from hil.look.readings import Changes, Fact
+from hil.pipeline.run import identify_archives
+from identification.validation.facts.diagnosis import NO_BODIES
+from tests.hil.diagnosis_cases import CASES, URDF, identified, needs_the_cases, rigid_error
+
+pytestmark = [pytest.mark.slow, needs_the_cases]
+
+THREE = CASES / "09-several-zeros" / "three.csv"
+ZEROS = {1: 0.35, 2: -0.2, 4: 0.15}  # rad, by joint
+SUBTRACTED = CASES / "06-torque-already-compensated" / "residual_97.csv"
+
+
+def robot_of(_: object) -> Robot:
+    return Robot.from_urdf(URDF)
+
+
+def archived(log: Path, folder: Path, robot: RobotOf = robot_of) -> Path:
+    """Import a log as it is recorded, without asking what its torque says."""
+    archive = folder / f"{log.stem}.mcap"
+    import_recording(log, archive, robot, ImportOptions())
+    return archive
+
+
+def test_several_zeros_are_found_at_once() -> None:
+    (row,) = [row for row in look_at(THREE, robot_of, ImportOptions()).rows if row.aspect == "zero"]
+    assert row.certainty is Certainty.CERTAIN
+    assert isinstance(row.reading, Changes)
+    found = {each.change.joints[0]: each.change.size for each in row.reading.changes}
+    assert found == pytest.approx(ZEROS, abs=np.radians(2.0))
+
+
+def test_an_identification_corrects_them() -> None:
+    arm = identified(THREE)
+    assert arm.verdict.good
+    assert rigid_error(arm) < 0.02
+
+
+def test_an_archive_is_asked_the_same_as_its_log(tmp_path: Path) -> None:
+    found = identify_archives([archived(THREE, tmp_path)], Silent())
+    assert not found.verdict.good
+    diagnosis = found.validation.evidence.diagnosis
+    assert diagnosis is not None
+    sizes = {step.change.joints[0]: step.change.size for step in diagnosis.zeros}
+    assert sizes == pytest.approx(ZEROS, abs=np.radians(2.0))
+
+
+def test_torque_without_bodies_is_named_by_a_look() -> None:
+    look = look_at(SUBTRACTED, robot_of, ImportOptions())
+    assert Fact.NO_BODIES in [row.reading for row in look.rows]
+    assert not look.questions
+    certain = {row.aspect for row in look.rows if row.certainty is Certainty.CERTAIN}
+    assert not certain & {"order", "signs", "zero", "gravity", "mounting", "side"}
+
+
+def test_torque_without_bodies_is_refused_or_called_wrong(tmp_path: Path) -> None:
+    with pytest.raises(SourceError, match="model of the arm was subtracted"):
+        identified(SUBTRACTED)
+    verdict = identify_archives([archived(SUBTRACTED, tmp_path)], Silent()).verdict
+    assert not verdict.good
+    assert next(each.check for each in verdict.findings if each.level == "wrong") == NO_BODIES

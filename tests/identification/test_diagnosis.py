@@ -1,0 +1,81 @@
+"""What a torque is other than that of the described arm: of no bodies, no gravity, other zeros."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from identification import Recording
+from identification.hypotheses.diagnosis import Diagnosis, diagnose
+from identification.signals.samples import Preprocessing, prepare
+from tests.identification.test_readings import HIP, KNEE, NAMES, TIME, model, motion
+
+Floats = NDArray[np.float64]
+
+
+def diagnosed(position: Floats, torque: Floats) -> Diagnosis:
+    recording = Recording(TIME, position, NAMES, torque)
+    options = Preprocessing(14.0, left_out="rests")
+    return diagnose(model(), [prepare(recording, model(), options=options)])
+
+
+def friction() -> Floats:
+    """The friction of `motion`, with noise."""
+    q, _, _ = motion()
+    velocity = np.gradient(q, TIME, axis=0)
+    noise = np.random.default_rng(1).normal(0.0, 0.02, q.shape)
+    return np.asarray(0.4 * np.sign(velocity) + 0.2 * velocity + noise)
+
+
+def test_an_arm_as_described_is_nothing_else() -> None:
+    found = diagnosed(*motion()[:2])
+    assert not found.rigid.is_nothing
+    assert not found.is_weightless
+    assert not found.zeros
+
+
+def test_what_a_subtracted_model_leaves_is_not_of_bodies() -> None:
+    q, torque, _ = motion()
+    left = 4.0 * friction() + 0.03 * (torque - friction())
+    found = diagnosed(q, left)
+    assert found.rigid.is_nothing
+    assert found.readings is None
+
+
+@pytest.mark.parametrize("ratio", [50.0, 160.0])
+def test_torque_of_the_motor_side_is_of_bodies(ratio: float) -> None:
+    """It is as small, but as much of it is of friction as on the joint side."""
+    q, torque, _ = motion()
+    found = diagnosed(q, torque / ratio)
+    assert found.rigid.scale == pytest.approx(1.0 / ratio, rel=0.1)
+    assert not found.rigid.is_nothing
+
+
+def test_removed_gravity_is_seen() -> None:
+    q, torque, weight = motion()
+    found = diagnosed(q, torque - weight)
+    assert found.is_weightless
+    assert not found.rigid.is_nothing
+
+
+def test_zeros_of_several_joints_are_seen_at_once() -> None:
+    q, torque, _ = motion()
+    found = diagnosed(q - 0.3 * HIP + 0.2 * KNEE, torque)
+    assert {step.change.joints: step.change.size for step in found.zeros} == {
+        (0,): pytest.approx(0.3, abs=0.03),
+        (1,): pytest.approx(-0.2, abs=0.03),
+    }
+    assert all(step.sure for step in found.zeros)
+
+
+@pytest.mark.parametrize(
+    "more",
+    [
+        pytest.param(lambda q: 6.0 * np.sin(2.0 * q) * KNEE, id="a spring"),
+        pytest.param(lambda q: 1.5 * np.sin(20.0 * q), id="ripple"),
+    ],
+)
+def test_what_is_no_zero_is_called_none(more: object) -> None:
+    q, torque, _ = motion()
+    assert not diagnosed(q, torque + more(q)).zeros  # type: ignore[operator]
