@@ -76,11 +76,7 @@ def concluded(
         return imported
     cell, samples, score = few
     is_bag = imported.map_text is None  # its joints have names: no other order is searched
-    diagnosis = diagnose(cell.model, [samples])
-    if diagnosis.rigid.is_nothing:
-        raise _without_bodies(source, diagnosis.rigid)
-    suspect = score.overall > _SUSPECT or bool(np.any(score.friction < _DRIVES))
-    suspect = suspect or any(step.sure for step in diagnosis.zeros)
+    suspect = _is_suspect(cell, samples, score, source)
     if is_bag or not (suspect or _hangs_otherwise(cell, samples, score)):
         contradictions = Contradictions.of(cell, cell.model, samples, score, score.overall)
         return _of_this_arm(imported, source, contradictions)
@@ -111,6 +107,19 @@ def concluded(
             return _of_this_arm(again, source, contradictions)
         return again
     return imported
+
+
+def _is_suspect(cell: Cell, samples: Samples, score: Score, source: Path) -> bool:
+    """Return whether a torque does not follow its arm as it is read.
+
+    Raises:
+        SourceError: there is nothing of bodies in it.
+    """
+    diagnosis = diagnose(cell.model, [samples])
+    if diagnosis.rigid.is_nothing:
+        raise _without_bodies(source, diagnosis.rigid)
+    is_off = score.overall > _SUSPECT or bool(np.any(score.friction < _DRIVES))
+    return is_off or any(step.sure for step in diagnosis.zeros)
 
 
 def _has_no_sign(archive: Archive) -> bool:

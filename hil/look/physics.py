@@ -401,7 +401,8 @@ class Finding:
             if not step.alike:
                 continue
             pairs = [(step.change, step.error), *step.alike]
-            meanings = [change.meaning for change, _ in pairs]
+            # A joint turned to the other side is another reading.
+            meanings = [(change.meaning, change.size > 0.0) for change, _ in pairs]
             first = [pair for k, pair in enumerate(pairs) if meanings[k] not in meanings[:k]]
             shown = first[:_MOST_CHOICES] if len(first) > 1 else pairs[:2]
             choices.append(tuple(self._choice(step, *pair) for pair in shown))

@@ -58,7 +58,7 @@ class RigidTorque:
 
 
 @dataclass(frozen=True, eq=False)
-class Diagnosis:
+class TorqueDiagnosis:
     """What recordings are.
 
     Attributes:
@@ -86,7 +86,7 @@ class Diagnosis:
         return tuple(step for step in steps if step.change.meaning == "zero")
 
 
-def diagnose(model: RobotModel, recordings: Sequence[Samples]) -> Diagnosis:
+def diagnose(model: RobotModel, recordings: Sequence[Samples]) -> TorqueDiagnosis:
     """Ask what prepared recordings of one arm are, by some hundred rows of them."""
     samples = _few_rows(recordings)
     read = model
@@ -96,7 +96,7 @@ def diagnose(model: RobotModel, recordings: Sequence[Samples]) -> Diagnosis:
         weightless = compare(score_of(without, samples), score_of(model, samples), model)
         if weightless.ratio < 1.0:
             read = without
-    found = Diagnosis(weightless, rigid_torque(read, samples), None)
+    found = TorqueDiagnosis(weightless, rigid_torque(read, samples), None)
     if found.rigid.is_nothing or found.is_weightless:
         return found
     return replace(found, readings=find_zeros_and_scales(model, samples))

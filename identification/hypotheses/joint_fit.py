@@ -90,6 +90,11 @@ class JointFit:
         """The joints whose torque has another scale."""
         return tuple(np.flatnonzero(np.abs(self.gain) > LEAST_GAIN).tolist())
 
+    def fixed(self, free: Mask) -> JointFit:
+        """Return it with the zeros and scales as stated that are not `free` (2 n,)."""
+        zero, gain = np.split(np.where(free, np.concatenate([self.zero, self.gain]), 0.0), 2)
+        return replace(self, zero=zero, gain=gain, free=free)
+
     @property
     def is_scale_known(self) -> bool:
         """Whether most torques that the motion compares agree: the others are off, not these."""
@@ -155,13 +160,10 @@ def find_joints(
     fit = replace(fit, gain=(1.0 + fit.gain) / np.median(1.0 + fit.gain) - 1.0)
     tied = _tied(problem, fit)
     while fit.free.any():
-        kept = _significant(problem, fit)
-        if np.array_equal(kept, fit.free):
+        needed = _significant(problem, fit)
+        if np.array_equal(needed, fit.free):
             break
-        states = np.where(kept, np.concatenate([fit.zero, fit.gain]), 0.0)
-        zero, gain = np.split(states, 2)
-        point = problem.settled(zero, gain, problem.weights(point.squares))
-        fit = _fitted(problem, kept, point)
+        fit = _fitted(problem, needed, problem.start(fit.fixed(needed)))
     return replace(fit, tied=tied)
 
 
@@ -376,10 +378,10 @@ def _significant(problem: _Problem, fit: JointFit) -> Mask:
     joints = np.concatenate([fit.zero, fit.gain])
     point = problem.settled(fit.zero, fit.gain, problem.weights(problem.power * fit.error**2))
     covariance = ROWS_PER_FACT * _inverse(problem.linearised(point, fit.free).matrix)[p:, p:]
-    kept = fit.free.copy()
-    while kept.any():
+    needed = fit.free.copy()
+    while needed.any():
         # What fixing one of them at zero costs, and where the others are then.
-        cost = np.where(kept, joints**2 / covariance.diagonal(), np.inf)
+        cost = np.where(needed, joints**2 / covariance.diagonal(), np.inf)
         worst = int(cost.argmin())
         if cost[worst] > _SIGNIFICANT:
             break
@@ -388,8 +390,8 @@ def _significant(problem: _Problem, fit: JointFit) -> Mask:
         joints = joints - column * (joints[worst] / pivot)
         covariance = covariance - np.outer(column, column) / pivot
         covariance[worst, worst] = 1.0
-        kept[worst] = False
-    return kept
+        needed[worst] = False
+    return needed
 
 
 def _solved(matrix: Array, right: Array) -> Array:

@@ -82,6 +82,9 @@ _IMPROVES: Final = 0.98  # error ratio of one exchange from which a whole order 
 _ORDERS: Final = 2  # best orders of each kind that are compared
 _CLOSER: Final = 12  # changes of least error on fewer rows, which are compared
 _MOST_STEPS: Final = 6
+_SAME_SIZE: Final = 0.3  # rad, or of a scale: difference of two fits that are one
+_FAR_WORSE: Final = 0.5  # error ratio to a zero far away, of which no better fit is expected
+_FAR_STARTS: Final = 2  # zeros far from what is stated at which a fit starts
 _NEEDED: Final = 2.0  # standard errors of one of several zeros and scales that its fit needs
 _ADEQUATE: Final = 1.2  # error ratio to a free fit, of a reading that explains the rows
 _AT_ONCE: Final = 24  # fits, so that their sums stay in the processor's cache
@@ -221,19 +224,8 @@ def find_readings(
     # What a change explains shows beside the others.
     steps = [step if step.alike else replace(step, error=search.score.overall) for step in steps]
     adequacy = search.adequacy()
-    if steps and not adequacy.is_enough:
-        # A sign or an order is certain as well if no free fit without it comes near.
-        without = started().free_fit()
-        beyond = search.stated_fit().ratio_to(without) < 1.0 - _LARGE
-        steps = [
-            replace(
-                step,
-                is_adequate=beyond
-                and step.is_adequate
-                and step.change.meaning not in (*SIZED, *UNITS),
-            )
-            for step in steps
-        ]
+    if not adequacy.is_enough:
+        steps = _doubted(steps, search, started())
     return Readings(
         tuple(steps),
         search.model,
@@ -243,6 +235,26 @@ def find_readings(
         search.unseen_zeros(),
         adequacy,
     )
+
+
+def _doubted(steps: Sequence[Step], found: _Search, as_recorded: _Search) -> list[Step]:
+    """Return steps of a reading that a free fit explains much better, none of them adequate.
+
+    A sign or an order still is if no free fit without it comes near.
+    """
+    if not steps:
+        return []
+    without = as_recorded.free_fit()
+    is_beyond = found.stated_fit().ratio_to(without) < 1.0 - _LARGE
+    return [
+        replace(
+            step,
+            is_adequate=is_beyond
+            and step.is_adequate
+            and step.change.meaning not in (*SIZED, *UNITS),
+        )
+        for step in steps
+    ]
 
 
 def find_zeros_and_scales(model: RobotModel, samples: Samples) -> Readings:
@@ -286,6 +298,7 @@ class _Search:
         self.score = score_of(model, samples)
         self._trials: list[Trial] | None = None
         self._tries: dict[Change, Trial] = {}
+        self._fitted: list[_Joints] = []
 
     def change(self, changes: Sequence[Change]) -> None:
         """Adopt changes as they are."""
@@ -302,6 +315,7 @@ class _Search:
         self._changes += changes
         self._trials = None
         self._tries.clear()
+        self._fitted.clear()
 
     def by_friction(self) -> list[Step]:
         """Adopt the sign of joints that friction would drive; none if it drives none."""
@@ -342,15 +356,31 @@ class _Search:
         if joints is not None and all(
             compare(joints.score, trial.score, self.model).ratio < 1.0 - _ALIKE for trial in good
         ):
-            return self._adopt_joints(joints, [t for t in better if t.change.meaning not in SIZED])
+            others = [trial for trial in better if trial.change.meaning not in SIZED]
+            return self._adopt_joints(joints, [*others, *self._singles(joints)])
         if not good:
             return []
         best = min(good, key=lambda trial: trial.against.ratio)
         close = [trial for trial in good if self._are_alike(trial, best)]
         best = min(close, key=lambda trial: (int(trial.score.driven.sum()), trial.against.ratio))
-        if joints is not None and len(joints.changes) == 1:
-            better.append(self._try(joints.changes[0]))
-        return [self._adopt(best, [t for t in better if t.change.meaning != "zero"])]
+        others = [trial for trial in better if trial.change.meaning != "zero"]
+        return [self._adopt(best, [*others, *self._singles()])]
+
+    def _singles(self, but: _Joints | None = None) -> list[Trial]:
+        """Return single zeros and scales that were fitted, other than those of the best."""
+        known = [] if but is None else list(but.changes)
+        singles = []
+        for each in self._fitted:
+            (change, *more) = each.changes
+            near = [
+                other
+                for other in known
+                if other[:2] == change[:2] and abs(other.size - change.size) < _SAME_SIZE
+            ]
+            if not more and not near:
+                known.append(change)
+                singles.append(self._try(change))
+        return singles
 
     def by_joint_fit(self, near: Sequence[Step]) -> list[Step]:
         """Adopt zeros and scales of all joints at once, near those found before, if any fit."""
@@ -363,7 +393,9 @@ class _Search:
                 zero[places] += step.change.size
             else:
                 gain[places] *= 1.0 + step.change.size
-        joints = self._joints(starting_at(self.model, self.samples, zero, gain - 1.0))
+        start = starting_at(self.model, self.samples, zero, gain - 1.0)
+        every = candidates(self.model, self.samples)
+        joints = self._joints(find_joints(self.model, self.samples, every, start))
         if joints is None:
             return []
         found = self._adopt_joints(joints, [])
@@ -388,43 +420,51 @@ class _Search:
 
     def _best_joints(self, trials: Sequence[Trial]) -> _Joints | None:
         """Return zeros and scales that predict better; None if none do."""
-        best = self._joints(None)
+        every = candidates(self.model, self.samples)
+        best = self._joints(find_joints(self.model, self.samples, every))
+        if best is not None:
+            self._fitted.append(best)
         zeros = [trial for trial in trials if trial.change.meaning == "zero"]
         zeros = [trial for trial in zeros if trial.against.ratio < 1.0 - _LARGE]
-        if zeros:  # far from what is stated
-            far = min(zeros, key=lambda trial: trial.against.ratio)
-            if best is None or compare(far.score, best.score, self.model).ratio < 1.0 - _ALIKE:
-                zero = np.zeros(self.model.n_joints)
-                zero[list(far.change.joints)] = far.change.size
-                start = starting_at(self.model, self.samples, zero, np.zeros_like(zero))
-                other = self._joints(start)
-                if best is None or (other is not None and other.fit.cost < best.fit.cost):
+        for far in sorted(zeros, key=lambda trial: trial.against.ratio)[:_FAR_STARTS]:
+            if best is not None and compare(best.score, far.score, self.model).ratio < _FAR_WORSE:
+                continue  # near what is stated is better
+            zero = np.zeros(self.model.n_joints)
+            joints = list(far.change.joints)
+            zero[joints] = far.change.size
+            start = starting_at(self.model, self.samples, zero, np.zeros_like(zero))
+            alone = np.isin(np.arange(len(every)), joints)
+            for free in (alone, every):
+                fit = find_joints(self.model, self.samples, free, start)
+                other = self._joints(fit)
+                if other is not None:
+                    self._fitted.append(other)
+                if other is not None and (
+                    best is None or _is_clearly_better(other.score, best.score, self.model)
+                ):
                     best = other
         return best
 
-    def _joints(self, start: JointFit | None) -> _Joints | None:
+    def _joints(self, fit: JointFit) -> _Joints | None:
         """Return the zeros and scales of a joint fit that predict better; None if none do."""
-        fit = find_joints(self.model, self.samples, candidates(self.model, self.samples), start)
-        zeros = [Change("zero", (j,), float(fit.zero[j])) for j in fit.moved]
-        scales = [Change("scale", (j,), float(fit.gain[j])) for j in fit.scaled]
-        changes = [*zeros, *scales]
-        while changes:
+        n = self.model.n_joints
+        while changes := _changes_of(fit):
             samples, score = self._scored(changes)
             without = [
                 self._scored([each for each in changes if each != one])[1] for one in changes
             ]
             against = [compare(score, other, self.model) for other in without]
-            needed = [
-                change
-                for change, each in zip(changes, against, strict=True)
-                if each.sigmas < -_NEEDED
-            ]
-            if len(needed) == len(changes):
+            is_needed = [each.sigmas < -_NEEDED for each in against]
+            if all(is_needed):
                 whole = compare(score, self.score, self.model)
                 if whole.ratio > 1.0 - _LEAST_GAIN or whole.sigmas > -SEPARATE:
                     return None
-                return _Joints(fit, tuple(changes), samples, score, whole, tuple(against))
-            changes = needed
+                return _Joints(fit, changes, samples, score, whole, tuple(against))
+            free = np.zeros(2 * n, dtype=np.bool_)
+            for change, is_one in zip(changes, is_needed, strict=True):
+                places = np.array(change.joints) + (0 if change.meaning == "zero" else n)
+                free[places] = is_one
+            fit = fit_joints(self.model, self.samples, free, fit.fixed(free))
         return None
 
     def _scored(self, changes: Sequence[Change]) -> tuple[Samples, Score]:
@@ -706,6 +746,15 @@ def _is_better(against: Comparison) -> bool:
     if against.ratio < 1.0 - _LARGE and against.sigmas < -SEPARATE:
         return True
     return against.ratio < 1.0 - _LEAST_GAIN and against.sigmas < -SURE
+
+
+def _is_clearly_better(score: Score, other: Score, model: RobotModel) -> bool:
+    return compare(score, other, model).ratio < 1.0 - _ALIKE
+
+
+def _changes_of(fit: JointFit) -> tuple[Change, ...]:
+    zeros = [Change("zero", (joint,), float(fit.zero[joint])) for joint in fit.moved]
+    return (*zeros, *(Change("scale", (j,), float(fit.gain[j])) for j in fit.scaled))
 
 
 def _thinned(samples: Samples, rows: int) -> Samples:

@@ -16,7 +16,7 @@ from identification.estimators.least_squares import RepeatedEstimate
 from identification.factor.columns import standard_factor
 from identification.factor.estimate import Estimate
 from identification.factor.factor import Factor, total_factor
-from identification.hypotheses.diagnosis import Diagnosis, diagnose
+from identification.hypotheses.diagnosis import TorqueDiagnosis, diagnose
 from identification.model.robot import RobotModel
 from identification.signals.samples import Samples
 from identification.validation.causes import Cause, find_causes
@@ -128,7 +128,7 @@ class Evidence:
     changes: tuple[Change, ...] = ()
     #: joints that moved in one direction only on the fitted motion (n,); None if not tested
     one_way: NDArray[np.bool_] | None = None
-    diagnosis: Diagnosis | None = None  #: what the fitted recordings are; None if not asked
+    diagnosis: TorqueDiagnosis | None = None  #: what the fitted recordings are; None if not asked
     gravity: GravityDirection | None = None  #: the direction of gravity that fits best
     load: CarriedLoad | None = None  #: body on the last link in unseen motion only
     #: error of the nominal (CAD) model on the same unseen motion
@@ -223,13 +223,11 @@ def gather(
     floor = noise_floor(model, values, training[:_MOST_RECORDINGS], noise)
     error, fitted = (_error(model, values, runs) for runs in (held_out, training))
     slow = None if noise is None else _slow_errors(model, result, held_out, error, unseen, noise)
-    speed = np.abs(np.concatenate([run.motion.velocity for run in held_out])).max(axis=0)
+    speed = np.max([np.abs(run.motion.velocity).max(axis=0) for run in held_out], axis=0)
     others, motors = (() if in_sample else held_out), context.motor_from_joint
-    fitted_time = np.sum([*map(_time_moved, training)], axis=0)
-    moved = fitted_time >= Thresholds().moved
-    causes = find_causes(
-        model, training, values, names, noise=floor, prior=prior, scale_std=context.scale_std
-    )
+    moved = _total_time_moved(training) >= Thresholds().moved
+    scale = context.scale_std
+    causes = find_causes(model, training, values, names, noise=floor, prior=prior, scale_std=scale)
     return Evidence(
         estimate=pooled,
         held_out=error,
@@ -256,7 +254,7 @@ def gather(
         context=context,
         in_sample=in_sample,
         prismatic=tuple(np.flatnonzero(~model.chain.revolute).tolist()),
-        moved=np.sum([*map(_time_moved, held_out)], axis=0),
+        moved=_total_time_moved(held_out),
     )
 
 
@@ -276,6 +274,10 @@ def _noise(
     if len(result.values) < 2:
         return None
     return repetition_noise(model, result.pooled.values, training, SLOW)
+
+
+def _total_time_moved(runs: Sequence[Samples]) -> Array:
+    return np.asarray(np.sum([*map(_time_moved, runs)], axis=0))
 
 
 def _time_moved(run: Samples) -> Array:

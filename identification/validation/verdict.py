@@ -109,11 +109,9 @@ def judge(
         good = fault is None and good_for(purposes, asked)
     if wrong and (fault is not None or not purposes):
         error = "" if purposes else f"; {measure}"
-        is_other = fault is not None and fault.check in (ARM, IMPOSSIBLE)
-        if is_other and evidence.held_out.overall <= evidence.allowed(thresholds):
-            line = _of_no_arm(tested_on, fault or wrong[0], evidence, error)
-        else:
-            line = f"The model must not be relied on: {(fault or wrong[0]).words}{error}."
+        is_near = evidence.held_out.overall <= evidence.allowed(thresholds)
+        other = _of_no_arm(tested_on, fault, evidence) if is_near else ""
+        line = f"The model must not be relied on: {other}{(fault or wrong[0]).words}{error}."
     elif purposes:
         line = purposes_in_a_sentence(purposes, naming.joints, asked)
         if tested_on != UNSEEN:
@@ -122,20 +120,24 @@ def judge(
             line += " Doubtful for anything else."
         elif reserve:
             line += f" {reserve[0].upper()}{reserve[1:]}."
-    causes = [finding for finding in (*wrong, *doubtful) if finding.role == "cause"]
-    explained = bool(causes) and (not wrong or causes[0].level == "wrong")
-    roles = ("condition",) if explained else ("condition", "symptom")
-    others = [finding for finding in wrong or doubtful if finding.role in roles]
-    steps = dict.fromkeys(finding.next_step for finding in (*causes, *others))
     return Verdict(
         good=good,
         line=line,
         reasons=tuple(finding.words for finding in wrong),
         warnings=tuple(finding.words for finding in doubtful),
-        next_steps=tuple(step for step in steps if step),
+        next_steps=_next_steps(wrong, doubtful),
         findings=tuple(findings),
         purposes=tuple(purposes),
     )
+
+
+def _next_steps(wrong: Sequence[Finding], doubtful: Sequence[Finding]) -> tuple[str, ...]:
+    causes = [finding for finding in (*wrong, *doubtful) if finding.role == "cause"]
+    explained = bool(causes) and (not wrong or causes[0].level == "wrong")
+    roles = ("condition",) if explained else ("condition", "symptom")
+    others = [finding for finding in wrong or doubtful if finding.role in roles]
+    steps = dict.fromkeys(finding.next_step for finding in (*causes, *others))
+    return tuple(step for step in steps if step)
 
 
 def fault_of(findings: Sequence[Finding]) -> Finding | None:
@@ -198,12 +200,12 @@ def facts_in_order(evidence: Evidence, limits: Thresholds) -> tuple[Facts, ...]:
     return tuple(facts for facts in ordered if facts is not None)
 
 
-def _of_no_arm(tested_on: str, fault: Finding, evidence: Evidence, error: str) -> str:
+def _of_no_arm(tested_on: str, fault: Finding | None, evidence: Evidence) -> str:
+    """Return that a model predicts and is of no arm, or not of the described one; else ""."""
+    if fault is None or fault.check not in (ARM, IMPOSSIBLE):
+        return ""
     share = percentage(evidence.held_out.overall, 1)
-    return (
-        f"The model must not be relied on: it predicts {tested_on} to {share} of the torque, but is"
-        f" not the arm of the URDF: {fault.words}{error}."
-    )
+    return f"it predicts {tested_on} to {share} of the torque, but is not the arm of the URDF: "
 
 
 def _without_explained(findings: Sequence[Finding]) -> list[Finding]:

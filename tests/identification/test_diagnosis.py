@@ -7,14 +7,14 @@ import pytest
 from numpy.typing import NDArray
 
 from identification import Recording
-from identification.hypotheses.diagnosis import Diagnosis, diagnose
+from identification.hypotheses.diagnosis import TorqueDiagnosis, diagnose
 from identification.signals.samples import Preprocessing, prepare
 from tests.identification.test_readings import HIP, KNEE, NAMES, TIME, model, motion
 
 Floats = NDArray[np.float64]
 
 
-def diagnosed(position: Floats, torque: Floats) -> Diagnosis:
+def diagnosed(position: Floats, torque: Floats) -> TorqueDiagnosis:
     recording = Recording(TIME, position, NAMES, torque)
     options = Preprocessing(14.0, left_out="rests")
     return diagnose(model(), [prepare(recording, model(), options=options)])

@@ -780,7 +780,7 @@ class TestChangesToUnseenMotion:
         assert (change.kind, change.joint) == ("gain", 1)
         assert change.ratio == pytest.approx(ratio, abs=0.02)
 
-    def test_a_joint_that_the_fitted_motion_has_not_moved_has_not_changed(self):
+    def test_a_joint_that_stood_has_none(self):
         more = with_friction(np.array([1.0, 2.0]))
         assert changes_between(as_it_is, more, moved=np.array([True, False])) == ()
 

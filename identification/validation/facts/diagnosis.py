@@ -8,7 +8,7 @@ from typing import Final
 
 import numpy as np
 
-from identification.hypotheses.diagnosis import Diagnosis, RigidTorque
+from identification.hypotheses.diagnosis import RigidTorque, TorqueDiagnosis
 from identification.text import percentage
 from identification.validation.evidence import Evidence
 from identification.validation.finding import Finding, Naming
@@ -25,7 +25,7 @@ _SIGMAS: Final = 3.0
 class MeaningFacts:
     """What the torque is: without bodies, without gravity, or at other zeros."""
 
-    diagnosis: Diagnosis
+    diagnosis: TorqueDiagnosis
 
     @classmethod
     def of(cls, evidence: Evidence) -> MeaningFacts | None:
