@@ -83,3 +83,17 @@ FREEDRIVE_BIT: Final = 2
 """Of `robot_status_bits`: the button with which a person moves the arm by hand."""
 SAFETY_NORMAL: Final = 1
 """`safety_mode` without a stop or a reduced speed."""
+GEAR_RATIO: Final = 101.0
+"""Motor revolutions per joint revolution, of every joint of every model (strain wave gears)."""
+TORQUES: Final = {
+    "UR3": (56.0, 56.0, 28.0, 12.0, 12.0, 12.0),
+    "UR5": (150.0, 150.0, 150.0, 28.0, 28.0, 28.0),
+    "UR10": (330.0, 330.0, 150.0, 56.0, 56.0, 56.0),
+    "UR3e": (54.0, 54.0, 28.0, 9.0, 9.0, 9.0),
+    "UR5e": (150.0, 150.0, 150.0, 28.0, 28.0, 28.0),
+    "UR10e": (330.0, 330.0, 150.0, 54.0, 54.0, 54.0),
+    "UR16e": (330.0, 330.0, 150.0, 54.0, 54.0, 54.0),
+    "UR20": (738.0, 738.0, 433.0, 107.0, 107.0, 107.0),
+    "UR30": (738.0, 738.0, 433.0, 107.0, 107.0, 107.0),
+}
+"""Largest torque of each joint by model [N·m], of the maker's description for ROS 2."""

@@ -4,16 +4,18 @@ from __future__ import annotations
 
 from dataclasses import replace
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Literal
 
 import typer
 
 from drivers.transports.udp import UdpSpec
+from drivers.ur.reader import RtdeSpec
 from hil.base.errors import InputError
 from hil.base.files import convert_write_errors, write_atomically
 from hil.base.progress import say
 from hil.base.safe_input import parse_port
 from hil.base.terminal_text import typed
+from hil.cell.schema import LINKS, RtdeTable
 from hil.cli.arguments import (
     ARM,
     ConventionOption,
@@ -28,6 +30,9 @@ from hil.control.motion_watch import stop_on_interrupt
 from hil.importers.dh import convention_of
 from hil.new import (
     CellValues,
+    NewCell,
+    ask_arm,
+    cell_of_arm,
     cell_of_dh,
     cell_of_urdf,
     from_archive,
@@ -48,6 +53,8 @@ def new(
     from_archive_file: Annotated[
         Path | None, typer.Option("--from-archive", metavar="ARCHIVE")
     ] = None,
+    controller: Annotated[Literal["ur"] | None, typer.Option(metavar="ur")] = None,
+    host: Annotated[str | None, typer.Option(metavar="HOST[:PORT]")] = None,
     bind: str = "0.0.0.0",
     arm: Annotated[int, typer.Option(min=1, max=4)] = 1,
     wait: Annotated[float, typer.Option(min=0.0)] = 300.0,
@@ -66,6 +73,10 @@ def new(
     with a "?" is refused with a list of all unknown values and where to find each of them. For an
     arm with known Denavit-Hartenberg parameters and no URDF use --dh.
 
+    A Universal Robots arm (--controller ur --host HOST) states type, serial number, calibration,
+    limits, payload and its torque constants: nothing moves, and nothing is claimed. Without --urdf
+    the kinematics are those that it states, and there are no masses.
+
     **Examples:** `hil new --urdf robot.urdf --from-controller 10.2.12.150 -o cell.toml`, `hil new
     --dh table.csv --convention modified -o cell.toml`, `hil new --design-only --urdf robot.urdf -o
     cell.toml`
@@ -76,6 +87,8 @@ def new(
         from_controller: Read drive train, limits and cycle from the init packet of the controller
             at HOST; this PC listens on PORT (1000).
         from_archive_file: Read the cell and the init packet of an archive of this arm.
+        controller: Ask an arm for its values: ur (Universal Robots, over RTDE).
+        host: Address of that arm; the port is that of RTDE (30004).
         bind: Local address to listen on; 0.0.0.0 for all.
         arm: Arm number of the controller.
         wait: Time to wait for the controller, s.
@@ -89,22 +102,27 @@ def new(
             a design needs beyond the URDF are assumed and listed.
         force: Replace an earlier file.
     """
-    exactly_one("--urdf arm.urdf, or --dh table.csv with --convention", urdf=urdf, dh=dh)
+    if controller is None or (urdf and dh):
+        exactly_one("--urdf arm.urdf, or --dh table.csv with --convention", urdf=urdf, dh=dh)
     at_most_one(
-        design_only=design_only, from_controller=from_controller, from_archive=from_archive_file
-    )
+        design_only=design_only, from_controller=from_controller,
+        from_archive=from_archive_file, controller=controller,
+    )  # fmt: skip
     if urdf is None and (base or tip):
         problem = "are links of a URDF"
         remedy = "omit them with --dh"
         raise InputError(None, problem, field="--base and --tip", remedy=remedy)
     _require_free(output, force=force)
     fixed = figures(fix or [], "--fix", "--fix finger=0.02 (rad or m)")
+    described: NewCell | None = None
     if urdf is not None:
-        moved = design_only or from_controller is not None or from_archive_file is not None
-        made = cell_of_urdf(urdf, fixed, base=base, tip=tip, moved=moved)
-    else:
-        assert dh is not None
-        made = cell_of_dh(dh, convention_of(convention), fixed)
+        asked = (from_controller, from_archive_file, controller)
+        moved = design_only or any(source is not None for source in asked)
+        described = cell_of_urdf(urdf, fixed, base=base, tip=tip, moved=moved)
+    elif dh is not None:
+        described = cell_of_dh(dh, convention_of(convention), fixed)
+    made = _of_arm(host, described) if controller is not None else described
+    assert made is not None, "one of --urdf and --dh is given"
     if made.urdf is not None:
         _require_free(made.urdf_beside(output), force=force, urdf_read=made.urdf_path)
     values = made.values
@@ -133,10 +151,22 @@ def new(
         say(f'unknown, marked "?": {", ".join(unknown)}')
         after = "design" if design_only else "doctor"
         say(f"fill them in, then `hil {after} {typed(output)}`, which lists what is still missing")
+    elif controller is not None:
+        say(f"check it, above all what is assumed, then `hil record {typed(output)} -o archives`")
     elif made.lifting:
         say(f"then `hil import log LOG --cell {typed(output)} --map MAP.toml`")
     elif design_only:
         say(f"check the assumed values in it, then `hil design {typed(output)}`")
+
+
+def _of_arm(address: str | None, described: NewCell | None) -> NewCell:
+    """Return the cell of the Universal Robots arm at HOST[:PORT]."""
+    fields = None if address is None else LINKS["rtde"].parse(address)
+    if fields is None:
+        problem = "is missing" if address is None else f"{address!r} is not HOST or HOST:PORT"
+        raise InputError(None, problem, field="--host", remedy="e.g. --host 192.168.0.10")
+    ports = RtdeTable(**fields["rtde"])
+    return cell_of_arm(ask_arm(RtdeSpec(fields["host"], ports.port), ports), described)
 
 
 def _asked(

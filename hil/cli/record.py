@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import time
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
+from types import MappingProxyType
 from typing import Annotated, Final, Literal
 
 import numpy as np
@@ -14,6 +16,7 @@ from rich.console import Console
 
 from hil.archive.live import LiveView
 from hil.archive.recorder import Recorded
+from hil.base.arrays import Array
 from hil.base.errors import ControllerError, HilError, InputError, OperatorStopError
 from hil.base.progress import put, say
 from hil.base.progress_lines import LINE_PERIOD, progress_console
@@ -24,7 +27,8 @@ from hil.cli.arguments import JsonOption, QuietOption, print_json
 from hil.control.live_link import LiveLink
 from hil.control.record import archive_path
 from hil.control.record import record as record_motion
-from hil.control.ur_recording import listening, record_arm
+from hil.control.ur_recording import ConstantsFound, listening, record_arm
+from identification.text import percentage
 
 Kind = Annotated[Literal["excitation", "validation", "standstill"], typer.Option(metavar="USE")]
 LINE_EVERY = 5.0
@@ -153,7 +157,32 @@ def record_listening(cell: Cell, how: RecordRequest, *, quiet: bool, json: bool)
             arm, cell, path,
             kind=how.kind, stop=stop, duration=how.duration, watch=view.show, report=warn,
         )  # fmt: skip
-    _finish(path, done, cell, how.duration, by_operator=stop.requested, line=HEARD_LINE, json=json)
+    found = ConstantsFound.of(path, cell)
+    more = {"stated_constants": [float(k) if np.isfinite(k) else None for k in found.stated]}
+    _finish(
+        path, done, cell, how.duration,
+        by_operator=stop.requested, line=HEARD_LINE, json=json, more=more,
+    )  # fmt: skip
+    if not json and not quiet and found.are_doubtful:
+        say("\n".join(constants_lines(found)))
+
+
+def constants_lines(found: ConstantsFound) -> Iterator[str]:
+    """Yield what an arm states of its torque constants, and the next step."""
+    if np.isfinite(found.stated).any():
+        yield f"torque constants by the arm's own model: {_constants(found.stated)}"
+    if found.differ:
+        yield f"those of the cell differ: {_constants(found.in_cell)}; correct torque_constant"
+    share = percentage(found.uncertainty)
+    yield (
+        f"next  they are uncertain by {share}: record the same motion with a known load, then\n"
+        "      hil torque-constants ARCHIVES --loaded LOADED --mass KG --centre X,Y,Z"
+    )
+
+
+def _constants(constants: Array) -> str:
+    values = ", ".join(f"{k:.2f}" if np.isfinite(k) else "-" for k in constants)
+    return f"{values} N·m/A, gears included"
 
 
 def _finish(
@@ -165,10 +194,11 @@ def _finish(
     by_operator: bool,
     line: str,
     json: bool,
+    more: Mapping[str, object] = MappingProxyType({}),
 ) -> None:
     """Print how a recording ended, or raise how it ended early."""
     early = _early_end(path, done, duration, by_operator=by_operator)
-    figures = _figures(path, done, cell)
+    figures = {**_figures(path, done, cell), **more}
     if not json:
         say(line.format_map(figures))
     elif early is None:

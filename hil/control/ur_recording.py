@@ -11,7 +11,7 @@ from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, fields, is_dataclass, replace
 from pathlib import Path
-from typing import Any, Final
+from typing import Any, Final, Self
 
 import numpy as np
 
@@ -28,10 +28,12 @@ from drivers.ur.outputs import (
     SAFETY_NORMAL,
 )
 from drivers.ur.reader import OutputFrames, RtdeReader, RtdeSpec
-from hil.archive import CONTROLLER_PROGRAM
+from drivers.ur.torque_constants import UNCERTAINTY, by_size, stated_constants
+from hil.archive import CONTROLLER_PROGRAM, open_archive
 from hil.archive.recorder import Recorded
 from hil.archive.schema import UR_STATE, Level
 from hil.archive.writer import ArchiveWriter
+from hil.base.arrays import Array
 from hil.base.errors import ControllerError, OperatorStopError
 from hil.cell import Cell
 from hil.control.link import Progress, Watch, recording_end
@@ -46,6 +48,8 @@ _FIRST: Final = 5.0
 """Longest wait for the first frame, s."""
 _RETRY: Final = 0.5
 """Time between two attempts to connect, s."""
+_SAME: Final = 0.01
+"""Relative difference of torque constants that is not reported."""
 _PAYLOAD_TOLERANCE: Final = 0.02
 """Difference of payloads that is reported, kg."""
 
@@ -238,6 +242,51 @@ class _Recording:
             not_accepted=0,
             disk_waited=writer.file.slowest_flush,
         )
+
+
+@dataclass(frozen=True, eq=False)
+class ConstantsFound:
+    """Torque constants that the arm of a recording states at rest, beside those of the cell.
+
+    Attributes:
+        stated: joint torque by current (6,) [N·m/A], gears included; NaN where nothing says it.
+        in_cell: those of the cell (6,), likewise.
+        uncertainty: of the cell's, the largest relative standard deviation.
+    """
+
+    stated: Array
+    in_cell: Array
+    uncertainty: float
+
+    @classmethod
+    def of(cls, path: Path, cell: Cell) -> Self:
+        """Return those of an archive; joints of equal largest torque have the same.
+
+        Raises:
+            ArchiveError: the archive cannot be read.
+        """
+        names = ("target_moment", "model_current", "target_velocity")
+        columns = open_archive(path, fields=names).recorded(*names)
+        stated = stated_constants(*(columns[name] for name in names))
+        limit = cell.torque_limit
+        drives = cell.drive_train
+        uncertainty = cell.drive_table.torque_uncertainty
+        return cls(
+            stated if limit is None else by_size(stated, limit.tolist()),
+            drives.torque_constant * np.abs(np.diag(drives.motor_from_joint)),
+            float(np.max(UNCERTAINTY if uncertainty is None else uncertainty)),
+        )
+
+    @property
+    def differ(self) -> bool:
+        """Whether those of the cell are not those that the arm states."""
+        off = np.abs(self.stated - self.in_cell) > _SAME * self.in_cell
+        return bool((np.isfinite(self.stated) & off).any())
+
+    @property
+    def are_doubtful(self) -> bool:
+        """Whether nothing better than the arm's own statement is known of them."""
+        return self.uncertainty >= UNCERTAINTY
 
 
 def _changes(before: np.void | None, now: np.void) -> Iterator[tuple[str, str, Level]]:

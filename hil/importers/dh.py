@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import math
+from collections.abc import Mapping, Sequence
 from html import escape
 from os import PathLike
 from pathlib import Path
@@ -58,8 +59,26 @@ def urdf_of_dh(path: str | PathLike[str], convention: Convention) -> str:
         InputError: the table cannot be read, or a line of it is invalid.
     """
     path = Path(path)
-    rows = _rows(path)
-    parts = [f'<robot name="{escape(path.stem or "robot")}">', _link("base_link")]
+    return _urdf(path.stem or "robot", _rows(path), convention)
+
+
+def urdf_of_parameters(
+    name: str, joints: Sequence[str], parameters: Mapping[str, Sequence[float]]
+) -> str:
+    """Return the URDF of revolute joints with parameters ``a, alpha, d, theta_offset`` [m, rad].
+
+    The convention is standard; see :func:`urdf_of_dh`.
+    """
+    columns = zip(*(parameters[column] for column in _NAMES[2:]), strict=True)
+    rows = [
+        _Row(joint, _TYPES["revolute"], *values)
+        for joint, values in zip(joints, columns, strict=True)
+    ]
+    return _urdf(name, rows, "standard")
+
+
+def _urdf(name: str, rows: Sequence[_Row], convention: Convention) -> str:
+    parts = [f'<robot name="{escape(name)}">', _link("base_link")]
     parent = "base_link"
     # The fixed transform follows a joint (standard) or precedes the next one (modified).
     for number, row in enumerate(rows, 1):

@@ -29,7 +29,7 @@ from hil.cell.errors import UNKNOWN, WHERE, models_of
 from hil.cell.gripper import gripper_joints, links_of
 from hil.cell.schema import CellFile
 from hil.cell.text import urdf_limits
-from hil.importers.dh import Convention, urdf_of_dh
+from hil.importers.dh import Convention, urdf_of_dh, urdf_of_parameters
 from identification.errors import ModelError
 from identification.model.kinematics import MOST_JOINTS, Chain, chain_from_urdf, pinocchio_model
 from identification.model.urdf_text import urdf_tree
@@ -168,6 +168,8 @@ class NewCell:
             **({} if folders is None else {"cell.mesh_folders": folders}),
             **self.values.values,
         }
+        if values["controller.transport"] == "rtde":  # its port is in [controller.rtde]
+            del values["controller.port"], values["controller.arm"]
         document = self._head()
         unknown = list[str]()
         without: Collection[str] = ("drive_train", "controller") if self.design_only else ()
@@ -250,12 +252,27 @@ class NewCell:
     def for_design(self) -> NewCell:
         """Return the cell for design only, with assumed values and a clear home posture."""
         cell_values = self.values | assumed_for_design(self.values, len(self.joint_names))
-        urdf = self.urdf if self.urdf is not None else read_text(self.urdf_path)
+        home = clear_home(self.urdf_text, cell_values, self.mesh_places)
+        return replace(self, values=cell_values | home, design_only=True)
+
+    def for_arm(self, stated: CellValues) -> NewCell:
+        """Return the cell with what an arm states, and assumed values of the rest."""
+        known = self.values | stated
+        assumed = assumed_for_design(known, len(self.joint_names))
+        made = replace(self, values=self.values | assumed | stated)
+        home = made.values | clear_home(made.urdf_text, made.values, made.mesh_places)
+        return replace(made, values=home)
+
+    @property
+    def urdf_text(self) -> str:
+        """Text of the cell's URDF."""
+        return self.urdf if self.urdf is not None else read_text(self.urdf_path)
+
+    @property
+    def mesh_places(self) -> list[str]:
+        """Folders of the meshes, as seen from here."""
         beside = self.urdf_path.resolve().parent
-        meshes = [str(beside / folder) for folder in self._mesh_folders(beside) or []]
-        return replace(
-            self, values=cell_values | clear_home(urdf, cell_values, meshes), design_only=True
-        )
+        return [str(beside / folder) for folder in self._mesh_folders(beside) or []]
 
     def urdf_beside(self, path: Path) -> Path:
         """Return the path of a changed URDF: next to the cell file, different from the original."""
@@ -293,6 +310,19 @@ def cell_of_dh(path: Path, convention: Convention, fixed: Mapping[str, float]) -
     note = "the URDF contains the geometry of the DH parameters only: no masses, no limits"
     made = _cell_of(path, text, fixed, moved=True)
     return replace(made, urdf=made.urdf or text, values=CellValues(notes=(note,)) | made.values)
+
+
+def cell_of_parameters(
+    name: str, joints: Sequence[str], parameters: Mapping[str, Sequence[float]]
+) -> NewCell:
+    """Return the cell of DH parameters by name (`urdf_of_parameters`), with a URDF to write."""
+    text = urdf_of_parameters(name, joints, parameters)
+    note = (
+        "the URDF contains the calibrated geometry that the arm states: no masses; one with masses "
+        "(--urdf) gives the estimate a prior"
+    )
+    made = _cell_of(Path(name), text, {}, moved=True)
+    return replace(made, urdf=text, values=CellValues(notes=(note,)) | made.values)
 
 
 def cell_of_urdf(

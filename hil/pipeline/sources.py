@@ -351,10 +351,14 @@ def known_warnings(cell: Cell, archive: Archive) -> list[str]:
     assumed = "drive_train.torque_constant" in cell.file.cell.assumed
     if not assumed or archive.header.only_simulated:
         return []
-    return [
+    warning = (
         "the torque constants are assumed: predictions of current are not affected, but all "
         "parameters are in units of the assumed constants"
-    ]
+    )
+    controller = cell.file.controller
+    if controller is not None and controller.transport == "rtde":
+        warning += "; weigh a known payload with `hil torque-constants`"
+    return [warning]
 
 
 def payload_warnings(cell: Cell) -> list[str]:

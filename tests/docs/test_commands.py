@@ -69,6 +69,8 @@ NOT_TYPED = {
     "hil simulate": "waits for a PC; tests/hil/test_simulate.py runs it",
     "hil move copy.toml": "needs a controller; tests/hil/test_move.py types it",
     "hil record": "waits for a controller; tests/hil/test_record_command.py runs it",
+    "hil new --controller ur": "needs an arm; tests/hil/test_new_ur.py asks a simulated one",
+    "hil torque-constants archives": "needs recordings with a load",
     "hil run campaigns/october --live": "needs a campaign on a real link",
     "hil import rosbag2": "needs a recording; tests/hil/test_importers_rosbag2.py",
     "hil import log log.csv --map columns.toml": "typed in bring-your-own-robot.md",

@@ -28,6 +28,7 @@ from hil.cell import Cell, CellError
 from hil.cli.record import with_rtde
 from hil.control.link import Progress
 from hil.control.motion_watch import Stop
+from hil.control.simulation import planted_truth
 from hil.control.ur_recording import IDENTITY, listening, record_arm
 from hil.importers.conclusions import Certainty
 from hil.importers.recording import ImportOptions
@@ -36,6 +37,7 @@ from hil.look.run import look_at
 from hil.pipeline.run import identify_archives
 from sim_fixtures.ur import (
     CELL_PATH,
+    UR5E_URDF,
     SimulatedUr,
     UrArmTruth,
     UrFault,
@@ -290,6 +292,19 @@ def test_a_link_is_given_by_the_cell_or_by_an_option(cell: Cell) -> None:
             with_rtde(cell, link)
 
 
+def test_the_cell_file_states_what_the_arm_is() -> None:
+    cell = Cell.load(CELL_PATH)
+    truth = UrArmTruth()
+    planted = planted_truth(cell)
+    for name in ("rotor_inertia", "coulomb", "viscous", "third", "inertia_scale"):
+        np.testing.assert_array_equal(getattr(planted, name), getattr(truth.plant, name), name)
+    assert cell.simulation.current_noise == truth.current_noise
+    assert cell.urdf == UR5E_URDF
+    np.testing.assert_allclose(
+        101.0 * cell.drive_train.torque_constant, truth.stated_constant, rtol=1e-6
+    )
+
+
 def test_a_cell_of_other_arms_is_refused(cell: Cell) -> None:
     problem = "is not a Universal Robots arm"
     with pytest.raises(CellError, match=problem), listening(cell, stop=Stop()):
@@ -316,8 +331,9 @@ def test_ctrl_c_ends_it_and_the_next_one_has_another_file(tmp_path: Path) -> Non
                 ):
                     time.sleep(0.1)
                 process.send_signal(signal.SIGINT)
-                last = process.stdout.read().splitlines()[-1]
+                said = process.stdout.read()
                 assert process.wait() == 0
-            assert "0 missed; completed: ended by the operator" in last
+            assert "0 missed; completed: ended by the operator" in said
+            assert "hil torque-constants ARCHIVES --loaded LOADED" in said
             written: Archive = open_archive(archive)
             assert written.complete and np.all(np.diff(written.columns["cycle"]) == 1)
