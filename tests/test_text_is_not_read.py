@@ -48,6 +48,7 @@ FOREIGN: Final[Mapping[str, str]] = {
     "hil.importers.text_table": "logs",
     "hil.new.cell_text": "URDFs",
     "hil.base.safe_input": "files",
+    "hil.fleet.limits": "limits that the user writes",
     "hil.fleet.naming": "patterns that the user writes, and names of files",
     "hil.control.simulator_on_link": "addresses that the user writes",
     "identification.excitation.collision_bodies": "errors of pinocchio",
@@ -56,7 +57,7 @@ FOREIGN: Final[Mapping[str, str]] = {
 }
 """Modules that read text of others."""
 OURS: Final[Mapping[str, str]] = {
-    "hil.batch.graph": "the reason of an unusable archive begins with its path",
+    "hil.batch.cluster": "the reason of an unusable archive begins with its path",
     "hil.control.errors": "an outcome that begins the reason is not said twice",
     "hil.control.simulator_process": "the last error that the simulated controller printed",
     "hil.report.drawing": "the lines of a label make its height",

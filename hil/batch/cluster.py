@@ -88,6 +88,11 @@ class SkippedArchive(NamedTuple):
         """The whole reason."""
         return f"{self.reason} of {self.copy_of}" if self.copy_of else self.reason
 
+    @property
+    def without_path(self) -> SkippedArchive:
+        """The same where the reason does not begin with the path."""
+        return self._replace(reason=self.reason.removeprefix(f"{self.path}: "))
+
     def as_json(self) -> dict[str, str]:
         """Return it for programs."""
         return {"path": self.path, "reason": self.message}

@@ -63,6 +63,9 @@ PARTITION: Final = 16
 are fifty times as large as what else is known of an archive."""
 
 
+LOGS_FOR_SETTINGS: Final = 8
+"""Logs, the earliest, by which the settings of a robot are decided."""
+
 # Settings
 
 
@@ -84,6 +87,8 @@ def archives_for_settings(
     Where the arm has settings only noise and cell are the campaign's own: one excitation is read.
     """
     ordered = sorted(refs, key=lambda ref: ref.order)
+    if all(ref.source for ref in refs):  # Those of a later month change no setting.
+        ordered = sorted(refs, key=lambda ref: (ref.when, ref.order))[:LOGS_FOR_SETTINGS]
     standstill = [ref for ref in ordered if ref.use == "standstill"]
     fitted = [ref for ref in ordered if ref.use == "excitation"]
     return (*standstill, *fitted[: MAX_RECORDINGS if arms is None else 1])
@@ -335,11 +340,7 @@ class _Batch:
         estimates = [estimate for result in results for estimate in result.estimates]
         pooled = [estimate for arm in arms for estimate in self._pooled(arm)]
         lost = [unused for result in results for unused in result.broken]
-        # Some reasons begin with the path.
-        reasons = (
-            unused._replace(reason=unused.reason.removeprefix(f"{unused.path}: "))
-            for unused in [*self.broken, *lost]
-        )
+        reasons = (unused.without_path for unused in [*self.broken, *lost])
         broken = tuple(dict.fromkeys(reasons))
         repetitions = tuple(estimate for estimate in estimates if estimate.level == "repetition")
         if not repetitions:

@@ -147,6 +147,36 @@ def reduced_archive(wanted: ToReduce, settings: Settings) -> tuple[Summary, Redu
     return summary, reduction
 
 
+def summarise(
+    refs: Sequence[ArchiveRef], settings: Settings, cache: CacheLocation
+) -> list[Summary | SkippedArchive]:
+    """Return what each archive says by itself, or why it cannot be used.
+
+    The sums of archives, a hundred times as large, are neither read nor cached.
+
+    Raises:
+        CacheError: the cache cannot be written.
+    """
+    summaries: list[Summary | SkippedArchive] = []
+    for ref in refs:
+        key = json_digest(["summary", ref.sha256, settings_digest(settings)])
+        try:
+            entry = cache.read(ref.origin, key)
+            known = None if entry is None else _unpacked([ref], *entry)
+        except (KeyError, ValueError, TypeError, IndexError):  # not an entry of this program
+            known = None
+        if known is None:
+            try:
+                summary = reduced_archive(ToReduce(ref), settings)[0]
+            except Exception as error:
+                summaries.append(SkippedArchive(ref.origin, reason_of(error)))
+                continue
+            known = ReducedArchives((summary,))
+            cache.write(ref.origin, key, *_packed(known))
+        summaries += known.summaries
+    return summaries
+
+
 def reduce_archives(
     wanted: Sequence[ToReduce], settings: Settings, cache: CacheLocation
 ) -> ReducedArchives:

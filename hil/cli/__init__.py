@@ -198,7 +198,7 @@ def _shorten(option: TyperOption) -> None:
 GROUPS: Final[Mapping[str, tuple[str, ...]]] = {
     "Start": ("demo", "new", "look"),
     "Identify": (
-        "identify", "payload", "torque-constants", "batch", "compare", "export", "rollout",
+        "identify", "payload", "torque-constants", "batch", "compare", "trend", "export", "rollout",
         "report",
     ),
     "On the controller": (

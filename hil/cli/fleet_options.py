@@ -74,8 +74,17 @@ class Fleet:
     ] = None
 
     @contextmanager
-    def opened(self, arm: Described, reading: Reading, reporter: Reporter) -> Iterator[FleetWork]:
+    def opened(
+        self,
+        arm: Described,
+        reading: Reading,
+        reporter: Reporter,
+        *,
+        columns: tuple[str, ...] = (),
+    ) -> Iterator[FleetWork]:
         """Provide workers and cache; logs are read if their robot is described.
+
+        Of logs these `columns` are read beside the motion.
 
         Raises:
             InputError: an option is invalid, or one of logs is given without their robot.
@@ -89,7 +98,8 @@ class Fleet:
         ):
             logs = None
             if arm.is_given:
-                how = LogReading.of(arm.robot, reading.options, repr(arm), naming.facts)
+                facts = naming.facts._replace(columns=(*naming.facts.columns, *columns))
+                how = LogReading.of(arm.robot, reading.options, repr(arm), facts)
                 logs = LogsOfBatch(how, cache, cluster, reporter)
             yield FleetWork(cluster, cache, naming, logs)
 

@@ -28,6 +28,7 @@ from hil.batch.estimates import BatchArm, BatchEstimate
 from hil.pipeline.options import Options
 from hil.pipeline.sources import arm_differences
 from identification import RobotModel
+from identification.factor.estimate import Estimate
 
 MIN_REPETITIONS: Final = 15
 """Repetitions needed to estimate their correlation. With fewer the effective number is 1, as all
@@ -35,7 +36,7 @@ may have been recorded while the arm warmed up."""
 CONFIDENCE: Final = 0.95  #: Of each interval
 FALSE_ALARMS: Final = 0.01  #: Probability of any change of an arm that has none
 LEAST: Final = 0.05  #: Smallest relevant change, as a share of the first value
-_SPEEDS: Final = np.geomspace(0.02, 5.0, 40)  # rad/s or m/s
+SPEEDS: Final = np.geomspace(0.02, 5.0, 40)  # rad/s or m/s
 _MAX_CORRELATION: Final = 0.95
 _NORMAL: Final = float(student.ppf(0.975, 1e6))
 _TWO: Final = "give two or more campaigns of one arm"
@@ -270,32 +271,43 @@ def quantities(model: RobotModel, first: BatchEstimate) -> list[ComparedQuantity
         ComparedQuantity(names[k], axes.get(names[k], ""), "inertia", units[k], single[k])
         for k in rows
     ]
-    table = np.zeros((len(_SPEEDS), model.n_joints, model.n_parameters))
-    for k, term in enumerate(terms):
-        forwards, backwards = (
-            term.term.column(sign * _SPEEDS, np.full(len(_SPEEDS), sign)) for sign in (1.0, -1.0)
-        )
-        table[:, term.owner, rank + k] = 0.5 * (forwards - backwards)
+    table = friction_weights(model, SPEEDS)
     for j, (joint, turns) in enumerate(zip(joints, model.chain.revolute, strict=True)):
         if not table[:, j].any():
             continue
-        value, variance = _projected(first, table[:, j])
+        value, variance = projected(first.estimate, table[:, j])
         with np.errstate(divide="ignore", invalid="ignore"):
             best = int(np.argmax(np.nan_to_num(np.abs(value) / np.sqrt(variance))))
         unit, speed = ("N·m", "rad/s") if turns else ("N", "m/s")
-        name = f"friction of {joint} at {_SPEEDS[best]:.2g} {speed}"
+        name = f"friction of {joint} at {SPEEDS[best]:.2g} {speed}"
         compared.append(ComparedQuantity(name, joint, "friction", unit, table[best, j]))
     return compared
 
 
-def _projected(level: BatchEstimate, weights: Array) -> tuple[Array, Array]:
+def friction_weights(model: RobotModel, speeds: Array) -> Array:
+    """Return weights (s, n, p) that give the friction of each joint, mean of both directions.
+
+    The `speeds` (s,) are in rad/s or m/s and not negative; at 0 it is that of a joint that begins
+    to move.
+    """
+    rank = model.base.rank
+    weights = np.zeros((len(speeds), model.n_joints, model.n_parameters))
+    for k, term in enumerate(model.friction.terms):
+        forwards, backwards = (
+            term.term.column(sign * speeds, np.full(len(speeds), sign)) for sign in (1.0, -1.0)
+        )
+        weights[:, term.owner, rank + k] = 0.5 * (forwards - backwards)
+    return weights
+
+
+def projected(estimate: Estimate, weights: Array) -> tuple[Array, Array]:
     """Return values and variances (k,) of weighted sums (k, p) of parameters; NaN if unknown."""
-    covariance = level.estimate.covariance
-    determinable = np.isfinite(level.estimate.std)
+    covariance = estimate.covariance
+    determinable = np.isfinite(estimate.std)
     determined = ~weights[:, ~determinable].any(axis=1)
     finite = np.where(np.isfinite(covariance), covariance, 0.0)
     variance = np.einsum("kp,pq,kq->k", weights, finite, weights)
-    value = np.where(determined, weights @ level.estimate.values, np.nan)
+    value = np.where(determined, weights @ estimate.values, np.nan)
     return value, np.where(determined, variance, np.nan)
 
 
@@ -365,9 +377,9 @@ def _figures(
     """Return the figure of each quantity of a campaign."""
     weights = np.array([each.weights for each in compared])
     freedom = freedom_of(campaign)
-    singles = np.array([_projected(each, weights)[0] for each in repetitions])
+    singles = np.array([projected(each.estimate, weights)[0] for each in repetitions])
     columns = singles.reshape(len(repetitions), len(compared)).T
-    rows = zip(*_projected(campaign, weights), columns, strict=True)
+    rows = zip(*projected(campaign.estimate, weights), columns, strict=True)
     return [
         figure(float(value), float(variance), freedom, column) for value, variance, column in rows
     ]

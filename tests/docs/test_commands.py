@@ -88,6 +88,7 @@ NOT_TYPED = {
     "hil identify '~/.cache": "needs a data set; tests/hil/test_lerobot.py writes and reads some",
     "hil export out": "needs recordings; tests/hil/test_servo_command.py exports such results",
     "hil batch /data": "needs other people's archives",
+    "hil trend logs": "needs logs; tests/hil/test_trend_command.py types it",
     "hil batch 'logs/": "needs logs; tests/hil/test_batch_logs.py types it",
     "hil study --quick": "minutes; tests/hil/test_study.py runs a shorter one",
     "hil study --output": "an hour; tests/hil/test_study.py runs a short one",

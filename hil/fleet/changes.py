@@ -1,0 +1,596 @@
+"""Changes of one quantity over time, in the series of robots of one type.
+
+A series is a level, steps and slopes that begin at some time, an effect of covariates, and noise
+from one recording to the next. What robots of one type have in common is estimated from all of
+them: the noise, its correlation from one recording to the next, the effect of covariates (with its
+spread between robots, DerSimonian and Laird 1986, always from the siblings of a robot), and what
+moves all of them at once, as a season does. The begin of a change is that of the greatest
+likelihood; its p value is Student's for this one, times the number of begins that were tried.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from itertools import pairwise
+from typing import Final, Literal, NamedTuple
+
+import numpy as np
+from scipy.stats import f as fisher
+from scipy.stats import t as student
+
+from hil.base.arrays import Array
+
+Kind = Literal["step", "slope"]
+
+FEWEST: Final = 4
+"""Recordings below which a series has no model."""
+AFTER: Final = 2
+"""Recordings on either side of a change: one alone may be an outlier."""
+SIBLINGS: Final = 4
+"""Other robots from which on their common course is subtracted."""
+_MOST_CHANGES: Final = 3
+_ROUNDS: Final = 3  # of models and noise
+_FINE: Final = 0.25  # of a month, between begins of a slope that are tried
+_OUTLIER: Final = 4.0  # times the median deviation
+_NORMAL_MAD: Final = 0.6745
+_OWN: Final = 10.0  # recordings that the noise of the type counts as beside that of a robot
+_MOST_CORRELATION: Final = 0.9
+_LIKELY: Final = 3.84  # twice the log-likelihood within which a begin is in its 95 % interval
+_LEAST_EFFECT: Final = 0.1  # of all friction, that heat and season leave
+_ENTRY: Final = 1e-3  # p value of one series from which on a change enters its model
+
+
+@dataclass(frozen=True, eq=False)
+class Series:
+    """One quantity of one robot, in order of time.
+
+    Attributes:
+        time: of each recording (m,) [months].
+        value: relative to the first months (m,).
+        variance: of the values, by the recordings alone (m,).
+        covariates: such as temperatures (m, c), finite.
+    """
+
+    time: Array
+    value: Array
+    variance: Array
+    covariates: Array
+
+
+class ShapeOfChange(NamedTuple):
+    """A step at a time, or a slope that begins there [months]."""
+
+    kind: Kind
+    begin: float
+
+    def column(self, time: Array) -> Array:
+        """Return the effect of a unit of it (m,): 1, or 1 a month."""
+        if self.kind == "step":
+            return (time > self.begin).astype(np.float64)
+        return np.maximum(time - self.begin, 0.0)
+
+
+@dataclass(frozen=True, eq=False)
+class Change:
+    """One change in a series.
+
+    Attributes:
+        shape: what it is, and when it begins.
+        size: of the step, or a month of the slope.
+        size_std: its standard deviation.
+        earliest, latest: ends of the 95 % interval of its begin [months].
+    """
+
+    shape: ShapeOfChange
+    size: float
+    size_std: float
+    earliest: float
+    latest: float
+
+
+@dataclass(frozen=True, eq=False)
+class Course:
+    """The model of a series.
+
+    Attributes:
+        adjusted: values without what covariates and all robots together explain (m,).
+        std: standard deviation of each value, from one recording to the next (m,).
+        fitted: adjusted values by the model (m,).
+        changes: in order of time.
+        p_value: of no change at all, for this series alone.
+        change, half: of the last value from the level before all changes, and half of its 95 %
+            interval.
+        rate, rate_half: a month, at the end, likewise.
+        level: before all changes.
+        effects: of the covariates (c,), for one unit.
+        freedom: degrees of freedom of the noise.
+        unadjusted_p: the p value if neither covariates nor what moves all robots at once are taken
+            into account.
+        unadjusted_largest: the largest departure, likewise.
+    """
+
+    adjusted: Array
+    std: Array
+    fitted: Array
+    changes: tuple[Change, ...]
+    p_value: float
+    change: float
+    half: float
+    rate: float
+    rate_half: float
+    level: float
+    effects: Array
+    freedom: float
+    unadjusted_p: float = 1.0
+    unadjusted_largest: float = 0.0
+
+    @property
+    def largest(self) -> float:
+        """The largest departure from the level before all changes."""
+        return float(np.max(np.abs(self.fitted - self.level), initial=0.0))
+
+
+class _Prior(NamedTuple):
+    """Of the effects of covariates: mean (c,) and information (c, c)."""
+
+    mean: Array
+    information: Array
+
+
+class _Noise(NamedTuple):
+    """Of all series: variance from day to day, correlation of successive values, freedom."""
+
+    day: float
+    correlation: float
+    freedom: float
+
+
+def courses(family: Sequence[Series]) -> list[Course | None]:
+    """Return the model of each series of robots of one type; None of those that are too short."""
+    centred = [
+        replace(each, covariates=each.covariates - each.covariates.mean(axis=0)) for each in family
+    ]
+    priors = _effects(centred)
+    known = [prior.mean for prior in priors]
+    # Heat and season act on the friction that there is, which may have doubled.
+    without = [
+        replace(each, value=_divided(each.value, each.covariates @ mean))
+        for each, mean in zip(centred, known, strict=True)
+    ]
+    rest = [prior._replace(mean=np.zeros_like(prior.mean)) for prior in priors]
+    found, noise = _fitted(_without_common(without), rest)
+    adjusted: list[Course | None] = []
+    for each, course, mean in zip(family, found, known, strict=True):
+        if course is None:
+            adjusted.append(None)
+            continue
+        # Without covariates, and without what all robots have in common.
+        alone = replace(each, covariates=each.covariates[:, :0])
+        unadjusted = _course(alone, _flat(0), noise)
+        adjusted.append(
+            replace(
+                course,
+                effects=course.effects + mean,
+                unadjusted_p=unadjusted.p_value,
+                unadjusted_largest=unadjusted.largest,
+            )
+        )
+    return adjusted
+
+
+def _divided(value: Array, effect: Array) -> Array:
+    """Return relative values (m,) without an effect by which they were multiplied."""
+    return (1.0 + value) / np.maximum(1.0 + effect, _LEAST_EFFECT) - 1.0
+
+
+def _fitted(
+    family: Sequence[Series], priors: Sequence[_Prior]
+) -> tuple[list[Course | None], _Noise]:
+    """Fit all series with one noise, which is estimated from what their models leave."""
+    noise = _noise_of_steps(family)
+    found: list[Course | None] = []
+    for number in range(_ROUNDS):
+        found = [
+            _course(series, prior, noise) if len(series.time) >= FEWEST else None
+            for series, prior in zip(family, priors, strict=True)
+        ]
+        if number < _ROUNDS - 1:
+            noise = _noise_of_residuals(family, found, noise)
+    return found, noise
+
+
+# What robots have in common
+
+
+def _flat(count: int) -> _Prior:
+    return _Prior(np.zeros(count), np.zeros((count, count)))
+
+
+def _effects(family: Sequence[Series]) -> list[_Prior]:
+    """Return for each series what its siblings say of the effects of covariates.
+
+    From differences of successive recordings, in which a step is one and a slope little.
+    """
+    count = family[0].covariates.shape[1] if family else 0
+    if not count:
+        return [_flat(0) for _ in family]
+    steps = [
+        (np.diff(np.log(np.maximum(1.0 + each.value, _LEAST_EFFECT))),
+         np.diff(each.covariates, axis=0))
+        for each in family
+    ]  # fmt: skip
+    value = np.concatenate([y for y, _ in steps])
+    columns = np.concatenate([x for _, x in steps])
+    within = np.ones(len(value), dtype=bool)
+    effect = np.zeros(count)
+    for _ in range(5):
+        effect = np.linalg.lstsq(columns[within], value[within], rcond=None)[0]
+        residual = np.abs(value - columns @ effect)
+        within = residual <= _OUTLIER * np.median(residual) / _NORMAL_MAD
+    variance = (
+        float(np.mean((value[within] - columns[within] @ effect) ** 2)) if within.any() else 0.0
+    )
+    bounds = np.cumsum([0, *(len(y) for y, _ in steps)])
+    rows = [np.flatnonzero(within[a:b]) + a for a, b in pairwise(bounds)]
+    information = np.array([columns[k].T @ columns[k] for k in rows])
+    products = np.array([columns[k].T @ value[k] for k in rows])
+    spread = _spread(information, products, effect, variance)
+    priors = []
+    for number in range(len(family)):
+        others = np.delete(np.arange(len(family)), number)
+        known = information[others].sum(axis=0)
+        if np.linalg.matrix_rank(known) < count or variance <= 0.0:
+            priors.append(_flat(count))
+            continue
+        mean = np.linalg.solve(known, products[others].sum(axis=0))
+        covariance = variance * np.linalg.inv(known) + np.diag(spread)
+        information_of_siblings = np.asarray(np.linalg.inv(covariance), dtype=np.float64)
+        priors.append(_Prior(mean, information_of_siblings))
+    return priors
+
+
+def _spread(information: Array, products: Array, effect: Array, variance: float) -> Array:
+    """Return the variance of each effect between robots (c,), by moments."""
+    count = len(effect)
+    spread = np.zeros(count)
+    for k in range(count):
+        weights = information[:, k, k] / variance if variance > 0.0 else np.zeros(len(information))
+        usable = weights > 0.0
+        if np.count_nonzero(usable) < 3:
+            continue
+        weights = weights[usable]
+        rest = products[usable, k] - information[usable, k] @ effect
+        own = rest / information[usable, k, k]  # of the robot, from the common effect
+        excess = float(weights @ own**2) - (len(own) - 1)
+        total = weights.sum() - float(weights @ weights) / weights.sum()
+        spread[k] = max(0.0, excess / total)
+    return spread
+
+
+def _without_common(family: Sequence[Series]) -> list[Series]:
+    """Divide each series by the median course of its siblings, and add its variance."""
+    if len(family) <= SIBLINGS:
+        return list(family)
+    rest = [_divided(each.value, np.full(1, np.median(each.value))) for each in family]
+    subtracted = []
+    for number, each in enumerate(family):
+        others = [
+            _at(each.time, other.time, rest[k])
+            for k, other in enumerate(family)
+            if k != number and len(other.time) >= FEWEST
+        ]
+        courses_of_others = np.array(others)
+        count = np.isfinite(courses_of_others).sum(axis=0) if others else np.zeros(len(each.time))
+        enough = count >= SIBLINGS
+        common = np.zeros(len(each.time))
+        variance = np.zeros(len(each.time))
+        if enough.any():
+            shown = courses_of_others[:, enough]
+            common[enough] = np.nanmedian(shown, axis=0)
+            deviation = np.nanmedian(np.abs(shown - common[enough]), axis=0) / _NORMAL_MAD
+            variance[enough] = 0.5 * np.pi * deviation**2 / count[enough]
+        subtracted.append(
+            replace(each, value=_divided(each.value, common), variance=each.variance + variance)
+        )
+    return subtracted
+
+
+def _at(time: Array, known: Array, values: Array) -> Array:
+    """Return values at other times (m,), NaN where no known one is within a month."""
+    found = np.interp(time, known, values)
+    nearest = np.min(np.abs(time[:, None] - known[None, :]), axis=1)
+    return np.where(nearest <= 1.0, found, np.nan)
+
+
+def _noise_of_steps(family: Sequence[Series]) -> _Noise:
+    """Return the noise by the median of second differences, which slopes and steps hardly move."""
+    steps = [np.diff(each.value, n=2) for each in family]
+    every = np.concatenate([*steps, np.empty(0)])
+    if not len(every):
+        return _Noise(0.0, 0.0, 1.0)
+    deviation = float(np.median(np.abs(every))) / _NORMAL_MAD / math.sqrt(6.0)
+    measured = float(np.mean(np.concatenate([each.variance for each in family])))
+    return _Noise(max(0.0, deviation**2 - measured), 0.0, max(1.0, float(len(every))))
+
+
+def _noise_of_residuals(
+    family: Sequence[Series], found: Sequence[Course | None], before: _Noise
+) -> _Noise:
+    """Return the noise of what the models leave, and the correlation of successive residuals."""
+    squares = 0.0
+    measured = 0.0
+    products = 0.0
+    freedom = 0.0
+    count = 0
+    pieces = 0
+    residuals = [
+        (series, course.adjusted - course.fitted, course)
+        for series, course in zip(family, found, strict=True)
+        if course is not None
+    ]
+    if not residuals:
+        return before
+    every = np.concatenate([rest for _, rest, _ in residuals])
+    limit = _OUTLIER * float(np.median(np.abs(every))) / _NORMAL_MAD
+    for series, rest, course in residuals:
+        clipped = np.clip(rest, -limit, limit) if limit > 0.0 else rest
+        squares += float(clipped @ clipped)
+        products += float(clipped[:-1] @ clipped[1:])
+        used = 1 + 2 * len(course.changes) + (series.covariates.shape[1] if len(family) < 2 else 0)
+        freedom += max(0.0, len(rest) - used)
+        measured += float(series.variance.sum())
+        count += len(rest)
+        pieces += 1 + len(course.changes)
+    freedom = max(1.0, freedom)
+    total = squares / freedom
+    day = max(0.0, total - measured / count)
+    # A fitted level leaves residuals with a correlation of -1 / m.
+    raw = products / squares if squares > 0.0 else 0.0
+    correlation = raw + pieces / count * (1.0 + max(raw, 0.0))
+    correlation = min(max(correlation, 0.0), _MOST_CORRELATION)
+    if correlation < 2.0 / np.sqrt(count):
+        correlation = 0.0
+    return _Noise(day, correlation, freedom)
+
+
+# One series
+
+
+def _course(series: Series, prior: _Prior, noise: _Noise) -> Course:
+    """Add the likeliest change, then the next, while they are significant."""
+    time = series.time
+    candidates = _candidates(time)
+    variance = noise.day + series.variance
+    variance = np.maximum(variance, 1e-12 + 1e-6 * float(np.median(series.value**2)))
+    scale = _own_scale(series, prior, variance, candidates)
+    inflation = (1.0 + noise.correlation) / (1.0 - noise.correlation) * scale
+    weights = 1.0 / (variance * inflation)
+    chosen: list[ShapeOfChange] = []
+    p_value = 1.0
+    while len(chosen) < _MOST_CHANGES:
+        best, statistic = _likeliest(series, prior, weights, chosen, candidates)
+        if best is None:
+            break
+        single = 2.0 * float(student.sf(abs(statistic), noise.freedom))
+        p = min(1.0, len(candidates) * single)
+        added = [best]
+        if not chosen:
+            # Wear until a repair is two changes, of which neither explains much alone.
+            pair, p_of_pair = _likeliest_pair(series, prior, weights, candidates, noise.freedom)
+            if p_of_pair < p and p > _ENTRY:
+                added = pair
+            p_value = p = min(1.0, 2.0 * min(p, p_of_pair))
+        if p > _ENTRY:
+            break
+        chosen = _refined(series, prior, weights, [*chosen, *added], candidates)
+    return _described(series, prior, weights, tuple(chosen), candidates, p_value, noise)
+
+
+def _candidates(time: Array) -> list[ShapeOfChange]:
+    """Return the changes that may be found: steps between recordings, slopes also between those."""
+    distinct = np.unique(time)
+    if len(distinct) < 2 * AFTER:
+        return []
+    middles = 0.5 * (distinct[:-1] + distinct[1:])
+    steps = middles[AFTER - 1 : len(middles) - AFTER + 1]
+    last = distinct[-AFTER - 1]
+    begins = np.arange(distinct[0], last + 1e-9, max(_FINE, (last - distinct[0]) / 200.0))
+    slopes = [ShapeOfChange("slope", float(begin)) for begin in begins]
+    return [*(ShapeOfChange("step", float(begin)) for begin in steps), *slopes]
+
+
+def _design(series: Series, chosen: Sequence[ShapeOfChange]) -> Array:
+    """Return the columns of the level, the covariates and the changes (m, 1 + c + k)."""
+    level = np.ones((len(series.time), 1))
+    return np.column_stack(
+        [level, series.covariates, *(shape.column(series.time) for shape in chosen)]
+    )
+
+
+def _solved(
+    series: Series, prior: _Prior, weights: Array, chosen: Sequence[ShapeOfChange]
+) -> tuple[Array, Array, Array]:
+    """Return coefficients, their covariance, and the design of a model."""
+    design = _design(series, chosen)
+    normal = design.T @ (weights[:, None] * design)
+    right = design.T @ (weights * series.value)
+    count = len(prior.mean)
+    normal[1 : 1 + count, 1 : 1 + count] += prior.information
+    right[1 : 1 + count] += prior.information @ prior.mean
+    covariance = np.asarray(np.linalg.pinv(normal, hermitian=True), dtype=np.float64)
+    return covariance @ right, covariance, design
+
+
+def _likeliest(
+    series: Series,
+    prior: _Prior,
+    weights: Array,
+    chosen: Sequence[ShapeOfChange],
+    candidates: Sequence[ShapeOfChange],
+) -> tuple[ShapeOfChange | None, float]:
+    """Return the candidate that explains most beside those chosen, and its statistic."""
+    if not candidates:
+        return None, 0.0
+    coefficients, covariance, design = _solved(series, prior, weights, chosen)
+    rest = series.value - design @ coefficients
+    columns = np.column_stack([shape.column(series.time) for shape in candidates])
+    weighted = weights[:, None] * columns
+    crossed = design.T @ weighted
+    size = np.einsum("mk,mk->k", columns, weighted)
+    free = size - np.einsum("pk,pq,qk->k", crossed, covariance, crossed)
+    usable = free > 1e-9 * size
+    statistic = np.zeros(len(candidates))
+    statistic[usable] = (weighted.T @ rest)[usable] / np.sqrt(free[usable])
+    best = int(np.argmax(np.abs(statistic)))
+    return (candidates[best], float(statistic[best])) if usable[best] else (None, 0.0)
+
+
+def _likeliest_pair(
+    series: Series,
+    prior: _Prior,
+    weights: Array,
+    candidates: Sequence[ShapeOfChange],
+    freedom: float,
+) -> tuple[list[ShapeOfChange], float]:
+    """Return the step and the other change that explain most together, and their p value."""
+    steps = [k for k, shape in enumerate(candidates) if shape.kind == "step"]
+    if not steps:
+        return [], 1.0
+    coefficients, covariance, design = _solved(series, prior, weights, ())
+    rest = series.value - design @ coefficients
+    columns = np.column_stack([shape.column(series.time) for shape in candidates])
+    weighted = weights[:, None] * columns
+    crossed = design.T @ weighted
+    products = columns.T @ weighted - crossed.T @ covariance @ crossed
+    sides = weighted.T @ rest
+    own = np.diag(products)
+    first = own[steps, None]
+    determinant = first * own - products[steps] ** 2
+    gain = (
+        sides[steps, None] ** 2 * own
+        - 2.0 * sides[steps, None] * sides * products[steps]
+        + sides**2 * first
+    ) / np.where(determinant > 1e-6 * first * own, determinant, np.inf)
+    step, other = np.unravel_index(int(np.argmax(gain)), gain.shape)
+    if not gain[step, other] > 0.0:
+        return [], 1.0
+    p = float(fisher.sf(0.5 * float(gain[step, other]), 2.0, freedom))
+    return [candidates[steps[int(step)]], candidates[int(other)]], min(1.0, gain.size * p)
+
+
+def _misfit(
+    series: Series, prior: _Prior, weights: Array, chosen: Sequence[ShapeOfChange]
+) -> float:
+    """Return twice the negative log-likelihood of a model, up to a constant."""
+    coefficients, _, design = _solved(series, prior, weights, chosen)
+    rest = series.value - design @ coefficients
+    off = coefficients[1 : 1 + len(prior.mean)] - prior.mean
+    return float(weights @ rest**2 + off @ prior.information @ off)
+
+
+def _refined(
+    series: Series,
+    prior: _Prior,
+    weights: Array,
+    chosen: Sequence[ShapeOfChange],
+    candidates: Sequence[ShapeOfChange],
+) -> list[ShapeOfChange]:
+    """Choose each change again beside the others."""
+    refined = list(chosen)
+    for _ in range(2 if len(chosen) > 1 else 1):
+        for number in range(len(refined)):
+            others = [*refined[:number], *refined[number + 1 :]]
+            best, _ = _likeliest(series, prior, weights, others, candidates)
+            if best is not None and best not in others:
+                refined[number] = best
+    return refined
+
+
+def _own_scale(
+    series: Series,
+    prior: _Prior,
+    variance: Array,
+    candidates: Sequence[ShapeOfChange],
+) -> float:
+    """Return by how much the variance of this robot exceeds that of its type, at least 1."""
+    weights = 1.0 / variance
+    pair, _ = _likeliest_pair(series, prior, weights, candidates, 1.0)
+    freedom = max(1.0, len(series.time) - 1.0 - 2.0 * len(pair))
+    ratio = _misfit(series, prior, weights, pair) / freedom
+    return max(1.0, (_OWN + freedom * ratio) / (_OWN + freedom))
+
+
+def _described(
+    series: Series,
+    prior: _Prior,
+    weights: Array,
+    chosen: tuple[ShapeOfChange, ...],
+    candidates: Sequence[ShapeOfChange],
+    p_value: float,
+    noise: _Noise,
+) -> Course:
+    """Return a model with its changes, and the intervals of what it says of the end."""
+    coefficients, covariance, design = _solved(series, prior, weights, chosen)
+    first = 1 + len(prior.mean)
+    factor = float(student.isf(0.025, noise.freedom))
+    end = np.array([shape.column(series.time[-1:])[0] for shape in chosen])
+    slope = np.array([float(shape.kind == "slope") for shape in chosen])
+    sizes = coefficients[first:]
+    of_changes = covariance[first:, first:]
+
+    def half(weights_of_end: Array) -> float:
+        variance = float(weights_of_end @ of_changes @ weights_of_end)
+        return factor * math.sqrt(max(0.0, variance))
+
+    changes = []
+    for number, shape in enumerate(chosen):
+        others = [*chosen[:number], *chosen[number + 1 :]]
+        earliest, latest = _begin_interval(series, prior, weights, others, shape, candidates)
+        std = float(np.sqrt(of_changes[number, number]))
+        changes.append(Change(shape, float(sizes[number]), std, earliest, latest))
+    changes.sort(key=lambda change: change.shape.begin)
+    explained = series.covariates @ coefficients[1:first]
+    whole_half = half(end) if chosen else _half_of_no_change(series, prior, weights, factor)
+    return Course(
+        adjusted=series.value - explained,
+        std=1.0 / np.sqrt(weights),
+        fitted=design @ coefficients - explained,
+        changes=tuple(changes),
+        p_value=p_value,
+        change=float(end @ sizes),
+        half=whole_half,
+        rate=float(slope @ sizes),
+        rate_half=half(slope),
+        level=float(coefficients[0]),
+        effects=coefficients[1:first],
+        freedom=noise.freedom,
+    )
+
+
+def _half_of_no_change(series: Series, prior: _Prior, weights: Array, factor: float) -> float:
+    """Return half of the interval of the difference between the second and the first half."""
+    middle = ShapeOfChange("step", float(np.median(series.time)) - 1e-9)
+    _, covariance, _ = _solved(series, prior, weights, (middle,))
+    return factor * float(np.sqrt(max(0.0, covariance[-1, -1])))
+
+
+def _begin_interval(
+    series: Series,
+    prior: _Prior,
+    weights: Array,
+    others: Sequence[ShapeOfChange],
+    shape: ShapeOfChange,
+    candidates: Sequence[ShapeOfChange],
+) -> tuple[float, float]:
+    """Return the begins of this kind of change within the 95 % interval by likelihood."""
+    alike = [each for each in candidates if each.kind == shape.kind]
+    misfits = np.array([_misfit(series, prior, weights, [*others, each]) for each in alike])
+    best = _misfit(series, prior, weights, [*others, shape])
+    likely = np.array([each.begin for each in alike])[misfits <= best + _LIKELY]
+    earliest, latest = float(likely.min()), float(likely.max())
+    if shape.kind == "step":  # anywhere between two recordings
+        earliest = float(series.time[series.time < earliest].max())
+        latest = float(series.time[series.time > latest].min())
+    return earliest, latest

@@ -1,0 +1,102 @@
+"""What a trend of a fleet says in words: a sentence for each robot."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from datetime import datetime
+from typing import Final
+
+from hil.base.terminal_text import plural
+from hil.fleet.trend import FleetTrend, LimitReached, QuantityTrend, RobotTrend
+from identification.text import percentage
+
+_NAMES: Final = {
+    "friction": "friction",
+    "coulomb": "Coulomb friction",
+    "viscous": "viscous friction",
+    "gravity load": "gravity load",
+    "torque scale": "torque scale",
+    "reference error": "torque error of the first months' model",
+}
+
+
+def month(date: str) -> str:
+    """Return month and year of a date."""
+    return f"{datetime.fromisoformat(date):%B %Y}"
+
+
+def signed(share: float) -> str:
+    """Return a share as a percentage with its sign."""
+    return f"{'−' if share < 0.0 else '+'}{percentage(abs(share), 1 if abs(share) < 0.1 else 0)}"
+
+
+def name_of(trend: QuantityTrend) -> str:
+    """Return a quantity in words."""
+    return _NAMES[trend.quantity]
+
+
+def verdict(fleet: FleetTrend) -> str:
+    """Return one line about the fleet."""
+    count = len(fleet.changed)
+    robots = plural(len(fleet.robots), "robot")
+    if not count:
+        return f"No significant change in {robots}"
+    return f"Changed: {', '.join(robot.robot for robot in fleet.changed)} ({count} of {robots})"
+
+
+def robot_sentence(robot: RobotTrend, fleet: FleetTrend) -> str:
+    """Return the sentence about a robot: what changed, since when, how fast, and why not."""
+    trend = robot.main
+    if trend is None:
+        recordings = plural(robot.recordings, "recording")
+        return f"{robot.robot}: {recordings}, too few to say whether anything changes"
+    if trend.changed:
+        return f"{robot.robot}, {trend_sentence(trend, fleet)}"
+    if trend.explained:
+        explanation = _explanation(fleet)
+        return f"{robot.robot}, {trend.joint}: {name_of(trend)} varies; {explanation} explains it"
+    return f"{robot.robot}: no significant change"
+
+
+def trend_sentence(trend: QuantityTrend, fleet: FleetTrend) -> str:
+    """Return joint, quantity and change of a trend that is significant."""
+    first = trend.changes[0]
+    parts = [f"{trend.joint}: {name_of(trend)} {signed(trend.change)} since {month(first.begin)}"]
+    last = trend.changes[-1]
+    if trend.rate:
+        parts.append(f"{signed(trend.rate)} a month")
+    elif last.kind == "step":
+        parts.append(f"at once on {last.begin[:10]}")
+    if fleet.covariates:
+        parts.append("not explained by temperature")
+    elif fleet.seasonal:
+        parts.append("not by a season of all robots")
+    parts += [limit_text(limit) for limit in trend.limits if limit.date is not None]
+    return ", ".join(parts)
+
+
+def limit_text(limit: LimitReached) -> str:
+    """Return when a limit is reached."""
+    reached = f"{limit.limit.quantity} {signed(limit.limit.share)}"
+    assert limit.date is not None
+    until = "later" if limit.latest is None else month(limit.latest)
+    since = month(limit.date) if limit.earliest is None else month(limit.earliest)
+    return f"reaches {reached} in {month(limit.date)} ({since} to {until})"
+
+
+def _explanation(fleet: FleetTrend) -> str:
+    if fleet.covariates:
+        return f"{' and '.join(fleet.covariates[:2])}, or a season of all robots,"
+    return "a season of all robots"
+
+
+def notes(fleet: FleetTrend) -> Iterator[str]:
+    """Yield what limits the result."""
+    if not fleet.covariates:
+        yield (
+            "no recording has a temperature: warm-up and season count as noise from day to day"
+            + (", but for what all robots have in common" if fleet.seasonal else "")
+        )
+    if fleet.dated_by_file:
+        recordings = plural(fleet.dated_by_file, "recording")
+        yield f"{recordings} dated by the file alone, which a copy changes; see --robot"

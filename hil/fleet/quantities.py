@@ -1,0 +1,150 @@
+"""What a trend follows of each joint, as functions of the estimate of a recording."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Final, Literal, get_args
+
+import numpy as np
+
+from hil.base.arrays import Array
+from hil.batch.reduction import Summary
+from hil.compare.comparison import SPEEDS, friction_weights, projected
+from identification import RobotModel
+from identification.factor.estimate import Estimate
+from identification.model.motion import Motion
+
+QuantityName = Literal[
+    "friction", "coulomb", "viscous", "gravity load", "torque scale", "reference error"
+]
+QUANTITIES: Final[tuple[QuantityName, ...]] = get_args(QuantityName)
+CAUSES: Final[Mapping[QuantityName, int]] = {"friction": 0, "gravity load": 0, "torque scale": 1}
+"""Quantities that say what changed, in their order: a load also changes the scale of torque. The
+others are parts of friction, and an error."""
+_STATES: Final = 200  # postures of gravity, and states of the scale of torque
+_SPEED: Final = 1.0  # rad/s or m/s, root mean square of these states
+_ACCELERATION: Final = 3.0  # rad/s² or m/s²
+_SHOWN: Final = 40  # recordings that choose the speed of friction
+_LEAST_LOAD: Final = 0.02  # of the largest joint's gravity, below which a joint carries none
+
+
+@dataclass(frozen=True, eq=False)
+class TrackedQuantity:
+    """One quantity of one joint.
+
+    Attributes:
+        joint: its name.
+        number: of the joint, from 0.
+        quantity: what it is.
+        unit: of its values.
+        speed: of friction [rad/s or m/s], None of others.
+        weights: (p,); their product with the parameters is the value; empty for the error of the
+            reference model.
+    """
+
+    joint: str
+    number: int
+    quantity: QuantityName
+    unit: str
+    speed: float | None
+    weights: Array
+
+    def of(self, summaries: Sequence[Summary], first: int) -> tuple[Array, Array]:
+        """Return values and variances (m,) of the recordings of a robot, NaN where unknown.
+
+        The reference model is the mean of the `first` recordings.
+        """
+        if self.quantity == "reference error":
+            return self._reference_errors(summaries, first)
+        pairs = [
+            projected(summary.fit, self.weights[None])
+            for summary in summaries
+            if summary.fit is not None
+        ]
+        values, variances = np.array(pairs)[:, :, 0].T
+        return values, variances
+
+    def _reference_errors(self, summaries: Sequence[Summary], first: int) -> tuple[Array, Array]:
+        """Return the torque errors of one model in all recordings; their noise is that of days."""
+        fits = [summary.fit.values for summary in summaries[:first] if summary.fit is not None]
+        reference = np.mean(fits, axis=0)
+        errors = []
+        for summary in summaries:
+            rows = summary.total.samples[self.number]
+            squares = summary.total.squared_errors(reference)[self.number]
+            errors.append(float(np.sqrt(squares / rows)) if rows > 0 else np.nan)
+        return np.array(errors), np.zeros(len(errors))
+
+
+def tracked_quantities(
+    model: RobotModel, fits: Sequence[Estimate], reference: Array
+) -> Iterator[TrackedQuantity]:
+    """Yield the quantities of each joint; `reference` are parameters (p,) near those of all robots.
+
+    Friction is that at the speed at which the recordings determine it best; Coulomb friction that
+    of a joint that begins to move, viscous friction what it gains up to that speed. Gravity load
+    and torque scale are the projections of gravity torques over postures, and of torques of motions
+    without friction, on those of the reference.
+    """
+    friction = friction_weights(model, SPEEDS)
+    at_rest = friction_weights(model, np.zeros(1))[0]
+    gravity, motion = _rigid_weights(model, reference)
+    loads = np.array([float(np.sqrt(weights @ reference)) for weights in gravity.values()])
+    for j, (joint, turns) in enumerate(zip(model.joint_names, model.chain.revolute, strict=True)):
+        unit, speed_unit = ("N·m", "rad/s") if turns else ("N", "m/s")
+        if friction[:, j].any():
+            best = _best_speed(fits, friction[:, j])
+            speed = float(SPEEDS[best])
+            weights = friction[best, j]
+            yield TrackedQuantity(joint, j, "friction", unit, speed, weights)
+            if at_rest[j].any():
+                yield TrackedQuantity(joint, j, "coulomb", unit, None, at_rest[j])
+            slope = (weights - at_rest[j]) / speed
+            if slope.any():
+                yield TrackedQuantity(joint, j, "viscous", f"{unit} / ({speed_unit})", None, slope)
+        if loads[j] > _LEAST_LOAD * loads.max():
+            weights = gravity[j] / loads[j]
+            yield TrackedQuantity(joint, j, "gravity load", unit, None, weights)
+        size = float(motion[j] @ reference)
+        if size > 0.0:
+            yield TrackedQuantity(joint, j, "torque scale", "1", None, motion[j] / size)
+        yield TrackedQuantity(joint, j, "reference error", unit, None, np.empty(0))
+
+
+def _best_speed(fits: Sequence[Estimate], weights: Array) -> int:
+    """Return the speed at which friction is largest beside its standard deviation."""
+    step = max(1, len(fits) // _SHOWN)
+    ratios = []
+    for fit in fits[::step]:
+        value, variance = projected(fit, weights)
+        with np.errstate(divide="ignore", invalid="ignore"):
+            ratios.append(np.nan_to_num(np.abs(value) / np.sqrt(variance)))
+    return int(np.argmax(np.median(ratios, axis=0)))
+
+
+def _rigid_weights(
+    model: RobotModel, reference: Array
+) -> tuple[dict[int, Array], dict[int, Array]]:
+    """Return by joint weights (p,) whose product with the reference is the mean square torque.
+
+    Of gravity over postures, and of motions, both without friction.
+    """
+    random = np.random.default_rng(0)
+    n = model.n_joints
+    position = random.uniform(-np.pi, np.pi, (_STATES, n))
+    velocity = _SPEED * random.standard_normal((_STATES, n))
+    acceleration = _ACCELERATION * random.standard_normal((_STATES, n))
+    rank = model.base.rank
+    frictional = slice(rank, rank + len(model.friction.terms))
+    weights = []
+    for motion in (
+        Motion.at_rest(position),
+        Motion.of_states(position, velocity, acceleration),
+    ):
+        rows = model.regressor(motion).dense(model.n_parameters)
+        rows[:, :, frictional] = 0.0
+        torque = rows @ reference
+        means = np.einsum("mjp,mj->jp", rows, torque) / _STATES
+        weights.append(dict(enumerate(means)))
+    return weights[0], weights[1]
