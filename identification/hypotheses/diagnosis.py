@@ -16,7 +16,13 @@ from identification.arrays import Array
 from identification.estimators.prior import body_prior, nominal_ratio, posterior_values
 from identification.factor.factor import Factor
 from identification.hypotheses.scores import ROWS_PER_FACT, Comparison, compare, score_of
-from identification.hypotheses.search import SEPARATE, Readings, Step, find_zeros_and_scales
+from identification.hypotheses.search import (
+    EXPLAINED,
+    SEPARATE,
+    Readings,
+    Step,
+    find_zeros_and_scales,
+)
 from identification.model.motion import Motion
 from identification.model.nominal_masses import without_masses
 from identification.model.robot import RobotModel
@@ -25,6 +31,7 @@ from identification.signals.samples import Samples
 _ROWS: Final = 700
 _WEIGHTLESS: Final = 0.7  # error ratio of a torque without gravity that chance does not make
 _SURE: Final = 4.5  # standard errors of it
+_FEWEST_ROWS: Final = 100  # that say something of bodies
 _NO_ARM: Final = 1.0 / 3.0  # of the nominal torque, below which bodies are not those of the arm
 _NO_BODY: Final = 0.5  # torque of bodies over that of friction where there is none of bodies
 
@@ -34,25 +41,28 @@ class RigidTorque:
     """How much of a torque is that of bodies.
 
     Attributes:
-        scale: over that of the description's bodies; NaN where it has no masses.
+        scale: over that of the description's bodies; NaN where it has no masses, or of few rows.
         std: standard deviation of it.
         over_friction: torque of fitted bodies over that of fitted friction, RMS (n,).
+        error: of that fit, as a share of the torque over all joints.
     """
 
     scale: float
     std: float
     over_friction: Array
+    error: float
 
     @property
     def is_nothing(self) -> bool:
-        """Whether it is friction and next to nothing of bodies.
+        """Whether it is friction, which explains it, and next to nothing of bodies.
 
         Torque of the motors, before the gears, is small as well, but has the arm's share of bodies.
         """
         if not np.isfinite(self.scale):
             return False
         return bool(
-            abs(self.scale) + SEPARATE * self.std < _NO_ARM
+            self.error < EXPLAINED
+            and abs(self.scale) + SEPARATE * self.std < _NO_ARM
             and self.over_friction.max(initial=0.0) < _NO_BODY
         )
 
@@ -114,9 +124,12 @@ def rigid_torque(model: RobotModel, samples: Samples) -> RigidTorque:
     rigid, other = np.sqrt(powers)
     over = np.where(rigid > 0.0, rigid / np.where(other > 0.0, other, np.inf), 0.0)
     over = np.where((other == 0.0) & (rigid > 0.0), np.inf, over)
-    if without_masses(model):
-        return RigidTorque(np.nan, np.inf, over)
-    return RigidTorque(*nominal_ratio(model, factor), over)
+    power = max(float(factor.gram[:, -1, -1].sum()), np.finfo(np.float64).tiny)
+    error = float(np.sqrt(factor.squared_errors(values).sum() / power))
+    is_little = samples.usable.any(axis=1).sum() < _FEWEST_ROWS or not powers[1].any()
+    if without_masses(model) or is_little:
+        return RigidTorque(np.nan, np.inf, over, error)
+    return RigidTorque(*nominal_ratio(model, factor), over, error)
 
 
 def _few_rows(recordings: Sequence[Samples]) -> Samples:

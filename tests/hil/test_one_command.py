@@ -35,7 +35,7 @@ from hil.pipeline.sources import cell_of
 from identification.validation.position_jumps import position_jumps
 from tests.hil.simulated_logs import urdf_path, write_moving_log
 from tests.hil.simulated_logs import write_log as log
-from tests.hil.test_bag_kinds import WHOLE
+from tests.hil.test_bag_kinds import WHOLE, message
 from tests.hil.test_importers_rosbag2 import DEFINITION, STATE, bag, mcap, state
 from tests.hil.test_log_kinds import JOINTS, POSITION, SLOPE, TIME, TORQUE, URDF
 
@@ -437,7 +437,9 @@ class TestOutputFolder:
     def test_no_archive_replaces_the_recording(self, tmp_path: Path, urdf: Path) -> None:
         """A foreign MCAP file in the folder that was named for the results."""
         source = tmp_path / "x.mcap"
-        mcap(source, {"/joint_states": (STATE, DEFINITION, "cdr", WHOLE)})
+        effort = TORQUE - 20.0 * np.sin(POSITION)  # of bodies as well
+        messages = [message(k, effort=effort) for k in range(len(WHOLE))]
+        mcap(source, {"/joint_states": (STATE, DEFINITION, "cdr", messages)})
         content = source.read_bytes()
         result = hil("identify", source, "--urdf", urdf, "--output", tmp_path)
         assert "is the recording itself" in str(result.exception)

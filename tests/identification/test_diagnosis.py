@@ -43,6 +43,12 @@ def test_what_a_subtracted_model_leaves_is_not_of_bodies() -> None:
     assert found.readings is None
 
 
+def test_torque_of_something_else_is_not_called_friction() -> None:
+    q, _, _ = motion()
+    noise = np.random.default_rng(2).normal(0.0, 1.0, q.shape)
+    assert not diagnosed(q, noise).rigid.is_nothing
+
+
 @pytest.mark.parametrize("ratio", [50.0, 160.0])
 def test_torque_of_the_motor_side_is_of_bodies(ratio: float) -> None:
     """It is as small, but as much of it is of friction as on the joint side."""
