@@ -14,6 +14,8 @@ from rosbags.interfaces import Nodetype
 from rosbags.typesys import Stores, get_types_from_idl, get_types_from_msg, get_typestore
 from rosbags.typesys.store import Typestore
 
+from hil.importers.xcdr2 import in_version_1, is_version_2
+
 JOINT_STATE: Final = "sensor_msgs/msg/JointState"
 CONTROLLER_STATE: Final = "control_msgs/msg/JointTrajectoryControllerState"
 _HEAD: Final = "std_msgs/Header header\nstring[] joint_names\n"
@@ -103,8 +105,10 @@ def decoded(store: Typestore, kind: str, data: bytes) -> Any:
     Raises:
         MessageError: it cannot be decoded.
     """
+    name = kind if "/msg/" in kind else _with_msg(kind)
     try:
-        return store.deserialize_cdr(data, kind if "/msg/" in kind else _with_msg(kind))
+        plain = in_version_1(data, name, store) if is_version_2(data) else data
+        return store.deserialize_cdr(plain, name)
     except Exception as error:  # rosbags does not document what it raises
         raise MessageError(f"cannot be decoded ({error or type(error).__name__})") from error
 
