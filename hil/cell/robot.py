@@ -11,6 +11,7 @@ from typing import Final
 import numpy as np
 
 from hil.base.arrays import Array
+from hil.cell.urdf_units import unit_problem
 from identification.errors import ModelError
 from identification.model.coupling import Coupling
 from identification.model.elements import (
@@ -54,6 +55,9 @@ def robot_model(
         if robot.locked:  # joints of any type
             _require(path, "robot.locked", robot.locked, tuple(pinocchio_model(urdf).names)[1:])
         chain = chain_from_urdf(urdf, robot.locked)
+    if (units := unit_problem(urdf)) is not None:
+        problem = f"{units.field}: {units.problem}"
+        raise CellError(path, "cell.urdf", urdf_name, problem, units.remedy)
     _require(path, "robot.friction.joints", friction.joints, chain.joint_names)
     coupling = _coupling(path, robot.coupling, chain, drive_train)
     payload = _payload(path, robot.payload, chain)

@@ -89,7 +89,7 @@ def whole(result: Look) -> list[str]:
     if result.groups:
         lines += ["", "the recording determines (parameters):", *groups_table(result.groups)]
     for choices in result.questions:
-        lines += ["", *question(choices)]
+        lines += ["", *(f"{part.label}{part.text}" for part in question(choices))]
     return [*lines, *_options(result)]
 
 
@@ -103,7 +103,7 @@ def screen(result: Look) -> list[str]:
         for row in result.rows
         if row.certainty is Certainty.UNDETERMINED and row.decider is not None
     ]
-    questions = [line for choices in result.questions for line in question(choices)]
+    questions = [part for choices in result.questions for part in question(choices)]
     parts += ["", *questions, *_options(result), "reasons, and all rows: -v"]
     room = LINES - len([part for part in parts if part])
     if not questions:
@@ -111,17 +111,18 @@ def screen(result: Look) -> list[str]:
     return one_screen(parts)
 
 
-def question(choices: Sequence[Choice]) -> list[str]:
-    """Return a question about readings that fit alike, and a line for each of them."""
-    lines = [f"{choices[0].aspect}: {fit_alike(choices)}; choose one line for the map:"]
+def question(choices: Sequence[Choice]) -> list[Paragraph]:
+    """Return a question about readings that fit alike, and the setting for each of them."""
+    asked = f"{choices[0].aspect}: {fit_alike(choices)}; choose one line for the map:"
+    parts = [Paragraph(asked)]
     for number, choice in enumerate(choices, 1):
         error = "" if choice.error is None else f" (error {percentage(choice.error, 2)})"
         reading = choice_text(choice)
         setting = setting_text(choice.setting)
-        lines.append(f"  {number}  {setting or reading}{error}")
+        parts.append(Paragraph(f"{setting or reading}{error}", f"  {number}  "))
         if setting:
-            lines.append(f"     {reading}")
-    return lines
+            parts.append(Paragraph(reading, "     "))
+    return parts
 
 
 def _options(result: Look) -> list[str]:
@@ -176,7 +177,7 @@ _AS_DESCRIBED: Final = frozenset(
 
 def summary(rows: Sequence[Row]) -> list[str]:
     """Return a line for each row, and one for those that are as the URDF says."""
-    usual = [row for row in rows if row.reading in _AS_DESCRIBED]
+    usual = [row for row in rows if isinstance(row.reading, Fact) and row.reading in _AS_DESCRIBED]
     width = max(len("channel"), *(len(row.aspect) for row in rows))
     lines = [f"{'channel':{width}}  {'meaning':{_MEANING}}  {'certainty':{_CERTAINTY}}  evidence"]
     for row in rows:

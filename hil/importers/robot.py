@@ -24,6 +24,7 @@ from hil.cell.arms import Links, joints_outside
 from hil.cell.gripper import gripper_joints
 from hil.cell.nominal import nominal_of
 from hil.cell.text import urdf_limits, with_values
+from hil.cell.urdf_units import unit_problem
 from hil.importers.conclusions import Conclusion, Examined, Excerpt, RecordedClock
 from hil.importers.dh import Convention, urdf_of_dh
 from hil.importers.excerpt import excerpt_of
@@ -95,6 +96,8 @@ class Robot:
             pinocchio_model(urdf)
         except ModelError as error:  # an error of this file, not of a cell file
             raise SourceError(path, str(error), remedy=otherwise) from error
+        if (units := unit_problem(urdf)) is not None:
+            raise SourceError(path, units.problem, field=units.field, remedy=units.remedy)
         held = _held(urdf, locked or {}, recorded, path, links)
         text = _cell_text(path.stem, friction or IMPORTED_LAW, gravity, held)
         return cls._checked(text, urdf, path, links)

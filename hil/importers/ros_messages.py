@@ -107,8 +107,8 @@ def decoded(store: Typestore, kind: str, data: bytes) -> Any:
     """
     name = kind if "/msg/" in kind else _with_msg(kind)
     try:
-        plain = in_version_1(data, name, store) if is_version_2(data) else data
-        return store.deserialize_cdr(plain, name)
+        version_1 = in_version_1(data, name, store) if is_version_2(data) else data
+        return store.deserialize_cdr(version_1, name)
     except Exception as error:  # rosbags does not document what it raises
         raise MessageError(f"cannot be decoded ({error or type(error).__name__})") from error
 

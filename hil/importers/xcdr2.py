@@ -12,7 +12,7 @@ from typing import Any, Final
 from rosbags.interfaces import Nodetype
 from rosbags.typesys.store import Typestore
 
-_PLAIN: Final = (b"\x00\x06", b"\x00\x07")
+_SIMPLE: Final = (b"\x00\x06", b"\x00\x07")
 _DELIMITED: Final = (b"\x00\x08", b"\x00\x09")
 """Also with the size of each structure before it: their types may get further fields."""
 _SIZES: Final = {
@@ -27,7 +27,7 @@ _HEAD: Final = 4  # bytes of the encapsulation
 
 def is_version_2(data: bytes) -> bool:
     """Return whether a message is in a form of version 2 that can be rewritten."""
-    return data[:2] in (*_PLAIN, *_DELIMITED)
+    return data[:2] in (*_SIMPLE, *_DELIMITED)
 
 
 def in_version_1(data: bytes, kind: str, store: Typestore) -> bytes:
@@ -98,7 +98,7 @@ class _Rewritten:
         if name == "string":
             length = self._read_length()
             self._write_length(length)
-            self._written += self._taken(length)
+            self._written += self._next(length)
         else:
             self._copy(_SIZES[name], 1)
 
@@ -106,11 +106,11 @@ class _Rewritten:
         """Copy numbers of this size."""
         self._align(size)
         self._written += bytes(-len(self._written) % size)
-        self._written += self._taken(size * count)
+        self._written += self._next(size * count)
 
     def _read_length(self) -> int:
         self._align(self._length.size)
-        return int(self._length.unpack(self._taken(self._length.size))[0])
+        return int(self._length.unpack(self._next(self._length.size))[0])
 
     def _write_length(self, length: int) -> None:
         self._written += bytes(-len(self._written) % self._length.size)
@@ -119,10 +119,10 @@ class _Rewritten:
     def _align(self, size: int) -> None:
         self._at += -self._at % min(size, _MOST_ALIGNED)
 
-    def _taken(self, count: int) -> bytes:
+    def _next(self, count: int) -> bytes:
         end = self._at + count
         if end > len(self._source):
             raise IndexError(f"it ends after {len(self._source)} bytes")
-        taken = self._source[self._at : end]
+        part = self._source[self._at : end]
         self._at = end
-        return taken
+        return part

@@ -110,6 +110,7 @@ _FACTS: Final[Mapping[Fact, str]] = {
     Fact.JOINT_TORQUE: "joint side, a torque",
     Fact.LARGE_TORQUE: "larger than the arm needs",
     Fact.MOTOR_SIDE: "motor side (before the gears), or a current",
+    Fact.SMALL_TORQUE: "smaller than the arm needs, by more than any gear",
     Fact.PAYLOAD_UNDETERMINED: "none stated; not determined",
     Fact.PAYLOAD_IN_LAST_BODY: "none stated; part of the last body",
     Fact.NO_TORQUE: "none, and no motor current",
@@ -654,17 +655,25 @@ def _(option: GravityOption) -> str:
 
 @_worded.register
 def _(torque: MotorTorque) -> str:
-    each = ", ".join([f"{torque.ratio:.0f}"] * torque.count)
-    return f'[torque] side = "motor"; [drive] gear_ratio = [{each}] (about; the maker\'s)'
+    return (
+        f'[torque] side = "motor"; [drive] gear_ratio = {_about(torque)}; the maker\'s are right)'
+    )
 
 
 @_worded.register
 def _(currents: MotorCurrents) -> str:
-    each = ", ".join([f"{currents.ratio:.0f}"] * currents.count)
     return (
-        f"[motor_current] in place of [torque]; [drive] torque_constant = [{each}] "
-        "(about, N·m/A with gears)"
+        "[motor_current] in place of [torque]; [drive] torque_constant = "
+        f"{_about(currents)}, N·m/A with gears)"
     )
+
+
+def _about(motors: MotorTorque | MotorCurrents) -> str:
+    """Return the ratios of each joint, and of which they are not seen, in an open bracket."""
+    each = ", ".join(f"{ratio:.3g}" for ratio in motors.ratios)
+    if not motors.unseen or len(motors.unseen) == len(motors.ratios):
+        return f"[{each}] (about"
+    return f"[{each}] (about; of {', '.join(motors.unseen)} that of the others"
 
 
 # --- what an identification says of a log that it has looked at

@@ -101,6 +101,8 @@ _MOST_CHOICES: Final = 3
 _ALIKE: Final = 1.02  # error ratio of readings of which the recording does not choose one
 _OTHER_UNIT: Final = 3.0  # factor beyond which the masses of a URDF do not explain a torque
 _THOUSAND: Final = 1000.0
+_MOST_GEARED: Final = 1000.0  # motor turns per joint turn; built are 1 to some 300
+_ALIKE_GEARS: Final = 10.0  # factor between the ratios of a joint and of the arm
 _WEAK: Final = 0.9  # posterior over prior deviation of a parameter that the recording hardly moves
 # Masses of arms over the cube of their reach, kg/m³: 11 (Gen3) to 216 (TX40).
 _DENSITY: Final = 45.0
@@ -115,10 +117,12 @@ class Size:
     Attributes:
         factor: of the whole arm; None where neither masses nor weight say.
         by_masses: whether it is by the URDF's masses, else by those of arms of its reach.
+        of_joints: the factor of each joint, with sign; None where the motion does not show it.
     """
 
     factor: float | None
     by_masses: bool
+    of_joints: tuple[float | None, ...] = ()
 
     @classmethod
     def of(cls, cell: Cell, model: RobotModel, samples: Samples) -> Size:
@@ -132,9 +136,17 @@ class Size:
         scale = nominal_scale(model, nominal.values, [samples]).scale
         if not np.isfinite(scale).any():
             return cls(_by_reach(model, samples), by_masses=True)
-        scales = np.abs(scale[np.isfinite(scale)])
-        positive = scales[scales > 0.0]
-        return cls(float(np.median(positive)) if len(positive) else None, by_masses=True)
+        known = np.isfinite(scale) & (scale != 0.0)
+        if not known.any():
+            return cls(None, by_masses=True)
+        factor = float(np.median(np.abs(scale[known])))
+        known &= np.abs(np.log(np.abs(scale, where=known, out=np.ones(len(scale))) / factor)) < (
+            np.log(_ALIKE_GEARS)
+        )
+        of_joints = tuple(
+            float(each) if is_known else None for each, is_known in zip(scale, known, strict=True)
+        )
+        return cls(factor, by_masses=True, of_joints=of_joints)
 
     @property
     def is_off(self) -> bool:
@@ -143,6 +155,11 @@ class Size:
             return False
         limit = _OTHER_UNIT if self.by_masses else _DENSITY_SPREAD**3
         return not 1.0 / limit < self.factor < limit
+
+    @property
+    def may_be_geared(self) -> bool:
+        """Whether gears between motors and joints may be what makes it too small."""
+        return self.is_off and 1.0 / _MOST_GEARED < (self.factor or 1.0) < 1.0
 
     @property
     def is_thousand(self) -> bool:
@@ -375,6 +392,9 @@ class Finding:
         if factor > 1.0:
             reading = Fact.LARGE_TORQUE
             return Row("side", reading, Certainty.UNDETERMINED, evidence, Decide.CHECK_UNIT)
+        if not self.size.may_be_geared:
+            reading = Fact.SMALL_TORQUE
+            return Row("side", reading, Certainty.UNDETERMINED, evidence, Decide.CHECK_UNIT)
         reading = Fact.MOTOR_SIDE
         return Row("side", reading, Certainty.UNDETERMINED, evidence, Decide.ASK_FOR_UNIT)
 
@@ -409,7 +429,7 @@ class Finding:
         size = self.size
         if self.rigid.is_nothing:
             return tuple(choices)
-        if size.is_off and not size.is_thousand and (size.factor or 1.0) < 1.0:
+        if size.may_be_geared and not size.is_thousand:
             choices.append(self._sides())
         return tuple(choices)
 
@@ -426,9 +446,12 @@ class Finding:
         return Choice(_ASPECTS[change.meaning], self._of_arm(change), error, setting)
 
     def _sides(self) -> tuple[Choice, ...]:
-        ratio = 1.0 / (self.size.factor or 1.0)
-        count = self.cell.model.n_joints
-        settings = (MotorTorque(ratio, count), MotorCurrents(ratio, count))
+        factor = self.size.factor or 1.0
+        joints = self.cell.joint_names
+        factors = self.size.of_joints or (None,) * len(joints)
+        ratios = tuple(1.0 / (each or factor) for each in factors)
+        unseen = tuple(name for name, each in zip(joints, factors, strict=True) if each is None)
+        settings = (MotorTorque(ratios, unseen), MotorCurrents(ratios, unseen))
         return tuple(Choice("side", None, None, setting) for setting in settings)
 
     def _entries_of(self, axes: Axes, text: str) -> dict[str, Any]:

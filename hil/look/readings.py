@@ -52,6 +52,7 @@ class Fact(Enum):
     JOINT_TORQUE = auto()
     LARGE_TORQUE = auto()
     MOTOR_SIDE = auto()
+    SMALL_TORQUE = auto()
     PAYLOAD_UNDETERMINED = auto()
     PAYLOAD_IN_LAST_BODY = auto()
     NO_TORQUE = auto()
@@ -551,18 +552,24 @@ class GravityOption:
 
 @dataclass(frozen=True)
 class MotorTorque:
-    """Torques of motors, behind gears of about this ratio for each of `count` joints."""
+    """Torques of motors, behind gears of about this ratio for each joint.
 
-    ratio: float
-    count: int
+    Of the joints `unseen` it is that of the others.
+    """
+
+    ratios: tuple[float, ...]
+    unseen: tuple[str, ...]
 
 
 @dataclass(frozen=True)
 class MotorCurrents:
-    """Currents of motors, of about this torque constant [N·m/A, with gears] for each joint."""
+    """Currents of motors, of about this torque constant [N·m/A, with gears] for each joint.
 
-    ratio: float
-    count: int
+    Of the joints `unseen` it is that of the others.
+    """
+
+    ratios: tuple[float, ...]
+    unseen: tuple[str, ...]
 
 
 Decider = Step | MapKey | MapEntries | GravityOption | OutsideLimits

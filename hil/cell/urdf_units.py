@@ -1,0 +1,65 @@
+"""Robot descriptions in other units than those of SI, refused before anything is concluded."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Final, NamedTuple
+
+from identification.errors import ModelError
+from identification.model.description_units import Quantity, WrongUnit, wrong_units
+
+_PLURAL: Final[Mapping[Quantity, str]] = {
+    "mass": "masses",
+    "length": "lengths of joints (origin of <joint>)",
+    "centre of mass": "centres of mass (origin of <inertial>)",
+    "inertia": "inertias",
+}
+_SI: Final[Mapping[Quantity, str]] = {
+    "mass": "kg",
+    "length": "m",
+    "centre of mass": "m",
+    "inertia": "kg·m²",
+}
+_FIELDS: Final[Mapping[Quantity, str]] = {
+    "mass": "inertial/mass",
+    "length": "origin",
+    "centre of mass": "inertial/origin",
+    "inertia": "inertial/inertia",
+}
+
+
+class UnitProblem(NamedTuple):
+    """What is wrong with the units of a description, where, and what to do."""
+
+    problem: str
+    field: str
+    remedy: str
+
+
+def unit_problem(urdf: str) -> UnitProblem | None:
+    """Return which quantities of a URDF are in other units than those of SI; None if none is."""
+    try:
+        wrong = wrong_units(urdf)
+    except ModelError:
+        return None  # the model says what is wrong
+    if not wrong:
+        return None
+    found = _joined([f"{_PLURAL[each.quantity]} in {each.unit}" for each in wrong])
+    places = "; ".join(f"{_place(each)} is {each.value:.6g} {_SI[each.quantity]}" for each in wrong)
+    steps = _joined(
+        [
+            f"{_PLURAL[each.quantity]} in {_SI[each.quantity]} (multiply by {each.factor:g})"
+            for each in wrong
+        ]
+    )
+    problem = f"has {found}: read in SI units no arm is like this ({places})"
+    return UnitProblem(problem, _place(wrong[0]), f"write {steps}")
+
+
+def _place(wrong: WrongUnit) -> str:
+    kind, name = wrong.element
+    return f"{kind} {name}: {_FIELDS[wrong.quantity]}"
+
+
+def _joined(parts: Sequence[str]) -> str:
+    return " and ".join([", ".join(parts[:-1]), parts[-1]] if len(parts) > 1 else parts)
