@@ -25,7 +25,7 @@ from hil.importers.json_samples import SUFFIXES as JSON
 from hil.importers.json_samples import read_json
 from hil.importers.matlab import NUMBERS, lost_bytes, mat_array, mat_shapes, script_matrices
 from hil.importers.ros_messages import MessageError, columns_of, decoded, typestore_of
-from hil.importers.units import without_unit
+from hil.importers.stated_units import without_unit
 
 MOST_NUMBERS: Final = 2**28
 """Elements of one array: 2 GiB of doubles, hours of an arm at 5 kHz."""

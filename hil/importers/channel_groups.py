@@ -11,7 +11,8 @@ from typing import Final
 from hil.importers.channels import Channel, kind_of
 from hil.importers.conclusions import NameBasis
 from hil.importers.name_words import kind_by_words
-from hil.importers.units import Kind, without_unit
+from hil.importers.stated_units import without_unit
+from hil.importers.units import Kind
 
 NUMBER: Final = re.compile(r"\d{1,2}(?=\D*$)")
 """The number of a joint in a name."""

@@ -25,8 +25,9 @@ from hil.importers.log_files import LogFiles, files_in, is_folder_of_logs
 from hil.importers.name_words import is_other, kind_by_words
 from hil.importers.rosbag2 import joint_state_topics
 from hil.importers.stamps import concluded_unit
+from hil.importers.stated_units import without_unit
 from hil.importers.text_table import Table
-from hil.importers.units import TIMES, Kind, unit_of, without_unit
+from hil.importers.units import TIMES, Kind, unit_of
 
 _NUMBER: Final = r"[\[(_. ]*(?P<number>\d{1,2})[\])]*"
 CHANNEL_NAMES: Final[Mapping[Kind, tuple[str, ...]]] = {

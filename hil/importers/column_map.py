@@ -18,7 +18,7 @@ from hil.base.safe_input import parse_toml, path_exists, read_text, remedy_for_m
 from hil.cell.arms import Links
 from hil.cell.errors import first_error
 from hil.cell.field_error import FieldError
-from hil.importers.units import PER_CENT, UNITS, names_of_units
+from hil.importers.units import RATED, UNITS, names_of_units, unit_of
 
 KINEMATIC: Final = ("position", "velocity", "commanded_position")
 """Quantities of the motion."""
@@ -65,7 +65,10 @@ class Quantity(_Table):
             column or array of each; None if each has only one.
         joints_along: of a whole matrix; None: time is along the longer side.
         unit: a unit of the quantity; None for the one that the file states, or else the SI one.
-        rated: value of each joint that is 100 %, in SI units, where the unit is per cent.
+        rated: value of each joint that is 100 %, in SI units, where the unit is per cent or per
+            mille.
+        sign_bit: of numbers that are a magnitude, the bit with their sign, as of servos: 10 where
+            those from 1024 on are negative.
         offset: added to the recorded numbers, one for all joints or one each.
         scale: factor after that, one for all joints or one each.
         side: ``motor`` if it was measured before the gears.
@@ -86,6 +89,9 @@ class Quantity(_Table):
     joints_along: Literal["columns", "rows"] | None = None
     unit: str | None = None
     rated: FiniteFloat | Vector | None = Field(default=None, description=_ONE_OR_EACH)
+    sign_bit: Annotated[int, Field(ge=1, le=62)] | None = Field(
+        default=None, description="the number of a bit, from 0"
+    )
     offset: FiniteFloat | Vector = Field(default=0.0, description=_ONE_OR_EACH)
     scale: FiniteFloat | Vector = Field(default=1.0, description=_ONE_OR_EACH)
     side: Literal["joint", "motor"] = "joint"
@@ -199,12 +205,15 @@ class ColumnMap(_Table):
         if (self.time is None) == (self.sample_rate is None):
             raise ValueError("give either a time column or sample_rate")
         for name, quantity in self.quantities().items():
-            if quantity.unit not in (None, *UNITS[name]):
-                units = names_of_units(name)
+            unit = None if quantity.unit is None else unit_of(quantity.unit, name)
+            if quantity.unit is not None and unit is None:
                 problem = f"{quantity.unit!r} is not a unit of {name}"
-                raise FieldError(problem, f"use {units}")
-            if quantity.unit == PER_CENT and quantity.rated is None:
-                raise ValueError(f"{name} is in per cent: give {name}.rated, the value of 100 %")
+                remedy = f"use {names_of_units(name)}, or a product such as kgf.cm or deg/min"
+                raise FieldError(problem, remedy)
+            if unit in RATED and quantity.rated is None:
+                whole = "100 %" if unit == RATED[0] else "1000 ‰"
+                problem = f"{name} is in parts of a rated value"
+                raise FieldError(problem, f"give {name}.rated, the value of {whole} in SI units")
             if quantity.side == "motor" and name != "motor_current" and not self.drive.geared:
                 raise ValueError(f"{name} is of the motor side, so drive.gear_ratio is needed")
             if quantity.files is not None and (quantity.file or quantity.joints_along):

@@ -180,6 +180,29 @@ class ConcludedUnit(Conclusion):
         return f"{self.kind}.unit"
 
 
+@dataclass(frozen=True)
+class EncoderTicks(ConcludedUnit):
+    """Positions that are ticks of an encoder, as servos write them.
+
+    Attributes:
+        ticks: of one turn, or of what the servo turns.
+        middle: the tick that is read as zero.
+    """
+
+    ticks: int
+    middle: int
+
+    @property
+    def certainty(self) -> Certainty:
+        """Within limits as ticks; the zero of the URDF may be at another one."""
+        return Certainty.LIKELY
+
+    @property
+    def decided_by(self) -> str:
+        """The key of a column map that states the zero."""
+        return f"{self.kind}.offset"
+
+
 class Omitted(Enum):
     """What an import leaves out."""
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import os
-from collections.abc import Callable, Collection, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from decimal import Decimal
 from os import PathLike
 from pathlib import Path
@@ -27,6 +27,7 @@ from hil.importers.conclusions import (
     ConcludedUnit,
     Conclusion,
     CopiedCommands,
+    EncoderTicks,
     JointOrder,
     LeftOut,
     MappedUnit,
@@ -42,6 +43,12 @@ from hil.importers.publishers import second_publisher
 from hil.importers.resampling import Timed, are_interleaved, on_one_base
 from hil.importers.robot import NOT_RECORDED, RecordingContent, Robot, Use
 from hil.importers.row_names import row_names
+from hil.importers.servo_numbers import (
+    are_per_mille,
+    encoder_of,
+    sign_bit_of,
+    signed,
+)
 from hil.importers.stamps import (
     YEAR,
     concluded_unit,
@@ -50,8 +57,9 @@ from hil.importers.stamps import (
     without_restarts,
     without_wraps,
 )
+from hil.importers.stated_units import other_unit
 from hil.importers.text_table import Table
-from hil.importers.units import PER_CENT, TIMES, UNITS, kind_named, unit_of
+from hil.importers.units import RATED, TIMES, UNITS, factor_of, kind_named, unit_of
 
 _MORE: Final = 64  # columns or files beyond the joints that are tried
 _LATEST: Final = 2**31 * 10**9  # ns, largest stamp of an archive
@@ -206,8 +214,29 @@ class _Log:
         for key, value in scales.items():
             if isinstance(value, tuple):
                 self._check_count(value, f"{name}.{key}")
-        factor = self._factor(name, quantity, [unit_of(unit or "", name) for unit in units])
+        factor = self._factor(name, quantity, units)
+        if quantity.sign_bit is not None:
+            values = signed(values, quantity.sign_bit)
+        elif quantity.unit is None and name in ("torque", "motor_current"):
+            self._refuse_encoded(name, quantity, values)
         return np.asarray((values + quantity.offset) * np.multiply(factor, quantity.scale))
+
+    def _refuse_encoded(self, name: str, quantity: Quantity, values: Array) -> None:
+        """Refuse torques or currents (m, k) in numbers of servos or drives, of no stated unit."""
+        columns = quantity.columns
+        names = [columns] if isinstance(columns, str) else [*map(str, columns or ())]
+        bit = sign_bit_of(values)
+        if bit is None and not are_per_mille(names, values):
+            return
+        problem = "is in whole numbers named as those of the object 6077h: per mille of a rated one"
+        if bit is not None:
+            problem = f"is a magnitude with the sign in bit {bit}, as servos write their load"
+        entries = [] if columns is None else [f"columns = {json.dumps(columns)}"]
+        entries += [] if bit is None else [f"sign_bit = {bit}"]
+        unit = next(iter(UNITS[name]))
+        entries += [f'unit = "{RATED[1]}"', f"rated = [...], the {unit} of each joint at 1000"]
+        remedy = f"state it in a map (--map): [{name}] {', '.join(entries)}"
+        raise SourceError(self.path, problem, field=name, remedy=remedy)
 
     def _require_any(self, name: str, values: Array) -> None:
         """Refuse a quantity (m, k) that some joints have and others have in no row."""
@@ -222,8 +251,14 @@ class _Log:
         raise SourceError(self.path, problem, field=name, remedy=remedy)
 
     def _factor(self, name: str, quantity: Quantity, stated: Sequence[str | None]) -> float | Array:
-        """Return the factors to SI units: of the map's unit, or of those that the file states."""
+        """Return the factors to SI units: of the map's unit, or of those that the file states.
+
+        Raises:
+            SourceError: the file states another unit, or parts of a rated value are of none.
+        """
         mapped = None if quantity.unit is None else unit_of(quantity.unit, name)
+        if mapped is None:
+            stated = [self._known_unit(name, quantity, unit) for unit in stated]
         others = [unit for unit in stated if unit not in (None, mapped)]
         if mapped is None and len(others) < len(stated):
             self._unstated.add(name)
@@ -234,13 +269,28 @@ class _Log:
         elif mapped is None:
             self.concluded.append(StatedUnit(kind_named(name), str(others[0])))
         units = [mapped or unit or next(iter(UNITS[name])) for unit in stated]
-        if PER_CENT in units and quantity.rated is None:
-            problem = "is in per cent of a rated value that the map does not state"
-            remedy = f"add to [{name}]: rated = [...], the value of each joint that is 100 %"
+        if quantity.rated is None and (parts := next((u for u in units if u in RATED), None)):
+            parts_of = "per cent" if parts == RATED[0] else "per mille"
+            problem = f"is in {parts_of} of a rated value that the map does not state"
+            remedy = (
+                f"add to [{name}]: rated = [...], the value of each joint that is "
+                f"{100 if parts == RATED[0] else 1000} {parts} (--map)"
+            )
             raise SourceError(self.path, problem, field=name, remedy=remedy)
-        factors = np.array([UNITS[name][unit] for unit in units])
+        factors = np.array([factor_of(unit, name) for unit in units])
         rated = 1.0 if quantity.rated is None else np.asarray(quantity.rated)
-        return np.where(np.array(units) == PER_CENT, factors * rated, factors)
+        return np.where(np.isin(units, RATED), factors * rated, factors)
+
+    def _known_unit(self, name: str, quantity: Quantity, unit: str | None) -> str | None:
+        """Return a unit that the file states, of a quantity; None if it states none."""
+        if unit is None:
+            return None
+        known = unit_of(unit, name)
+        if known is None:
+            columns = quantity.columns
+            names = columns if isinstance(columns, str) else ", ".join(map(str, columns or ()))
+            raise other_unit(self.path, kind_named(name), names or name, unit)
+        return known
 
     def clock(self, count: int) -> _Clock:
         """Return the stamps of a log with this number of rows."""
@@ -351,9 +401,12 @@ class _Log:
 
     def _unit_of_time(self, file: Table | ArrayFile, time: TimeColumn) -> str:
         """Return the unit of a time column where the map states none."""
-        stated = unit_of(file.unit(time.column) or "", "time")
+        written = file.unit(time.column) or ""
+        stated = unit_of(written, "time")
         if stated is not None:
             return stated
+        if unit_of(written) is not None:
+            raise other_unit(file.path, "time", str(time.column), written)
         times = _unbroken(file, time, TIMES["s"])
         if is_row_counter(times):
             problem = f"column {time.column} counts the rows from {int((times[0] or 0) / 1e9)}"
@@ -455,26 +508,28 @@ class _Log:
     def in_concluded_units(
         self, stamp: NDArray[np.int64], values: dict[str, Array], robot: Robot
     ) -> dict[str, Array]:
-        """Return quantities of the joint side, in degrees where no unit is stated and those fit.
+        """Return quantities of the joint side, in degrees or ticks where no unit is stated.
 
-        Positions are taken as degrees if as radians they leave the limits of the URDF by far and as
-        degrees none does; velocities, if they are 57.3 times the slope of the positions.
+        Positions are taken as degrees, or as ticks of an encoder, if as radians they leave the
+        limits of the URDF by far and in this unit none does; velocities, if they are 57.3 times the
+        slope of the positions.
         """
         joint = _joint_side(values, self._map, self)
         names = robot.joint_names
         degree = UNITS["position"]["deg"]
-        if "position" in self._unstated:
-            degrees = {
-                name: array * degree
+        for unit, offset, factor in self._other_units(values["position"]):
+            others = {
+                name: (array - offset) * factor
                 if name in ("position", "commanded_position") and name in self._unstated
                 else array
                 for name, array in values.items()
             }
-            converted = _joint_side(degrees, self._map, self)
+            converted = _joint_side(others, self._map, self)
             if are_degrees(joint["position"], converted["position"], names, robot.urdf):
                 joint = converted
-                values = degrees
-                self.concluded.append(ConcludedUnit("position", "deg"))
+                values = others
+                self.concluded.append(unit)
+                break
         if "velocity" in self._unstated and len(stamp) > 1:
             time = (stamp - stamp[0]) * 1e-9
             if has_degrees_per_second(time, joint["position"], joint["velocity"]):
@@ -482,6 +537,18 @@ class _Log:
                 joint = _joint_side(degrees, self._map, self)
                 self.concluded.append(ConcludedUnit("velocity", "deg/s"))
         return joint
+
+    def _other_units(self, position: Array) -> Iterator[tuple[ConcludedUnit, float, float]]:
+        """Yield units of positions (m, k) where none is stated: zero, and factor to rad."""
+        if "position" not in self._unstated:
+            return
+        yield ConcludedUnit("position", "deg"), 0.0, UNITS["position"]["deg"]
+        quantity = self._map.position
+        is_raw = not np.any(quantity.offset) and np.all(np.asarray(quantity.scale) == 1.0)
+        encoder = encoder_of(position) if is_raw else None
+        if encoder is not None:
+            ticks = EncoderTicks("position", "ticks", encoder.ticks, encoder.middle)
+            yield ticks, encoder.middle, encoder.turn / encoder.ticks
 
     def copied_commands(self) -> CopiedCommands | None:
         """Return which commands of the log its positions copy bit for bit, None if they do not."""

@@ -18,6 +18,7 @@ from hil.importers.conclusions import (
     CopiedCommands,
     CounterContinued,
     DifferentCommands,
+    EncoderTicks,
     EpisodeUnits,
     Examined,
     Excerpt,
@@ -200,6 +201,11 @@ def source_of(unit: StatedUnit | ConcludedUnit) -> str:
     if isinstance(unit, StatedUnit):
         return f"in {unit.unit}, as the file states"
     none = "no unit is stated; read as"
+    if isinstance(unit, EncoderTicks):
+        return (
+            f"{none} ticks of an encoder of {unit.ticks}, with zero at {unit.middle}: within the "
+            "limits of the URDF, which radians and degrees leave"
+        )
     if unit.kind == "time":
         return f"{none} {unit.unit}, which gives a usual rate"
     if unit.kind == "velocity":

@@ -48,6 +48,16 @@ _OTHER: Final = frozenset(f"{_WANTED} {_OUTSIDE} {_PART}".split())
 """Words of channels that are not the measured quantity of a joint."""
 
 
+_PLACES: Final = """
+joint axis axes arm link left right raw filtered filt value signal channel motor output input side
+index id nr no number utc local gmt cet cest date iso x y z base world abs rel total mean avg
+robot"""
+_QUALIFIERS: Final = frozenset(
+    {*_MEASURED, *_OTHER, *_PLACES.split()}.union(*_QUANTITIES.values()) - {"m", "t"}
+)
+"""Words in brackets behind a name that are no unit."""
+
+
 def words_of(name: str) -> list[str]:
     """Return the words of a name in lower case, split at marks, digits and capitals.
 
@@ -65,6 +75,11 @@ def is_other(name: str, kind: Kind) -> bool:
     """
     allowed = {"motor", "motors"} if kind == "motor_current" else set()
     return not (_OTHER - allowed).isdisjoint(words_of(name))
+
+
+def is_qualifier(text: str) -> bool:
+    """Return whether a text in brackets says which of several channels it is, and no unit."""
+    return not _QUALIFIERS.isdisjoint(words_of(text))
 
 
 def is_measured(name: str) -> bool:

@@ -72,6 +72,12 @@ class PartialMap:
         }
 
     @property
+    def with_unit(self) -> frozenset[str]:
+        """Quantities whose unit it states."""
+        quantities = self.stated.quantities().items()
+        return frozenset(kind for kind, each in quantities if each.unit is not None)
+
+    @property
     def sample_rate(self) -> float | None:
         """Of a log without a time [Hz]."""
         return self.stated.sample_rate if "sample_rate" in self.entries else None

@@ -6,7 +6,7 @@ positions, velocities and torques against the URDF.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Final, NoReturn
@@ -29,6 +29,7 @@ from hil.importers.log_files import LogFiles
 from hil.importers.name_words import is_measured, kind_by_words, kinds_said, words_of
 from hil.importers.robot import Robot
 from hil.importers.row_names import row_names
+from hil.importers.stated_units import other_unit
 from hil.importers.units import Kind, kind_named, unit_of
 
 _JOINT_KINDS: Final[tuple[Kind, ...]] = (
@@ -69,6 +70,7 @@ def proposed_map(
     *,
     sample_rate: float | None = None,
     form: Format | None = None,
+    with_unit: Collection[str] = (),
     files: LogFiles | None = None,
 ) -> Proposal:
     """Return the column map that the channels of a log suggest for a robot.
@@ -76,8 +78,8 @@ def proposed_map(
     A ready map whose columns the log has comes first, then the names of
     :data:`hil.importers.channels.CHANNEL_NAMES`. `chosen` are channels by quantity that are given:
     a name with ``{}`` for the joint, or names separated by commas. `sample_rate` [Hz] replaces the
-    time; `form` is how texts are written, where that is stated; `files` are those that were parsed
-    before.
+    time; `form` is how texts are written, where that is stated; of the quantities `with_unit` a map
+    states the unit; `files` are those that were parsed before.
 
     Raises:
         SourceError: the log cannot be read, or its channels leave a quantity open.
@@ -99,6 +101,7 @@ def proposed_map(
             return _of_ready_map(ready, recorded)
     search = _Search(log, joints, groups, chosen, sample_rate, recorded)
     search.nanoseconds = nanoseconds
+    search.with_unit = with_unit
     return search.proposal(form)
 
 
@@ -169,6 +172,7 @@ class _Search:
         self._recorded = recorded
         self._columns_of = recorded or joints
         self.nanoseconds: str | int | None = None  #: column that is added to that of the time
+        self.with_unit: Collection[str] = ()  #: quantities whose unit a map states
         self._groups = groups
         self._chosen = chosen
         self._rate = sample_rate
@@ -228,7 +232,8 @@ class _Search:
         (group,) = groups
         if kind == "commanded_position" and group.size != len(self._columns_of):
             return None  # actions of something else
-        if group.unit is not None and unit_of(group.unit, kind) is None:
+        is_open = group.unit is not None and kind not in self.with_unit
+        if is_open and unit_of(group.unit or "", kind) is None:
             self._refuse_unit(kind, group)
         if kind == "time":
             if group.size > 1:
@@ -317,9 +322,11 @@ class _Search:
     def _refuse_unit(self, kind: Kind, group: Group) -> NoReturn:
         assert group.unit is not None
         problem = f"{group.label} is named as {kind}, and {group.unit} is not a unit of it"
-        kinds = [kind, *(other for other in _JOINT_KINDS[:4] if unit_of(group.unit, other))]
+        kinds = [other for other in _JOINT_KINDS[:4] if unit_of(group.unit, other)]
+        if not kinds or kind == "time":
+            raise other_unit(self._log, kind, group.label, group.unit)
         options = " or ".join(f"--columns '{name}={group.pattern}'" for name in kinds)
-        raise SourceError(self._log, problem, field=kind, remedy=f"choose one: {options}")
+        raise SourceError(self._log, problem, field=kind, remedy=f"choose: {options}")
 
     def _refuse_count(self, kind: Kind, group: Group) -> NoReturn:
         count = group.size

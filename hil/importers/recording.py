@@ -526,21 +526,28 @@ def _proposed(
         rate = some.sample_rate
         form = some.stated.format if "format" in some.entries else None
     source = request.source
+    files = request.files
     commands = None
     if options.commands is not None:
         if source.is_dir():
             problem = "is for a single log: a folder has its commands in one of its files"
             remedy = "state the file: --columns 'commanded_position=FILE'"
             raise SourceError(options.commands, problem, field="--commands", remedy=remedy)
-        commands = CommandFile.of(options.commands, source, robot.joint_names, form, request.files)
+        commands = CommandFile.of(options.commands, source, robot.joint_names, form, files)
         chosen = {**chosen, "commanded_position": ",".join(commands.columns)}
-    propose = proposed_map_of_folder if source.is_dir() else proposed_map
-    proposal = propose(source, robot, chosen, sample_rate=rate, form=form, files=request.files)
-    if commands is not None:
-        text = with_values(proposal.text, commands.entries)
-        columns = ColumnMap.model_validate(parse_toml(text))
-        proposal = replace(proposal, text=text, columns=columns)
-    if not source.is_dir():
+    if source.is_dir():
+        proposal = proposed_map_of_folder(
+            source, robot, chosen, sample_rate=rate, form=form, files=files
+        )
+    else:
+        with_unit = frozenset[str]() if some is None else some.with_unit
+        proposal = proposed_map(
+            source, robot, chosen, sample_rate=rate, form=form, with_unit=with_unit, files=files
+        )
+        if commands is not None:
+            text = with_values(proposal.text, commands.entries)
+            columns = ColumnMap.model_validate(parse_toml(text))
+            proposal = replace(proposal, text=text, columns=columns)
         proposal = _with_own_rows(request, robot, proposal)
     return proposal if some is None else some.completed(proposal)
 

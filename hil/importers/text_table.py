@@ -35,7 +35,8 @@ from hil.importers.dialect import (
 from hil.importers.list_cells import spread_lists
 from hil.importers.log_text import COMMENTS, table_text, text_of
 from hil.importers.long_text import LongText, long_text
-from hil.importers.units import unit_of, without_unit
+from hil.importers.stated_units import stated_unit, without_unit
+from hil.importers.units import unit_of
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -45,6 +46,7 @@ _EMPTY: Final = "record again, or name the file that has the samples"
 _PROBED: Final = 100  # lines
 _LONGEST_TIME: Final = 30  # digits before the point, more than of nanoseconds since 1970
 _QUOTES: Final = "\"'"
+_BRACKETS: Final = "[]() "
 # Of columns, as PLCs and programs write them below the names.
 _TYPE: Final = re.compile(
     r"l?real|float(32|64)?|double|single|numeric|number|[usld]{0,2}int(8|16|32|64)?|integer|bool"
@@ -146,13 +148,16 @@ class Table:
         return np.asarray(self.numbered) - self.numbered[0]
 
     def unit(self, column: Column) -> str | None:
-        """Return the unit that the file states for a column: below its name, or in brackets."""
+        """Return the unit that the file states for a column: below its name, or in brackets.
+
+        One that is not known is returned as it is written.
+        """
         place = self._place(column)
         if place is None:
             return None
         below = self.units[place] if place < len(self.units) else ""
         name = self.names[place] if place < len(self.names) else ""
-        return unit_of(below.strip("[]() ")) or without_unit(name)[1]
+        return stated_unit(below) or without_unit(name)[1]
 
     @property
     def lacks_numbers(self) -> bool:
@@ -468,9 +473,10 @@ def _first_row(lines: Sequence[tuple[int, str]], dialect: Dialect) -> int:
 
 
 def _are_units(cells: Sequence[str]) -> bool:
-    """Return whether the cells of a line are units, of which some may be missing."""
-    filled = [cell.strip("[]() ") for cell in cells if cell.strip("[]() -")]
-    return bool(filled) and all(without_unit(f"x [{cell}]")[1] for cell in filled)
+    """Return whether the cells of a line are units, of which some may be missing or not known."""
+    filled = [cell.strip(_BRACKETS) for cell in cells if cell.strip(f"{_BRACKETS}-")]
+    known = sum(unit_of(cell) is not None for cell in filled)
+    return known > 0.5 * len(filled) and all(map(stated_unit, filled))
 
 
 def _are_types(cells: Sequence[str]) -> bool:

@@ -3,25 +3,27 @@
 from __future__ import annotations
 
 import math
-import re
 from collections.abc import Mapping
 from typing import Final, Literal, get_args
+
+from hil.importers.unit_products import product_of
 
 Kind = Literal["time", "position", "velocity", "torque", "motor_current", "commanded_position"]
 
 _TURN: Final = 2.0 * math.pi
 _DEGREE: Final = math.pi / 180.0
 _ANGLES: Final = {"rad": 1.0, "mrad": 1e-3, "deg": _DEGREE, "rev": _TURN, "m": 1.0, "mm": 1e-3}
-_SI: Final[Mapping[str, Mapping[str, float]]] = {
+UNITS: Final[Mapping[str, Mapping[str, float]]] = {
     "position": _ANGLES,
     "velocity": {
         "rad/s": 1.0, "deg/s": _DEGREE, "rev/s": _TURN, "rpm": _TURN / 60.0, "m/s": 1.0,
         "mm/s": 1e-3,
     },
-    "torque": {"N.m": 1.0, "mN.m": 1e-3, "kN.m": 1e3, "N": 1.0, "%": 0.01},
-    "motor_current": {"A": 1.0, "mA": 1e-3, "%": 0.01},
+    "torque": {"N.m": 1.0, "mN.m": 1e-3, "kN.m": 1e3, "N": 1.0, "%": 0.01, "‰": 0.001},
+    "motor_current": {"A": 1.0, "mA": 1e-3, "%": 0.01, "‰": 0.001},
     "commanded_position": _ANGLES,
 }  # fmt: skip
+"""Factors to SI units of the usual units of a quantity, the SI one first; of rated ones to 1."""
 _SPELLED: Final[Mapping[str, tuple[str, ...]]] = {
     "rad": ("radian", "radians"),
     "deg": ("degree", "degrees", "°", "grad"),
@@ -35,32 +37,22 @@ _SPELLED: Final[Mapping[str, tuple[str, ...]]] = {
     "kN.m": ("kNm", "kN·m", "kN m"),
     "A": ("amp", "amps", "ampere", "amperes"),
     "%": ("percent", "per cent"),
+    "‰": ("permille", "per mille", "per mil", "0.1%", "0.1 %", "1/1000"),
     "s": ("sec", "secs", "second", "seconds"),
     "ms": ("msec", "millisecond", "milliseconds"),
     "us": ("usec", "µs", "μs", "microsecond", "microseconds"),
     "ns": ("nsec", "nanosecond", "nanoseconds"),
 }
-PER_CENT: Final = "%"
+RATED: Final = ("%", "‰")
 """Of a rated torque or current, which the column map states."""
 TIMES: Final[Mapping[str, int]] = {"s": 0, "ms": 3, "us": 6, "ns": 9}
 """Decimal places between a unit of time and the second."""
-UNITS: Final[Mapping[str, Mapping[str, float]]] = {
-    kind: {
-        spelled: factor
-        for unit, factor in table.items()
-        for spelled in (unit, *_SPELLED.get(unit, ()))
-    }
-    for kind, table in _SI.items()
-}
-"""Factors to SI units by quantity and unit, in every spelling; of "%" to a share."""
 
 _BY_SPELLING: Final = {
     spelled.lower(): unit
-    for unit in dict.fromkeys([*TIMES, *(unit for table in _SI.values() for unit in table)])
+    for unit in dict.fromkeys([*TIMES, *(unit for table in UNITS.values() for unit in table)])
     for spelled in (unit, *_SPELLED.get(unit, ()))
 }
-_BRACKETED: Final = re.compile(r"(.*?)[\s_]*(?:\[([^\[\]]*)\]|\(([^()]*)\))")
-_SUFFIXES: Final = ("deg", "rad", "mrad", "rpm", "Nm", "ms", "us", "ns", "sec", "mA")
 
 
 def kind_named(name: str) -> Kind:
@@ -69,33 +61,30 @@ def kind_named(name: str) -> Kind:
 
 
 def names_of_units(kind: str) -> str:
-    """Return the units of a quantity, each in one spelling, for a message."""
-    return ", ".join(_SI[kind])
+    """Return the usual units of a quantity, each in one spelling, for a message."""
+    return ", ".join(UNITS[kind])
 
 
 def unit_of(text: str, kind: str | None = None) -> str | None:
     """Return the unit that a text spells, of a quantity or of any; None if it spells none.
 
-    Units of different size differ in more than case: mN.m and MN.m would not, and the latter is
-    none of them.
+    A product such as ``kgf cm`` is returned as it is spelled. Units of different size differ in
+    more than case: mN.m and MN.m would not, and the latter is none of them.
     """
-    unit = _BY_SPELLING.get(text.strip().lower())
-    if unit is None or kind is None:
+    text = text.strip()
+    unit = _BY_SPELLING.get(text.lower())
+    if unit is not None and (kind is None or unit in (TIMES if kind == "time" else UNITS[kind])):
         return unit
-    return unit if unit in (TIMES if kind == "time" else _SI[kind]) else None
+    product = product_of(text)
+    if product is None or kind == "time":  # times are read as decimals
+        return None
+    return text if kind is None or kind in product.kinds else None
 
 
-def without_unit(name: str) -> tuple[str, str | None]:
-    """Return the name of a column without its unit, and that unit or None.
-
-    A unit is in brackets, as in ``q1 [deg]`` or ``M1 (Nm)``, or a few are at the end, ``q1_deg``.
-    """
-    match = _BRACKETED.fullmatch(name.strip())
-    if match is not None:
-        unit = unit_of(match[2] if match[2] is not None else match[3])
-        if unit is not None:
-            return match[1], unit
-    bare, _, end = name.rpartition("_")
-    if bare and end in _SUFFIXES:
-        return bare, unit_of(end)
-    return name, None
+def factor_of(unit: str, kind: str) -> float:
+    """Return the factor of a unit of a quantity to SI units, of a rated one to 1."""
+    if unit in UNITS[kind]:
+        return UNITS[kind][unit]
+    product = product_of(unit)
+    assert product is not None, unit  # `unit_of` returned it
+    return product.factor
