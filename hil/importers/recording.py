@@ -556,7 +556,7 @@ def _with_own_rows(request: _Request, robot: Robot, proposal: Proposal) -> Propo
     """Return a proposal that interpolates, where quantities are in rows of their own."""
     columns = proposal.columns
     source = request.source
-    if columns.format.missing != "refuse":
+    if columns.format.missing == "interpolate":
         return proposal
     file = request.files.file(source, columns.format)
     if isinstance(file, Table) and not file.lacks_numbers:

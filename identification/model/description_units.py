@@ -63,7 +63,8 @@ _MASS: Final = _Range((0.0, 1e6), (0.05, 5000.0))  # kg, of all bodies
 _SPREAD: Final = _Range((0.01, 2000.0), (0.5, 300.0))  # kg/m³, mass over the cube of the extent
 _OFFSET: Final = _Range((0.0, 5.0), (0.02, 2.0))  # farthest centre of mass over the longest chain
 _GYRATION: Final = _Range((1e-3, 20.0), (0.02, 1.0))  # over the extent, mean over the mass
-_DENSITY: Final = _Range((1.0, 5e4), (20.0, 15e3))  # kg/m³, of ellipsoids with these inertias
+_DENSITY: Final = _Range((0.05, 5e4), (20.0, 15e3))  # kg/m³, of ellipsoids with these inertias
+_ISOTROPIC: Final = 1.0 + 1e-9  # ratio of the moments of inertia of a ball
 _CHANGE: Final = 0.5  # decades that another unit for one more quantity costs
 
 
@@ -134,9 +135,9 @@ class _Description:
         yield _MASS, float(mass.sum())
         yield _SPREAD, float(mass.sum()) / extent**3
         inertia = of_inertia * self.inertia
-        bodies = inertia[:, -1] > 0.0
+        bodies = inertia[:, -1] > _ISOTROPIC * inertia[:, 0]  # others are placeholders
         if mass[bodies].sum() < 0.5 * mass.sum():
-            return  # points, or placeholders
+            return
         gyration = math.sqrt(float(inertia[bodies, -1].sum() / mass[bodies].sum()))
         yield _GYRATION, gyration / extent
         density = _median(_densities(mass[bodies], inertia[bodies]), mass[bodies])

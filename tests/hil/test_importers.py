@@ -351,7 +351,7 @@ class TestMapFile:
         [
             (RATE, "position: is missing"),
             (POSITION, "either a time column or sample_rate; see the column map in docs"),
-            (f"{RATE}{POSITION}unit = 'inch'\n", "'inch' is not a unit"),
+            (f"{RATE}{POSITION}unit = 'furlong'\n", "'furlong' is not a unit"),
             (f"{RATE}{POSITION}side = 'motor'\n", "drive.gear_ratio is needed"),
             (f"{RATE}[position]\ncolumns = [-1]\n", r"position.columns\[0\]: .* must be a name"),
             (f"{RATE}{POSITION}scale = 0.0\n", "scale is 0, .*; see the column map in docs"),

@@ -12,7 +12,7 @@ import pytest
 from identification.model.description_units import WrongUnit, wrong_units
 from tests.hil.simulated_logs import urdf_path
 
-ARMS = ("ur5_robot.urdf", "panda.urdf", "so100.urdf", "kinova.urdf", "z1.urdf")
+ARMS = ("ur5_robot.urdf", "panda.urdf", "so101.urdf", "kinova.urdf", "z1.urdf")
 MASS = {"mass": 1e3}
 LENGTHS = {"length": 1e3, "centre of mass": 1e3}
 IN_OTHER_UNITS: dict[str, Mapping[str, float]] = {
