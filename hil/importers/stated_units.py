@@ -8,14 +8,9 @@ from typing import Final
 
 from hil.base.errors import SourceError
 from hil.importers.name_words import is_qualifier
-from hil.importers.units import Kind, names_of_units, unit_of
+from hil.importers.units import SUFFIXES, Kind, names_of_units, unit_of
 
 _BRACKETED: Final = re.compile(r"(.*?)[\s_]*(?:\[([^\[\]]*)\]|\(([^()]*)\))")
-_SUFFIXES: Final = (
-    *("deg", "rad", "mrad", "gon", "mdeg", "rpm", "ms", "us", "ns", "sec", "mA", "permille"),
-    *("Nm", "mNm", "Ncm", "Nmm", "kgcm", "kgfcm", "ozin", "ozfin", "lbft", "lbfft", "lbin"),
-    *("ticks", "counts", "increments"),
-)
 _LIKE_A_UNIT: Final = re.compile(r"[A-Za-zµμΩ°%‰·⋅*./^⁻¹²³ '\"-]{1,16}")
 _NO_UNIT: Final = frozenset({"", "-", "--", "none", "n/a", "na", "null", "bool", "text", "string"})
 
@@ -45,7 +40,7 @@ def without_unit(name: str) -> tuple[str, str | None]:
         if unit is not None:
             return match[1], unit
     bare, _, end = name.rpartition("_")
-    if bare and end in _SUFFIXES:
+    if bare and end in SUFFIXES:
         return bare, unit_of(end) or end
     return name, None
 

@@ -48,6 +48,12 @@ RATED: Final = ("%", "‰")
 TIMES: Final[Mapping[str, int]] = {"s": 0, "ms": 3, "us": 6, "ns": 9}
 """Decimal places between a unit of time and the second."""
 
+SUFFIXES: Final = (
+    *("deg", "rad", "mrad", "gon", "mdeg", "rpm", "ms", "us", "ns", "sec", "mA", "permille"),
+    *("Nm", "mNm", "Ncm", "Nmm", "kgcm", "kgfcm", "ozin", "ozfin", "lbft", "lbfft", "lbin"),
+    *("ticks", "counts", "increments"),
+)
+"""Units that end the name of a column, behind an underscore."""
 _BY_SPELLING: Final = {
     spelled.lower(): unit
     for unit in dict.fromkeys([*TIMES, *(unit for table in UNITS.values() for unit in table)])
