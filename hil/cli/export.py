@@ -9,6 +9,7 @@ from typing import Annotated, Literal
 import typer
 
 from hil.base.errors import InputError
+from hil.base.one_screen import brief
 from hil.base.progress import reporter as make_reporter
 from hil.base.progress import say
 from hil.cli.arguments import (
@@ -158,5 +159,5 @@ def print_export(
     if json:
         print_json(exported.to_dict())
         return
-    for line in exported.lines()[-1 if quiet else 0 :]:
+    for line in brief(exported.lines()[-1 if quiet else 0 :]):
         say(line)

@@ -166,7 +166,6 @@ def test_what_follows_an_identification_fills_one_screen(
         ("batch", folder, "-o", tmp_path / "batch"),
         ("compare", folder, folder),
         ("payload", archive, "--loaded", archive),
-        ("identify", folder, "--quiet"),
     ):
         require_one_screen(printed(*words))
 
