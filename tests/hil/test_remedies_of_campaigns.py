@@ -75,7 +75,8 @@ TYPED = {
     "design a better excitation (`hil design`)": "test_an_excitation_that_determines_too_little",
     "FIELD workers of Dask did not start": "test_workers_that_do_not_start",
     "the scaled condition number is FIELD": "test_parameters_that_are_poorly_separated",
-    "FIELD more: see --output and --json": "test_more_campaigns_than_are_shown",
+    "give --joint and --by": "test_an_axis_alone_without_a_joint",
+    "leave it out, or run against `hil simulate`": "test_a_live_view_in_virtual_time",
 }  # fmt: skip
 ELSEWHERE = {
     "find the torque constants with `hil torque-constants`": "tests/hil/test_importers.py",
@@ -84,6 +85,14 @@ ELSEWHERE = {
     "repeat with --resume to draw it": "a picture on a full disk",
     "free disk space": "tests/disk",
     "the FIELD joints form FIELD arms": "tests/hil/test_design_settings.py",
+    "add --urdf ARM.urdf": "tests/hil/test_one_command.py",
+    "centre of mass of the payload (--payload-centre) may be": "tests/hil/test_payload_campaign.py",
+    "weigh it under another name (--payload)": "tests/hil/test_payload_campaign.py",
+    "add --for payload": "tests/hil/test_precision.py",
+    "add --kind FIELD": "tests/hil/test_record_command.py",
+    "give one of --udp, --can and --link": "tests/hil/test_simulate.py",
+    "leave --priority out, or raise the limit": "a user without the right to a priority",
+    "or add --link rtde:HOST": "tests/hil/test_record_ur.py",
 }
 
 
@@ -232,7 +241,10 @@ def pass_both_rehearsals(campaign: Path, text: str) -> None:
 
 class TestPrecision:
     def test_an_assumed_torque_error(self, here: Path, repeated: tuple[Path, str]) -> None:
-        line = (*PRECISE, "--precision", "parameters 50 %", "-o")
+        """Of a real arm: that of a simulated one is known."""
+        cell = fast_cell(here, repetitions=2).with_values({"controller.transport": "udp"})
+        (here / "udp.toml").write_text(cell.text)
+        line = ("design", "udp.toml", *PRECISE[2:], "--precision", "parameters 50 %", "-o")
         assumed = " ".join(accepted(*line, "b").split())
         assert "recordings measure it (--given)" in assumed
         text = " ".join(accepted(*line, "c", "--given", repeated[0]).split())
@@ -290,6 +302,18 @@ class TestCampaign:
         for ask in (lambda: accepted("status", designed), lambda: refusal("run", designed)):
             (designed / "rehearsal.json").write_text("{")
             type_printed(ask())
+
+    def test_an_axis_alone_without_a_joint(self, here: Path) -> None:
+        assert "give --joint and --by" in refusal(
+            "move", "cell.toml", "--to", "start", "--only-axis"
+        )
+        way = ("--joint", "elbow", "--by", 2)
+        accepted("move", "cell.toml", "--only-axis", *way, "--yes", "-o", "moved")
+
+    def test_a_live_view_in_virtual_time(self, rehearsed: Path) -> None:
+        text = refusal("run", rehearsed, "--dry-run", "--live", 8765)
+        assert "leave it out" in text
+        accepted("run", rehearsed, "--dry-run")
 
     def test_both_at_once(self, rehearsed: Path) -> None:
         text = refusal("run", rehearsed, "--dry-run", "--accept-dry-run")
@@ -383,7 +407,7 @@ class TestBatch:
     def test_parameters_that_are_poorly_separated(
         self, folder: Path, monkeypatch: pytest.MonkeyPatch
     ) -> None:
-        for module in ("batch.estimates", "identify.estimating"):
+        for module in ("batch.estimates", "pipeline.estimating"):
             monkeypatch.setattr(f"hil.{module}.QR_CONDITION", 1.0)
         text = accepted("batch", folder, "--estimator", "wls")
         assert "`hil identify` on these archives uses QR" in text
