@@ -40,7 +40,7 @@ from .reduction import (
     settings_digest,
 )
 
-Level = Literal["repetition", "campaign", "pooled"]
+Level = Literal["repetition", "campaign", "pooled", "siblings"]
 BatchEstimator = Literal["auto", "wls", "consistent"]
 """Estimators that need factors only, and no samples."""
 

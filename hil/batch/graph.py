@@ -21,6 +21,7 @@ from hil.pipeline.estimating import with_loading
 from hil.pipeline.options import Options
 from hil.pipeline.prepared import MAX_RECORDINGS, carried_over, decide
 from hil.pipeline.sources import Source, all_fitted
+from identification.estimators.siblings import with_siblings
 from identification.selection.settings import Settings
 
 from .cache import CacheLocation, code_digest
@@ -151,6 +152,8 @@ class BatchResult:
     repetitions: tuple[BatchEstimate, ...]  #: of all campaigns, in the order of `ArchiveRef.order`
     campaigns: tuple[BatchEstimate, ...]  #: in the same order
     pooled: tuple[BatchEstimate, ...]  #: one per arm
+    #: likewise of robots with two siblings or more: with the common prior of their type
+    siblings: tuple[BatchEstimate, ...]
     broken: tuple[SkippedArchive, ...]  #: archives and campaigns (by folder) that could not be used
     skipped: tuple[SkippedArchive, ...]  #: archives that are not intended for fitting
     read: int  #: archives whose factor was computed
@@ -353,6 +356,7 @@ class _Batch:
             repetitions=repetitions,
             campaigns=tuple(estimate for estimate in estimates if estimate.level == "campaign"),
             pooled=tuple(pooled),
+            siblings=tuple(_siblings(pooled, {arm.model.digest: arm.model for arm in arms})),
             broken=broken,
             skipped=skipped,
             read=sum(result.read for result in results),
@@ -495,6 +499,19 @@ class _Batch:
             for estimate in result.estimates
             if estimate.level == "campaign"
         ]
+
+
+def _siblings(
+    pooled: Sequence[BatchEstimate], models: Mapping[str, ArmModel]
+) -> Iterator[BatchEstimate]:
+    """Yield the estimates of robots with the common prior of their type."""
+    named = [each for each in pooled if models[each.arm].robot]
+    for _, members in groupby(named, lambda each: models[each.arm].arm_type):
+        robots = list(members)
+        found = with_siblings([each.estimate for each in robots])
+        if found is not None:
+            for each, estimate in zip(robots, found.estimates, strict=True):
+                yield replace(each, level="siblings", estimate=estimate)
 
 
 def _by_arm(campaigns: Sequence[_Campaign]) -> list[tuple[str, list[_Campaign]]]:

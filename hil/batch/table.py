@@ -110,7 +110,12 @@ def _unused_rows(result: BatchResult) -> Iterator[Row]:
 
 def _levels(result: BatchResult) -> Iterator[tuple[BatchEstimate, Row]]:
     """Yield estimates, each with the columns that all its rows share."""
-    for level in (*result.repetitions, *result.campaigns, *result.pooled):
+    for level in (
+        *result.repetitions,
+        *result.campaigns,
+        *result.pooled,
+        *result.siblings,
+    ):
         shared = {
             "level": level.level,
             "arm": result.arms[level.arm].name,

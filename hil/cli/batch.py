@@ -186,6 +186,7 @@ def as_dict(result: BatchResult, written: Sequence[Path]) -> dict[str, Any]:
                     if estimate.arm == digest
                 },
                 "pooled": next((_level(o) for o in result.pooled if o.arm == digest), None),
+                "siblings": next((_level(o) for o in result.siblings if o.arm == digest), None),
             }
             for digest, arm in result.arms.items()
         },

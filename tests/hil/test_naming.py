@@ -133,7 +133,7 @@ class TestFacts:
 
 @pytest.mark.long
 def test_robots_of_one_type_have_estimates_of_their_own(tmp_path):
-    plan = FleetPlan(robots=2, months=2, duration=10.0, spread=0.3)
+    plan = FleetPlan(robots=3, months=2, duration=10.0, spread=0.3)
     write_fleet(tmp_path, Fleet(plan))
     (tmp_path / "spare.csv").write_text((tmp_path / "robot00" / "2024-01-15.csv").read_text())
     reading = LogReading.of(lambda _: Robot.from_urdf(urdf()), ImportOptions(), "")
@@ -143,9 +143,13 @@ def test_robots_of_one_type_have_estimates_of_their_own(tmp_path):
     result = reidentify(
         [str(tmp_path)], FIXED, Here(), Silent(), cache=cache, importing=logs, place=naming.place
     )
-    assert [arm.robot for arm in result.arms.values()] == ["00", "01"]
+    assert [arm.robot for arm in result.arms.values()] == ["00", "01", "02"]
     assert len({arm.arm_type for arm in result.arms.values()}) == 1
-    assert [each.repetitions for each in result.pooled] == [2, 2]
+    assert [each.repetitions for each in result.pooled] == [2, 2, 2]
+    assert [each.level for each in result.siblings] == ["siblings"] * 3
+    for own, shared in zip(result.pooled, result.siblings, strict=True):
+        determined = np.isfinite(own.estimate.std)
+        assert (shared.estimate.std <= 1.01 * own.estimate.std)[determined].all()
     assert len({each.settings for each in result.campaigns}) == 1
     (unused,) = result.broken
     assert unused.path.endswith("spare.csv")
