@@ -186,6 +186,17 @@ class WorkerProcess:
             self.close()
             raise
 
+    def wait(self, seconds: float) -> bool:
+        """Return whether `receive` can return or raise within so many seconds."""
+        if not self._ready:
+            if not self.connection.poll(seconds):
+                return False
+            with suppress(EOFError, ConnectionError):  # it died, which `receive` reports
+                self.connection.recv_bytes()
+                self._ready = True
+                self.deadline = monotonic() + self._timeout
+        return self.connection.poll(seconds)
+
     def receive(self) -> Any:
         """Return the result of the call that `begin` began, or raise its exception."""
         try:

@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import shutil
 from contextlib import suppress
+from pathlib import Path
 from typing import Final
 
 from hil.base.errors import CampaignFolderError, ExecutionError, HilError, OperatorStopError
 from hil.base.files import make_folder
-from hil.base.progress import Reporter
+from hil.base.progress import Reporter, Silent
 from hil.base.version import software
 from hil.campaign.planned_motions import planned_motions, require_runnable
 from hil.campaign.rehearsal_criteria import SATURATED, of_currents, of_estimate, of_motions
@@ -18,9 +19,12 @@ from hil.control.errors import MotionFailedError
 from hil.control.motion_checks import PLANNED_CURRENT, collision_checker
 from hil.control.motion_watch import Stop, Unattended
 from hil.control.virtual_link import VirtualLink
+from planner.errors import PlannerError
+from planner.worker import WorkerProcess
 from sim_fixtures import SimulationError
 
 from .errors import RepetitionsRejectedError
+from .folder import CampaignFolder
 from .motion_runner import RunOptions
 from .operator import RunWatch
 from .rehearsal import AS_MODELLED, CRITERIA, EFFECTS, Rehearsal, RehearsalCriterion
@@ -30,6 +34,9 @@ from .state import CampaignState
 REPETITIONS: Final = 3
 """Repetitions of the excitation: enough for their scatter, few enough for a minute."""
 SEED: Final = 1
+LONGEST: Final = 24.0 * 3600.0
+"""Most that a run on a simulated arm may take, s."""
+_POLL: Final = 0.2  # s between two looks whether the operator stopped it
 
 
 def rehearse(
@@ -66,30 +73,29 @@ def rehearse(
 def _rehearsed(
     campaign: CampaignState, plan_hash: str, reporter: Reporter, seed: int, stop: Stop
 ) -> Rehearsal:
-    """Run the plan in the folder of the rehearsal and judge it."""
+    """Run the plan in the folder of the rehearsal, on two simulated arms at once, and judge it."""
     twin = Twin.of(campaign.cell, seed=seed, repetitions=REPETITIONS)
     for sentence in twin.assumed:
         reporter.say(f"assumed: {sentence}")
-    criteria: list[RehearsalCriterion] = []
-    seconds = 0.0
-    for name, where, effects in ((AS_MODELLED, "plain", False), (EFFECTS, "effects", True)):
-        # One repetition shows the effects that the model leaves out.
-        cell = twin.cell.with_campaign(repetitions=1) if effects else twin.cell
-        rehearsal = CampaignState.create(campaign.folder.rehearsed / where, cell, campaign.plan)
-        reporter.step(f"rehearsing on a simulated arm, {name}")
-        motions = planned_motions(rehearsal.cell, rehearsal.plan)
-        planned = sum(motion.trajectory.duration for motion in motions)
-        link = twin.link(planned, effects=effects)
-        failure = _failure(rehearsal, link, twin, reporter, stop)
-        seconds += link.cycles * cell.period
-        criteria.append(of_motions(twin.cell, rehearsal.folder, name, failure))
-        if rehearsal.folder.manifest():
-            bound = SATURATED if effects else PLANNED_CURRENT
-            criteria.append(of_currents(twin.cell, rehearsal.folder, name, bound))
-        if failure:
-            break  # the other criteria would fail for the same reason
-        if not effects:
-            criteria += of_estimate(twin, rehearsal.folder, reporter)
+    modelled = _created(campaign, twin.cell, "plain")
+    # One repetition shows the effects that the model leaves out.
+    with_effects = _created(campaign, twin.cell.with_campaign(repetitions=1), "effects")
+    with WorkerProcess(timeout=LONGEST) as child:
+        child.begin(run_with_effects, with_effects.folder.root, twin)
+        reporter.step(f"rehearsing on a simulated arm, {AS_MODELLED}")
+        link = twin.link(_planned(modelled), effects=False)
+        failure = _failure(modelled, link, twin, reporter, stop)
+        seconds = link.cycles * modelled.cell.period
+        criteria = _of_run(twin, modelled.folder, AS_MODELLED, failure, PLANNED_CURRENT)
+        if failure:  # the other criteria would fail for the same reason
+            child.close()
+            shutil.rmtree(with_effects.folder.root)
+        else:
+            criteria += of_estimate(twin, modelled.folder, reporter)
+            reporter.step(f"rehearsing on a simulated arm, {EFFECTS}")
+            failure, cycles = waited_for(child, stop)
+            seconds += cycles * modelled.cell.period
+            criteria += _of_run(twin, with_effects.folder, EFFECTS, failure, SATURATED)
     names = {criterion.name for criterion in criteria}
     return Rehearsal(
         plan_hash=plan_hash,
@@ -102,6 +108,55 @@ def _rehearsed(
         motion_seconds=seconds,
         software=software(),
     )
+
+
+def _created(campaign: CampaignState, cell: Cell, where: str) -> CampaignState:
+    return CampaignState.create(campaign.folder.rehearsed / where, cell, campaign.plan)
+
+
+def _planned(rehearsal: CampaignState) -> float:
+    """Return the duration of the planned motions [s]."""
+    motions = planned_motions(rehearsal.cell, rehearsal.plan)
+    return float(sum(motion.trajectory.duration for motion in motions))
+
+
+def _of_run(
+    twin: Twin, folder: CampaignFolder, name: str, failure: str, bound: float
+) -> list[RehearsalCriterion]:
+    """Return the criteria of motions and currents of a run."""
+    criteria = [of_motions(twin.cell, folder, name, failure)]
+    if folder.manifest():
+        criteria.append(of_currents(twin.cell, folder, name, bound))
+    return criteria
+
+
+def run_with_effects(folder: Path, twin: Twin) -> tuple[str, int]:
+    """Run a plan on the arm with what the model leaves out; return the failure, and the cycles.
+
+    In a process of its own, beside the run as modelled: each has its own link, seed and folder, so
+    that neither notices the other.
+    """
+    rehearsal = CampaignState.open(folder)
+    link = twin.link(_planned(rehearsal), effects=True)
+    return _failure(rehearsal, link, twin, Silent(), Stop()), link.cycles
+
+
+def waited_for(child: WorkerProcess, stop: Stop) -> tuple[str, int]:
+    """Return what :func:`run_with_effects` returned in its process.
+
+    Raises:
+        OperatorStopError: the rehearsal was stopped.
+        ExecutionError: the process ended.
+    """
+    while not child.wait(_POLL):
+        if stop.requested:
+            raise OperatorStopError("the rehearsal was stopped; rehearse again")
+    try:
+        failure, cycles = child.receive()
+    except PlannerError as error:
+        problem = f"the process of the second simulated arm ended: {error}"
+        raise ExecutionError(f"{problem}; rehearse again") from error
+    return str(failure), int(cycles)
 
 
 def _failure(

@@ -8,8 +8,8 @@ from rich.text import Text
 
 from hil.base.progress import put
 from hil.base.terminal_text import printable
-from hil.campaign import Campaign
-from hil.campaign.status import CampaignStatus
+from hil.campaign.state import CampaignState
+from hil.campaign.status import CampaignStatus, status_of
 from hil.cli.arguments import CampaignArgument, JsonOption, print_json
 
 _MARKS = {"done": ("done", "green"), "next": ("next", "bold yellow"), "blocked": ("blocked", "dim")}
@@ -23,7 +23,7 @@ def status(
 
     Changes nothing, and can be used while the campaign runs.
     """
-    progress = Campaign.open(campaign).status()
+    progress = status_of(CampaignState.open(campaign))
     if json:
         print_json(progress.to_dict())
         return

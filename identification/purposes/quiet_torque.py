@@ -6,9 +6,9 @@ from collections.abc import Sequence
 from typing import Final, NamedTuple
 
 import numpy as np
-from scipy.special import chdtri
 
 from identification.arrays import Array, Indices
+from identification.distributions import chi_squared_limit
 from identification.model.motion import Motion
 from identification.model.robot import RobotModel
 from identification.signals.masks import EDGE, SATURATED
@@ -106,7 +106,7 @@ def once_in_interval(period: float, peaks: Array) -> tuple[Array, Array]:
     """
     tail = _Tail.of(period, peaks)
     freedom = 2.0 * tail.beyond
-    longest, shortest = freedom / chdtri(freedom, [0.975, 0.025])
+    longest, shortest = freedom / chi_squared_limit([0.975, 0.025], freedom)
     growth = -np.log(tail.chance)
     ends = [tail.threshold + tail.scale * growth * share for share in (shortest, longest)]
     return np.minimum(*ends), np.maximum(*ends)

@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import json
+import os
 import re
 import shlex
+import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import replace
@@ -18,7 +20,7 @@ from typer.testing import CliRunner
 from drivers.drive_train import DriveTrain
 from drivers.transports.simulated import Lose
 from hil.archive import open_archive
-from hil.base.errors import OperatorStopError
+from hil.base.errors import ExecutionError, OperatorStopError
 from hil.base.progress import Silent, Task
 from hil.campaign import Campaign, CampaignPlan, NotRehearsedError, Stop, rehearsal_criteria
 from hil.campaign.folder import CampaignFolder
@@ -26,11 +28,13 @@ from hil.campaign.gates import require_rehearsed
 from hil.campaign.identified import identify_campaign
 from hil.campaign.rehearsal import CRITERIA, Rehearsal
 from hil.campaign.rehearsal_criteria import of_currents, of_motions
+from hil.campaign.rehearsing import waited_for
 from hil.campaign.twin import FASTEST, SPREAD, Twin, link_faults, too_far_without_a_packet
 from hil.cell import Cell
 from hil.cell.text import with_values
 from hil.cli import app
 from planner import Move, plan_moves
+from planner.worker import WorkerProcess
 from sim_fixtures.plant import ElasticPlant, PlantTruth
 from tests import messages
 from tests.hil.fast_cell import CELL, URDF, fast_campaign, fast_cell
@@ -301,6 +305,40 @@ def test_a_stopped_rehearsal_replaces_no_passed_one(tmp_path: Path, designed: Ca
     written = campaign.folder.rehearsal.stat().st_mtime_ns
     assert campaign.rehearse().passed
     assert campaign.folder.rehearsal.stat().st_mtime_ns == written
+
+
+def test_one_seed_is_one_bit_identical_rehearsal(tmp_path: Path, designed: Campaign) -> None:
+    """Also of the run in the second process."""
+    campaign = Campaign.create(tmp_path / "campaign", designed.cell, designed.plan)
+    campaign.rehearse()
+    for run in ("plain", "effects"):
+        first, again = (
+            {path.name: path.read_bytes() for path in folder.glob(f"{run}/archives/*.mcap")}
+            for folder in (designed.folder.rehearsed, campaign.folder.rehearsed)
+        )
+        assert first
+        assert first == again
+
+
+def test_of_a_failed_run_as_modelled_nothing_else_is_left(tmp_path: Path) -> None:
+    cell = cell_of(tmp_path, CELL.replace("gear_ratio = [100.0", "gear_ratio = [-100.0") + GEARS)
+    campaign = fast_campaign(tmp_path / "campaign", cell, rehearsed=False)
+    assert not campaign.rehearse().passed
+    assert [path.name for path in campaign.folder.rehearsed.iterdir()] == ["plain"]
+
+
+def test_a_rehearsal_is_stopped_while_the_second_run_goes_on() -> None:
+    with WorkerProcess(timeout=60.0) as child:
+        child.begin(time.sleep, 30.0)
+        with pytest.raises(OperatorStopError, match="rehearse again"):
+            waited_for(child, Stop(requested=True))
+
+
+def test_a_second_run_that_was_killed_is_no_verdict() -> None:
+    with WorkerProcess(timeout=60.0) as child:
+        child.begin(os.abort)
+        with pytest.raises(ExecutionError, match="second simulated arm ended"):
+            waited_for(child, Stop())
 
 
 def test_the_command_is_the_method_with_exit_codes(designed: Campaign, tmp_path: Path) -> None:
