@@ -11,8 +11,6 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final, NoReturn
 
-import numpy as np
-
 from hil.base.errors import SourceError, UnrecordedJointError
 from hil.base.safe_input import parse_toml
 from hil.base.toml_text import to_text
@@ -26,6 +24,7 @@ from hil.importers.log_files import LogFiles, files_in
 from hil.importers.name_words import kind_by_words
 from hil.importers.proposal import Proposal
 from hil.importers.robot import NOT_RECORDED, Robot
+from hil.importers.stamps import is_clock
 from hil.importers.text_table import Table
 from hil.importers.units import Kind, kind_named
 
@@ -33,16 +32,6 @@ _JOINT_KINDS: Final[tuple[Kind, ...]] = (
     "position", "velocity", "torque", "motor_current", "commanded_position",
 )  # fmt: skip
 _ARM: Final = ("torque", "motor_current", "commanded_position")
-_EVEN: Final = 0.9  # of the steps of a clock are usual ones
-
-
-def is_clock(values: np.ndarray[Any, Any]) -> bool:
-    """Return whether numbers (m,) are times: they grow in every row, mostly by the same step."""
-    steps = np.diff(values)
-    if len(steps) < 2 or not np.all(steps > 0.0):
-        return False
-    usual = np.median(steps)
-    return bool(np.mean(np.abs(steps - usual) <= 0.5 * usual) >= _EVEN)
 
 
 @dataclass(frozen=True)

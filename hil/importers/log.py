@@ -580,6 +580,12 @@ class _Log:
             upright = self._upright(matrix, quantity, file.path, name)
             return upright, units if upright is matrix else [None] * upright.shape[1]
         columns = (columns,) if isinstance(columns, str) else columns
+        if len(columns) < len(self.joints):
+            problem = f"has {len(columns)} entries"
+            remedy = f"one for each of the joints {', '.join(self.joints)}; or {NOT_RECORDED}"
+            raise UnrecordedJointError(self.path, problem, field=field, remedy=remedy).of(
+                len(columns)
+            )
         self._check_count(columns, field)
         units = [file.unit(column) for column in columns]
         if isinstance(file, ArrayFile):

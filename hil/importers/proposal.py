@@ -6,14 +6,17 @@ positions, velocities and torques against the URDF.
 
 from __future__ import annotations
 
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import Final, NoReturn
 
+from hil.base.arrays import Array
 from hil.base.errors import SourceError, UnrecordedJointError
 from hil.base.safe_input import parse_toml
 from hil.base.toml_text import to_text
+from hil.importers.arrays import ArrayFile
 from hil.importers.channel_groups import NUMBER, Group, grouped
 from hil.importers.channels import CHANNEL_NAMES, Channel, channels_of, kind_of, kinds_of_file
 from hil.importers.column_map import ColumnMap, Format, ready_map, ready_maps
@@ -30,12 +33,17 @@ from hil.importers.name_words import is_measured, kind_by_words, kinds_said, wor
 from hil.importers.robot import Robot
 from hil.importers.row_names import row_names
 from hil.importers.stated_units import other_unit
+from hil.importers.text_table import Table
 from hil.importers.units import Kind, kind_named, unit_of
+from hil.importers.unnamed_columns import ColumnBlocks, blocks_of, roughness
 
 _JOINT_KINDS: Final[tuple[Kind, ...]] = (
     "position", "velocity", "torque", "motor_current", "commanded_position",
 )  # fmt: skip
 _MOST_NAMED: Final = 30
+_ERRORS: Final = frozenset({"error", "errors", "err"})
+"""Words of the deviations of a controller, which are no quantity of a joint."""
+_CLEARLY: Final = 1.5  # ratio of roughness of times that do not fit the motion to those that do
 _NANO: Final = frozenset({"nano", "nanosec", "nanosecs", "nanoseconds", "nsec", "nsecs"})
 """Words of the nanoseconds of a time whose seconds are in another column."""
 _Columns = str | Sequence[str | int]
@@ -102,6 +110,10 @@ def proposed_map(
     search = _Search(log, joints, groups, chosen, sample_rate, recorded)
     search.nanoseconds = nanoseconds
     search.with_unit = with_unit
+    search.of_arm = len(robot.without_gripper().joint_names)
+    search.file = (
+        None if log.is_dir() else partial((files or LogFiles()).file, log, form or Format())
+    )
     return search.proposal(form)
 
 
@@ -172,6 +184,8 @@ class _Search:
         self._recorded = recorded
         self._columns_of = recorded or joints
         self.nanoseconds: str | int | None = None  #: column that is added to that of the time
+        self.of_arm = len(joints)  #: joints without those of a gripper
+        self.file: Callable[[], Table | ArrayFile] | None = None  #: the log, parsed
         self.with_unit: Collection[str] = ()  #: quantities whose unit a map states
         self._groups = groups
         self._chosen = chosen
@@ -316,8 +330,51 @@ class _Search:
             patterns = [name for name in names if "{}" not in name]
         listing = " and ".join(group.label for group in groups)
         problem = f"{listing} are all named as {kind}"
+        if kind == "time":
+            best = self._smoothest([name for name in patterns if "{}" not in name])
+            if best is not None:
+                patterns = [best, *(name for name in patterns if name != best)]
+                problem += (
+                    f", of which {best} fits the motion: at its times the positions are smooth"
+                )
         options = " or ".join(f"--columns '{kind}={pattern}'" for pattern in patterns[:_MOST_NAMED])
         raise SourceError(self._log, problem, field=kind, remedy=f"choose one: {options}")
+
+    def _smoothest(self, names: Sequence[str]) -> str | None:
+        """Return the times at which the positions are clearly smoothest; None if none are."""
+        positions = [group for group in self._groups_of("position") if group.size > 1]
+        if self.file is None or len(positions) != 1 or len(names) < 2:
+            return None
+        try:
+            file = self.file()
+            position = self._numbers(file, positions[0])
+            found = {
+                name: roughness(file.numbers([name], "time", None)[:, 0], position)
+                for name in names
+            }
+        except SourceError:  # of dates, or of a cell that is no number
+            return None
+        known = sorted((value, name) for name, value in found.items() if value is not None)
+        if not known or (len(known) > 1 and known[1][0] < _CLEARLY * known[0][0]):
+            return None
+        return known[0][1]
+
+    @staticmethod
+    def _numbers(file: Table | ArrayFile, group: Group) -> Array:
+        if isinstance(file, ArrayFile) and len(group.names) == 1:
+            return file.matrix(group.names[0], "position")
+        return file.numbers(group.names, "position", None)
+
+    def _blocks(self) -> ColumnBlocks | None:
+        """Return what the columns of a table without names may be."""
+        if self.file is None:
+            return None
+        try:
+            file = self.file()
+            values = file.matrix(None, "position")
+        except SourceError:
+            return None
+        return blocks_of(values, (len(self._joints), self.of_arm))
 
     def _refuse_unit(self, kind: Kind, group: Group) -> NoReturn:
         assert group.unit is not None
@@ -382,16 +439,19 @@ class _Search:
             problem += f", which name no quantity (the name of the file says {_named(stated[0])})"
             remedy = self._remedy_for_files(files)
         else:
-            place = "0" if self._nameless else "NAME"
-            steps = [f"--sample-rate HZ or --columns time={place}"] if "time" in missing else []
-            count = len(self._joints)
-            for number, kind in enumerate(kind for kind in missing if kind != "time"):
+            blocks = self._blocks() if self._nameless else None
+            steps = ["--sample-rate HZ or --columns time=NAME"] if "time" in missing else []
+            if blocks is not None and steps:
+                steps = ["--sample-rate HZ" if blocks.time is None else "--columns time=0"]
+            for kind in (kind for kind in missing if kind != "time"):
                 pattern = _likely(kind, unnamed)
                 unnamed = [group for group in unnamed if group.pattern != pattern]
                 if self._nameless:
-                    first = 1 + number * count
-                    pattern = ",".join(map(str, range(first, first + count)))
+                    block = None if blocks is None else getattr(blocks, kind)
+                    pattern = "NUMBER,NUMBER,..." if block is None else ",".join(map(str, block))
                 steps.append(f"--columns '{kind}={pattern}'")
+            if blocks is not None and blocks.velocity is not None:
+                steps.append(f"--columns 'velocity={','.join(map(str, blocks.velocity))}'")
             remedy = f"state {'; '.join(steps)}; or write a map (--map map.toml)"
             if missing == ["torque"]:
                 remedy += (
@@ -430,7 +490,11 @@ class _Search:
 
 def _likely(kind: str, groups: Sequence[Group]) -> str:
     """Return the pattern of the group that may be of a quantity: by its words, else the first."""
-    said = {group.pattern: kinds_said(group.pattern) for group in groups if group.kind is None}
+    said = {
+        group.pattern: kinds_said(group.pattern)
+        for group in groups
+        if group.kind is None and _ERRORS.isdisjoint(words_of(group.pattern))
+    }
     patterns = [pattern for pattern, kinds in said.items() if kind in kinds]
     patterns += [pattern for pattern, kinds in said.items() if not kinds]
     return patterns[0] if patterns else "NAME{}"

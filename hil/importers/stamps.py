@@ -10,6 +10,7 @@ from typing import Final, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from hil.base.arrays import Array
 from hil.base.errors import SourceError
 from hil.importers.conclusions import ClockRestarted, CounterContinued, Sample, SortedSamples
 from hil.importers.units import TIMES
@@ -25,6 +26,7 @@ _SHORTEST_PART: Final = 10**9  # ns of a motion that was recorded after another 
 _PAUSE: Final = 10**9  # ns between them
 _FEWEST_ROWS: Final = 20  # rows
 _SWAPPED: Final = 0.02  # share of the samples of a recording that may have changed places
+_EVEN: Final = 0.9  # of the steps of a clock are usual ones
 YEAR: Final = 365 * 86_400 * 10**9
 """[ns]"""
 _WRAPS: Final[dict[str, int]] = {
@@ -144,6 +146,15 @@ def is_row_counter(times: Sequence[int | None]) -> bool:
     if len(known) < _FEWEST_ROWS or known[0] not in (0, 10**9):
         return False
     return all(after - before == 10**9 for before, after in pairwise(known))
+
+
+def is_clock(values: Array) -> bool:
+    """Return whether numbers (m,) are times: they grow in every row, mostly by the same step."""
+    steps = np.diff(values)
+    if len(steps) < 2 or not np.all(steps > 0.0):
+        return False
+    usual = np.median(steps)
+    return bool(np.mean(np.abs(steps - usual) <= 0.5 * usual) >= _EVEN)
 
 
 def check_clock(stamp: Stamps, path: Path, remedy: str | None = None) -> None:
