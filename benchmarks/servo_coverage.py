@@ -79,6 +79,7 @@ def judged(seed: int, seconds: float) -> tuple[list[Judged], float]:
     truth = planted.Planted.drawn(rng)
     model, bodies = _model()
     motions = []
+    fine = []
     for duration in (seconds, 12.0):
         instants, command = planted.commands(rng, duration)
         position = planted.simulated(truth, instants, command)
@@ -88,9 +89,11 @@ def judged(seed: int, seconds: float) -> tuple[list[Judged], float]:
             joint_names=planted.NAMES,
             commanded_position=command,
         )
-        motions += motions_of(recording, model, bodies, Grid.of(recording))
+        grid = Grid.of(recording)
+        motions += motions_of(recording, model, bodies, grid)
+        fine += motions_of(recording, model, bodies, grid.halved)
     fitted, unseen = motions
-    found = fit_servos([fitted], np.full(3, planted.COUNT / np.sqrt(12.0)))
+    found = fit_servos([fitted], fine[:1], np.full(3, planted.COUNT / np.sqrt(12.0)))
     intervals = intervals_of(found)
     (simulated,) = predicted(model, bodies, unseen, [intervals.values])
     error = np.sqrt(np.mean((simulated - unseen.position) ** 2))

@@ -32,6 +32,14 @@ class ServoValue(Frozen):
     present: bool  #: whether the model has this term
 
 
+class ServoPush(Frozen):
+    """A joint that moved while its command rested and the model stood."""
+
+    joint: str
+    time: float  #: from the start of the motion [s]
+    change_mrad: float
+
+
 class ServoPrediction(Frozen):
     """Error of a motion that was simulated from its commands alone."""
 
@@ -43,6 +51,7 @@ class ServoPrediction(Frozen):
     command_joint_errors_mrad: list[float]
     compared_error_mrad: Known = None  #: of the parameters of the file to compare with
     compared_joint_errors_mrad: list[float] | None = None
+    pushed: tuple[ServoPush, ...] = ()  #: joints that something touched
 
 
 class ServoTermChoice(Frozen):

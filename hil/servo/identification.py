@@ -22,6 +22,7 @@ from hil.pipeline.sources import Source, Sources, gather_sources
 from hil.results.servo_result import (
     ServoPosterior,
     ServoPrediction,
+    ServoPush,
     ServoResults,
     ServoTermChoice,
     ServoValue,
@@ -37,6 +38,7 @@ from identification.servo.intervals import intervals_of
 from identification.servo.motion import Grid, ServoMotion, motions_of
 from identification.servo.parameters import TERMS, in_units
 from identification.servo.prediction import predicted
+from identification.servo.pushes import pushes_of
 from identification.servo.simulators import ENGINES, ITERATIONS, Engine, fits_in_simulators
 
 _FINEST: Final = 1e-5  # rad or m, least resolution of positions
@@ -95,9 +97,10 @@ def identify_servos(
     if options.compare is not None:
         compared = maker_parameters(options.compare, cell.joint_names)
     grid = Grid.of(sources.training[0].recording)
-    fitted = [
-        motion for source in sources.training for motion in _motions(source, cell, bodies, grid)
-    ]
+    fitted, fine = (
+        [each for source in sources.training for each in _motions(source, cell, bodies, on)]
+        for on in (grid, grid.halved)
+    )
     if not fitted:
         problem = "has no part in which the commanded positions are known"
         remedy = "record the commanded positions, or name them (--columns)"
@@ -105,7 +108,7 @@ def identify_servos(
     resolution = _resolution(sources)
     started = time.process_time()
     with reporter.task("servos", steps_of_a_fit() + len(ENGINES) * ITERATIONS) as task:
-        fit = fit_servos(fitted, resolution, done=lambda: task.advance(1))
+        fit = fit_servos(fitted, fine, resolution, done=lambda: task.advance(1))
         simulators = fits_in_simulators(fitted, fit, resolution, done=lambda: task.advance(1))
     found = _Found(fit, simulators, time.process_time() - started)
     with reporter.task("held-out motions", len(sources.held_out)) as task:
@@ -213,6 +216,16 @@ def _prediction(series: ServoSeries, engine: Engine | None = None) -> ServoPredi
     )
 
 
+def _pushes(series: ServoSeries, names: Sequence[str]) -> tuple[ServoPush, ...]:
+    """Return the joints that something touched."""
+    step = float(series.time[1] - series.time[0])
+    pushes = pushes_of(step, series.commanded, series.measured, series.identified)
+    return tuple(
+        ServoPush(joint=names[push.joint], time=push.time, change_mrad=_MILLI * push.change)
+        for push in pushes
+    )
+
+
 def _results(
     name: str,
     sources: Sources,
@@ -238,7 +251,9 @@ def _results(
         seconds=found.seconds,
         delay=estimate.bus_delay,
         servo=_values(found.fit, cell),
-        validation=[_prediction(each) for each in series],
+        validation=[
+            _prediction(each).model_copy(update={"pushed": _pushes(each, names)}) for each in series
+        ],
         in_sample=sources.in_sample,
         tested_on=sources.tested_on,
         compared=None if options.compare is None else options.compare.name,

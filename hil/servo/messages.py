@@ -59,7 +59,15 @@ def verdict_of(results: ServoResults) -> ServoVerdict:
             results.joint_names, each.joint_errors_mrad, each.command_joint_errors_mrad, strict=True
         )
         poor = [joint for joint, own, command in pairs if own > max(command, 1.0)]
-        if poor:
+        pushed = max(each.pushed, key=lambda push: abs(push.change_mrad), default=None)
+        if pushed is not None:
+            joints = ", ".join(push.joint for push in each.pushed)
+            warnings.append(
+                f"{each.archive}: something touched the arm: {joints} moved while the command"
+                f" rested and the model stood, {pushed.joint} by {pushed.change_mrad:.0f} {unit} at"
+                f" {pushed.time:.0f} s"
+            )
+        elif poor:
             warnings.append(
                 f"{each.archive}: {', '.join(poor)} predicted worse than by the command itself"
             )

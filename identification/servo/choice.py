@@ -18,7 +18,8 @@ from identification.servo.motion import ServoMotion
 from identification.servo.parameters import OPTIONAL, PLACE, TERMS
 from identification.servo.start import STARTS, prior_of, start_of
 
-ITERATIONS: Final = 24
+ITERATIONS: Final = 12
+_FINE: Final = 7  # iterations on the halved grid
 _ROUGH: Final = 12  # iterations of each start
 _TRIAL: Final = 4  # of each fit of a fold
 _FOLDS: Final = 2
@@ -63,11 +64,12 @@ class ServoFit:
 
 def steps_of_a_fit() -> int:
     """Return the number of iterations that `fit_servos` reports at most."""
-    return len(STARTS) * _ROUGH + (1 + len(OPTIONAL)) * _FOLDS * _TRIAL + ITERATIONS
+    return len(STARTS) * _ROUGH + (1 + len(OPTIONAL)) * _FOLDS * _TRIAL + ITERATIONS + _FINE
 
 
 def fit_servos(
     motions: Sequence[ServoMotion],
+    fine: Sequence[ServoMotion],
     resolution: Array,
     *,
     done: Callable[[], None] = lambda: None,
@@ -76,6 +78,7 @@ def fit_servos(
 
     Args:
         motions: that are fitted.
+        fine: the same on the halved grid, for the last iterations.
         resolution: standard deviation of the measured positions (n,).
         done: called after each iteration.
     """
@@ -90,6 +93,7 @@ def fit_servos(
             start_of(prior, start),
             resolution,
             iterations=_ROUGH,
+            rough=True,
             done=done,
         )
         for start in STARTS
@@ -104,7 +108,12 @@ def fit_servos(
         windows, prior, chosen, best.coordinates, resolution, iterations=ITERATIONS,
         bus=best.bus_delay, done=done,
     )  # fmt: skip
-    return ServoFit(final, choices, windows.count, shown_terms(windows, final))
+    finely = Windows.of(fine)
+    final = fit(
+        finely, prior, chosen, final.coordinates, resolution, iterations=_FINE,
+        bus=final.bus_delay, done=done,
+    )  # fmt: skip
+    return ServoFit(final, choices, windows.count, shown_terms(finely, final))
 
 
 def shown_terms(windows: Windows, estimate: ServoEstimate) -> NDArray[np.bool_]:

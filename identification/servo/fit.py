@@ -117,6 +117,8 @@ class ServoEstimate:
         alike: residuals that count as one (n,).
         bus_delay: delay of the bus [s].
         cost: of each joint (n,).
+        between: covariance of the coordinates of each joint by leaving out a window each
+            (n, P, P), for the windows alone, without the prior.
     """
 
     coordinates: Array
@@ -127,6 +129,7 @@ class ServoEstimate:
     alike: Array
     bus_delay: float
     cost: Array
+    between: Array
 
     @property
     def values(self) -> Array:
@@ -279,6 +282,7 @@ class _Fit:
         residuals would give, the median of the terms: one at a limit may scatter anyhow.
         """
         self._alike = self.alike.copy()
+        self._between = np.zeros((self.windows.n_joints, _P, _P))
         weights = _weights(here / self.scatter)
         for joint in range(self.windows.n_joints):
             inside = self.present[joint, terms]
@@ -291,7 +295,10 @@ class _Fit:
             whole = of_data + np.diag(self.prior.spread[joint, terms[inside]] ** -2.0)
             shifts = np.linalg.solve(whole - by_window, scores[..., None])[..., 0]
             count = len(shifts)
-            scatter = (shifts**2).sum(axis=0) * (count - 1) / count
+            between = shifts.T @ shifts * (count - 1) / count
+            places = terms[inside]
+            self._between[joint][np.ix_(places, places)] = between
+            scatter = np.diag(between)
             inverse = np.linalg.inv(whole)
             expected = np.diag(inverse @ of_data @ inverse)
             known = expected > 0.0
@@ -310,6 +317,7 @@ class _Fit:
         self.alike = self._alike.copy()
 
     _alike: Array = field(default_factory=lambda: np.zeros(0))
+    _between: Array = field(default_factory=lambda: np.zeros(0))
     _least: Array = field(default_factory=lambda: np.zeros(0))
 
 
@@ -378,4 +386,5 @@ def fit(
         progress.alike,
         progress.bus,
         progress.cost,
+        progress._between,
     )

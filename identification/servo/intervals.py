@@ -86,19 +86,28 @@ def sampled(
 
 
 def _spread(estimate: ServoEstimate) -> Array:
-    """Return standard deviations of the parameters (n, P), logarithms of positive ones."""
+    """Return standard deviations of the parameters (n, P), logarithms of positive ones.
+
+    Residuals of a window are alike for longer in some directions than in others. So what they add
+    to the variance of a parameter is at least its scatter when a window each is left out.
+    """
     n, count = estimate.coordinates.shape
-    blocks = np.stack(
-        [
-            estimate.covariance[j * count : (j + 1) * count, j * count : (j + 1) * count]
-            for j in range(n)
-        ]
-    )
-    own = np.diagonal(blocks, axis1=1, axis2=2)
-    kp = PLACE["kp"]
-    both = own[:, [kp]] + own - 2.0 * blocks[:, kp]
-    variance = np.where(_POWER == 1, both, own)
-    return np.sqrt(np.maximum(variance, 0.0))
+    combinations = np.eye(count)
+    combinations[_POWER == 1, PLACE["kp"]] -= 1.0
+    deviations = np.empty((n, count))
+    for joint in range(n):
+        part = slice(joint * count, (joint + 1) * count)
+        whole = estimate.covariance[part, part]
+        present = np.outer(estimate.present[joint], estimate.present[joint])
+        whole = np.where(present, whole, 0.0)
+        of_prior = (whole * estimate.prior.spread[joint] ** -2.0) @ whole
+        variance, by_prior, between = (
+            np.einsum("pa,ab,pb->p", combinations, matrix, combinations)
+            for matrix in (whole, of_prior, estimate.between[joint])
+        )
+        by_windows = np.maximum(variance - by_prior, between)
+        deviations[joint] = np.sqrt(np.maximum(by_prior + by_windows, 0.0))
+    return deviations
 
 
 def _prior_spread(estimate: ServoEstimate) -> Array:

@@ -18,9 +18,9 @@ from benchmarks import servo_arm as arm
 from hil.base.errors import InputError
 from hil.base.one_screen import one_screen
 from hil.cli import app
-from hil.results.servo_result import ServoResults, is_servo_result
+from hil.results.servo_result import ServoPush, ServoResults, is_servo_result
 from hil.servo.maker_file import maker_parameters
-from hil.servo.messages import screen
+from hil.servo.messages import screen, verdict_of
 from identification.servo.parameters import PLACE
 
 SO101 = Path(__file__).resolve().parents[3] / "shared" / "data" / "so101"
@@ -106,6 +106,18 @@ class TestCommand:
         assert is_servo_result(folder / "results.json")
         document = json.loads((folder / "results.json").read_text())
         assert {value["name"] for value in document["servo"]} == set(PLACE)
+
+    def test_a_touched_arm_is_said(self, identified: tuple[Path, str, int]) -> None:
+        folder, _, _ = identified
+        results = ServoResults.load(folder / "results.json")
+        (unseen,) = results.validation
+        assert not unseen.pushed
+        push = ServoPush(joint="lift", time=35.6, change_mrad=-60.0)
+        touched = results.model_copy(
+            update={"validation": [unseen.model_copy(update={"pushed": (push,)})]}
+        )
+        (warning,) = [w for w in verdict_of(touched).warnings if "touched" in w]
+        assert "lift by -60 mrad at 36 s" in warning
 
     def test_the_screen_is_short(self, identified: tuple[Path, str, int]) -> None:
         folder, _, _ = identified
@@ -241,17 +253,23 @@ class TestExports:
             kp = document["draws"]["kp"][k]
             assert model.actuator_gainprm[:, 0] == pytest.approx(kp, rel=1e-5)
 
-    def test_what_moves_together_is_sampled_together(
+    def test_draws_are_correlated_as_the_posterior_is(
         self, identified: tuple[Path, str, int], tmp_path: Path
     ) -> None:
-        """All torques of a joint grow with its gain: positions show their ratios best."""
         folder, _, _ = identified
         path = tmp_path / "arm.py"
-        assert exported(folder, "--to", "genesis", "-o", path, "--ensemble", 400)[0] == 0
+        assert exported(folder, "--to", "genesis", "-o", path, "--ensemble", 2000)[0] == 0
         draws = json.loads((tmp_path / "arm.ranges.json").read_text())["draws"]
-        kp, viscous = (np.log(draws[name]) for name in ("KP", "DAMPING"))
+        posterior = ServoResults.load(folder / "results.json").simulators["mujoco"].posterior
         for joint in range(3):
-            assert np.corrcoef(kp[:, joint], viscous[:, joint])[0, 1] > 0.5
+            # Coordinates are logarithms of 1 / kp and of friction over kp.
+            first = joint * len(PLACE)
+            logarithms = np.zeros((2, len(posterior.covariance)))
+            logarithms[:, first + PLACE["kp"]] = -1.0
+            logarithms[1, first + PLACE["viscous"]] = 1.0
+            expected = logarithms @ np.array(posterior.covariance) @ logarithms.T
+            found = np.cov([np.log(draws[name])[:, joint] for name in ("KP", "DAMPING")])
+            np.testing.assert_allclose(found, expected, atol=0.15 * expected.max())
 
     def test_an_own_mjcf_is_changed_in_place(
         self, identified: tuple[Path, str, int], tmp_path: Path

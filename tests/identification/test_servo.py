@@ -11,6 +11,7 @@ from identification.servo.intervals import intervals_of, sampled
 from identification.servo.motion import Grid, motions_of
 from identification.servo.parameters import NAMES, PLACE, TERMS, in_errors, in_units
 from identification.servo.prediction import predicted
+from identification.servo.pushes import pushes_of
 from identification.servo.simulation import JointInputs, simulate
 from identification.signals.recording import Recording
 
@@ -104,14 +105,17 @@ def planted():
     truth = arm.Planted.drawn(rng)
     model, bodies = model_of_arm()
     motions = []
+    fine = []
     for duration in (40.0, 15.0):
         time, command = arm.commands(rng, duration)
         position = arm.simulated(truth, time, command)
         recording = Recording(
             time=time, position=position, joint_names=arm.NAMES, commanded_position=command
         )
-        motions += motions_of(recording, model, bodies, Grid.of(recording))
-    fit = fit_servos(motions[:1], np.full(3, arm.COUNT / np.sqrt(12.0)))
+        grid = Grid.of(recording)
+        motions += motions_of(recording, model, bodies, grid)
+        fine += motions_of(recording, model, bodies, grid.halved)
+    fit = fit_servos(motions[:1], fine[:1], np.full(3, arm.COUNT / np.sqrt(12.0)))
     intervals = intervals_of(fit)
     (simulated,) = predicted(model, bodies, motions[1], [intervals.values])
     return truth, fit, intervals, motions[1], simulated
@@ -148,3 +152,36 @@ def test_draws_scatter_as_the_intervals_say(planted):
     inside = (draws[:, :, kp] > intervals.lower[:, kp]) & (draws[:, :, kp] < intervals.upper[:, kp])
     assert 0.9 < inside.mean() < 1.0
     assert len(NAMES) == draws.shape[2]
+
+
+def test_intervals_hold_the_planted_values(planted):
+    truth, _, intervals, *_ = planted
+    names = [name for name in NAMES if hasattr(truth, name)]
+    places = [PLACE[name] for name in names]
+    true = np.stack([np.broadcast_to(getattr(truth, name), 3) for name in names], axis=1)
+    lower, upper, value, known = (
+        part[:, places]
+        for part in (intervals.lower, intervals.upper, intervals.values, intervals.determined)
+    )
+    held = (lower <= true) & (true <= upper)
+    assert held[known].mean() >= 0.85
+    ratio = np.maximum(value, 1e-9)[known] / true[known]
+    assert ((ratio > 0.5) & (ratio < 2.0)).all()
+
+
+def test_a_joint_that_moves_while_its_command_rests_was_pushed():
+    """Not one that follows late, nor one that the model moves as well."""
+    step = 0.01
+    time = step * np.arange(1000)
+    command = np.zeros((1000, 3))
+    command[:, 2] = np.clip(time - 2.0, 0.0, 0.3)
+    measured = np.zeros((1000, 3))
+    measured[:, 0] = -0.06 * np.clip(2.0 * (time - 6.0), 0.0, 1.0)
+    measured[:, 1] = 0.05 * np.clip(time - 3.0, 0.0, 1.0)
+    measured[:, 2] = np.clip(time - 2.1, 0.0, 0.3)
+    simulated = measured.copy()
+    simulated[:, 0] = 0.0
+    (push,) = pushes_of(step, command, measured, simulated)
+    assert push.joint == 0
+    assert push.change == pytest.approx(-0.06)
+    assert push.time == pytest.approx(6.0, abs=0.6)
