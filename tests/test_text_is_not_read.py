@@ -27,6 +27,7 @@ SEARCHES: Final = frozenset(
 """Methods of a string that look into it; those that only rewrite it for output are not meant."""
 PATTERNS: Final = frozenset({"search", "match", "fullmatch", "findall", "finditer", "split", "sub"})
 FOREIGN: Final[Mapping[str, str]] = {
+    "sim_fixtures.ur.controller": "--fault",
     "hil.archive.cdr": "definitions of ROS messages",
     "hil.archive.live": "addresses that the user writes",
     "hil.cell.schema": "addresses that the user writes",

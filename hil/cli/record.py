@@ -175,7 +175,7 @@ def constants_lines(found: ConstantsFound) -> Iterator[str]:
         yield f"those of the cell differ: {_constants(found.in_cell)}; correct torque_constant"
     share = percentage(found.uncertainty)
     yield (
-        f"next  they are uncertain by {share}: record the same motion with a known load, then\n"
+        f"next  the constants are uncertain by {share}: record the motion with a known load, then\n"
         "      hil torque-constants ARCHIVES --loaded LOADED --mass KG --centre X,Y,Z"
     )
 

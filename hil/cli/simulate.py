@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 import time
 from collections import Counter
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Annotated, Final, Literal
 
@@ -16,6 +16,7 @@ from hil.base.progress import say_at_once
 from hil.base.terminal_text import plural, printable
 from hil.cell import Cell
 from hil.cli.arguments import JsonOption, print_json
+from hil.cli.record import with_rtde
 from hil.control.move import joint_index
 from hil.control.simulation import (
     OWN_SPEED,
@@ -31,6 +32,7 @@ from hil.control.simulator_on_link import (
     realtime_process,
     serve_session,
 )
+from hil.control.ur_simulation import served_arm
 from sim_fixtures import ControllerSettings, Phase, SimulatedController
 from sim_fixtures.faults import parse_fault, split_faults
 from sim_fixtures.serve import PATIENCE, Latencies, Request, ServeCounts
@@ -162,11 +164,14 @@ def simulate(
     ends the session properly (a second one at once); `kill -USR1` presses drive-on, `kill -USR2`
     the emergency stop. See `docs/simulate.md`, also for the faults.
 
+    With --link rtde:HOST[:PORT] it is a Universal Robots controller that listens at that address
+    (RTDE, primary interface and dashboard) until Ctrl-C: outputs only, for programs that read them.
+
     Options:
         cell: Cell file; without a [simulation] table the arm has the values of [nominal].
         udp: Address of the PC program.
         can: CAN bus in place of UDP, in python-can names, such as socketcan:can0.
-        link: Either of them, or another transport of cell files, such as udp:127.0.0.1:2001.
+        link: Either of them, such as udp:127.0.0.1:2001; or rtde:HOST[:PORT].
         cycle: Cycle, ms. Default: that of the cell.
         mode: Open mode: 1, 2, 4, 5, 7, 8 or 9. Default: that of the cell.
         stagger: Cycles between two axes entering open mode.
@@ -190,6 +195,19 @@ def simulate(
         priority: Real-time priority (SCHED_FIFO) to request.
     """
     read = Cell.load(cell)
+    if link is not None and link.startswith("rtde:"):
+        others = {
+            "--udp": udp, "--can": can, "--cycle": cycle, "--mode": mode, "--only-axis": only_axis,
+            "--warm-start": warm_start, "--intervals": intervals, "--effects": effects,
+            "--repeat": repeat, "--patience": patience,
+        }  # fmt: skip
+        serve_rtde(
+            with_rtde(read, link),
+            ArmOnRtde(own_speed if own_motion else None, fault or [], seed, duration, priority),
+            [option for option, value in others.items() if value],
+            json=json,
+        )
+        return
     loaded = with_simulation(read)
     if only_axis is not None:
         joint_index(loaded, str(only_axis), "--only-axis")
@@ -262,6 +280,51 @@ def simulate(
         raise typer.Exit(130)
     if served.controller.program.gave_up or not served.summary.ended:
         raise typer.Exit(4)
+
+
+@dataclass(frozen=True)
+class ArmOnRtde:
+    """How an arm is simulated: speed of its program, faults, seed, s, and priority."""
+
+    own_speed: float | None
+    faults: list[str]
+    seed: int | None
+    duration: float | None
+    priority: int | None
+
+
+def serve_rtde(cell: Cell, arm: ArmOnRtde, others: list[str], *, json: bool) -> None:
+    """Serve the Universal Robots arm of a cell until Ctrl-C or the end of the duration."""
+    if others:
+        problem = "does not apply to a Universal Robots controller"
+        raise InputError(None, problem, field=others[0], remedy="leave it out")
+    loaded = with_simulation(cell)
+    server = served_arm(loaded, own_speed=arm.own_speed, faults=arm.faults, seed=arm.seed)
+    if not json:
+        ports = ", ".join(f"{name} {port}" for name, port in server.ports.items())
+        say_at_once(
+            f"{cell.name}: a SIMULATED Universal Robots controller at {cell.controller.host}; "
+            f"nothing moves.\nports: {ports}; process {os.getpid()}"
+        )
+    try:
+        with buttons(arm.duration) as pressed, realtime_process(arm.priority):
+            server.run(lambda: pressed.request() is not Request.CONTINUE)
+    finally:
+        server.close()
+    figures = {
+        "cycles": server.controller.cycle + 1,
+        "late": server.late,
+        "skipped": server.skipped,
+        "clients": server.most_clients,
+    }
+    if json:
+        print_json(figures)
+    else:
+        text = (
+            "{cycles} cycles, {late} of them late by a cycle; at most {clients} clients at a time, "
+            "to which {skipped} frames were not sent because they did not read"
+        )
+        typer.echo(text.format_map(figures))
 
 
 def _print_closing(served: Served, *, as_json: bool) -> None:

@@ -78,6 +78,7 @@ class SimulatedUrArm:
         seed: of its noise.
         load: what its flange carries, and the controller does not know.
         entered: the payload that the controller knows; the flange carries it as well.
+        urdf: of the arm, six joints.
     """
 
     def __init__(
@@ -89,10 +90,11 @@ class SimulatedUrArm:
         seed: int = 0,
         load: Carried | None = None,
         entered: Carried | None = None,
+        urdf: str = UR5E_URDF,
     ) -> None:
         self.truth = truth
-        self.plant = Plant(UR5E_URDF, truth.plant, position=position)
-        self._model = build_model(UR5E_URDF, (0.0, 0.0, -9.81), truth.plant.rotor_inertia)
+        self.plant = Plant(urdf, truth.plant, position=position)
+        self._model = build_model(urdf, (0.0, 0.0, -9.81), truth.plant.rotor_inertia)
         carry(self.plant.model, load)
         carry(self.plant.model, entered)
         carry(self._model, entered)

@@ -2,15 +2,17 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Final, Literal
+from typing import Final, Literal, cast, get_args
 
 import numpy as np
 
 from sim_fixtures.arrays import Array
 from sim_fixtures.plant import Carried
-from sim_fixtures.ur.arm import SimulatedUrArm, UrArmTruth
+from sim_fixtures.settings import SettingError
+from sim_fixtures.ur.arm import UR5E_URDF, SimulatedUrArm, UrArmTruth
 
 RUNNING: Final = 7
 POWER_OFF: Final = 3
@@ -114,6 +116,23 @@ class UrFault:
     count: int = 1
 
 
+_FAULT: Final = re.compile(r"(?P<kind>[a-z-]+)@(?P<cycle>[0-9]{1,9})(?:x(?P<count>[0-9]{1,9}))?")
+
+
+def parse_ur_fault(text: str) -> UrFault:
+    """Return the fault that KIND@CYCLE or KIND@CYCLExCOUNT means.
+
+    Raises:
+        SettingError: it is none; the kinds are named.
+    """
+    match = _FAULT.fullmatch(text)
+    kinds = get_args(UrFaultKind)
+    if match is None or match["kind"] not in kinds:
+        raise SettingError("fault", text, f"KIND@CYCLE[xCOUNT]; kinds are {', '.join(kinds)}")
+    kind = cast(UrFaultKind, match["kind"])
+    return UrFault(kind, int(match["cycle"]), int(match["count"] or 1))
+
+
 @dataclass(frozen=True)
 class UrPayload:
     """Payload as entered at the controller, in the frame of the flange."""
@@ -163,6 +182,7 @@ class SimulatedUr:
         seed: of the noise.
         load: what the flange carries beyond the payload entered.
         repeats: whether the program begins again at its end.
+        urdf: of the arm; its kinematics as the primary interface states them are those of a UR5e.
     """
 
     def __init__(
@@ -175,6 +195,7 @@ class SimulatedUr:
         seed: int = 0,
         load: Carried | None = None,
         repeats: bool = False,
+        urdf: str = UR5E_URDF,
     ) -> None:
         self.settings = settings or UrSettings()
         self.period = 1.0 / self.settings.frequency
@@ -189,6 +210,7 @@ class SimulatedUr:
             seed=seed,
             load=load,
             entered=_carried(self.settings.payload),
+            urdf=urdf,
         )
         self.cycle = -1
         self._program_time = 0.0

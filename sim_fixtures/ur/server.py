@@ -70,6 +70,8 @@ class UrServer:
     Attributes:
         ports: of the three interfaces, by name.
         skipped: frames that were not sent to slow clients.
+        late: cycles that began late by a period or more.
+        most_clients: largest number of clients that received outputs.
 
     Raises:
         SimulationError: a port cannot be opened.
@@ -88,6 +90,8 @@ class UrServer:
         self.controller = controller
         self.ports: dict[str, int] = {}
         self.skipped = 0
+        self.late = 0
+        self.most_clients = 0
         self._real_time = real_time
         self._selector = selectors.DefaultSelector()
         self._clients: list[_Client] = []
@@ -121,6 +125,7 @@ class UrServer:
             if self._cycle_is_due():
                 self.controller.step()
                 self._send_cycle()
+                self.most_clients = max(self.most_clients, self.clients)
 
     @contextmanager
     def running(self) -> Iterator[Self]:
@@ -167,6 +172,7 @@ class UrServer:
         now = time.monotonic()
         if now < self._due:
             return False
+        self.late += now - self._due >= self.controller.period
         # After a delay of this program cycles are shifted; they are not sent in a burst.
         self._due = max(self._due, now - 10 * self.controller.period) + self.controller.period
         return True
