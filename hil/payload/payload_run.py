@@ -14,6 +14,7 @@ from hil.base.arrays import Array
 from hil.base.errors import ArchiveError, InputError
 from hil.base.progress import Reporter
 from hil.pipeline.cell_context import TorqueScale, torque_scale
+from hil.pipeline.meaning import require_weight
 from hil.pipeline.options import Options
 from hil.pipeline.prepared import Prepared, prepare_sources, samples_of
 from hil.pipeline.sources import (
@@ -287,7 +288,7 @@ def find_payload(
 
     Raises:
         NoPayloadError: the loaded recordings show no payload.
-        InputError: archives cannot be used, or are of two arms.
+        InputError: archives cannot be used, are of two arms, or hold torque without gravity.
         IdentificationError: the recordings do not determine the mass.
     """
     sides = _sides(bare, loaded)
@@ -301,6 +302,7 @@ def find_payload(
     sources = replace(by_side[False], cell=cell, training=first, held_out=first)
     prepared = prepare_sources(sources, options, reporter)
     cell = prepared.sources.cell
+    require_weight(cell.model, prepared.fitted, first[0].path)
     frame = frame or flange_of(cell.model)
     runs = _runs(prepared, last, frame, reporter)
     simulated = all(side.header.only_simulated for side in by_side.values())

@@ -126,7 +126,8 @@ class TorqueSums(NamedTuple):
         weights = np.zeros(len(gram))
         if start is not None:
             variance = np.where(start > 0.0, 1.0 / np.where(start > 0.0, start, 1.0), variance)
-        has_rows = samples > 0
+        # A torque that is zero throughout was not measured.
+        has_rows = (samples > 0) & (gram[:, -1, -1] > 0.0)
         for _ in range(_ROUNDS):
             weights = np.where(has_rows, 1.0 / np.maximum(variance, floor), 0.0)
             # One product of flat matrices: a general sum takes several times as long.

@@ -257,7 +257,9 @@ class _Spectra:
         variance = np.broadcast_to(power / rows, (len(filters), len(rows)))
         smallest = np.maximum(_SMALLEST_NOISE**2 * power / rows, np.finfo(np.float64).tiny)
         for _ in range(2):  # with weights of the torque, then of the residual
-            values = self._solved(sums, 1.0 / np.maximum(variance, smallest))
+            # A torque that is zero throughout was not measured.
+            weights = np.where(power > 0.0, 1.0 / np.maximum(variance, smallest), 0.0)
+            values = self._solved(sums, weights)
             squares = [
                 _squared_error(products, values[:, joint.columns])
                 for joint, products in zip(self.joints, sums, strict=True)

@@ -255,7 +255,8 @@ class _Problem:
 
     def weights(self, squares: Array) -> Array:
         """Return the weights of the joints (n,) by their squared residuals."""
-        return np.asarray(np.where(self.power > 0.0, self.rows / squares, 0.0))
+        loaded = self.power > 0.0
+        return np.asarray(np.where(loaded, self.rows / np.where(loaded, squares, 1.0), 0.0))
 
     def of_torque(self) -> Array:
         """Return the weights of the joints (n,) by their torque."""

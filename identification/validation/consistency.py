@@ -142,7 +142,7 @@ def check_consistency(
     free = unconstrained.values
     shift = np.abs(consistent.shift)
     links = model.layout.links
-    rise = held_out.relative_errors(values) - held_out.relative_errors(free)
+    rise = _rise(held_out, values, free)
     torque = np.sqrt(held_out.gram[:, -1, -1] / np.maximum(held_out.samples, 1))
     rise[little_torque(torque, ~model.chain.revolute)] = np.nan
     # In axes in which the reference's pseudo-inertia is the unit matrix.
@@ -175,6 +175,13 @@ def check_consistency(
         judged_on="in-sample" if in_sample else "held-out",
         overloaded=_overloaded(model, training, held_out, values, free),
     )
+
+
+def _rise(held_out: Factor, values: Array, free: Array) -> Array:
+    """Return by how much the error of each joint rises (n,), NaN where the torque is zero."""
+    errors = held_out.relative_errors(values), held_out.relative_errors(free)
+    known = np.asarray(np.isfinite(errors).all(axis=0))
+    return np.asarray(np.subtract(*errors, out=np.full(len(known), np.nan), where=known))
 
 
 def _overloaded(

@@ -207,3 +207,17 @@ def test_two_clocks_are_chosen_from(tmp_path: Path, urdf: Path, table: Table) ->
     for option in re.findall(r"--columns '[^']*'", refused):
         result = typed("import", "log", source, "--urdf", urdf, *shlex.split(option), "--force")
         assert result.exit_code == 0, result.exception
+
+
+@pytest.mark.parametrize("joint", [0, 2])
+def test_a_torque_of_zero_throughout_ends_in_a_verdict(
+    tmp_path: Path, urdf: Path, table: Table, joint: int
+) -> None:
+    """As of the fingers of a bag, or of a sensor that was not read."""
+    torque = table["tau"].copy()
+    torque[:, joint] = 0.0
+    path = csv(tmp_path / "a.csv", table, tau=torque)
+    arguments = ["identify", str(path), "--urdf", str(urdf), "-o", str(tmp_path / "out"), "--json"]
+    result = CliRunner().invoke(app, arguments)
+    assert result.exception is None or isinstance(result.exception, (HilError, SystemExit))
+    assert result.exit_code != 0

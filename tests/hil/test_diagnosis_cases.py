@@ -7,13 +7,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from hil.base.errors import SourceError
+from hil.base.errors import InputError, SourceError
 from hil.base.progress import Silent
 from hil.importers.conclusions import Certainty
 from hil.importers.recording import ImportOptions, RobotOf, import_recording
 from hil.importers.robot import Robot
 from hil.look import look_at
 from hil.look.readings import Changes, Fact
+from hil.payload.payload_run import find_payload
 from hil.pipeline.run import identify_archives
 from identification.validation.facts.diagnosis import NO_BODIES
 from tests.hil.diagnosis_cases import CASES, URDF, identified, needs_the_cases, rigid_error
@@ -73,3 +74,10 @@ def test_torque_without_bodies_is_refused_or_called_wrong(tmp_path: Path) -> Non
     verdict = identify_archives([archived(SUBTRACTED, tmp_path)], Silent()).verdict
     assert not verdict.good
     assert next(each.check for each in verdict.findings if each.level == "wrong") == NO_BODIES
+
+
+def test_no_load_is_weighed_without_gravity(tmp_path: Path) -> None:
+    folder = CASES / "06-torque-already-compensated"
+    bare, loaded = (archived(folder / f"{name}.csv", tmp_path) for name in ("bare_g", "full_g"))
+    with pytest.raises(InputError, match="gravity was removed from the torque"):
+        find_payload([bare], [loaded], Silent())
