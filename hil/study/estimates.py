@@ -48,6 +48,11 @@ class DesignEstimates:
     values: Array  #: (c, r, p)
     few_rows: Array  #: from as many rows as method A has in the print (c, r, p)
 
+    @property
+    def mean(self) -> Array:
+        """Mean over the repetitions (c, p), as in the paper's Table 2."""
+        return np.asarray(self.values.mean(axis=1))
+
 
 @dataclass(frozen=True, eq=False)
 class HeldOutForms:
@@ -57,17 +62,10 @@ class HeldOutForms:
     forms: Array  #: of each condition and motion, relative to the torque (c, m, p + 1, p + 1)
 
     def errors(self, values: Array) -> Array:
-        """Return the products y' G y' of r estimates (c, r, p), (c, m, r, r).
-
-        Those of their mean is the mean over both last axes; the roots of it is a relative error.
-        """
-        return quadratic(self.forms, values)
-
-
-def quadratic(forms: Array, values: Array) -> Array:
-    """Return y_r' G y_s for estimates (..., r, p) and forms (..., m, p + 1, p + 1)."""
-    y = np.concatenate([-values, np.ones_like(values[..., :1])], axis=-1)[..., None, :, :]
-    return np.asarray(y @ forms @ np.swapaxes(y, -1, -2))
+        """Return the relative errors (c, m) of an estimate under each condition (c, p)."""
+        y = np.concatenate([-values, np.ones((len(values), 1))], axis=1)
+        squared = np.einsum("cp,cmpq,cq->cm", y, self.forms, y, optimize=True)
+        return np.asarray(np.sqrt(np.maximum(squared, 0.0)))
 
 
 def prepared_archives(root: Path, kind: str) -> Prepared:

@@ -74,7 +74,7 @@ def conclusion_of(results: StudyResults) -> list[str]:
     by_key = {condition.key: condition for condition in results.conditions}
     none = by_key[NONE.key]
     worst = by_key.get(ALL.key, none)
-    sentences = [f"Torque error of B over A, {condition_words(none)}: {_b_over_a(none)}."]
+    sentences = [f"Torque error of B over A, exact model: {_b_over_a(none)}."]
     if worst is not none:
         sentences.append(f"The same with {condition_words(worst)}: {_b_over_a(worst)}.")
         sentences.append(_by_error(results.conditions))
@@ -142,7 +142,7 @@ def _of_criterion(results: StudyResults, criterion: Criterion) -> str:
     relation = results.relation(criterion, "error", worst)
     interval = f"{fixed(relation.low, 2)} to {fixed(relation.high, 2)}"
     parts.append(f"{fixed(relation.correlation, 2)} with error ({interval})")
-    return f"{capitalised(CRITERION_WORDS[criterion])}: rank correlation {', '.join(parts)}."
+    return f"{capitalised(CRITERION_WORDS[criterion])}: ranks correlate {', '.join(parts)}."
 
 
 def _for_design(conditions: Sequence[ConditionResult]) -> str:

@@ -21,6 +21,12 @@ from .searches import LABELS
 
 COLOURS: Final = (drawing.FIRST, drawing.SECOND, drawing.INK)
 _VARIABLES: Final = ("--first", "--second", "--ink")
+_TICKS: Final = (
+    (0.7, 0.8, 0.9, 1.0, 1.1, 1.2, 1.3),
+    (0.3, 0.5, 0.7, 1.0, 1.4, 2.0, 3.0),
+    (0.01, 0.1, 0.2, 0.5, 1.0, 2.0, 5.0, 10.0, 100.0),
+)
+"""Of ratios of errors, the first that reach far enough."""
 _NAMES: Final = 150.0  # width of the names of conditions, px
 
 
@@ -76,18 +82,35 @@ def _ratios(results: StudyResults, motions: str) -> drawing.Panel:
     rows = [(float(-k), condition_words(one)) for k, one in enumerate(conditions)]
     axes = drawing.Axes(
         _NAMES, 20.0, 560.0 - _NAMES, 22.0 * len(rows), "", f"error over that of A, {motions}",
-        y_limits=(0.6 - len(rows), 0.6), y_names=rows, x_ticks=6,
+        y_limits=(0.6 - len(rows), 0.6), y_names=rows, grid="both",
     )  # fmt: skip
-    axes.segments(np.array([[1.0, 1.0]]), np.array([[-np.inf, np.inf]]), drawing.MUTED, 1.2)
+    axes.segments(np.array([[0.0, 0.0]]), np.array([[-np.inf, np.inf]]), drawing.MUTED, 1.2)
+    reached = list[float]()
     for (first, second), _, variable, side in _RATIOS:
         found = [one.comparison(first, second, motions) for one in conditions]
         colour = f"var({variable})"
         places = np.array([place + side for place, _ in rows])
-        ends = [(row.low or row.ratio, row.high or row.ratio) for row in found]
-        axes.segments(np.array(ends), np.column_stack([places, places]), colour, 1.6)
-        axes.dots(np.array([row.ratio for row in found]), places, colour, 6.0)
+        ends = np.log10([(row.low or row.ratio, row.high or row.ratio) for row in found])
+        axes.segments(ends, np.column_stack([places, places]), colour, 1.6)
+        axes.dots(np.log10([row.ratio for row in found]), places, colour, 6.0)
+        reached += ends.ravel().tolist()
+    margin = 0.04 * (max(reached) - min(reached)) or 0.1
+    axes.x_limits = (min(reached) - margin, max(reached) + margin)
+    axes.x_names = [
+        (math.log10(tick), f"{tick:g}")
+        for tick in _ticks(*axes.x_limits)
+        if axes.x_limits[0] <= math.log10(tick) <= axes.x_limits[1]
+    ]
     what = "error of torque with B and with the gradient over that with A, by error of the model"
     return drawing.panel([axes], Caption(f"r{motions}", motions, "", what), 580.0)
+
+
+def _ticks(low: float, high: float) -> tuple[float, ...]:
+    """Return ticks for a range of logarithms."""
+    for ticks in _TICKS:
+        if math.log10(ticks[0]) < low and high < math.log10(ticks[-1]):
+            return ticks
+    return _TICKS[-1]
 
 
 def _quantities(results: StudyResults) -> list[tuple[Quantity, str, str]]:

@@ -23,7 +23,7 @@ from . import estimates
 from .campaigns import CLASSES, StudyExecution, execute, plan_study
 from .children import in_children
 from .comparison import compared
-from .estimates import DesignEstimates, HeldOutForms, quadratic
+from .estimates import DesignEstimates, HeldOutForms
 from .messages import conclusion_of, effect_words
 from .model_errors import ALL, NONE, Condition, ModelErrors, conditions_of
 from .page import study_page
@@ -133,10 +133,9 @@ class _Parts(NamedTuple):
 def _results(name: str, cell: Cell, settings: StudySettings, parts: _Parts) -> StudyResults:
     """Compare the methods and relate the criteria, without a conclusion."""
     values = {design.key: design.values for design in parts.designs}
-    every = np.concatenate([of_class.forms for of_class in parts.forms], axis=1)
     errors = {
-        key: np.sqrt(quadratic(every, of_search).mean(axis=(2, 3)))
-        for key, of_search in values.items()
+        design.key: np.concatenate([forms.errors(design.mean) for forms in parts.forms], axis=1)
+        for design in parts.designs
     }
     points = design_points(parts.searches, parts.conditions, values, errors)
     return StudyResults(
@@ -162,11 +161,11 @@ def _compared(parts: _Parts) -> list[ConditionResult]:
     """Compare the methods under each condition and on each class of motions."""
     methods = {search.key: search.method for search in parts.searches}
 
-    def products(of_class: HeldOutForms, method: Method, *, few_rows: bool) -> Array:
-        """Return the products of errors of a method's searches (c, s, m, r, r)."""
+    def errors(forms: HeldOutForms, method: Method, *, few_rows: bool = False) -> Array:
+        """Return the errors of a method's searches (c, s, m)."""
         return np.stack(
             [
-                quadratic(of_class.forms, design.few_rows if few_rows else design.values)
+                forms.errors(design.few_rows.mean(axis=1) if few_rows else design.mean)
                 for design in parts.designs
                 if methods[design.key] == method
             ],
@@ -175,8 +174,8 @@ def _compared(parts: _Parts) -> list[ConditionResult]:
 
     rows: list[list[StudyComparison]] = [[] for _ in parts.conditions]
     for of_class in sorted(parts.forms, key=lambda one: CLASSES.index(one.motions)):
-        whole = {method: products(of_class, method, few_rows=False) for method in LABELS}
-        thinned = products(of_class, "a", few_rows=True)
+        whole = {method: errors(of_class, method) for method in LABELS}
+        thinned = errors(of_class, "a", few_rows=True)
         pairs = [(first, second, whole[first], whole[second], False) for first, second in _PAIRS]
         pairs.append(("a", "b", thinned, whole["b"], True))
         for number, of_condition in enumerate(rows):
