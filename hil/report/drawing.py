@@ -245,7 +245,7 @@ def chart_panel(chart: Chart, bins: int = _BINS) -> Panel:
     low, high = (float(scale(np.array(end))) for end in chart.x_limits)
     x_names = [(float(scale(np.array(tick))), f"{tick:g}") for tick in chart.ticks]
     if chart.log and not x_names:
-        x_names = decades(low, high)
+        x_names = _decades(low, high)
     for k, plot in enumerate(chart.plots):
         last = k == len(chart.plots) - 1
         bottom, upper = (float(scale(np.array(end))) for end in plot.y_limits)
@@ -253,7 +253,7 @@ def chart_panel(chart: Chart, bins: int = _BINS) -> Panel:
             _LEFT, top, _WIDTH - _LEFT - _RIGHT, plot.height, plot.heading,
             chart.foot if last else "", x_limits=(low, high), x_ticks=6, x_labelled=last,
             y_limits=(bottom, upper), x_names=x_names,
-            y_names=decades(bottom, upper) if chart.log else (),
+            y_names=_decades(bottom, upper) if chart.log else (),
         )  # fmt: skip
         if plot.shaded:
             infinite = np.full((len(plot.shaded), 1), np.inf)
@@ -283,7 +283,7 @@ def _log10(values: Array) -> Array:
     return np.where(np.isfinite(logarithm), logarithm, np.nan)
 
 
-def decades(low: float, high: float) -> list[tuple[float, str]]:
+def _decades(low: float, high: float) -> list[tuple[float, str]]:
     """Return the powers of ten in a range of logarithms, at most six, with their texts.
 
     If there are fewer than two: their multiples, or the middle of a range without any.

@@ -30,7 +30,7 @@ CRITERION_WORDS: Final[dict[Criterion, str]] = {
 QUANTITY_WORDS: Final[dict[Quantity, str]] = {
     "variance": "scatter",
     "bias": "bias",
-    "error": "error on unseen motion",
+    "error": "error",
 }
 _OTHERS: Final[dict[str, Method]] = {"A": "a", "B": "b"}
 _BETTER: Final = ("better", "slightly better")
@@ -74,7 +74,7 @@ def conclusion_of(results: StudyResults) -> list[str]:
     by_key = {condition.key: condition for condition in results.conditions}
     none = by_key[NONE.key]
     worst = by_key.get(ALL.key, none)
-    sentences = [f"Torque error of B over A, exact model: {_b_over_a(none)}."]
+    sentences = [f"Error of B over A, exact model: {_b_over_a(none, decimals=3)}."]
     if worst is not none:
         sentences.append(f"The same with {condition_words(worst)}: {_b_over_a(worst)}.")
         sentences.append(_by_error(results.conditions))
@@ -88,14 +88,14 @@ def conclusion_of(results: StudyResults) -> list[str]:
     return sentences
 
 
-def _b_over_a(condition: ConditionResult, *, printed_sizes: bool = False) -> str:
+def _b_over_a(condition: ConditionResult, *, printed_sizes: bool = False, decimals: int = 2) -> str:
     texts = []
     for motions in CLASSES:
         row = condition.comparison("a", "b", motions, printed_sizes=printed_sizes)
         interval = "too few searches"
         if row.low is not None:
-            interval = f"{fixed(row.low, 2)} to {fixed(row.high, 2)}"
-        texts.append(f"{motions} {fixed(row.ratio, 2)} ({interval})")
+            interval = f"{fixed(row.low, decimals)} to {fixed(row.high, decimals)}"
+        texts.append(f"{motions} {fixed(row.ratio, decimals)} ({interval})")
     return ", ".join(texts)
 
 
@@ -110,13 +110,13 @@ def _by_error(conditions: Sequence[ConditionResult]) -> str:
     b = [1.0 - row.ratio for row in cases if row.verdict in _BETTER]
     a = [1.0 - 1.0 / row.ratio for row in cases if row.verdict in _WORSE]
     return (
-        f"Errors of the model one by one: of {len(cases)} cases B is better in {len(b)}"
+        f"Errors one by one: of {len(cases)} cases B is better in {len(b)}"
         f"{_at_most(b)}, A in {len(a)}{_at_most(a)}."
     )
 
 
 def _at_most(savings: Sequence[float]) -> str:
-    return f" (by up to {significant(100.0 * max(savings), 2)} %)" if savings else ""
+    return f" (up to {significant(100.0 * max(savings), 2)} %)" if savings else ""
 
 
 def _of_default(condition: ConditionResult) -> str:
@@ -138,24 +138,29 @@ def _of_criterion(results: StudyResults, criterion: Criterion) -> str:
         places.append(("bias", worst))
     for quantity, key in places:
         relation = results.relation(criterion, quantity, key)
-        parts.append(f"{fixed(relation.correlation, 2)} with {QUANTITY_WORDS[quantity]}")
+        parts.append(f"{QUANTITY_WORDS[quantity]} {fixed(relation.correlation, 2)}")
     relation = results.relation(criterion, "error", worst)
     interval = f"{fixed(relation.low, 2)} to {fixed(relation.high, 2)}"
-    parts.append(f"{fixed(relation.correlation, 2)} with error ({interval})")
-    return f"{capitalised(CRITERION_WORDS[criterion])}: ranks correlate {', '.join(parts)}."
+    parts.append(f"{QUANTITY_WORDS['error']} {fixed(relation.correlation, 2)} ({interval})")
+    return f"{capitalised(CRITERION_WORDS[criterion])}, rank correlation: {', '.join(parts)}."
 
 
 def _for_design(conditions: Sequence[ConditionResult]) -> str:
-    """Say what it means for the default of `hil design`."""
+    """Say whether B, with its weight of the coupling index, is worth offering by `hil design`.
+
+    That takes an error of the model under which it predicts better than both other methods.
+    """
     helped = [
         condition
         for condition in conditions
         if any(
-            condition.comparison("gradient", "b", motions).verdict in _BETTER for motions in CLASSES
+            condition.comparison("a", "b", motions).verdict in _BETTER
+            and condition.comparison("gradient", "b", motions).verdict in _BETTER
+            for motions in CLASSES
         )
     ]
     if not helped:
-        return "B is better than the default of hil design under no error of the model."
+        return "Under no error of the model is B better than both A and the default of hil design."
     words = condition_words(helped[0])
     more = f" and {len(helped) - 1} more" if len(helped) > 1 else ""
-    return f"B is better than the default of hil design with {words}{more}."
+    return f"B is better than both A and the default of hil design with {words}{more}."

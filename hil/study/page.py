@@ -23,7 +23,7 @@ COLOURS: Final = (drawing.FIRST, drawing.SECOND, drawing.INK)
 _VARIABLES: Final = ("--first", "--second", "--ink")
 _TICKS: Final = (
     (0.7, 0.8, 0.9, 1.0, 1.1, 1.2, 1.3),
-    (0.3, 0.5, 0.7, 1.0, 1.4, 2.0, 3.0),
+    (0.5, 0.6, 0.7, 0.8, 0.9, 1.0, 1.1, 1.2, 1.4, 1.6, 2.0, 2.5),
     (0.01, 0.1, 0.2, 0.5, 1.0, 2.0, 5.0, 10.0, 100.0),
 )
 """Of ratios of errors, the first that reach far enough."""
@@ -133,17 +133,11 @@ def _points(
 ) -> drawing.Panel:
     """Draw a point for each design: a criterion and what it is meant to foretell."""
     axes = drawing.single(240.0, heading, CRITERION_WORDS[criterion])
-    logs = []
     for method, colour in zip(LABELS, COLOURS, strict=True):
         points = [point for point in results.designs if point.method == method]
         x = np.array([point.criteria[criterion] for point in points])
-        y = np.log10([_figure(point, quantity, condition) for point in points])
-        logs += y.tolist()
+        y = np.array([_figure(point, quantity, condition) for point in points])
         axes.dots(x, y, colour, 6.0, opacity=0.85)
-    low, high = min(logs), max(logs)
-    margin = 0.08 * (high - low) or 0.1
-    axes.y_limits = (low - margin, high + margin)
-    axes.y_names = drawing.decades(*axes.y_limits)
     relation = results.relation(criterion, quantity, condition)
     note = (
         f"rank correlation {fixed(relation.correlation, 2)}"

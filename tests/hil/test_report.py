@@ -24,7 +24,7 @@ from matplotlib.image import imread
 
 from hil.report import figures, numbers, page
 from hil.report.chart import thinned
-from hil.report.drawing import chart_panel, decades, round_ticks, single
+from hil.report.drawing import _decades, chart_panel, round_ticks, single
 from hil.report.interactive import chart_data, encoded
 from hil.report.page import report_bytes
 from hil.report.rendering import environment
@@ -863,7 +863,7 @@ class TestDrawing:
 
     @given(st.floats(-9.0, 9.0), st.floats(0.01, 12.0))
     def test_ticks_of_a_logarithmic_axis_are_in_its_range(self, low, span):
-        names = decades(low, low + span)
+        names = _decades(low, low + span)
         assert 1 <= len(names) <= 7
         for place, text in names:
             assert low <= place <= low + span
