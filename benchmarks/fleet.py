@@ -1,22 +1,31 @@
 """A fleet of simulated arms with known faults, and how soon `hil trend` finds them.
 
-Run with ``python -m benchmarks.fleet``. Torques are those of recursive Newton-Euler by pinocchio
-with friction, temperature and noise of this module: nothing of `hil` or `identification`.
+Run with ``python -m benchmarks.fleet [--fleets N]``: fleets of 20 robots over 24 months, which are
+asked about every month, as a nightly job does. The friction of each joint is known from each log
+to half a per cent, as from 30 s of motion; what follows is the trend. Torques of logs
+(`write_fleet`) are those of recursive Newton-Euler by pinocchio with friction, temperature and
+noise of this module: nothing of `hil` or `identification`.
 """
 
 from __future__ import annotations
 
+import argparse
 import importlib.metadata
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
-from typing import Final, Literal
+from time import process_time
+from typing import Final, Literal, NamedTuple
 
 import numpy as np
 import pinocchio as pin
 from numpy.typing import NDArray
 from scipy.signal import lfilter
+
+from hil.compare.comparison import LEAST, holm
+from hil.fleet.changes import Course, Series, courses
+from hil.fleet.trend import FALSE_ALARMS
 
 Array = NDArray[np.float64]
 FaultKind = Literal["wear", "lubricant", "replacement", "tool"]
@@ -91,19 +100,25 @@ class FleetPlan:
     seed: int = 0
 
 
+class Condition(NamedTuple):
+    """What a robot is like on a day."""
+
+    when: datetime
+    temperature: float  #: of the joints [°C], as a controller measures it
+    friction: Array  #: share of the nominal friction of each joint (6,)
+
+
 @dataclass(frozen=True, eq=False)
 class FleetLog:
     """One log: time (m,) [s], motion and torque (m, 6) in SI units, and what is known of it."""
 
     robot: int
     month: int
-    when: datetime
+    condition: Condition
     time: Array
     position: Array
     velocity: Array
     torque: Array
-    temperature: float  #: of the joints [°C], as a controller measures it
-    friction: Array  #: share of the nominal friction of each joint (6,)
 
 
 def urdf() -> Path:
@@ -134,33 +149,42 @@ class Fleet:
         self.acceleration = -(size * rate**2 * np.sin(angle)).sum(axis=1)
         self.of_robot = 1.0 + plan.spread * random.standard_normal((plan.robots, 6))
 
+    def condition(self, robot: int, month: int) -> Condition:
+        """Return date, temperature and friction of a robot when its log of a month begins."""
+        plan = self.plan
+        random = np.random.default_rng([plan.seed, robot, month])
+        season = np.cos(2.0 * np.pi * month / 12.0)
+        cold = float(random.uniform(0.0, 1.0))  # how much of the warm-up is still to come
+        share = self.of_robot[robot] * (1.0 + plan.season * season + plan.warm_up * cold)
+        share = share * (1.0 + plan.day * random.standard_normal(6))
+        for fault in plan.faults:
+            if fault.robot == robot:
+                share[fault.joint] *= 1.0 + fault.share(month)
+        return Condition(
+            when=FIRST + month * MONTH + timedelta(hours=float(random.uniform(0.0, 8.0))),
+            temperature=35.0 - 8.0 * season - 12.0 * cold + 0.3 * float(random.standard_normal()),
+            friction=share,
+        )
+
     def log(self, robot: int, month: int) -> FleetLog:
         """Return the log of a robot in a month."""
         plan = self.plan
-        random = np.random.default_rng([plan.seed, robot, month])
-        faults = [fault for fault in plan.faults if fault.robot == robot]
-        season = np.cos(2.0 * np.pi * month / 12.0)
-        cold = random.uniform(0.0, 1.0)  # how much of the warm-up is still to come
-        share = self.of_robot[robot] * (1.0 + plan.season * season + plan.warm_up * cold)
-        share = share * (1.0 + plan.day * random.standard_normal(6))
-        for fault in faults:
-            share[fault.joint] *= 1.0 + fault.share(month)
-        load = sum(f.size for f in faults if f.kind == "tool" and month >= f.month)
-        torque = self._without_friction(load) + share * (
-            _COULOMB * np.tanh(self.velocity / 1e-3) + _VISCOUS * self.velocity
-        )
-        white = random.standard_normal(torque.shape)
-        coloured = lfilter([0.6], [1.0, -0.8], white, axis=0)
+        condition = self.condition(robot, month)
+        random = np.random.default_rng([plan.seed, robot, month, 1])
+        carried = [f for f in plan.faults if f.robot == robot and f.kind == "tool"]
+        load = sum(fault.size for fault in carried if month >= fault.month)
+        dry = _COULOMB * np.tanh(self.velocity / 1e-3)
+        friction = condition.friction * (dry + _VISCOUS * self.velocity)
+        torque = self._without_friction(load) + friction
+        coloured = lfilter([0.6], [1.0, -0.8], random.standard_normal(torque.shape), axis=0)
         return FleetLog(
             robot=robot,
             month=month,
-            when=FIRST + month * MONTH + timedelta(hours=float(random.uniform(0.0, 8.0))),
+            condition=condition,
             time=self.time,
             position=self.position + 2e-5 * random.standard_normal(torque.shape),
             velocity=self.velocity,
             torque=torque + _NOISE * torque.std(axis=0) * coloured,
-            temperature=35.0 - 8.0 * season - 12.0 * cold + 0.3 * float(random.standard_normal()),
-            friction=share,
         )
 
     def _without_friction(self, load: float) -> Array:
@@ -178,11 +202,11 @@ class Fleet:
 
 def write_log(path: Path, log: FleetLog, *, clock: bool = True, temperature: bool = True) -> Path:
     """Write a log as CSV; with `clock` its time counts from 1970, with `temperature` it has one."""
-    start = log.when.timestamp() if clock else 0.0
+    start = log.condition.when.timestamp() if clock else 0.0
     columns = [*(f"{name}{joint}" for name in ("q", "qd", "tau") for joint in range(1, 7))]
     times = [f"{start + time:.6f}" for time in log.time.tolist()]
     tables = np.column_stack([log.position, log.velocity, log.torque])
-    ends = f",{log.temperature:.2f}" if temperature else ""
+    ends = f",{log.condition.temperature:.2f}" if temperature else ""
     rows = [
         f"{time},{','.join(f'{value:.9g}' for value in row)}{ends}"
         for time, row in zip(times, tables.tolist(), strict=True)
@@ -198,6 +222,112 @@ def write_fleet(folder: Path, fleet: Fleet, *, months: Sequence[int] = ()) -> li
     plan = fleet.plan
     logs = (fleet.log(r, m) for r in range(plan.robots) for m in months or range(plan.months))
     return [
-        write_log(folder / f"robot{log.robot:02d}" / f"{log.when:%Y-%m-%d}.csv", log)
+        write_log(folder / f"robot{log.robot:02d}" / f"{log.condition.when:%Y-%m-%d}.csv", log)
         for log in logs
     ]
+
+
+# The benchmark
+
+_MEASURED: Final = 0.005  # standard deviation of the friction from one log
+_FIRST_ASKED: Final = 6  # months of logs
+_MOST_FAULTS: Final = 3
+_IN_TIME: Final = 2.0  # months from 10 % to an alarm
+
+
+class Outcome(NamedTuple):
+    """What was said of one fleet over all months."""
+
+    found: list[tuple[Fault, int | None, float]]  #: month of the alarm; error of its begin at last
+    alarms: int  #: joints without a fault that were called changed at any time
+    years: float
+
+
+def planned(seed: int, *, faulty: bool) -> FleetPlan:
+    """Return a fleet with one to three faults of different robots, or with none."""
+    random = np.random.default_rng(seed)
+    faults = []
+    robots = random.permutation(20)
+    kinds: tuple[FaultKind, ...] = ("wear", "lubricant", "replacement")
+    for robot in robots[: random.integers(1, _MOST_FAULTS + 1)] if faulty else ():
+        kind = kinds[random.integers(len(kinds))]
+        size = {
+            "wear": random.uniform(0.02, 0.08),
+            "lubricant": random.uniform(0.12, 0.4),
+            "replacement": -random.uniform(0.12, 0.3),
+        }[kind]
+        month = float(random.uniform(6.0, 15.0))
+        faults.append(Fault(int(robot), kind, int(random.integers(6)), month, float(size)))
+    return FleetPlan(faults=tuple(faults), seed=seed)
+
+
+def watched(plan: FleetPlan, *, heat: bool = True) -> Outcome:
+    """Ask about a fleet every month, with the temperatures of its logs or without them."""
+    fleet = Fleet(plan)
+    random = np.random.default_rng(plan.seed)
+    conditions = [[fleet.condition(r, m) for m in range(plan.months)] for r in range(plan.robots)]
+    friction = np.array([[each.friction for each in robot] for robot in conditions])
+    friction *= 1.0 + _MEASURED * random.standard_normal(friction.shape)
+    months = np.array([[(e.when - FIRST) / MONTH for e in robot] for robot in conditions])
+    temperature = np.array([[e.temperature for e in robot] for robot in conditions])
+    places = {(fault.robot, fault.joint): fault for fault in plan.faults}
+    first: dict[tuple[int, int], int] = {}
+    last: dict[tuple[int, int], Course] = {}
+    for month in range(_FIRST_ASKED, plan.months + 1):
+        found: list[Course] = []
+        for joint in range(6):
+            family = []
+            for robot in range(plan.robots):
+                value = friction[robot, :month, joint]
+                relative = value / value[:3].mean() - 1.0
+                columns = temperature[robot, :month, None][:, : int(heat)]
+                variance = np.full(month, _MEASURED**2)
+                family.append(Series(months[robot, :month], relative, variance, columns))
+            found += [each for each in courses(family) if each is not None]
+        adjusted = holm(np.array([each.p_value for each in found]))
+        for number, (each, p_value) in enumerate(zip(found, adjusted.tolist(), strict=True)):
+            place = (number % plan.robots, number // plan.robots)
+            if p_value < FALSE_ALARMS and each.largest >= LEAST:
+                first.setdefault(place, month - 1)
+                last[place] = each
+    results = []
+    for place, fault in places.items():
+        begins = [change.shape.begin for change in last[place].changes] if place in last else []
+        error = min((abs(begin - fault.month) for begin in begins), default=np.inf)
+        results.append((fault, first.get(place), float(error)))
+    return Outcome(results, len(first.keys() - places.keys()), plan.months / 12.0)
+
+
+def main() -> None:
+    """Print how soon faults are found, how well they are dated, and how many alarms are false."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--fleets", type=int, default=4, help="with faults, and without, each")
+    fleets = parser.parse_args().fleets
+    begun = process_time()
+    for heat in (True, False):
+        faulty = [watched(planned(seed, faulty=True), heat=heat) for seed in range(fleets)]
+        others = [watched(planned(100 + k, faulty=False), heat=heat) for k in range(fleets)]
+        every = [result for outcome in faulty for result in outcome.found]
+        # Wear that has not passed 10 % two months before the end need not be found.
+        due = [(f, m, e) for f, m, e in every if f.passes_tenth + _IN_TIME < 23.0]
+        soon = [
+            m is not None and m <= np.ceil(max(f.passes_tenth, _FIRST_ASKED)) + _IN_TIME
+            for f, m, _ in due
+        ]
+        dated = [error <= 1.0 for _, _, error in due]
+        years = sum(outcome.years for outcome in (*faulty, *others))
+        alarms = sum(outcome.alarms for outcome in (*faulty, *others))
+        print(
+            f"{'with' if heat else 'without'} temperature: {sum(soon)} of {len(due)} faults found"
+            f" within two months of 10 %, {sum(dated)} dated within a month;"
+            f" {alarms} false alarms in {years:.0f} fleet-years"
+        )
+        for fault, month, error in due:
+            alarm = "no alarm" if month is None else f"alarm {month}"
+            when = f"10 % at {fault.passes_tenth:.1f}, begin off by {error:.2f} months"
+            print(f"  {fault.kind} {fault.size:+.3f} at {fault.month:.1f}: {alarm}, {when}")
+    print(f"{process_time() - begun:.0f} s of processor time")
+
+
+if __name__ == "__main__":
+    main()
