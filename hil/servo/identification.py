@@ -92,7 +92,7 @@ def identify_servos(
     )
     cell = sources.cell
     first = place_of(archives[0])
-    bodies = _bodies(cell, first)
+    bodies = bodies_of(cell, first)
     compared = None
     if options.compare is not None:
         compared = maker_parameters(options.compare, cell.joint_names)
@@ -132,7 +132,7 @@ class _Found:
     seconds: float
 
 
-def _bodies(cell: Cell, path: Path) -> Array:
+def bodies_of(cell: Cell, path: Path) -> Array:
     """Return the parameters (p,) of the URDF's bodies, without friction and rotors."""
     if nominal_of(cell) is None:
         remedy = "give a URDF with masses, which set the scale of gains and friction"
