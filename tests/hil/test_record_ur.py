@@ -34,7 +34,10 @@ from hil.importers.conclusions import Certainty
 from hil.importers.recording import ImportOptions
 from hil.look.readings import Fact
 from hil.look.run import look_at
+from hil.pipeline.gain_run import find_gains
 from hil.pipeline.run import identify_archives
+from identification.model.payload import Payload
+from sim_fixtures.plant import Carried
 from sim_fixtures.ur import (
     CELL_PATH,
     UR5E_URDF,
@@ -143,6 +146,21 @@ def test_it_identifies_the_arm_in_units_of_the_stated_constants(
     units = truth.stated_constant / truth.torque_constant
     coulomb = [p.estimate for p in found.results.parameters if p.name.startswith("f0_")]
     np.testing.assert_allclose(coulomb, truth.plant.coulomb * units, rtol=0.1)
+
+
+def test_a_known_load_decides_the_torque_constants(recorded: Path, tmp_path: Path) -> None:
+    """Those that the arm states are 1 to 7 % off."""
+    load = Payload(3.0, (0.0, 0.0, 0.05), (0.0,) * 6, "flange")
+    loaded = tmp_path / NAME
+    place = np.array([0.0, 0.0, 0.0996 + 0.05])  # from the last joint, the flange included
+    carried = Carried(5, 3.0, place, np.zeros((3, 3)))
+    with UrServer(SimulatedUr(program=UrProgram(), load=carried), real_time=False).running() as at:
+        recording_of(loaded, at, duration=UrProgram().duration)
+    gains = find_gains([recorded], {loaded: load}, Silent()).gains
+    assert gains.determined.tolist() == [True] * 5 + [False]  # the load does not reach the last
+    true = UrArmTruth().torque_constant[:5] / 101.0
+    error = np.abs(gains.values[:5] - true)
+    assert np.all(error < np.maximum(gains.interval_factor * gains.std[:5], 0.005 * true))
 
 
 def test_a_look_needs_nothing_but_the_archive(recorded: Path) -> None:
