@@ -50,7 +50,12 @@ def slip_of(path: Path) -> str:
         driven = _travel(velocity, recording.time)
         jumps = position_jumps(replace(recording, position=position - driven))
         names = recording.joint_names
-        found += [jump for jump in jumps if not _frozen(recording.time, position, names, jump)]
+        found += [
+            jump
+            for jump in jumps
+            if not _frozen(recording.time, position, names, jump)
+            and not _within_velocities(recording, velocity, jump)
+        ]
     disturbed = _disturbed(archive, recording)
     found = [jump for jump in found if not (np.abs(disturbed - jump.time) < NEAR).any()]
     if not found:
@@ -93,6 +98,20 @@ def _travel(velocity: Array, time: Array) -> Array:
     mean = 0.5 * (velocity[1:] + velocity[:-1])
     steps = np.where(np.isfinite(mean), mean, 0.0) * np.diff(time)[:, None]
     return np.concatenate([np.zeros_like(velocity[:1]), np.cumsum(steps, axis=0)])
+
+
+def _within_velocities(recording: Recording, velocity: Array, jump: PositionJump) -> bool:
+    """Return whether a step is one between the velocities before and after it.
+
+    So it is where a joint stops at once, as one that is stuck does: the mean of the two velocities,
+    by which :func:`_travel` goes, is not that of the step.
+    """
+    row = int(np.searchsorted(recording.time, recording.time[0] + jump.time))
+    joint = recording.joint_names.index(jump.joint)
+    step = recording.position[row, joint] - recording.position[row - 1, joint]
+    ends = velocity[row - 1 : row + 1, joint] * (recording.time[row] - recording.time[row - 1])
+    tolerance = 0.1 * abs(jump.size)
+    return bool(ends.min() - tolerance <= step <= ends.max() + tolerance)
 
 
 def _frozen(time: Array, position: Array, names: tuple[str, ...], jump: PositionJump) -> bool:
