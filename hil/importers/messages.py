@@ -222,7 +222,7 @@ def _(left_out: LeftOut) -> str:
 def _(excerpt: Excerpt) -> str:
     return (
         f"{excerpt.count} of {excerpt.total} rows are used, {excerpt.stretches} stretches over the "
-        "whole recording in which the arm moves (`hil import` reads every row)"
+        "whole recording in which the arm moves (`hil import log` reads every row)"
     )
 
 
