@@ -25,7 +25,13 @@ ENTRIES = (
     re.compile(r"\b(?P<key>[a-z]+(?:_[a-z]+)*)`? (?:of|in|under) \[(?P<table>[a-z_]+)\]"),
 )
 OTHER_WORDS = {"and", "both", "factor", "listed", "parameters", "place", "stated", "that"}
-NOT_OF_HIL = ("hil/report/", "hil/study/page.py", "hil/cli/suggestions.py", "hil/doctor/checks.py")
+NOT_OF_HIL = (
+    "hil/report/",
+    "hil/study/page.py",
+    "hil/fleet/trend_page.py",
+    "hil/cli/suggestions.py",
+    "hil/doctor/checks.py",
+)
 """Variables of a style sheet, misspelt options, commands of the system."""
 
 
