@@ -37,7 +37,7 @@ def study(
     **Examples:**
 
     - `hil study --quick --output runs/quick`: some minutes
-    - `hil study --output runs/study`: ten searches of each, 20 minutes on two idle processors
+    - `hil study --output runs/study`: ten searches of each, about 20 minutes on two processors
 
     Options:
         output: Folder for the study.
