@@ -89,8 +89,7 @@ def export(
     **Example:** `hil export runs/demo --to mjcf`, `hil export runs/demo --to c -o arm.c`
 
     Options:
-        to: For a simulator mjcf (MuJoCo), isaaclab, genesis, urdf, sdf or pinocchio; for a
-            controller c (C99) or st (structured text).
+        to: Simulator: mjcf, isaaclab, genesis, urdf, sdf, pinocchio; controller: c, st.
         output: File to write; with --ensemble a folder, or an .npz file of all parameters.
             Default: identified.*, arm.c or arm.st in the campaign folder or working directory.
         ranges: Also write NAME.ranges.json for domain randomisation: value and 95 % interval of
