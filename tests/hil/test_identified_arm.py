@@ -154,6 +154,27 @@ class TestResult:
         assert "&lt;b&gt;tau{}" in result._repr_html_()
 
 
+class TestWhatWasRead:
+    """Report and `results.json` say what is not as the log has it."""
+
+    def test_turned_torques_are_named(self, folder: Path, tmp_path: Path) -> None:
+        import pandas
+
+        frame = pandas.read_csv(folder / "a.csv")
+        frame[[name for name in frame if name.startswith("tau")]] *= -1.0
+        arm = hil.identify(frame, urdf=folder / "three.urdf")
+        place = arm.save(tmp_path / "turned")
+        (read,) = Results.load(place / "results.json").recordings
+        assert (read.file, read.use) == ("recording.csv", "fitted")
+        assert any("torque negated" in change for change in read.changes), read.changes
+        assert any(line.startswith("tau1 .. tau3: torque") for line in read.channels)
+        assert read.changes[0] in (place / "report.html").read_text()
+
+    def test_a_log_that_is_right_has_no_changes(self, result: Any) -> None:
+        assert [read.use for read in result.results.recordings] == ["fitted", "predicted"]
+        assert [read.changes for read in result.results.recordings] == [[], []]
+
+
 class TestSaved:
     def test_nothing_is_written_before(self, folder: Path, result: Any) -> None:
         assert result.verdict.good

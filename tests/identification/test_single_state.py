@@ -89,3 +89,12 @@ def test_a_mass_that_no_body_has_is_refused():
     values = np.full(model.n_parameters, -1.0)
     with pytest.raises(ModelError, match="positive masses"):
         SingleStateTorque(model, values)
+
+
+def test_a_rotor_of_nothing_but_rounding_is_at_its_bound():
+    model = RobotModel.from_urdf(TWO_LINK)
+    standard = model.nominal
+    standard[model.layout.rotors] = [1e-12, 0.02]
+    assert model.layout.rotors_at_bound(standard).tolist() == [True, False]
+    alone = RobotModel.from_urdf(TWO_LINK, rotor_inertia=False)
+    assert not alone.layout.rotors_at_bound(alone.nominal).any()
