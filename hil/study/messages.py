@@ -77,9 +77,10 @@ def conclusion_of(results: StudyResults) -> list[str]:
     sentences = [f"Error of B over A, exact model: {_b_over_a(none, decimals=3)}."]
     if worst is not none:
         sentences.append(f"The same with {condition_words(worst)}: {_b_over_a(worst)}.")
-        sentences.append(_by_error(results.conditions))
     printed = _b_over_a(worst, printed_sizes=True)
     sentences.append(f"The same, A from 2000 rows as in the print: {printed}.")
+    if worst is not none:
+        sentences.append(_by_error(results.conditions))
     sentences.append(_of_default(worst))
     sentences += [_of_criterion(results, criterion) for criterion in get_args(Criterion)]
     sentences.append(_for_design(results.conditions))
