@@ -311,7 +311,8 @@ class TestReuse:
 
         monkeypatch.setattr(stored_identification, "identify_paths", identify)
         reused = command("export", folder, "--to", "urdf", "-o", stored)
-        assert f"parameters: from {folder}/results.json and parameters.json" in reused.stdout
+        shown = " ".join(reused.stdout.split())
+        assert f"parameters: from {folder}/results.json and parameters.json" in shown
         assert stored.read_text() == new.read_text()
 
     def test_files_of_other_archives_are_not_used(self, folder: Path, log: Path) -> None:

@@ -224,7 +224,7 @@ class TestSaved:
         parsed = []
         read = Table.read
         monkeypatch.setattr(
-            Table, "read", lambda path, form: parsed.append(path) or read(path, form)
+            Table, "read", lambda path, *how: parsed.append(path) or read(path, *how)
         )
         hil.identify(folder / "a.csv", urdf=folder / "three.urdf")
         assert parsed == [folder / "a.csv"]

@@ -16,7 +16,7 @@ from hil.archive import Samples, write_samples
 from hil.archive.supervised import Failed
 from hil.base.errors import ArchiveWriteError, ControllerError, HilError, InputError
 from hil.base.files import convert_write_errors, make_folder
-from hil.campaign import Campaign
+from hil.campaign.state import CampaignState
 from hil.cli import COMMANDS, app, as_json, exit_code_of, main
 from hil.control.live_link import write_error
 from planner import PlannerError
@@ -37,6 +37,7 @@ FAILING = {
     "compare": ("compare", NOWHERE),
     "study": ("study", "--cell", NOWHERE),
     "batch": ("batch", NOWHERE, "--workers", "1"),
+    "trend": ("trend", NOWHERE),
     "torque-constants": ("torque-constants", NOWHERE, NOWHERE, "--mass", "1"),
     "payload": ("payload", NOWHERE, "--loaded", NOWHERE),
     "export": ("export", NOWHERE, "--to", "mjcf"),
@@ -131,7 +132,7 @@ def test_ctrl_c_and_unexpected_errors_are_json_too(
     def fail(*_: object) -> None:
         raise raised
 
-    monkeypatch.setattr(Campaign, "open", fail)
+    monkeypatch.setattr(CampaignState, "open", fail)
     document = json.loads(called("status", NOWHERE).stdout)
     assert document["exit_code"] == code and document["error"]
     silent = CliRunner().invoke(app, ["status", NOWHERE])

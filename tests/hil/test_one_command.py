@@ -191,7 +191,7 @@ REFUSED: Mapping[str, tuple[list[str], list[Floats], str, str]] = {
         ["t", "q{}", "tau{} [A]"],
         [TIME, POSITION, TORQUE],
         "tau1 .. tau3 is named as torque, and A is not a unit of it",
-        "--columns 'torque=tau{}' or --columns 'motor_current=tau{}'",
+        "--columns 'motor_current=tau{}'",
     ),
     "no torque": (
         ["t", "q{}", "v{}"],

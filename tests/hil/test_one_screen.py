@@ -51,7 +51,7 @@ class TestText:
         assert len(shown) == LINES
         assert shown[0] == "line 0" and shown[-2:] == ["line 38", "line 39"]
         assert "17 more lines: -v" in shown
-        require_one_screen("\n".join(brief(["x " * 200] * 50)))
+        require_one_screen("\n".join(brief([f"{k} " * 200 for k in range(50)])))
 
 
 @pytest.fixture(scope="module")
