@@ -226,6 +226,8 @@ def find_readings(
     adequacy = search.adequacy()
     if not adequacy.is_enough:
         steps = _doubted(steps, search, started())
+    if not all(step.sure for step in steps):  # each was chosen beside the others
+        steps = [replace(step, is_adequate=False) for step in steps]
     return Readings(
         tuple(steps),
         search.model,
