@@ -10,6 +10,7 @@ from benchmarks.fleet import Fault, Fleet, FleetPlan, planned, watched
 LOST = Fault(1, "lubricant", 2, 6.5, 0.25)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("heat", [True, False])
 def test_a_lost_lubricant_is_found_and_dated(heat: bool) -> None:
     outcome = watched(FleetPlan(robots=6, months=10, faults=(LOST,)), heat=heat)

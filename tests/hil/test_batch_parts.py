@@ -385,6 +385,7 @@ def result():
         repetitions=(repetition,),
         campaigns=(first, other),
         pooled=(replace(pooled, unseen_torque_rms=first.torque_rms),),
+        siblings=(),
         broken=(SkippedArchive("a/truncated.mcap", "its footer is missing"),),
         skipped=(SkippedArchive("a/slow.mcap", "holds a validation run"),),
         read=1,

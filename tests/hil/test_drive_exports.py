@@ -16,6 +16,8 @@ from hil.base.errors import InputError
 from hil.campaign.campaign import Campaign
 from hil.cli import app
 
+pytestmark = pytest.mark.long
+
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory: pytest.TempPathFactory, identified_campaign: Campaign) -> Path:

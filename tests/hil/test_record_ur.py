@@ -132,6 +132,7 @@ def test_torques_are_currents_times_the_cells_constants(recorded: Path) -> None:
     )
 
 
+@pytest.mark.long
 def test_it_identifies_the_arm_in_units_of_the_stated_constants(
     recorded: Path, tmp_path: Path
 ) -> None:

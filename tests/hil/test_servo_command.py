@@ -69,6 +69,7 @@ def identified(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, str, int
     return root / "out", done.output, done.exit_code
 
 
+@pytest.mark.long
 class TestCommand:
     def test_a_folder_of_states_and_commands_gives_a_verdict(
         self, identified: tuple[Path, str, int]

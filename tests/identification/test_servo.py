@@ -121,6 +121,7 @@ def planted():
     return truth, fit, intervals, motions[1], simulated
 
 
+@pytest.mark.long
 def test_a_planted_arm_is_predicted_within_encoder_steps(planted):
     *_, motion, simulated = planted
     error = np.sqrt(np.mean((simulated - motion.position) ** 2))
@@ -129,6 +130,7 @@ def test_a_planted_arm_is_predicted_within_encoder_steps(planted):
     assert error < 2.0 * arm.COUNT
 
 
+@pytest.mark.long
 def test_planted_parameters_are_found(planted):
     truth, _, intervals, *_ = planted
     for name, most in (("kp", 0.1), ("armature", 0.2), ("viscous", 0.2), ("static", 0.4)):
@@ -137,6 +139,7 @@ def test_planted_parameters_are_found(planted):
     assert intervals.determined[:, PLACE["kp"]].all()
 
 
+@pytest.mark.long
 def test_a_limit_that_no_motion_reaches_is_not_determined(planted):
     truth, _, intervals, *_ = planted
     limit = PLACE["limit"]
@@ -144,6 +147,7 @@ def test_a_limit_that_no_motion_reaches_is_not_determined(planted):
     assert (intervals.upper[:, limit] >= truth.limit).all()
 
 
+@pytest.mark.long
 def test_draws_scatter_as_the_intervals_say(planted):
     _, fit, intervals, *_ = planted
     estimate = fit.estimate
@@ -154,6 +158,7 @@ def test_draws_scatter_as_the_intervals_say(planted):
     assert len(NAMES) == draws.shape[2]
 
 
+@pytest.mark.long
 def test_intervals_hold_the_planted_values(planted):
     truth, _, intervals, *_ = planted
     names = [name for name in NAMES if hasattr(truth, name)]
