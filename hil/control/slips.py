@@ -27,6 +27,7 @@ from .errors import SlippedError
 CHECKED: Final = ("completed", "stopped")
 """Outcomes of motions whose measured positions are checked; the others are failures already."""
 NEAR: Final = 0.2  # s around a lost packet or reply in which a jump is no slip
+AROUND: Final = 3  # cycles on either side of a jump whose velocities may explain it
 _FIELDS: Final = ("cycle", "gap", "position", "velocity")
 
 
@@ -50,12 +51,8 @@ def slip_of(path: Path) -> str:
         driven = _travel(velocity, recording.time)
         jumps = position_jumps(replace(recording, position=position - driven))
         names = recording.joint_names
-        found += [
-            jump
-            for jump in jumps
-            if not _frozen(recording.time, position, names, jump)
-            and not _within_velocities(recording, velocity, jump)
-        ]
+        found += [jump for jump in jumps if not _frozen(recording.time, position, names, jump)]
+        found = [jump for jump in found if not _within_velocities(recording, velocity, jump)]
     disturbed = _disturbed(archive, recording)
     found = [jump for jump in found if not (np.abs(disturbed - jump.time) < NEAR).any()]
     if not found:
@@ -101,17 +98,21 @@ def _travel(velocity: Array, time: Array) -> Array:
 
 
 def _within_velocities(recording: Recording, velocity: Array, jump: PositionJump) -> bool:
-    """Return whether a step is one between the velocities before and after it.
+    """Return whether the travel around a jump lies between the sums of its least and largest speeds.
 
-    So it is where a joint stops at once, as one that is stuck does: the mean of the two velocities,
-    by which :func:`_travel` goes, is not that of the step.
+    So it does where a joint stops at once, as one that is stuck does, or where a drive saturates for
+    a few cycles: the mean of two velocities, by which :func:`_travel` goes, is not that of the step.
     """
     row = int(np.searchsorted(recording.time, recording.time[0] + jump.time))
     joint = recording.joint_names.index(jump.joint)
-    step = recording.position[row, joint] - recording.position[row - 1, joint]
-    ends = velocity[row - 1 : row + 1, joint] * (recording.time[row] - recording.time[row - 1])
+    rows = slice(max(row - 1 - AROUND, 0), row + 1 + AROUND)
+    position = recording.position[rows, joint]
+    ends = np.stack([velocity[rows, joint][:-1], velocity[rows, joint][1:]])
+    steps = ends * np.diff(recording.time[rows])
+    travel = position[-1] - position[0]
     tolerance = 0.1 * abs(jump.size)
-    return bool(ends.min() - tolerance <= step <= ends.max() + tolerance)
+    least, largest = steps.min(axis=0).sum(), steps.max(axis=0).sum()
+    return bool(least - tolerance <= travel <= largest + tolerance)
 
 
 def _frozen(time: Array, position: Array, names: tuple[str, ...], jump: PositionJump) -> bool:
