@@ -98,10 +98,11 @@ def _travel(velocity: Array, time: Array) -> Array:
 
 
 def _within_velocities(recording: Recording, velocity: Array, jump: PositionJump) -> bool:
-    """Return whether the travel around a jump lies between the sums of its least and largest speeds.
+    """Return whether the travel around a jump lies between what its velocities allow.
 
-    So it does where a joint stops at once, as one that is stuck does, or where a drive saturates for
-    a few cycles: the mean of two velocities, by which :func:`_travel` goes, is not that of the step.
+    So it does where a joint stops at once, as one that is stuck does, or where a drive saturates
+    for a few cycles: the mean of two velocities, by which :func:`_travel` goes, is not that of the
+    step between them.
     """
     row = int(np.searchsorted(recording.time, recording.time[0] + jump.time))
     joint = recording.joint_names.index(jump.joint)

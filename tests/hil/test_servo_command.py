@@ -147,6 +147,7 @@ def executed(path: Path) -> dict[str, Any]:
     return space
 
 
+@pytest.mark.long
 class TestExports:
     def test_mujoco_plays_the_held_out_motion_back(
         self, identified: tuple[Path, str, int], tmp_path: Path
