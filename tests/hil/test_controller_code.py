@@ -116,14 +116,17 @@ def test_thresholds_are_tables_that_a_program_reads(tmp_path: Path) -> None:
     arm = an_arm(urdf_text())
     torque = tuple(np.arange(1.0, 7.0).tolist())
     levels = [
-        ContactThreshold(period, False, torque, torque, torque, 50.0, 5.0)
-        for period in (12.5, 60.0)
+        ContactThreshold(period, False, torque, torque, torque, force, 5.0)
+        for period, force in ((12.5, 50.0), (60.0, np.inf))
     ]
     code = c_source(control_tables(arm), "arm", [], "double", levels)
     assert COMPILER is not None
     built = CompiledArm.of(code, "arm", tmp_path, COMPILER, "double")
     periods = (ctypes.c_double * 2).in_dll(built.library, "arm_threshold_period")
     rows = (ctypes.c_double * 12).in_dll(built.library, "arm_threshold")
+    forces = (ctypes.c_double * 2).in_dll(built.library, "arm_threshold_force")
+    masses = (ctypes.c_double * 2).in_dll(built.library, "arm_threshold_mass")
+    assert [*forces] == [50.0, np.inf] and [*masses] == [5.0, 5.0]
     assert [*periods] == [12.5, 60.0]
     assert tuple(rows[6:]) == torque
 

@@ -36,6 +36,14 @@ class Threshold(Protocol):
     def torque(self) -> Sequence[float]:
         """Of each joint (n,) [N·m or N]."""
 
+    @property
+    def force(self) -> float:
+        """At the flange, of which 95 % of directions exceed it [N]; infinite where none does."""
+
+    @property
+    def mass(self) -> float:
+        """At the flange, whose weight exceeds it [kg]; infinite where none does."""
+
 
 class CSource(NamedTuple):
     """Header and source of an arm."""
@@ -149,6 +157,14 @@ def _thresholds(thresholds: Sequence[Threshold], precision: Precision) -> Iterat
     write = _Writer(precision)
     periods = write.initial(np.array([each.period for each in thresholds]))
     yield f"\nconst arm_real arm_threshold_period[{len(thresholds)}] = {periods};\n"
+    for name, values in (
+        ("force", [each.force for each in thresholds]),
+        ("mass", [each.mass for each in thresholds]),
+    ):
+        yield (
+            f"const arm_real arm_threshold_{name}[{len(thresholds)}] = "
+            f"{write.initial(np.array(values))};\n"
+        )
     rows = ",\n".join(f"    {write.initial(np.array(each.torque))}" for each in thresholds)
     yield f"const arm_real arm_threshold[{len(thresholds)}][ARM_JOINTS] = {{\n{rows}}};\n"
 
@@ -162,6 +178,8 @@ class _Writer:
 
     def number(self, value: float) -> str:
         """Return a literal with as few digits as are read back as it was."""
+        if np.isinf(value):
+            return "(arm_real)HUGE_VAL"
         digits = str(self._real(value + 0.0))
         return (digits if re.search(r"[.e]", digits) else f"{digits}.0") + self._suffix
 

@@ -56,6 +56,10 @@ void arm_observer_step(arm_observer *observer, const arm_real q[], const arm_rea
    not fitted and for an observer below 10 Hz; the longer periods are extrapolated. */
 extern const arm_real arm_threshold_period[ARM_THRESHOLDS];
 extern const arm_real arm_threshold[ARM_THRESHOLDS][ARM_JOINTS];
+/* In the middle of the joints' ranges: force at the flange [N] that 95 % of directions show above them,
+   and the mass there [kg] whose weight does. */
+extern const arm_real arm_threshold_force[ARM_THRESHOLDS];
+extern const arm_real arm_threshold_mass[ARM_THRESHOLDS];
 #endif
 
 #ifdef __cplusplus
