@@ -86,9 +86,16 @@ class InputError(HilError):
         self.problem = problem
         self.remedy = remedy
         shown = path if isinstance(path, str) and "://" in path else self.path  # a URL as it is
-        place = [printable(str(part), keep="") for part in (shown, field) if part]
-        sentence = ": ".join([*place, problem])
-        super().__init__(f"{sentence}; {remedy}" if remedy else sentence)
+        super().__init__(self._message(shown))
+
+    def message_next_to(self, path: str) -> str:
+        """Return the message for a reader who sees a path: without it if it is of this error."""
+        return self._message(None) if self.path == Path(path) else str(self)
+
+    def _message(self, shown: str | Path | None) -> str:
+        place = [printable(str(part), keep="") for part in (shown, self.field) if part]
+        sentence = ": ".join([*place, self.problem])
+        return f"{sentence}; {self.remedy}" if self.remedy else sentence
 
 
 class ArchiveError(InputError):

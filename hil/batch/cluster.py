@@ -88,11 +88,6 @@ class SkippedArchive(NamedTuple):
         """The whole reason."""
         return f"{self.reason} of {self.copy_of}" if self.copy_of else self.reason
 
-    @property
-    def without_path(self) -> SkippedArchive:
-        """The same where the reason does not begin with the path."""
-        return self._replace(reason=self.reason.removeprefix(f"{self.path}: "))
-
     def as_json(self) -> dict[str, str]:
         """Return it for programs."""
         return {"path": self.path, "reason": self.message}
@@ -436,7 +431,7 @@ def run_task(
     except CacheError:
         raise
     except Exception as error:
-        return SkippedArchive(path, reason_of(error))
+        return SkippedArchive(path, reason_of(error, path))
 
 
 def other_version(address: str) -> ClusterError:
@@ -448,7 +443,9 @@ def other_version(address: str) -> ClusterError:
     )
 
 
-def reason_of(error: Exception) -> str:
-    """Return the text of an error; an internal one costs an archive, not the batch."""
+def reason_of(error: Exception, path: str) -> str:
+    """Return the text of an error next to a path; an internal one costs only its archive."""
+    if isinstance(error, InputError):
+        return error.message_next_to(path)
     expected = isinstance(error, HilError | IdentificationError)
     return str(error) if expected else f"{type(error).__name__}: {error}"

@@ -222,7 +222,7 @@ def _placed(
     try:
         return place(ref)
     except InputError as error:
-        return SkippedArchive(ref.origin, str(error))
+        return SkippedArchive(ref.origin, reason_of(error, ref.origin))
 
 
 def _inspected(
@@ -380,7 +380,7 @@ def inspect_archives(
         except CacheError:
             raise
         except Exception as error:
-            refs.append(SkippedArchive(place, reason_of(error)))
+            refs.append(SkippedArchive(place, reason_of(error, place)))
     return refs
 
 

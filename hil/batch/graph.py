@@ -126,7 +126,7 @@ def decide_settings(
             elif standstill is None:
                 standstill = load_source(ref, to_fit=False)[1]
         except Exception as error:
-            broken.append(SkippedArchive(ref.origin, reason_of(error)))
+            broken.append(SkippedArchive(ref.origin, reason_of(error, ref.origin)))
     if not fitted:
         return None, broken
     noise = None if standstill is None else standstill.recording
@@ -343,8 +343,7 @@ class _Batch:
         estimates = [estimate for result in results for estimate in result.estimates]
         pooled = [estimate for arm in arms for estimate in self._pooled(arm)]
         lost = [unused for result in results for unused in result.broken]
-        reasons = (unused.without_path for unused in [*self.broken, *lost])
-        broken = tuple(dict.fromkeys(reasons))
+        broken = tuple(dict.fromkeys([*self.broken, *lost]))
         repetitions = tuple(estimate for estimate in estimates if estimate.level == "repetition")
         if not repetitions:
             problem = "there is no excitation and no imported recording that can be fitted"

@@ -169,7 +169,7 @@ def summarise(
             try:
                 summary = reduced_archive(ToReduce(ref), settings)[0]
             except Exception as error:
-                summaries.append(SkippedArchive(ref.origin, reason_of(error)))
+                summaries.append(SkippedArchive(ref.origin, reason_of(error, ref.origin)))
                 continue
             known = ReducedArchives((summary,))
             cache.write(ref.origin, key, *_packed(known))
@@ -206,7 +206,9 @@ def _reduce_archive(wanted: ToReduce, settings: Settings, cache: CacheLocation) 
     try:
         summary, reduction = reduced_archive(wanted, settings)
     except Exception as error:
-        return ReducedArchives(broken=(SkippedArchive(ref.origin, reason_of(error)),), read=1)
+        return ReducedArchives(
+            broken=(SkippedArchive(ref.origin, reason_of(error, ref.origin)),), read=1
+        )
     total = reduction if ref.use == "excitation" else None
     result = ReducedArchives((summary,), total, read=1)
     _write((wanted,), result, settings, cache)

@@ -193,11 +193,11 @@ def read_log(log: str, maps: Sequence[LogMap], reading: LogReading, cache: Cache
         except CacheError:
             raise
         except Exception as error:
-            failures.append(reason_of(error))
+            failures.append(reason_of(error, log))
     try:
         channels = _channels(source)
     except Exception as error:  # of a damaged file, of whatever library
-        return UnreadLog(failures[0] if failures else reason_of(error), None)
+        return UnreadLog(failures[0] if failures else reason_of(error, log), None)
     return UnreadLog(failures[0] if failures else "", channels)
 
 

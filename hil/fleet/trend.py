@@ -234,7 +234,7 @@ def fleet_trend(
         dated_by_file=sum(ref.dated_by == "file" for each in types for ref in each.refs),
         simulated=all(ref.simulated for each in types for ref in each.refs),
         recordings=sum(len(each.refs) for each in types),
-        broken=tuple(each.without_path for each in broken),
+        broken=tuple(broken),
         skipped=found.skipped,
     )
 

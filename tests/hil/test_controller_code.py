@@ -115,8 +115,10 @@ def test_the_compiled_torque_is_pinocchios(name: str, precision: Precision) -> N
 def test_thresholds_are_tables_that_a_program_reads(tmp_path: Path) -> None:
     arm = an_arm(urdf_text())
     torque = tuple(np.arange(1.0, 7.0).tolist())
+    low = tuple(np.arange(0.5, 6.0).tolist())
+    high = tuple(np.arange(2.0, 8.0).tolist())
     levels = [
-        ContactThreshold(period, False, torque, torque, torque, force, 5.0)
+        ContactThreshold(period, False, torque, low, high, force, 5.0)
         for period, force in ((12.5, 50.0), (60.0, np.inf))
     ]
     code = c_source(control_tables(arm), "arm", [], "double", levels)
@@ -129,6 +131,9 @@ def test_thresholds_are_tables_that_a_program_reads(tmp_path: Path) -> None:
     assert [*forces] == [50.0, np.inf] and [*masses] == [5.0, 5.0]
     assert [*periods] == [12.5, 60.0]
     assert tuple(rows[6:]) == torque
+    for end, expected in (("low", low), ("high", high)):
+        ends = (ctypes.c_double * 12).in_dll(built.library, f"arm_threshold_{end}")
+        assert tuple(ends[6:]) == expected
 
 
 def test_another_arm_is_refused() -> None:

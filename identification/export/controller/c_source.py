@@ -37,6 +37,14 @@ class Threshold(Protocol):
         """Of each joint (n,) [N·m or N]."""
 
     @property
+    def low(self) -> Sequence[float]:
+        """Lower ends of its 95 % interval (n,)."""
+
+    @property
+    def high(self) -> Sequence[float]:
+        """Upper ends (n,)."""
+
+    @property
     def force(self) -> float:
         """At the flange, of which 95 % of directions exceed it [N]; infinite where none does."""
 
@@ -165,8 +173,13 @@ def _thresholds(thresholds: Sequence[Threshold], precision: Precision) -> Iterat
             f"const arm_real arm_threshold_{name}[{len(thresholds)}] = "
             f"{write.initial(np.array(values))};\n"
         )
-    rows = ",\n".join(f"    {write.initial(np.array(each.torque))}" for each in thresholds)
-    yield f"const arm_real arm_threshold[{len(thresholds)}][ARM_JOINTS] = {{\n{rows}}};\n"
+    for name, levels in (
+        ("threshold", [each.torque for each in thresholds]),
+        ("threshold_low", [each.low for each in thresholds]),
+        ("threshold_high", [each.high for each in thresholds]),
+    ):
+        rows = ",\n".join(f"    {write.initial(np.array(level))}" for level in levels)
+        yield f"const arm_real arm_{name}[{len(thresholds)}][ARM_JOINTS] = {{\n{rows}}};\n"
 
 
 class _Writer:

@@ -53,9 +53,12 @@ void arm_observer_step(arm_observer *observer, const arm_real q[], const arm_rea
 
 #if ARM_THRESHOLDS > 0
 /* Torque from outside that motion without contact exceeded once in a period [s], from motion that was
-   not fitted and for an observer below 10 Hz; the longer periods are extrapolated. */
+   not fitted and for an observer below 10 Hz, with its 95 % interval. The first period is what that
+   motion shows; longer ones are extrapolated (peaks over threshold, exponential tail). */
 extern const arm_real arm_threshold_period[ARM_THRESHOLDS];
 extern const arm_real arm_threshold[ARM_THRESHOLDS][ARM_JOINTS];
+extern const arm_real arm_threshold_low[ARM_THRESHOLDS][ARM_JOINTS];
+extern const arm_real arm_threshold_high[ARM_THRESHOLDS][ARM_JOINTS];
 /* In the middle of the joints' ranges: force at the flange [N] that 95 % of directions show above them,
    and the mass there [kg] whose weight does. */
 extern const arm_real arm_threshold_force[ARM_THRESHOLDS];
