@@ -2,9 +2,9 @@
 
 Run with ``python -m benchmarks.fleet [--fleets N]``: fleets of 20 robots over 24 months, which are
 asked about every month, as a nightly job does. The friction of each joint is known from each log
-to half a per cent, as from 30 s of motion; what follows is the trend. Torques of logs
-(`write_fleet`) are those of recursive Newton-Euler by pinocchio with friction, temperature and
-noise of this module: nothing of `hil` or `identification`.
+to half a per cent, as from 30 s of motion; what follows is the trend. `write_fleet`
+simulates logs by pinocchio's recursive Newton-Euler with this module's friction, temperature and
+noise; it uses nothing of `hil` or `identification`.
 """
 
 from __future__ import annotations
@@ -47,7 +47,7 @@ class Fault:
     Attributes:
         robot: its number.
         kind: wear grows by `size` of the friction a month; a lost lubricant is a step of it, a
-            replaced gear one downwards; a tool weighs `size` [kg] and is told to nobody.
+            replaced gear one downwards; a tool weighs `size` [kg], which no log states.
         joint: its number; of no meaning for a tool.
         month: when it begins, counted from the first log.
         size: a share of friction, or kg.
