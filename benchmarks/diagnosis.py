@@ -128,7 +128,7 @@ def said(look: Look) -> Iterator[tuple[Change, bool]]:
 
 
 def judged(seed: int, folder: Path) -> dict[str, object]:
-    """Return what is said of one log."""
+    """Return the outcome of a look at one log."""
     case = planted(seed)
     path = folder / "log.npz"
     np.savez(path, t=case.time, q=case.position, tau=case.torque)
