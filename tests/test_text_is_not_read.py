@@ -60,7 +60,6 @@ FOREIGN: Final[Mapping[str, str]] = {
 }
 """Modules that read text of others."""
 OURS: Final[Mapping[str, str]] = {
-    "hil.batch.cluster": "the reason of an unusable archive begins with its path",
     "hil.control.errors": "an outcome that begins the reason is not said twice",
     "hil.control.simulator_process": "the last error that the simulated controller printed",
     "hil.report.drawing": "the lines of a label make its height",
