@@ -14,7 +14,7 @@ from unittest.mock import patch
 import numpy as np
 
 from identification.selection import questions as names
-from identification.selection.scores import SettingDecision, Trial
+from identification.selection.scores import SettingDecision, SettingsTrial
 from identification.selection.settings import Choice, Settings
 
 CHOICES: Final[Mapping[str, tuple[str, ...]]] = {
@@ -40,14 +40,18 @@ CHOICES: Final[Mapping[str, tuple[str, ...]]] = {
 def without(choice: str) -> Iterator[None]:
     """Leave out a choice: its decisions return the first candidate, a delay the stated one."""
     if choice == "averaging":
-        with patch.object(Trial, "odds", lambda *_: 0.0):
+        with patch.object(SettingsTrial, "odds", lambda *_: 0.0):
             yield
         return
     left_out = CHOICES[choice]
 
     def deciding(decide: Callable[..., SettingDecision]) -> Callable[..., SettingDecision]:
         def decided(
-            trial: Trial, name: str, candidates: Sequence[Settings], *others: Any, **more: Any
+            trial: SettingsTrial,
+            name: str,
+            candidates: Sequence[Settings],
+            *others: Any,
+            **more: Any,
         ) -> SettingDecision:
             if name not in left_out:
                 return decide(trial, name, candidates, *others, **more)
@@ -59,8 +63,8 @@ def without(choice: str) -> Iterator[None]:
         return decided
 
     with (
-        patch.object(Trial, "decide", deciding(Trial.decide)),
-        patch.object(Trial, "decide_last", deciding(Trial.decide_last)),
+        patch.object(SettingsTrial, "decide", deciding(SettingsTrial.decide)),
+        patch.object(SettingsTrial, "decide_last", deciding(SettingsTrial.decide_last)),
     ):
         yield
 

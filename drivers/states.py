@@ -279,7 +279,7 @@ _LOSS: Final = {
 """Reason for the loss of a motion."""
 
 
-class Motion(Protocol):
+class RequestedMotion(Protocol):
     """What a decision reads of the requested motion, an `Execution`."""
 
     @property
@@ -330,7 +330,7 @@ def decide(
     state: State,
     cause: Input,
     losses: LossTracker,
-    motion: Motion | None,
+    motion: RequestedMotion | None,
     axes: Axes | None = None,
 ) -> Decision:
     """Return what an input does in this state; changes nothing.
@@ -360,7 +360,7 @@ def decide(
 
 
 def _ending(
-    before: State, cause: Input, after: State, losses: LossTracker, motion: Motion
+    before: State, cause: Input, after: State, losses: LossTracker, motion: RequestedMotion
 ) -> tuple[Outcome, str] | None:
     """Return outcome and reason of a motion that this transition ends, or None."""
     if cause in (Input.REFUSAL, Input.EXIT):

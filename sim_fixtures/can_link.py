@@ -12,7 +12,7 @@ from typing import Final
 
 import can
 
-from drivers.transports.can.profile import UP, BusRates, End
+from drivers.transports.can.profile import UP, BusRates, CanEndpoint
 from drivers.transports.can.transport import CanLink, CanSpec, open_bus
 
 START_PATIENCE: Final = 0.25
@@ -34,7 +34,7 @@ class CanControllerLink(CanLink):
         start_patience: float = START_PATIENCE,
         clock: Callable[[], float] = time.time,
     ) -> None:
-        self._end = End(rates, UP)
+        self._end = CanEndpoint(rates, UP)
         super().__init__(bus, self._end, clock=clock)
         self._start_patience = start_patience
         self._awaited = False

@@ -26,7 +26,7 @@ CEILINGS: Final[Mapping[str, int]] = {
     "motions taken apart": 0,
     "array types defined twice": 0,
     "long names of tests": 0,
-    "class names defined twice": 23,
+    "class names defined twice": 3,
 }
 """Figures that no change may exceed. Size has none: features are not traded for lines."""
 BANNED: Final = {

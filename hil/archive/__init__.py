@@ -13,7 +13,7 @@ from hil.archive.imported import imported_archive, write_archive
 from hil.archive.reader import Archive, open_archive, opened, place_of
 from hil.archive.recorder import ArchiveSpec, Recorder
 from hil.archive.schema import ArchivedEvent, Level
-from hil.archive.writer import ArchiveWriter, Samples, write_samples
+from hil.archive.writer import ArchiveWriter, ImportedSamples, write_samples
 
 __all__ = [
     "CONTROLLER_PROGRAM",
@@ -29,7 +29,7 @@ __all__ = [
     "Findings",
     "Level",
     "Recorder",
-    "Samples",
+    "ImportedSamples",
     "imported_archive",
     "open_archive",
     "opened",

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from hil.archive.header import DESCRIPTION, ArchiveHeader, ArchiveOutcome, checksum
 from hil.archive.reader import Archive
-from hil.archive.writer import Samples, described, require_storable, write_samples
+from hil.archive.writer import ImportedSamples, described, require_storable, write_samples
 
 COPIED_COMMANDS: Final = "copied_commands"
 """Entry of the header: the commands that the positions of a log copy bit for bit."""
@@ -25,7 +25,7 @@ _DERIVED: Final = ("joint_names", "period", "format_version", "attachments", "ki
 
 def imported_archive(
     path: Path,
-    samples: Samples,
+    samples: ImportedSamples,
     *,
     joint_names: Sequence[str],
     metadata: Mapping[str, str],
@@ -68,11 +68,11 @@ def imported_archive(
 
 def write_archive(archive: Archive, path: Path) -> Path:
     """Write an archive in memory to a file; see :func:`write_samples`."""
-    columns = {field.name: archive.columns.get(field.name) for field in fields(Samples)}
+    columns = {field.name: archive.columns.get(field.name) for field in fields(ImportedSamples)}
     entries = archive.header.entries
     return write_samples(
         path,
-        Samples(**columns),  # type: ignore[arg-type]
+        ImportedSamples(**columns),  # type: ignore[arg-type]
         joint_names=archive.joint_names,
         metadata={key: text for key, text in entries.items() if key not in _DERIVED},
         attachments=archive.attachments,
@@ -80,10 +80,10 @@ def write_archive(archive: Archive, path: Path) -> Path:
     )
 
 
-def _columns(samples: Samples) -> dict[str, NDArray[Any]]:
+def _columns(samples: ImportedSamples) -> dict[str, NDArray[Any]]:
     """Return contiguous read-only columns of what was recorded, by name."""
     columns: dict[str, NDArray[Any]] = {"stamp": np.array(samples.stamp, dtype=np.int64)}
-    for field in fields(Samples):
+    for field in fields(ImportedSamples):
         values = getattr(samples, field.name)
         if field.name != "stamp" and values is not None:
             columns[field.name] = np.array(values, dtype=np.float64, order="C")

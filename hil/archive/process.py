@@ -30,14 +30,14 @@ from hil.archive.live import LivePublisher, Serve
 from hil.archive.recorder import Recorder
 from hil.archive.supervised import (
     Answer,
-    Channel,
     Close,
     Closed,
-    End,
+    CommandSocket,
     Failed,
     Open,
     Opened,
     Serving,
+    Shutdown,
 )
 from hil.base.errors import ArchiveError, InputError
 
@@ -125,13 +125,13 @@ class ArchiveProcess:
         ring: RingReader,
         events: EventReader,
         control: SharedState,
-        commands: Channel,
+        commands: CommandSocket,
         exchange: int,
     ) -> None:
         self._ring = ring
         self._events = events
         self._control = control
-        self._commands: Channel | None = commands
+        self._commands: CommandSocket | None = commands
         self._job: Job | None = None
         self._leaving = False
         self._progress = time.monotonic()
@@ -186,7 +186,7 @@ class ArchiveProcess:
                 self._close(command.outcome, command.reason)
         elif isinstance(command, Serve):
             self._serve(command)
-        elif isinstance(command, End):
+        elif isinstance(command, Shutdown):
             self._leaving = True
             if self._job is not None and not self._job.until_ended:
                 self._close("stopped", "the recording was ended")
@@ -367,7 +367,7 @@ def main() -> None:
         RingReader(ring, n_joints),
         EventReader(events),
         SharedState(control),
-        Channel(socket(fileno=commands, type=SOCK_SEQPACKET)),
+        CommandSocket(socket(fileno=commands, type=SOCK_SEQPACKET)),
         exchange,
     )
     signal.signal(signal.SIGTERM, process.leave)

@@ -44,7 +44,7 @@ class Close:
 
 
 @dataclass(frozen=True)
-class End:
+class Shutdown:
     """Close the open archive and end the process."""
 
 
@@ -82,11 +82,11 @@ class Failed:
     errno: int | None = None
 
 
-Command = Open | Close | Serve | End
+Command = Open | Close | Serve | Shutdown
 Answer = Opened | Closed | Serving | Failed
 
 
-class Channel:
+class CommandSocket:
     """One end of the command socket, a `SOCK_SEQPACKET`.
 
     A message is sent in parts after their number; neither end waits longer than `TIMEOUT` s.
@@ -163,7 +163,7 @@ class ArchiveProcessHandle:
     """Starts, commands and ends the archive process, a child in its own process session."""
 
     process: ChildProcess
-    channel: Channel
+    channel: CommandSocket
     monitor: HeartbeatMonitor
     _gone: bool = False
     _ended_for: str = field(default="")
@@ -185,7 +185,7 @@ class ArchiveProcessHandle:
             undo.pop_all()
             os.close(exchange)
             theirs.close()
-        return cls(process, Channel(ours), monitor)
+        return cls(process, CommandSocket(ours), monitor)
 
     @property
     def alive(self) -> bool:
@@ -211,7 +211,7 @@ class ArchiveProcessHandle:
         try:
             self.channel.send(command)
         except TimeoutError:
-            self.kill(f"accepted no command for {Channel.TIMEOUT:g} s and was ended")
+            self.kill(f"accepted no command for {CommandSocket.TIMEOUT:g} s and was ended")
         except OSError:
             self._lose()
 
@@ -237,7 +237,7 @@ class ArchiveProcessHandle:
     def end(self) -> str | None:
         """Close the open archive and end the process, killed if it hangs; return its fault."""
         if self.alive:
-            self.send(End())
+            self.send(Shutdown())
         deadline = time.monotonic() + END_TIMEOUT
         while self.process.alive and not self._gone:
             if self.monitor.silence() > HUNG:

@@ -515,7 +515,7 @@ class ArchiveWriter:
 
 
 @dataclass(frozen=True, eq=False)
-class Samples:
+class ImportedSamples:
     """A recording to be imported, m samples of n joints, joint side in SI units.
 
     Attributes:
@@ -535,7 +535,7 @@ class Samples:
     commanded_position: Array | None = None
 
 
-def require_storable(path: Path, samples: Samples) -> None:
+def require_storable(path: Path, samples: ImportedSamples) -> None:
     """Raise ArchiveWriteError if a stamp cannot be stored."""
     stamp = samples.stamp
     if stamp.size and not 0 <= stamp.min() <= stamp.max() < 2**31 * 10**9:
@@ -546,7 +546,7 @@ def require_storable(path: Path, samples: Samples) -> None:
 
 def write_samples(
     path: str | PathLike[str],
-    samples: Samples,
+    samples: ImportedSamples,
     *,
     joint_names: Sequence[str],
     metadata: Mapping[str, str],

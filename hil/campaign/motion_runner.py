@@ -22,7 +22,7 @@ from hil.base.version import software
 from hil.cell import Cell
 from hil.control.errors import MotionFailedError, SlippedError
 from hil.control.link import NOT_STARTED, MotionLink
-from hil.control.motions import REPEATED, CampaignMotion, StraightMoves, moves_to_dict, player_of
+from hil.control.motions import REPEATED, CampaignMotion, CheckedMoves, moves_to_dict, player_of
 from hil.control.record import archive_spec, origin_of, with_present_date
 from hil.control.simulation import simulated_provenance
 from hil.control.slips import CHECKED, require_no_slip
@@ -172,7 +172,7 @@ class Runner:
         reporter: Reporter,
         *,
         warmth: Warmth,
-        straight: StraightMoves,
+        straight: CheckedMoves,
         start: Array,
         unrehearsed: bool,
     ) -> None:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from hil.cell import Cell
 from hil.control.motion_checks import MotionChecks
-from hil.control.motions import CampaignMotion, StraightMoves, require_allowed, rest
+from hil.control.motions import CampaignMotion, CheckedMoves, require_allowed, rest
 
 from .plan import CampaignPlan
 
@@ -28,4 +28,4 @@ def require_runnable(cell: Cell, plan: CampaignPlan, checks: MotionChecks | None
     checks = checks or MotionChecks.of(cell)
     motions = planned_motions(cell, plan)
     require_allowed(motions, checks)  # before moves to them are planned
-    StraightMoves(cell, checks).with_moves(motions, cell.home)
+    CheckedMoves(cell, checks).with_moves(motions, cell.home)

@@ -16,7 +16,7 @@ from hil.control.cell_link import cell_link
 from hil.control.connection import active_checks, narrower_limits
 from hil.control.link import MotionLink
 from hil.control.motion_checks import MotionChecks
-from hil.control.motions import CampaignMotion, StraightMoves, require_allowed
+from hil.control.motions import CampaignMotion, CheckedMoves, require_allowed
 
 from .dry_run import OVERRIDE, DryRunState
 from .gates import require_as_rehearsed, require_dry_run, require_gates
@@ -177,7 +177,7 @@ class _CampaignRun:
                     f"the controller's own current limits counted ({'; '.join(below)})"
                 )
             # Dry run and warm-up use the moves of the motions that they are made of.
-            straight = StraightMoves(cell, narrowed)
+            straight = CheckedMoves(cell, narrowed)
             joined = straight.with_moves([*slow, *full], start)
             runner = Runner(
                 self._campaign,

@@ -218,7 +218,7 @@ OWN_LINES: Final = frozenset(("simulate", "run", "record", "move"))
 """Commands that print lines of their own."""
 
 
-class Group(TyperGroup):
+class CommandGroup(TyperGroup):
     """The commands of `COMMANDS`."""
 
     def __init__(self, **settings: Any) -> None:
@@ -286,7 +286,7 @@ def _global_options(version: Annotated[bool, _VERSION] = False) -> None:
 
 app = typer.Typer(
     name="hil",
-    cls=Group,
+    cls=CommandGroup,
     callback=_global_options,
     help=(
         "Identify the dynamics of an industrial robot with its own controller in the loop.\n\n"

@@ -35,7 +35,7 @@ from hil.importers.lerobot import EpisodeUnit
 from hil.importers.messages import sentence
 from hil.importers.recording import ImportedRecording, ImportOptions, import_bag, import_recording
 from hil.importers.robot import STANDARD_GRAVITY, Robot, Use
-from hil.importers.rosbag2 import Clock, Effort
+from hil.importers.rosbag2 import CommandStamps, Effort
 from hil.pipeline.options import friction_from
 from identification import FrictionLaw
 from identification.model.kinematics import MOST_JOINTS
@@ -321,7 +321,7 @@ def rosbag2(
     arm: Described,
     topic: str | None = None,
     effort: Annotated[Effort, typer.Option(metavar="QUANTITY")] = "torque",
-    clock: Annotated[Clock, typer.Option(metavar="STAMPS")] = "auto",
+    clock: Annotated[CommandStamps, typer.Option(metavar="STAMPS")] = "auto",
     command_topic: Annotated[str | None, typer.Option(metavar="TOPIC")] = None,
     rename: Annotated[list[str] | None, typer.Option(metavar="RECORDED=URDF")] = None,
     held: Held = None,

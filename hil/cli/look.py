@@ -17,7 +17,7 @@ from hil.base.terminal_text import printable
 from hil.cli.arguments import JsonOption, VerboseOption, print_json, with_options
 from hil.cli.imports import Described, Reading
 from hil.importers.conclusions import Certainty
-from hil.look import Choice, Group, Look, Row, look_at
+from hil.look import Look, ParameterGroup, Row, TiedReading, look_at
 from hil.look.maps import with_entries
 from hil.look.messages import (
     as_json,
@@ -111,7 +111,7 @@ def screen(result: Look) -> list[str]:
     return one_screen(parts)
 
 
-def question(choices: Sequence[Choice]) -> list[Paragraph]:
+def question(choices: Sequence[TiedReading]) -> list[Paragraph]:
     """Return a question about readings that fit alike, and the setting for each of them."""
     asked = f"{choices[0].aspect}: {fit_alike(choices)}; choose one line for the map:"
     parts = [Paragraph(asked)]
@@ -129,7 +129,7 @@ def _options(result: Look) -> list[str]:
     return [] if result.gravity is None else [f"hil identify {gravity_option(result.gravity)}"]
 
 
-def _ask(choices: Sequence[Choice]) -> Choice | None:
+def _ask(choices: Sequence[TiedReading]) -> TiedReading | None:
     """Ask which reading is right; None if that is not known."""
     numbers = "1 or 2" if len(choices) == 2 else f"1 to {len(choices)}"
     answer = typer.prompt(f"{choices[0].aspect}: {numbers}, or 0 if unknown", type=int, default=0)
@@ -194,7 +194,7 @@ def summary(rows: Sequence[Row]) -> list[str]:
     return lines
 
 
-def determined(groups: Sequence[Group]) -> list[str]:
+def determined(groups: Sequence[ParameterGroup]) -> list[str]:
     """Return three lines: what the recording determines well, weakly, and not."""
     numbers = {
         "well": [group.identifiable for group in groups],
@@ -215,7 +215,7 @@ def determined(groups: Sequence[Group]) -> list[str]:
     return lines
 
 
-def groups_table(groups: Sequence[Group]) -> list[str]:
+def groups_table(groups: Sequence[ParameterGroup]) -> list[str]:
     """Return one line per body or joint."""
     width = max(len(group.body) for group in groups)
     lines = [f"{'joint'.ljust(width)}  of        identifiable  weak  not"]

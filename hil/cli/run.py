@@ -30,14 +30,14 @@ from hil.cli.arguments import (
     with_options,
 )
 from hil.cli.verdict import NOT_GOOD, as_json, finish
-from hil.cli.weigh import Weighing, weigh
+from hil.cli.weigh import WeighingOptions, weigh
 from hil.control.cell_link import require_real_time
 from hil.control.errors import stopped
 from hil.precision.requirements import Requirement
 from hil.report.output_files import REPORT
 
 
-@with_options(Weighing, "weighing")
+@with_options(WeighingOptions, "weighing")
 def run(
     campaign: CampaignArgument,
     rehearse: bool = False,
@@ -48,7 +48,7 @@ def run(
     until_precise: bool = False,
     precision: Annotated[list[str] | None, typer.Option(metavar="REQUIREMENTS")] = None,
     *,
-    weighing: Weighing,
+    weighing: WeighingOptions,
     live: Annotated[str | None, typer.Option(metavar="[HOST:]PORT")] = None,
     quiet: QuietOption = False,
     verbose: VerboseOption = False,

@@ -54,7 +54,7 @@ WORDS: Final = {
 }
 
 
-class Status:
+class PhasePrinter:
     """Prints a line for each change of a session's phase; nothing if `quiet`."""
 
     def __init__(self, settings: ControllerSettings, *, quiet: bool) -> None:
@@ -243,7 +243,7 @@ def simulate(
 
     addresses = {"--udp": udp, "--can": can, "--link": link}
     end = open_controller_link(addresses, settings, len(loaded.joint_names))
-    status = Status(settings, quiet=json)
+    status = PhasePrinter(settings, quiet=json)
     status.say(
         f"{loaded.name}: a SIMULATED controller for {udp or can or link}; nothing moves.\n"
         f"cycle {1e3 * settings.period:g} ms, mode {settings.open_mode}, process {os.getpid()}"

@@ -32,7 +32,7 @@ _ANSWER: Final = "Type yes when the arm may move; anything else ends the run: "
 
 
 @dataclass(frozen=True)
-class Weighing:
+class WeighingOptions:
     """Options of a payload campaign; see `hil.cli.arguments.with_options`."""
 
     payload: Annotated[
@@ -107,7 +107,7 @@ def centre_from(text: str | None) -> tuple[float, float, float]:
 
 def weigh(
     campaign: Campaign,
-    weighing: Weighing,
+    weighing: WeighingOptions,
     execute: Execute,
     choices: Mapping[str, Any],
     requirements: Sequence[Requirement],

@@ -95,7 +95,7 @@ def limit_violation(cell: Cell, posture: Array, verb: str = "stands at") -> str 
     )
 
 
-class StraightMoves:
+class CheckedMoves:
     """Straight moves between postures, each planned and checked once."""
 
     def __init__(self, cell: Cell, checks: MotionChecks) -> None:

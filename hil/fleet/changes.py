@@ -73,7 +73,7 @@ class ShapeOfChange(NamedTuple):
 
 
 @dataclass(frozen=True, eq=False)
-class Change:
+class SeriesChange:
     """One change in a series.
 
     Attributes:
@@ -114,7 +114,7 @@ class Course:
     adjusted: Array
     std: Array
     fitted: Array
-    changes: tuple[Change, ...]
+    changes: tuple[SeriesChange, ...]
     p_value: float
     change: float
     half: float
@@ -549,7 +549,7 @@ def _described(
         others = [*chosen[:number], *chosen[number + 1 :]]
         earliest, latest = _begin_interval(series, prior, weights, others, shape, candidates)
         std = float(np.sqrt(of_changes[number, number]))
-        changes.append(Change(shape, float(sizes[number]), std, earliest, latest))
+        changes.append(SeriesChange(shape, float(sizes[number]), std, earliest, latest))
     changes.sort(key=lambda change: change.shape.begin)
     explained = series.covariates @ coefficients[1:first]
     whole_half = half(end) if chosen else _half_of_no_change(series, prior, weights, factor)

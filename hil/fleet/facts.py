@@ -16,7 +16,7 @@ from hil.importers.arrays import ArrayFile
 from hil.importers.channels import channels_of
 from hil.importers.column_map import Format
 from hil.importers.log_files import LogFiles
-from hil.importers.text_table import Table
+from hil.importers.text_table import TextTable
 
 _TEMPERATURE: Final = re.compile(r"temp(?!late|orary|lat)|celsius|°c", re.IGNORECASE)
 _MOST_COLUMNS: Final = 64
@@ -58,10 +58,10 @@ def facts_of(source: Path, wanted: WantedFacts, files: LogFiles) -> dict[str, fl
     return facts
 
 
-def _means(table: Table | ArrayFile, name: str) -> Iterator[tuple[str, float]]:
+def _means(table: TextTable | ArrayFile, name: str) -> Iterator[tuple[str, float]]:
     """Yield the mean of a column; of an array with several, that of each, numbered from 1."""
     try:
-        if isinstance(table, Table):
+        if isinstance(table, TextTable):
             values = table.numbers([name], "facts")
         else:
             values = table.matrix(name, "facts")

@@ -14,7 +14,7 @@ from hil.base.toml_text import to_text
 from hil.cell.arms import Links
 from hil.cell.errors import first_error
 from hil.importers.column_map import map_text
-from hil.importers.rosbag2 import Clock, Effort
+from hil.importers.rosbag2 import CommandStamps, Effort
 
 _COMMENT: Final = "How hil read the joint states of the bag; joints by their names"
 _DOCUMENTATION: Final = "docs/bring-your-own-robot.md"
@@ -35,7 +35,7 @@ class BagMap(BaseModel):
     model_config = ConfigDict(frozen=True, extra="forbid", defer_build=True)
 
     topic: str | None = None
-    clock: Clock = "auto"
+    clock: CommandStamps = "auto"
     effort: Effort = "torque"
     command_topic: str | None = None
     rename: Mapping[str, str] = {}

@@ -20,7 +20,7 @@ _REPEATED_MARK: Final = re.compile(r"([_.-])\1+")  # around the name of a joint
 
 
 @dataclass(frozen=True)
-class Group:
+class ChannelGroup:
     """Channels that differ by the number or the name of a joint only.
 
     Attributes:
@@ -66,7 +66,7 @@ class Group:
         return list(self.names)
 
 
-def grouped(channels: Iterable[Channel], joints: Sequence[str]) -> list[Group]:
+def grouped(channels: Iterable[Channel], joints: Sequence[str]) -> list[ChannelGroup]:
     """Group channels by their name without number or joint, in the order of the log."""
     channels = list(channels)
     bare_names = [without_unit(channel.name)[0].strip() or channel.name for channel in channels]
@@ -100,7 +100,7 @@ def grouped(channels: Iterable[Channel], joints: Sequence[str]) -> list[Group]:
         size = sum(channel.size for _, _, channel in entries)
         unit = entries[0][2].unit
         whole = names[0] if len(names) == 1 else pattern
-        groups.append(Group(whole, kind, names, size, unit, by_joint))
+        groups.append(ChannelGroup(whole, kind, names, size, unit, by_joint))
     return groups
 
 

@@ -26,7 +26,7 @@ from hil.importers.name_words import is_other, kind_by_words
 from hil.importers.rosbag2 import joint_state_topics
 from hil.importers.stamps import concluded_unit
 from hil.importers.stated_units import without_unit
-from hil.importers.text_table import Table
+from hil.importers.text_table import TextTable
 from hil.importers.units import TIMES, Kind, unit_of
 
 _NUMBER: Final = r"[\[(_. ]*(?P<number>\d{1,2})[\])]*"
@@ -148,9 +148,9 @@ def kind_of(name: str, unit: str | None = None) -> tuple[Kind | None, int | None
     return kinds[0], number
 
 
-def named_channels(file: Table | ArrayFile) -> list[Channel]:
+def named_channels(file: TextTable | ArrayFile) -> list[Channel]:
     """Return the channels of a file by their names, of which no number is read."""
-    if isinstance(file, Table):
+    if isinstance(file, TextTable):
         return [Channel(name, 1, len(file.lines), kind=kind_of(name)[0]) for name in file.names]
     shapes = {name: file.shape(name) for name in file.names}
     return [
@@ -180,7 +180,7 @@ def _of_folder(folder: Path, form: Format | None, files: LogFiles) -> Iterator[C
             yield replace(channel, kind=kind)
 
 
-def _of_table(table: Table) -> Iterator[Channel]:
+def _of_table(table: TextTable) -> Iterator[Channel]:
     names = table.names or tuple(map(str, range(table.width)))
     rate = None
     kinds = [kind_of(name, table.unit(place)) for place, name in enumerate(names[: table.width])]
@@ -205,7 +205,7 @@ def _of_table(table: Table) -> Iterator[Channel]:
         )  # fmt: skip
 
 
-def _rate(table: Table | ArrayFile, place: int | str) -> float | None:
+def _rate(table: TextTable | ArrayFile, place: int | str) -> float | None:
     """Return the rate by a column of times, in its own unit or the one that is concluded."""
     stated = unit_of(table.unit(place) or "", "time")
     try:
@@ -225,7 +225,7 @@ def _is_time(name: str, kind: Kind | None) -> bool:
 _Place = TypeVar("_Place", int, str)
 
 
-def _repeated_times(table: Table | ArrayFile, places: Sequence[_Place]) -> set[_Place]:
+def _repeated_times(table: TextTable | ArrayFile, places: Sequence[_Place]) -> set[_Place]:
     """Return the columns of times that are all those of a column before."""
     repeated = set()
     earlier: list[Sequence[int | None]] = []

@@ -10,17 +10,20 @@ import numpy as np
 from hil.base.arrays import Array
 from hil.base.errors import SourceError
 from hil.importers.arrays import ArrayFile
-from hil.importers.channel_groups import Group
+from hil.importers.channel_groups import ChannelGroup
 from hil.importers.commands import COMMANDED
 from hil.importers.conclusions import CopiedCommands
 from hil.importers.name_words import kinds_said
-from hil.importers.text_table import Table
+from hil.importers.text_table import TextTable
 
 _ALIKE: Final = 0.999  # of the rows
 
 
 def copied_commands(
-    position: Array, file: Table | ArrayFile, groups: Sequence[Group], used: Collection[str]
+    position: Array,
+    file: TextTable | ArrayFile,
+    groups: Sequence[ChannelGroup],
+    used: Collection[str],
 ) -> CopiedCommands | None:
     """Return which commands positions (m, n) copy, and which channels may hold measured ones.
 
@@ -55,10 +58,10 @@ def copied_commands(
     return None
 
 
-def _numbers(file: Table | ArrayFile, group: Group) -> Array | None:
+def _numbers(file: TextTable | ArrayFile, group: ChannelGroup) -> Array | None:
     """Return the numbers of a group of channels (m, n); None where they are none."""
     try:
-        if isinstance(file, Table):
+        if isinstance(file, TextTable):
             return file.numbers(group.names, "position")
         if len(group.names) == 1:
             return file.matrix(group.names[0], "position")

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from hil.base.errors import SourceError
-from hil.importers.channel_groups import Group, grouped
+from hil.importers.channel_groups import ChannelGroup, grouped
 from hil.importers.channels import channels_of
 from hil.importers.column_map import Format
 from hil.importers.log_files import LogFiles
@@ -65,7 +65,7 @@ class CommandFile:
         return cls(tuple(columns), entries)
 
 
-def _columns(groups: Sequence[Group], joints: Sequence[str]) -> Sequence[str] | None:
+def _columns(groups: Sequence[ChannelGroup], joints: Sequence[str]) -> Sequence[str] | None:
     """Return the channels of the joints: by their names, else the only group of as many."""
     names = {name for group in groups for name in group.names}
     if names.issuperset(joints):
@@ -75,5 +75,5 @@ def _columns(groups: Sequence[Group], joints: Sequence[str]) -> Sequence[str] | 
     return commands[0].names if len(commands) == 1 else None
 
 
-def _kind(group: Group) -> str | None:
+def _kind(group: ChannelGroup) -> str | None:
     return group.kind or kind_by_words(group.pattern)

@@ -40,7 +40,7 @@ _ARRAY: Final = "std_msgs/msg/Float64MultiArray"
 _ALIKE: Final = 1e-3  # rad or m between the commands of two topics that are the same
 
 
-class Clock(NamedTuple):
+class CommandStamps(NamedTuple):
     """Stamps of messages on the clock of the measured positions."""
 
     by_header: bool
@@ -63,7 +63,7 @@ class Measured:
     renamed: Mapping[str, str]  #: names in the URDF by name in the bag
     stamp: Stamps  #: (m,) [ns]
     position: Array  #: (m, n) [rad or m]
-    clock: Clock
+    clock: CommandStamps
 
     def places(self, names: Sequence[str]) -> list[int] | None:
         """Return where the joints are in the names of a message; None if one is missing."""

@@ -14,7 +14,7 @@ import numpy as np
 import scipy
 from numpy.typing import NDArray
 
-from hil.archive import Samples
+from hil.archive import ImportedSamples
 from hil.base.arrays import Array
 from hil.base.errors import SourceError
 from hil.cell.text import UrdfLimits, urdf_limits
@@ -67,7 +67,7 @@ NominalTorque = Callable[[Motion], Array]
 
 
 def examine(
-    samples: Samples,
+    samples: ImportedSamples,
     joint_names: Sequence[str],
     urdf: str,
     *,
@@ -362,7 +362,7 @@ def against_position(time: Array, position: Array, velocity: Array) -> tuple[Arr
     return factor, correlation
 
 
-def _torques(samples: Samples, names: Sequence[str], limits: Array) -> Iterator[Conclusion]:
+def _torques(samples: ImportedSamples, names: Sequence[str], limits: Array) -> Iterator[Conclusion]:
     if samples.torque is None and samples.motor_current is None:
         yield NoTorque(is_commanded=samples.commanded_position is not None)
     if samples.torque is None:
@@ -375,7 +375,7 @@ def _torques(samples: Samples, names: Sequence[str], limits: Array) -> Iterator[
 
 
 def _torque_size(
-    samples: Samples, names: Sequence[str], limits: Array, nominal: NominalTorque | None
+    samples: ImportedSamples, names: Sequence[str], limits: Array, nominal: NominalTorque | None
 ) -> Iterator[Conclusion]:
     """Yield a warning where torques have another order of magnitude than the arm needs.
 
@@ -408,7 +408,7 @@ def _those(names: Sequence[str], which: NDArray[np.bool_]) -> list[str]:
     return [name for name, chosen in zip(names, which.tolist(), strict=True) if chosen]
 
 
-def _nominal_rms(samples: Samples, nominal: NominalTorque) -> Array | None:
+def _nominal_rms(samples: ImportedSamples, nominal: NominalTorque) -> Array | None:
     """Return the root mean square of the nominal torque over the motion (n,); None if too short.
 
     Positions are averaged over blocks first, in which the noise of differences is small.

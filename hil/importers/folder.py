@@ -15,7 +15,7 @@ from hil.base.errors import SourceError, UnrecordedJointError
 from hil.base.safe_input import parse_toml
 from hil.base.toml_text import to_text
 from hil.importers.arrays import ArrayFile
-from hil.importers.channel_groups import NUMBER, Group, grouped
+from hil.importers.channel_groups import NUMBER, ChannelGroup, grouped
 from hil.importers.channels import channels_of, kinds_of_file
 from hil.importers.column_map import ColumnMap, Format
 from hil.importers.commands import COMMANDED
@@ -25,7 +25,7 @@ from hil.importers.name_words import kind_by_words
 from hil.importers.proposal import Proposal
 from hil.importers.robot import NOT_RECORDED, Robot
 from hil.importers.stamps import is_clock
-from hil.importers.text_table import Table
+from hil.importers.text_table import TextTable
 from hil.importers.units import Kind, kind_named
 
 _JOINT_KINDS: Final[tuple[Kind, ...]] = (
@@ -233,7 +233,7 @@ class _Search:
             return
         self._read_columns(path, grouped(channels, self._joints), stem)
 
-    def _read_columns(self, path: Path, groups: Sequence[Group], stem: Kind | None) -> None:
+    def _read_columns(self, path: Path, groups: Sequence[ChannelGroup], stem: Kind | None) -> None:
         """Note the quantities of a file whose columns or arrays have names."""
         times = [
             group
@@ -255,10 +255,10 @@ class _Search:
             )  # fmt: skip
             self._held.setdefault(_commanded(kind, path), []).append(held)
 
-    def _nameless(self, file: Table | ArrayFile, count: int) -> _Held:
+    def _nameless(self, file: TextTable | ArrayFile, count: int) -> _Held:
         """Return the columns of a file without names, the first of which may be its times."""
         name = file.path.name
-        has_times = isinstance(file, Table) and count == len(self._joints) + 1
+        has_times = isinstance(file, TextTable) and count == len(self._joints) + 1
         if has_times and is_clock(file.numbers([0], "time", None)[:, 0]):
             return _Held(name, list(range(1, count)), count - 1, (), None, 0, by_file=True)
         return _Held(name, None, count, (), None, None, by_file=True)
@@ -310,9 +310,9 @@ def _number(held: _Held) -> tuple[int, str]:
     return (int(match[0]) if match else 0, held.file)
 
 
-def _width(file: Table | ArrayFile) -> int:
+def _width(file: TextTable | ArrayFile) -> int:
     """Return how many numbers a sample of a file without names has."""
-    if isinstance(file, Table):
+    if isinstance(file, TextTable):
         return file.width
     shape = file.shape(file.names[0])
     return 1 if len(shape) == 1 else min(shape)

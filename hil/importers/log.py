@@ -13,7 +13,7 @@ from typing import Any, Final, Literal, NamedTuple, NoReturn
 import numpy as np
 from numpy.typing import NDArray
 
-from hil.archive import Samples
+from hil.archive import ImportedSamples
 from hil.archive.imported import COPIED_COMMANDS, ROW_COUNTER
 from hil.base.arrays import Array
 from hil.base.errors import SourceError, UnrecordedJointError
@@ -58,7 +58,7 @@ from hil.importers.stamps import (
     without_wraps,
 )
 from hil.importers.stated_units import other_unit
-from hil.importers.text_table import Table
+from hil.importers.text_table import TextTable
 from hil.importers.units import RATED, TIMES, UNITS, factor_of, kind_named, unit_of
 
 _MORE: Final = 64  # columns or files beyond the joints that are tried
@@ -197,7 +197,7 @@ class _Log:
         self._parsed = parsed
         self._folder = path if path.is_dir() else path.parent
         self._map = columns
-        self.files: dict[Path, Table | ArrayFile] = {}
+        self.files: dict[Path, TextTable | ArrayFile] = {}
         self.concluded: list[Conclusion] = []
         self.joints = columns.joints or self._row_names(robot.joint_names)
         self.order = self._joint_order(robot)
@@ -307,7 +307,7 @@ class _Log:
     def _refuse_interrupted(self) -> None:
         """Raise SourceError for an empty line in a log that has no times: rows may be missing."""
         for file in self.files.values():
-            line = file.interrupted if isinstance(file, Table) else None
+            line = file.interrupted if isinstance(file, TextTable) else None
             if line is None:
                 continue
             problem = f"line {line} is empty, and no time tells whether rows are missing there"
@@ -324,7 +324,7 @@ class _Log:
             file, *_ = self._file_per_joint(position.files, "position.files")
         else:
             file = self._file(position.file, "position.file")
-        return file.row_numbers if isinstance(file, Table) else np.arange(count)
+        return file.row_numbers if isinstance(file, TextTable) else np.arange(count)
 
     def _clock_of(self, time: TimeColumn, quantity: Quantity, name: str) -> _Clock:
         """Return the stamps of a quantity by its column of times."""
@@ -383,7 +383,7 @@ class _Log:
         self.concluded.append(OtherClock(1e-9 * offset))
         return {**parts, "commanded_position": Timed(command.stamp + offset, command.values)}
 
-    def _times(self, file: Table | ArrayFile, time: TimeColumn) -> Sequence[int | None]:
+    def _times(self, file: TextTable | ArrayFile, time: TimeColumn) -> Sequence[int | None]:
         """Return the times of a file [ns], None where one is missing."""
         if time.nanoseconds is None:
             unit = time.unit or self._unit_of_time(file, time)
@@ -399,7 +399,7 @@ class _Log:
             for second, part in zip(whole, parts, strict=True)
         ]
 
-    def _unit_of_time(self, file: Table | ArrayFile, time: TimeColumn) -> str:
+    def _unit_of_time(self, file: TextTable | ArrayFile, time: TimeColumn) -> str:
         """Return the unit of a time column where the map states none."""
         written = file.unit(time.column) or ""
         stated = unit_of(written, "time")
@@ -483,7 +483,7 @@ class _Log:
         values: Mapping[str, Array],
         complete: NDArray[np.bool_],
         robot: Robot,
-    ) -> Samples:
+    ) -> ImportedSamples:
         """Return the complete rows (m,) on the joint side, sorted, of the first publisher."""
         rows = np.flatnonzero(complete)
         swapped = sorted_neighbours(clock.stamp[rows], "row")
@@ -502,7 +502,7 @@ class _Log:
             self.concluded.append(silent.publisher)
             stamp = stamp[~silent.rows]
             joint = {name: array[~silent.rows] for name, array in joint.items()}
-        return Samples(stamp, **joint)
+        return ImportedSamples(stamp, **joint)
 
     @np.errstate(over="ignore", invalid="ignore")  # such numbers are refused later
     def in_concluded_units(
@@ -625,7 +625,9 @@ class _Log:
         ]
         return np.column_stack(columns_of_files), units
 
-    def _file_per_joint(self, names: str | Sequence[str], field: str) -> list[Table | ArrayFile]:
+    def _file_per_joint(
+        self, names: str | Sequence[str], field: str
+    ) -> list[TextTable | ArrayFile]:
         if isinstance(names, str):
             numbers = range(len(self.joints) + _MORE)
             possible = [names.replace("{}", str(number)) for number in [*numbers, *self.joints]]
@@ -699,7 +701,7 @@ class _Log:
             raise refusal
         return upright
 
-    def _file(self, name: str | None, field: str) -> Table | ArrayFile:
+    def _file(self, name: str | None, field: str) -> TextTable | ArrayFile:
         if name is None and self.path.is_dir():
             problem = "is a folder"
             remedy = 'name a file in it: file = "q.txt", or one per joint: files = "q_{}.txt"'
@@ -716,7 +718,7 @@ class _Log:
         if not numbered or any(quantity.file or quantity.files for quantity in quantities):
             return joints
         file = self._file(None, "position.file")
-        names = row_names(file.texts, joints) if isinstance(file, Table) else None
+        names = row_names(file.texts, joints) if isinstance(file, TextTable) else None
         if names is None or names.joints in ((), joints):
             return joints
         self.concluded.append(JointOrder(names.joints))
@@ -790,10 +792,10 @@ class _Log:
             raise SourceError(self.path, problem, field=field, remedy=remedy)
 
 
-def _unbroken(file: Table | ArrayFile, time: TimeColumn, decimals: int) -> Sequence[int | None]:
+def _unbroken(file: TextTable | ArrayFile, time: TimeColumn, decimals: int) -> Sequence[int | None]:
     """Return the times of the first rows, as far as no row was left out."""
     times = file.times(time.column, decimals, time.array)
-    return times[: file.unbroken] if isinstance(file, Table) else times
+    return times[: file.unbroken] if isinstance(file, TextTable) else times
 
 
 def _check_lengths(

@@ -8,7 +8,7 @@ from typing import Final
 
 from hil.importers.arrays import READERS, ArrayFile, format_of
 from hil.importers.column_map import Format
-from hil.importers.text_table import Table
+from hil.importers.text_table import TextTable
 
 TEXTS: Final = (".csv", ".txt", ".dat", ".tsv", ".asc", ".log", ".gz")
 _ARRAYS: Final = tuple(suffix for suffix in READERS if suffix not in (".mcap", ".m", ".json"))
@@ -48,7 +48,7 @@ class LogFiles:
     ) -> None:
         self.longest = longest
         self._arrays: dict[Path, ArrayFile] = dict(arrays or {})
-        self._tables: dict[tuple[Path, str], Table] = {}
+        self._tables: dict[tuple[Path, str], TextTable] = {}
 
     def arrays(self, path: Path) -> ArrayFile:
         """Return a file of arrays.
@@ -60,7 +60,7 @@ class LogFiles:
             self._arrays[path] = ArrayFile(path)
         return self._arrays[path]
 
-    def table(self, path: Path, form: Format) -> Table:
+    def table(self, path: Path, form: Format) -> TextTable:
         """Return a text table.
 
         Raises:
@@ -68,9 +68,9 @@ class LogFiles:
         """
         key = path, form.model_dump_json()
         if key not in self._tables:
-            self._tables[key] = Table.read(path, form, self.longest)
+            self._tables[key] = TextTable.read(path, form, self.longest)
         return self._tables[key]
 
-    def file(self, path: Path, form: Format) -> Table | ArrayFile:
+    def file(self, path: Path, form: Format) -> TextTable | ArrayFile:
         """Return arrays or a table, by the suffix of the file; see both."""
         return self.arrays(path) if format_of(path) in READERS else self.table(path, form)

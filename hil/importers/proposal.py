@@ -17,7 +17,7 @@ from hil.base.errors import SourceError, UnrecordedJointError
 from hil.base.safe_input import parse_toml
 from hil.base.toml_text import to_text
 from hil.importers.arrays import ArrayFile
-from hil.importers.channel_groups import NUMBER, Group, grouped
+from hil.importers.channel_groups import NUMBER, ChannelGroup, grouped
 from hil.importers.channels import CHANNEL_NAMES, Channel, channels_of, kind_of, kinds_of_file
 from hil.importers.column_map import ColumnMap, Format, ready_map, ready_maps
 from hil.importers.conclusions import (
@@ -33,7 +33,7 @@ from hil.importers.name_words import is_measured, kind_by_words, kinds_said, wor
 from hil.importers.robot import Robot
 from hil.importers.row_names import row_names
 from hil.importers.stated_units import other_unit
-from hil.importers.text_table import Table
+from hil.importers.text_table import TextTable
 from hil.importers.units import Kind, kind_named, unit_of
 from hil.importers.unnamed_columns import ColumnBlocks, blocks_of, roughness
 
@@ -134,7 +134,7 @@ def _refuse_row_for_each_joint(
     raise SourceError(log, problem, field=column.name, remedy=remedy)
 
 
-def _matching_ready_map(groups: Sequence[Group], count: int) -> str | None:
+def _matching_ready_map(groups: Sequence[ChannelGroup], count: int) -> str | None:
     """Return the ready map whose columns are all in the log, one for each of `count` joints."""
     sizes = {group.pattern: group.size for group in groups}
     has_torque = any(group.kind == "torque" for group in groups)
@@ -174,7 +174,7 @@ class _Search:
         self,
         log: Path,
         joints: Sequence[str],
-        groups: Sequence[Group],
+        groups: Sequence[ChannelGroup],
         chosen: Mapping[str, str],
         sample_rate: float | None,
         recorded: Sequence[str],
@@ -185,7 +185,7 @@ class _Search:
         self._columns_of = recorded or joints
         self.nanoseconds: str | int | None = None  #: column that is added to that of the time
         self.of_arm = len(joints)  #: joints without those of a gripper
-        self.file: Callable[[], Table | ArrayFile] | None = None  #: the log, parsed
+        self.file: Callable[[], TextTable | ArrayFile] | None = None  #: the log, parsed
         self.with_unit: Collection[str] = ()  #: quantities whose unit a map states
         self._groups = groups
         self._chosen = chosen
@@ -258,7 +258,7 @@ class _Search:
         self._concluded.append(self._meaning(kind, group))
         return group.columns(self._columns_of)
 
-    def _groups_of(self, kind: Kind) -> list[Group]:
+    def _groups_of(self, kind: Kind) -> list[ChannelGroup]:
         """Return the groups of a quantity: by whole names, else by words in them."""
         given = set(self._chosen.values())
         groups = [g for g in self._groups if g.pattern not in given]
@@ -279,7 +279,7 @@ class _Search:
             self._used.add(parts[0].pattern)
         return single or named
 
-    def _by_words(self, kind: Kind, groups: Sequence[Group]) -> list[Group]:
+    def _by_words(self, kind: Kind, groups: Sequence[ChannelGroup]) -> list[ChannelGroup]:
         """Return the groups whose names say a quantity by a word in them."""
         said = [g for g in groups if kind_by_words(g.pattern) == kind]
         said = [replace(g, by_words=NameBasis.WORD) for g in said]
@@ -293,9 +293,11 @@ class _Search:
             return exact or several
         names = tuple(g.names[0] for g in single)
         by_words = NameBasis.WORDS
-        return [Group(",".join(names), kind, names, count, single[0].unit, by_words=by_words)]
+        return [
+            ChannelGroup(",".join(names), kind, names, count, single[0].unit, by_words=by_words)
+        ]
 
-    def _is_used(self, group: Group) -> bool:
+    def _is_used(self, group: ChannelGroup) -> bool:
         return group.pattern in self._used or self._used.issuperset(group.names)
 
     def _given(self, text: str) -> _Columns:
@@ -311,7 +313,7 @@ class _Search:
         return all(group.pattern in ("{}", "0") for group in self._groups)
 
     @staticmethod
-    def _meaning(kind: Kind, group: Group) -> ChannelMeaning:
+    def _meaning(kind: Kind, group: ChannelGroup) -> ChannelMeaning:
         """Return quantity and unit, and from what."""
         unit_basis = UnitBasis.LOG
         if group.unit is None:
@@ -323,7 +325,7 @@ class _Search:
         basis = group.by_words or basis
         return ChannelMeaning(group.label, kind, basis, group.unit, unit_basis)
 
-    def _refuse_several(self, kind: Kind, groups: Sequence[Group]) -> NoReturn:
+    def _refuse_several(self, kind: Kind, groups: Sequence[ChannelGroup]) -> NoReturn:
         names = [name for group in groups for name in (group.pattern, *group.names)]
         patterns = [group.pattern for group in groups]
         if len(groups) == 1:
@@ -360,7 +362,7 @@ class _Search:
         return known[0][1]
 
     @staticmethod
-    def _numbers(file: Table | ArrayFile, group: Group) -> Array:
+    def _numbers(file: TextTable | ArrayFile, group: ChannelGroup) -> Array:
         if isinstance(file, ArrayFile) and len(group.names) == 1:
             return file.matrix(group.names[0], "position")
         return file.numbers(group.names, "position", None)
@@ -376,7 +378,7 @@ class _Search:
             return None
         return blocks_of(values, (len(self._joints), self.of_arm))
 
-    def _refuse_unit(self, kind: Kind, group: Group) -> NoReturn:
+    def _refuse_unit(self, kind: Kind, group: ChannelGroup) -> NoReturn:
         assert group.unit is not None
         problem = f"{group.label} is named as {kind}, and {group.unit} is not a unit of it"
         kinds = [other for other in _JOINT_KINDS[:4] if unit_of(group.unit, other)]
@@ -385,7 +387,7 @@ class _Search:
         options = " or ".join(f"--columns '{name}={group.pattern}'" for name in kinds)
         raise SourceError(self._log, problem, field=kind, remedy=f"choose: {options}")
 
-    def _refuse_count(self, kind: Kind, group: Group) -> NoReturn:
+    def _refuse_count(self, kind: Kind, group: ChannelGroup) -> NoReturn:
         count = group.size
         joints = ", ".join(self._joints)
         problem = (
@@ -409,7 +411,7 @@ class _Search:
             remedy += f", or the channels of its joints, such as --columns '{kind}={some}'"
         raise SourceError(self._log, problem, field=kind, remedy=f"{remedy}; {otherwise}")
 
-    def _absent(self, group: Group) -> tuple[Sequence[str], str]:
+    def _absent(self, group: ChannelGroup) -> tuple[Sequence[str], str]:
         """Return the joints without a channel by the numbers of the others, else the last ones."""
         numbers = [NUMBER.search(name) for name in group.names]
         places = {int(match[0]) for match in numbers if match is not None}
@@ -488,7 +490,7 @@ class _Search:
         )
 
 
-def _likely(kind: str, groups: Sequence[Group]) -> str:
+def _likely(kind: str, groups: Sequence[ChannelGroup]) -> str:
     """Return the pattern of the group that may be of a quantity: by its words, else the first."""
     said = {
         group.pattern: kinds_said(group.pattern)

@@ -18,22 +18,22 @@ _RETURNS: Final = 0.25  # of a step to another sequence, which the step back lea
 _LEAST_SHARE: Final = 0.02  # of the samples, beyond single spikes
 
 
-class Silent(NamedTuple):
+class FrozenSamples(NamedTuple):
     """Samples with one and the same pose between others that move."""
 
     rows: NDArray[np.bool_]  #: (m,)
     publisher: SecondPublisher | None  #: None if there are none
 
 
-def second_publisher(position: Array, sample: Sample) -> Silent:
+def second_publisher(position: Array, sample: Sample) -> FrozenSamples:
     """Find those of positions (m, n) [rad or m]."""
     rows = _of_one_pose(position)
     if not rows.any():
-        return Silent(rows, None)
+        return FrozenSamples(rows, None)
     pose = position[np.argmax(rows)]
     where = tuple(pose.tolist()) if pose.any() else ()
     count = int(np.count_nonzero(rows))
-    return Silent(rows, SecondPublisher(count, len(position), where, sample))
+    return FrozenSamples(rows, SecondPublisher(count, len(position), where, sample))
 
 
 def _of_one_pose(position: Array) -> NDArray[np.bool_]:

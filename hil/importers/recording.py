@@ -37,7 +37,7 @@ from hil.importers.partial_map import PartialMap
 from hil.importers.proposal import Proposal, proposed_map
 from hil.importers.robot import RecordingContent, Robot, Use, require_writable, write_to
 from hil.importers.rosbag2 import Effort, joint_state_topics, read_rosbag2, recorded_joints
-from hil.importers.text_table import Table
+from hil.importers.text_table import TextTable
 from hil.importers.units import UNITS, Kind
 
 _BAGS: Final = (".db3", ".bag", ".mcap", ".zstd", ".zst")
@@ -559,7 +559,7 @@ def _with_own_rows(request: _Request, robot: Robot, proposal: Proposal) -> Propo
     if columns.format.missing == "interpolate":
         return proposal
     file = request.files.file(source, columns.format)
-    if isinstance(file, Table) and not file.lacks_numbers:
+    if isinstance(file, TextTable) and not file.lacks_numbers:
         return proposal
     text = with_values(proposal.text, {"format.missing": "interpolate"})
     interpolating = ColumnMap.model_validate(parse_toml(text))

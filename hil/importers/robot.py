@@ -14,7 +14,7 @@ from typing import Any, Final, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from hil.archive import Archive, Samples, imported_archive, write_archive
+from hil.archive import Archive, ImportedSamples, imported_archive, write_archive
 from hil.base.errors import ArchiveWriteError, SourceError
 from hil.base.files import file_digest, make_folder, replace_file
 from hil.base.safe_input import path_exists, read_input
@@ -285,7 +285,7 @@ class RecordingContent:
         clock_remedy: in place of the remedies for an invalid clock of a log.
     """
 
-    samples: Samples
+    samples: ImportedSamples
     robot: Robot
     source: tuple[Path, ...]
     metadata: Mapping[str, str]
@@ -377,7 +377,7 @@ class RecordingContent:
         others = (each for each in self.concluded if not isinstance(each, Excerpt))
         total = max([len(samples.stamp), *read])
         said = Excerpt(len(chosen.rows), total, chosen.stretches)
-        return replace(self, samples=Samples(**excerpt), concluded=(*others, said))
+        return replace(self, samples=ImportedSamples(**excerpt), concluded=(*others, said))
 
     def _examined(self, held_joints: Sequence[str]) -> Examined:
         """Return the findings of an import, what was concluded first."""
@@ -424,7 +424,7 @@ def _replaced(output: Path) -> Iterator[Path]:
         raise ArchiveWriteError(output, problem, remedy="choose another name (-o)") from error
 
 
-def _check(samples: Samples, source: Path, joints: Sequence[str]) -> None:
+def _check(samples: ImportedSamples, source: Path, joints: Sequence[str]) -> None:
     if not len(samples.stamp):
         raise SourceError(source, "has no sample")
     quantities = {

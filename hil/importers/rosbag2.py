@@ -11,11 +11,11 @@ from typing import Final, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from hil.archive import Samples
+from hil.archive import ImportedSamples
 from hil.base.arrays import Array
 from hil.base.errors import SourceError, UnrecordedJointError
 from hil.importers.bags import Bag, BagMessage, open_bag
-from hil.importers.commands import Clock as CommandClock
+from hil.importers.commands import CommandStamps as CommandClock
 from hil.importers.commands import (
     Measured,
     as_joint_state,
@@ -38,7 +38,7 @@ from hil.importers.ros_messages import CONTROLLER_STATE, JOINT_STATE
 from hil.importers.stamps import leading_zeros, sorted_neighbours
 
 Effort = Literal["torque", "motor_current", "ignore"]
-Clock = Literal["auto", "header", "bag"]
+CommandStamps = Literal["auto", "header", "bag"]
 
 _QUANTITIES: Final = ("position", "velocity", "effort")
 _MOST_APART: Final = 2.0  # periods between a sample and the one that it is interpolated to
@@ -54,7 +54,7 @@ def import_rosbag2(
     robot: Robot,
     topic: str | None = None,
     effort: Effort = "torque",
-    clock: Clock = "auto",
+    clock: CommandStamps = "auto",
     joint_names: Mapping[str, str] | None = None,
     command_topic: str | None = None,
     held_joints: Sequence[str] = (),
@@ -101,7 +101,7 @@ def read_rosbag2(
     robot: Robot,
     topic: str | None = None,
     effort: Effort = "torque",
-    clock: Clock = "auto",
+    clock: CommandStamps = "auto",
     joint_names: Mapping[str, str] | None = None,
     command_topic: str | None = None,
 ) -> RecordingContent:
@@ -214,7 +214,7 @@ class _States:
         joints: Sequence[str],
         renamed: Mapping[str, str],
         effort: Effort,
-        clock: Clock,
+        clock: CommandStamps,
     ) -> None:
         self._source = source
         self._joints = tuple(joints)
@@ -259,7 +259,7 @@ class _States:
                 )
                 raise SourceError(self._source, problem, field=name)
 
-    def samples(self) -> Samples:
+    def samples(self) -> ImportedSamples:
         """Return the samples of all joints in the robot's order.
 
         Raises:
@@ -272,7 +272,7 @@ class _States:
         self.clock = "header" if has_header else "bag"
         joined = self._merged(parts, [self._joined(part) for part in parts])
         effort = joined.values.get("effort")
-        return Samples(
+        return ImportedSamples(
             stamp=joined.stamp,
             position=joined.values["position"],
             velocity=joined.values.get("velocity"),
@@ -280,7 +280,7 @@ class _States:
             motor_current=effort if self._effort == "motor_current" else None,
         )
 
-    def measured(self, samples: Samples) -> Measured:
+    def measured(self, samples: ImportedSamples) -> Measured:
         """Return the positions that commands have to follow, and the clock of their stamps."""
         late = [
             received - stamp

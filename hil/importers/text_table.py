@@ -65,7 +65,7 @@ class _Layout(NamedTuple):
 
 
 @dataclass(frozen=True, eq=False)
-class Table:
+class TextTable:
     """A text table of numbers, not yet converted."""
 
     path: Path
@@ -83,7 +83,7 @@ class Table:
     _times: dict[tuple[int, int], Sequence[int | None]] = field(default_factory=dict, compare=False)
 
     @classmethod
-    def read(cls, path: Path, form: Format, longest: int | None = None) -> Table:
+    def read(cls, path: Path, form: Format, longest: int | None = None) -> TextTable:
         """Read a file and detect its encoding, dialect, header and units.
 
         Of one with more lines than `longest` stretches are read.

@@ -19,7 +19,7 @@ from hil.importers.robot import Robot, Use
 from hil.look.messages import choice_text, fit_alike, sentences, setting_text
 from hil.look.other_arm import Contradictions
 from hil.look.readings import DoubtfulArm, ExplainedTorque, GravityOption, NoJointTorque
-from hil.look.result import ChangedReading, Choice, Look, Row
+from hil.look.result import ChangedReading, Look, Row, TiedReading
 from hil.look.run import SETTINGS, look_at_joints, mountings
 from hil.pipeline.sources import cell_of, source_of
 from identification.errors import IdentificationError
@@ -247,7 +247,7 @@ def _again(
 
 
 def undecided(
-    source: Path, choices: tuple[Choice, ...], contradictions: Contradictions
+    source: Path, choices: tuple[TiedReading, ...], contradictions: Contradictions
 ) -> SourceError:
     """Return the refusal of readings that fit alike; a doubtful arm is said first."""
     errors = [

@@ -31,7 +31,7 @@ from hil.look.readings import (
     BeyondSpeed,
     Changes,
     Channels,
-    Clock,
+    ClockReading,
     ColumnOrder,
     Contradiction,
     Correlation,
@@ -56,19 +56,19 @@ from hil.look.readings import (
     Mounting,
     NearestZero,
     NextBest,
+    NextStep,
     NoJointTorque,
     NotSlopes,
     OtherAxes,
     OtherLengths,
     RigidShare,
-    Rows,
+    RowsReading,
     Setting,
     SizeRatio,
     SlopeFactors,
     SlopeRatio,
     SmoothPositions,
     StatedPayload,
-    Step,
     StillJoints,
     StillUnexplained,
     TorqueDelay,
@@ -80,7 +80,7 @@ from hil.look.readings import (
     Vector,
     Wrapped,
 )
-from hil.look.result import ChangedReading, Choice, Look, Row
+from hil.look.result import ChangedReading, Look, Row, TiedReading
 from identification.hypotheses.changes import IN_ORDER, Meaning
 from identification.hypotheses.faults import COUPLED
 from identification.text import percentage
@@ -154,36 +154,36 @@ _BASES: Final[Mapping[Basis, str]] = {
     Basis.FREE_PARAMETERS: "with free parameters, before a fit of the friction law",
     Basis.NO_BODIES: "torque of friction says nothing of it",
 }
-_STEPS: Final[Mapping[Step, str]] = {
-    Step.STATE_UNIT_OR_GEARS: "state unit, sign or gears of both",
-    Step.STATE_GRAVITY: "state --gravity X Y Z",
-    Step.STATE_DRIVE: "state gear ratios or torque constants ([drive] of a map) if not",
-    Step.STATE_TORQUE_CONSTANT: (
+_STEPS: Final[Mapping[NextStep, str]] = {
+    NextStep.STATE_UNIT_OR_GEARS: "state unit, sign or gears of both",
+    NextStep.STATE_GRAVITY: "state --gravity X Y Z",
+    NextStep.STATE_DRIVE: "state gear ratios or torque constants ([drive] of a map) if not",
+    NextStep.STATE_TORQUE_CONSTANT: (
         "[drive] torque_constant of a map (N·m/A), or `hil torque-constants`"
     ),
-    Step.NAME_JOINTS: "name the joint of each column",
-    Step.ESTIMATE_DELAY: "--delay auto",
-    Step.GIVE_URDF: "add --urdf ARM.urdf",
-    Step.GIVE_URDF_OF_THIS_ARM: "give the URDF of this arm",
-    Step.CHECK_COLUMNS: "check the order of the columns of both",
-    Step.CHECK_UNIT: "check the unit",
-    Step.MOVE_ALL_OR_LOCK: "record a motion of all joints, or fix these (--locked NAME)",
-    Step.MOVE_EACH_JOINT: "move the joints one by one",
-    Step.PUSH_A_JOINT: "push one joint by hand and see its torque",
-    Step.COMPARE_A_POSTURE: "compare a posture with the URDF's (viewer)",
-    Step.RECORD_ALL_TORQUE: "record the torque of motors or sensors, before that",
-    Step.WEIGH_A_LOAD: "hold a known load with and without it (`hil torque-constants`)",
-    Step.TURN_ONE_JOINT: "turn one joint alone and see which angles change",
-    Step.HOLD_STILL: "hold the arm still, stretched out, and see the torque",
-    Step.RECORD_MEASURED: "record the measured ones",
-    Step.RECORD_MEASURED_IF_ANY: "record the measured ones if the controller has them",
-    Step.RECORD_TORQUE: "record it",
-    Step.RECORD_FASTER: "record faster motion",
-    Step.RECORD_PAYLOAD: "record with and without it (`hil payload`)",
-    Step.IMPORT_COMMANDS: "import it: `hil rollout --polish` identifies servo and friction",
-    Step.ASK_FOR_POSITIONS: "ask for the raw encoder positions",
-    Step.ASK_FOR_UNIT: "ask for the unit of the channel",
-    Step.ASK_FOR_FILTER: "ask for the filter of the channel",
+    NextStep.NAME_JOINTS: "name the joint of each column",
+    NextStep.ESTIMATE_DELAY: "--delay auto",
+    NextStep.GIVE_URDF: "add --urdf ARM.urdf",
+    NextStep.GIVE_URDF_OF_THIS_ARM: "give the URDF of this arm",
+    NextStep.CHECK_COLUMNS: "check the order of the columns of both",
+    NextStep.CHECK_UNIT: "check the unit",
+    NextStep.MOVE_ALL_OR_LOCK: "record a motion of all joints, or fix these (--locked NAME)",
+    NextStep.MOVE_EACH_JOINT: "move the joints one by one",
+    NextStep.PUSH_A_JOINT: "push one joint by hand and see its torque",
+    NextStep.COMPARE_A_POSTURE: "compare a posture with the URDF's (viewer)",
+    NextStep.RECORD_ALL_TORQUE: "record the torque of motors or sensors, before that",
+    NextStep.WEIGH_A_LOAD: "hold a known load with and without it (`hil torque-constants`)",
+    NextStep.TURN_ONE_JOINT: "turn one joint alone and see which angles change",
+    NextStep.HOLD_STILL: "hold the arm still, stretched out, and see the torque",
+    NextStep.RECORD_MEASURED: "record the measured ones",
+    NextStep.RECORD_MEASURED_IF_ANY: "record the measured ones if the controller has them",
+    NextStep.RECORD_TORQUE: "record it",
+    NextStep.RECORD_FASTER: "record faster motion",
+    NextStep.RECORD_PAYLOAD: "record with and without it (`hil payload`)",
+    NextStep.IMPORT_COMMANDS: "import it: `hil rollout --polish` identifies servo and friction",
+    NextStep.ASK_FOR_POSITIONS: "ask for the raw encoder positions",
+    NextStep.ASK_FOR_UNIT: "ask for the unit of the channel",
+    NextStep.ASK_FOR_FILTER: "ask for the filter of the channel",
 }
 _CHANGES: Final[Mapping[Meaning, str]] = {
     "torque sign": "torque negated",
@@ -216,7 +216,7 @@ def row_text(row: Row) -> RowText:
     return RowText(worded(row.reading), "; ".join(map(worded, row.evidence)), decide)
 
 
-def choice_text(choice: Choice) -> str:
+def choice_text(choice: TiedReading) -> str:
     """Return one of the readings that fit alike in words."""
     if choice.reading is not None:
         return described(choice.reading)
@@ -233,7 +233,7 @@ def gravity_option(gravity: Vector) -> str:
     return f"--gravity {' '.join(f'{part:g}' for part in gravity)}"
 
 
-def fit_alike(choices: Sequence[Choice]) -> str:
+def fit_alike(choices: Sequence[TiedReading]) -> str:
     """Return how many readings fit alike, in words."""
     return f"{'two' if len(choices) == 2 else 'three'} readings fit alike"
 
@@ -344,19 +344,19 @@ def _(basis: Basis) -> str:
 
 
 @_worded.register
-def _(step: Step) -> str:
+def _(step: NextStep) -> str:
     return _STEPS[step]
 
 
 @_worded.register
-def _(clock: Clock) -> str:
+def _(clock: ClockReading) -> str:
     unit = "stamps of the messages; " if clock.of_messages else ""
     unit = f"{clock.unit}; " if clock.unit is not None else unit
     return f"{unit}{'; '.join(clock.base.describe())}"
 
 
 @_worded.register
-def _(rows: Rows) -> str:
+def _(rows: RowsReading) -> str:
     times = () if rows.times is None else rows.times.describe()
     return "; ".join([*(fault.describe() for fault in rows.faults), *times])
 

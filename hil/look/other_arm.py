@@ -26,9 +26,9 @@ from hil.look.readings import (
     BeyondSpeed,
     Contradiction,
     Fact,
+    NextStep,
     OtherAxes,
     OtherLengths,
-    Step,
     UnexplainedTorque,
 )
 from hil.look.result import Row
@@ -124,7 +124,7 @@ class Contradictions:
     @property
     def row(self) -> Row:
         """What a look says of a doubtful arm."""
-        step = Step.GIVE_URDF_OF_THIS_ARM
+        step = NextStep.GIVE_URDF_OF_THIS_ARM
         return Row("arm", Fact.OTHER_ARM, Certainty.UNDETERMINED, self.found, step)
 
     @property

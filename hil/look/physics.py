@@ -53,8 +53,8 @@ from hil.look.readings import (
     UnseenZeros,
     Vector,
 )
-from hil.look.readings import Step as Decide
-from hil.look.result import Aspect, Choice, Group, Row
+from hil.look.readings import NextStep as Decide
+from hil.look.result import Aspect, ParameterGroup, Row, TiedReading
 from identification.estimators.delay import DelayEstimate
 from identification.estimators.prior import LEARNED, body_prior, fit_posterior
 from identification.factor.factor import Factor
@@ -191,7 +191,7 @@ def _by_reach(model: RobotModel, samples: Samples) -> float | None:
 
 
 @dataclass(frozen=True, eq=False)
-class Finding:
+class TorqueFindings:
     """What the torque says of a recording.
 
     Attributes:
@@ -217,7 +217,7 @@ class Finding:
         """How much of the torque is that of bodies."""
         return rigid_torque(self.readings.model, self.readings.samples)
 
-    def rows(self, groups: Sequence[Group] = ()) -> list[Row]:
+    def rows(self, groups: Sequence[ParameterGroup] = ()) -> list[Row]:
         """Return the rows of the table; `groups` are the parameters that are determined."""
         rows = [
             self._order(),
@@ -398,7 +398,7 @@ class Finding:
         reading = Fact.MOTOR_SIDE
         return Row("side", reading, Certainty.UNDETERMINED, evidence, Decide.ASK_FOR_UNIT)
 
-    def _payload(self, groups: Sequence[Group]) -> Row:
+    def _payload(self, groups: Sequence[ParameterGroup]) -> Row:
         payload = self.cell.file.robot.payload
         if payload is not None:
             stated = StatedPayload(payload.mass)
@@ -414,7 +414,7 @@ class Finding:
         reading = Fact.PAYLOAD_IN_LAST_BODY
         return Row("payload", reading, Certainty.LIKELY, evidence, decider)
 
-    def questions(self) -> tuple[tuple[Choice, ...], ...]:
+    def questions(self) -> tuple[tuple[TiedReading, ...], ...]:
         """Return the readings that fit alike, the best of each meaning."""
         choices = []
         for step in self.readings.steps:
@@ -433,7 +433,7 @@ class Finding:
             choices.append(self._sides())
         return tuple(choices)
 
-    def _choice(self, step: Step, change: Change, error: float) -> Choice:
+    def _choice(self, step: Step, change: Change, error: float) -> TiedReading:
         others = [change if other is step else other.change for other in self.readings.steps]
         axes = Axes.of(others, self.cell.model.n_joints)
         entries: Mapping[str, Any] = {}
@@ -443,16 +443,16 @@ class Finding:
         if setting is None and change.meaning in ("no gravity", "mounting"):
             gravity = (0.0, 0.0, 0.0) if change.meaning == "no gravity" else MOUNTINGS[change.name]
             setting = GravityOption(gravity)
-        return Choice(_ASPECTS[change.meaning], self._of_arm(change), error, setting)
+        return TiedReading(_ASPECTS[change.meaning], self._of_arm(change), error, setting)
 
-    def _sides(self) -> tuple[Choice, ...]:
+    def _sides(self) -> tuple[TiedReading, ...]:
         factor = self.size.factor or 1.0
         joints = self.cell.joint_names
         factors = self.size.of_joints or (None,) * len(joints)
         ratios = tuple(1.0 / (each or factor) for each in factors)
         unseen = tuple(name for name, each in zip(joints, factors, strict=True) if each is None)
         settings = (MotorTorque(ratios, unseen), MotorCurrents(ratios, unseen))
-        return tuple(Choice("side", None, None, setting) for setting in settings)
+        return tuple(TiedReading("side", None, None, setting) for setting in settings)
 
     def _entries_of(self, axes: Axes, text: str) -> dict[str, Any]:
         names = {channel.name for channel in channels_of(self.source, files=self.files)}
@@ -543,7 +543,7 @@ def _delay_row(delay: DelayEstimate | None) -> Row:
     return Row("delay", Fact.NO_DELAY_SEEN, Certainty.LIKELY, (problem,), Decide.RECORD_FASTER)
 
 
-def determined(readings: Readings) -> tuple[Group, ...]:
+def determined(readings: Readings) -> tuple[ParameterGroup, ...]:
     """Return how many parameters of each body and joint the recording determines.
 
     By the posterior over the prior standard deviation of each base parameter.
@@ -564,7 +564,7 @@ def determined(readings: Readings) -> tuple[Group, ...]:
             if ratios:
                 good = sum(value < LEARNED for value in ratios)
                 weak = sum(LEARNED <= value < _WEAK for value in ratios)
-                groups.append(Group(name, quantity, good, weak, len(ratios) - good - weak))
+                groups.append(ParameterGroup(name, quantity, good, weak, len(ratios) - good - weak))
     return tuple(groups)
 
 

@@ -68,7 +68,7 @@ class Fact(Enum):
 
 
 @dataclass(frozen=True)
-class Clock:
+class ClockReading:
     """Time base, with the unit of a log's time, or the stamps of messages."""
 
     base: TimeBase
@@ -77,7 +77,7 @@ class Clock:
 
 
 @dataclass(frozen=True)
-class Rows:
+class RowsReading:
     """Rows that are not of the motion, and times of the others that are not their stamps."""
 
     faults: tuple[RowFault, ...]
@@ -210,8 +210,8 @@ class LowPassedTorque:
 
 Reading = (
     Fact
-    | Clock
-    | Rows
+    | ClockReading
+    | RowsReading
     | Channels
     | JointOrder
     | NotSlopes
@@ -497,7 +497,7 @@ Evidence = (
 """From what a row concludes."""
 
 
-class Step(Enum):
+class NextStep(Enum):
     """What a person does to decide a row: states an option or a key, measures, or asks."""
 
     STATE_UNIT_OR_GEARS = auto()
@@ -572,7 +572,7 @@ class MotorCurrents:
     unseen: tuple[str, ...]
 
 
-Decider = Step | MapKey | MapEntries | GravityOption | OutsideLimits
+Decider = NextStep | MapKey | MapEntries | GravityOption | OutsideLimits
 """What decides a row; positions outside the limits say by what they would be within them."""
 
 Setting = MapEntries | GravityOption | MotorTorque | MotorCurrents

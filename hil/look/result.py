@@ -65,7 +65,7 @@ class Row:
 
 
 @dataclass(frozen=True)
-class Choice:
+class TiedReading:
     """One of the readings that fit alike.
 
     Attributes:
@@ -88,7 +88,7 @@ class Choice:
 
 
 @dataclass(frozen=True)
-class Group:
+class ParameterGroup:
     """How many parameters of a body or joint the recording determines."""
 
     body: str
@@ -115,8 +115,8 @@ class Look:
 
     source: str
     rows: tuple[Row, ...]
-    questions: tuple[tuple[Choice, ...], ...]
-    groups: tuple[Group, ...]
+    questions: tuple[tuple[TiedReading, ...], ...]
+    groups: tuple[ParameterGroup, ...]
     map_text: str | None
     gravity: Vector | None = None
     error: float | None = None

@@ -22,8 +22,8 @@ from hil.importers.units import Kind
 from hil.look import physics, signals
 from hil.look.maps import with_entries
 from hil.look.other_arm import Contradictions
-from hil.look.readings import Basis, Fact, Step
-from hil.look.result import Aspect, Group, Look, Row
+from hil.look.readings import Basis, Fact, NextStep
+from hil.look.result import Aspect, Look, ParameterGroup, Row
 from hil.look.undescribed import undescribed_robot
 from hil.pipeline.sources import Source, cell_of, source_of
 from identification.errors import IdentificationError
@@ -97,7 +97,7 @@ def _without_robot(recording: Recording) -> Row:
     quantity: Aspect = "torque" if recording.torque is not None else "motor current"
     evidence = (Basis.NO_GEOMETRY,)
     open_ = Certainty.UNDETERMINED
-    return Row(quantity, Fact.TORQUE_UNEXAMINED, open_, evidence, Step.GIVE_URDF)
+    return Row(quantity, Fact.TORQUE_UNEXAMINED, open_, evidence, NextStep.GIVE_URDF)
 
 
 def _with_torque(
@@ -136,15 +136,17 @@ def look_at_joints(source: Path, imported: ImportedRecording) -> Look:
 
 def _finding(
     source: Path, imported: ImportedRecording, cell: Cell, recording: Recording
-) -> physics.Finding:
+) -> physics.TorqueFindings:
     readings = _readings(cell, recording, imported)
     axes = Axes.of((step.change for step in readings.steps), cell.model.n_joints)
-    return physics.Finding(
+    return physics.TorqueFindings(
         cell, recording, readings, axes, imported.map_text, source, imported.files
     )
 
 
-def _look_of(finding: physics.Finding, rows: Sequence[Row], groups: tuple[Group, ...]) -> Look:
+def _look_of(
+    finding: physics.TorqueFindings, rows: Sequence[Row], groups: tuple[ParameterGroup, ...]
+) -> Look:
     text = finding.map_text
     if text is not None:
         text = with_entries(text, finding.entries())

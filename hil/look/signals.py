@@ -30,17 +30,17 @@ from hil.importers.units import Kind
 from hil.look.readings import (
     Basis,
     Channels,
-    Clock,
+    ClockReading,
     Correlation,
     Fact,
     LateVelocity,
     MapKey,
+    NextStep,
     NotSlopes,
-    Rows,
+    RowsReading,
     SlopeFactors,
     SlopeRatio,
     SmoothPositions,
-    Step,
     StillJoints,
     Travel,
     Wrapped,
@@ -81,7 +81,7 @@ def rows(source: Source, imported: ImportedRecording, arm: Cell | None) -> list[
     units = [each for each in imported.examined.found if isinstance(each, _UNITS)]
     table = [_time(recording, concluded, units)]
     if source.faults or source.retimed:
-        found = Rows(source.faults, source.times if source.retimed else None)
+        found = RowsReading(source.faults, source.times if source.retimed else None)
         table.append(Row("rows", found, Certainty.CERTAIN, (Basis.POSITIONS_ALONE,)))
     table += [row for each in concluded if (row := _concluded(each, units)) is not None]
     if recording.velocity is not None:
@@ -103,14 +103,16 @@ def _time(recording: Recording, concluded: Sequence[Conclusion], units: Sequence
     unit = next((each for each in units if each.kind == "time"), None)
     if isinstance(unit, ConcludedUnit):
         decider = MapKey(unit.decided_by)
-        return Row("time", Clock(base, unit.unit), unit.certainty, (Basis.USUAL_RATE,), decider)
+        return Row(
+            "time", ClockReading(base, unit.unit), unit.certainty, (Basis.USUAL_RATE,), decider
+        )
     if any(each.basis is NameBasis.MESSAGE for each in meanings):
-        clock = Clock(base, of_messages=True)
+        clock = ClockReading(base, of_messages=True)
         return Row("time", clock, Certainty.CERTAIN, (Basis.MESSAGE_TYPE,))
     if stated is None:
-        return Row("time", Clock(base), Certainty.CERTAIN, (Basis.GIVEN_RATE,))
+        return Row("time", ClockReading(base), Certainty.CERTAIN, (Basis.GIVEN_RATE,))
     basis = Basis.NAME_AND_RATE if stated.unit is None else Basis.STATED_UNIT
-    return Row("time", Clock(base, stated.unit or "s"), Certainty.CERTAIN, (basis,))
+    return Row("time", ClockReading(base, stated.unit or "s"), Certainty.CERTAIN, (basis,))
 
 
 def _concluded(conclusion: Conclusion, units: Sequence[_Unit]) -> Row | None:
@@ -150,7 +152,7 @@ def _velocity(recording: Recording) -> Row:
     if itself.min() < _FOLLOWS:
         bad = tuple(name for name, r in zip(names, itself, strict=True) if r < _FOLLOWS)
         evidence = Correlation(float(itself.min()))
-        decider = Step.CHECK_COLUMNS
+        decider = NextStep.CHECK_COLUMNS
         return Row("velocity", NotSlopes(bad), Certainty.CERTAIN, (evidence,), decider)
     if np.all(np.abs(factor - 1.0) < _CLOSE):
         ratio = SlopeRatio(float(1.0 / np.mean(factor)))
@@ -160,7 +162,7 @@ def _velocity(recording: Recording) -> Row:
     ]
     factors = SlopeFactors(dict(zip(names, factor.tolist(), strict=True)))
     reading = explanations[0] if explanations else Fact.SCALED_SLOPE
-    decider = Step.STATE_UNIT_OR_GEARS
+    decider = NextStep.STATE_UNIT_OR_GEARS
     return Row("velocity", reading, Certainty.CERTAIN, (factors,), decider)
 
 
@@ -176,7 +178,7 @@ def _rests(recording: Recording) -> Row:
         return Row("motion", Fact.EVERY_JOINT_MOVES, Certainty.CERTAIN, (moved,))
     evidence = Travel(STUCK_MOVEMENT, at_least=False)
     still = StillJoints(tuple(rests))
-    return Row("motion", still, Certainty.CERTAIN, (evidence,), Step.MOVE_ALL_OR_LOCK)
+    return Row("motion", still, Certainty.CERTAIN, (evidence,), NextStep.MOVE_ALL_OR_LOCK)
 
 
 def _wraps(recording: Recording) -> Row:
@@ -199,7 +201,7 @@ def _measured(
     """Return whether positions are measured, by their noise and the lag of the velocity."""
     copied = next((each for each in found if isinstance(each, CopiedCommands)), None)
     if copied is not None:
-        decider = Step.RECORD_MEASURED
+        decider = NextStep.RECORD_MEASURED
         return Row("positions", Fact.COMMANDED, Certainty.CERTAIN, (copied,), decider)
     names = [
         each.channels
@@ -207,19 +209,19 @@ def _measured(
         if isinstance(each, ChannelMeaning) and each.kind == "position"
     ]
     if any(COMMANDED.search(name) for name in names):
-        decider = Step.RECORD_MEASURED_IF_ANY
+        decider = NextStep.RECORD_MEASURED_IF_ANY
         return Row("positions", Fact.COMMANDED, Certainty.LIKELY, (Basis.NAME,), decider)
     quiet = noiseless_above(recording.time, recording.position, recording.segments())
     lag = velocity_lag(recording)
     if lag is not None and lag > 0.0:
         evidence = LateVelocity(lag)
-        decider = Step.RECORD_MEASURED
+        decider = NextStep.RECORD_MEASURED
         return Row("positions", Fact.COMMANDED, Certainty.LIKELY, (evidence,), decider)
     if quiet is None:
         return Row("positions", Fact.MEASURED, Certainty.CERTAIN, (Basis.ENCODER_NOISE,))
     reading = SmoothPositions(quiet)
     open_ = Certainty.UNDETERMINED
-    return Row("positions", reading, open_, (Basis.NO_NOISE,), Step.ASK_FOR_POSITIONS)
+    return Row("positions", reading, open_, (Basis.NO_NOISE,), NextStep.ASK_FOR_POSITIONS)
 
 
 def velocity_lag(recording: Recording) -> float | None:

@@ -42,7 +42,7 @@ from identification.rollout.comparison import (
     recorded_stretches,
     simulate,
 )
-from identification.rollout.encoders import NAMES, ServoFit, fit_servo
+from identification.rollout.encoders import NAMES, EncoderFit, fit_servo
 from identification.rollout.polish import Driven
 from identification.rollout.servo import lead_of
 from identification.rollout.simulation import Feedback
@@ -113,7 +113,7 @@ def _samples(sources: Sequence[Source], cell: Cell) -> list[Samples]:
 
 
 def _driven(
-    fit: ServoFit, sources: Sequence[Source], samples: Sequence[Samples], most: int
+    fit: EncoderFit, sources: Sequence[Source], samples: Sequence[Samples], most: int
 ) -> Driven:
     """Return the arm on its servo, in windows of recordings whose torque is that of the model."""
     model = fit.arm.model
@@ -134,7 +134,7 @@ def _errors(driven: Driven) -> RolloutErrors:
 
 
 def _result(
-    sources: Sources, cell: Cell, fit: ServoFit, driven: Driven, bodies: ExportedArm
+    sources: Sources, cell: Cell, fit: EncoderFit, driven: Driven, bodies: ExportedArm
 ) -> RolloutResult:
     """Return the errors of the arm with its servo and of the bodies alone on the same servo."""
     arm = driven.arm
@@ -176,7 +176,7 @@ def _result(
     )
 
 
-def _servo_result(fit: ServoFit) -> ServoResult:
+def _servo_result(fit: EncoderFit) -> ServoResult:
     model = fit.arm.model
     parameters = []
     for joint in range(model.n_joints):

@@ -45,7 +45,7 @@ _SEEDS: Final = 1000  # of each study
 
 
 @dataclass(frozen=True)
-class Choice:
+class SearchChoice:
     """One open choice of a method."""
 
     key: str
@@ -62,7 +62,7 @@ class SearchPlan:
 
     key: str  #: of its folders
     method: Method
-    choices: tuple[Choice, ...]
+    choices: tuple[SearchChoice, ...]
 
 
 @dataclass(frozen=True, eq=False)
@@ -86,10 +86,10 @@ def search_plans(settings: StudySettings, n_joints: int) -> list[SearchPlan]:
     ]
 
 
-def _sines(settings: StudySettings, number: int, n_joints: int) -> tuple[Choice, ...]:
+def _sines(settings: StudySettings, number: int, n_joints: int) -> tuple[SearchChoice, ...]:
     duration = settings.duration
     return tuple(
-        Choice(
+        SearchChoice(
             key,
             f"sines {words}",
             _searched("a", settings, number, settings.effort_a).replaced(
@@ -102,25 +102,25 @@ def _sines(settings: StudySettings, number: int, n_joints: int) -> tuple[Choice,
     )
 
 
-def _via_points(settings: StudySettings, number: int, _: int) -> tuple[Choice, ...]:
+def _via_points(settings: StudySettings, number: int, _: int) -> tuple[SearchChoice, ...]:
     base = _searched("b", settings, number, settings.effort_b).replaced(
         constraints=_durations(settings)
     )
     return tuple(
-        Choice(key, words, base.replaced(via_points={"n_via": count}))
+        SearchChoice(key, words, base.replaced(via_points={"n_via": count}))
         for key, (words, count) in VIA_POINTS.items()
     )
 
 
-def _gradient(settings: StudySettings, number: int, _: int) -> tuple[Choice, ...]:
+def _gradient(settings: StudySettings, number: int, _: int) -> tuple[SearchChoice, ...]:
     base = _searched("gradient", settings, number, settings.effort_gradient)
     chosen = base.replaced(
         search={"gradient": settings.gradient_steps}, constraints=_durations(settings)
     )
-    return (Choice("default", "16 via points, improved by the gradient", chosen),)
+    return (SearchChoice("default", "16 via points, improved by the gradient", chosen),)
 
 
-_CHOICES: Final[Mapping[Method, Callable[[StudySettings, int, int], tuple[Choice, ...]]]] = {
+_CHOICES: Final[Mapping[Method, Callable[[StudySettings, int, int], tuple[SearchChoice, ...]]]] = {
     "a": _sines,
     "b": _via_points,
     "gradient": _gradient,
@@ -160,7 +160,7 @@ def run_searches(
         for plan, choice in every
     ]
     results = in_children(searched, calls, "searching excitations", reporter, cluster)
-    found: dict[str, list[tuple[Choice, DesignResult]]] = {plan.key: [] for plan in plans}
+    found: dict[str, list[tuple[SearchChoice, DesignResult]]] = {plan.key: [] for plan in plans}
     for (plan, choice), result in zip(every, results, strict=True):
         if result is not None:
             found[plan.key].append((choice, result))
@@ -180,10 +180,10 @@ def searched(place: Path, cell: Cell, settings: DesignSettings) -> DesignResult 
         return None
 
 
-def take_best(plan: SearchPlan, found: Sequence[tuple[Choice, DesignResult]]) -> Search:
+def take_best(plan: SearchPlan, found: Sequence[tuple[SearchChoice, DesignResult]]) -> Search:
     """Return the motion of largest determinant (eq. 9) for A, of largest fitness (eq. 7) for B."""
 
-    def score(one: tuple[Choice, DesignResult]) -> float:
+    def score(one: tuple[SearchChoice, DesignResult]) -> float:
         criteria = one[1].excitation.criteria
         return criteria.log10_det if plan.method == "a" else criteria.fitness
 

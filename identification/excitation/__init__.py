@@ -4,7 +4,7 @@
 import types
 
 from identification.errors import WorkspaceError
-from identification.excitation.collision import CollisionChecker, Contact
+from identification.excitation.collision import CollisionChecker, Proximity
 from identification.excitation.constraints import (
     SAMPLE_PERIOD,
     Constraints,

@@ -19,7 +19,7 @@ from identification.arrays import Array, Indices
 from identification.errors import ShapeError
 from identification.excitation.collision_bodies import link_bodies, obstacles
 from identification.excitation.separation import (
-    Bodies,
+    BodyHulls,
     Frames,
     Separation,
     frames,
@@ -52,7 +52,7 @@ _SEED = 20140901
 _NO_RANGE = 1e-6  # ranges below this [rad, m] are not limits
 
 
-class Contact(NamedTuple):
+class Proximity(NamedTuple):
     """A part of the arm closer to another body than the margin."""
 
     first: str  #: link
@@ -83,7 +83,7 @@ class Path(NamedTuple):
     """Positions of all bodies at m samples."""
 
     frames: Frames  # of base and links
-    bodies: Bodies  # hulls
+    bodies: BodyHulls  # hulls
 
 
 class CollisionChecker:
@@ -261,7 +261,7 @@ class CollisionChecker:
         """Return the distances of a pair in the sampled postures (k,) [m]."""
         return np.array([self.distance(pair, self._tried, k) for k in range(_N_POSTURES)])
 
-    def deepest_contact(self, q: Array) -> Contact | None:
+    def deepest_contact(self, q: Array) -> Proximity | None:
         """Return the deepest contact in postures (m, n), None if all are clear.
 
         Another contact may be deeper by up to 5 mm.
@@ -275,7 +275,7 @@ class CollisionChecker:
 
     def deepest_along(
         self, trajectory: PiecewiseCubic | FourierSeries, *, between: bool = True
-    ) -> Contact | None:
+    ) -> Proximity | None:
         """Return the deepest contact along a trajectory, None if it is clear.
 
         It is checked at every instant, or, if not `between`, at instants up to 8 ms apart. An
@@ -374,7 +374,7 @@ class _Nearest:
     def __init__(self, checker: CollisionChecker, resolution: float) -> None:
         self._checker = checker
         self._resolution = resolution
-        self.contact: Contact | None = None
+        self.contact: Proximity | None = None
         self._deepest = 0.0  # its distance beyond the required one [m]
         self.distances = 0
 
@@ -412,7 +412,7 @@ class _Nearest:
         first, second = self._checker.names(pair)
         required = float(self._checker.required[pair])
         at = float(time), tuple(posture.tolist())
-        self.contact = Contact(first, second, None, *at, distance, required)
+        self.contact = Proximity(first, second, None, *at, distance, required)
         self._deepest = distance - required
 
 

@@ -9,7 +9,7 @@ from typing import Final
 import numpy as np
 
 from identification.arrays import Array
-from identification.excitation.collision import CollisionChecker, Contact
+from identification.excitation.collision import CollisionChecker, Proximity
 from identification.excitation.violation import Kind, Violation
 from identification.model.motion import Motion
 from identification.model.robot import RobotModel
@@ -250,7 +250,7 @@ def clearance(checker: CollisionChecker, q: Array) -> Violation | None:
     return None if contact is None else _collision(checker, contact)
 
 
-def _collision(checker: CollisionChecker, contact: Contact) -> Violation:
+def _collision(checker: CollisionChecker, contact: Proximity) -> Violation:
     return Violation(
         "collision",
         f"{contact.first} and {contact.second}",

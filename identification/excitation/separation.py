@@ -27,7 +27,7 @@ class Frames(NamedTuple):
     translation: Array
 
 
-class Bodies(NamedTuple):
+class BodyHulls(NamedTuple):
     """Hulls of b bodies at m samples."""
 
     centre: Array  # (3, b, m) [m]
@@ -64,7 +64,7 @@ def frames(chain: Chain, q: Array) -> Frames:
     return Frames(rotation, translation)
 
 
-def placed(bodies: Sequence[CollisionBody], at: Frames) -> Bodies:
+def placed(bodies: Sequence[CollisionBody], at: Frames) -> BodyHulls:
     """Return the positions of the hulls of bodies, which are sorted by joint."""
     centre, axis = np.empty((2, 3, len(bodies), at.translation.shape[2]))
     joints = np.array([body.joint for body in bodies])
@@ -82,7 +82,7 @@ def placed(bodies: Sequence[CollisionBody], at: Frames) -> Bodies:
         np.matmul(centres, rotation, out=centre[:, part])
         centre[:, part] += at.translation[joint + 1][:, None]
         np.matmul(axes, rotation, out=axis[:, part])
-    return Bodies(centre, axis)
+    return BodyHulls(centre, axis)
 
 
 class Separation:
@@ -113,7 +113,7 @@ class Separation:
         exact = np.array([body.hull.exact for body in bodies])
         self.exact: NDArray[np.bool_] = exact[self.first] & (np.arange(len(pairs)) >= self._planes)
 
-    def bound(self, at: Bodies, pair: Indices, sample: Indices) -> Array:
+    def bound(self, at: BodyHulls, pair: Indices, sample: Indices) -> Array:
         """Return lower bounds (k,) [m] of pairs (k,) in rising order, at samples (k,)."""
         lower = np.empty(len(pair))
         boxes, planes = np.searchsorted(pair, (self._boxes, self._planes)).tolist()
@@ -126,7 +126,7 @@ class Separation:
                 lower[part] = bound(at, pair[part], sample[part])
         return lower
 
-    def _along(self, at: Bodies, pair: Indices, sample: Indices, normal: Array) -> Array:
+    def _along(self, at: BodyHulls, pair: Indices, sample: Indices, normal: Array) -> Array:
         """Return the bounds (k,) [m] of pairs (k,) at samples (k,) in directions (3, k)."""
         a = self.first[pair]
         b = self.second[pair]
@@ -137,7 +137,7 @@ class Separation:
             bound -= _dot(np.abs(normal), self._half_sides[:, b])
         return bound
 
-    def _above_plane(self, at: Bodies, pair: Indices, sample: Indices) -> Array:
+    def _above_plane(self, at: BodyHulls, pair: Indices, sample: Indices) -> Array:
         return self._along(at, pair, sample, _at(at.axis, self.second[pair], sample))
 
     def _support(self, body: Indices, cosine: Array) -> Array:
@@ -148,7 +148,7 @@ class Separation:
         height += self._ball[body]
         return height
 
-    def _between_axes(self, at: Bodies, pair: Indices, sample: Indices) -> Array:
+    def _between_axes(self, at: BodyHulls, pair: Indices, sample: Indices) -> Array:
         a = self.first[pair]
         b = self.second[pair]
         axis_a = _at(at.axis, a, sample)
@@ -166,7 +166,7 @@ class Separation:
         bound -= self._support(b, _dot(normal, axis_b))
         return bound
 
-    def _from_box(self, at: Bodies, pair: Indices, sample: Indices) -> Array:
+    def _from_box(self, at: BodyHulls, pair: Indices, sample: Indices) -> Array:
         """Use the best of three faces and of the direction from the box to the body's centre."""
         a = self.first[pair]
         b = self.second[pair]

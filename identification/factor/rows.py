@@ -14,7 +14,7 @@ from identification.model.robot import RobotModel
 from identification.signals.samples import Samples
 
 
-class Rows(NamedTuple):
+class FactorRows(NamedTuple):
     """Rows of k consecutive samples, joint by joint."""
 
     part: slice  # of the recording
@@ -23,7 +23,7 @@ class Rows(NamedTuple):
     blocks: list[Array]
 
 
-def augmented_rows(model: RobotModel, samples: Samples) -> Iterator[Rows]:
+def augmented_rows(model: RobotModel, samples: Samples) -> Iterator[FactorRows]:
     """Yield [W | y] of a recording in chunks, zero for unusable rows.
 
     ``model.plan.columns[j]`` are the parameters of the columns of joint j.
@@ -44,7 +44,7 @@ def augmented_rows(model: RobotModel, samples: Samples) -> Iterator[Rows]:
             if lost.any():
                 # Unusable rows may be NaN.
                 block[:, np.flatnonzero(lost)] = 0.0
-        yield Rows(part, blocks)
+        yield FactorRows(part, blocks)
 
 
 def _filtered(model: RobotModel, samples: Samples) -> Iterator[tuple[slice, list[Array]]]:

@@ -21,7 +21,7 @@ _ROUNDING: Final = 1e-9  # m, of a lever
 _LEVERAGE: Final = 0.1  # of the median one; with less a mass cannot be told from the residual
 
 
-class Contact(NamedTuple):
+class ContactLevel(NamedTuple):
     """What motion without contact exceeds once in `PERIOD`, and the force that exceeds it."""
 
     torque: Array  # of each joint (n,) [N·m or N]
@@ -30,13 +30,13 @@ class Contact(NamedTuple):
 
 def contact(
     model: RobotModel, residuals: Sequence[SlowResidual], postures: Array
-) -> Contact | None:
+) -> ContactLevel | None:
     """Return thresholds and force at postures (m, n); None of too little unseen motion."""
     peaks = residual_peaks(residuals)
     torque = once_in(PERIOD, np.concatenate(peaks)) if peaks else None
     if torque is None:
         return None
-    return Contact(torque, seen_force(model, torque, postures))
+    return ContactLevel(torque, seen_force(model, torque, postures))
 
 
 def residual_peaks(residuals: Sequence[SlowResidual]) -> list[Array]:

@@ -48,7 +48,7 @@ _LAGS: Final = (0.0, 0.01, 0.02, 0.03, 0.04)  # s of the commands that are instr
 _DETERMINED: Final = 2.0  # standard deviations that a determined parameter is larger than
 
 
-class ServoFit(NamedTuple):
+class EncoderFit(NamedTuple):
     """Servo and drives of an arm with given bodies."""
 
     arm: ExportedArm  #: with friction and rotor inertias
@@ -63,7 +63,7 @@ class ServoFit(NamedTuple):
         return np.asarray(self.values > _DETERMINED * self.deviations)
 
 
-def fit_servo(arm: ExportedArm, stretches: Sequence[Stretch], step: float) -> ServoFit:
+def fit_servo(arm: ExportedArm, stretches: Sequence[Stretch], step: float) -> EncoderFit:
     """Fit servo, friction and rotor inertias of an arm whose bodies are given.
 
     Its friction law has to have `f0` and `f1`; other terms are set to zero.
@@ -97,7 +97,7 @@ def fit_servo(arm: ExportedArm, stretches: Sequence[Stretch], step: float) -> Se
             f"the gain of {name} is not determined: it hardly moves, or does not follow its"
             " commanded position"
         )
-    return ServoFit(
+    return EncoderFit(
         _with_drives(bare, values),
         PositionServo(values[:, 0], values[:, 1], delay),
         values,

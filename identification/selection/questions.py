@@ -25,7 +25,7 @@ from identification.selection.scores import (
     Known,
     Ready,
     SettingDecision,
-    Trial,
+    SettingsTrial,
 )
 from identification.selection.settings import Choice, Hedge, Settings
 from identification.signals.masks import LeftOut
@@ -133,7 +133,7 @@ def choose_settings(
     `springs` those for "springs". Returns settings with their choices; `start` if the data are too
     short, or predict no part of themselves.
     """
-    trial = Trial(model, ready, stated, ripples)
+    trial = SettingsTrial(model, ready, stated, ripples)
     now = _first_candidates(start, questions)
     requested: set[str] = {*questions}
     if "estimator" in requested:
@@ -172,7 +172,7 @@ def choose_settings(
     return replace(now, choices=tuple(choice for choice in choices if len(choice.candidates) > 1))
 
 
-def _hedge(trial: Trial, now: Settings) -> Hedge | None:
+def _hedge(trial: SettingsTrial, now: Settings) -> Hedge | None:
     """Return the usual bandwidth with the odds that another motion prefers it to the chosen one."""
     usual = now.preprocessed(rigid_bandwidth=BANDWIDTHS[0])
     weight = 0.0 if usual == now else trial.odds(usual, now, TRANSFER)
@@ -194,7 +194,7 @@ def _first_candidates(start: Settings, questions: Collection[Question]) -> Setti
 
 
 def _choose_prior(
-    trial: Trial, now: Settings, requested: Collection[str]
+    trial: SettingsTrial, now: Settings, requested: Collection[str]
 ) -> tuple[Settings, Settings, list[Choice]]:
     """Choose the strength of the prior, then whether bodies must be possible.
 
@@ -223,7 +223,7 @@ def _choose_prior(
     return compared, now, choices
 
 
-def _friction_terms(trial: Trial, now: Settings) -> SettingDecision:
+def _friction_terms(trial: SettingsTrial, now: Settings) -> SettingDecision:
     """Choose the terms beside Coulomb and viscous friction, the stated ones first.
 
     A term must also predict fast motion from slower one no worse, and leave friction in a faster
@@ -246,7 +246,7 @@ def _friction_terms(trial: Trial, now: Settings) -> SettingDecision:
     return trial.decide(FRICTION_AT_SPEED, candidates, TERM_WORTHWHILE, possible=possible)
 
 
-def _load_friction(trial: Trial, now: Settings) -> SettingDecision:
+def _load_friction(trial: SettingsTrial, now: Settings) -> SettingDecision:
     """Choose whether dry friction grows with the transmitted torque, as in strain-wave gears.
 
     A stated term comes first. Shares that no gear has are refused.
@@ -261,7 +261,9 @@ def _load_friction(trial: Trial, now: Settings) -> SettingDecision:
     )
 
 
-def _torsion_springs(trial: Trial, now: Settings, joints: Sequence[str]) -> list[SettingDecision]:
+def _torsion_springs(
+    trial: SettingsTrial, now: Settings, joints: Sequence[str]
+) -> list[SettingDecision]:
     """Choose the joints with a torsion spring, such as a hose that their motion twists.
 
     Bodies that cannot exist, with a negative inertia, predict the torque of a spring as well; so
@@ -293,7 +295,7 @@ def _torsion_springs(trial: Trial, now: Settings, joints: Sequence[str]) -> list
 
 
 def _compare_delays(
-    trial: Trial,
+    trial: SettingsTrial,
     first: Settings,
     now: Settings,
     choices: list[Choice],
@@ -323,7 +325,7 @@ def _compare_delays(
 
 
 def _compare_low_passes(
-    trial: Trial,
+    trial: SettingsTrial,
     first: Settings,
     now: Settings,
     choices: list[Choice],
@@ -376,7 +378,7 @@ def _compare_low_passes(
     return now, [*choices, decision.choice]
 
 
-def _smooth_reversal(trial: Trial, now: Settings, filtered: Settings) -> SettingDecision:
+def _smooth_reversal(trial: SettingsTrial, now: Settings, filtered: Settings) -> SettingDecision:
     """Choose friction of ``tanh(v / v_t)`` in place of a low-pass if it predicts clearly better."""
     best = trial.best([_with_tanh(now, speed) for speed in REVERSAL_SPEEDS])
     for step in REVERSAL_STEPS:
@@ -394,7 +396,7 @@ def _with_tanh(now: Settings, speed: float) -> Settings:
 
 
 def _sweep(
-    trial: Trial, now: Settings, questions: Collection[str]
+    trial: SettingsTrial, now: Settings, questions: Collection[str]
 ) -> tuple[Settings, list[Choice]]:
     """Decide interdependent settings in turn until nothing changes."""
     requested = [swept for swept in _SETTINGS_SEARCHED if swept.question in questions]
@@ -425,7 +427,7 @@ def _sweep(
 
 
 def _rows_for_motion(
-    trial: Trial, now: Settings, candidates: Sequence[Settings]
+    trial: SettingsTrial, now: Settings, candidates: Sequence[Settings]
 ) -> SettingDecision:
     """Choose among the candidates that predict all rows as well by the rows in motion.
 

@@ -83,7 +83,7 @@ class SettingDecision(NamedTuple):
     choice: Choice
 
 
-class Trial:
+class SettingsTrial:
     """Scores of settings, with cached factors."""
 
     def __init__(

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from identification.arrays import Array
-from identification.servo.fit import ServoEstimate, Windows, data_cost, fit
+from identification.servo.fit import ServoEstimate, ServoWindows, data_cost, fit
 from identification.servo.motion import ServoMotion
 from identification.servo.parameters import OPTIONAL, PLACE, TERMS
 from identification.servo.start import STARTS, prior_of, start_of
@@ -82,7 +82,7 @@ def fit_servos(
         resolution: standard deviation of the measured positions (n,).
         done: called after each iteration.
     """
-    windows = Windows.of(motions)
+    windows = ServoWindows.of(motions)
     prior = prior_of(motions, resolution)
     present = np.ones((windows.n_joints, len(TERMS)), np.bool_)
     rough = [
@@ -108,7 +108,7 @@ def fit_servos(
         windows, prior, chosen, best.coordinates, resolution, iterations=ITERATIONS,
         bus=best.bus_delay, done=done,
     )  # fmt: skip
-    finely = Windows.of(fine)
+    finely = ServoWindows.of(fine)
     final = fit(
         finely, prior, chosen, final.coordinates, resolution, iterations=_FINE,
         bus=final.bus_delay, done=done,
@@ -116,7 +116,7 @@ def fit_servos(
     return ServoFit(final, choices, windows.count, shown_terms(finely, final))
 
 
-def shown_terms(windows: Windows, estimate: ServoEstimate) -> NDArray[np.bool_]:
+def shown_terms(windows: ServoWindows, estimate: ServoEstimate) -> NDArray[np.bool_]:
     """Return whether the cost without a term is higher, by more than chance (n, P)."""
     shown = np.ones_like(estimate.present)
     before = data_cost(windows, estimate, estimate.present)
@@ -129,7 +129,7 @@ def shown_terms(windows: Windows, estimate: ServoEstimate) -> NDArray[np.bool_]:
     return shown
 
 
-def _errors(windows: Windows, estimate: ServoEstimate, resolution: Array) -> Array:
+def _errors(windows: ServoWindows, estimate: ServoEstimate, resolution: Array) -> Array:
     """Return the logarithms of mean squared errors of windows and joints (w, n).
 
     Errors below the step of the encoder count as that.
@@ -140,7 +140,7 @@ def _errors(windows: Windows, estimate: ServoEstimate, resolution: Array) -> Arr
 
 
 def _choices(
-    windows: Windows, full: ServoEstimate, resolution: Array, done: Callable[[], None]
+    windows: ServoWindows, full: ServoEstimate, resolution: Array, done: Callable[[], None]
 ) -> tuple[TermChoice, ...]:
     """Choose by the errors of windows that were not fitted, for each joint by itself."""
     with_all = _predicted(windows, full, full.present, resolution, done)
@@ -159,7 +159,7 @@ def _choices(
 
 
 def _predicted(
-    windows: Windows,
+    windows: ServoWindows,
     start: ServoEstimate,
     present: NDArray[np.bool_],
     resolution: Array,

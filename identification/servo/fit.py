@@ -40,7 +40,7 @@ Done = Callable[[], None]
 
 
 @dataclass(frozen=True, eq=False)
-class Windows:
+class ServoWindows:
     """w windows of recorded motions, n joints side by side.
 
     Attributes:
@@ -56,7 +56,7 @@ class Windows:
     every: int
 
     @classmethod
-    def of(cls, motions: Sequence[ServoMotion]) -> Windows:
+    def of(cls, motions: Sequence[ServoMotion]) -> ServoWindows:
         """Return the windows of motions, which follow each other without overlap."""
         total = sum(motion.duration for motion in motions)
         duration = float(np.clip(total / _WINDOWS, _SHORTEST, _LONGEST))
@@ -79,7 +79,7 @@ class Windows:
         """Number n of joints."""
         return int(self.measured.shape[2])
 
-    def some(self, chosen: NDArray[np.intp]) -> Windows:
+    def some(self, chosen: NDArray[np.intp]) -> ServoWindows:
         """Return some of the windows."""
         columns = (chosen[:, None] * self.n_joints + np.arange(self.n_joints)).ravel()
 
@@ -87,7 +87,7 @@ class Windows:
             return np.ascontiguousarray(getattr(self.inputs, name)[..., columns])
 
         measured = self.measured[:, chosen]
-        return Windows(self.inputs.mapped(cut), measured, len(chosen), self.every)
+        return ServoWindows(self.inputs.mapped(cut), measured, len(chosen), self.every)
 
     def residuals(self, values: Array) -> Array:
         """Return simulated less measured positions (K, V, w, n) at values (V, n, P)."""
@@ -156,7 +156,7 @@ def losses(relative: Array) -> Array:
 class _Fit:
     """A fit in progress."""
 
-    windows: Windows
+    windows: ServoWindows
     prior: Prior
     present: NDArray[np.bool_]
     coordinates: Array
@@ -321,7 +321,7 @@ class _Fit:
     _least: Array = field(default_factory=lambda: np.zeros(0))
 
 
-def data_cost(windows: Windows, estimate: ServoEstimate, present: NDArray[np.bool_]) -> Array:
+def data_cost(windows: ServoWindows, estimate: ServoEstimate, present: NDArray[np.bool_]) -> Array:
     """Return the cost of the residuals of each joint (n,) with some terms, at an estimate."""
     values = without_absent(natural(estimate.coordinates), present)
     relative = windows.residuals(values[None])[:, 0] / estimate.scatter
@@ -329,7 +329,7 @@ def data_cost(windows: Windows, estimate: ServoEstimate, present: NDArray[np.boo
 
 
 def fit(
-    windows: Windows,
+    windows: ServoWindows,
     prior: Prior,
     present: NDArray[np.bool_],
     start: Array,

@@ -13,7 +13,7 @@ import numpy as np
 
 from identification.arrays import Array
 from identification.servo.choice import ServoFit, shown_terms
-from identification.servo.fit import Windows, fit
+from identification.servo.fit import ServoWindows, fit
 from identification.servo.motion import ServoMotion
 from identification.servo.parameters import NAMES
 
@@ -45,7 +45,7 @@ def fits_in_simulators(
         resolution: standard deviation of the measured positions (n,).
         done: called after each iteration.
     """
-    windows = Windows.of(motions)
+    windows = ServoWindows.of(motions)
     best = found.estimate
     fits = dict[Engine, ServoFit]()
     for engine in ENGINES:

@@ -28,8 +28,8 @@ from identification.validation.gravity import CarriedLoad, GravityDirection, fin
 from identification.validation.nominal_friction import with_fitted_friction
 from identification.validation.nominal_scale import InertiaRatio, NominalScale
 from identification.validation.physical_signs import (
-    Dissipation,
     Implausible,
+    TopSpeedFriction,
     dissipation_of,
     implausibilities,
 )
@@ -137,7 +137,7 @@ class Evidence:
     nominal_with_friction: PredictionError | None = None
     implausible: Implausible = _PLAUSIBLE  #: physically impossible signs of the estimate
     consistency: ConsistencyCheck | None = None  #: with the nearest consistent parameters
-    dissipation: Dissipation | None = None  #: friction of each joint at its top speed
+    dissipation: TopSpeedFriction | None = None  #: friction of each joint at its top speed
     residuals: ResidualChecks | None = None  #: patterns of the residual
     form: FormUncertainty | None = None  #: whether the friction law of a joint lacks a term
     context: CellContext = CellContext()  #: data on the cell

@@ -118,7 +118,7 @@ def _wrong_signs(
             yield f"{name} is negative: {figures}", direction, False
 
 
-class Dissipation(NamedTuple):
+class TopSpeedFriction(NamedTuple):
     """Friction of n joints at their top speed, negative if it drives the joint."""
 
     torque: Array  # (n,) [N·m or N]
@@ -143,7 +143,7 @@ class Dissipation(NamedTuple):
         return np.array([f"{torque:.3g} ± {2.0 * std:.2g}" for torque, std in pairs], dtype=object)
 
 
-def dissipation_of(model: RobotModel, estimate: Estimate, speed: Array) -> Dissipation:
+def dissipation_of(model: RobotModel, estimate: Estimate, speed: Array) -> TopSpeedFriction:
     """Return the friction of each joint at its highest speed (n,) [rad/s or m/s]."""
     std = np.full(model.n_joints, np.inf)
     determined = np.isfinite(np.diag(estimate.covariance))
@@ -152,7 +152,7 @@ def dissipation_of(model: RobotModel, estimate: Estimate, speed: Array) -> Dissi
     for joint, row in enumerate(rows):
         if row.any() and not np.any(row[~determined]):
             std[joint] = float(np.sqrt(row @ covariance @ row))
-    return Dissipation(rows @ estimate.values, std)
+    return TopSpeedFriction(rows @ estimate.values, std)
 
 
 def friction_at(model: RobotModel, speed: Array) -> Array:

@@ -19,7 +19,7 @@ from benchmarks.plain_fit import Measured
 from benchmarks.published import Published, Split, known
 from hil.importers.robot import Robot
 from identification.selection.questions import BANDWIDTH
-from identification.selection.scores import Trial
+from identification.selection.scores import SettingsTrial
 from identification.selection.settings import Settings
 from identification.signals.samples import Preprocessing
 from tests.identification.two_link import MODEL
@@ -166,7 +166,7 @@ class TestRow:
         assert judged["bandwidth"]["dropped_by"] == []
 
     def test_a_choice_that_is_left_out_keeps_its_first_candidate(self) -> None:
-        trial = Trial(MODEL, lambda *_: [])
+        trial = SettingsTrial(MODEL, lambda *_: [])
         candidates = [Settings(Preprocessing(rigid_bandwidth=width)) for width in (14.0, 7.0)]
         with without("bandwidth"):
             decision = trial.decide(BANDWIDTH, candidates)

@@ -24,7 +24,7 @@ from drivers import (
     exchange,
 )
 from drivers.packets import next_number
-from drivers.transports.can.profile import DOWN, PAYLOADS_FD, UP, BusRates, End
+from drivers.transports.can.profile import DOWN, PAYLOADS_FD, UP, BusRates, CanEndpoint
 from drivers.transports.can.transport import CanTransport
 from hil.cell import Cell
 from hil.control.simulation import planted_truth, simulated_drive
@@ -60,8 +60,8 @@ class Wire:
     """Both ends without a bus; frames pass at `time`, a cycle of 2 ms each."""
 
     def __init__(self, *, n_axes: int = N, sample_time: int = 2) -> None:
-        self.far = End(BusRates(), UP)
-        self.near = End(BusRates(), DOWN)
+        self.far = CanEndpoint(BusRates(), UP)
+        self.near = CanEndpoint(BusRates(), DOWN)
         self.n_axes = n_axes
         self.time = 1000.0
         packet = init_packet(n_axes, sample_time)

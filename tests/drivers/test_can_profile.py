@@ -22,7 +22,7 @@ from drivers.transports.can.profile import (
     UP,
     BusRates,
     CanBusLoadError,
-    End,
+    CanEndpoint,
     Frame,
     TransferAssembler,
     payload_sizes,
@@ -247,7 +247,7 @@ class TestDbc:
         packet = random_packet(np.random.default_rng(2), 11)
         wanted = decoded(packet)
         signals = {}
-        for index, frame in enumerate(End(BusRates(), sends).frames(packet)):
+        for index, frame in enumerate(CanEndpoint(BusRates(), sends).frames(packet)):
             message = database.get_message_by_frame_id(frame.id)
             assert (message.name, message.is_fd) == (name, True)
             frame_signals = message.decode(frame.data, decode_choices=False)
@@ -276,7 +276,7 @@ class TestDbc:
 
 
 def test_init_packet_is_passed_on_unless_its_cycle_is_too_short():
-    end = End(BusRates(), UP)
+    end = CanEndpoint(BusRates(), UP)
     broken = init_packet(open_axes_map=np.full((4, 10), 3))
     for packet in (broken, init_packet(sample_time=0), init_packet(7, 4)):
         assert end.frames(packet)

@@ -12,8 +12,8 @@ import numpy as np
 import pytest
 
 from drivers import CyclicPacket
-from drivers.transports.can.profile import DOWN, UP, BusRates, End
-from hil.archive import Samples, write_samples
+from drivers.transports.can.profile import DOWN, UP, BusRates, CanEndpoint
+from hil.archive import ImportedSamples, write_samples
 from hil.base.errors import ArchiveError, InputError, SourceError
 from hil.base.toml_text import from_text
 from hil.campaign.folder import CampaignFolder
@@ -38,9 +38,11 @@ pytestmark = pytest.mark.long
 JOINTS = ("shoulder", "elbow")
 
 
-def archive(path: Path, samples: Samples | None = None, /, **attachments: bytes) -> Path:
+def archive(path: Path, samples: ImportedSamples | None = None, /, **attachments: bytes) -> Path:
     """Three samples of two joints, with attachments (`_` stands for the dot of their names)."""
-    still = Samples(np.arange(3) * 2_000_000, position=np.zeros((3, 2)), torque=np.ones((3, 2)))
+    still = ImportedSamples(
+        np.arange(3) * 2_000_000, position=np.zeros((3, 2)), torque=np.ones((3, 2))
+    )
     files = {".".join(name.rsplit("_", 1)): data for name, data in attachments.items()}
     return write_samples(
         path, samples or still, joint_names=JOINTS, metadata={}, attachments=files, durable=False
@@ -48,7 +50,7 @@ def archive(path: Path, samples: Samples | None = None, /, **attachments: bytes)
 
 
 def test_jump_of_the_clock_by_years_is_fast(tmp_path: Path) -> None:
-    far = Samples(np.array([0, 2**60]), position=np.ones((2, 2)), torque=np.ones((2, 2)))
+    far = ImportedSamples(np.array([0, 2**60]), position=np.ones((2, 2)), torque=np.ones((2, 2)))
     view = view_of(archive(tmp_path / "imported.mcap", far))
     assert view.stop == pytest.approx(2**60 * 1e-9)
     assert np.count_nonzero(np.isfinite(view.quantities[0].traces[0].value)) == 2
@@ -56,7 +58,7 @@ def test_jump_of_the_clock_by_years_is_fast(tmp_path: Path) -> None:
 
 def test_position_too_large_for_degrees_is_not_shown(tmp_path: Path) -> None:
     position = np.array([[0.1, 0.2], [1e307, -1e307], [0.3, 0.4]])
-    large = Samples(np.arange(3) * 2_000_000, position=position, torque=np.ones((3, 2)))
+    large = ImportedSamples(np.arange(3) * 2_000_000, position=position, torque=np.ones((3, 2)))
     view = view_of(archive(tmp_path / "imported.mcap", large))
     (shown,) = (quantity for quantity in view.quantities if quantity.title == "position [deg]")
     assert np.nanmax(np.abs(shown.traces[0].value)) == pytest.approx(np.degrees(0.3))
@@ -185,8 +187,8 @@ def test_number_out_of_range_is_refused(
 
 def test_signalling_nan_is_sent_over_can() -> None:
     """To the bit, as any other word."""
-    sender = End(BusRates(), UP)
-    receiver = End(BusRates(), DOWN)
+    sender = CanEndpoint(BusRates(), UP)
+    receiver = CanEndpoint(BusRates(), DOWN)
     packet = CyclicPacket.zeros(11, 1)
     packet.axes.view(np.int32)[1] = 0x7F800001
     sent = packet.encode()

@@ -14,7 +14,7 @@ import pytest
 
 from drivers import CyclicPacket, Guard, Session
 from drivers.transports.can import profile
-from drivers.transports.can.profile import End, TransferAssembler, payloads
+from drivers.transports.can.profile import CanEndpoint, TransferAssembler, payloads
 from hil.archive import ArchiveHeader, open_archive
 from hil.base.errors import ArchiveError
 from tests.fuzz import __main__ as command
@@ -47,9 +47,9 @@ PLANTED: dict[str, tuple[str, Any, str, Callable[..., Any], str]] = {
     "a codec that changes a byte":
         ("codec", CyclicPacket, "encode", lambda self: encode(self)[:-1] + b"\7", IN_THE_CODEC),
     "a link that receives nothing by CAN":
-        ("codec", End, "receive", lambda *_: None, IN_THE_CODEC),
+        ("codec", CanEndpoint, "receive", lambda *_: None, IN_THE_CODEC),
     "a link that sends nothing by CAN":
-        ("codec", End, "frames", lambda *_: int("none"), "ValueError"),
+        ("codec", CanEndpoint, "frames", lambda *_: int("none"), "ValueError"),
     "transfers without their last frame":
         ("codec", profile, "payloads", cut_short, IN_THE_CODEC),
     "an assembler that loses axes":

@@ -30,9 +30,9 @@ from hil.archive.recorder import Recorded
 from hil.archive.supervised import (
     Answer,
     ArchiveProcessHandle,
-    Channel,
     Close,
     Closed,
+    CommandSocket,
     Open,
     Opened,
 )
@@ -243,7 +243,7 @@ class TestArchiveProcess:
         with supervisor, own:
             process = ArchiveProcess(
                 RingReader(memory.ring_fd, 2), EventReader(memory.event_fd), memory.control,
-                Channel(own), exchange,
+                CommandSocket(own), exchange,
             )  # fmt: skip
             path = rig.folder / NAME
             spec = ArchiveSpec(
@@ -252,7 +252,7 @@ class TestArchiveProcess:
             clock = time.monotonic()
             monkeypatch.setattr(time, "monotonic", lambda: clock + 100.0)
             process._open(Open(1, spec, drive_train(), False, True))
-            assert Channel(supervisor).receive() == Opened(1)
+            assert CommandSocket(supervisor).receive() == Opened(1)
             assert memory.control.archive_heartbeat == clock + 100.0
             assert process._progress == clock + 100.0
             process._close("completed", "enough")

@@ -18,7 +18,7 @@ import pytest
 from typer.testing import CliRunner
 
 from benchmarks import archive_files
-from hil.archive import ArchiveWriter, Samples, write_samples
+from hil.archive import ArchiveWriter, ImportedSamples, write_samples
 from hil.archive.repair import repair, repaired_name
 from hil.base.errors import ArchiveError, InputError
 from hil.base.progress import Silent
@@ -466,7 +466,7 @@ def recording(path, cell, **metadata):
     rows = np.random.default_rng(seed).normal(size=(100, len(cell.joint_names)))
     return write_samples(
         path,
-        Samples(np.arange(100) * 1_000_000, rows, torque=rows),
+        ImportedSamples(np.arange(100) * 1_000_000, rows, torque=rows),
         joint_names=cell.joint_names,
         metadata=metadata,
         attachments={"cell.toml": cell.text.encode(), "robot.urdf": cell.urdf.encode()},

@@ -35,7 +35,7 @@ from hil.campaign.planned_motions import planned_motions
 from hil.cell import AngleFrame, Cell
 from hil.control.errors import refusal_text
 from hil.control.motion_checks import MotionChecks
-from hil.control.motions import CampaignMotion, StraightMoves, player_of, require_allowed, rest
+from hil.control.motions import CampaignMotion, CheckedMoves, player_of, require_allowed, rest
 from hil.control.simulation import simulated_controller, simulated_link
 from planner import (
     Move,
@@ -369,11 +369,11 @@ def test_an_older_folder_with_a_collision_is_refused(
 def test_only_a_move_from_the_arm_asks_for_jogging(cell: Cell, plan: CampaignPlan) -> None:
     low = cell.home + np.array([0.0, 1.6, -1.5, 0.0, 0.0, 0.0])
     motions = planned_motions(cell, plan)
-    joined = StraightMoves(cell, MotionChecks.of(cell)).with_moves(motions, low)
+    joined = CheckedMoves(cell, MotionChecks.of(cell)).with_moves(motions, low)
     assert [motion.from_arm for motion in joined if motion.kind == "move"] == [True, True]
     buried = MotionChecks.of(written(cell, "floor = 0.0", "floor = 0.3"))
     with pytest.raises(MotionRefusedError, match=r"move 1 .*jog the arm"):
-        StraightMoves(cell, buried).with_moves(motions, low)
+        CheckedMoves(cell, buried).with_moves(motions, low)
     wild = CampaignMotion("excitation", 0, rest(cell.home + 10.0, 1.0))
     with pytest.raises(MotionRefusedError, match=r"repetition 1 .*; design another motion\."):
         require_allowed([wild], buried)

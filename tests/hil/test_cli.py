@@ -19,7 +19,7 @@ import pytest
 from typer.testing import CliRunner
 
 import hil as hil_package
-from hil.archive import Samples, open_archive, write_samples
+from hil.archive import ImportedSamples, open_archive, write_samples
 from hil.base.errors import InputError
 from hil.base.progress import reporter
 from hil.campaign import Campaign
@@ -261,7 +261,7 @@ class TestMistypedPaths:
         for name in ("first.mcap", "second.mcap"):
             write_samples(
                 tmp_path / "run" / name,
-                Samples(np.arange(3) * 10**7, np.zeros((3, 1)), torque=np.zeros((3, 1))),
+                ImportedSamples(np.arange(3) * 10**7, np.zeros((3, 1)), torque=np.zeros((3, 1))),
                 joint_names=("a",),
                 metadata={"clock_origin_ns": str(1_700_000_000 * 10**9), "importer": "log"},
             )

@@ -20,7 +20,7 @@ from typer.testing import CliRunner
 import hil
 from hil.base.errors import InputError, SourceError
 from hil.cli import app
-from hil.importers.text_table import Table
+from hil.importers.text_table import TextTable
 from hil.report.figures import joints_of, torque_charts
 from hil.results.results import Results
 from tests.hil.browser import OpenedPage, chromium
@@ -222,9 +222,9 @@ class TestSaved:
 
     def test_the_log_is_parsed_once(self, folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
         parsed = []
-        read = Table.read
+        read = TextTable.read
         monkeypatch.setattr(
-            Table, "read", lambda path, *how: parsed.append(path) or read(path, *how)
+            TextTable, "read", lambda path, *how: parsed.append(path) or read(path, *how)
         )
         hil.identify(folder / "a.csv", urdf=folder / "three.urdf")
         assert parsed == [folder / "a.csv"]

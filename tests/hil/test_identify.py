@@ -14,7 +14,7 @@ import pytest
 import typer
 from typer.testing import CliRunner
 
-from hil.archive import Samples, write_samples
+from hil.archive import ImportedSamples, write_samples
 from hil.base.errors import ArchiveError, InputError, OutputError
 from hil.base.one_screen import COLUMNS, LINES
 from hil.base.progress import Silent
@@ -95,7 +95,7 @@ def imported(path, names=None, *, torque=True, noise=0.0, **spoilt):
             stamp[value] -= 10**9
     write_samples(
         path,
-        Samples(stamp, position, None, torques if torque else None, None),
+        ImportedSamples(stamp, position, None, torques if torque else None, None),
         joint_names=names or robot.joint_names,
         metadata={"kind": "imported"},
         attachments=robot.attachments(),

@@ -7,7 +7,13 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from hil.archive import Samples, imported_archive, open_archive, write_archive, write_samples
+from hil.archive import (
+    ImportedSamples,
+    imported_archive,
+    open_archive,
+    write_archive,
+    write_samples,
+)
 from hil.base.errors import ArchiveWriteError
 
 JOINTS = ("shoulder", "elbow")
@@ -25,7 +31,7 @@ def recorded(channels, count=2500, seed=0):
     arrays = {name: rng.normal(size=(count, 2)) for name in ("position", *channels)}
     if "commanded_position" in arrays:
         arrays["commanded_position"][:3] = np.nan
-    return Samples(stamp=stamp, **arrays)
+    return ImportedSamples(stamp=stamp, **arrays)
 
 
 def assert_same(mine, read):
@@ -66,6 +72,6 @@ def test_it_does_not_change_with_the_arrays_it_was_made_of(tmp_path):
 
 
 def test_a_stamp_that_no_archive_stores_is_refused(tmp_path):
-    samples = Samples(stamp=np.array([-1, 5]), position=np.zeros((2, 2)))
+    samples = ImportedSamples(stamp=np.array([-1, 5]), position=np.zeros((2, 2)))
     with pytest.raises(ArchiveWriteError, match="outside 0"):
         imported_archive(tmp_path / "a.mcap", samples, **WHAT)

@@ -29,7 +29,7 @@ from numpy.typing import NDArray
 from scipy.io import savemat
 from typer.testing import CliRunner
 
-from hil.archive import ArchiveHeader, Findings, Samples, open_archive
+from hil.archive import ArchiveHeader, Findings, ImportedSamples, open_archive
 from hil.archive.recordings import open_recording
 from hil.base.errors import ArchiveWriteError, InputError, SourceError
 from hil.cell import Cell
@@ -49,7 +49,7 @@ from hil.importers.messages import sentence as worded
 from hil.importers.recording import import_bag
 from hil.importers.robot import Robot, _cell_text
 from hil.importers.stamps import check_clock
-from hil.importers.text_table import Table
+from hil.importers.text_table import TextTable
 from hil.pipeline.sources import cell_of
 from identification import FrictionLaw
 from identification.model.kinematics import chain_from_urdf
@@ -622,7 +622,7 @@ class TestTextMatrices:
             lines.insert(0, delimiter.join(["q1", "q2", "q3"]))
         path = tmp_path_factory.mktemp("any") / "q.txt"
         path.write_bytes(ends.join(lines).encode())
-        table = Table.read(path, Format())
+        table = TextTable.read(path, Format())
         assert np.array_equal(table.numbers([0, 1, 2], "position"), values)
         assert table.names == (("q1", "q2", "q3") if header else ())
 
@@ -902,7 +902,7 @@ def warnings(
 ) -> list[str]:
     stamp = np.rint(arm.time * clock * 1e9).astype(np.int64)
     columns = slice(None) if order is None else list(order)
-    samples = Samples(
+    samples = ImportedSamples(
         stamp,
         arm.position * position,
         velocity=arm.velocity[:, columns] * velocity,
@@ -950,7 +950,7 @@ class TestWarnings:
     def test_a_joint_with_one_reading_is_named_unless_it_was_held(self, arm: Simulated) -> None:
         stamp = np.rint(arm.time * 1e9).astype(np.int64)
         standing = np.where(np.arange(6) == 2, 0.4, arm.position)
-        samples = Samples(stamp, standing, torque=arm.torque)
+        samples = ImportedSamples(stamp, standing, torque=arm.torque)
         robot = Robot.from_urdf(arm.urdf, recorded=arm.joint_names)
 
         def findings(held_joints: Sequence[str] = ()) -> list[str]:
@@ -970,7 +970,7 @@ class TestWarnings:
         first = round((1.0 - last) * len(arm.time))
         position = arm.position.copy()
         position[first:, 1] = position[first, 1]
-        samples = Samples(stamp, position, commanded_position=arm.position)
+        samples = ImportedSamples(stamp, position, commanded_position=arm.position)
         robot = Robot.from_urdf(arm.urdf, recorded=arm.joint_names)
         result = examine(samples, arm.joint_names, robot.urdf)
         stopped = [found for found in result.warnings if isinstance(found, StoppedJoint)]

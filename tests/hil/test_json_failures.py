@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner, Result
 
-from hil.archive import Samples, write_samples
+from hil.archive import ImportedSamples, write_samples
 from hil.archive.supervised import Failed
 from hil.base.errors import ArchiveWriteError, ControllerError, HilError, InputError
 from hil.base.files import convert_write_errors, make_folder
@@ -109,7 +109,7 @@ def test_errors_of_a_disk_are_not_bad_input(
     def refuse(*_: object) -> int:
         raise refusal
 
-    samples = Samples(np.arange(3) * 10**7, np.zeros((3, 1)))
+    samples = ImportedSamples(np.arange(3) * 10**7, np.zeros((3, 1)))
     monkeypatch.setattr("hil.archive.writer.os.write", refuse)
     with pytest.raises(ArchiveWriteError) as of_archive:
         write_samples(tmp_path / "a.mcap", samples, joint_names=("a",), metadata={})

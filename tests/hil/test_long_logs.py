@@ -18,7 +18,7 @@ from hil.importers.log_files import LogFiles
 from hil.importers.messages import sentence
 from hil.importers.recording import ImportedRecording, ImportOptions, read_recording
 from hil.importers.robot import Robot
-from hil.importers.text_table import Table
+from hil.importers.text_table import TextTable
 from hil.pipeline.sources import cell_of, source_of
 from identification.signals.recording import PAUSE, Recording, cut_at_pauses
 from tests.hil.test_log_kinds import JOINTS, URDF
@@ -95,23 +95,23 @@ def test_a_column_that_counts_rows_is_known_in_a_long_log(robot: Robot, tmp_path
 def test_a_cell_without_a_number_is_named_by_its_line(tmp_path: Path) -> None:
     time = np.arange(ROWS) / RATE
     path = written(tmp_path / "log.csv", time, *moving(time))
-    table = Table.read(path, Format(), LONGEST)
+    table = TextTable.read(path, Format(), LONGEST)
     line = table.numbered[-5]
     lines = path.read_text().splitlines()
     assert table.lines[-5] == lines[line - 1]
     lines[line - 1] = lines[line - 1].replace(",", ",x", 1)
     path.write_text("\n".join(lines) + "\n")
     with pytest.raises(SourceError, match=f"line {line} has 'x"):
-        Table.read(path, Format(), LONGEST).numbers(["q1"], "position")
+        TextTable.read(path, Format(), LONGEST).numbers(["q1"], "position")
 
 
 def test_a_compressed_log_is_read_in_stretches(tmp_path: Path) -> None:
     time = np.arange(ROWS) / RATE
     path = written(tmp_path / "log.csv", time, *moving(time))
-    plain = Table.read(path, Format(), LONGEST)
+    plain = TextTable.read(path, Format(), LONGEST)
     packed = tmp_path / "log.csv.gz"
     packed.write_bytes(gzip.compress(path.read_bytes()))
-    assert Table.read(packed, Format(), LONGEST).lines == plain.lines
+    assert TextTable.read(packed, Format(), LONGEST).lines == plain.lines
     assert len(plain.lines) < LONGEST
 
 
@@ -122,7 +122,7 @@ def test_encodings_and_decimal_commas_of_long_logs(encoding: str, tmp_path: Path
     text = plain.replace(",", ";").replace(".", ",").replace("q1", "Position1 (°)", 1)
     path = tmp_path / "log.csv"
     path.write_bytes(text.replace("\n", "\r\n").encode(encoding))
-    table = Table.read(path, Format(), 2 * STRETCH)
+    table = TextTable.read(path, Format(), 2 * STRETCH)
     assert table.names[1] == "Position1 (°)"
     assert len(table.lines) == 2 * STRETCH - 1
     values = table.numbers(["time", 1], "position")

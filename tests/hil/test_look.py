@@ -42,7 +42,7 @@ from hil.look.readings import (
     OtherLengths,
     TorqueDelay,
 )
-from hil.look.result import Aspect, Choice
+from hil.look.result import Aspect, TiedReading
 from hil.look.run import SETTINGS
 from hil.pipeline.sources import cell_of, source_of
 from identification.estimators.delay import DelayEstimate
@@ -291,8 +291,8 @@ class TestConclusions:
 
     def test_a_refusal_names_options_and_lines_of_a_map(self) -> None:
         choices = (
-            Choice("mounting", UPRIGHT, 0.07, GravityOption((0.0, 0.0, -9.81))),
-            Choice("zero", MOVED, 0.07, MapEntries((("position.offset", [0.0, 3.0]),))),
+            TiedReading("mounting", UPRIGHT, 0.07, GravityOption((0.0, 0.0, -9.81))),
+            TiedReading("zero", MOVED, 0.07, MapEntries((("position.offset", [0.0, 3.0]),))),
         )
         contradictions = Contradictions()
         message = str(undecided(Path("my log.csv"), choices, contradictions))
@@ -424,7 +424,7 @@ class TestOtherArm:
 
     def test_a_doubtful_arm_is_said_before_readings_that_fit_alike(self, tmp_path: Path) -> None:
         size = Contradictions(BeyondRange("a", np.radians(75.0), turns=True), is_far=True)
-        choices = (Choice("zero", MOVED, 0.13, GravityOption((0.0, 0.0, 0.0))),) * 2
+        choices = (TiedReading("zero", MOVED, 0.13, GravityOption((0.0, 0.0, 0.0))),) * 2
         refusal = undecided(tmp_path / "a.csv", choices, size)
         assert refusal.field == "--urdf"
         assert "may not be of the arm of the URDF: a moves 75°" in refusal.problem
@@ -433,7 +433,7 @@ class TestOtherArm:
     def test_readings_of_an_axis_that_are_not_so_are_another_arm(self, tmp_path: Path) -> None:
         aspects: tuple[tuple[Aspect, bool], ...] = (("zero", True), ("side", False))
         for aspect, said in aspects:
-            choices = (Choice(aspect, MOVED, 0.13, GravityOption((0.0, 0.0, 0.0))),) * 2
+            choices = (TiedReading(aspect, MOVED, 0.13, GravityOption((0.0, 0.0, 0.0))),) * 2
             remedy = undecided(tmp_path / "a.csv", choices, Contradictions()).remedy
             assert remedy is not None
             assert ("if none of these is so, give the URDF of this arm" in remedy) == said

@@ -20,7 +20,7 @@ from typer.testing import CliRunner
 from drivers.init_check import verify_controller
 from drivers.packets import InitPacket
 from drivers.transports.udp import UdpSpec
-from hil.archive import Samples, write_samples
+from hil.archive import ImportedSamples, write_samples
 from hil.base.errors import ArchiveError, ControllerError, InputError
 from hil.base.progress import Silent
 from hil.campaign import Campaign, CampaignPlan, Stop, design
@@ -327,7 +327,9 @@ def test_an_archive_without_a_valid_arm_is_of_arm_1(arm: str, tmp_path: Path) ->
     cell = f"[controller]\narm = {arm}\n".encode()
     path = write_samples(
         tmp_path / "a.mcap",
-        Samples(np.arange(3) * 2_000_000, position=np.zeros((3, 2)), torque=np.ones((3, 2))),
+        ImportedSamples(
+            np.arange(3) * 2_000_000, position=np.zeros((3, 2)), torque=np.ones((3, 2))
+        ),
         joint_names=("shoulder", "elbow"),
         metadata={},
         attachments={"cell.toml": cell, "init_packet.bin": packet},

@@ -9,7 +9,7 @@ import pytest
 from numpy.typing import NDArray
 
 from drivers.record import cycle_dtype
-from hil.archive import ArchiveWriter, Samples, open_archive, write_samples
+from hil.archive import ArchiveWriter, ImportedSamples, open_archive, write_samples
 from hil.archive.recordings import open_recording, recording_of
 from hil.base.errors import ArchiveError
 
@@ -95,7 +95,7 @@ def test_restarted_cycles_are_not_read(tmp_path: Path, monkeypatch: pytest.Monke
 
 def test_imported_stamps_are_converted_to_seconds(tmp_path: Path) -> None:
     stamp = np.array([0, 8_000_001, 15_999_999], np.int64) + 1_700_000_000 * 10**9
-    samples = Samples(stamp, np.arange(6.0).reshape(3, 2))
+    samples = ImportedSamples(stamp, np.arange(6.0).reshape(3, 2))
     path = write_samples(tmp_path / "x.mcap", samples, joint_names=JOINTS, metadata={})
     recording = open_recording(path)
     assert recording.time.tolist() == pytest.approx([0.0, 8.000001e-3, 15.999999e-3], abs=1e-15)

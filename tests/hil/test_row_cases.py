@@ -16,7 +16,7 @@ from hil.importers.conclusions import ClockRestarted, CopiedCommands, RowCounter
 from hil.importers.recording import ImportOptions, read_recording
 from hil.importers.robot import Robot
 from hil.look import look_at
-from hil.look.readings import Fact, Rows
+from hil.look.readings import Fact, RowsReading
 from identification.signals.row_faults import RowFaultKind
 from tests.hil.diagnosis_cases import CASES, URDF, identified, needs_the_cases, rigid_error
 
@@ -128,7 +128,7 @@ def test_held_out_stamps_are_judged_as_those_that_are_fitted(tmp_path: Path) -> 
 def test_look_names_the_rows() -> None:
     looked = look_at(frozen(CASES), lambda _: Robot.from_urdf(URDF), ImportOptions())
     (row,) = (each for each in looked.rows if each.aspect == "rows")
-    assert isinstance(row.reading, Rows)
+    assert isinstance(row.reading, RowsReading)
     assert [fault.kind for fault in row.reading.faults] == [RowFaultKind.FROZEN]
     assert not looked.questions
 

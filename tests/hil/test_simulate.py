@@ -30,7 +30,7 @@ from hil.base.errors import InputError
 from hil.base.progress import say_at_once
 from hil.cell import Cell, CellError
 from hil.cli import exit_code_of, main
-from hil.cli.simulate import WORDS, Status, _sentences, simulate
+from hil.cli.simulate import WORDS, PhasePrinter, _sentences, simulate
 from hil.control.motion_checks import MotionChecks
 from hil.control.simulation import (
     controller_settings,
@@ -254,7 +254,7 @@ def test_a_program_that_has_ended_costs_one_extension():
 
 
 def test_lines_that_come_back_are_collapsed(capfd):
-    status = Status(ControllerSettings(), quiet=False)
+    status = PhasePrinter(ControllerSettings(), quiet=False)
     phases = [Phase.CLOSED, Phase.OPENING] * 50 + [Phase.ENDED]
     for cycle, phase in enumerate(phases):
         status.watch(SimpleNamespace(phase=phase, reason=""), ServeCounts(cycles=cycle))

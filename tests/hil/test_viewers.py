@@ -15,7 +15,7 @@ import pytest
 from mcap.reader import make_reader
 from typer.testing import CliRunner
 
-from hil.archive import Samples, open_archive, write_samples
+from hil.archive import ImportedSamples, open_archive, write_samples
 from hil.base.errors import ArchiveError, InputError
 from hil.campaign import Campaign
 from hil.cli import app
@@ -108,7 +108,7 @@ def test_one_sample_of_a_long_recording_is_not_lost(tmp_path: Path) -> None:
     path = tmp_path / "long.mcap"
     write_samples(
         path,
-        Samples(np.rint(time * 1e9).astype(np.int64), position, torque=spike),
+        ImportedSamples(np.rint(time * 1e9).astype(np.int64), position, torque=spike),
         joint_names=("only",),
         metadata={},
         attachments={},

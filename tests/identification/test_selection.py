@@ -33,7 +33,7 @@ from identification.selection.questions import (
     Question,
     choose_settings,
 )
-from identification.selection.scores import IMPOSSIBLE_WORTHWHILE, WORTHWHILE, Trial
+from identification.selection.scores import IMPOSSIBLE_WORTHWHILE, WORTHWHILE, SettingsTrial
 from identification.selection.settings import Settings, Strength
 from identification.signals.recording import Recording
 from identification.signals.samples import Preprocessing, prepare
@@ -488,7 +488,7 @@ class TestChosenSettings:
 
 def decided(*errors):
     """Index of the candidate that is chosen by its errors in segments (k,) with one joint."""
-    trial = Trial(MODEL, lambda *_: [])
+    trial = SettingsTrial(MODEL, lambda *_: [])
     start = Settings(Preprocessing())
     candidates = [
         replace(start, preprocessing=Preprocessing(rigid_bandwidth=10.0 + k))
@@ -548,7 +548,7 @@ class TestLast:
         ],
     )
     def test_none_behind_a_worse_one_is_chosen(self, means, chosen):
-        trial = Trial(MODEL, lambda *_: [])
+        trial = SettingsTrial(MODEL, lambda *_: [])
         weights = range(len(means))
         candidates = [Settings(Preprocessing(), strength=Strength(weight)) for weight in weights]
         trial.errors = lambda each: Errors(

@@ -28,7 +28,7 @@ from identification.validation.fault_tables import FaultTables
 from identification.validation.finding import Thresholds
 from identification.validation.gravity import CarriedLoad
 from identification.validation.nominal_scale import NominalScale
-from identification.validation.physical_signs import Dissipation, Implausible
+from identification.validation.physical_signs import Implausible, TopSpeedFriction
 from identification.validation.prediction import PredictionError
 from identification.validation.purpose import Purpose
 from identification.validation.residuals import (
@@ -570,7 +570,7 @@ class TestJudgement:
         """By the nominal model, or by friction that would drive every axis."""
         signs = Implausible(("m1 is negative", "I2m is negative"), ())
         nominal = NominalScale(np.full(2, -1.0), np.full(2, 0.1))
-        driving = Dissipation(np.full(2, -3.0), np.full(2, 0.1))
+        driving = TopSpeedFriction(np.full(2, -3.0), np.full(2, 0.1))
         for symptom in ({"nominal_scale": nominal}, {"dissipation": driving}):
             verdict = judged(implausible=signs, causes=caused("axis sign", 0), **symptom)
             (reason,) = verdict.reasons
@@ -583,7 +583,7 @@ class TestJudgement:
         assert "opposite sign" in reason and "two -1" in reason and "one" not in reason
 
     def test_friction_that_drives_one_axis_is_not_all_torques(self):
-        dissipation = Dissipation(np.array([3.0, -3.0]), np.full(2, 0.1))
+        dissipation = TopSpeedFriction(np.array([3.0, -3.0]), np.full(2, 0.1))
         assert judged(dissipation=dissipation).good
 
     def test_good_findings(self):

@@ -23,7 +23,7 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
-from hil.archive import ArchiveHeader, Samples, open_archive, write_samples
+from hil.archive import ArchiveHeader, ImportedSamples, open_archive, write_samples
 from hil.archive.check import check_archive
 from hil.archive.container import MAGIC
 from hil.base.errors import ArchiveError, HilError, InputError
@@ -42,7 +42,7 @@ from hil.cli.plan import read_via_points
 from hil.importers.arrays import READERS, ArrayFile
 from hil.importers.bags import bag_files, open_bag
 from hil.importers.column_map import Format
-from hil.importers.text_table import Table
+from hil.importers.text_table import TextTable
 from hil.report.output_files import rewrite_report
 from hil.results.results import Results
 from hil.results.series import SERIES, load_series
@@ -220,7 +220,7 @@ def test_link_is_no_lock(folder: Path) -> None:
 
 
 RECORDINGS: dict[str, Callable[[Path], object]] = {
-    "log.csv": lambda path: Table.read(path, Format()),
+    "log.csv": lambda path: TextTable.read(path, Format()),
     **{f"log{suffix}": ArrayFile for suffix in READERS},
     "bag.db3": bag_files,
     "bag.mcap": lambda path: open_bag(path).__enter__(),
@@ -431,7 +431,9 @@ def test_meshes_that_cannot_be_read_are_missing(mesh: str, folder: Path) -> None
 @pytest.fixture
 def imported(tmp_path: Path) -> Path:
     """An imported recording."""
-    still = Samples(np.arange(50) * 2_000_000, position=np.zeros((50, 2)), torque=np.ones((50, 2)))
+    still = ImportedSamples(
+        np.arange(50) * 2_000_000, position=np.zeros((50, 2)), torque=np.ones((50, 2))
+    )
     return write_samples(
         tmp_path / "imported.mcap", still, joint_names=("shoulder", "elbow"), metadata={}
     )

@@ -210,7 +210,7 @@ class TransferAssembler:
         return None
 
 
-class End:
+class CanEndpoint:
     """One end of a session on a bus: packets to frames and back; `sends` is its identifier.
 
     Attributes:

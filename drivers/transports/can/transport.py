@@ -21,7 +21,7 @@ from can.interfaces.udp_multicast import UdpMulticastBus
 
 from drivers.errors import TransportClosed
 from drivers.transports.base import CanBus, LinkInUseError, TransportError, TransportSpec
-from drivers.transports.can.profile import DOWN, BusRates, CanError, End, Frame
+from drivers.transports.can.profile import DOWN, BusRates, CanEndpoint, CanError, Frame
 
 logging.getLogger("can").addHandler(logging.NullHandler())  # our errors have its reasons
 
@@ -131,7 +131,7 @@ class CanLink:
     of the end, and "bus_error" (error frames) and "unsent" (frames not accepted by the bus).
     """
 
-    def __init__(self, bus: can.BusABC, end: End, *, clock: Callable[[], float]) -> None:
+    def __init__(self, bus: can.BusABC, end: CanEndpoint, *, clock: Callable[[], float]) -> None:
         self.discarded = end.discarded
         self._bus = bus
         self._frames = end
@@ -296,7 +296,7 @@ class CanTransport(CanLink):
         lock: int | None = None,
     ) -> None:
         self._lock = lock
-        super().__init__(bus, End(rates, DOWN), clock=clock)
+        super().__init__(bus, CanEndpoint(rates, DOWN), clock=clock)
 
     @property
     def now(self) -> float:

@@ -13,7 +13,7 @@ import numpy as np
 
 from drivers import InitPacket
 from drivers.record import cycle_dtype
-from hil.archive import Archive, ArchiveWriter, Samples, open_archive, write_samples
+from hil.archive import Archive, ArchiveWriter, ImportedSamples, open_archive, write_samples
 from hil.archive.check import check_archive, read_overview
 from hil.archive.recordings import recording_of
 from hil.archive.repair import repair
@@ -147,7 +147,7 @@ def seeds() -> list[bytes]:
         archive.event(5000, "Refused", "a text", data={"joint": 1})
         archive.write(rows, rows["target_current"])
         archive.close("completed")
-    samples = Samples(cycle * 2_000_000, position=rows["position"], torque=rows["position"])
+    samples = ImportedSamples(cycle * 2_000_000, position=rows["position"], torque=rows["position"])
     urdf = {"robot.urdf": URDF.encode()}
     write_samples(bare, samples, joint_names=JOINTS, attachments=urdf, metadata={})
     truncated.write_bytes(whole.read_bytes()[: whole.stat().st_size * 3 // 4])

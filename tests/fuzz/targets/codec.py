@@ -16,7 +16,7 @@ from drivers.packets import (
     next_number,
     packet_number,
 )
-from drivers.transports.can.profile import DOWN, UP, BusRates, CanError, End, Frame
+from drivers.transports.can.profile import DOWN, UP, BusRates, CanEndpoint, CanError, Frame
 from tests.fuzz.draw import Draw, mutate_bytes
 from tests.fuzz.targets import Target
 
@@ -28,8 +28,8 @@ class Talk:
 
     def __init__(self, draw: Draw) -> None:
         self._draw = draw
-        self._pc = End(BusRates(), DOWN)
-        self._controller = End(BusRates(), UP)
+        self._pc = CanEndpoint(BusRates(), DOWN)
+        self._controller = CanEndpoint(BusRates(), UP)
         self._n = draw.between(1, 6)
         self._time = 0.0
         self._untouched = True
@@ -66,7 +66,7 @@ class Talk:
         status = bytes((draw.choice((DRIVE_ON, 0, 1, 4)), 0, 0, 0))
         return CyclicPacket(number, status, draw.raw(4).ljust(4, b"\0"), axes).encode()
 
-    def _passed(self, packet: bytes, sender: End, receiver: End) -> bytes | None:
+    def _passed(self, packet: bytes, sender: CanEndpoint, receiver: CanEndpoint) -> bytes | None:
         """The packet as it arrives: to the byte, or not at all where a frame was harmed."""
         frames = sender.frames(packet)
         self._sent.add(packet)

@@ -21,7 +21,15 @@ from mcap_ros2.decoder import DecoderFactory
 from typer.testing import CliRunner
 
 from drivers.record import cycle_dtype
-from hil.archive import Archive, Samples, container, header, open_archive, schema, write_samples
+from hil.archive import (
+    Archive,
+    ImportedSamples,
+    container,
+    header,
+    open_archive,
+    schema,
+    write_samples,
+)
 from hil.archive import repair as repairing
 from hil.archive.check import check_archive
 from hil.archive.container import encode
@@ -250,7 +258,7 @@ class TestLosses:
 
     def test_imported_recording(self, tmp_path):
         position = np.random.default_rng(1).normal(size=(3500, 2))
-        samples = Samples(np.arange(3500, dtype=np.int64) * 1_000_000, position)
+        samples = ImportedSamples(np.arange(3500, dtype=np.int64) * 1_000_000, position)
         path = tmp_path / "x.mcap"
         write_samples(path, samples, joint_names=("a", "b"), metadata={})
         assert check_archive(path).conforms

@@ -11,7 +11,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from drivers.record import cycle_dtype
-from hil.archive import ArchiveWriter, Samples, open_archive, write_samples
+from hil.archive import ArchiveWriter, ImportedSamples, open_archive, write_samples
 from hil.archive.check import check_archive
 from hil.archive.repair import repair
 from tests.hil.archive.conftest import FIRST, peak
@@ -69,7 +69,7 @@ class TestTimes:
         stamp = np.array([5, 9, 1, 7, 3], np.int64) * 10**9
         position = np.arange(5.0)[:, None]
         path = write_samples(
-            tmp_path / "x.mcap", Samples(stamp, position), joint_names=("a",), metadata={}
+            tmp_path / "x.mcap", ImportedSamples(stamp, position), joint_names=("a",), metadata={}
         )
         archive = open_archive(path, start=3.0, stop=8.0)
         assert archive.columns["position"][:, 0].tolist() == [0.0, 3.0, 4.0]

@@ -20,7 +20,15 @@ from mcap.records import Attachment, Channel, Metadata
 from typer.testing import CliRunner
 
 import hil
-from hil.archive import Samples, container, header, open_archive, schema, write_samples, writer
+from hil.archive import (
+    ImportedSamples,
+    container,
+    header,
+    open_archive,
+    schema,
+    write_samples,
+    writer,
+)
 from hil.archive.cdr import LayoutError, fixed_layout
 from hil.archive.check import check_archive, read_overview
 from hil.archive.container import Record
@@ -256,7 +264,7 @@ class TestContents:
         """An imported recording of 60 samples in three chunks: joints and currents, no cycles."""
         monkeypatch.setattr(writer, "_SAMPLES_PER_CHUNK", 20)
         values = np.arange(120.0).reshape(60, 2)
-        samples = Samples(np.arange(60) * 10**9, values, motor_current=-values)
+        samples = ImportedSamples(np.arange(60) * 10**9, values, motor_current=-values)
         path = tmp_path / "original.mcap"
         write_samples(path, samples, joint_names=["a", "b"], metadata={}, durable=False)
         return path.read_bytes()
