@@ -3,8 +3,8 @@
 A simulated arm follows the planned motion to a fraction of a milliradian, whatever its model lacks:
 what an error changes is the motors' torque. So each motion is simulated once, without effects, and
 the torque of each error along the plan is added to what was measured. A second size costs nothing
-then, and noise is the same under every condition. `tests/hil/test_study_errors.py` compares with
-the simulated arm that has ripple, drift, elastic gears and delay itself.
+then, and noise is the same under every condition. `tests/hil/study/test_model_errors.py` compares
+with the simulated arm that has ripple, drift, elastic gears and delay itself.
 """
 
 from __future__ import annotations

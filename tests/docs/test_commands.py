@@ -26,8 +26,8 @@ from tests.hil.simulated_logs import write_moving_log
 pytestmark = pytest.mark.long
 
 TYPED_ELSEWHERE = {
-    "campaign.md": "tests/hil/test_campaign_day.py",
-    "payload.md": "tests/hil/test_payload_command.py",
+    "campaign.md": "tests/hil/campaign/test_campaign_day.py",
+    "payload.md": "tests/hil/payload/test_payload_command.py",
     **dict.fromkeys(
         (
             "bring-your-own-robot.md",
@@ -61,18 +61,18 @@ OTHER_PROGRAMS = {
 
 NOT_TYPED = {
     "hil demo --effects": "minutes",
-    "hil demo --resume": "resumes a stopped one; tests/hil/test_cli.py stops one",
+    "hil demo --resume": "resumes a stopped one; tests/hil/cli/test_cli.py stops one",
     "hil demo --excitation": "the whole NS 16 campaign: minutes",
     "hil demo --output runs/": "a campaign of the fixture stands in its place",
     "hil design cell.toml --method b -o runs/b": "half a minute; a short one needs other settings",
     "hil doctor cell.toml --duration 14400": "four hours",
-    "hil simulate": "waits for a PC; tests/hil/test_simulate.py runs it",
-    "hil move copy.toml": "needs a controller; tests/hil/test_move.py types it",
-    "hil record": "waits for a controller; tests/hil/test_record_command.py runs it",
-    "hil new --controller ur": "needs an arm; tests/hil/test_new_ur.py asks a simulated one",
+    "hil simulate": "waits for a PC; tests/hil/control/test_simulate.py runs it",
+    "hil move copy.toml": "needs a controller; tests/hil/control/test_move.py types it",
+    "hil record": "waits for a controller; tests/hil/control/test_record_command.py runs it",
+    "hil new --controller ur": "needs an arm; tests/hil/new/test_ur_values.py asks a simulated one",
     "hil torque-constants archives": "needs recordings with a load",
     "hil run campaigns/october --live": "needs a campaign on a real link",
-    "hil import rosbag2": "needs a recording; tests/hil/test_importers_rosbag2.py",
+    "hil import rosbag2": "needs a recording; tests/hil/importers/test_rosbag2.py",
     "hil import log log.csv --map columns.toml": "typed in bring-your-own-robot.md",
     "hil torque-constants empty.mcap": "typed in bring-your-own-robot.md",
     "hil payload bare --loaded gripper": "typed in payload.md",
@@ -83,15 +83,15 @@ NOT_TYPED = {
     "hil run runs/precise": "typed in precision.md",
     "hil rehearse runs/next": "typed in precision.md",
     "hil run runs/next": "typed in precision.md",
-    "hil identify ur10": "needs a recording; tests/hil/test_one_command.py reads it",
-    "hil identify chirp_sweep": "needs recordings; tests/hil/test_servo_command.py reads such",
-    "hil identify '~/.cache": "needs a data set; tests/hil/test_lerobot.py writes and reads some",
-    "hil export out": "needs recordings; tests/hil/test_servo_command.py exports such results",
+    "hil identify ur10": "needs a recording; tests/hil/identified/test_one_command.py reads it",
+    "hil identify chirp_sweep": "needs recordings; tests/hil/servo/test_servo_command.py",
+    "hil identify '~/.cache": "needs a data set; tests/hil/importers/test_lerobot.py writes some",
+    "hil export out": "needs recordings; tests/hil/servo/test_servo_command.py exports",
     "hil batch /data": "needs other people's archives",
-    "hil trend logs": "needs logs; tests/hil/test_trend_command.py types it",
-    "hil batch 'logs/": "needs logs; tests/hil/test_batch_logs.py types it",
-    "hil study --quick": "minutes; tests/hil/test_study.py runs a shorter one",
-    "hil study --output": "an hour; tests/hil/test_study.py runs a short one",
+    "hil trend logs": "needs logs; tests/hil/fleet/test_trend.py types it",
+    "hil batch 'logs/": "needs logs; tests/hil/fleet/test_logs.py types it",
+    "hil study --quick": "minutes; tests/hil/study/test_study.py runs a shorter one",
+    "hil study --output": "an hour; tests/hil/study/test_study.py runs a short one",
 }  # Beginnings of commands that are read and not run, and why
 
 SHORTER = {

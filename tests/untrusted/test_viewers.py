@@ -13,8 +13,8 @@ pytest.importorskip("foxglove", reason="the extra 'live' is not installed")
 pytest.importorskip("websockets", reason="websockets is not installed")
 
 from hil.archive import live
+from tests.hil.archive.test_live import records, served
 from tests.hil.live_viewer import Viewer
-from tests.hil.test_live_view import records, served
 
 pytestmark = pytest.mark.safety
 

@@ -1,0 +1,233 @@
+"""Conclusions are values: their sentences are made at the edge and read by nobody."""
+
+from __future__ import annotations
+
+import json
+import re
+from collections.abc import Callable, Mapping
+from dataclasses import replace
+from pathlib import Path
+from typing import Any, get_args
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+from typer.testing import CliRunner
+
+from hil.cli import app
+from hil.importers import messages as import_messages
+from hil.importers.conclusions import Certainty, Conclusion
+from hil.importers.recording import ImportOptions
+from hil.importers.robot import Robot
+from hil.look import Look, Row, look_at
+from hil.look import messages as look_messages
+from hil.look.readings import Channels, Decider, Evidence, NextBest, Reading, Setting
+from hil.look.result import Aspect
+from identification.validation import verdict
+from identification.validation.finding import Facts, Finding, Naming
+from tests.hil.importers.test_log_kinds import URDF
+from tests.hil.importers.test_several_arms import robot_of_arms
+from tests.hil.simulated_logs import write_log, write_moving_log
+
+Floats = NDArray[np.float64]
+NAMES = ["t", "q{}", "v{}", "tau{}"]
+
+
+@pytest.fixture(scope="module")
+def urdf(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    path = tmp_path_factory.mktemp("arm") / "three.urdf"
+    path.write_text(URDF)
+    return path
+
+
+@pytest.fixture(scope="module")
+def columns(urdf: Path) -> tuple[Floats, ...]:
+    """Time, positions, velocities and torques of three joints."""
+    path = write_moving_log(urdf.with_name("moving.csv"), URDF)
+    values = np.loadtxt(path, delimiter=",", skiprows=1)
+    return values[:, 0], values[:, 1:4], values[:, 4:7], values[:, 7:]
+
+
+def hil(*arguments: object) -> Any:
+    return CliRunner().invoke(app, [str(argument) for argument in arguments])
+
+
+def look(urdf: Path, log: Path) -> Look:
+    return look_at(log, lambda _: Robot.from_urdf(urdf), ImportOptions())
+
+
+def row_of(looked: Look, aspect: str) -> Row:
+    (row,) = [row for row in looked.rows if row.aspect == aspect]
+    return row
+
+
+class TestNamesOfChannels:
+    """A channel may be called what it likes: only its meaning counts."""
+
+    def test_a_target_beside_the_positions_leaves_their_unit_open(
+        self, tmp_path: Path, urdf: Path, columns: tuple[Floats, ...]
+    ) -> None:
+        alone = write_log(tmp_path / "a.csv", NAMES, *columns)
+        target = columns[1] + 0.01
+        path = write_log(tmp_path / "b.csv", [*NAMES, "target_position{}"], *columns, target)
+        row = row_of(look(urdf, path), "angle unit")
+        assert row == row_of(look(urdf, alone), "angle unit")
+        assert row.certainty is Certainty.CERTAIN
+        (nearest,) = row.evidence
+        assert isinstance(nearest, NextBest)
+        assert nearest.ratio > 3.0
+        result = hil("look", path, "--urdf", urdf, "-v")
+        assert re.search(r"next best: \w+, error \d+\.\d+ times", result.output)
+
+    def test_the_recorded_arm_has_a_row_of_its_own(self, tmp_path: Path) -> None:
+        urdf = robot_of_arms(tmp_path, ("left", 3), ("head", 1))
+        time = np.arange(400) * 0.01
+        phases = np.array([0.0, 1.0, 2.0])
+        q = np.sin(3.0 * time[:, None] + phases)
+        path = write_log(tmp_path / "a.csv", ["t", "q{}", "tau{}"], time, q, np.cos(q))
+        looked = look(urdf, path)
+        row = row_of(looked, "recorded arm")
+        assert row.reading == Channels("left_j1 .. left_j3")
+        assert {row.aspect for row in looked.rows} <= ASPECTS
+
+    @pytest.mark.parametrize("name", ["q: left{}", "joint: q{}"])
+    def test_a_colon_in_a_name_stays(
+        self, tmp_path: Path, urdf: Path, columns: tuple[Floats, ...], name: str
+    ) -> None:
+        path = write_log(tmp_path / "a.csv", ["t", "v{}", name, "tau{}"], columns[0],
+                         columns[2], columns[1], columns[3])  # fmt: skip
+        chosen = ImportOptions(chosen={"position": name})
+        looked = look_at(path, lambda _: Robot.from_urdf(urdf), chosen)
+        assert row_of(looked, "position").reading == Channels(name)
+        text = look_messages.row_text(row_of(looked, "position"))
+        assert text[:2] == (name, "as given with --columns")
+
+
+@pytest.mark.parametrize("kind", get_args(Reading | Evidence | Decider | Setting))
+def test_what_a_row_of_a_look_may_have_has_words(kind: type) -> None:
+    words = look_messages._worded.dispatch
+    assert words(kind) is not words(object)
+
+
+ASPECTS = frozenset(get_args(Aspect))
+
+
+def negated(columns: tuple[Floats, ...]) -> tuple[Floats, ...]:
+    return (*columns[:3], -columns[3])
+
+
+def in_degrees_and_milliseconds(columns: tuple[Floats, ...]) -> tuple[Floats, ...]:
+    return (1e3 * columns[0], np.degrees(columns[1]), np.degrees(columns[2]), columns[3])
+
+
+def of_motors(columns: tuple[Floats, ...]) -> tuple[Floats, ...]:
+    return (*columns[:3], columns[3] / 100.0)
+
+
+LOGS: Mapping[str, Callable[[tuple[Floats, ...]], tuple[Floats, ...]]] = {
+    "negated torque": negated,
+    "degrees and milliseconds": in_degrees_and_milliseconds,
+    "motor side": of_motors,
+}
+
+
+class _OfKeys:
+    """Facts whose findings say the name of their check and no more."""
+
+    def __init__(self, facts: Facts) -> None:
+        self._facts = facts
+
+    def findings(self, naming: Naming) -> Any:
+        for finding in self._facts.findings(naming):
+            yield _by_key(finding)
+
+
+def _by_key(finding: Finding) -> Finding:
+    step = f"{finding.check}, step" if finding.next_step else ""
+    reservation = finding.check if finding.reservation else ""
+    return replace(finding, words=finding.check, next_step=step, reservation=reservation)
+
+
+def say_keys(patch: pytest.MonkeyPatch) -> None:
+    """Replace all sentences of importers, looks and findings by their keys."""
+
+    def key(value: object) -> str:
+        return type(value).__name__
+
+    def of_facts(*arguments: Any) -> tuple[Any, ...]:
+        return tuple(_OfKeys(facts) for facts in facts_in_order(*arguments))
+
+    facts_in_order = verdict.facts_in_order
+    patch.setattr(import_messages, "worded", key)
+    patch.setattr(look_messages, "_worded", key)
+    for name in ("described", "sentences", "fit_alike", "problem_of", "remedy_of"):
+        for module in (import_messages, look_messages):
+            if hasattr(module, name):
+                patch.setattr(module, name, key)
+    patch.setattr(verdict, "facts_in_order", of_facts)
+
+
+MESSAGES = frozenset(
+    {
+        *("words", "next_step", "next_steps", "reservation", "line", "reasons", "warnings"),
+        *("content", "changes", "channels"),
+        *("findings", "reading", "reason", "decide", "options", "identified_at"),
+    }
+)
+"""Keys whose values are sentences, and that of the time of day."""
+
+
+def without_messages(value: Any) -> Any:
+    """Return JSON without messages; findings by check, level and role."""
+    if isinstance(value, list):
+        return [without_messages(item) for item in value]
+    if not isinstance(value, dict):
+        return value
+    kept = {k: without_messages(v) for k, v in value.items() if k not in MESSAGES}
+    if isinstance(findings := value.get("findings"), list):
+        kept["findings"] = [(each["check"], each["level"], each["role"]) for each in findings]
+    return kept
+
+
+@pytest.mark.parametrize("log", LOGS)
+def test_sentences_decide_nothing(
+    tmp_path: Path, urdf: Path, columns: tuple[Floats, ...], log: str
+) -> None:
+    """With its key in place of every sentence all statuses, results and choices are the same."""
+    path = write_log(tmp_path / "a.csv", NAMES, *LOGS[log](columns))
+
+    def played(name: str) -> dict[str, Any]:
+        folder = tmp_path / name
+        looked = hil("look", path, "--urdf", urdf, "--json")
+        done = hil("identify", path, "--urdf", urdf, "--output", folder)
+        results = json.loads((folder / "results.json").read_text())
+        return {
+            "statuses": (looked.exit_code, done.exit_code),
+            "look": without_messages(json.loads(looked.stdout)),
+            "map": (folder / "map.toml").read_text(),
+            "results": without_messages(results),
+            "said": looked.stdout + done.output,
+        }
+
+    in_words = played("words")
+    with pytest.MonkeyPatch.context() as patch:
+        say_keys(patch)
+        by_keys = played("keys")
+    assert by_keys.pop("said") != in_words.pop("said")
+    assert by_keys == in_words
+
+
+def leaves(kind: type) -> set[type]:
+    """All types of conclusions without types of their own."""
+    below = kind.__subclasses__()
+    return set().union(*map(leaves, below)) if below else {kind}
+
+
+def test_every_conclusion_has_words() -> None:
+    """So that the base case, which only raises, is never reached."""
+    base = import_messages.worded.dispatch(Conclusion)
+    assert not [
+        kind.__name__
+        for kind in leaves(Conclusion)
+        if import_messages.worded.dispatch(kind) is base
+    ]

@@ -1,0 +1,396 @@
+"""Arms without torque from the command line: a folder of states and commands to a verdict."""
+
+from __future__ import annotations
+
+import json
+import sys
+from pathlib import Path
+from types import ModuleType, SimpleNamespace
+from typing import Any
+from unittest.mock import Mock
+from xml.etree import ElementTree
+
+import numpy as np
+import pytest
+from typer.testing import CliRunner
+
+from benchmarks import servo_arm as arm
+from hil.base.errors import InputError
+from hil.base.one_screen import one_screen
+from hil.cli import app
+from hil.results.servo_result import ServoPush, ServoResults, is_servo_result
+from hil.servo.maker_file import maker_parameters
+from hil.servo.messages import screen, verdict_of
+from identification.servo.parameters import PLACE
+
+SO101 = Path(__file__).resolve().parents[4] / "shared" / "data" / "so101"
+MICROSECONDS = 1e6
+
+
+def written(folder: Path, truth: arm.Planted, rng: np.random.Generator, duration: float) -> Path:
+    """Write a recording as a servo's logger does: two files, lists in cells, microseconds, load."""
+    folder.mkdir()
+    time, command = arm.commands(rng, duration)
+    position = arm.simulated(truth, time, command)
+    load = np.round(np.abs(command - position) * 10.0 / 0.0228) * 0.0228
+    velocity = np.gradient(position, time, axis=0)
+
+    def cells(row: np.ndarray) -> str:
+        return f'"{[float(number) for number in row]}"'
+
+    state = ["type,timestamp,positions,velocities,torques"]
+    control = ["type,timestamp,positions"]
+    for k, stamp in enumerate(time * MICROSECONDS):
+        parts = ",".join(map(cells, (position[k], velocity[k], load[k])))
+        state.append(f"STATE_MOTOR,{stamp},{parts}")
+        control.append(f"CONTROL,{stamp},{cells(command[k])}")
+    (folder / "state_motor.csv").write_text("\n".join(state) + "\n")
+    (folder / "control.csv").write_text("\n".join(control) + "\n")
+    (folder / "event.csv").write_text("type,timestamp,event\nEVENT,0,START\n")
+    return folder
+
+
+@pytest.fixture(scope="module")
+def identified(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, str, int]:
+    """Folder of results, output and exit status."""
+    root = tmp_path_factory.mktemp("servo")
+    rng = np.random.default_rng(5)
+    truth = arm.Planted.drawn(rng)
+    fitted = written(root / "fast", truth, rng, 30.0)
+    unseen = written(root / "slow", truth, rng, 12.0)
+    (root / "arm.urdf").write_text(arm.urdf())
+    maker = '<default><joint armature="0.03"/><position kp="20" forcerange="-3 3"/></default>'
+    (root / "maker.xml").write_text(maker)
+    done = CliRunner().invoke(
+        app,
+        ["identify", str(fitted), "--predict", str(unseen), "--urdf", str(root / "arm.urdf"),
+         "--compare", str(root / "maker.xml"), "-o", str(root / "out"), "-v"],
+    )  # fmt: skip
+    return root / "out", done.output, done.exit_code
+
+
+@pytest.mark.long
+class TestCommand:
+    def test_a_folder_of_states_and_commands_gives_a_verdict(
+        self, identified: tuple[Path, str, int]
+    ) -> None:
+        folder, output, status = identified
+        assert status == 0, output
+        results = ServoResults.load(folder / "results.json")
+        (unseen,) = results.validation
+        assert results.verdict.good
+        assert unseen.position_error_mrad < 5.0
+        assert unseen.position_error_mrad < 0.2 * unseen.command_error_mrad
+        assert unseen.compared_error_mrad is not None
+        assert unseen.position_error_mrad < unseen.compared_error_mrad
+
+    def test_the_load_of_a_servo_is_left_out_and_said(
+        self, identified: tuple[Path, str, int]
+    ) -> None:
+        _, output, _ = identified
+        lines = " ".join(output.split())
+        assert "torque: left out, it is never negative" in lines
+        assert "--columns 'torque=NAME'" in lines
+
+    def test_files_are_written(self, identified: tuple[Path, str, int]) -> None:
+        folder, _, _ = identified
+        names = {path.name for path in folder.iterdir()}
+        assert {"results.json", "report.html", "motion.png", "fast.mcap", "slow.mcap"} <= names
+        page = (folder / "report.html").read_text()
+        assert "maker.xml" in page
+        assert "Servo report" in page
+
+    def test_its_results_are_told_from_those_of_an_arm(
+        self, identified: tuple[Path, str, int]
+    ) -> None:
+        folder, _, _ = identified
+        assert is_servo_result(folder / "results.json")
+        document = json.loads((folder / "results.json").read_text())
+        assert {value["name"] for value in document["servo"]} == set(PLACE)
+
+    def test_a_touched_arm_is_said(self, identified: tuple[Path, str, int]) -> None:
+        folder, _, _ = identified
+        results = ServoResults.load(folder / "results.json")
+        (unseen,) = results.validation
+        assert not unseen.pushed
+        push = ServoPush(joint="lift", time=35.6, change_mrad=-60.0)
+        touched = results.model_copy(
+            update={"validation": [unseen.model_copy(update={"pushed": (push,)})]}
+        )
+        (warning,) = [w for w in verdict_of(touched).warnings if "touched" in w]
+        assert "lift by -60 mrad at 36 s" in warning
+
+    def test_the_screen_is_short(self, identified: tuple[Path, str, int]) -> None:
+        folder, _, _ = identified
+        lines = one_screen(screen(ServoResults.load(folder / "results.json")))
+        assert len(lines) <= 24
+        assert max(map(len, lines)) <= 100
+        assert any(line.startswith("slow.mcap") for line in lines)
+
+
+def exported(folder: Path, *options: object) -> tuple[int, str]:
+    """Return status of an export of results, and its output or why it was refused."""
+    done = CliRunner().invoke(app, ["export", str(folder), *map(str, options)])
+    return done.exit_code, f"{done.output}{done.exception or ''}"
+
+
+def identified_values(folder: Path, engine: str, name: str) -> dict[str, float]:
+    """Return a parameter with the terms of an engine by joint."""
+    servo = ServoResults.load(folder / "results.json").simulators[engine].servo
+    return {value.joint: value.value for value in servo if value.name == name}
+
+
+def executed(path: Path) -> dict[str, Any]:
+    """Return what a Python file defines."""
+    space: dict[str, Any] = {}
+    exec(compile(path.read_text(), str(path), "exec"), space)
+    return space
+
+
+@pytest.mark.long
+class TestExports:
+    def test_mujoco_plays_the_held_out_motion_back(
+        self, identified: tuple[Path, str, int], tmp_path: Path
+    ) -> None:
+        folder, _, _ = identified
+        path = tmp_path / "arm.xml"
+        done = CliRunner().invoke(
+            app, ["export", str(folder), "--to", "mjcf", "-o", str(path), "--json"]
+        )
+        assert done.exit_code == 0, done.output
+        (played,) = json.loads(done.stdout)["played_back"]
+        simple = ServoResults.load(folder / "results.json").simulators["mujoco"].validation[0]
+        # MuJoCo is an integrator of its own, and moves all joints at once.
+        assert played["error"] == pytest.approx(simple.position_error_mrad, rel=0.15)
+        assert played["error"] < 0.2 * played["command"]
+
+    def test_an_mjcf_has_position_actuators_with_delay(
+        self, identified: tuple[Path, str, int], tmp_path: Path
+    ) -> None:
+        mujoco = pytest.importorskip("mujoco")
+        folder, _, _ = identified
+        path = tmp_path / "arm.xml"
+        assert exported(folder, "--to", "mjcf", "-o", path)[0] == 0
+        model = mujoco.MjModel.from_xml_path(str(path))
+        for name in arm.NAMES:
+            actuator = model.actuator(name).id
+            dof = model.joint(name).dofadr[0]
+            kp = identified_values(folder, "mujoco", "kp")[name]
+            assert model.actuator_gainprm[actuator, 0] == pytest.approx(kp)
+            assert model.actuator_biasprm[actuator, 1] == pytest.approx(-kp)
+            delay = identified_values(folder, "mujoco", "delay")[name]
+            assert model.actuator_delay[actuator] == pytest.approx(delay)
+            for term, attribute in (
+                ("coulomb", model.dof_frictionloss),
+                ("viscous", model.dof_damping),
+                ("armature", model.dof_armature),
+            ):
+                value = identified_values(folder, "mujoco", term)[name]
+                assert attribute[dof] == pytest.approx(value, rel=1e-6)
+
+    def test_isaac_lab_gets_drives_with_friction_and_delay_in_steps(
+        self,
+        identified: tuple[Path, str, int],
+        tmp_path: Path,
+        monkeypatch: pytest.MonkeyPatch,
+    ) -> None:
+        folder, _, _ = identified
+        path = tmp_path / "arm.py"
+        assert exported(folder, "--to", "isaaclab", "-o", path)[0] == 0
+        isaaclab = ModuleType("isaaclab.actuators")
+        isaaclab.DelayedPDActuatorCfg = SimpleNamespace  # type: ignore[attr-defined]
+        monkeypatch.setitem(sys.modules, "isaaclab", ModuleType("isaaclab"))
+        monkeypatch.setitem(sys.modules, "isaaclab.actuators", isaaclab)
+        drives = executed(path)["actuators"](physics_dt=0.005)
+        assert list(drives) == list(arm.NAMES)
+        for name, drive in drives.items():
+            assert drive.joint_names_expr == [name]
+            kp = identified_values(folder, "physx", "kp")[name]
+            assert drive.stiffness == pytest.approx(kp, rel=1e-5)
+            assert drive.dynamic_friction <= drive.friction
+            delay = identified_values(folder, "physx", "delay")[name]
+            assert drive.min_delay == drive.max_delay == round(delay / 0.005)
+
+    def test_genesis_gets_the_values_of_each_dof(
+        self, identified: tuple[Path, str, int], tmp_path: Path
+    ) -> None:
+        folder, _, _ = identified
+        path = tmp_path / "arm.py"
+        assert exported(folder, "--to", "genesis", "-o", path)[0] == 0
+        entity = Mock()
+        places = dict(zip(arm.NAMES, (2, 0, 1), strict=True))
+        entity.get_joint = lambda name: SimpleNamespace(dofs_idx_local=[places[name]])
+        executed(path)["apply"](entity)
+        values, dofs = entity.set_dofs_kp.call_args.args
+        kp = identified_values(folder, "mujoco", "kp")
+        assert dofs == [2, 0, 1]
+        assert values == pytest.approx([kp[name] for name in arm.NAMES], rel=1e-5)
+        for setter in ("armature", "damping", "frictionloss", "force_range"):
+            assert getattr(entity, f"set_dofs_{setter}").called
+
+    def test_ranges_contain_the_values_and_say_where_they_are_from(
+        self, identified: tuple[Path, str, int], tmp_path: Path
+    ) -> None:
+        folder, _, _ = identified
+        path = tmp_path / "arm.xml"
+        assert exported(folder, "--to", "mjcf", "-o", path, "--ranges", "--ensemble", 4)[0] == 0
+        document = json.loads((tmp_path / "arm.ranges.json").read_text())
+        fields = document["ranges"]
+        assert set(fields) == {
+            "kp", "forcerange", "delay", "frictionloss", "damping", "armature", "offset"
+        }  # fmt: skip
+        for field in fields.values():
+            for entry in field.values():
+                infinite = entry["high"] is None
+                assert entry["low"] <= entry["value"] and (
+                    infinite or entry["value"] <= entry["high"]
+                )
+                assert entry["from"] in ("data", "prior")
+        assert {entry["from"] for entry in fields["kp"].values()} == {"data"}
+        assert fields["kp"]["lift"]["unit"] == "N·m/rad"
+        assert np.shape(document["draws"]["kp"]) == (4, 3)
+        mujoco = pytest.importorskip("mujoco")
+        for k in range(4):
+            model = mujoco.MjModel.from_xml_path(str(tmp_path / f"arm_{k + 1}.xml"))
+            kp = document["draws"]["kp"][k]
+            assert model.actuator_gainprm[:, 0] == pytest.approx(kp, rel=1e-5)
+
+    def test_draws_are_correlated_as_the_posterior_is(
+        self, identified: tuple[Path, str, int], tmp_path: Path
+    ) -> None:
+        folder, _, _ = identified
+        path = tmp_path / "arm.py"
+        assert exported(folder, "--to", "genesis", "-o", path, "--ensemble", 2000)[0] == 0
+        draws = json.loads((tmp_path / "arm.ranges.json").read_text())["draws"]
+        posterior = ServoResults.load(folder / "results.json").simulators["mujoco"].posterior
+        for joint in range(3):
+            # Coordinates are logarithms of 1 / kp and of friction over kp.
+            first = joint * len(PLACE)
+            logarithms = np.zeros((2, len(posterior.covariance)))
+            logarithms[:, first + PLACE["kp"]] = -1.0
+            logarithms[1, first + PLACE["viscous"]] = 1.0
+            expected = logarithms @ np.array(posterior.covariance) @ logarithms.T
+            found = np.cov([np.log(draws[name])[:, joint] for name in ("KP", "DAMPING")])
+            np.testing.assert_allclose(found, expected, atol=0.15 * expected.max())
+
+    def test_an_own_mjcf_is_changed_in_place(
+        self, identified: tuple[Path, str, int], tmp_path: Path
+    ) -> None:
+        folder, _, _ = identified
+        path = tmp_path / "own.xml"
+        path.write_text(OWN)
+        status, output = exported(folder, "--to", "mjcf", "--into", path)
+        assert status == 0, output
+        text = path.read_text()
+        assert "not read back" in output  # its mesh is not there
+        assert "<!-- my arm -->" in text and 'mesh file="hand.stl"' in text
+        root = ElementTree.fromstring(text)
+        finger = root.find(".//joint[@name='finger']")
+        assert finger is not None and finger.attrib == {"name": "finger", "damping": "9"}
+        kp = identified_values(folder, "mujoco", "kp")
+        by_joint = {node.get("joint"): node for node in root.iter("position")}
+        assert set(by_joint) == set(arm.NAMES)
+        for name, node in by_joint.items():
+            assert float(node.attrib["kp"]) == pytest.approx(kp[name])
+        assert by_joint["pan"].get("name") == "m1" and by_joint["pan"].get("ctrlrange") == "-1 1"
+        assert "dampratio" not in by_joint["pan"].attrib
+
+    def test_a_file_without_the_joints_is_left_as_it_is(
+        self, identified: tuple[Path, str, int], tmp_path: Path
+    ) -> None:
+        folder, _, _ = identified
+        path = tmp_path / "other.xml"
+        path.write_text(OWN.replace('"elbow"', '"other"'))
+        before = path.read_text()
+        status, output = exported(folder, "--to", "mjcf", "--into", path)
+        assert status != 0 and "there is no joint elbow" in output
+        assert path.read_text() == before
+
+    def test_an_own_urdf_gets_friction(
+        self, identified: tuple[Path, str, int], tmp_path: Path
+    ) -> None:
+        folder, _, _ = identified
+        path = tmp_path / "own.urdf"
+        path.write_text(arm.urdf())
+        assert exported(folder, "--to", "urdf", "--into", path)[0] == 0
+        root = ElementTree.fromstring(path.read_text())
+        coulomb = identified_values(folder, "mujoco", "coulomb")
+        for joint in root.findall("joint"):
+            dynamics = joint.find("dynamics")
+            assert dynamics is not None
+            friction = float(dynamics.attrib["friction"])
+            assert friction == pytest.approx(coulomb[joint.attrib["name"]])
+
+    def test_a_format_without_servos_is_refused(self, identified: tuple[Path, str, int]) -> None:
+        folder, _, _ = identified
+        status, output = exported(folder, "--to", "sdf")
+        assert status != 0 and "which --to sdf does not express" in output
+
+
+OWN = """<?xml version="1.0"?>
+<!-- my arm -->
+<mujoco><asset><mesh file="hand.stl"/></asset><worldbody>
+  <body><inertial mass="1" pos="0 0 0" diaginertia="1 1 1"/><joint name="pan"/>
+  <body><inertial mass="1" pos="0 0 0" diaginertia="1 1 1"/><joint name="lift" damping="7"/>
+  <body><inertial mass="1" pos="0 0 0" diaginertia="1 1 1"/><joint name="elbow"/>
+  <body><joint name="finger" damping="9"/><geom type="mesh" mesh="hand"/>
+  </body></body></body></body>
+  </worldbody>
+  <actuator><position name="m1" joint="pan" kp="3" dampratio="1" ctrlrange="-1 1"/>
+  <motor name="m2" joint="lift" ctrlrange="-9 9"/></actuator></mujoco>
+"""
+
+
+class TestMakerFile:
+    JOINTS = ("a", "b")
+
+    def test_classes_are_inherited(self, tmp_path: Path) -> None:
+        path = tmp_path / "arm.xml"
+        path.write_text("""<mujoco>
+          <default><joint damping="1"/>
+            <default class="servo"><joint armature="0.02" frictionloss="0.1"/>
+              <position kp="17" kv="0.5" forcerange="-3 3"/></default></default>
+          <worldbody><body childclass="servo"><joint name="a"/>
+            <body><joint name="b" damping="0.2"/></body></body></worldbody>
+          <actuator><position class="servo" joint="a"/>
+            <position class="servo" joint="b" kp="9"/></actuator></mujoco>""")
+        values = maker_parameters(path, self.JOINTS)
+        assert values[:, PLACE["kp"]].tolist() == [17.0, 9.0]
+        assert values[:, PLACE["viscous"]] == pytest.approx([1.5, 0.7])
+        assert values[:, PLACE["armature"]].tolist() == [0.02, 0.02]
+        assert values[:, PLACE["limit"]].tolist() == [3.0, 3.0]
+
+    @pytest.mark.parametrize(
+        ("text", "problem"),
+        [
+            ("no xml", "is no XML"),
+            ("<mujoco/>", "no position actuator of joint a"),
+            ('<default><position kp="none"/></default>', "no number"),
+            ('<default><position kp="-1"/></default>', "stiffness of -1"),
+        ],
+    )
+    def test_what_cannot_be_compared_is_refused(
+        self, tmp_path: Path, text: str, problem: str
+    ) -> None:
+        path = tmp_path / "arm.xml"
+        path.write_text(text)
+        with pytest.raises(InputError, match=problem) as caught:
+            maker_parameters(path, self.JOINTS)
+        assert caught.value.remedy
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(not SO101.is_dir(), reason="the motions of the SO-101 are not here")
+def test_a_real_arm_is_predicted_from_its_commands(tmp_path: Path) -> None:
+    """The goals of the command: 8 and 6 mrad of motions whose commands are 16 and 33 off."""
+    done = CliRunner().invoke(
+        app,
+        ["identify", str(SO101 / "chirp_sweep"), str(SO101 / "coupled_joints"),
+         "--predict", str(SO101 / "circular_motion"), "--predict",
+         str(SO101 / "backlash_detection"), "--urdf", str(SO101 / "robot.urdf"),
+         "-o", str(tmp_path / "out")],
+    )  # fmt: skip
+    assert done.exit_code == 0, done.output
+    circular, backlash = ServoResults.load(tmp_path / "out" / "results.json").validation
+    assert circular.position_error_mrad < 8.0
+    assert backlash.position_error_mrad < 6.0
