@@ -22,7 +22,8 @@ from rich.terminal_theme import MONOKAI, TerminalTheme
 from hil import Campaign, Cell, Silent, Stop, reporter
 from hil.campaign import design
 from hil.campaign.operator import RunStatus
-from hil.campaign.screen import Keyboard, Screen
+from hil.campaign.operator_keys import Keyboard
+from hil.campaign.screen import Screen
 
 HERE: Final = Path(__file__).parent
 COLUMNS = 80

@@ -49,9 +49,10 @@ from drivers.errors import (
 )
 from drivers.execution import Execution
 from drivers.guard import FIRST_FRACTION, Guard, Joints, all_true, require
+from drivers.losses import LossTracker
 from drivers.packets import Mode
 from drivers.safe_reply import D1, D2, PacketStatus, ReplyBuilder
-from drivers.states import LossTracker, State
+from drivers.states import State
 
 MAX_TARGET_JUMP: Final = 0.25
 """Share of the following-error threshold allowed between target and set-point sent last."""

@@ -77,6 +77,7 @@ from drivers.events import (
 )
 from drivers.execution import Execution, execution_of
 from drivers.guard import Guard
+from drivers.losses import LossTracker
 from drivers.motion_source import MotionSource
 from drivers.open_mode import Exit, OpenCycle, OpenReply, Refuse, Reply
 from drivers.packets import (
@@ -100,7 +101,6 @@ from drivers.states import (
     Axes,
     Decision,
     Input,
-    LossTracker,
     Outcome,
     State,
     decide,

@@ -53,9 +53,9 @@ from identification.model.regressor import Regressor
 from identification.model.robot import RobotModel
 from identification.selection.essential import Elimination, eliminate
 from identification.signals.clock import SampleTimes, TimeBase, time_base, true_times
+from identification.signals.noise import standstill_variance
 from identification.signals.recording import Recording, RecordingError
 from identification.signals.samples import Preprocessing, Samples, prepare, smooth
-from identification.signals.smoothing import standstill_variance
 from identification.validation.evidence import Evidence, gather
 from identification.validation.prediction import PredictionError, prediction_error
 from identification.validation.verdict import Thresholds, Verdict, judge

@@ -12,7 +12,7 @@ from typing import Final
 
 import can
 
-from drivers.transports.can.profile import UP, BusRates, CanEndpoint
+from drivers.transports.can.frames import UP, BusRates, CanEndpoint
 from drivers.transports.can.transport import CanLink, CanSpec, open_bus
 
 START_PATIENCE: Final = 0.25

@@ -25,8 +25,8 @@ from hil.base.errors import ArchiveError
 from hil.cell import Cell
 from hil.control.motions import CampaignMotion
 from hil.control.slips import slip_of
+from identification.signals.noise import STANDSTILL_WINDOW
 from identification.signals.recording import stuck
-from identification.signals.smoothing import STANDSTILL_WINDOW
 from identification.text import percentage
 from planner import FourierSeries, PiecewiseCubic
 

@@ -13,7 +13,7 @@ from pydantic import BaseModel, ConfigDict
 
 from hil.base.errors import InputError
 from hil.base.terminal_text import typed
-from hil.cell.gripper import links_of
+from hil.cell.gripper_names import links_of
 
 LINKS_REMEDY: Final = "name links of the URDF, the tip farther from the root than the base"
 _MOST_NAMES: Final = 12

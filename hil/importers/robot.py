@@ -21,7 +21,7 @@ from hil.base.safe_input import path_exists, read_input
 from hil.base.toml_text import to_text
 from hil.cell import Cell
 from hil.cell.arms import Links, joints_outside
-from hil.cell.gripper import gripper_joints
+from hil.cell.gripper_names import gripper_joints
 from hil.cell.nominal import nominal_of
 from hil.cell.text import urdf_limits, with_values
 from hil.cell.urdf_units import unit_problem

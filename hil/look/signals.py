@@ -48,8 +48,8 @@ from hil.look.readings import (
 from hil.look.result import Aspect, Row
 from hil.pipeline.sources import Source
 from identification.signals.clock import time_base
+from identification.signals.noise import noiseless_above
 from identification.signals.recording import STUCK_MOVEMENT, UNWRAPPED, Recording
-from identification.signals.smoothing import noiseless_above
 
 _FOLLOWS: Final = 0.7  # correlation of a velocity with the slope of its position
 _CLOSE: Final = 0.1  # relative deviation of their ratio

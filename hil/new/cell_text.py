@@ -26,7 +26,7 @@ from hil.base.safe_input import read_input, read_text
 from hil.base.toml_text import comment_lines, inline
 from hil.cell.arms import Links, joints_outside
 from hil.cell.errors import UNKNOWN, WHERE, models_of
-from hil.cell.gripper import gripper_joints, links_of
+from hil.cell.gripper_names import gripper_joints, links_of
 from hil.cell.schema import CellFile
 from hil.cell.text import urdf_limits
 from hil.importers.dh import Convention, urdf_of_dh, urdf_of_parameters

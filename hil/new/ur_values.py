@@ -18,7 +18,7 @@ from drivers.ur.torque_constants import UNCERTAINTY, by_size, stated_constants
 from hil.base.arrays import Array
 from hil.base.errors import ControllerError, InputError
 from hil.cell.errors import UNKNOWN
-from hil.cell.gripper import links_of
+from hil.cell.gripper_names import links_of
 from hil.cell.schema import RtdeTable
 
 from .cell_text import NewCell, cell_of_parameters

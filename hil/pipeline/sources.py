@@ -23,6 +23,7 @@ from hil.base.files import file_digest
 from hil.base.safe_input import path_exists
 from hil.cell import Cell
 from identification.signals.clock import SampleTimes, true_times
+from identification.signals.noise import standstill_variance
 from identification.signals.recording import (
     Recording,
     RecordingError,
@@ -31,7 +32,6 @@ from identification.signals.recording import (
     without_repeats,
 )
 from identification.signals.row_faults import RowFault, without_faulty_rows
-from identification.signals.smoothing import standstill_variance
 from identification.text import percentage
 
 FLOAT32_STEP = 2.0**-24

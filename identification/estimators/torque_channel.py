@@ -20,13 +20,13 @@ from identification.arrays import Array
 from identification.factor.blocks import EqualRuns, add_grams, equal_runs
 from identification.model.robot import RobotModel
 from identification.signals.masks import LONGEST_END, edge_rows
+from identification.signals.noise import noiseless_above
 from identification.signals.recording import Recording
 from identification.signals.samples import RIGID_BANDWIDTH, Preprocessing, Samples, prepare
 from identification.signals.smoothing import (
     FORWARDS,
     WITHOUT_PHASE,
     LowPassShape,
-    noiseless_above,
 )
 
 Complex = NDArray[np.complex128]

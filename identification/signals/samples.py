@@ -13,12 +13,12 @@ from identification.model.motion import Motion
 from identification.model.regressor import Regressor
 from identification.model.robot import RobotModel
 from identification.signals.masks import SHORTEST_STRETCH, LeftOut, RowMask, mask_rows
+from identification.signals.noise import difference_variance
 from identification.signals.recording import Recording, RecordingError
 from identification.signals.smoothing import (
     SMOOTHER,
     LowPassShape,
     SmoothingSpline,
-    difference_variance,
     fit_smoothing_spline,
     low_passed,
 )

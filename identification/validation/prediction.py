@@ -14,8 +14,9 @@ from numpy.typing import NDArray
 
 from identification.arrays import Array
 from identification.model.robot import RobotModel
+from identification.signals.noise import noiseless_above
 from identification.signals.samples import Samples
-from identification.signals.smoothing import low_pass, noiseless_above
+from identification.signals.smoothing import low_pass
 
 FRICTION_CHANGE: Final = 0.10
 # Hz. The torque of a rigid arm lies below, torque ripple and current noise above.

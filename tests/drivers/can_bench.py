@@ -24,7 +24,7 @@ from drivers import (
     exchange,
 )
 from drivers.packets import next_number
-from drivers.transports.can.profile import DOWN, PAYLOADS_FD, UP, BusRates, CanEndpoint
+from drivers.transports.can.frames import DOWN, PAYLOADS_FD, UP, BusRates, CanEndpoint
 from drivers.transports.can.transport import CanTransport
 from hil.cell import Cell
 from hil.control.simulation import planted_truth, simulated_drive

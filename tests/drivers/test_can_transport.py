@@ -17,7 +17,7 @@ from can.interfaces.slcan import slcanBus
 
 from drivers import CyclicPacket, GapSeen, MotionEnded, PacketRejected, State, TransportClosed
 from drivers.transports.base import TransportError
-from drivers.transports.can.profile import (
+from drivers.transports.can.frames import (
     UP,
     BusRates,
     CanBusLoadError,

@@ -14,14 +14,13 @@ from pathlib import Path
 import pytest
 
 from drivers.exchange.loop import exchange
+from drivers.losses import LOSS_WINDOW, LossTracker
 from drivers.session import Session
 from drivers.states import (
     HAS_SET_POINTS,
-    LOSS_WINDOW,
     TRANSITIONS,
     Decision,
     Input,
-    LossTracker,
     State,
     decide,
     keeps_request,
@@ -208,8 +207,8 @@ class TestOwner:
 IN_THE_SESSION = {
     "session", "packets", "safe_reply", "open_mode", "guard", "drive_train", "execution",
 }  # fmt: skip
-BESIDE = {"states", "record"}
-"""The session's table, and the ring that receives the record."""
+BESIDE = {"states", "losses", "record"}
+"""The session's table, what it counts as lost, and the ring that receives the record."""
 
 
 BEFORE = {"udp", "loop"}

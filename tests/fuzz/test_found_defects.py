@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from drivers import CyclicPacket
-from drivers.transports.can.profile import DOWN, UP, BusRates, CanEndpoint
+from drivers.transports.can.frames import DOWN, UP, BusRates, CanEndpoint
 from hil.archive import ImportedSamples, write_samples
 from hil.base.errors import ArchiveError, InputError, SourceError
 from hil.base.toml_text import from_text

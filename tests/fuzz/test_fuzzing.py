@@ -13,8 +13,8 @@ import numpy as np
 import pytest
 
 from drivers import CyclicPacket, Guard, Session
-from drivers.transports.can import profile
-from drivers.transports.can.profile import CanEndpoint, TransferAssembler, payloads
+from drivers.transports.can import frames
+from drivers.transports.can.frames import CanEndpoint, TransferAssembler, payloads
 from hil.archive import ArchiveHeader, open_archive
 from hil.base.errors import ArchiveError
 from tests.fuzz import __main__ as command
@@ -51,7 +51,7 @@ PLANTED: dict[str, tuple[str, Any, str, Callable[..., Any], str]] = {
     "a link that sends nothing by CAN":
         ("codec", CanEndpoint, "frames", lambda *_: int("none"), "ValueError"),
     "transfers without their last frame":
-        ("codec", profile, "payloads", cut_short, IN_THE_CODEC),
+        ("codec", frames, "payloads", cut_short, IN_THE_CODEC),
     "an assembler that loses axes":
         ("codec", TransferAssembler, "add", loses_axes(TransferAssembler.add), IN_THE_CODEC),
     "a header whose errors are not named":

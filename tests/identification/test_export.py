@@ -35,7 +35,8 @@ from identification.model.payload import Payload
 from identification.model.robot import RobotModel
 from identification.model.urdf_text import LONGEST, MOST_LINKS, refusal, urdf_tree
 from identification.model.workspace import Workspace
-from identification.signals.smoothing import LowPassShape, low_passed, noiseless_above
+from identification.signals.noise import noiseless_above
+from identification.signals.smoothing import LowPassShape, low_passed
 from sim_fixtures.ns16 import urdf_text
 from tests import messages
 from tests.identification.robots import random_urdf, robot_text, some_bodies

@@ -29,6 +29,11 @@ from identification.signals.masks import (
     flat_topped,
     mask_rows,
 )
+from identification.signals.noise import (
+    difference_variance,
+    noiseless_above,
+    standstill_variance,
+)
 from identification.signals.recording import (
     Recording,
     RecordingError,
@@ -38,11 +43,8 @@ from identification.signals.recording import (
 )
 from identification.signals.samples import Preprocessing, prepare
 from identification.signals.smoothing import (
-    difference_variance,
     fit_smoothing_spline,
     low_pass,
-    noiseless_above,
-    standstill_variance,
 )
 from tests.identification.two_link import MODEL, URDF, one_sine, sine_motion, truth
 

@@ -11,8 +11,8 @@ import pytest
 
 from drivers.execution import Execution
 from drivers.guard import Guard
+from drivers.losses import LossTracker
 from drivers.packets import PacketSequence
-from drivers.states import LossTracker
 from hil.archive.recorder import Recorder
 from hil.campaign.folder import CampaignFolder
 from hil.campaign.motion_runner import Runner

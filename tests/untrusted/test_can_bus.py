@@ -15,7 +15,7 @@ import numpy as np
 import pytest
 
 from drivers import MotionEnded, PacketRejected, TransportClosed
-from drivers.transports.can.profile import PACKED, BusRates
+from drivers.transports.can.frames import PACKED, BusRates
 from drivers.transports.can.transport import CanTransport
 from sim_fixtures import Phase
 from sim_fixtures.can_link import CanControllerLink

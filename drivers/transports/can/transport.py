@@ -21,7 +21,7 @@ from can.interfaces.udp_multicast import UdpMulticastBus
 
 from drivers.errors import TransportClosed
 from drivers.transports.base import CanBus, LinkInUseError, TransportError, TransportSpec
-from drivers.transports.can.profile import DOWN, BusRates, CanEndpoint, CanError, Frame
+from drivers.transports.can.frames import DOWN, BusRates, CanEndpoint, CanError, Frame
 
 logging.getLogger("can").addHandler(logging.NullHandler())  # our errors have its reasons
 

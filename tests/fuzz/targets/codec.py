@@ -16,7 +16,7 @@ from drivers.packets import (
     next_number,
     packet_number,
 )
-from drivers.transports.can.profile import DOWN, UP, BusRates, CanEndpoint, CanError, Frame
+from drivers.transports.can.frames import DOWN, UP, BusRates, CanEndpoint, CanError, Frame
 from tests.fuzz.draw import Draw, mutate_bytes
 from tests.fuzz.targets import Target
 

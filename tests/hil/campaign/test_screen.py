@@ -26,7 +26,8 @@ from hil.base.progress import Bar, LineReporter, Silent, reporter
 from hil.base.progress_lines import ProgressLines
 from hil.campaign import screen as layout
 from hil.campaign.operator import RunStatus
-from hil.campaign.screen import Keyboard, Screen, ScreenError, after, single_keys, typed
+from hil.campaign.operator_keys import Keyboard, after, single_keys, typed
+from hil.campaign.screen import Screen, ScreenError
 from hil.cell import Cell
 from hil.cell.schema import CanTable
 from hil.control.motion_watch import MotionProgress, OperatorRequest, Stop
@@ -362,7 +363,9 @@ def test_a_blocked_terminal_delays_no_stop(tmp_path: Path) -> None:
 
 def test_split_key_sequences_are_joined(monkeypatch: pytest.MonkeyPatch) -> None:
     """Over a slow line the parts of an arrow come one by one; none of them is a key."""
-    monkeypatch.setattr("hil.campaign.screen._SEQUENCE_WAIT", 5.0)  # this machine may be slow, too
+    monkeypatch.setattr(
+        "hil.campaign.operator_keys._SEQUENCE_WAIT", 5.0
+    )  # this machine may be slow, too
     near, far = pty.openpty()
     pressed: list[str] = []
     keyboard = Keyboard(pressed.append)

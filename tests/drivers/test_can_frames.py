@@ -13,8 +13,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from drivers.packets import LAST_NUMBER, CyclicPacket, Mode, cyclic_length, next_number
-from drivers.transports.can import profile as can_profile
-from drivers.transports.can.profile import (
+from drivers.transports.can import frames
+from drivers.transports.can.frames import (
     DOWN,
     LOAD_LIMIT,
     PACKED,
@@ -239,7 +239,7 @@ class TestDbc:
 
     @pytest.fixture
     def database(self):
-        folder = Path(can_profile.__file__).parent
+        folder = Path(frames.__file__).parent
         return cantools.database.load_file(folder / "c4g_open_fd.dbc", strict=True)
 
     @pytest.mark.parametrize(("sends", "name"), [(UP, "UP"), (DOWN, "DOWN")])

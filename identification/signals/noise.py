@@ -1,0 +1,127 @@
+"""Noise floor of a recording: at standstill, in motion, and whether there is any."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Final
+
+import numpy as np
+
+from identification.arrays import Array
+from identification.signals.recording import RecordingError
+from identification.signals.spectrum import HARRIS, power_density
+
+STANDSTILL_WINDOW: Final = 0.1  # s
+_SHORTEST_WINDOW: Final = 20  # samples
+_HIGHEST_DIFFERENCE: Final = 8
+
+
+def standstill_variance(time: Array, values: Array) -> Array:
+    """Return the noise variance per channel (c,) of a recording at standstill (m, c).
+
+    Median over windows of 0.1 s of the variance about a straight line, so that creep and single
+    stick-slip moves do not count. Zero for a constant reading.
+
+    Raises:
+        RecordingError: fewer samples than one window.
+    """
+    if len(time) < _SHORTEST_WINDOW:
+        raise RecordingError(
+            f"a variance at standstill requires {_SHORTEST_WINDOW} samples, got {len(time)}"
+        )
+    width = max(_SHORTEST_WINDOW, round(STANDSTILL_WINDOW / float(np.median(np.diff(time)))))
+    width = min(width, len(time))
+    count = len(time) // width
+    line = np.linspace(-1.0, 1.0, width)
+    basis = np.column_stack([np.ones(width), line])
+    basis /= np.linalg.norm(basis, axis=0)
+    windows = values[: count * width].reshape(count, width, -1)
+    windows = windows - windows.mean(axis=1, keepdims=True)
+    residual = windows - np.einsum("wk,vk,nvc->nwc", basis, basis, windows)
+    freedom = width - 2
+    variance = (residual**2).sum(axis=1) / freedom
+    # Median over mean of a chi-squared variable (Wilson and Hilferty).
+    return np.asarray(np.median(variance, axis=0) / (1.0 - 2.0 / (9.0 * freedom)) ** 3)
+
+
+def difference_variance(time: Array, values: Array) -> Array:
+    """Return the white noise variance (c,) of smooth channels (m, c).
+
+    By divided differences of rising order, scaled to unit noise gain (Gasser, Sroka and
+    Jennen-Steinmetz 1986), up to the order at which the next changes the estimate by less than 5 %.
+
+    Raises:
+        RecordingError: fewer samples than the highest order needs.
+    """
+    if len(time) < 2 * _HIGHEST_DIFFERENCE:
+        raise RecordingError(
+            f"a noise variance requires {2 * _HIGHEST_DIFFERENCE} samples, got {len(time)}"
+        )
+    variances = [_difference_variance(time, values, 1)]
+    settled = np.zeros((0, values.shape[1]), dtype=np.bool_)
+    for order in range(2, _HIGHEST_DIFFERENCE + 1):
+        variances.append(_difference_variance(time, values, order))
+        settled = np.array(variances[1:]) > 0.95 * np.array(variances[:-1])
+        if settled.any(axis=0).all():  # higher orders are not needed
+            break
+    estimates = np.array(variances)
+    first = np.where(settled.any(axis=0), settled.argmax(axis=0), _HIGHEST_DIFFERENCE - 1)
+    return np.asarray(np.take_along_axis(estimates, first[None, :], axis=0)[0])
+
+
+def _difference_variance(time: Array, values: Array, order: int) -> Array:
+    total = np.zeros(values.shape[1])
+    count = len(time) - order
+    for start in range(0, count, ROWS_AT_ONCE):
+        rows = min(ROWS_AT_ONCE, count - start)
+        channels = np.ascontiguousarray(values[start : start + rows + order].T)
+        times = [time[start + k : start + k + rows] for k in range(order + 1)]
+        scale = times[-1] - times[0]
+        weights = np.ones((order + 1, rows))
+        for k in range(order + 1):
+            for earlier in range(k):
+                apart = (times[k] - times[earlier]) / scale
+                weights[k] *= apart
+                weights[earlier] *= -apart
+        np.divide(1.0, weights, out=weights)
+        weights /= np.linalg.norm(weights, axis=0)
+        difference = weights[0] * channels[:, :rows]
+        for k in range(1, order + 1):
+            difference += weights[k] * channels[:, k : k + rows]
+        total += np.einsum("cm,cm->c", difference, difference)
+    return np.asarray(total / count)
+
+
+ROWS_AT_ONCE: Final = 8192  # of a long recording, whose intermediate arrays would be its largest
+_STRETCH: Final = 4.0  # s; resolution 0.25 Hz
+_FEWEST: Final = 32  # samples
+_NO_POWER: Final = 1e-6  # share of a signal's power; noise of 0.1 % of the amplitude
+_LOW_PASSED: Final = 0.75  # share of half the sampling rate; anti-alias filters cut at about 0.8
+
+
+def noiseless_above(time: Array, signals: Array, segments: Sequence[slice]) -> float | None:
+    """Return the frequency [Hz] above which signals (m, c) have no power; None with noise."""
+    frequency, power = _power(time, signals, segments)
+    power = power[:, power.sum(axis=0) > 0.0]
+    if not power.size:
+        return None
+    above = np.cumsum(power[::-1], axis=0)[::-1]
+    silent = np.all(above < _NO_POWER * above[0], axis=1)
+    edge = float(frequency[np.argmax(silent)])
+    return edge if silent.any() and edge < _LOW_PASSED * frequency[-1] else None
+
+
+def _power(time: Array, signals: Array, segments: Sequence[slice]) -> tuple[Array, Array]:
+    """Return frequencies (f,) above zero and power spectral densities (f, c)."""
+    longest = max(
+        segments, key=lambda segment: int(segment.stop - segment.start), default=slice(0, 0)
+    )
+    time = time[longest]
+    signals = signals[longest]
+    if time.size < _FEWEST:
+        return np.empty(0), np.empty((0, signals.shape[1]))
+    interval = float(np.median(np.diff(time)))
+    even = np.arange(time[0], time[-1], interval)
+    resampled = np.column_stack([np.interp(even, time, column) for column in signals.T])
+    length = min(len(even), max(_FEWEST, round(_STRETCH / interval)))
+    return power_density(resampled, 1.0 / interval, length, HARRIS)
