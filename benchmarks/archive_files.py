@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from drivers import DriveTrain
-from drivers.record import cycle_dtype
+from drivers.cycle_records import cycle_dtype
 from hil.archive import ArchiveName, ArchiveWriter
 from hil.cell import Cell
 from sim_fixtures.ns16 import CELL_PATH

@@ -26,14 +26,14 @@ from numpy.typing import NDArray
 
 from benchmarks import parser_of, show, timed
 from benchmarks.archive_files import JOINTS, PERIOD, drive_train, records
+from drivers.cycle_records import CycleRing
 from drivers.exchange import control as control_memory
 from drivers.exchange import event_log
 from drivers.exchange.control import SharedState
 from drivers.exchange.event_log import EventWriter
-from drivers.record import CycleRing
 from hil.archive import ArchiveSpec, open_archive
+from hil.archive.process_handle import ArchiveProcessHandle, Close, Closed, Open, Opened
 from hil.archive.schema import Batch, cycle_messages
-from hil.archive.supervised import ArchiveProcessHandle, Close, Closed, Open, Opened
 from hil.archive.writer import ArchiveFile
 
 Array = NDArray[np.float64]

@@ -34,7 +34,7 @@ import numpy as np
 
 from benchmarks import parser_of, show
 from benchmarks.published import FITTED_SHARE, Published
-from hil.archive.recordings import open_recording
+from hil.archive.recording_of_archive import open_recording
 from hil.base.progress import Silent
 from hil.pipeline.estimating import estimate_with
 from hil.pipeline.options import Options

@@ -37,7 +37,7 @@ from benchmarks.turnaround_ends import (
     spin,
 )
 from drivers import MotionEnded
-from drivers.exchange.process import ExchangeProcess, ExchangeSettings
+from drivers.exchange.process_handle import ExchangeProcess, ExchangeSettings
 from drivers.exchange.realtime import RealTimeSettings
 from drivers.transports.udp import UdpSpec
 from hil.control.simulator_process import free_port

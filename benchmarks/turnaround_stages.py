@@ -17,11 +17,11 @@ from typing import Any, Final
 import numpy as np
 
 from drivers import open_mode, packets, safe_reply, session
+from drivers.cycle_records import CycleRing
 from drivers.drive_train import ArmWire
 from drivers.exchange import loop
 from drivers.execution import Execution
 from drivers.guard import Guard
-from drivers.record import CycleRing
 from drivers.transports.udp import UdpTransport
 
 FILE: Final = "HIL_TURNAROUND_STAGES"

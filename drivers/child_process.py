@@ -11,7 +11,7 @@ from contextlib import suppress
 from pathlib import Path
 from typing import Final
 
-from drivers.record import create_memory
+from drivers.cycle_records import create_memory
 
 _LONGEST_TEXT: Final = 1 << 20  # bytes of output that are read
 

@@ -2,8 +2,8 @@
 
 A `RefusalError` states why a set-point was not sent; a `GuardError` among them names a quantity
 outside its bound. `drivers.transports.base.TransportError` and
-`drivers.exchange.process.ExchangeError` are defined there. All errors survive pickling with message
-and attributes, without their cause.
+`drivers.exchange.process_handle.ExchangeError` are defined there. All errors survive pickling with
+message and attributes, without their cause.
 """
 
 # ruff: noqa: N818  leaves are named after the fault; their roots end in Error

@@ -49,7 +49,8 @@ from typing import Final
 
 import numpy as np
 
-from drivers.controller import Controller, connect
+from drivers.controller_description import Controller, connect
+from drivers.cycle_records import CycleRing
 from drivers.drive_train import DriveTrain
 from drivers.errors import (
     AxisNotInMode,
@@ -93,7 +94,6 @@ from drivers.packets import (
     is_init,
     packet_number,
 )
-from drivers.record import CycleRing
 from drivers.safe_reply import MODE, PacketStatus, ReplyBuilder, Words, words_of
 from drivers.states import (
     HAS_SET_POINTS,

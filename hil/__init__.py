@@ -42,11 +42,11 @@ if TYPE_CHECKING:
     from os import PathLike
 
     from hil.archive import open_archive
-    from hil.archive.recordings import open_recording
+    from hil.archive.recording_of_archive import open_recording
     from hil.base.progress import LineReporter, Reporter, Silent, reporter
     from hil.batch.graph import reidentify
     from hil.campaign import Campaign
-    from hil.campaign.identified import identify_campaign
+    from hil.campaign.identified_campaign import identify_campaign
     from hil.campaign.screen import Screen
     from hil.cell import Cell
     from hil.control.cell_link import cell_link
@@ -88,13 +88,13 @@ _HOME = {
     "cell_link": "control.cell_link",
     "export_model": "export.model_files",
     "identify_archives": "pipeline.run",
-    "identify_campaign": "campaign.identified",
+    "identify_campaign": "campaign.identified_campaign",
     "identify_servo": "identified.identified_arm",
     "load": "identified.identified_arm",
     "import_log": "importers.log",
     "import_rosbag2": "importers.rosbag2",
     "open_archive": "archive",
-    "open_recording": "archive.recordings",
+    "open_recording": "archive.recording_of_archive",
     "reidentify": "batch.graph",
     "run_study": "study",
     "simulated_controller": "control.simulation",

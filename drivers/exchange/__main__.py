@@ -13,6 +13,7 @@ from collections.abc import Sequence
 from contextlib import suppress
 from typing import Final
 
+from drivers.cycle_records import CycleRing
 from drivers.exchange import realtime
 from drivers.exchange.control import SharedState
 from drivers.exchange.event_log import (
@@ -23,11 +24,10 @@ from drivers.exchange.event_log import (
     ExchangeStarted,
 )
 from drivers.exchange.loop import MAX_LATE, exchange
-from drivers.exchange.process import ExchangeSettings
+from drivers.exchange.process_handle import ExchangeSettings
 from drivers.exchange.serving import CommandHandler, portable
 from drivers.exchange.warm_up import WarmUp, may_poll
 from drivers.guard import Guard
-from drivers.record import CycleRing
 from drivers.session import Session
 from drivers.states import State
 from drivers.transports.base import PollingTransport, Transport, TransportError

@@ -13,7 +13,7 @@ from collections.abc import Callable, Sequence
 from enum import IntEnum
 from typing import Any, ClassVar, Final, Self, TypeAlias
 
-from drivers.record import attach_memory, create_memory
+from drivers.cycle_records import attach_memory, create_memory
 from drivers.states import Outcome
 
 HEARTBEAT_TIMEOUT: Final = 0.5

@@ -12,10 +12,10 @@ import zlib
 from dataclasses import dataclass
 from typing import Final
 
+from drivers.cycle_records import attach_memory, create_memory
 from drivers.events import Event
 from drivers.exchange.control import HEARTBEAT_TIMEOUT, IDLE_HEARTBEAT_TIMEOUT
 from drivers.exchange.realtime import RealTimeReport
-from drivers.record import attach_memory, create_memory
 
 _SUSPENDED: Final = "it was suspended (Ctrl-Z, SIGSTOP, a debugger), or had no processor time"
 NO_SUPERVISOR: Final = (

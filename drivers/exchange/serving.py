@@ -13,6 +13,7 @@ from typing import Final
 
 import numpy as np
 
+from drivers.cycle_records import MEASURED, CycleRing
 from drivers.errors import DriverError, RequestError
 from drivers.events import Event, GapSeen, LinkLost, MotionEnded, PacketRejected, RepliesLost
 from drivers.exchange.control import (
@@ -37,7 +38,6 @@ from drivers.exchange.loop import POLL
 from drivers.exchange.motion_transfer import READ, WITHDRAWN, Inbox, unpack
 from drivers.motion_source import MotionSource, progress_of
 from drivers.packets import InitPacket
-from drivers.record import MEASURED, CycleRing
 from drivers.session import Session
 from drivers.states import State
 from drivers.transports.base import Transport

@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from drivers.arrays import Array
+from drivers.cycle_records import CycleRing
 from drivers.drive_train import DriveTrain
 from drivers.guard import Guard, GuardLimits
 from drivers.motion_source import BoundsName
@@ -22,7 +23,6 @@ from drivers.packets import (
     Mode,
     next_number,
 )
-from drivers.record import CycleRing
 from drivers.session import Session
 from drivers.states import State
 from drivers.transports.base import PollingTransport, Transport

@@ -8,9 +8,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from drivers.arrays import Array
+from drivers.cycle_records import cycle_dtype
 from drivers.drive_train import DriveTrain
 from drivers.packets import DRIVE_ON
-from drivers.record import cycle_dtype
 from drivers.states import State
 from drivers.ur.outputs import N_JOINTS, POWER_MODES, ROBOT_RUNNING
 from drivers.ur.reader import OutputFrames

@@ -22,13 +22,12 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
+from drivers.cycle_records import RingReader
 from drivers.events import InitReceived
 from drivers.exchange.control import ArchiveState, HeartbeatMonitor, SharedState
 from drivers.exchange.event_log import EventReader, ExchangeEvent
-from drivers.record import RingReader
 from hil.archive.live import LivePublisher, Serve
-from hil.archive.recorder import Recorder
-from hil.archive.supervised import (
+from hil.archive.process_handle import (
     Answer,
     Close,
     Closed,
@@ -39,6 +38,7 @@ from hil.archive.supervised import (
     Serving,
     Shutdown,
 )
+from hil.archive.recorder import Recorder
 from hil.base.errors import ArchiveError, InputError
 
 Records = NDArray[np.void]

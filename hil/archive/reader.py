@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from drivers.record import cycle_dtype
+from drivers.cycle_records import cycle_dtype
 from hil.archive import schema
 from hil.archive.cdr import Rows
 from hil.archive.header import (

@@ -14,9 +14,9 @@ from tempfile import TemporaryDirectory
 from typing import Any, Final, Literal, NamedTuple, Protocol
 
 from hil.archive import Archive, ArchiveName, ArchiveOutcome, open_archive
+from hil.archive.campaign_archives import Entry, RecordedCampaign
 from hil.archive.check import recording_date
 from hil.archive.header import KINDS
-from hil.archive.recorded_campaign import Entry, RecordedCampaign
 from hil.base.errors import ArchiveError, CampaignFolderError, InputError
 from hil.base.files import digest, file_digest, json_digest
 from hil.base.progress import Reporter

@@ -19,13 +19,13 @@ from hil.pipeline.options import Options
 from hil.precision.requirements import Requirement
 from identification.excitation import Excitation
 
+from .campaign_run import RunResult, run_motions
 from .folder import LOCK, PAYLOADS, CampaignFolder
 from .motion_runner import RunOptions
 from .operator import Operator, RunWatch
 from .plan import CampaignPlan
-from .rehearsal import Rehearsal
-from .rehearsing import SEED, rehearse
-from .run import RunResult, run_motions
+from .rehearsal_record import Rehearsal
+from .rehearsal_run import SEED, rehearse
 from .state import CampaignState
 from .status import CampaignStatus, status_of
 
@@ -78,7 +78,7 @@ class Campaign(CampaignState):
             InputError: there is no complete excitation yet, or the archives cannot be used.
             OutputError: the folder cannot be written to.
         """
-        from hil.campaign.identified import identify_campaign
+        from hil.campaign.identified_campaign import identify_campaign
         from hil.report.output_files import write_outcome
 
         reporter = reporter or Silent()

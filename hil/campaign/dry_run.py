@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hil.archive import open_archive
-from hil.archive.recorded_campaign import load_record
+from hil.archive.campaign_archives import load_record
 from hil.base.arrays import Array
 from hil.base.errors import ArchiveError
 from identification.model.motion import Motion

@@ -16,7 +16,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final, TypeVar
 
 from hil.archive import ArchiveName
-from hil.archive.recorded_campaign import Below, Entry, Manifest, RecordedCampaign
+from hil.archive.campaign_archives import Below, Entry, Manifest, RecordedCampaign
 from hil.base.errors import CampaignFolderError
 from hil.base.files import (
     digest,

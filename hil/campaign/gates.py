@@ -16,7 +16,7 @@ from .dry_run import DryRunRecord, not_accepted, yes_or_no
 from .errors import DryRunError, NotRehearsedError
 from .folder import CampaignFolder
 from .motion_runner import RunOptions
-from .rehearsal import Rehearsal
+from .rehearsal_record import Rehearsal
 from .state import CampaignState
 
 _ADDRESS: Final = {"transport", "host", "port", "bind", "can"}

@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Final, Literal, Self
 
-from hil.archive.recorded_campaign import load_record
+from hil.archive.campaign_archives import load_record
 from hil.base.terminal_text import plural
 from hil.precision.requirements import Requirement, requirements_from
 

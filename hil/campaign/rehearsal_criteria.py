@@ -25,7 +25,7 @@ from identification.validation.prediction import pooled_error, prediction_error
 
 from .folder import CampaignFolder
 from .oscillation import growing_oscillation
-from .rehearsal import EFFECTS, RehearsalCriterion
+from .rehearsal_record import EFFECTS, RehearsalCriterion
 from .twin import Twin
 
 MOST_SIGMA: Final = 4.0

@@ -11,11 +11,11 @@ from hil.base.progress import Reporter
 from hil.control.motions import CampaignMotion
 
 from .dry_run import OVERRIDE, DryRunRecord, DryRunState, is_from, not_accepted
+from .joint_warm_up import FrictionMeter, WarmUpRecord, drift_wanted
 from .motion_runner import RunArchives, Runner, RunOptions
 from .operator import ExpectedMotion, RunWatch
 from .quality import QualityProblem
 from .state import CampaignState
-from .warmup import FrictionMeter, WarmUpRecord, drift_wanted
 
 
 class DryRunStage:

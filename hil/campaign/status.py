@@ -18,10 +18,10 @@ from identification.text import percentage
 
 from .dry_run import DryRunRecord
 from .folder import PAYLOAD_RESULT, PAYLOADS, SIDES, CampaignFolder
+from .joint_warm_up import WarmUpRecord, drift_wanted
 from .precision_record import PrecisionRecord
-from .rehearsal import Rehearsal
+from .rehearsal_record import Rehearsal
 from .state import CampaignState
-from .warmup import WarmUpRecord, drift_wanted
 
 State = Literal["done", "next", "blocked"]
 NOT_REQUIRED: Final = "not required (warmup_drift)"

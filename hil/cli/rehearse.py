@@ -10,7 +10,7 @@ from hil.base.one_screen import brief
 from hil.base.progress import reporter as make_reporter
 from hil.base.progress import say
 from hil.campaign import Campaign, stop_on_interrupt
-from hil.campaign.rehearsal import Rehearsal
+from hil.campaign.rehearsal_record import Rehearsal
 from hil.cli.arguments import CampaignArgument, JsonOption, QuietOption, VerboseOption
 from hil.cli.verdict import NOT_GOOD
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import typer
 
-from hil.archive.recorded_campaign import RecordedCampaign
+from hil.archive.campaign_archives import RecordedCampaign
 from hil.base.progress import reporter as make_reporter
 from hil.campaign import Campaign
 from hil.cli.arguments import CampaignArgument, JsonOption, QuietOption, print_json

@@ -17,9 +17,9 @@ from hil.base.one_screen import brief
 from hil.base.progress import reporter as make_reporter
 from hil.base.progress import say
 from hil.campaign import Campaign, MotionFailedError, stop_on_interrupt
+from hil.campaign.campaign_run import RunResult
 from hil.campaign.folder import CampaignFolder
 from hil.campaign.reached_precision import requirements_of
-from hil.campaign.run import RunResult
 from hil.campaign.screen import Screen
 from hil.cli.arguments import (
     CampaignArgument,

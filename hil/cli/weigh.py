@@ -14,8 +14,8 @@ from hil.base.errors import InputError
 from hil.base.one_screen import brief
 from hil.base.progress import reporter as make_reporter
 from hil.campaign import Campaign, stop_on_interrupt
+from hil.campaign.campaign_run import RunResult
 from hil.campaign.operator_keys import can_read
-from hil.campaign.run import RunResult
 from hil.campaign.screen import confirmed
 from hil.cli.arguments import PAYLOAD, numbers, print_json
 from hil.cli.verdict import NOT_GOOD

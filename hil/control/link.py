@@ -20,14 +20,14 @@ from drivers.errors import DriverError, RequestError
 from drivers.events import MotionEnded, Refused
 from drivers.exchange.control import HEARTBEAT_TIMEOUT, HeartbeatMonitor
 from drivers.exchange.event_log import NO_ARCHIVE
-from drivers.exchange.process import WithdrawnError
+from drivers.exchange.process_handle import WithdrawnError
 from drivers.exchange.serving import ARM_MOVED
 from drivers.motion_source import MotionSource
 from drivers.states import HAS_SET_POINTS, Outcome, State
 from hil.archive import ArchiveSpec
 from hil.archive.live import LiveView
+from hil.archive.process_handle import NO_TIME
 from hil.archive.recorder import Recorded, describe
-from hil.archive.supervised import NO_TIME
 from hil.base.arrays import Array
 from hil.base.errors import ArchiveWriteError, ControllerError, OperatorStopError
 from hil.base.terminal_text import with_joint_names

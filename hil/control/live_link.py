@@ -18,6 +18,7 @@ from typing import Final, Self, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
+from drivers.cycle_records import RingReader
 from drivers.errors import DriverError
 from drivers.exchange.control import HeartbeatMonitor, SharedState
 from drivers.exchange.event_log import (
@@ -29,16 +30,14 @@ from drivers.exchange.event_log import (
     ExchangeFailed,
     Leaving,
 )
-from drivers.exchange.process import ExchangeProcess, ExchangeSettings, is_exchange
+from drivers.exchange.process_handle import ExchangeProcess, ExchangeSettings, is_exchange
 from drivers.exchange.realtime import RealTimeSettings
 from drivers.motion_source import MotionSource
-from drivers.record import RingReader
 from drivers.states import State
 from drivers.transports.base import LinkInUseError, TransportSpec
 from hil.archive import ArchiveSpec
 from hil.archive.live import LiveView, LiveViewError, Serve
-from hil.archive.recorder import Recorded
-from hil.archive.supervised import (
+from hil.archive.process_handle import (
     Answer,
     ArchiveProcessHandle,
     Close,
@@ -50,6 +49,7 @@ from hil.archive.supervised import (
     Serving,
     silent_for,
 )
+from hil.archive.recorder import Recorded
 from hil.base.errors import ArchiveWriteError, ControllerError
 from hil.cell import Cell
 from hil.control.motion_watch import Stop

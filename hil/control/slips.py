@@ -15,7 +15,7 @@ import numpy as np
 
 from hil.archive import Archive, open_archive
 from hil.archive.header import REJECTED, REPLIES_LOST
-from hil.archive.recordings import recording_of
+from hil.archive.recording_of_archive import recording_of
 from hil.archive.repair import amend_outcome
 from hil.base.arrays import Array
 from hil.base.errors import ArchiveError

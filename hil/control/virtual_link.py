@@ -9,11 +9,11 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
+from drivers.cycle_records import CycleRing
 from drivers.events import Event, MotionEnded
 from drivers.exchange.loop import exchange
 from drivers.guard import Guard
 from drivers.motion_source import MotionSource, progress_of
-from drivers.record import CycleRing
 from drivers.session import Session
 from drivers.states import HAS_SET_POINTS
 from drivers.transports.base import Transport

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from hil.archive import Archive, place_of
-from hil.archive.recorded_campaign import RecordedCampaign
+from hil.archive.campaign_archives import RecordedCampaign
 from hil.base.arrays import Array
 from hil.base.errors import InputError
 from hil.base.files import make_folder, write_output
@@ -457,7 +457,9 @@ def _identified(
     first = place_of(archives[0])
     if not RecordedCampaign(first).sealed:
         return identification
-    from hil.campaign.identified import with_conduct  # which loads what executes a campaign
+    from hil.campaign.identified_campaign import (
+        with_conduct,  # which loads what executes a campaign
+    )
 
     return with_conduct(identification, first)
 

@@ -15,7 +15,7 @@ from numpy.typing import ArrayLike
 
 from drivers.drive_train import WRIST_AXES, DriveTrain
 from drivers.errors import DriverError, PacketError
-from drivers.exchange.process import ExchangeProcess, ExchangeSettings
+from drivers.exchange.process_handle import ExchangeProcess, ExchangeSettings
 from drivers.guard import GuardLimits
 from drivers.packets import N_ARMS, InitPacket
 from drivers.transports.base import TransportSpec

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from hil.archive import Archive
-from hil.archive.recorded_campaign import RecordedCampaign
+from hil.archive.campaign_archives import RecordedCampaign
 from hil.base.errors import InputError
 from hil.base.progress import Reporter
 from hil.base.threads import one_thread
@@ -53,7 +53,7 @@ def identify_recorded(
 ) -> Identification:
     """Identify from the complete archives of a campaign folder; `predict` adds held-out archives.
 
-    How the campaign was conducted is added by :func:`hil.campaign.identified.with_conduct`.
+    How it was conducted is added by :func:`hil.campaign.identified_campaign.with_conduct`.
 
     Raises:
         InputError: the folder has no complete excitation.

@@ -14,9 +14,9 @@ from numpy.typing import NDArray
 
 from drivers.packets import DRIVE_ON
 from hil.archive import Archive, ArchiveHeader, ArchiveName, open_archive, opened, place_of
+from hil.archive.campaign_archives import RecordedCampaign
 from hil.archive.header import EPISODE, REJECTED
-from hil.archive.recorded_campaign import RecordedCampaign
-from hil.archive.recordings import recording_of
+from hil.archive.recording_of_archive import recording_of
 from hil.base.arrays import Array
 from hil.base.errors import ArchiveError, CampaignFolderError, InputError
 from hil.base.files import file_digest

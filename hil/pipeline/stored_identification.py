@@ -14,7 +14,7 @@ from typing import Any
 
 import numpy as np
 
-from hil.archive.recorded_campaign import RecordedCampaign
+from hil.archive.campaign_archives import RecordedCampaign
 from hil.base.arrays import Array
 from hil.base.errors import HilError, InputError
 from hil.base.files import file_digest

@@ -26,13 +26,13 @@ from hil.base.progress import Reporter
 from hil.base.safe_input import path_exists
 from hil.base.terminal_text import plural
 from hil.campaign.campaign import Campaign, campaign_of_design
+from hil.campaign.campaign_run import RunResult
 from hil.campaign.errors import RepetitionsRejectedError
 from hil.campaign.folder import PAYLOAD_RESULT, PAYLOADS, SIDES, CampaignFolder
 from hil.campaign.gates import require_rehearsed
 from hil.campaign.plan import CampaignPlan
 from hil.campaign.precision_record import PrecisionLook, PrecisionRecord, Reached
 from hil.campaign.reached_precision import further
-from hil.campaign.run import RunResult
 from hil.cell import Cell
 from hil.cell.cell import ASSUMED_PAYLOAD
 from hil.cell.schema import CellFile

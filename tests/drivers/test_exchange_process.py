@@ -20,7 +20,8 @@ import numpy as np
 import pytest
 
 from drivers import CyclicPacket, Mode, MotionEnded, MotionStarted, RequestError, State
-from drivers.exchange import process, realtime
+from drivers.cycle_records import RingReader
+from drivers.exchange import process_handle, realtime
 from drivers.exchange.control import ArchiveState, SharedState
 from drivers.exchange.event_log import (
     ExchangeEnded,
@@ -28,7 +29,7 @@ from drivers.exchange.event_log import (
     ExchangeStarted,
     Leaving,
 )
-from drivers.exchange.process import (
+from drivers.exchange.process_handle import (
     ExchangeError,
     ExchangeProcess,
     ExchangeSettings,
@@ -36,7 +37,6 @@ from drivers.exchange.process import (
 )
 from drivers.exchange.realtime import RealTimeReport, RealTimeSettings
 from drivers.packets import DRIVE_ON, next_number
-from drivers.record import RingReader
 from drivers.transports.base import TransportError
 from drivers.transports.udp import UdpSpec, UdpTransport
 from hil.control.simulator_process import free_port
@@ -322,7 +322,7 @@ class TestRefusedMotions:
         with running() as (exchange, controller):
             os.kill(exchange.pid, signal.SIGSTOP)
             with monkeypatch.context() as impatient:
-                impatient.setattr(process, "ANSWER_TIMEOUT", 0.3)
+                impatient.setattr(process_handle, "ANSWER_TIMEOUT", 0.3)
                 with pytest.raises(ExchangeError, match=r"not answer within 0\.3 s"):
                     exchange.submit(smooth_move(MOVE, 300))
             os.kill(exchange.pid, signal.SIGCONT)
@@ -386,7 +386,7 @@ class TestBetweenReadingAndBegin:
             assert_nothing_moves(controller)
 
     def test_interrupted_submission_leaves_no_motion(self, monkeypatch):
-        hand_over = process.hand_over
+        hand_over = process_handle.hand_over
 
         def interrupted(*arguments):
             hand_over(*arguments)
@@ -394,7 +394,7 @@ class TestBetweenReadingAndBegin:
 
         with running() as (exchange, controller):
             with monkeypatch.context() as patch, pytest.raises(KeyboardInterrupt):
-                patch.setattr(process, "hand_over", interrupted)
+                patch.setattr(process_handle, "hand_over", interrupted)
                 exchange.submit(Cruise())
             exchange.submit(still(10))
             assert_nothing_moves(controller)

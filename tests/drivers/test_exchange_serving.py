@@ -17,6 +17,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from drivers import GapSeen, MotionEnded, State, StateChanged
+from drivers.cycle_records import CycleRing
 from drivers.errors import RequestError
 from drivers.events import Counters, Outcome, PacketRejected, RepliesLost
 from drivers.exchange import control, event_log, motion_transfer
@@ -44,7 +45,6 @@ from drivers.exchange.event_log import (
 )
 from drivers.exchange.loop import POLL
 from drivers.exchange.serving import DETACHED_LINGER, MAX_LINGER, CommandHandler, EventLimiter
-from drivers.record import CycleRing
 from tests.drivers.rig import Cruise, N, still
 from tests.messages import MISSED_IN_A_ROW
 

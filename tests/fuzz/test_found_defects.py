@@ -17,7 +17,7 @@ from hil.archive import ImportedSamples, write_samples
 from hil.base.errors import ArchiveError, InputError, SourceError
 from hil.base.toml_text import from_text
 from hil.campaign.folder import CampaignFolder
-from hil.campaign.rehearsal import Rehearsal
+from hil.campaign.rehearsal_record import Rehearsal
 from hil.cell import Cell
 from hil.design.result import DesignResult
 from hil.importers.column_map import ColumnMap

@@ -12,7 +12,7 @@ from hil.base.progress import Silent
 from hil.campaign import Campaign
 from hil.campaign.folder import CampaignFolder
 from hil.campaign.plan import design
-from hil.campaign.rehearsal import CRITERIA, Rehearsal, RehearsalCriterion
+from hil.campaign.rehearsal_record import CRITERIA, Rehearsal, RehearsalCriterion
 from hil.cell import Cell
 from hil.cell.text import with_values
 from planner import PiecewiseCubic

@@ -15,7 +15,7 @@ from typing import Any, Final
 from drivers.transports.simulated import SimulatedTransport
 from hil.base.progress import Silent
 from hil.campaign import Campaign, CampaignPlan, Stop, VirtualLink
-from hil.campaign.identified import identify_campaign
+from hil.campaign.identified_campaign import identify_campaign
 from hil.campaign.plan import design
 from hil.cell import Cell
 from hil.control.simulation import simulated_controller

@@ -27,9 +27,9 @@ from typing import Any, Final, Self
 import numpy as np
 from numpy.typing import NDArray
 
-from drivers import record
+from drivers import cycle_records
+from drivers.cycle_records import RingReader, cycle_dtype
 from drivers.exchange.control import SharedState
-from drivers.record import RingReader, cycle_dtype
 from drivers.states import State
 from hil.base.errors import HilError
 from hil.base.progress import Silent
@@ -98,12 +98,12 @@ class Memory:
 
     @property
     def written(self) -> int:
-        return int(self._words[record._WRITTEN])
+        return int(self._words[cycle_records._WRITTEN])
 
     @property
     def behind(self) -> int:
         """Records written that the archive process has not read; 0 before it began."""
-        read = int(self._words[record._READ])
+        read = int(self._words[cycle_records._READ])
         return self.written - read if read else 0
 
     def records(self) -> NDArray[np.void]:

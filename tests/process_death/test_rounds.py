@@ -14,7 +14,7 @@ from typing import Any, Final, cast, get_args
 import numpy as np
 import pytest
 
-from drivers.record import cycle_dtype
+from drivers.cycle_records import cycle_dtype
 from hil.base.progress import Silent
 from hil.campaign.plan import design
 from sim_fixtures import Phase

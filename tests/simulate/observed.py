@@ -12,8 +12,8 @@ from numpy.typing import NDArray
 
 from drivers import Counters
 from drivers.events import Event
+from hil.campaign.campaign_run import RunResult
 from hil.campaign.plan import CampaignPlan
-from hil.campaign.run import RunResult
 from hil.cell import Cell
 from identification import RobotModel, Samples
 from identification.estimators.least_squares import RepeatedEstimate

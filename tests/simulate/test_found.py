@@ -11,10 +11,10 @@ import pytest
 from numpy.typing import NDArray
 
 from drivers import State
+from drivers.cycle_records import cycle_dtype
 from drivers.errors import SourceFailed
 from drivers.events import Refused
 from drivers.exchange.loop import exchange
-from drivers.record import cycle_dtype
 from drivers.transports.simulated import SimulatedTransport
 from hil.archive import ArchiveOutcome, ArchiveSpec, open_archive
 from hil.base.errors import ControllerError

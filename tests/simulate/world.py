@@ -28,11 +28,11 @@ from hil.base.files import write_atomically
 from hil.base.progress import Silent
 from hil.campaign import Campaign, VirtualLink
 from hil.campaign import folder as campaign_folder
+from hil.campaign.campaign_run import RunResult
 from hil.campaign.dry_run import DryRunRecord
 from hil.campaign.errors import RepetitionsRejectedError
 from hil.campaign.folder import CampaignFolder
 from hil.campaign.operator import RunStatus
-from hil.campaign.run import RunResult
 from hil.control import link, operator_control
 from hil.control.errors import MotionFailedError, MotionRefusedError
 from hil.control.motion_watch import OperatorRequest, Stop

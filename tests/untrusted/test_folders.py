@@ -32,10 +32,10 @@ from hil.base.safe_input import parse_toml, read_text
 from hil.campaign import Campaign, CampaignFolderError
 from hil.campaign.dry_run import Acceptance, DryRunRecord
 from hil.campaign.folder import LOCK, CampaignFolder
+from hil.campaign.joint_warm_up import FrictionMeter, WarmUpRecord
 from hil.campaign.quality import Executed
-from hil.campaign.rehearsal import Rehearsal
+from hil.campaign.rehearsal_record import Rehearsal
 from hil.campaign.status import conduct_of
-from hil.campaign.warmup import FrictionMeter, WarmUpRecord
 from hil.cell import Cell
 from hil.cli import app
 from hil.cli.plan import read_via_points

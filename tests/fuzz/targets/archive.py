@@ -12,10 +12,10 @@ from pathlib import Path
 import numpy as np
 
 from drivers import InitPacket
-from drivers.record import cycle_dtype
+from drivers.cycle_records import cycle_dtype
 from hil.archive import Archive, ArchiveWriter, ImportedSamples, open_archive, write_samples
 from hil.archive.check import check_archive, read_overview
-from hil.archive.recordings import recording_of
+from hil.archive.recording_of_archive import recording_of
 from hil.archive.repair import repair
 from hil.base.errors import ArchiveError, ArchiveWriteError, InputError
 from hil.new import cell_of_urdf, from_archive

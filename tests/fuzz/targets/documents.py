@@ -12,9 +12,9 @@ from hil.base.errors import CampaignFolderError, InputError
 from hil.campaign.dry_run import DryRunRecord
 from hil.campaign.errors import NotRehearsedError
 from hil.campaign.folder import CampaignFolder
+from hil.campaign.joint_warm_up import WarmUpRecord
 from hil.campaign.plan import CampaignPlan
-from hil.campaign.rehearsal import Rehearsal
-from hil.campaign.warmup import WarmUpRecord
+from hil.campaign.rehearsal_record import Rehearsal
 from hil.design.result import DesignResult, _seal
 from hil.design.settings import load_settings, preset_text
 from hil.results.results import Results

@@ -12,7 +12,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from drivers.record import cycle_dtype
+from drivers.cycle_records import cycle_dtype
 from hil.archive import (
     KINDS,
     ArchiveName,

@@ -20,7 +20,7 @@ from mcap.writer import CompressionType, IndexType
 from mcap_ros2.decoder import DecoderFactory
 from typer.testing import CliRunner
 
-from drivers.record import cycle_dtype
+from drivers.cycle_records import cycle_dtype
 from hil.archive import (
     Archive,
     ImportedSamples,

@@ -18,7 +18,7 @@ from mcap_ros2.decoder import DecoderFactory
 from numpy.typing import NDArray
 from rosbags.highlevel import AnyReader
 
-from drivers.record import cycle_dtype
+from drivers.cycle_records import cycle_dtype
 from hil.archive import Archive, ArchiveWriter, container, open_archive
 from hil.archive import schema as profile
 from hil.archive.schema import description_message

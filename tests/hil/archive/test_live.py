@@ -11,9 +11,9 @@ from typing import Any
 import numpy as np
 import pytest
 
+from drivers.cycle_records import cycle_dtype
 from drivers.drive_train import DriveTrain
 from drivers.events import GapSeen
-from drivers.record import cycle_dtype
 from hil.archive.live import LiveView, LiveViewError, Serve
 
 pytest.importorskip("foxglove", reason="the extra 'live' is not installed")

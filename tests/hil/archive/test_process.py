@@ -17,17 +17,16 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from drivers.cycle_records import CycleRing, RingReader, cycle_dtype
 from drivers.drive_train import DriveTrain
 from drivers.events import MotionEnded, MotionStarted, PacketRejected, RepliesLost
 from drivers.exchange import control as control_memory
 from drivers.exchange import event_log
 from drivers.exchange.control import OUTCOMES, ArchiveState, SharedState
 from drivers.exchange.event_log import EventReader, EventWriter
-from drivers.record import CycleRing, RingReader, cycle_dtype
 from hil.archive import Archive, ArchiveOutcome, ArchiveSpec, ArchiveWriter, open_archive
 from hil.archive.process import ArchiveProcess
-from hil.archive.recorder import Recorded
-from hil.archive.supervised import (
+from hil.archive.process_handle import (
     Answer,
     ArchiveProcessHandle,
     Close,
@@ -36,6 +35,7 @@ from hil.archive.supervised import (
     Open,
     Opened,
 )
+from hil.archive.recorder import Recorded
 
 pytestmark = pytest.mark.long
 

@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from drivers.cycle_records import cycle_dtype
 from drivers.drive_train import DriveTrain
 from drivers.events import (
     InitReceived,
@@ -20,7 +21,6 @@ from drivers.events import (
     StateChanged,
 )
 from drivers.packets import InitPacket
-from drivers.record import cycle_dtype
 from drivers.states import State
 from hil.archive import Archive, ArchiveSpec, Recorder, open_archive
 from hil.archive.process import BUFFERED_CYCLES, PreTriggerBuffer

@@ -10,7 +10,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from drivers.record import cycle_dtype
+from drivers.cycle_records import cycle_dtype
 from hil.archive import ArchiveWriter, ImportedSamples, open_archive, write_samples
 from hil.archive.check import check_archive
 from hil.archive.repair import repair

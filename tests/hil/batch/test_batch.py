@@ -30,7 +30,7 @@ from hil.batch.discovery import discover, open_ref
 from hil.batch.estimates import BatchEstimator
 from hil.batch.graph import reidentify
 from hil.batch.reduction import ToReduce, cached_reduction, reduce_archives
-from hil.campaign.identified import identify_campaign
+from hil.campaign.identified_campaign import identify_campaign
 from hil.cell import Cell
 from hil.cli import app
 from hil.pipeline.estimating import estimate_with, with_transmitted_load

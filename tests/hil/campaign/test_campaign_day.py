@@ -23,9 +23,9 @@ from hil.campaign import Campaign, CampaignFolderError, MotionRefusedError
 from hil.campaign.campaign import campaign_of_design
 from hil.campaign.dry_run import Acceptance, DryRunRecord
 from hil.campaign.folder import CampaignFolder
-from hil.campaign.identified import identify_campaign
+from hil.campaign.identified_campaign import identify_campaign
+from hil.campaign.joint_warm_up import WarmMotion, WarmUpRecord
 from hil.campaign.status import conduct_of, status_of
-from hil.campaign.warmup import WarmMotion, WarmUpRecord
 from hil.cell import Cell
 from hil.cli import app
 from hil.control.motion_checks import MotionChecks

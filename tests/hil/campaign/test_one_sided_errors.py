@@ -14,10 +14,10 @@ import pinocchio as pin
 import pytest
 
 import hil.pipeline.sources
-from hil.archive.recordings import recording_of
+from hil.archive.recording_of_archive import recording_of
 from hil.base.progress import Silent
 from hil.campaign import CampaignPlan
-from hil.campaign.identified import identify_campaign
+from hil.campaign.identified_campaign import identify_campaign
 from hil.cell import Cell, CellError
 from hil.control.simulation import (
     planted_truth,

@@ -17,7 +17,7 @@ from hil.archive import ArchiveName, open_archive
 from hil.base.errors import InputError
 from hil.base.progress import Silent
 from hil.campaign import Campaign, CampaignPlan, MotionRefusedError, design, plan_around
-from hil.campaign.identified import identify_campaign
+from hil.campaign.identified_campaign import identify_campaign
 from hil.campaign.plan import LEAST, quick_settings
 from hil.cell import Cell
 from hil.cli import app

@@ -25,10 +25,10 @@ from hil.base.progress import Silent, Task
 from hil.campaign import Campaign, CampaignPlan, NotRehearsedError, Stop, rehearsal_criteria
 from hil.campaign.folder import CampaignFolder
 from hil.campaign.gates import require_rehearsed
-from hil.campaign.identified import identify_campaign
-from hil.campaign.rehearsal import CRITERIA, Rehearsal
+from hil.campaign.identified_campaign import identify_campaign
 from hil.campaign.rehearsal_criteria import of_currents, of_motions
-from hil.campaign.rehearsing import waited_for
+from hil.campaign.rehearsal_record import CRITERIA, Rehearsal
+from hil.campaign.rehearsal_run import waited_for
 from hil.campaign.twin import FASTEST, SPREAD, Twin, link_faults, too_far_without_a_packet
 from hil.cell import Cell
 from hil.cell.text import with_values

@@ -9,7 +9,7 @@ import pytest
 from hil.base.progress import Silent
 from hil.campaign import Campaign
 from hil.campaign.plan import design
-from hil.campaign.rehearsal import CRITERIA
+from hil.campaign.rehearsal_record import CRITERIA
 from hil.cell import Cell
 
 ROOT = Path(__file__).resolve().parents[3]

@@ -11,7 +11,7 @@ from typer.testing import CliRunner
 from hil.base.errors import ExecutionError, InputError
 from hil.base.progress import Silent
 from hil.campaign import Campaign
-from hil.campaign.identified import identify_campaign
+from hil.campaign.identified_campaign import identify_campaign
 from hil.campaign.plan import design
 from hil.campaign.precision_record import PrecisionLook, PrecisionRecord, Reached
 from hil.campaign.reached_precision import PrecisionMeter, further, noise_shares, requirements_of

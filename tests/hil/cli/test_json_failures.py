@@ -13,7 +13,7 @@ import pytest
 from typer.testing import CliRunner, Result
 
 from hil.archive import ImportedSamples, write_samples
-from hil.archive.supervised import Failed
+from hil.archive.process_handle import Failed
 from hil.base.errors import ArchiveWriteError, ControllerError, HilError, InputError
 from hil.base.files import convert_write_errors, make_folder
 from hil.campaign.state import CampaignState

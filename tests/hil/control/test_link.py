@@ -13,7 +13,7 @@ import pytest
 from drivers.errors import AxisNotInMode, RequestError
 from drivers.events import MotionEnded, MotionStarted, PacketRejected, Refused, StateChanged
 from drivers.exchange.event_log import NO_ARCHIVE, EventsLost
-from drivers.exchange.process import ExchangeError, WithdrawnError
+from drivers.exchange.process_handle import ExchangeError, WithdrawnError
 from drivers.states import State
 from hil.archive import ArchiveSpec
 from hil.archive.recorder import Recorded

@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 
 from drivers.exchange.event_log import NO_ARCHIVE
-from drivers.exchange.process import ExchangeProcess, ExchangeSettings
+from drivers.exchange.process_handle import ExchangeProcess, ExchangeSettings
 from drivers.motion_source import MotionSource
 from drivers.packets import INIT_LENGTH
 from drivers.states import State

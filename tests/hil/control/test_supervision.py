@@ -16,6 +16,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from drivers.cycle_records import cycle_dtype
 from drivers.events import MotionEnded, MotionStarted
 from drivers.exchange.control import create as create_control
 from drivers.exchange.event_log import (
@@ -25,7 +26,6 @@ from drivers.exchange.event_log import (
     EventsLost,
     ExchangeEnded,
 )
-from drivers.record import cycle_dtype
 from drivers.states import State
 from hil.archive import Archive, ArchiveSpec, ArchiveWriter, open_archive
 from hil.base.errors import ControllerError

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from typer.testing import CliRunner
 
 from hil.archive import open_archive
-from hil.archive.recordings import open_recording
+from hil.archive.recording_of_archive import open_recording
 from hil.base import one_screen
 from hil.base.errors import InputError, SourceError
 from hil.base.output_folder import SOURCES, folder_beside, sources_text

@@ -17,7 +17,7 @@ from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 from typer.testing import CliRunner
 
 from hil.archive import open_archive
-from hil.archive.recordings import open_recording
+from hil.archive.recording_of_archive import open_recording
 from hil.base.errors import InputError
 from hil.cli import app
 from hil.importers.bag_map import BagMap

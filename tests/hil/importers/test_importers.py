@@ -30,7 +30,7 @@ from scipy.io import savemat
 from typer.testing import CliRunner
 
 from hil.archive import ArchiveHeader, Findings, ImportedSamples, open_archive
-from hil.archive.recordings import open_recording
+from hil.archive.recording_of_archive import open_recording
 from hil.base.errors import ArchiveWriteError, InputError, SourceError
 from hil.cell import Cell
 from hil.cell.nominal import nominal_of

@@ -21,7 +21,7 @@ from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
 from hil.archive import Archive, container, open_archive
 from hil.archive.cdr import ENCAPSULATION
-from hil.archive.recordings import open_recording
+from hil.archive.recording_of_archive import open_recording
 from hil.base.errors import InputError, SourceError
 from hil.cell import Cell
 from hil.importers import bags, mcap_messages

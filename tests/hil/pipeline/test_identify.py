@@ -18,7 +18,7 @@ from hil.archive import ImportedSamples, write_samples
 from hil.base.errors import ArchiveError, InputError, OutputError
 from hil.base.one_screen import COLUMNS, LINES
 from hil.base.progress import Silent
-from hil.campaign.identified import identify_campaign
+from hil.campaign.identified_campaign import identify_campaign
 from hil.cli import app
 from hil.cli.verdict import NOT_GOOD, as_json, finish, screen, sentences, table, whole
 from hil.control.simulation import planted_values

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
-from hil.archive.recordings import open_recording
+from hil.archive.recording_of_archive import open_recording
 from hil.base.errors import InputError
 from hil.cli import app
 from hil.results.provenance import RESULTS

@@ -20,9 +20,9 @@ from hil.base.errors import InputError, OperatorStopError
 from hil.base.progress import Silent
 from hil.campaign import Campaign, CampaignFolderError, MotionRefusedError, NotRehearsedError
 from hil.campaign.campaign import require_replaceable
+from hil.campaign.campaign_run import RunResult
 from hil.campaign.errors import RepetitionsRejectedError
 from hil.campaign.folder import SIDES, CampaignFolder
-from hil.campaign.run import RunResult
 from hil.cli import app
 from hil.control.errors import MotionFailedError
 from hil.control.motion_watch import OperatorRequest, Stop

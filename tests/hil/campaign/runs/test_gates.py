@@ -23,7 +23,7 @@ from hil.campaign import (
 from hil.campaign.dry_run import DryRunRecord
 from hil.campaign.folder import CampaignFolder
 from hil.campaign.gates import require_rehearsed
-from hil.campaign.rehearsal import Rehearsal
+from hil.campaign.rehearsal_record import Rehearsal
 from hil.control.connection import active_checks
 from hil.control.motion_checks import MotionChecks
 from hil.control.motion_watch import Stop

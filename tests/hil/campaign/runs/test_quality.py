@@ -20,7 +20,7 @@ from hil.campaign.errors import (
     RepetitionsRejectedError,
 )
 from hil.campaign.quality import FIELDS, Executed, RepetitionCheck
-from hil.campaign.run import RunResult
+from hil.campaign.campaign_run import RunResult
 from hil.control.motion_watch import OperatorRequest
 from hil.control.simulation import controller_settings, simulated_controller
 from hil.pipeline.sources import gather_sources

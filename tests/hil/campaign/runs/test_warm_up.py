@@ -14,9 +14,9 @@ from hil.campaign import (
     Campaign,
 )
 from hil.campaign.operator import RunStatus
-from hil.campaign.run import RunResult
+from hil.campaign.campaign_run import RunResult
 from hil.campaign.stages import WarmUpStage
-from hil.campaign.warmup import (
+from hil.campaign.joint_warm_up import (
     COLD_AFTER,
     FrictionMeter,
     WarmUpRecord,

@@ -19,7 +19,7 @@ from typing import Final, Literal, Self
 import numpy as np
 
 from hil.archive import open_archive
-from hil.archive.recorded_campaign import load_record
+from hil.archive.campaign_archives import load_record
 from hil.base.arrays import Array
 from hil.cell import Cell
 from identification.model.motion import Motion

@@ -7,7 +7,7 @@ from typing import Final, Literal, Self
 
 from pydantic import StrictBool, model_validator
 
-from hil.archive.recorded_campaign import load_record
+from hil.archive.campaign_archives import load_record
 from hil.base.files import write_output
 from hil.base.terminal_text import typed
 from hil.results.results import Frozen

@@ -13,6 +13,11 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from drivers import errors, events
+from drivers.cycle_records import (
+    MEASURED,
+    CycleRing,
+    RingReader,
+)
 from drivers.errors import (
     AxisNotInMode,
     Check,
@@ -28,11 +33,6 @@ from drivers.errors import (
     TransportClosed,
 )
 from drivers.packets import InitPacket
-from drivers.record import (
-    MEASURED,
-    CycleRing,
-    RingReader,
-)
 from tests.drivers.rig import Cruise, N, moving
 
 pytestmark = pytest.mark.safety

@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from drivers.record import cycle_dtype
+from drivers.cycle_records import cycle_dtype
 from hil.archive import ArchiveWriter, ImportedSamples, open_archive, write_samples
-from hil.archive.recordings import open_recording, recording_of
+from hil.archive.recording_of_archive import open_recording, recording_of
 from hil.base.errors import ArchiveError
 
 JOINTS = ("a", "b")

@@ -23,12 +23,12 @@ from planner.errors import PlannerError
 from planner.worker import WorkerProcess
 from sim_fixtures import SimulationError
 
+from .campaign_run import run_motions
 from .errors import RepetitionsRejectedError
 from .folder import CampaignFolder
 from .motion_runner import RunOptions
 from .operator import RunWatch
-from .rehearsal import AS_MODELLED, CRITERIA, EFFECTS, Rehearsal, RehearsalCriterion
-from .run import run_motions
+from .rehearsal_record import AS_MODELLED, CRITERIA, EFFECTS, Rehearsal, RehearsalCriterion
 from .state import CampaignState
 
 REPETITIONS: Final = 3

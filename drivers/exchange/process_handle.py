@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import Any, Final
 
 from drivers.child_process import ChildProcess
+from drivers.cycle_records import CycleRing, create_memory
 from drivers.drive_train import DriveTrain
 from drivers.errors import DriverError, RequestError
 from drivers.exchange import control, event_log
@@ -21,7 +22,6 @@ from drivers.exchange.motion_transfer import LONGEST_MESSAGE, READ, WITHDRAWN, h
 from drivers.exchange.realtime import RealTimeReport, RealTimeSettings
 from drivers.guard import GuardLimits
 from drivers.motion_source import MotionSource
-from drivers.record import CycleRing, create_memory
 from drivers.transports.base import TransportSpec
 
 
