@@ -188,7 +188,7 @@ class _CampaignRun:
                 warmth=self._warm_up,
                 straight=straight,
                 start=start,
-                unrehearsed=self._options.unrehearsed,
+                options=self._options,
             )
             before = link.cycles
             expected = runner.expected(joined, len(slow))
@@ -215,12 +215,14 @@ class _CampaignRun:
                 self._warm_up.motion_ended()
 
     def _missing(self, *kinds: str) -> list[CampaignMotion]:
-        """Return what is to be run at full speed, up to a number of repetitions if stated."""
+        """Return what is to be run at full speed, as far as the options say."""
         most = self._options.repetitions
+        only = self._options.only
         return [
             motion
             for motion in self._campaign.missing(*kinds)
-            if most is None or motion.kind != "excitation" or motion.index < most
+            if (most is None or motion.kind != "excitation" or motion.index < most)
+            and (only is None or (motion.kind, motion.index) in only)
         ]
 
     def _result(self) -> RunResult:

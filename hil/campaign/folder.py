@@ -104,6 +104,7 @@ class CampaignFolder(RecordedCampaign):
     Attributes:
         confirmed: options by which its command confirms what nobody can be asked; "" for none.
         rehearsed: folder of the rehearsal's own campaigns.
+        second_session: folder of a simulated session at the same time, while it runs.
     """
 
     confirmed: str = ""
@@ -115,6 +116,7 @@ class CampaignFolder(RecordedCampaign):
     report = Below("report.html")
     rehearsal = Below("rehearsal.json")
     rehearsed = Below("rehearsal")
+    second_session = Below("second_session")
     dry_run = Below("dry_run.json")
     warmup = Below("warmup.json")
     precision = Below("precision.json")

@@ -39,7 +39,12 @@ from .state import CampaignState
 
 @dataclass(frozen=True)
 class RunOptions:
-    """What the caller of `Campaign.run` chose; see there."""
+    """What the caller of `Campaign.run` chose; see there.
+
+    Attributes:
+        only: kind and index of the motions to run; None for all that are missing.
+        first_move: index of the first move between motions.
+    """
 
     provenance: Mapping[str, str] | None = None
     durable: bool | None = None
@@ -51,6 +56,8 @@ class RunOptions:
     until_precise: tuple[Requirement, ...] = ()
     repetitions: int | None = None
     say_unchecked: bool = True
+    only: frozenset[tuple[str, int]] | None = None
+    first_move: int = 0
 
 
 class RunArchives:
@@ -155,7 +162,8 @@ class Runner:
         warmth: of the joints.
         straight: moves between motions.
         start: (n,) [rad], the first position of the arm, to which it returns.
-        unrehearsed: no dry run is wanted, so that no move is slow for not having been seen in one.
+        options: of the run; in one without rehearsal, no move is slow for not having been seen in
+            a dry run.
 
     Attributes:
         task: receives the seconds of motion.
@@ -174,7 +182,7 @@ class Runner:
         warmth: Warmth,
         straight: CheckedMoves,
         start: Array,
-        unrehearsed: bool,
+        options: RunOptions,
     ) -> None:
         self.campaign = campaign
         self._link = link
@@ -185,8 +193,8 @@ class Runner:
         self._reporter = reporter
         self._warmth = warmth
         self._position = start
-        self._moves = 0
-        self._seen = None if unrehearsed else seen_in_dry_run(campaign.folder)
+        self._moves = options.first_move
+        self._seen = None if options.unrehearsed else seen_in_dry_run(campaign.folder)
 
     def expected(self, joined: Sequence[CampaignMotion], slow: int) -> list[ExpectedMotion]:
         """Return motions and ways as they will be run, the first `slow` motions slowly."""

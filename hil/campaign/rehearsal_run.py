@@ -19,7 +19,6 @@ from hil.control.errors import MotionFailedError
 from hil.control.motion_checks import PLANNED_CURRENT, collision_checker
 from hil.control.motion_watch import Stop, Unattended
 from hil.control.virtual_link import VirtualLink
-from planner.errors import PlannerError
 from planner.worker import WorkerProcess
 from sim_fixtures import SimulationError
 
@@ -29,14 +28,12 @@ from .folder import CampaignFolder
 from .motion_runner import RunOptions
 from .operator import RunWatch
 from .rehearsal_record import AS_MODELLED, CRITERIA, EFFECTS, Rehearsal, RehearsalCriterion
+from .simulated_sessions import LONGEST, result_of
 from .state import CampaignState
 
 REPETITIONS: Final = 3
 """Repetitions of the excitation: enough for their scatter, few enough for a minute."""
 SEED: Final = 1
-LONGEST: Final = 24.0 * 3600.0
-"""Most that a run on a simulated arm may take, s."""
-_POLL: Final = 0.2  # s between two looks whether the operator stopped it
 
 
 def rehearse(
@@ -93,7 +90,7 @@ def _rehearsed(
         else:
             criteria += of_estimate(twin, modelled.folder, reporter)
             reporter.step(f"rehearsing on a simulated arm, {EFFECTS}")
-            failure, cycles = waited_for(child, stop)
+            failure, cycles = result_of(child, stop, "the rehearsal", "rehearse again")
             seconds += cycles * modelled.cell.period
             criteria += _of_run(twin, with_effects.folder, EFFECTS, failure, SATURATED)
     names = {criterion.name for criterion in criteria}
@@ -139,24 +136,6 @@ def run_with_effects(folder: Path, twin: Twin) -> tuple[str, int]:
     rehearsal = CampaignState.open(folder)
     link = twin.link(_planned(rehearsal), effects=True)
     return _failure(rehearsal, link, twin, Silent(), Stop()), link.cycles
-
-
-def waited_for(child: WorkerProcess, stop: Stop) -> tuple[str, int]:
-    """Return what :func:`run_with_effects` returned in its process.
-
-    Raises:
-        OperatorStopError: the rehearsal was stopped.
-        ExecutionError: the process ended.
-    """
-    while not child.wait(_POLL):
-        if stop.requested:
-            raise OperatorStopError("the rehearsal was stopped; rehearse again")
-    try:
-        failure, cycles = child.receive()
-    except PlannerError as error:
-        problem = f"the process of the second simulated arm ended: {error}"
-        raise ExecutionError(f"{problem}; rehearse again") from error
-    return str(failure), int(cycles)
 
 
 def _failure(

@@ -21,11 +21,11 @@ from hil.campaign import (
     stop_on_interrupt,
 )
 from hil.campaign.planned_motions import require_runnable
+from hil.campaign.simulated_sessions import run_simulated
 from hil.cell import Cell
 from hil.cli.arguments import JsonOption, QuietOption, VerboseOption
 from hil.cli.verdict import finish
 from hil.control.errors import stopped
-from hil.control.simulation import simulated_link, simulated_provenance
 from hil.design import load_design
 from hil.report.output_files import FILES, REPORT
 from hil.results.provenance import RESULTS
@@ -113,22 +113,15 @@ def _run(campaign: Campaign, reporter: Reporter, *, effects: bool) -> None:
     """Run the missing motions on a simulated controller; Ctrl-C stops the arm, then the program."""
     cell = campaign.cell
     started = time.perf_counter()
-    link = simulated_link(cell, effects=effects)
     with stop_on_interrupt() as stop:
         try:
-            campaign.run(
-                link,
-                stop,
-                reporter,
-                provenance=simulated_provenance(cell, effects),
-                unrehearsed=True,  # the arm is simulated
-            )
+            cycles = run_simulated(campaign, stop, reporter, effects=effects)
         except ExecutionError as fault:
             if stop.requested:
                 raise stopped(fault, "resume with --resume") from fault
             raise
     took = time.perf_counter() - started
-    seconds = link.cycles * cell.period
+    seconds = cycles * cell.period
     reporter.say(
         f"recorded {seconds:.0f} s of simulated motion in {took:.1f} s "
         f"({seconds / took:.1f} x real time)"
@@ -137,7 +130,7 @@ def _run(campaign: Campaign, reporter: Reporter, *, effects: bool) -> None:
 
 _OURS = {"archives", "cell.toml", "robot.urdf", "plan.json", "manifest.json", "paper"}
 _OURS |= {"rehearsal", "rehearsal.json", "dry_run.json", "warmup.json", "precision.json"}
-_OURS |= {"campaign.lock", RESULTS, REPORT, SERIES, *FILES}
+_OURS |= {"campaign.lock", "second_session", RESULTS, REPORT, SERIES, *FILES}
 
 
 def _require_replaceable(output: Path, *, force: bool) -> None:

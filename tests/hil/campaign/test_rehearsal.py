@@ -28,7 +28,7 @@ from hil.campaign.gates import require_rehearsed
 from hil.campaign.identified_campaign import identify_campaign
 from hil.campaign.rehearsal_criteria import of_currents, of_motions
 from hil.campaign.rehearsal_record import CRITERIA, Rehearsal
-from hil.campaign.rehearsal_run import waited_for
+from hil.campaign.simulated_sessions import result_of
 from hil.campaign.twin import FASTEST, SPREAD, Twin, link_faults, too_far_without_a_packet
 from hil.cell import Cell
 from hil.cell.text import with_values
@@ -331,14 +331,14 @@ def test_a_rehearsal_is_stopped_while_the_second_run_goes_on() -> None:
     with WorkerProcess(timeout=60.0) as child:
         child.begin(time.sleep, 30.0)
         with pytest.raises(OperatorStopError, match="rehearse again"):
-            waited_for(child, Stop(requested=True))
+            result_of(child, Stop(requested=True), "the rehearsal", "rehearse again")
 
 
 def test_a_second_run_that_was_killed_is_no_verdict() -> None:
     with WorkerProcess(timeout=60.0) as child:
         child.begin(os.abort)
         with pytest.raises(ExecutionError, match="second simulated arm ended"):
-            waited_for(child, Stop())
+            result_of(child, Stop(), "the rehearsal", "rehearse again")
 
 
 def test_the_command_is_the_method_with_exit_codes(designed: Campaign, tmp_path: Path) -> None:
