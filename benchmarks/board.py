@@ -50,9 +50,9 @@ from benchmarks.joint_log import JointLog
 from benchmarks.published import FITTED_SHARE, Published, Split, known
 from hil.base.errors import HilError
 from hil.base.progress import Silent
-from hil.importers.robot import Robot
+from hil.importers.imported_robot import Robot
+from hil.pipeline.identification import identify_archives
 from hil.pipeline.options import Options
-from hil.pipeline.run import identify_archives
 from hil.results.results import Results
 from identification.errors import IdentificationError
 from identification.validation.facts.errors import LEFT_OPEN

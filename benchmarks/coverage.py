@@ -78,9 +78,9 @@ from benchmarks.degradations import CAUSES
 from benchmarks.joint_log import JointLog
 from benchmarks.plain_fit import robot_from_urdf
 from hil.base.progress import Silent
-from hil.importers.robot import IMPORTED_LAW, Robot
+from hil.importers.imported_robot import IMPORTED_LAW, Robot
+from hil.pipeline.identification import identify_archives
 from hil.pipeline.identified_model import IdentifiedModel, ensemble_of, model_of
-from hil.pipeline.run import identify_archives
 from hil.results.results import Results
 from identification.model.friction import FrictionLaw
 from identification.model.motion import Motion as SampledMotion

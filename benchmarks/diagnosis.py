@@ -27,8 +27,8 @@ from benchmarks.arms import urdf
 from benchmarks.coverage import DEFAULTS, ArmType, drawn_arm, logged
 from benchmarks.planted import PLANTED_ARMS
 from hil.importers.conclusions import Certainty
-from hil.importers.recording import ImportOptions
-from hil.importers.robot import Robot
+from hil.importers.imported_robot import Robot
+from hil.importers.recording_import import ImportOptions
 from hil.look import Look, look_at
 from hil.look.readings import ArmChange, Changes
 from identification.hypotheses.changes import SIGNS, Change

@@ -24,7 +24,7 @@ from numpy.typing import NDArray
 from scipy.signal import lfilter
 
 from hil.compare.comparison import LEAST, holm
-from hil.fleet.changes import Course, Series, courses
+from hil.fleet.series_changes import Course, Series, courses
 from hil.fleet.trend import FALSE_ALARMS
 
 Array = NDArray[np.float64]

@@ -26,7 +26,7 @@ from benchmarks import parser_of, show
 from hil.base.progress import Silent
 from hil.campaign import Campaign, CampaignPlan, design
 from hil.cell import Cell
-from hil.control.simulation import planted_values, simulated_link
+from hil.control.simulated_cell import planted_values, simulated_link
 from hil.pipeline.sources import Sources, gather_sources
 from identification.estimators.least_squares import estimate_repetitions
 from identification.signals.samples import Preprocessing, prepare

@@ -13,8 +13,8 @@ from benchmarks.plain_fit import Measured, robot_from_urdf
 from hil.archive import open_archive
 from hil.cell import Cell
 from hil.importers.column_map import ColumnMap, Quantity, TimeColumn
+from hil.importers.imported_robot import Robot
 from hil.importers.log import import_log
-from hil.importers.robot import Robot
 
 Array = NDArray[np.float64]
 

@@ -25,8 +25,8 @@ from benchmarks.arms import urdf as arm_urdf
 from hil.archive import open_archive
 from hil.base.errors import HilError
 from hil.importers.conclusions import Certainty
-from hil.importers.recording import ImportOptions, RobotOf, import_recording
-from hil.importers.robot import Robot
+from hil.importers.imported_robot import Robot
+from hil.importers.recording_import import ImportOptions, RobotOf, import_recording
 from hil.look import Look, look_at
 from hil.look.messages import choice_text, row_text
 from hil.pipeline.sources import cell_of, source_of

@@ -53,8 +53,8 @@ from benchmarks.coverage import (
 from benchmarks.degradations import CAUSES
 from benchmarks.joint_log import JointLog
 from hil.base.progress import Silent
-from hil.importers.robot import Robot
-from hil.pipeline.run import Identification, identify_archives
+from hil.importers.imported_robot import Robot
+from hil.pipeline.identification import Identification, identify_archives
 
 Array = NDArray[np.float64]
 

@@ -39,7 +39,7 @@ from benchmarks.coverage import drawn_body
 from benchmarks.joint_log import JointLog
 from benchmarks.plain_fit import robot_from_urdf
 from hil.base.errors import HilError
-from hil.importers.robot import Robot
+from hil.importers.imported_robot import Robot
 from identification.errors import IdentificationError
 from identification.model.urdf_text import urdf_tree
 

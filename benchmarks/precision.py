@@ -48,7 +48,7 @@ from hil.campaign.reached_precision import PrecisionMeter
 from hil.cell import Cell
 from hil.control.link import MotionLink
 from hil.control.motion_checks import MotionChecks
-from hil.control.simulation import (
+from hil.control.simulated_cell import (
     controller_settings,
     planted_truth,
     planted_values,
@@ -57,8 +57,8 @@ from hil.control.simulation import (
     simulated_provenance,
 )
 from hil.control.virtual_link import VirtualLink
+from hil.design.design import run_search
 from hil.design.problem import problem_of
-from hil.design.run import run_search
 from hil.payload.payload_run import flange_of
 from hil.precision.forecast import PrecisionDesign, payload_search, short_search
 from hil.precision.requirements import Requirement, requirements_from

@@ -10,7 +10,7 @@ from typing import Any, Final
 from benchmarks.arms import ARMS, urdf
 from hil.campaign.twin import Twin
 from hil.cell import Cell
-from hil.cell.text import with_values
+from hil.cell.toml_edits import with_values
 from hil.cli import new
 
 _FULL_SPEED_TIME: Final = 0.6  # s, in which a joint reaches its largest speed

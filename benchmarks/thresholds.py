@@ -17,8 +17,8 @@ from benchmarks import parser_of, show
 from benchmarks.board import DATA, import_all
 from benchmarks.published import FITTED_SHARE, Published, Split, known
 from hil.base.progress import Silent
+from hil.pipeline.identification import identify_archives
 from hil.pipeline.options import Options
-from hil.pipeline.run import identify_archives
 from identification.arrays import Array
 from identification.purposes.contact import residual_peaks
 from identification.purposes.quiet_torque import once_in, slow_residuals

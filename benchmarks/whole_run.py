@@ -18,7 +18,7 @@ from benchmarks.arms import ARMS, urdf
 from benchmarks.coverage import ARM_TYPES, Conditions, drawn_arm, logged
 from benchmarks.fresh_process import Usage, usage
 from benchmarks.joint_log import JointLog
-from hil.importers.robot import Robot
+from hil.importers.imported_robot import Robot
 
 RATES: Final = (1000.0, 250.0)  # Hz
 DURATION: Final = 30.0  # s

@@ -52,7 +52,7 @@ if TYPE_CHECKING:
     from hil.control.cell_link import cell_link
     from hil.control.motion_watch import Stop, stop_on_interrupt
     from hil.control.move import plan_move, send
-    from hil.control.simulation import simulated_controller
+    from hil.control.simulated_cell import simulated_controller
     from hil.export.model_files import export_model
     from hil.identified.identified_arm import (
         IdentifiedArm,
@@ -62,12 +62,12 @@ if TYPE_CHECKING:
     )
     from hil.identified.identified_servo import IdentifiedServo
     from hil.importers.column_map import ColumnMap
+    from hil.importers.imported_robot import Robot
     from hil.importers.log import import_log
-    from hil.importers.recording import ImportOptions, RobotOf
-    from hil.importers.robot import Robot
+    from hil.importers.recording_import import ImportOptions, RobotOf
     from hil.importers.rosbag2 import import_rosbag2
+    from hil.pipeline.identification import identify_archives
     from hil.pipeline.options import Options
-    from hil.pipeline.run import identify_archives
     from hil.results.results import Results
     from hil.study import run_study
 
@@ -80,14 +80,14 @@ _HOME = {
     "ColumnMap": "importers.column_map",
     "IdentifiedArm": "identified.identified_arm",
     "IdentifiedServo": "identified.identified_servo",
-    "ImportOptions": "importers.recording",
+    "ImportOptions": "importers.recording_import",
     "Options": "pipeline.options",
     "Results": "results.results",
-    "Robot": "importers.robot",
+    "Robot": "importers.imported_robot",
     "Screen": "campaign.screen",
     "cell_link": "control.cell_link",
     "export_model": "export.model_files",
-    "identify_archives": "pipeline.run",
+    "identify_archives": "pipeline.identification",
     "identify_campaign": "campaign.identified_campaign",
     "identify_servo": "identified.identified_arm",
     "load": "identified.identified_arm",
@@ -97,7 +97,7 @@ _HOME = {
     "open_recording": "archive.recording_of_archive",
     "reidentify": "batch.graph",
     "run_study": "study",
-    "simulated_controller": "control.simulation",
+    "simulated_controller": "control.simulated_cell",
 }
 
 __all__ = [

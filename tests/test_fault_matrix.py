@@ -16,9 +16,9 @@ from drivers import SimulatedTransport
 from hil.archive import Archive, ArchiveSpec, open_archive
 from hil.campaign import Stop, VirtualLink
 from hil.cell import Cell
-from hil.cell.text import with_values
+from hil.cell.toml_edits import with_values
 from hil.control.motions import START_TOLERANCE, player_of
-from hil.control.simulation import controller_settings, simulated_controller
+from hil.control.simulated_cell import controller_settings, simulated_controller
 from identification.text import percentage
 from planner import PiecewiseCubic, plan
 from sim_fixtures.faults import parse_fault, split_faults

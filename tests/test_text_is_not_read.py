@@ -51,7 +51,7 @@ FOREIGN: Final[Mapping[str, str]] = {
     "hil.importers.unit_products": "units of logs",
     "hil.new.cell_text": "URDFs",
     "hil.base.safe_input": "files",
-    "hil.fleet.limits": "limits that the user writes",
+    "hil.fleet.trend_limits": "limits that the user writes",
     "hil.fleet.naming": "patterns that the user writes, and names of files",
     "hil.control.simulator_on_link": "addresses that the user writes",
     "identification.excitation.collision_bodies": "errors of pinocchio",

@@ -15,8 +15,8 @@ import hil
 from hil.base.progress import Silent
 from hil.cli import identify as command
 from hil.identified.identified_arm import identify_recordings
-from hil.importers.recording import ImportOptions
-from hil.importers.robot import Robot
+from hil.importers.imported_robot import Robot
+from hil.importers.recording_import import ImportOptions
 from hil.pipeline.options import Options
 from identification.validation.verdict import Verdict
 from tests.hil.importers.test_log_kinds import URDF

@@ -27,9 +27,9 @@ from identification.reduction.posterior import Posterior
 from identification.reduction.reduction import Reduction
 from identification.selection.settings import Settings
 
+from .archive_discovery import ArchiveRef, cell_from
 from .cache import CacheLocation
 from .cluster import SkippedArchive
-from .discovery import ArchiveRef, cell_from
 from .reduction import (
     ReducedArchives,
     Summary,

@@ -24,9 +24,7 @@ from hil.pipeline.sources import Source, all_fitted
 from identification.estimators.siblings import with_siblings
 from identification.selection.settings import Settings
 
-from .cache import CacheLocation, code_digest
-from .cluster import AnyFuture, Cluster, ClusterTask, Death, SkippedArchive, error_of, reason_of
-from .discovery import (
+from .archive_discovery import (
     ArchiveRef,
     CellTexts,
     Discovery,
@@ -38,6 +36,8 @@ from .discovery import (
     open_only,
     open_ref,
 )
+from .cache import CacheLocation, code_digest
+from .cluster import AnyFuture, Cluster, ClusterTask, Death, SkippedArchive, error_of, reason_of
 from .estimates import (
     ArmModel,
     BatchArm,

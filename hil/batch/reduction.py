@@ -27,9 +27,9 @@ from identification.factor.factor import Factor
 from identification.reduction.reduction import ALIKE, Reduction, Unmodelled
 from identification.selection.settings import Settings
 
+from .archive_discovery import ArchiveRef, cell_in, errors_of_origin, open_ref
 from .cache import Arrays, CacheLocation, code_digest
 from .cluster import SkippedArchive, reason_of
-from .discovery import ArchiveRef, cell_in, errors_of_origin, open_ref
 
 Term = TypeVar("Term", Factor, Reduction)
 

@@ -30,7 +30,7 @@ from .state import CampaignState
 from .status import CampaignStatus, status_of
 
 if TYPE_CHECKING:
-    from hil.pipeline.run import Identification
+    from hil.pipeline.identification import Identification
 
 
 class Campaign(CampaignState):

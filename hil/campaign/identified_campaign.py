@@ -8,9 +8,9 @@ from pathlib import Path
 
 from hil.base.progress import Reporter
 from hil.base.threads import one_thread
+from hil.pipeline.identification import Identification
 from hil.pipeline.identify_folder import identify_recorded
 from hil.pipeline.options import Options
-from hil.pipeline.run import Identification
 
 from .folder import CampaignFolder
 from .status import conduct_of

@@ -24,7 +24,7 @@ from hil.control.errors import MotionFailedError, SlippedError
 from hil.control.link import NOT_STARTED, MotionLink
 from hil.control.motions import REPEATED, CampaignMotion, CheckedMoves, moves_to_dict, player_of
 from hil.control.record import archive_spec, origin_of, with_present_date
-from hil.control.simulation import simulated_provenance
+from hil.control.simulated_cell import simulated_provenance
 from hil.control.slips import CHECKED, require_no_slip
 from hil.precision.requirements import Requirement
 from identification.excitation.excitation import trajectory_from_dict

@@ -17,7 +17,7 @@ from hil.campaign.planned_motions import planned_motions, require_runnable
 from hil.cell import Cell
 from hil.control.motion_checks import MotionChecks
 from hil.control.motions import CampaignMotion
-from hil.design.run import DESIGN_FILES
+from hil.design.design import DESIGN_FILES
 from identification.excitation import Excitation
 
 from .folder import CampaignFolder

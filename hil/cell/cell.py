@@ -24,7 +24,7 @@ from identification.model.workspace import Box, Workspace
 from planner import JointLimits
 
 from .errors import CellError, first_error, require_known
-from .robot import robot_model
+from .robot_model import robot_model
 from .schema import (
     LINKS,
     CampaignTable,
@@ -37,7 +37,7 @@ from .schema import (
     SimulationTable,
     Table,
 )
-from .text import urdf_limits, with_values
+from .toml_edits import urdf_limits, with_values
 
 T = TypeVar("T")
 

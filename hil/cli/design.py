@@ -25,8 +25,8 @@ from hil.cli.weigh import centre_from
 from hil.control.motion_checks import MotionChecks
 from hil.control.motion_watch import stop_on_interrupt
 from hil.design import METHODS, Method, load_settings, preset
+from hil.design.design import Designed, DesignFolder, run_design
 from hil.design.messages import criteria_text
-from hil.design.run import Designed, DesignFolder, run_design
 from hil.design.settings import preset_text
 from hil.plots import save
 from hil.plots.design_picture import draw_design

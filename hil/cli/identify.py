@@ -21,7 +21,7 @@ from hil.cli.verdict import LABEL, finish
 from hil.identified.identified_arm import identify_recordings, write_arm
 from hil.identified.identified_servo import IdentifiedServo, write_servo
 from hil.identified.messages import read_lines, servo_read_lines
-from hil.importers.recording import is_archive
+from hil.importers.recording_import import is_archive
 from hil.report.output_files import REPORT
 
 RecordingsArgument = Annotated[

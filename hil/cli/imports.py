@@ -31,10 +31,16 @@ from hil.importers.bag_map import BagMap
 from hil.importers.channels import CHANNEL_NAMES
 from hil.importers.column_map import ready_map, ready_maps
 from hil.importers.dh import convention_of
+from hil.importers.imported_robot import STANDARD_GRAVITY, Robot
 from hil.importers.lerobot import EpisodeUnit
 from hil.importers.messages import sentence
-from hil.importers.recording import ImportedRecording, ImportOptions, import_bag, import_recording
-from hil.importers.robot import STANDARD_GRAVITY, Robot, Use
+from hil.importers.recording_content import Use
+from hil.importers.recording_import import (
+    ImportedRecording,
+    ImportOptions,
+    import_bag,
+    import_recording,
+)
 from hil.importers.rosbag2 import CommandStamps, Effort
 from hil.pipeline.options import friction_from
 from identification import FrictionLaw

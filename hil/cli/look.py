@@ -18,7 +18,7 @@ from hil.cli.arguments import JsonOption, VerboseOption, print_json, with_option
 from hil.cli.imports import Described, Reading
 from hil.importers.conclusions import Certainty
 from hil.look import Look, ParameterGroup, Row, TiedReading, look_at
-from hil.look.maps import with_entries
+from hil.look.corrected_map import with_entries
 from hil.look.messages import (
     as_json,
     choice_text,

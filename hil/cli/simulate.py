@@ -18,7 +18,7 @@ from hil.cell import Cell
 from hil.cli.arguments import JsonOption, print_json
 from hil.cli.record import with_rtde
 from hil.control.move import joint_index
-from hil.control.simulation import (
+from hil.control.simulated_cell import (
     OWN_SPEED,
     controller_settings,
     own_postures,

@@ -15,8 +15,8 @@ from hil.base.toml_text import comment_lines, inline
 from hil.cli.arguments import JsonOption, QuietOption, numbers, print_json
 from hil.cli.identify_options import delay_from
 from hil.cli.verdict import NOT_GOOD
-from hil.pipeline.gain_run import GainsFound, find_gains
 from hil.pipeline.sources import archives_in
+from hil.pipeline.torque_constants import GainsFound, find_gains
 from identification.model.payload import Payload
 
 

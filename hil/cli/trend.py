@@ -17,9 +17,9 @@ from hil.cli.fleet_options import Fleet, RecordingsArgument, last, map_lines
 from hil.cli.identify_options import Identifying
 from hil.cli.imports import Described, Reading
 from hil.fleet.documents import as_dict, write_table
-from hil.fleet.limits import TrendLimit
 from hil.fleet.messages import notes, robot_sentence, verdict
 from hil.fleet.trend import FleetTrend, fleet_trend
+from hil.fleet.trend_limits import TrendLimit
 from hil.fleet.trend_page import trend_page
 
 CHANGED: Final = 5

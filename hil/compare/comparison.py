@@ -22,8 +22,8 @@ from hil.base.arrays import Array
 from hil.base.errors import InputError
 from hil.base.progress import Reporter
 from hil.batch import graph as run
+from hil.batch.archive_discovery import ArchiveRef, Discovery, cell_in, open_ref
 from hil.batch.cluster import Cluster
-from hil.batch.discovery import ArchiveRef, Discovery, cell_in, open_ref
 from hil.batch.estimates import BatchArm, BatchEstimate
 from hil.pipeline.options import Options
 from hil.pipeline.sources import arm_differences

@@ -10,7 +10,7 @@ from hil.cell import Cell
 from hil.control.link import MotionLink
 from hil.control.live_link import LiveLink
 from hil.control.motion_watch import Stop
-from hil.control.simulation import simulated_link
+from hil.control.simulated_cell import simulated_link
 
 
 @contextmanager

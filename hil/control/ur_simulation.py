@@ -10,7 +10,7 @@ from drivers.ur.identity import MODELS
 from drivers.ur.outputs import N_JOINTS
 from hil.base.errors import InputError
 from hil.cell import Cell
-from hil.control.simulation import planted_truth
+from hil.control.simulated_cell import planted_truth
 from sim_fixtures.settings import SettingError, SimulationError
 from sim_fixtures.ur import (
     SimulatedUr,

@@ -2,9 +2,9 @@
 
 from identification.excitation import METHODS, Method
 
+from .design import run_search
 from .problem import problem_of, search_settings
 from .result import DesignResult, load_design
-from .run import run_search
 from .settings import DesignSettings, SettingsError, load_settings, preset
 
 __all__ = [

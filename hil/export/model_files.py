@@ -12,8 +12,8 @@ import numpy as np
 
 from hil.base.arrays import Array
 from hil.base.files import make_folder, write_files
+from hil.pipeline.identification import Identification
 from hil.pipeline.identified_model import IdentifiedModel, ensemble_of, model_of, remarks_of
-from hil.pipeline.run import Identification
 from identification import Samples
 from identification.estimators.ensemble import FEWEST, Ensemble
 from identification.export.simulators import (

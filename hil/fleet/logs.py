@@ -19,20 +19,21 @@ from hil.archive import write_archive
 from hil.base.errors import ArchiveError, SourceError
 from hil.base.files import digest, file_digest, json_digest, replace_file, write_output
 from hil.base.progress import Reporter
+from hil.batch.archive_discovery import ArchiveRef, campaign_of, described_archive, is_untouched
 from hil.batch.cache import CacheError, CacheLocation, cache_errors, code_digest
 from hil.batch.cluster import Cluster, ClusterTask, SkippedArchive, reason_of
-from hil.batch.discovery import ArchiveRef, campaign_of, described_archive, is_untouched
 from hil.batch.places import SUFFIX, Stamp, name_of, stamp_of
 from hil.cell import Cell
-from hil.fleet.facts import WantedFacts, facts_of
-from hil.importers.arrays import READERS
+from hil.fleet.extra_channels import WantedFacts, facts_of
+from hil.importers.array_files import READERS
 from hil.importers.bag_map import BagMap
 from hil.importers.bags import SUFFIXES as BAGS
 from hil.importers.channels import channels_of, kinds_of_file
 from hil.importers.column_map import ColumnMap, map_text
+from hil.importers.imported_robot import Robot
 from hil.importers.log_files import MARKS, TEXTS, LogFiles, files_in
 from hil.importers.messages import sentence
-from hil.importers.recording import (
+from hil.importers.recording_import import (
     ImportedRecording,
     ImportOptions,
     RobotOf,
@@ -41,7 +42,6 @@ from hil.importers.recording import (
     read_recording,
 )
 from hil.importers.required_signals import has_servo, require_motion, require_torque
-from hil.importers.robot import Robot
 from hil.look.before_identification import concluded
 
 _ARCHIVE: Final = ".recording"

@@ -13,9 +13,9 @@ from typing import Final, Literal
 from hil.archive import open_archive
 from hil.base.errors import InputError
 from hil.base.files import digest
-from hil.batch.discovery import ArchiveRef
+from hil.batch.archive_discovery import ArchiveRef
 from hil.batch.places import as_file
-from hil.fleet.facts import WantedFacts
+from hil.fleet.extra_channels import WantedFacts
 
 ROBOT: Final = "{robot}"
 DATE: Final = "{date}"

@@ -1,8 +1,8 @@
 """Which robot of a fleet changes: in which joint, how fast, since when, and whether by heat.
 
 Each recording is estimated by itself; each quantity of each joint is a series over time, and the
-series of robots of one type are modelled together (:mod:`hil.fleet.changes`). p values are adjusted
-for all robots, joints and quantities (Holm 1979).
+series of robots of one type are modelled together (:mod:`hil.fleet.series_changes`). p values are
+adjusted for all robots, joints and quantities (Holm 1979).
 """
 
 from __future__ import annotations
@@ -20,14 +20,12 @@ from hil.base.arrays import Array
 from hil.base.errors import InputError
 from hil.base.progress import Reporter
 from hil.base.threads import one_thread
+from hil.batch.archive_discovery import ArchiveRef, LogImport, cell_in, discover, open_ref
 from hil.batch.cache import CacheLocation
 from hil.batch.cluster import Cluster, ClusterTask, SkippedArchive
-from hil.batch.discovery import ArchiveRef, LogImport, cell_in, discover, open_ref
 from hil.batch.graph import archives_for_settings, cached_settings, decide_settings
 from hil.batch.reduction import Summary, summarise
 from hil.compare.comparison import LEAST, holm
-from hil.fleet.changes import FEWEST, SIBLINGS, Course, Series, courses
-from hil.fleet.limits import TrendLimit
 from hil.fleet.naming import RobotNaming
 from hil.fleet.quantities import (
     CAUSES,
@@ -35,6 +33,8 @@ from hil.fleet.quantities import (
     TrackedQuantity,
     tracked_quantities,
 )
+from hil.fleet.series_changes import FEWEST, SIBLINGS, Course, Series, courses
+from hil.fleet.trend_limits import TrendLimit
 from hil.pipeline.options import Options
 from identification import RobotModel
 from identification.factor.estimate import Estimate

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from hil.archive.schema import LIBRARY, MEASURED, PROFILE, joint_states, profile
 from hil.base.arrays import Array
 from hil.base.files import file_digest, make_folder, write_files
-from hil.pipeline.run import Identification
+from hil.pipeline.identification import Identification
 from hil.pipeline.sources import stamps_of
 from hil.pipeline.stored_identification import StoredIdentification
 

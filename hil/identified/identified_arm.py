@@ -34,13 +34,13 @@ from hil.identified.identified_servo import (
 from hil.identified.recordings_read import recording_results
 from hil.identified.staging import Staging, require_torques, staged
 from hil.identified.torque_plot import TorquePlot, torque_plot
+from hil.importers.imported_robot import Robot
 from hil.importers.messages import sentence
-from hil.importers.recording import ImportOptions, RobotOf, is_archive
-from hil.importers.robot import Robot
+from hil.importers.recording_import import ImportOptions, RobotOf, is_archive
+from hil.pipeline.identification import Identification
 from hil.pipeline.identified_model import IdentifiedModel, model_of
 from hil.pipeline.identify_folder import identify_paths
 from hil.pipeline.options import Options
-from hil.pipeline.run import Identification
 from hil.pipeline.stored_identification import (
     NotReusableError,
     StoredIdentification,

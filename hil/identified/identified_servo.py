@@ -13,7 +13,7 @@ from hil.base.files import make_folder, write_files
 from hil.base.output_folder import SOURCES, folder_beside, sources_text
 from hil.base.progress import Reporter, Silent
 from hil.identified.staging import Staging
-from hil.importers.recording import is_archive
+from hil.importers.recording_import import is_archive
 from hil.importers.required_signals import has_servo
 from hil.pipeline.options import Options
 from hil.plots.chart_picture import draw_charts

@@ -20,7 +20,7 @@ from hil.importers.conclusions import (
     StatedUnit,
 )
 from hil.importers.messages import sentence
-from hil.importers.recording import ImportedRecording
+from hil.importers.recording_import import ImportedRecording
 from hil.look.readings import DoubtfulArm
 from hil.look.result import ChangedReading
 from hil.results.results import RecordingResult

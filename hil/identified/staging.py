@@ -19,7 +19,8 @@ from hil.importers.excerpt import LONGEST
 from hil.importers.lerobot import is_data_set
 from hil.importers.log_files import LogFiles
 from hil.importers.messages import sentence
-from hil.importers.recording import (
+from hil.importers.recording_content import Use
+from hil.importers.recording_import import (
     ImportedRecording,
     ImportOptions,
     RobotOf,
@@ -28,7 +29,6 @@ from hil.importers.recording import (
     read_recording,
 )
 from hil.importers.required_signals import has_servo, require_motion, require_torque
-from hil.importers.robot import Use
 from hil.look.before_identification import concluded
 
 MAP: Final = "map.toml"

@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hil.base.errors import SourceError
-from hil.importers.arrays import READERS, ArrayFile, format_of
+from hil.importers.array_files import READERS, ArrayFile, format_of
 from hil.importers.bags import SUFFIXES, open_bag
 from hil.importers.column_map import Format
 from hil.importers.commands import as_joint_state, measured_topics

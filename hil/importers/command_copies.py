@@ -9,7 +9,7 @@ import numpy as np
 
 from hil.base.arrays import Array
 from hil.base.errors import SourceError
-from hil.importers.arrays import ArrayFile
+from hil.importers.array_files import ArrayFile
 from hil.importers.channel_groups import ChannelGroup
 from hil.importers.commands import COMMANDED
 from hil.importers.conclusions import CopiedCommands

@@ -17,7 +17,7 @@ from hil.archive import ImportedSamples
 from hil.archive.imported import COPIED_COMMANDS, ROW_COUNTER
 from hil.base.arrays import Array
 from hil.base.errors import SourceError, UnrecordedJointError
-from hil.importers.arrays import ArrayFile
+from hil.importers.array_files import ArrayFile
 from hil.importers.channel_groups import grouped
 from hil.importers.channels import named_channels
 from hil.importers.clock_offset import clock_offset
@@ -37,11 +37,12 @@ from hil.importers.conclusions import (
     RowCounter,
     StatedUnit,
 )
-from hil.importers.findings import are_degrees, has_degrees_per_second
+from hil.importers.imported_robot import NOT_RECORDED, Robot
 from hil.importers.log_files import LogFiles
+from hil.importers.plausibility import are_degrees, has_degrees_per_second
 from hil.importers.publishers import second_publisher
+from hil.importers.recording_content import RecordingContent, Use
 from hil.importers.resampling import Timed, are_interleaved, on_one_base
-from hil.importers.robot import NOT_RECORDED, RecordingContent, Robot, Use
 from hil.importers.row_names import row_names
 from hil.importers.servo_numbers import (
     are_per_mille,

@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Final
 
-from hil.importers.arrays import READERS, ArrayFile, format_of
+from hil.importers.array_files import READERS, ArrayFile, format_of
 from hil.importers.column_map import Format
 from hil.importers.text_table import TextTable
 

@@ -18,7 +18,7 @@ from hil.base.safe_input import (
     remedy_for_missing,
 )
 from hil.base.terminal_text import typed
-from hil.importers.arrays import READERS
+from hil.importers.array_files import READERS
 from hil.importers.column_map import Format
 from hil.importers.spreadsheet import is_spreadsheet, text_of_sheet
 

@@ -16,9 +16,9 @@ from pydantic import ValidationError
 from hil.base.errors import SourceError
 from hil.base.safe_input import parse_toml
 from hil.cell.errors import first_error
-from hil.cell.text import with_values
+from hil.cell.toml_edits import with_values
 from hil.importers.column_map import DOCUMENTATION, ColumnMap, map_text
-from hil.importers.proposal import Proposal
+from hil.importers.proposed_map import Proposal
 from hil.importers.units import UNITS
 
 

@@ -30,10 +30,11 @@ from hil.importers.conclusions import (
     Omitted,
     PartialVelocity,
 )
+from hil.importers.imported_robot import NOT_RECORDED, Robot
 from hil.importers.mcap_messages import Topic
 from hil.importers.publishers import APART, STALLED, second_publisher
+from hil.importers.recording_content import RecordingContent, Use
 from hil.importers.resampling import at_stamps
-from hil.importers.robot import NOT_RECORDED, RecordingContent, Robot, Use
 from hil.importers.ros_messages import CONTROLLER_STATE, JOINT_STATE
 from hil.importers.stamps import leading_zeros, sorted_neighbours
 

@@ -14,13 +14,14 @@ from hil.base.errors import SourceError
 from hil.base.terminal_text import typed
 from hil.cell import Cell
 from hil.importers.conclusions import Certainty, ChannelMeaning
-from hil.importers.recording import ImportedRecording, ImportOptions, RobotOf, read_again
-from hil.importers.robot import Robot, Use
+from hil.importers.imported_robot import Robot
+from hil.importers.recording_content import Use
+from hil.importers.recording_import import ImportedRecording, ImportOptions, RobotOf, read_again
+from hil.look.look import SETTINGS, look_at_joints, mountings
 from hil.look.messages import choice_text, fit_alike, sentences, setting_text
 from hil.look.other_arm import Contradictions
 from hil.look.readings import DoubtfulArm, ExplainedTorque, GravityOption, NoJointTorque
 from hil.look.result import ChangedReading, Look, Row, TiedReading
-from hil.look.run import SETTINGS, look_at_joints, mountings
 from hil.pipeline.sources import cell_of, source_of
 from identification.errors import IdentificationError
 from identification.estimators.torque_channel import possible_low_passes

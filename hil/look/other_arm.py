@@ -15,9 +15,9 @@ import numpy as np
 
 from hil.base.arrays import Array
 from hil.cell import Cell
-from hil.cell.text import urdf_limits
+from hil.cell.toml_edits import urdf_limits
 from hil.importers.conclusions import Certainty
-from hil.importers.findings import limit_excess, whole_turns
+from hil.importers.plausibility import limit_excess, whole_turns
 from hil.look.physics import Size, mounted
 from hil.look.readings import (
     BeyondEffort,

@@ -15,7 +15,7 @@ from hil.cell.nominal import nominal_of
 from hil.importers.channels import channels_of
 from hil.importers.conclusions import Certainty
 from hil.importers.log_files import LogFiles
-from hil.look.maps import entries_of
+from hil.look.corrected_map import entries_of
 from hil.look.readings import (
     AngleUnit,
     ArmChange,

@@ -24,8 +24,8 @@ from hil.importers.conclusions import (
     StatedUnit,
     UnitBasis,
 )
-from hil.importers.findings import against_position, outside_limits
-from hil.importers.recording import ImportedRecording
+from hil.importers.plausibility import against_position, outside_limits
+from hil.importers.recording_import import ImportedRecording
 from hil.importers.units import Kind
 from hil.look.readings import (
     Basis,

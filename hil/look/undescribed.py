@@ -7,9 +7,9 @@ from tempfile import TemporaryDirectory
 
 from hil.base.errors import SourceError
 from hil.importers.channels import CHANNEL_NAMES, channels_of
+from hil.importers.imported_robot import Robot
 from hil.importers.log_files import LogFiles
-from hil.importers.recording import ImportOptions
-from hil.importers.robot import Robot
+from hil.importers.recording_import import ImportOptions
 
 
 def undescribed_robot(source: Path, options: ImportOptions, files: LogFiles) -> Robot:

@@ -24,7 +24,7 @@ from hil.base.arrays import Array
 from hil.base.errors import ArchiveError, ControllerError, OperatorStopError
 from hil.base.safe_input import parse_toml
 from hil.cell.errors import UNKNOWN
-from hil.cell.text import urdf_limits
+from hil.cell.toml_edits import urdf_limits
 from hil.control.connection import Connection
 from hil.control.live_link import END_TIMEOUT, ExchangeMonitor
 from hil.control.motion_watch import Stop

@@ -13,8 +13,8 @@ import numpy as np
 from hil.base.arrays import Array
 from hil.base.errors import ArchiveError, InputError
 from hil.base.progress import Reporter
+from hil.pipeline.carried_weight import require_weight
 from hil.pipeline.cell_context import TorqueScale, torque_scale
-from hil.pipeline.meaning import require_weight
 from hil.pipeline.options import Options
 from hil.pipeline.prepared import Prepared, prepare_sources, samples_of
 from hil.pipeline.sources import (

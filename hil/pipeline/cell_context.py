@@ -15,7 +15,7 @@ from hil.archive.imported import COPIED_COMMANDS, ROW_COUNTER
 from hil.base.arrays import Array
 from hil.cell import Cell
 from hil.cell.nominal import nominal_of
-from hil.cell.text import urdf_limits
+from hil.cell.toml_edits import urdf_limits
 from identification.estimators.torque_channel import torque_noiseless_above
 from identification.estimators.torque_scale import DATA_SHEET, described
 from identification.factor.estimate import Estimate

@@ -13,12 +13,12 @@ import numpy as np
 from hil.base.arrays import Array
 from hil.base.errors import InputError
 from hil.cell import Cell
-from hil.cell.text import urdf_limits
+from hil.cell.toml_edits import urdf_limits
 from hil.pipeline.cell_context import torque_limits
 from hil.pipeline.estimating import posterior_of
 from hil.pipeline.estimators import OF_PRIOR
+from hil.pipeline.identification import Identification
 from hil.pipeline.prepared import Prepared
-from hil.pipeline.run import Identification
 from hil.results.provenance import (
     provenance_of,
 )

@@ -10,8 +10,8 @@ from hil.archive.campaign_archives import RecordedCampaign
 from hil.base.errors import InputError
 from hil.base.progress import Reporter
 from hil.base.threads import one_thread
+from hil.pipeline.identification import Identification, identify_archives
 from hil.pipeline.options import Options
-from hil.pipeline.run import Identification, identify_archives
 
 
 @one_thread()

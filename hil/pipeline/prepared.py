@@ -17,7 +17,7 @@ from hil.base.arrays import Array
 from hil.base.errors import ArchiveError, InputError
 from hil.base.progress import Reporter, Silent
 from hil.cell import Cell
-from hil.cell.robot import ripples
+from hil.cell.robot_model import ripples
 from identification.errors import IdentificationError
 from identification.estimators.delay import (
     CLOSED_LOOP_BIAS,

@@ -19,7 +19,7 @@ from hil.base.output_folder import SOURCES
 from hil.base.progress import Reporter
 from hil.base.safe_input import path_exists
 from hil.cell import Cell
-from hil.pipeline.run import Identification
+from hil.pipeline.identification import Identification
 from hil.report.page import report_bytes
 from hil.results.provenance import PARAMETERS_JSON, RESULTS, provenance_of, single_line
 from hil.results.results import ExportResult, OccasionResult, Results, SettingsResult

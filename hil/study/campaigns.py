@@ -17,7 +17,7 @@ from hil.campaign.errors import RepetitionsRejectedError
 from hil.campaign.plan import PlannedMotion, moves_of, validation_motions
 from hil.cell import Cell
 from hil.control.motion_checks import MotionChecks
-from hil.control.simulation import simulated_link, simulated_provenance
+from hil.control.simulated_cell import simulated_link, simulated_provenance
 from hil.design.messages import NoExcitationError
 from identification.excitation import SineGenome
 

@@ -11,8 +11,8 @@ from hil.base.progress import Reporter, Silent
 from hil.batch.cluster import Cluster
 from hil.cell import Cell
 from hil.design import DesignResult, DesignSettings, preset
+from hil.design.design import DesignFolder, run_design
 from hil.design.messages import NoExcitationError
-from hil.design.run import DesignFolder, run_design
 from identification.excitation import Excitation, Method
 
 from .children import in_children

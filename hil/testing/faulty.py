@@ -14,7 +14,7 @@ from hil.base.errors import HilError
 from hil.base.progress import Silent
 from hil.campaign import Campaign, VirtualLink, design
 from hil.cell import Cell
-from hil.control.simulation import simulated_controller, simulated_link
+from hil.control.simulated_cell import simulated_controller, simulated_link
 from hil.control.simulator_process import LOOPBACK, SimulatorProcess, free_port
 from sim_fixtures import SimulatedController
 from sim_fixtures.faults import parse_fault, split_faults

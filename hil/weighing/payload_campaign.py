@@ -40,7 +40,7 @@ from hil.control.errors import MotionRefusedError
 from hil.control.link import MotionLink
 from hil.control.motion_checks import MotionChecks
 from hil.control.motion_watch import Stop
-from hil.control.simulation import simulated_link
+from hil.control.simulated_cell import simulated_link
 from hil.payload.payload_run import NoPayloadError, PayloadFound, find_payload, flange_of
 from hil.precision.requirements import Requirement
 from identification import IdentificationError

@@ -45,7 +45,7 @@ from identification.excitation.searches.population import (
     Scores,
     SearchSettings,
 )
-from identification.excitation.searches.run import (
+from identification.excitation.searches.search import (
     RESCORE_PERIOD,
     Design,
     SearchProgress,

@@ -17,7 +17,7 @@ from benchmarks.degradations import DEGRADATIONS, EXPECTED, FITTED_ONLY
 from benchmarks.joint_log import JointLog
 from benchmarks.plain_fit import Measured
 from benchmarks.published import Published, Split, known
-from hil.importers.robot import Robot
+from hil.importers.imported_robot import Robot
 from identification.selection.questions import BANDWIDTH
 from identification.selection.scores import SettingsTrial
 from identification.selection.settings import Settings

@@ -18,7 +18,7 @@ from benchmarks.coverage import (
     drawn_motion,
     logged,
 )
-from hil.importers.robot import IMPORTED_LAW
+from hil.importers.imported_robot import IMPORTED_LAW
 from identification.model.motion import Motion
 from identification.model.robot import RobotModel
 

@@ -17,7 +17,7 @@ from hil.archive.repair import repair
 from hil.base.errors import HilError
 from hil.base.progress import Silent
 from hil.campaign.identified_campaign import identify_campaign
-from hil.pipeline.run import Identification, identify_archives
+from hil.pipeline.identification import Identification, identify_archives
 from hil.plots.archive_view import view_of
 from tests.hil.mcap_bytes import chunks, heads
 

@@ -11,7 +11,7 @@ import pytest
 from hil.archive import open_archive
 from hil.base.errors import ArchiveError
 from hil.base.progress import Silent
-from hil.pipeline.run import identify_archives
+from hil.pipeline.identification import identify_archives
 from tests.disk.damage import KINDS, SWAPPED, campaign, harmed, play
 from tests.disk.readers import Undamaged, blamed
 from tests.hil.mcap_bytes import chunks

@@ -23,7 +23,7 @@ from hil.base.progress import Silent
 from hil.campaign import Campaign, CampaignPlan
 from hil.cell import Cell
 from hil.cli import app
-from hil.control.simulation import controller_settings, simulated_controller
+from hil.control.simulated_cell import controller_settings, simulated_controller
 from hil.control.virtual_link import VirtualLink
 from tests.disk.disks import Disk, planted_disk
 from tests.faults import CREATE, REFUSALS, RENAME, SYNC, WRITE, DiskFault, parse_disk_fault

@@ -24,7 +24,7 @@ from hil.archive import open_archive
 from hil.base.progress import Silent
 from hil.campaign import design
 from hil.cell.errors import UnknownFieldsError
-from hil.cell.text import with_values
+from hil.cell.toml_edits import with_values
 from hil.cli import app
 from hil.control.simulator_process import free_port
 from hil.results.results import Results

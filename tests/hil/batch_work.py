@@ -17,7 +17,7 @@ from typing import Final
 from distributed import WorkerPlugin
 
 from hil.base.errors import ArchiveError
-from hil.batch import discovery
+from hil.batch import archive_discovery
 from hil.batch.cluster import Cluster, ClusterTask, SkippedArchive
 
 NOTHING_OPEN: Final = (
@@ -48,14 +48,14 @@ class Deadly(WorkerPlugin):
         self.names = names
 
     def setup(self, worker):
-        read = discovery.open_archive
+        read = archive_discovery.open_archive
 
         def deadly(path, **how):
             if path.name in self.names and how["fields"]:
                 os.kill(os.getpid(), signal.SIGSEGV)
             return read(path, **how)
 
-        discovery.open_archive = deadly
+        archive_discovery.open_archive = deadly
 
 
 class Held(WorkerPlugin):
@@ -68,14 +68,14 @@ class Held(WorkerPlugin):
         self.until = until
 
     def setup(self, worker):
-        read = discovery.open_archive
+        read = archive_discovery.open_archive
 
         def held(path, **how):
             while path.name == self.archive and how["fields"] and not self.until.exists():
                 time.sleep(0.02)
             return read(path, **how)
 
-        discovery.open_archive = held
+        archive_discovery.open_archive = held
 
 
 class Process:

@@ -11,7 +11,7 @@ from hil.base.progress import Silent
 from hil.campaign import Campaign, CampaignPlan, Stop, design
 from hil.cell import Cell
 from hil.control import operator_control
-from hil.control.simulation import simulated_link, simulated_provenance
+from hil.control.simulated_cell import simulated_link, simulated_provenance
 from sim_fixtures import SimulatedDrive
 from sim_fixtures.ns16 import CELL_PATH
 

@@ -10,7 +10,7 @@ import pinocchio as pin
 import pytest
 
 from hil.identified.identified_arm import IdentifiedArm, arm_from
-from hil.importers.recording import ImportOptions
+from hil.importers.recording_import import ImportOptions
 
 CASES: Final = Path(__file__).parents[3] / "shared" / "cases" / "diagnosis"
 URDF: Final = CASES / "arm.urdf"

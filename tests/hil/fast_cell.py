@@ -14,7 +14,7 @@ from hil.campaign.folder import CampaignFolder
 from hil.campaign.plan import design
 from hil.campaign.rehearsal_record import CRITERIA, Rehearsal, RehearsalCriterion
 from hil.cell import Cell
-from hil.cell.text import with_values
+from hil.cell.toml_edits import with_values
 from planner import PiecewiseCubic
 
 QUICK_GRADIENT = """\

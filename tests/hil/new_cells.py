@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from hil.cell.text import with_values
+from hil.cell.toml_edits import with_values
 
 TWO_JOINTS = """<?xml version="1.0"?>
 <robot name="two">

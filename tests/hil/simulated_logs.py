@@ -14,8 +14,8 @@ from numpy.typing import NDArray
 
 from hil.archive import open_archive
 from hil.importers.column_map import ColumnMap
+from hil.importers.imported_robot import Robot
 from hil.importers.log import import_log
-from hil.importers.robot import Robot
 from identification import FrictionLaw, RobotModel
 
 Array = NDArray[np.float64]

@@ -18,11 +18,11 @@ from identification.excitation.criteria import (
     log10_det,
 )
 from identification.excitation.precision import Precision, Quantities
-from identification.excitation.searches import run
+from identification.excitation.searches import search as search_module
 from identification.excitation.searches.bundle_method import Ascent, _Cut, _step, improve
 from identification.excitation.searches.local_change import LocalChange
 from identification.excitation.searches.population import Population, Scores, SearchSettings
-from identification.excitation.searches.run import search
+from identification.excitation.searches.search import search
 from identification.excitation.searches.sensitivity import Linearisation, gene_slopes
 from identification.model.coupling import Coupling
 from identification.model.motion import Motion
@@ -351,7 +351,7 @@ def test_several_starts_share_half_of_the_steps(monkeypatch, population):
         taken.append((genes.tobytes(), fitness(scores)[0], steps, improved[0].tobytes()))
         return improved
 
-    monkeypatch.setattr(run, "improve", recorded)
+    monkeypatch.setattr(search_module, "improve", recorded)
     design = search(population, replace(SETTINGS, gradient=32, starts=4))
     assert [steps for _, _, steps, _ in taken] == [4, 4, 4, 4, 16]
     starts = [start for start, *_ in taken[:4]]

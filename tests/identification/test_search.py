@@ -26,7 +26,7 @@ from identification.excitation.searches.population import (
     SearchSettings,
     unplanned,
 )
-from identification.excitation.searches.run import search
+from identification.excitation.searches.search import search
 from identification.excitation.violation import NoFeasibleMotionError, excess_by_kind
 from planner import FourierSeries, JointLimits, check_limits
 from planner.errors import LimitExceeded

@@ -25,8 +25,8 @@ from benchmarks.coverage import (
 )
 from benchmarks.joint_log import JointLog
 from hil.base.progress import Silent
-from hil.importers.robot import IMPORTED_LAW, Robot
-from hil.pipeline.run import Identification, identify_archives
+from hil.importers.imported_robot import IMPORTED_LAW, Robot
+from hil.pipeline.identification import Identification, identify_archives
 from identification.validation.finding import Finding
 
 GAIN = 1.1

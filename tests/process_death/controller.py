@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 
 from drivers.packets import packet_number
 from hil.cell import Cell
-from hil.control.simulation import controller_settings, simulated_controller
+from hil.control.simulated_cell import controller_settings, simulated_controller
 from hil.control.simulator_on_link import Buttons, realtime_process, serve_session
 from sim_fixtures import Phase, SimulatedController
 from sim_fixtures.serve import Request, ServeCounts, UdpControllerLink

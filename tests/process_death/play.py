@@ -18,7 +18,7 @@ from hil.campaign import Campaign, CampaignPlan, Stop, VirtualLink
 from hil.campaign.identified_campaign import identify_campaign
 from hil.campaign.plan import design
 from hil.cell import Cell
-from hil.control.simulation import simulated_controller
+from hil.control.simulated_cell import simulated_controller
 from hil.pipeline.options import FIXED
 from identification import Estimate
 from tests.faults import Strikes

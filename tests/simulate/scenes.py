@@ -16,7 +16,7 @@ from hil.campaign.plan import CampaignPlan, PlannedMotion
 from hil.campaign.planned_motions import require_runnable
 from hil.cell import Cell
 from hil.control.motion_checks import MotionChecks
-from hil.control.simulation import controller_settings
+from hil.control.simulated_cell import controller_settings
 from identification.excitation import RESCORE_PERIOD, Excitation, Objective
 from planner import FourierSeries, PiecewiseCubic, PlanningError, plan_in_child
 from sim_fixtures import ControllerSettings

@@ -25,7 +25,7 @@ from hil.control import virtual_link
 from hil.control.errors import MotionFailedError
 from hil.control.motion_watch import Stop
 from hil.control.motions import START_TOLERANCE
-from hil.control.simulation import simulated_controller
+from hil.control.simulated_cell import simulated_controller
 from planner import Move, TrajectoryPlayer, plan_moves
 from sim_fixtures import Phase, SimulatedController
 from tests import messages

@@ -36,7 +36,7 @@ from hil.campaign.operator import RunStatus
 from hil.control import link, operator_control
 from hil.control.errors import MotionFailedError, MotionRefusedError
 from hil.control.motion_watch import OperatorRequest, Stop
-from hil.control.simulation import simulated_controller
+from hil.control.simulated_cell import simulated_controller
 from hil.pipeline.options import FIXED
 from hil.pipeline.prepared import prepare_sources
 from hil.pipeline.sources import gather_sources

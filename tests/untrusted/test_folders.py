@@ -39,7 +39,7 @@ from hil.campaign.status import conduct_of
 from hil.cell import Cell
 from hil.cli import app
 from hil.cli.plan import read_via_points
-from hil.importers.arrays import READERS, ArrayFile
+from hil.importers.array_files import READERS, ArrayFile
 from hil.importers.bags import bag_files, open_bag
 from hil.importers.column_map import Format
 from hil.importers.text_table import TextTable

@@ -15,8 +15,8 @@ from hil.archive import open_archive
 from hil.archive.check import check_archive
 from hil.base.errors import ArchiveWriteError, InputError, SourceError
 from hil.importers.column_map import ColumnMap
+from hil.importers.imported_robot import Robot
 from hil.importers.log import import_log
-from hil.importers.robot import Robot
 from hil.importers.rosbag2 import import_rosbag2
 from tests.fuzz.draw import mutate_bytes, mutate_text
 from tests.fuzz.mutate_mcap import mutate_mcap

@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 
 from hil.base.errors import InputError
-from hil.importers.robot import Robot
+from hil.importers.imported_robot import Robot
 from hil.new import cell_of_urdf
 from identification.errors import ModelError
 from identification.excitation import Workspace

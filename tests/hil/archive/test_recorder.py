@@ -25,7 +25,7 @@ from drivers.states import State
 from hil.archive import Archive, ArchiveSpec, Recorder, open_archive
 from hil.archive.process import BUFFERED_CYCLES, PreTriggerBuffer
 from hil.cell import Cell
-from hil.control.simulation import simulated_controller
+from hil.control.simulated_cell import simulated_controller
 from sim_fixtures.ns16 import CELL_PATH
 
 PERIOD = 0.001

@@ -15,7 +15,7 @@ from hypothesis import strategies as st
 
 from hil.base.errors import InputError
 from hil.base.toml_text import Angles, degrees_text, from_text, radians_of, to_text
-from hil.cell.text import with_values
+from hil.cell.toml_edits import with_values
 
 texts = st.text(st.characters(codec="utf-8"))
 single = (

@@ -22,11 +22,11 @@ from hil.archive import ArchiveWriter, ImportedSamples, write_samples
 from hil.archive.repair import repair, repaired_name
 from hil.base.errors import ArchiveError, InputError
 from hil.base.progress import Silent
-from hil.batch import discovery, reduction
+from hil.batch import archive_discovery, reduction
 from hil.batch import graph as batch_run
+from hil.batch.archive_discovery import discover, open_ref
 from hil.batch.cache import CacheLocation
 from hil.batch.cluster import Cluster
-from hil.batch.discovery import discover, open_ref
 from hil.batch.estimates import BatchEstimator
 from hil.batch.graph import reidentify
 from hil.batch.reduction import ToReduce, cached_reduction, reduce_archives
@@ -262,11 +262,11 @@ class TestCache:
         long_ago = time.time() - 100.0
         for path in (folder / "archives").glob("*.mcap"):
             os.utime(path, (long_ago, long_ago))
-        monkeypatch.setattr(discovery, "_UNTOUCHED", 0)
+        monkeypatch.setattr(archive_discovery, "_UNTOUCHED", 0)
         first = batch(folder, cache=CacheLocation())
         assert (first.read, first.cached) == (5, 0)
         with monkeypatch.context() as patch:
-            patch.setattr(discovery, "open_archive", pytest.fail)
+            patch.setattr(archive_discovery, "open_archive", pytest.fail)
             second = batch(folder, cache=CacheLocation(), estimator="consistent")
         assert (second.read, second.cached) == (0, 5)
         assert "consistent" in second.campaigns[0].estimate.method
@@ -603,7 +603,7 @@ class TestGroups:
             {
                 "name": paths[key].name,
                 "outcome": "rejected" if key == (3, 1) else "completed",
-                "sha256": "other" if key == (5, 2) else discovery.digest_of(paths[key]),
+                "sha256": "other" if key == (5, 2) else archive_discovery.digest_of(paths[key]),
             }
             for key in listed
         ]
@@ -635,22 +635,22 @@ class TestGroups:
 class TestMetadata:
     def test_cached_ones_are_valid_until_the_programs_change(self, tmp_path, arm, monkeypatch):
         path = recording(tmp_path / "data" / "a.mcap", arm)
-        monkeypatch.setattr(discovery, "_UNTOUCHED", 0)
+        monkeypatch.setattr(archive_discovery, "_UNTOUCHED", 0)
         time.sleep(0.01)  # then its time stamps are trusted
         opened = []
-        read = discovery.open_archive
+        read = archive_discovery.open_archive
 
         def counting(path, **how):
             opened.append(path)
             return read(path, **how)
 
-        monkeypatch.setattr(discovery, "open_archive", counting)
+        monkeypatch.setattr(archive_discovery, "open_archive", counting)
         first = found_in(path, cache=CacheLocation())
         count = len(opened)
         assert found_in(path, cache=CacheLocation()) == first
         assert len(opened) == count
-        monkeypatch.setattr(discovery, "code_digest", lambda: "other programs")
-        monkeypatch.setattr(discovery, "arm_digest", lambda *_, **__: "another digest")
+        monkeypatch.setattr(archive_discovery, "code_digest", lambda: "other programs")
+        monkeypatch.setattr(archive_discovery, "arm_digest", lambda *_, **__: "another digest")
         (ref,) = found_in(path, cache=CacheLocation()).refs
         assert ref.arm == "another digest"
         assert len(opened) == 2 * count
@@ -659,13 +659,13 @@ class TestMetadata:
         """It is not cached."""
         path = recording(tmp_path / "a.mcap", arm)
         (ref,) = found_in(path).refs
-        read = discovery.open_archive
+        read = archive_discovery.open_archive
 
         def written_to(archive, **how):
             path.write_bytes(path.read_bytes()[:-500])
             return read(archive, **how)
 
-        monkeypatch.setattr(discovery, "open_archive", written_to)
+        monkeypatch.setattr(archive_discovery, "open_archive", written_to)
         with pytest.raises(ArchiveError, match="was changed"):
             open_ref(ref)
         cache = CacheLocation(str(tmp_path / "cache"))

@@ -24,9 +24,9 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from pyarrow import parquet
 
+from hil.batch.archive_discovery import ArchiveRef, arm_digest
 from hil.batch.cache import HEADER, JSON, NPZ, NUMBERS, CacheError, CacheLocation, code_digest
 from hil.batch.cluster import Cluster, ClusterTask, SkippedArchive, error_of
-from hil.batch.discovery import ArchiveRef, arm_digest
 from hil.batch.estimates import BatchArm
 from hil.batch.graph import PARTITION, BatchResult, _Campaign
 from hil.batch.reduction import (
@@ -307,7 +307,7 @@ class TestCache:
 
 class TestDigests:
     @pytest.mark.parametrize(
-        "name", ["batch/discovery.py", "batch/graph.py", "signals/samples.py", "record.py"]
+        "name", ["batch/archive_discovery.py", "batch/graph.py", "signals/samples.py", "record.py"]
     )
     def test_that_of_the_programs_depends_on_each(self, name, monkeypatch):
         here = code_digest()

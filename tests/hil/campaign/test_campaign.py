@@ -36,7 +36,7 @@ from hil.cell import AngleFrame, Cell
 from hil.control.errors import refusal_text
 from hil.control.motion_checks import MotionChecks
 from hil.control.motions import CampaignMotion, CheckedMoves, player_of, require_allowed, rest
-from hil.control.simulation import simulated_controller, simulated_link
+from hil.control.simulated_cell import simulated_controller, simulated_link
 from planner import (
     Move,
     PiecewiseCubic,

@@ -19,7 +19,7 @@ from hil.base.progress import Silent
 from hil.campaign import CampaignPlan
 from hil.campaign.identified_campaign import identify_campaign
 from hil.cell import Cell, CellError
-from hil.control.simulation import (
+from hil.control.simulated_cell import (
     planted_truth,
     planted_values,
     simulated_controller,

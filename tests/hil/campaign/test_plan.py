@@ -25,7 +25,7 @@ from hil.cli import demo as demo_module
 from hil.control.motion_checks import PLANNED_CURRENT, MotionChecks
 from hil.control.simulator_process import SimulatorProcess
 from hil.design import load_design, preset
-from hil.design.run import DesignFolder, run_design
+from hil.design.design import DesignFolder, run_design
 from hil.report.output_files import FILES
 from hil.results.results import Results
 from identification.excitation import Constraints, Criteria, Excitation, sampled

@@ -31,7 +31,7 @@ from hil.campaign.rehearsal_record import CRITERIA, Rehearsal
 from hil.campaign.simulated_sessions import result_of
 from hil.campaign.twin import FASTEST, SPREAD, Twin, link_faults, too_far_without_a_packet
 from hil.cell import Cell
-from hil.cell.text import with_values
+from hil.cell.toml_edits import with_values
 from hil.cli import app
 from planner import Move, plan_moves
 from planner.worker import WorkerProcess

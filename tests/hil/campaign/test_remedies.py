@@ -21,7 +21,7 @@ from distributed import LocalCluster
 
 from hil.base.errors import InputError
 from hil.campaign.folder import SIDES, CampaignFolder
-from hil.control.simulation import simulated_link
+from hil.control.simulated_cell import simulated_link
 from hil.design import DesignResult
 from tests.docs.test_messages import COMMAND, FIELD, OPTION, messages
 from tests.hil.campaign.test_campaign_day import QUICK

@@ -15,7 +15,7 @@ from typer.testing import CliRunner
 
 from hil.campaign.trajectory_files import SCRIPT_RATE, SLOW, trajectory_files
 from hil.cell import Cell
-from hil.cell.text import with_values
+from hil.cell.toml_edits import with_values
 from hil.cli import app
 from hil.control.motion_checks import current_model
 from identification.model.motion import Motion

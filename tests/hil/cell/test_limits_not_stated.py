@@ -12,7 +12,7 @@ from typer.testing import CliRunner
 
 from hil.archive import open_archive
 from hil.cell import Cell
-from hil.cell.text import urdf_limits
+from hil.cell.toml_edits import urdf_limits
 from hil.cli import app
 from tests.hil.fast_cell import CELL
 from tests.hil.fast_cell import URDF as FAST

@@ -13,7 +13,7 @@ from drivers.transports.base import TransportSpec
 from hil.base.errors import InputError
 from hil.cell import Cell, CellError
 from hil.cell.schema import LINKS, CanTable, ControllerTable
-from hil.control.simulation import controller_settings
+from hil.control.simulated_cell import controller_settings
 from hil.control.simulator_on_link import open_controller_link
 from hil.doctor.checks import CheckStatus, DoctorCheck, System, link_checks
 from sim_fixtures.ns16 import CELL_PATH

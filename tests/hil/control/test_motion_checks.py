@@ -9,7 +9,7 @@ import pinocchio as pin
 import pytest
 
 from hil.cell import AngleFrame, Cell, CellError
-from hil.cell.text import with_values
+from hil.cell.toml_edits import with_values
 from hil.control.motion_checks import MotionChecks, always_so, collision_checker, violation_text
 from hil.control.motions import rest
 from hil.design import preset, problem_of

@@ -33,14 +33,14 @@ from hil.cell import Cell
 from hil.cli import record as record_cli
 from hil.cli.record import record as record_command
 from hil.control.record import archive_path, record
-from hil.control.simulation import (
+from hil.control.simulated_cell import (
     OWN_SPEED,
     controller_settings,
     own_postures,
     simulated_controller,
 )
 from hil.control.simulator_process import SIMULATE, free_port
-from hil.pipeline.run import identify_archives
+from hil.pipeline.identification import identify_archives
 from planner.moves import SEGMENT_VELOCITY
 from sim_fixtures.ns16 import CELL_PATH
 from tests.hil.loopback import on_loopback

@@ -32,7 +32,7 @@ from hil.cell import Cell, CellError
 from hil.cli import exit_code_of, main
 from hil.cli.simulate import WORDS, PhasePrinter, _sentences, simulate
 from hil.control.motion_checks import MotionChecks
-from hil.control.simulation import (
+from hil.control.simulated_cell import (
     controller_settings,
     own_postures,
     simulated_controller,

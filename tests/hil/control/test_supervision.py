@@ -37,7 +37,7 @@ from hil.control.link import Standstill
 from hil.control.live_link import STALL, ExchangeMonitor, Heartbeat
 from hil.control.motion_watch import MotionProgress, OperatorRequest
 from hil.control.motions import player_of
-from hil.control.simulation import simulated_link
+from hil.control.simulated_cell import simulated_link
 from hil.control.virtual_link import VirtualLink
 from hil.testing import faulty_link
 from planner import Move, PiecewiseCubic, TrajectoryPlayer, plan_moves

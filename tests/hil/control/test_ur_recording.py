@@ -28,14 +28,14 @@ from hil.cell import Cell, CellError
 from hil.cli.record import with_rtde
 from hil.control.link import Progress
 from hil.control.motion_watch import Stop
-from hil.control.simulation import planted_truth
+from hil.control.simulated_cell import planted_truth
 from hil.control.ur_recording import IDENTITY, listening, record_arm
 from hil.importers.conclusions import Certainty
-from hil.importers.recording import ImportOptions
+from hil.importers.recording_import import ImportOptions
+from hil.look.look import look_at
 from hil.look.readings import Fact
-from hil.look.run import look_at
-from hil.pipeline.gain_run import find_gains
-from hil.pipeline.run import identify_archives
+from hil.pipeline.identification import identify_archives
+from hil.pipeline.torque_constants import find_gains
 from identification.model.payload import Payload
 from sim_fixtures.plant import Carried
 from sim_fixtures.ur import (

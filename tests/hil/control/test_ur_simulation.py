@@ -22,7 +22,7 @@ from drivers.ur.torque_constants import stated_constants
 from hil.base.errors import InputError
 from hil.cell import Cell
 from hil.cli import app
-from hil.control.simulation import with_simulation
+from hil.control.simulated_cell import with_simulation
 from hil.control.ur_simulation import served_arm
 from sim_fixtures.ur import CELL_PATH, UR5E_URDF, UrArmTruth
 

@@ -14,7 +14,7 @@ import pytest
 
 from drivers.packets import INIT_DTYPE
 from hil.cell import Cell
-from hil.control.simulation import simulated_controller
+from hil.control.simulated_cell import simulated_controller
 from hil.testing import UdpController
 from sim_fixtures.ns16 import CELL_PATH
 from tests.hil import foreign_pc

@@ -12,8 +12,8 @@ from hil.base.errors import InputError
 from hil.base.progress import Silent
 from hil.cell import Cell
 from hil.design import DesignResult, load_design, preset, problem_of
+from hil.design.design import Designed, DesignFolder, run_design
 from hil.design.result import _seal, fingerprint
-from hil.design.run import Designed, DesignFolder, run_design
 from sim_fixtures.ns16 import CELL_PATH
 
 pytestmark = pytest.mark.long

@@ -17,7 +17,7 @@ import pytest
 import hil
 from hil.base.arrays import Array
 from hil.export.controller_code import AGREES, STRICT, CompiledArm, checked, pointer
-from hil.importers.recording import ImportOptions
+from hil.importers.recording_import import ImportOptions
 from hil.pipeline.identified_model import model_of
 from identification.errors import ModelError, ShapeError
 from identification.export.arm import ExportedArm

@@ -23,10 +23,10 @@ from typer.testing import CliRunner
 import hil
 from hil.cli import app
 from hil.importers.column_map import ColumnMap
+from hil.importers.imported_robot import Robot
 from hil.importers.log import import_log
-from hil.importers.robot import Robot
 from hil.pipeline import stored_identification
-from hil.pipeline.run import Identification
+from hil.pipeline.identification import Identification
 from hil.report.output_files import FILES, Exports
 from hil.results.results import Results
 from hil.results.servo_result import ServoResults

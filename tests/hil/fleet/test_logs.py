@@ -17,13 +17,13 @@ from hil.base.errors import InputError
 from hil.base.progress import Silent
 from hil.batch.cache import CacheLocation
 from hil.batch.graph import reidentify
-from hil.batch.search import find_recordings
+from hil.batch.recording_search import find_recordings
 from hil.cli import app
 from hil.fleet import logs as fleet_logs
 from hil.fleet.logs import LogReading, LogsOfBatch
 from hil.identified.identified_arm import arm_from
-from hil.importers.recording import ImportOptions
-from hil.importers.robot import Robot
+from hil.importers.imported_robot import Robot
+from hil.importers.recording_import import ImportOptions
 from hil.pipeline.options import FIXED
 from tests.hil.batch_work import NOTHING_OPEN, Here
 

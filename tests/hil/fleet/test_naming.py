@@ -11,15 +11,15 @@ import pytest
 from benchmarks.fleet import Fleet, FleetPlan, urdf, write_fleet
 from hil.base.errors import InputError
 from hil.base.progress import Silent
+from hil.batch.archive_discovery import ArchiveRef
 from hil.batch.cache import CacheLocation
-from hil.batch.discovery import ArchiveRef
 from hil.batch.graph import reidentify
-from hil.fleet.facts import WantedFacts, facts_of
+from hil.fleet.extra_channels import WantedFacts, facts_of
 from hil.fleet.logs import LogReading, LogsOfBatch
 from hil.fleet.naming import RobotNaming, date_in
+from hil.importers.imported_robot import Robot
 from hil.importers.log_files import LogFiles
-from hil.importers.recording import ImportOptions
-from hil.importers.robot import Robot
+from hil.importers.recording_import import ImportOptions
 from hil.pipeline.options import FIXED
 from tests.hil.batch_work import Here
 

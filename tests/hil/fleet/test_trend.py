@@ -12,8 +12,8 @@ from typer.testing import CliRunner
 from benchmarks.fleet import Fault, Fleet, FleetPlan, urdf, write_fleet
 from hil.base.errors import InputError
 from hil.cli import app
-from hil.fleet.limits import TrendLimit
 from hil.fleet.trend import names_of_joint
+from hil.fleet.trend_limits import TrendLimit
 from tests.hil.batch_work import NOTHING_OPEN
 from tests.hil.report.test_report import Page, assert_inert, assert_stands_alone
 

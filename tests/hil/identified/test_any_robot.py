@@ -19,8 +19,9 @@ from hil.base.progress import Silent
 from hil.cli import app
 from hil.cli.verdict import NOT_GOOD
 from hil.importers.column_map import ColumnMap, Quantity, TimeColumn
+from hil.importers.imported_robot import Robot
 from hil.importers.log import import_log
-from hil.importers.robot import Robot, Use
+from hil.importers.recording_content import Use
 from hil.pipeline.options import FIXED, Options
 from hil.pipeline.prepared import Prepared, prepare_sources, stated_settings
 from hil.pipeline.sources import gather_sources

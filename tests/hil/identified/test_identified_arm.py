@@ -262,7 +262,7 @@ class TestLoaded:
         assert loaded._repr_html_() == result._repr_html_()
 
     def test_nothing_is_estimated(self, saved: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-        monkeypatch.delattr("hil.pipeline.run.estimate_with")
+        monkeypatch.delattr("hil.pipeline.identification.estimate_with")
         assert hil.load(saved).verdict.good
 
     def test_its_files_can_be_saved_elsewhere(

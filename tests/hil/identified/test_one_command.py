@@ -25,11 +25,11 @@ from hil.base.output_folder import SOURCES, folder_beside, sources_text
 from hil.cli import app
 from hil.importers.column_map import ColumnMap
 from hil.importers.conclusions import ChannelMeaning, NameBasis, UnitBasis, UnusedChannels
+from hil.importers.imported_robot import Robot
 from hil.importers.log import import_log
 from hil.importers.messages import sentence
-from hil.importers.proposal import proposed_map
-from hil.importers.recording import ImportOptions, import_recording
-from hil.importers.robot import Robot
+from hil.importers.proposed_map import proposed_map
+from hil.importers.recording_import import ImportOptions, import_recording
 from hil.importers.rosbag2 import import_rosbag2
 from hil.pipeline.sources import cell_of
 from identification.validation.position_jumps import position_jumps

@@ -19,7 +19,7 @@ from typer.testing import CliRunner
 from hil.archive import Archive, open_archive
 from hil.base.errors import SourceError
 from hil.cli import app
-from hil.importers.robot import Robot
+from hil.importers.imported_robot import Robot
 from hil.importers.rosbag2 import import_rosbag2, recorded_joints
 from tests import messages
 from tests.hil.importers.test_log_kinds import (

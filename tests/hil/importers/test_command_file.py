@@ -10,8 +10,8 @@ from numpy.typing import NDArray
 
 from hil.base.errors import SourceError
 from hil.importers.conclusions import ChannelMeaning, OtherClock
-from hil.importers.recording import ImportedRecording, ImportOptions, read_recording
-from hil.importers.robot import Robot
+from hil.importers.imported_robot import Robot
+from hil.importers.recording_import import ImportedRecording, ImportOptions, read_recording
 from tests.hil.importers.test_lerobot import JOINTS, motion, urdf
 
 Array = NDArray[np.float64]

@@ -14,8 +14,8 @@ from mcap.writer import Writer
 from pyarrow import parquet
 
 from hil.base.errors import SourceError
-from hil.importers.recording import import_recording
-from hil.importers.robot import Robot
+from hil.importers.imported_robot import Robot
+from hil.importers.recording_import import import_recording
 from tests.hil.importers.test_log_kinds import JOINTS, POSITION, TIME, TORQUE, URDF
 
 EPOCH = 10**18  # ns

@@ -36,18 +36,18 @@ from hil.cell import Cell
 from hil.cell.nominal import nominal_of
 from hil.cli import app
 from hil.cli.imports import _names
-from hil.importers import arrays as array_files
+from hil.importers import array_files as array_files
 from hil.importers import matlab
-from hil.importers.arrays import ArrayFile
+from hil.importers.array_files import ArrayFile
 from hil.importers.bag_map import BagMap
 from hil.importers.column_map import UNITS, ColumnMap, Format, ready_map, ready_maps
 from hil.importers.conclusions import StoppedJoint
 from hil.importers.dh import Convention, urdf_of_dh
-from hil.importers.findings import examine
+from hil.importers.imported_robot import Robot, _cell_text
 from hil.importers.log import import_log
 from hil.importers.messages import sentence as worded
-from hil.importers.recording import import_bag
-from hil.importers.robot import Robot, _cell_text
+from hil.importers.plausibility import examine
+from hil.importers.recording_import import import_bag
 from hil.importers.stamps import check_clock
 from hil.importers.text_table import TextTable
 from hil.pipeline.sources import cell_of

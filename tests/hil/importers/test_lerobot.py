@@ -16,9 +16,9 @@ from typer.testing import CliRunner
 from hil.base.errors import InputError, SourceError
 from hil.cli import app
 from hil.importers.conclusions import EpisodeUnits, UnitsFrom
+from hil.importers.imported_robot import Robot
 from hil.importers.lerobot import DataSet, is_data_set
-from hil.importers.recording import ImportOptions, read_episodes
-from hil.importers.robot import Robot
+from hil.importers.recording_import import ImportOptions, read_episodes
 from hil.pipeline.sources import refuse_duplicates
 
 Array = NDArray[np.float64]

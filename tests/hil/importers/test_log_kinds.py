@@ -13,11 +13,11 @@ from numpy.typing import NDArray
 
 from hil.archive import Archive, open_archive
 from hil.base.errors import SourceError
-from hil.cell.text import UrdfLimits
+from hil.cell.toml_edits import UrdfLimits
 from hil.importers.column_map import ColumnMap
-from hil.importers.findings import whole_turns
+from hil.importers.imported_robot import Robot
 from hil.importers.log import import_log
-from hil.importers.robot import Robot
+from hil.importers.plausibility import whole_turns
 
 Floats = NDArray[np.float64]
 RATE = 250

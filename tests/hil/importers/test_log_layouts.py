@@ -12,10 +12,10 @@ import pytest
 from hil.base.errors import SourceError
 from hil.importers.channels import kind_of
 from hil.importers.conclusions import ChannelMeaning, JointOrder, UnusedChannels
+from hil.importers.imported_robot import Robot
 from hil.importers.messages import sentence
 from hil.importers.name_words import kind_by_words
-from hil.importers.recording import ImportedRecording, ImportOptions, import_recording
-from hil.importers.robot import Robot
+from hil.importers.recording_import import ImportedRecording, ImportOptions, import_recording
 from hil.look import look_at
 from hil.look.messages import row_text
 from tests.hil.importers.test_log_kinds import JOINTS, POSITION, SLOPE, TIME, TORQUE, URDF, Floats

@@ -14,10 +14,10 @@ from hil.base.errors import SourceError
 from hil.importers.column_map import Format
 from hil.importers.conclusions import Excerpt
 from hil.importers.excerpt import DURATION, STRETCH, activity, chosen_stretches, excerpt_of
+from hil.importers.imported_robot import Robot
 from hil.importers.log_files import LogFiles
 from hil.importers.messages import sentence
-from hil.importers.recording import ImportedRecording, ImportOptions, read_recording
-from hil.importers.robot import Robot
+from hil.importers.recording_import import ImportedRecording, ImportOptions, read_recording
 from hil.importers.text_table import TextTable
 from hil.pipeline.sources import cell_of, source_of
 from identification.signals.recording import PAUSE, Recording, cut_at_pauses

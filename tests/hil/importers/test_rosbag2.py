@@ -25,10 +25,10 @@ from hil.archive.recording_of_archive import open_recording
 from hil.base.errors import InputError, SourceError
 from hil.cell import Cell
 from hil.importers import bags, mcap_messages
-from hil.importers.arrays import read_mcap
+from hil.importers.array_files import read_mcap
 from hil.importers.column_map import ColumnMap
+from hil.importers.imported_robot import Robot
 from hil.importers.log import import_log
-from hil.importers.robot import Robot
 from hil.importers.ros_messages import MessageError, decoded, typestore_of
 from hil.importers.rosbag2 import import_rosbag2, recorded_joints
 from identification import FrictionLaw

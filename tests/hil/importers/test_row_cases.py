@@ -13,8 +13,8 @@ from hil.archive import open_archive
 from hil.base.errors import SourceError
 from hil.identified.identified_arm import arm_from
 from hil.importers.conclusions import ClockRestarted, CopiedCommands, RowCounter
-from hil.importers.recording import ImportOptions, read_recording
-from hil.importers.robot import Robot
+from hil.importers.imported_robot import Robot
+from hil.importers.recording_import import ImportOptions, read_recording
 from hil.look import look_at
 from hil.look.readings import Fact, RowsReading
 from identification.signals.row_faults import RowFaultKind

@@ -11,9 +11,9 @@ import pytest
 from hil.archive import open_archive
 from hil.base.errors import InputError, SourceError
 from hil.cell.arms import Links, arms_of, recorded_arms
+from hil.importers.imported_robot import Robot
 from hil.importers.messages import sentence
-from hil.importers.recording import ImportOptions, import_recording
-from hil.importers.robot import Robot
+from hil.importers.recording_import import ImportOptions, import_recording
 from hil.look import look_at
 from hil.pipeline.sources import cell_of
 from tests.hil.identified.test_one_command import hil

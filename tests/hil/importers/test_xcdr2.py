@@ -13,7 +13,7 @@ from typer.testing import CliRunner
 from hil.archive import open_archive
 from hil.base.errors import SourceError
 from hil.cli import app
-from hil.importers.robot import Robot
+from hil.importers.imported_robot import Robot
 from hil.importers.ros_messages import typestore_of
 from hil.importers.rosbag2 import import_rosbag2
 from hil.importers.xcdr2 import in_version_1

@@ -10,12 +10,12 @@ import pytest
 from hil.base.errors import InputError, SourceError
 from hil.base.progress import Silent
 from hil.importers.conclusions import Certainty
-from hil.importers.recording import ImportOptions, RobotOf, import_recording
-from hil.importers.robot import Robot
+from hil.importers.imported_robot import Robot
+from hil.importers.recording_import import ImportOptions, RobotOf, import_recording
 from hil.look import look_at
 from hil.look.readings import Changes, Fact
 from hil.payload.payload_run import find_payload
-from hil.pipeline.run import identify_archives
+from hil.pipeline.identification import identify_archives
 from identification.validation.facts.diagnosis import NO_BODIES
 from tests.hil.diagnosis_cases import CASES, URDF, identified, needs_the_cases, rigid_error
 

@@ -24,11 +24,12 @@ from hil.base.errors import SourceError
 from hil.cli import app
 from hil.importers.column_map import ColumnMap
 from hil.importers.conclusions import Certainty
-from hil.importers.recording import ImportOptions, import_recording
-from hil.importers.robot import Robot
+from hil.importers.imported_robot import Robot
+from hil.importers.recording_import import ImportOptions, import_recording
 from hil.look import Look, look_at
 from hil.look.before_identification import concluded, undecided
-from hil.look.maps import entries_of
+from hil.look.corrected_map import entries_of
+from hil.look.look import SETTINGS
 from hil.look.messages import row_text
 from hil.look.other_arm import Contradictions
 from hil.look.physics import channel_rows
@@ -43,7 +44,6 @@ from hil.look.readings import (
     TorqueDelay,
 )
 from hil.look.result import Aspect, TiedReading
-from hil.look.run import SETTINGS
 from hil.pipeline.sources import cell_of, source_of
 from identification.estimators.delay import DelayEstimate
 from identification.hypotheses.changes import Axes, Change

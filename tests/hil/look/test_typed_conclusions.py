@@ -17,8 +17,8 @@ from typer.testing import CliRunner
 from hil.cli import app
 from hil.importers import messages as import_messages
 from hil.importers.conclusions import Certainty, Conclusion
-from hil.importers.recording import ImportOptions
-from hil.importers.robot import Robot
+from hil.importers.imported_robot import Robot
+from hil.importers.recording_import import ImportOptions
 from hil.look import Look, Row, look_at
 from hil.look import messages as look_messages
 from hil.look.readings import Channels, Decider, Evidence, NextBest, Reading, Setting

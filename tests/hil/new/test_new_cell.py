@@ -26,12 +26,12 @@ from hil.base.progress import Silent
 from hil.campaign import Campaign, CampaignPlan, Stop, design
 from hil.cell import Cell
 from hil.cell.errors import UnknownFieldsError
-from hil.cell.text import urdf_limits
+from hil.cell.toml_edits import urdf_limits
 from hil.cli import app
 from hil.control.motion_checks import collision_checker
-from hil.control.simulation import simulated_link
+from hil.control.simulated_cell import simulated_link
 from hil.control.simulator_process import SIMULATE, free_port
-from hil.importers.robot import Robot
+from hil.importers.imported_robot import Robot
 from hil.new import cell_of_urdf, from_archive
 from hil.new.cell_text import with_fixed
 from hil.new.cell_values import _nothing_moves

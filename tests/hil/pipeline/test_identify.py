@@ -21,13 +21,13 @@ from hil.base.progress import Silent
 from hil.campaign.identified_campaign import identify_campaign
 from hil.cli import app
 from hil.cli.verdict import NOT_GOOD, as_json, finish, screen, sentences, table, whole
-from hil.control.simulation import planted_values
-from hil.importers.robot import Robot
+from hil.control.simulated_cell import planted_values
+from hil.importers.imported_robot import Robot
 from hil.pipeline.estimating import estimate_with
 from hil.pipeline.estimators import ESTIMATORS
+from hil.pipeline.identification import identify_archives
 from hil.pipeline.options import FIXED, Options, friction_from
 from hil.pipeline.prepared import _DelayChoice, decide, prepare_sources, renewed_delay, stated_delay
-from hil.pipeline.run import identify_archives
 from hil.pipeline.sources import gather_sources
 from hil.pipeline.summary import _delays
 from hil.report.output_files import settings_result, write_outcome

@@ -22,18 +22,18 @@ from hil.base.errors import InputError
 from hil.base.interrupt import descendants
 from hil.base.progress import Silent
 from hil.cell import Cell
-from hil.control.simulation import planted_values
+from hil.control.simulated_cell import planted_values
 from hil.design.messages import NoExcitationError
 from hil.study import FULL, QUICK, StudyResults, StudySettings, run_study, study_settings
 from hil.study.campaigns import CLASSES, StudyExecution, execute
-from hil.study.comparison import MIN_UNITS, compared, verdict_of
 from hil.study.estimates import HeldOutForms
+from hil.study.method_comparison import MIN_UNITS, compared, verdict_of
 from hil.study.model_errors import ALL, NONE, Condition
+from hil.study.paper_figures import parameters_of
 from hil.study.relations import relations_of
 from hil.study.results import Criterion, DesignPoint
 from hil.study.searches import SINES, search_plans, take_best
 from hil.study.settings import Effort
-from hil.study.shown import parameters_of
 from sim_fixtures.ns16 import CELL_PATH
 from tests.hil.fast_cell import fast_cell
 from tests.hil.report.test_report import assert_stands_alone
@@ -267,7 +267,7 @@ def arm(tmp_path_factory: pytest.TempPathFactory) -> Cell:
 def whole(tmp_path_factory: pytest.TempPathFactory, small: StudySettings, arm: Cell) -> Whole:
     """A study that Ctrl-C ended after its first campaign, and that was then started again."""
     root = tmp_path_factory.mktemp("first") / "study"
-    in_children = "hil.study.run.in_children"
+    in_children = "hil.study.study.in_children"
 
     def one_and_ctrl_c(
         _: object, calls: Sequence[tuple[Path, tuple[StudyExecution]]], *__: Any

@@ -19,7 +19,7 @@ from hil.campaign.dry_run import DryRunRecord
 from hil.campaign.operator import RunStatus
 from hil.campaign.campaign_run import RunResult
 from hil.control.motion_watch import OperatorRequest
-from hil.control.simulation import simulated_controller, simulated_link
+from hil.control.simulated_cell import simulated_controller, simulated_link
 from tests.hil.fast_cell import set_points
 
 Array = NDArray[np.float64]

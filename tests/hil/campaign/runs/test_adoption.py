@@ -15,7 +15,7 @@ from hil.archive.check import check_archive
 from hil.archive.repair import amend_outcome
 from hil.base.progress import Silent
 from hil.batch.cache import CacheLocation
-from hil.batch.discovery import discover
+from hil.batch.archive_discovery import discover
 from hil.campaign import (
     Campaign,
     quality,

@@ -20,7 +20,7 @@ from hil.campaign.errors import (
 )
 from hil.campaign.folder import CampaignFolder
 from hil.control.motion_watch import Stop
-from hil.control.simulation import simulated_link
+from hil.control.simulated_cell import simulated_link
 from tests.hil.campaign.runs.rig import Make, Operator, Real, kinds, peak_speed
 from tests.hil.fast_cell import mirrored, pass_rehearsal
 from tests.messages import AGAINST_GRAVITY, DRY_RUN_NOT_DONE

@@ -12,7 +12,7 @@ from hil.base.errors import OutputError
 from hil.campaign.operator import RunStatus
 from hil.control.errors import MotionFailedError
 from hil.control.motion_watch import OperatorRequest, Stop
-from hil.control.simulation import simulated_link
+from hil.control.simulated_cell import simulated_link
 from tests.hil.campaign.runs.rig import Make, Operator, kinds
 
 pytestmark = pytest.mark.safety

@@ -28,7 +28,7 @@ from hil.control.connection import active_checks
 from hil.control.motion_checks import MotionChecks
 from hil.control.motion_watch import Stop
 from hil.control.move import plan_move, send
-from hil.control.simulation import simulated_controller, simulated_link
+from hil.control.simulated_cell import simulated_controller, simulated_link
 from tests.hil.campaign.runs.rig import Make, Real
 from tests.hil.fast_cell import pass_rehearsal
 from tests.messages import ANOTHER_CELL_OR_PLAN

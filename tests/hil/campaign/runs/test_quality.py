@@ -22,7 +22,7 @@ from hil.campaign.errors import (
 from hil.campaign.quality import FIELDS, Executed, RepetitionCheck
 from hil.campaign.campaign_run import RunResult
 from hil.control.motion_watch import OperatorRequest
-from hil.control.simulation import controller_settings, simulated_controller
+from hil.control.simulated_cell import controller_settings, simulated_controller
 from hil.pipeline.sources import gather_sources
 from sim_fixtures.faults import parse_fault, split_faults
 from tests import messages

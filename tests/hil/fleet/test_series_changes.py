@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from hil.compare.comparison import holm
-from hil.fleet.changes import FEWEST, Series, courses
+from hil.fleet.series_changes import FEWEST, Series, courses
 
 MONTHS = 24
 SEASON = 0.06

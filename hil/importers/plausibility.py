@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from hil.archive import ImportedSamples
 from hil.base.arrays import Array
 from hil.base.errors import SourceError
-from hil.cell.text import UrdfLimits, urdf_limits
+from hil.cell.toml_edits import UrdfLimits, urdf_limits
 from hil.importers.conclusions import (
     Conclusion,
     ConstantPositions,

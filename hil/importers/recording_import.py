@@ -14,7 +14,7 @@ from hil.base.errors import ArchiveError, NotAnArchiveError, SourceError, Unreco
 from hil.base.safe_input import parse_toml
 from hil.base.toml_text import to_text
 from hil.cell.arms import Arm, Links, arms_of, recorded_arms
-from hil.cell.text import with_values
+from hil.cell.toml_edits import with_values
 from hil.importers.bag_map import BagMap
 from hil.importers.bags import open_bag
 from hil.importers.channels import channels_of
@@ -29,13 +29,14 @@ from hil.importers.conclusions import (
     RecordedArm,
     UnitBasis,
 )
-from hil.importers.folder import proposed_map_of_folder
+from hil.importers.folder_of_files import proposed_map_of_folder
+from hil.importers.imported_robot import Robot
 from hil.importers.lerobot import DataSet, Episode, EpisodeUnit, is_data_set
 from hil.importers.log import are_in_rows_of_their_own, read_log
 from hil.importers.log_files import LogFiles, is_folder_of_logs
 from hil.importers.partial_map import PartialMap
-from hil.importers.proposal import Proposal, proposed_map
-from hil.importers.robot import RecordingContent, Robot, Use, require_writable, write_to
+from hil.importers.proposed_map import Proposal, proposed_map
+from hil.importers.recording_content import RecordingContent, Use, require_writable, write_to
 from hil.importers.rosbag2 import Effort, joint_state_topics, read_rosbag2, recorded_joints
 from hil.importers.text_table import TextTable
 from hil.importers.units import UNITS, Kind
@@ -52,7 +53,7 @@ class ImportOptions:
     Attributes:
         columns: file of a column map, of some entries of one, or the name of a ready one; what it
             does not state is proposed.
-        chosen: channels by quantity, see :func:`hil.importers.proposal.proposed_map`.
+        chosen: channels by quantity, see :func:`hil.importers.proposed_map.proposed_map`.
         sample_rate: of a log without a time [Hz].
         topic: of the joint states of a bag.
         joint_names: in the URDF by name in the bag, where they differ.

@@ -12,7 +12,7 @@ from mcap.reader import make_reader
 
 from hil.base.errors import SourceError
 from hil.base.safe_input import open_file
-from hil.importers.arrays import ArrayFile
+from hil.importers.array_files import ArrayFile
 from hil.importers.channels import channels_of
 from hil.importers.column_map import Format
 from hil.importers.log_files import LogFiles

@@ -15,18 +15,19 @@ from hil.base.threads import one_thread
 from hil.base.version import software
 from hil.batch.cluster import Cluster
 from hil.cell import Cell
-from hil.control.simulation import planted_values, simulated_link
+from hil.control.simulated_cell import planted_values, simulated_link
 from identification.excitation import Method
 from sim_fixtures.ns16 import CELL_PATH
 
 from . import estimates
 from .campaigns import CLASSES, StudyExecution, execute, plan_study
 from .children import in_children
-from .comparison import compared
 from .estimates import DesignEstimates, HeldOutForms
 from .messages import conclusion_of, effect_words
+from .method_comparison import compared
 from .model_errors import ALL, NONE, Condition, ModelErrors, conditions_of
 from .page import study_page
+from .paper_figures import best_of, parameters_of, printed_rows, shown_condition
 from .relations import design_points, relations_of
 from .results import (
     ConditionResult,
@@ -37,7 +38,6 @@ from .results import (
 )
 from .searches import LABELS, Search, run_searches, search_plans
 from .settings import FULL, StudyFolder, StudySettings
-from .shown import best_of, parameters_of, printed_rows, shown_condition
 
 _PAIRS: Final[tuple[tuple[Method, Method], ...]] = (
     ("a", "b"),

@@ -16,7 +16,7 @@ from hil.base.arrays import Array
 from hil.base.errors import SourceError, UnrecordedJointError
 from hil.base.safe_input import parse_toml
 from hil.base.toml_text import to_text
-from hil.importers.arrays import ArrayFile
+from hil.importers.array_files import ArrayFile
 from hil.importers.channel_groups import NUMBER, ChannelGroup, grouped
 from hil.importers.channels import CHANNEL_NAMES, Channel, channels_of, kind_of, kinds_of_file
 from hil.importers.column_map import ColumnMap, Format, ready_map, ready_maps
@@ -28,9 +28,9 @@ from hil.importers.conclusions import (
     UnitBasis,
     UnusedChannels,
 )
+from hil.importers.imported_robot import Robot
 from hil.importers.log_files import LogFiles
 from hil.importers.name_words import is_measured, kind_by_words, kinds_said, words_of
-from hil.importers.robot import Robot
 from hil.importers.row_names import row_names
 from hil.importers.stated_units import other_unit
 from hil.importers.text_table import TextTable

@@ -14,16 +14,16 @@ from typing import Any, Final, NoReturn
 from hil.base.errors import SourceError, UnrecordedJointError
 from hil.base.safe_input import parse_toml
 from hil.base.toml_text import to_text
-from hil.importers.arrays import ArrayFile
+from hil.importers.array_files import ArrayFile
 from hil.importers.channel_groups import NUMBER, ChannelGroup, grouped
 from hil.importers.channels import channels_of, kinds_of_file
 from hil.importers.column_map import ColumnMap, Format
 from hil.importers.commands import COMMANDED
 from hil.importers.conclusions import ChannelMeaning, NameBasis, UnitBasis, UnusedChannels
+from hil.importers.imported_robot import NOT_RECORDED, Robot
 from hil.importers.log_files import LogFiles, files_in
 from hil.importers.name_words import kind_by_words
-from hil.importers.proposal import Proposal
-from hil.importers.robot import NOT_RECORDED, Robot
+from hil.importers.proposed_map import Proposal
 from hil.importers.stamps import is_clock
 from hil.importers.text_table import TextTable
 from hil.importers.units import Kind, kind_named

@@ -3,7 +3,7 @@
 import json
 
 from hil.cell import Cell
-from hil.control.simulation import simulated_provenance
+from hil.control.simulated_cell import simulated_provenance
 from sim_fixtures.ns16 import CELL_PATH
 
 

@@ -11,9 +11,14 @@ import pytest
 
 from hil.base.errors import SourceError
 from hil.importers.conclusions import OneTimeBase
+from hil.importers.imported_robot import Robot
 from hil.importers.log_files import is_folder_of_logs
-from hil.importers.recording import ImportedRecording, ImportOptions, is_archive, read_recording
-from hil.importers.robot import Robot
+from hil.importers.recording_import import (
+    ImportedRecording,
+    ImportOptions,
+    is_archive,
+    read_recording,
+)
 from tests.hil.importers.test_log_kinds import (
     JOINTS,
     POSITION,

@@ -37,7 +37,7 @@ from .places import (
     stamp_of,
     text_at,
 )
-from .search import KindsOfLogs, find_recordings
+from .recording_search import KindsOfLogs, find_recordings
 
 USES: Final = ("excitation", "validation", "standstill")
 """Uses of archives in a batch; archives of other kinds are skipped."""

@@ -16,11 +16,11 @@ from hil.cell import Cell
 from hil.importers.conclusions import Certainty, ChannelMeaning, Examined, NameBasis, UnitBasis
 from hil.importers.excerpt import LONGEST
 from hil.importers.log_files import LogFiles
-from hil.importers.recording import ImportedRecording, ImportOptions, RobotOf, read_recording
+from hil.importers.recording_import import ImportedRecording, ImportOptions, RobotOf, read_recording
 from hil.importers.required_signals import require_motion
 from hil.importers.units import Kind
 from hil.look import physics, signals
-from hil.look.maps import with_entries
+from hil.look.corrected_map import with_entries
 from hil.look.other_arm import Contradictions
 from hil.look.readings import Basis, Fact, NextStep
 from hil.look.result import Aspect, Look, ParameterGroup, Row
