@@ -20,7 +20,7 @@ from hil.base.files import make_folder
 from hil.base.progress import Reporter, Silent
 from hil.control.motion_watch import Stop, Unattended
 from hil.control.motions import CampaignMotion
-from hil.control.simulation import simulated_link, simulated_provenance
+from hil.control.simulated_cell import simulated_link, simulated_provenance
 from planner.errors import PlannerError
 from planner.worker import WorkerProcess
 
