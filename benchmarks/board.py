@@ -1,11 +1,13 @@
 """Identification with default settings and an ordinary fit, on real and on degraded recordings.
 
-Run with ``python -m benchmarks.board [--data FOLDER] [--only NAME] [--short] [--degraded]
-[--choices] [--json] [--page FILE]``, where FOLDER holds the folders of recordings that
+Run with ``python -m benchmarks.board [--data FOLDER] [--only NAME] [--splits WHICH]
+[--degraded] [--choices] [--json] [--page FILE]``, where FOLDER holds the folders of recordings that
 `benchmarks/recordings` describes. ``--fetch [FROM ...]`` collects these in FOLDER instead
 (`benchmarks.fetch`); ``--page docs/board.md`` writes the page (`benchmarks.board_page`), with
-``--rows FILE`` from a saved line of JSON instead of measuring. With ``--short`` the first and the
-last 40 % of each log are fitted and its rest is predicted.
+``--rows FILE`` from a saved line of JSON instead of measuring. With ``--splits short`` the first
+and the last 40 % of each log are fitted and its rest is predicted; with ``--splits perturbed``
+other pairs of motions, halves of logs, their first 10, 20 and 30 s, and one row in two: none of
+these is used in the choice of any default, so that they show what becomes of other recordings.
 
 Errors are ||tau - tau_hat|| / ||tau|| over all joints and every row of what is predicted, of the
 torque as it was recorded. *hil* imports a recording and identifies from the archive as `hil
@@ -36,13 +38,13 @@ import tempfile
 import time
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import Any, Final, NamedTuple
+from typing import Any, Final, Literal, NamedTuple, get_args
 
 import numpy as np
 
 from benchmarks import parser_of, plain_fit, show
 from benchmarks.board_page import commit, write_page
-from benchmarks.choices import CHOICES, judged_by_others, without
+from benchmarks.choices import CHOICES, judged_by_others, taken, without
 from benchmarks.degradations import CAUSES, DEGRADATIONS, EXPECTED, FITTED_ONLY, HARMLESS
 from benchmarks.fetch import FETCHED, fetch, show_fetched
 from benchmarks.identification_study import recorded, study
@@ -75,6 +77,8 @@ _RATED_PAYLOAD: Final = 16.0  # kg, of the NS 16
 _VALIDATION_SEED: Final = 1_000_000  # noise of its own
 
 
+Which = Literal["configured", "short", "perturbed"]
+"""Of the splits of each robot."""
 Row = dict[str, Any]
 """Of the line of JSON: `data` and `split` or `case`, and what was found."""
 
@@ -96,6 +100,14 @@ class Identified(NamedTuple):
 
 def cut(split: Split, logs: Mapping[str, JointLog]) -> Parts:
     """The parts of a split, of logs by name."""
+    parts = _parts(split, logs)
+    fitted, predicted = (part.rows(slice(None, None, split.every)) for part in parts)
+    if split.seconds is not None:
+        fitted = fitted.rows(fitted.time < fitted.time[0] + split.seconds)
+    return Parts(fitted, predicted)
+
+
+def _parts(split: Split, logs: Mapping[str, JointLog]) -> Parts:
     whole = logs[split.fitted]
     if split.predicted is not None:
         return Parts(whole, logs[split.predicted])
@@ -122,6 +134,8 @@ def identified(
 def identified_split(split: Split, archives: Mapping[str, Path], parts: Parts) -> Identified:
     """Identify what a split asks for, from whole archives where the options can say it."""
     fitted = archives[split.fitted]
+    if split.seconds is not None or split.every != 1:
+        return identified_parts(parts, fitted.parent)
     if split.predicted is not None:
         return identified(fitted, [archives[split.predicted]])
     if split.part == "last" or split.share != FITTED_SHARE:
@@ -176,7 +190,8 @@ def row(
     """
     parts = cut(split, logs)
     start = time.process_time()
-    ours = identified_split(split, archives, parts)
+    with taken() as made:
+        ours = identified_split(split, archives, parts)
     middle = time.process_time()
     fit, fit_joints = fit_errors(parts)
     seconds = {"hil": middle - start, "plain": time.process_time() - middle}
@@ -184,8 +199,10 @@ def row(
     calibration = ours.results.calibration
     left_out = {}
     for choice in CHOICES if choices else ():
-        with without(choice):
-            left_out[choice] = identified_split(split, archives, parts).error / ours.error
+        left_out[choice] = 1.0
+        if choice in made:
+            with without(choice):
+                left_out[choice] = identified_split(split, archives, parts).error / ours.error
     return {
         "data": name,
         "split": str(split),
@@ -202,13 +219,19 @@ def row(
     }
 
 
-def rows_of(name: str, data: Path, *, short: bool = False, choices: bool = False) -> Iterator[Row]:
-    """Every split of a configuration, or every short one, in the folder of all recordings."""
+def rows_of(
+    name: str, data: Path, which: Which = "configured", *, choices: bool = False
+) -> Iterator[Row]:
+    """Every split of a configuration, or every other one, in the folder of all recordings."""
     published = Published.named(name)
     with tempfile.TemporaryDirectory() as scratch:
         archives = import_all(published, data / (published.folder or name), Path(scratch))
         logs = {log: JointLog.read(path, published.rated_payload) for log, path in archives.items()}
-        for split in published.short_splits if short else published.splits:
+        splits = published.short_splits if which == "short" else published.splits
+        if which == "perturbed":
+            seconds = {log: float(np.ptp(values.time)) for log, values in logs.items()}
+            splits = published.perturbed_splits(seconds)
+        for split in splits:
             yield row(name, split, archives, logs, choices=choices)
 
 
@@ -390,7 +413,13 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser.add_argument(
         "--only", action="append", choices=[*known(), SIMULATED], help="may be repeated"
     )
-    parser.add_argument("--short", action="store_true", help="fit 40 %% of a log, predict the rest")
+    parser.add_argument(
+        "--splits",
+        choices=get_args(Which),
+        default="configured",
+        help="short: fit 40 %% of a log, predict the rest; perturbed: other pairs of motions,"
+        " halves, 10 to 30 s, one row in two",
+    )
     parser.add_argument("--choices", action="store_true", help="without each choice as well")
     parser.add_argument("--degraded", action="store_true", help="spoilt copies as well")
     parser.add_argument(
@@ -414,7 +443,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     rows: list[Row] = []
     degraded: list[Row] = []
     for name in wanted:
-        measured = rows_of(name, options.data, short=options.short, choices=options.choices)
+        measured = rows_of(name, options.data, options.splits, choices=options.choices)
         for row in () if name == SIMULATED else measured:
             rows.append(row)
             if not options.json:

@@ -69,6 +69,49 @@ def without(choice: str) -> Iterator[None]:
         yield
 
 
+@contextmanager
+def taken() -> Iterator[set[str]]:
+    """Collect the choices that make a difference: all but those that return a first candidate.
+
+    Leaving out one of the others repeats the same identification.
+    """
+    found = set[str]()
+
+    def noting(decide: Callable[..., SettingDecision]) -> Callable[..., SettingDecision]:
+        def noted(
+            trial: SettingsTrial,
+            name: str,
+            candidates: Sequence[Settings],
+            *others: Any,
+            **more: Any,
+        ) -> SettingDecision:
+            decision = decide(trial, name, candidates, *others, **more)
+            kept = candidates[0]
+            if name == names.DELAY:
+                kept = min(candidates, key=_added_delay)
+            if trial.key(decision.settings) != trial.key(kept):
+                found.update(choice for choice, decisions in CHOICES.items() if name in decisions)
+            return decision
+
+        return noted
+
+    def hedged(odds: Callable[..., float]) -> Callable[..., float]:
+        def measured(trial: SettingsTrial, *others: Any) -> float:
+            weight = odds(trial, *others)
+            if weight > names.LEAST_ODDS:
+                found.add("averaging")
+            return weight
+
+        return measured
+
+    with (
+        patch.object(SettingsTrial, "decide", noting(SettingsTrial.decide)),
+        patch.object(SettingsTrial, "decide_last", noting(SettingsTrial.decide_last)),
+        patch.object(SettingsTrial, "odds", hedged(SettingsTrial.odds)),
+    ):
+        yield found
+
+
 def _added_delay(settings: Settings) -> float:
     return abs(settings.preprocessing.torque_delay - settings.stated_delay)
 

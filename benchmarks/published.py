@@ -10,6 +10,7 @@ import importlib.metadata
 import io
 import tempfile
 import tomllib
+from collections.abc import Mapping
 from contextlib import redirect_stdout
 from pathlib import Path
 from typing import Any, Final, Literal, Self
@@ -22,6 +23,8 @@ from hil.cli import imports
 CONFIGURATIONS: Final = Path(__file__).parent / "recordings"
 FITTED_SHARE: Final = 0.7
 SHORT_SHARE: Final = 0.4
+LENGTHS: Final = (10.0, 20.0, 30.0)  # s, of what is fitted in perturbed splits
+LEAST_SECONDS: Final = 5.0
 
 
 class _Table(BaseModel):
@@ -37,12 +40,16 @@ class Split(_Table):
         part: of that log what is fitted: its first or last rows, and the rest predicted, or all of
             it, and predicted as well.
         share: of its rows that are fitted where it is a part.
+        seconds: at most so much of what is fitted, from its start; None: all of it.
+        every: of all rows every second one (2), or third; 1: all of them.
     """
 
     fitted: str
     predicted: str | None = None
     part: Literal["first", "last", "all"] = "all"
     share: float = FITTED_SHARE
+    seconds: float | None = None
+    every: int = 1
 
     @property
     def in_sample(self) -> bool:
@@ -50,6 +57,11 @@ class Split(_Table):
         return self.predicted is None and self.part == "all"
 
     def __str__(self) -> str:
+        shortened = "" if self.seconds is None else f", {self.seconds:g} s"
+        thinned = "" if self.every == 1 else f", 1 row in {self.every}"
+        return f"{self._parts()}{shortened}{thinned}"
+
+    def _parts(self) -> str:
         if self.predicted is not None:
             return f"{self.fitted} to {self.predicted}"
         if self.part == "all":
@@ -127,6 +139,38 @@ class Published(_Table):
             for log in self.logs
             for part in ("first", "last")
         )
+
+    def perturbed_splits(self, seconds: Mapping[str, float]) -> tuple[Split, ...]:
+        """Splits beside the configured ones, by the length of each log [s].
+
+        Every other pair of logs that configured splits join, directly or by others; the halves of
+        each log; of the first held-out split 10, 20 and 30 s, and one row in two. None fits less
+        than `LEAST_SECONDS`.
+        """
+        joined = {log: {log} for log in self.logs}
+        for split in self.splits:
+            if split.predicted is not None:
+                group = joined[split.fitted] | joined[split.predicted]
+                joined |= dict.fromkeys(group, group)
+        pairs = [
+            Split(fitted=one, predicted=other)
+            for one in self.logs
+            for other in self.logs
+            if one != other and other in joined[one]
+        ]
+        halves = [
+            Split(fitted=log, part=part, share=0.5)
+            for log in self.logs
+            for part in ("first", "last")
+            if 0.5 * seconds[log] >= LEAST_SECONDS
+        ]
+        held_out = next(split for split in self.splits if not split.in_sample)
+        whole = seconds[held_out.fitted] * (1.0 if held_out.predicted else held_out.share)
+        changed = [
+            held_out.model_copy(update={"seconds": length}) for length in LENGTHS if length < whole
+        ]
+        changed.append(held_out.model_copy(update={"every": 2}))
+        return tuple(each for each in (*pairs, *halves, *changed) if each not in self.splits)
 
     def urdf_text(self, folder: Path) -> str:
         """The URDF, beside the logs or in an installed package, with the bag's names of joints.

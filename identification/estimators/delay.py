@@ -448,7 +448,8 @@ def _moved(gram: Array, solution: Solution) -> tuple[Array, int]:
     gram = gram[gram[:, -1, -1] > 0.0]
     augmented = np.append(-solution.values, 1.0)
     gram = merged(gram, block_length(gram[:, :-1] @ augmented))
-    moved = spread(gram[:, :-1, :-1], gram[:, :-1] @ augmented, solution.root)
+    # A delay that is not there costs more than one whose interval is wide.
+    moved = spread(gram[:, :-1, :-1], gram[:, :-1] @ augmented, solution.root, left_out=True)
     return moved, max(2, len(gram))
 
 

@@ -338,7 +338,7 @@ def fit_posterior(
     `design_effect` rows count as one, by default as many as :func:`design_effect_of` says. The
     covariance has the scatter of the data, cluster-robust, and the prior's of what they leave open.
     That of a stronger prior is the mean square error by what is believed: the covariance of the
-    believed posterior, and the square of the way from its mean.
+    believed posterior, and the square of the way from its mean as far as its errors do not make it.
 
     Raises:
         IdentificationError: the factor has no rows.
@@ -350,10 +350,17 @@ def fit_posterior(
     if prior.believed is not None:
         base = fit_posterior(model, factor, prior.believed, design_effect)
         shift = values - base.estimate.values
+        bias = _beyond_chance(
+            shift,
+            base.estimate.covariance,
+            factor.weighted(weights).A,
+            design_effect * prior.information,
+            design_effect * prior.believed.information,
+        )
         estimate = replace(
             base.estimate,
             values=values,
-            covariance=base.estimate.covariance + np.outer(shift, shift),
+            covariance=base.estimate.covariance + np.outer(bias, bias),
             noise_std=factor.residual_rms(values),
             method=posterior_method(prior.origin, design_effect, base.scatter),
         )
@@ -371,6 +378,35 @@ def fit_posterior(
     return PosteriorEstimate(
         estimate, prior.mean, prior.std, prior.origin, design_effect, unmoved, scatter
     )
+
+
+def _beyond_chance(
+    shift: Array, covariance: Array, data: Array, stronger: Array, believed: Array
+) -> Array:
+    """Return the part of a shift (p,) by a stronger prior that errors of the estimate do not make.
+
+    Its square is that of the shift less what these errors make of it on average, both in units of
+    the information of data and prior; zero where that is more (James and Stein 1961, positive
+    part). Its direction is kept, as shifts of single parameters cancel in the torque.
+
+    Args:
+        shift: from the estimate by what is believed.
+        covariance: of that estimate (p, p), infinite variances of undetermined parameters.
+        data: information of the rows (p, p).
+        stronger: information of the stronger prior (p, p).
+        believed: of the prior of that estimate (p, p).
+    """
+    information = data + stronger
+    scale = 1.0 / np.sqrt(information.diagonal())
+    unit = solve_positive(
+        information * scale[:, None] * scale, (stronger - believed) * scale[:, None]
+    )
+    pull = scale[:, None] * unit
+    moved = pull @ np.where(np.isfinite(covariance), covariance, 0.0) @ pull.T
+    metric = data + believed
+    square = float(shift @ metric @ shift)
+    by_chance = float(np.einsum("pq,pq->", metric, moved))
+    return shift * np.sqrt(max(0.0, 1.0 - by_chance / square)) if square > 0.0 else shift
 
 
 def posterior_method(origin: str, design_effect: float, scatter: str) -> str:

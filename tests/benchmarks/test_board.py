@@ -12,12 +12,13 @@ import pinocchio as pin
 import pytest
 
 from benchmarks import board, degradations, plain_fit
-from benchmarks.choices import CHOICES, judged_by_others, without
+from benchmarks.choices import CHOICES, judged_by_others, taken, without
 from benchmarks.degradations import DEGRADATIONS, EXPECTED, FITTED_ONLY
 from benchmarks.joint_log import JointLog
 from benchmarks.plain_fit import Measured
 from benchmarks.published import Published, Split, known
 from hil.importers.imported_robot import Robot
+from identification.selection.folds import Errors
 from identification.selection.questions import BANDWIDTH
 from identification.selection.scores import SettingsTrial
 from identification.selection.settings import Settings
@@ -80,6 +81,12 @@ class TestSplit:
         assert np.array_equal(
             np.sort(np.concatenate([parts.fitted.time, parts.predicted.time])), whole
         )
+
+    def test_less_of_a_log_is_fitted_and_rows_are_left_out_of_both(self, logs: Logs) -> None:
+        split = Split(fitted="one", predicted="other", seconds=4.0, every=2)
+        parts = board.cut(split, logs)
+        assert np.array_equal(parts.fitted.time, logs["one"].time[:400:2])
+        assert np.array_equal(parts.predicted.time, logs["other"].time[::2])
 
     def test_the_split_of_an_archive_is_that_of_its_log(
         self, logs: Logs, archives: Archives, tmp_path: Path
@@ -173,6 +180,20 @@ class TestRow:
         assert decision.settings is candidates[0]
         assert decision.choice.chosen == 0
 
+    @pytest.mark.parametrize(("better", "made"), [(7.0, {"bandwidth"}), (14.0, set())])
+    def test_only_choices_that_differ_from_the_first_candidate_are_left_out(
+        self, better: float, made: set[str], monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        def errors(_: SettingsTrial, settings: Settings, __: str = "all") -> Errors:
+            size = 0.1 if settings.preprocessing.rigid_bandwidth == better else 0.2
+            return Errors(np.full((5, 2), size**2), np.ones((5, 2)))
+
+        monkeypatch.setattr(SettingsTrial, "errors", errors)
+        candidates = [Settings(Preprocessing(rigid_bandwidth=width)) for width in (14.0, 7.0)]
+        with taken() as found:
+            SettingsTrial(MODEL, lambda *_: []).decide(BANDWIDTH, candidates)
+        assert found == made
+
     def test_the_fields_of_a_degraded_one(
         self, logs: Logs, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
     ) -> None:
@@ -217,6 +238,27 @@ class TestConfiguration:
         for split in published.splits:
             assert {split.fitted, split.predicted or split.fitted} <= published.logs.keys()
         assert any(not split.in_sample for split in published.splits)
+
+    def test_perturbed_splits_are_others_of_logs_that_belong_together(self) -> None:
+        """Pairs that splits join, by a third log as well; halves; shorter and thinner ones."""
+        published = Published.named("psm")
+        splits = published.perturbed_splits({"f1": 25.0, "f2": 15.0, "f3": 8.0})
+        assert [str(split) for split in splits] == [
+            "f2 to f1", "f2 to f3", "f3 to f1", "f3 to f2",
+            "f1: first 50 % to last 50 %", "f1: last 50 % to first 50 %",
+            "f2: first 50 % to last 50 %", "f2: last 50 % to first 50 %",
+            "f1 to f2, 10 s", "f1 to f2, 20 s", "f1 to f2, 1 row in 2",
+        ]  # fmt: skip
+        assert not set(splits) & set(published.splits)
+
+    def test_sensors_and_currents_of_one_motion_are_no_pair(self) -> None:
+        published = Published.named("gen3")
+        names = {
+            str(split) for split in published.perturbed_splits(dict.fromkeys(published.logs, 4.0))
+        }
+        assert names == {
+            "b_sensor to a_sensor", "b_current to a_current", "a_sensor to b_sensor, 1 row in 2",
+        }  # fmt: skip
 
 
 class TestDegradations:

@@ -46,7 +46,13 @@ from identification import (
 from identification.distributions import student_limit
 from identification.estimators import prior as prior_module
 from identification.estimators.consistent import consistent_values, is_consistent
-from identification.estimators.covariance import Clustered, block_length, cluster_covariance, spread
+from identification.estimators.covariance import (
+    Clustered,
+    block_length,
+    cluster_covariance,
+    leverage_corrected,
+    spread,
+)
 from identification.estimators.delay import LONGEST_DELAY, delay_sensitivity
 from identification.estimators.losses import Loss
 from identification.estimators.prior import (
@@ -179,8 +185,8 @@ class TestBlocks:
         if correlation >= 0.02:
             assert np.mean(classical) < 0.75
 
-    def test_leverage_correction_is_leaving_out_one_block(self):
-        # CR3: corrected score is A times the change without the block.
+    def test_leaving_out_one_block_at_a_time(self):
+        """The score is A times the change without the block."""
         motion = a_motion(4.0)
         noise = coloured(np.random.default_rng(9), len(motion.time), 5e-3, 0.02)
         phase = Factor.by_time(MODEL, recording(noise, motion))
@@ -195,8 +201,30 @@ class TestBlocks:
         np.testing.assert_allclose(phase.scores(weights, values), scores, atol=1e-8)
         without = np.linalg.solve(a - a_blocks, (b - b_blocks)[:, :, None])[:, :, 0]
         moved = values - without
-        rows = spread(a_blocks, scores, solve(phase.weighted(weights)).root)
+        rows = spread(a_blocks, scores, solve(phase.weighted(weights)).root, left_out=True)
         np.testing.assert_allclose(rows.T @ rows, moved.T @ moved, rtol=1e-9)
+
+    @pytest.mark.parametrize("largest", [0.1, 0.45])
+    def test_covariance_is_unbiased_for_white_residuals(self, largest):
+        """Whose scores have the covariance H - H² after the fit; the truth is the unit matrix.
+
+        `largest` is the leverage of one block in one direction.
+        """
+        rng = np.random.default_rng(4)
+        rows = rng.standard_normal((30, 4, 5))
+        rows[:, :, -1] *= np.sqrt(1.0 - largest)
+        rows[7, 0, -1] = np.sqrt(30.0 * 4.0 * largest)
+        information = np.swapaxes(rows, 1, 2) @ rows
+        root = solve(NormalEquations(information.sum(axis=0), np.ones(5))).root
+        shares = root.T @ information @ root
+        left = shares - shares @ shares
+        eigenvalues, vectors = np.linalg.eigh(left)
+        halves = vectors * np.sqrt(np.maximum(eigenvalues, 0.0))[:, None]
+        total = np.zeros((5, 5))
+        for k in range(5):
+            corrected = leverage_corrected(shares, halves[:, :, k])
+            total += corrected.T @ corrected
+        np.testing.assert_allclose(np.linalg.eigvalsh(total), 1.0, rtol=3e-3)
 
     @pytest.mark.parametrize("largest", [0.1, 0.7, 1.0])
     def test_symmetric_shares_have_the_covariance_of_general_ones(self, largest):
@@ -713,6 +741,24 @@ class TestWeightOfBodies:
             half = estimate.interval_factor * estimate.std
             inside.append(np.abs(estimate.values - values) < half)
         assert np.mean(inside) > 0.9
+
+    def test_a_shift_that_chance_alone_makes_hardly_widens_intervals(self):
+        """Of an arm that is as described: by less than half of its square, E max(0, z² - 1)."""
+        motion = a_motion(5.0)
+        torque = MODEL.torque(self.PRIOR.gaussian.mean, motion)
+        ratios = []
+        whole = []
+        for seed in range(12):
+            noisy_torque = torque + gaussian(np.random.default_rng(seed), motion)
+            factor = Factor.by_time(MODEL, as_samples(MODEL, motion, noisy_torque))
+            believed = fit_posterior(MODEL, factor, self.PRIOR.gaussian, 1.0)
+            result = fit_posterior(MODEL, factor, self.PRIOR.with_weight(1e6).gaussian, 1.0)
+            variance = believed.estimate.std**2
+            ratios.append(result.estimate.std**2 / variance)
+            whole.append(1.0 + result.shift**2 / variance)
+        added, of_the_shift = np.mean(ratios) - 1.0, np.mean(whole) - 1.0
+        assert of_the_shift > 0.5
+        assert added < 0.5 * of_the_shift
 
 
 class TestDesignEffect:
