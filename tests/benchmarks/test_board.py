@@ -82,7 +82,7 @@ class TestSplit:
             np.sort(np.concatenate([parts.fitted.time, parts.predicted.time])), whole
         )
 
-    def test_less_of_a_log_is_fitted_and_rows_are_left_out_of_both(self, logs: Logs) -> None:
+    def test_seconds_of_the_fitted_rows_and_one_row_in_two(self, logs: Logs) -> None:
         split = Split(fitted="one", predicted="other", seconds=4.0, every=2)
         parts = board.cut(split, logs)
         assert np.array_equal(parts.fitted.time, logs["one"].time[:400:2])
@@ -181,7 +181,7 @@ class TestRow:
         assert decision.choice.chosen == 0
 
     @pytest.mark.parametrize(("better", "made"), [(7.0, {"bandwidth"}), (14.0, set())])
-    def test_only_choices_that_differ_from_the_first_candidate_are_left_out(
+    def test_choices_of_a_first_candidate_are_not_left_out(
         self, better: float, made: set[str], monkeypatch: pytest.MonkeyPatch
     ) -> None:
         def errors(_: SettingsTrial, settings: Settings, __: str = "all") -> Errors:
@@ -239,7 +239,7 @@ class TestConfiguration:
             assert {split.fitted, split.predicted or split.fitted} <= published.logs.keys()
         assert any(not split.in_sample for split in published.splits)
 
-    def test_perturbed_splits_are_others_of_logs_that_belong_together(self) -> None:
+    def test_perturbed_splits_are_of_logs_that_belong_together(self) -> None:
         """Pairs that splits join, by a third log as well; halves; shorter and thinner ones."""
         published = Published.named("psm")
         splits = published.perturbed_splits({"f1": 25.0, "f2": 15.0, "f3": 8.0})

@@ -742,7 +742,7 @@ class TestWeightOfBodies:
             inside.append(np.abs(estimate.values - values) < half)
         assert np.mean(inside) > 0.9
 
-    def test_a_shift_that_chance_alone_makes_hardly_widens_intervals(self):
+    def test_a_shift_by_chance_hardly_widens_intervals(self):
         """Of an arm that is as described: by less than half of its square, E max(0, z² - 1)."""
         motion = a_motion(5.0)
         torque = MODEL.torque(self.PRIOR.gaussian.mean, motion)
