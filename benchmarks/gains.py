@@ -14,9 +14,9 @@ from numpy.typing import NDArray
 
 from benchmarks import parser_of, show
 from benchmarks.payload import DRIFT, arm_model, load_of, recordings_of, samples_of
-from identification.estimators.gains import identify_gains
+from identification.estimators.current_gains import identify_gains
 from identification.factor.columns import gain_factor
-from identification.model.payload import Payload
+from identification.model.known_payload import Payload
 
 Array = NDArray[np.float64]
 

@@ -18,7 +18,7 @@ import scipy
 from numpy.typing import NDArray
 
 from benchmarks import parser_of, show
-from identification.estimators.payload import NAMES, figures_of, identify_payload
+from identification.estimators.payload_estimate import NAMES, figures_of, identify_payload
 from identification.estimators.payload_problem import Run
 from identification.model.friction import FrictionLaw
 from identification.model.pseudo_inertia import Body

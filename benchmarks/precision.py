@@ -70,7 +70,7 @@ from hil.weighing.payload_campaign import (
     assumed_payload,
     loaded_cell,
 )
-from identification.estimators.payload import NAMES, figures_of, identify_payload
+from identification.estimators.payload_estimate import NAMES, figures_of, identify_payload
 from identification.estimators.payload_problem import KnownArm, Run
 from identification.estimators.prior import body_prior, design_effect_of, fit_posterior
 from identification.excitation import ViaPointMotion

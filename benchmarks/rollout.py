@@ -43,9 +43,10 @@ from hil.pipeline.identify_folder import identify_paths
 from hil.results.rollout_result import JUDGED, RolloutResult
 from hil.rollout.torque_rollout import RolloutOptions, nominal_arm, roll_out
 from identification import Samples
-from identification.export.arm import ExportedArm, Ranges
+from identification.export.exported_arm import ExportedArm, Ranges
 from identification.model.motion import Motion
-from identification.rollout.comparison import (
+from identification.rollout.polish import Driven, polished
+from identification.rollout.position_errors import (
     HORIZONS,
     RecordedMotion,
     continued,
@@ -55,7 +56,6 @@ from identification.rollout.comparison import (
     recorded_stretches,
     simulate,
 )
-from identification.rollout.polish import Driven, polished
 from identification.rollout.windows import STEP, windows_of
 from sim_fixtures.ns16 import CELL_PATH
 

@@ -31,9 +31,9 @@ from benchmarks import servo_arm as planted
 from identification import RobotModel
 from identification.servo.choice import fit_servos
 from identification.servo.intervals import intervals_of
-from identification.servo.motion import Grid, motions_of
 from identification.servo.parameters import PLACE
 from identification.servo.prediction import predicted
+from identification.servo.recorded_motion import Grid, motions_of
 from identification.signals.recording import Recording
 
 Array = NDArray[np.float64]

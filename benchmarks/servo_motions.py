@@ -21,9 +21,9 @@ from hil.results.provenance import RESULTS
 from hil.results.servo_result import ServoResults, ServoValue
 from hil.servo.identification import bodies_of
 from hil.servo.maker_file import maker_parameters
-from identification.servo.motion import Grid, motions_of
 from identification.servo.parameters import PLACE
 from identification.servo.prediction import predicted
+from identification.servo.recorded_motion import Grid, motions_of
 
 Array = NDArray[np.float64]
 

@@ -17,10 +17,10 @@ from typing import Any, Final, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from identification.export.arm import ExportedArm
+from identification.export.exported_arm import ExportedArm
 from identification.export.simulators import mjcf
-from identification.rollout.comparison import RecordedMotion, horizon_rows
-from identification.rollout.simulation import Feedback, RolloutArm
+from identification.rollout.mujoco_simulation import Feedback, RolloutArm
+from identification.rollout.position_errors import RecordedMotion, horizon_rows
 
 Array = NDArray[np.float64]
 

@@ -4,13 +4,13 @@
 from identification.errors import IdentificationError, ModelError, ShapeError
 from identification.estimators.consistent import ConsistentEstimate, consistent_estimate
 from identification.estimators.covariance import with_block_covariance
+from identification.estimators.current_gains import Gains, identify_gains
 from identification.estimators.delay import (
     DelayEstimate,
     estimate_delay,
     rate_products,
     with_uncertain_delay,
 )
-from identification.estimators.gains import Gains, identify_gains
 from identification.estimators.instrumental import (
     InstrumentalEstimate,
     estimate_instrumental,
@@ -31,7 +31,7 @@ from identification.estimators.prior import (
     with_prior,
 )
 from identification.estimators.robust import RobustEstimate, robust_estimate
-from identification.export.parameters import covariance_csv, parameters_csv, parameters_json
+from identification.export.parameter_files import covariance_csv, parameters_csv, parameters_json
 from identification.export.urdf import write_urdf
 from identification.factor.columns import instrument_factor
 from identification.factor.estimate import Estimate, estimate
@@ -47,8 +47,8 @@ from identification.model.elements import (
     TorsionSpring,
 )
 from identification.model.friction import FrictionLaw, JointFriction
+from identification.model.known_payload import Payload
 from identification.model.motion import Motion
-from identification.model.payload import Payload
 from identification.model.regressor import Regressor
 from identification.model.robot import RobotModel
 from identification.selection.essential import Elimination, eliminate

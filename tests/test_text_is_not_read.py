@@ -66,7 +66,7 @@ OURS: Final[Mapping[str, str]] = {
     "hil.report.numbers": "figures are typeset",
     "hil.campaign.screen": "the colour of a refusal, which begins with one word in capitals",
     "hil.base.terminal_text": "joints get their names in what the drivers say",
-    "identification.export.parameters": "a comment is made safe for spreadsheets",
+    "identification.export.parameter_files": "a comment is made safe for spreadsheets",
 }
 """Modules that read text of ours: for its form, or until what they look for is a value."""
 

@@ -28,9 +28,7 @@ from identification.reduction.reduction import Reduction
 from identification.selection.settings import Settings
 
 from .archive_discovery import ArchiveRef, cell_from
-from .cache import CacheLocation
-from .cluster import SkippedArchive
-from .reduction import (
+from .archive_reduction import (
     ReducedArchives,
     Summary,
     ToReduce,
@@ -39,6 +37,8 @@ from .reduction import (
     reduce_archives,
     settings_digest,
 )
+from .cache import CacheLocation
+from .cluster import SkippedArchive
 
 Level = Literal["repetition", "campaign", "pooled", "siblings"]
 BatchEstimator = Literal["auto", "wls", "consistent"]

@@ -36,6 +36,14 @@ from .archive_discovery import (
     open_only,
     open_ref,
 )
+from .archive_reduction import (
+    ToReduce,
+    ensure_reduced,
+    load_source,
+    reduce_archives,
+    reduction_key,
+    to_reduce,
+)
 from .cache import CacheLocation, code_digest
 from .cluster import AnyFuture, Cluster, ClusterTask, Death, SkippedArchive, error_of, reason_of
 from .estimates import (
@@ -49,14 +57,6 @@ from .estimates import (
     estimate_campaign,
     group_of,
     result_of,
-)
-from .reduction import (
-    ToReduce,
-    ensure_reduced,
-    load_source,
-    reduce_archives,
-    reduction_key,
-    to_reduce,
 )
 
 PARTITION: Final = 16

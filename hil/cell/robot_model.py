@@ -26,7 +26,7 @@ from identification.model.elements import (
 )
 from identification.model.friction import FrictionLaw
 from identification.model.kinematics import Chain, chain_from_urdf, pinocchio_model
-from identification.model.payload import Payload
+from identification.model.known_payload import Payload
 from identification.model.robot import RobotModel
 
 from .errors import CellError

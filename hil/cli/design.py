@@ -34,7 +34,7 @@ from hil.precision.forecast import PrecisionDesign, payload_search, short_search
 from hil.precision.given_recordings import given_of
 from hil.precision.requirements import requirements_from
 from hil.weighing.payload_campaign import assumed_payload, loaded_cell, payload_options
-from identification.model.payload import Payload
+from identification.model.known_payload import Payload
 
 
 def design_summary(done: Designed, folder: DesignFolder) -> dict[str, Any]:

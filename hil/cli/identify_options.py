@@ -13,7 +13,7 @@ from hil.base.errors import InputError
 from hil.cli.arguments import ESTIMATION
 from hil.pipeline.estimators import ESTIMATORS, Estimator
 from hil.pipeline.options import Options, friction_from
-from identification.rollout.servo import PositionServo
+from identification.rollout.servo_by_torque import PositionServo
 
 LONGEST_DELAY: Final = 0.5
 """Largest delay accepted, s."""

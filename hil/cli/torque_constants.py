@@ -17,7 +17,7 @@ from hil.cli.identify_options import delay_from
 from hil.cli.verdict import NOT_GOOD
 from hil.pipeline.sources import archives_in
 from hil.pipeline.torque_constants import GainsFound, find_gains
-from identification.model.payload import Payload
+from identification.model.known_payload import Payload
 
 
 def torque_constants(

@@ -27,7 +27,7 @@ from hil.weighing.payload_campaign import (
     PayloadMounting,
     assumed_payload,
 )
-from identification.model.payload import Payload
+from identification.model.known_payload import Payload
 
 _ANSWER: Final = "Type yes when the arm may move; anything else ends the run: "
 

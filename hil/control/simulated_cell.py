@@ -15,7 +15,7 @@ from hil.cell import AngleFrame, Cell, CellError
 from hil.control.motion_checks import collision_checker
 from hil.control.own_moves import InterpolatedMoves
 from hil.control.virtual_link import VirtualLink
-from identification.model.payload import Payload
+from identification.model.known_payload import Payload
 from identification.model.pseudo_inertia import body
 from identification.text import percentage
 from sim_fixtures import (

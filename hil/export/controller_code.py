@@ -18,11 +18,11 @@ from hil.base.arrays import Array
 from hil.base.errors import InputError
 from hil.base.files import make_folder, write_files
 from hil.pipeline.identified_model import IdentifiedModel
-from identification.export.arm import ExportedArm
 from identification.export.controller.c_source import CSource, Precision, c_source
 from identification.export.controller.reference import reference_torque
 from identification.export.controller.structured_text import structured_text
 from identification.export.controller.tables import control_tables
+from identification.export.exported_arm import ExportedArm
 from identification.export.simulators import STATES, random_states
 from identification.export.urdf import WriteBackError
 

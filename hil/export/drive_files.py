@@ -16,7 +16,7 @@ from hil.base.files import make_folder, write_files
 from hil.base.safe_input import read_input
 from hil.pipeline.identified_model import IdentifiedModel, ensemble_of, remarks_of
 from identification.export.actuators import Actuators, FieldRange, Quantity, ranges_of
-from identification.export.arm import ExportedArm
+from identification.export.exported_arm import ExportedArm
 from identification.export.patching import PatchError, patched
 from identification.export.python_files import (
     GENESIS,

@@ -21,7 +21,7 @@ from hil.pipeline.sources import Source, gather_sources
 from hil.results.provenance import RESULTS
 from hil.results.servo_result import ServoResults, SimulatorServo, is_servo_result
 from identification.export.actuators import Actuators, FieldRange, Quantity, ranges_of
-from identification.export.arm import ExportedArm
+from identification.export.exported_arm import ExportedArm
 from identification.export.patching import PatchError, patched
 from identification.export.playback import played_back
 from identification.export.python_files import (

@@ -9,7 +9,7 @@ from typing import Final, Literal, get_args
 import numpy as np
 
 from hil.base.arrays import Array
-from hil.batch.reduction import Summary
+from hil.batch.archive_reduction import Summary
 from hil.compare.comparison import SPEEDS, friction_weights, projected
 from identification import RobotModel
 from identification.factor.estimate import Estimate

@@ -21,10 +21,10 @@ from hil.base.errors import InputError
 from hil.base.progress import Reporter
 from hil.base.threads import one_thread
 from hil.batch.archive_discovery import ArchiveRef, LogImport, cell_in, discover, open_ref
+from hil.batch.archive_reduction import Summary, summarise
 from hil.batch.cache import CacheLocation
 from hil.batch.cluster import Cluster, ClusterTask, SkippedArchive
 from hil.batch.graph import archives_for_settings, cached_settings, decide_settings
-from hil.batch.reduction import Summary, summarise
 from hil.compare.comparison import LEAST, holm
 from hil.fleet.naming import RobotNaming
 from hil.fleet.quantities import (

@@ -26,7 +26,7 @@ from hil.pipeline.sources import (
     gather_sources,
     refuse_duplicates,
 )
-from identification.estimators.payload import (
+from identification.estimators.payload_estimate import (
     NAMES,
     PayloadEstimate,
     contradiction,

@@ -11,7 +11,7 @@ from hil.cell.nominal import nominal_of
 from hil.results.series import ReportSeries, example_series
 from identification import RobotModel
 from identification.estimators.least_squares import RepeatedEstimate
-from identification.export.friction import friction_curve, friction_torque, median_load
+from identification.export.friction_curve import friction_curve, friction_torque, median_load
 from identification.signals.samples import Samples
 
 from .prepared import Prepared, moving_rows

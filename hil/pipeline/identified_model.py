@@ -25,8 +25,8 @@ from hil.results.provenance import (
 from identification import Estimate, Factor, Samples
 from identification.estimators.consistent import ConsistentEstimate
 from identification.estimators.ensemble import Ensemble, draw_ensemble
-from identification.export.arm import ExportedArm, Ranges
-from identification.export.friction import median_load
+from identification.export.exported_arm import ExportedArm, Ranges
+from identification.export.friction_curve import median_load
 from identification.factor.blocks import FINE_BLOCK, fine_blocks
 from identification.model.pseudo_inertia import margin
 from identification.model.robot import RobotModel

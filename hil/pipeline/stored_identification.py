@@ -36,7 +36,7 @@ from hil.results.provenance import (
 from hil.results.results import Results, SettingsResult
 from hil.results.series import ReportSeries, load_series
 from identification.errors import IdentificationError
-from identification.export.parameters import estimate_in
+from identification.export.parameter_files import estimate_in
 from identification.factor.estimate import Estimate
 from identification.model.link_wrenches import LINK_SYMBOLS
 from identification.validation.verdict import Verdict

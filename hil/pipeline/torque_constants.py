@@ -14,11 +14,11 @@ from hil.archive import open_archive
 from hil.base.errors import ArchiveError, InputError
 from hil.base.progress import Reporter
 from hil.cell import Cell
-from identification.estimators.gains import MOST_BLOCKS, Gains, identify_gains
+from identification.estimators.current_gains import MOST_BLOCKS, Gains, identify_gains
 from identification.factor.blocks import FINE_BLOCK
 from identification.factor.columns import gain_factor
 from identification.factor.factor import Factor
-from identification.model.payload import Payload
+from identification.model.known_payload import Payload
 from identification.model.robot import RobotModel
 from identification.selection.settings import Settings
 from identification.signals.recording import RecordingError

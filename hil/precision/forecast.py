@@ -26,20 +26,20 @@ from hil.pipeline.options import FIXED
 from hil.pipeline.prepared import reduction_of, stated_settings, versions_of
 from hil.precision.given_recordings import given_sources
 from hil.precision.required_quantities import ReferenceMotions, Wanted
-from identification.estimators.payload import parameter_change
+from identification.estimators.payload_estimate import parameter_change
 from identification.estimators.payload_problem import DRIFT
 from identification.excitation import Excitation, LoadQuantities, Objective, midpoints
-from identification.excitation.precision import Precision, Quantities
+from identification.excitation.motion_precision import Precision, Quantities
 from identification.factor.estimate import inverse_variance
 from identification.factor.factor import Factor
+from identification.model.known_payload import Payload
 from identification.model.motion import Motion
-from identification.model.payload import Payload
 from identification.model.robot import RobotModel
 from identification.selection.settings import Strength
 from planner import JointLimits, Trajectory
 from sim_fixtures.servo import loops_per_cycle
 
-from .predicted import PredictedRows
+from .predicted_variances import PredictedRows
 from .requirements import Requirement, require_known
 
 ERROR_SHARE: Final = 0.03

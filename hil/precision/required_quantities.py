@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hil.base.arrays import Array
-from identification.excitation.precision import LoadQuantities, Quantities
+from identification.excitation.motion_precision import LoadQuantities, Quantities
 from identification.model.motion import Motion
 from identification.model.robot import RobotModel
 

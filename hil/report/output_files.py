@@ -27,8 +27,8 @@ from hil.results.rollout_result import ROLLOUT, RolloutResult
 from hil.results.series import SERIES, load_series
 from identification import Estimate, IdentificationError
 from identification.estimators.consistent import ConsistentEstimate
-from identification.export.friction import median_load
-from identification.export.parameters import covariance_csv, parameters_csv, parameters_json
+from identification.export.friction_curve import median_load
+from identification.export.parameter_files import covariance_csv, parameters_csv, parameters_json
 from identification.export.urdf import write_urdf
 
 REPORT = "report.html"

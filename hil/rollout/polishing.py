@@ -6,9 +6,9 @@ import numpy as np
 
 from hil.base.progress import Reporter
 from hil.results.rollout_result import ArmErrors, PolishedParameter, PolishResult
-from identification.export.arm import ExportedArm
-from identification.rollout.comparison import RolloutErrors, errors_of, horizon_rows
+from identification.export.exported_arm import ExportedArm
 from identification.rollout.polish import Driven, polished
+from identification.rollout.position_errors import RolloutErrors, errors_of, horizon_rows
 from identification.text import percentage
 
 

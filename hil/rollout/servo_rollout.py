@@ -29,9 +29,11 @@ from hil.rollout.torque_rollout import (
     with_commands,
 )
 from identification import IdentificationError, Samples
-from identification.export.arm import ExportedArm
+from identification.export.exported_arm import ExportedArm
 from identification.model.flange import flange_name
-from identification.rollout.comparison import (
+from identification.rollout.mujoco_simulation import Feedback
+from identification.rollout.polish import Driven
+from identification.rollout.position_errors import (
     HORIZONS,
     RecordedMotion,
     RolloutErrors,
@@ -42,10 +44,8 @@ from identification.rollout.comparison import (
     recorded_stretches,
     simulate,
 )
-from identification.rollout.encoders import NAMES, EncoderFit, fit_servo
-from identification.rollout.polish import Driven
-from identification.rollout.servo import lead_of
-from identification.rollout.simulation import Feedback
+from identification.rollout.servo_by_positions import NAMES, EncoderFit, fit_servo
+from identification.rollout.servo_by_torque import lead_of
 from identification.rollout.windows import STEP, windows_of
 
 _FRICTION = "coulomb,viscous"

@@ -28,10 +28,12 @@ from hil.results.rollout_result import JUDGED, ROLLOUT, ArmErrors, PolishResult,
 from hil.rollout.polishing import polish
 from identification import IdentificationError, Samples
 from identification.estimators.ensemble import Ensemble
-from identification.export.arm import ExportedArm
+from identification.export.exported_arm import ExportedArm
 from identification.export.simulators import FORMATS, read_back
 from identification.model.flange import flange_name
-from identification.rollout.comparison import (
+from identification.rollout.mujoco_simulation import LARGEST_ERROR, Feedback
+from identification.rollout.polish import Driven
+from identification.rollout.position_errors import (
     HORIZONS,
     RecordedMotion,
     ResidualTorque,
@@ -46,9 +48,12 @@ from identification.rollout.comparison import (
     simulate,
     variants,
 )
-from identification.rollout.polish import Driven
-from identification.rollout.servo import NoServoError, PositionServo, identify_servo, lead_of
-from identification.rollout.simulation import LARGEST_ERROR, Feedback
+from identification.rollout.servo_by_torque import (
+    NoServoError,
+    PositionServo,
+    identify_servo,
+    lead_of,
+)
 from identification.rollout.windows import STEP, Stretch, windows_of
 
 PICTURE = "rollout.png"

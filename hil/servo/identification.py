@@ -35,11 +35,11 @@ from hil.servo.messages import verdict_of
 from identification.servo.choice import ServoFit, fit_servos, steps_of_a_fit
 from identification.servo.fit import ServoEstimate
 from identification.servo.intervals import intervals_of
-from identification.servo.motion import Grid, ServoMotion, motions_of
 from identification.servo.parameters import TERMS, in_units
 from identification.servo.prediction import predicted
 from identification.servo.pushes import pushes_of
-from identification.servo.simulators import ENGINES, ITERATIONS, Engine, fits_in_simulators
+from identification.servo.recorded_motion import Grid, ServoMotion, motions_of
+from identification.servo.simulator_terms import ENGINES, ITERATIONS, Engine, fits_in_simulators
 
 _FINEST: Final = 1e-5  # rad or m, least resolution of positions
 _MILLI: Final = 1e3

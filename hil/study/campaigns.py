@@ -21,7 +21,7 @@ from hil.control.simulated_cell import simulated_link, simulated_provenance
 from hil.design.messages import NoExcitationError
 from identification.excitation import SineGenome
 
-from .children import StudyError
+from .child_calls import StudyError
 from .searches import Search
 from .settings import StudyFolder, StudySettings
 

@@ -15,7 +15,7 @@ from hil.design.design import DesignFolder, run_design
 from hil.design.messages import NoExcitationError
 from identification.excitation import Excitation, Method
 
-from .children import in_children
+from .child_calls import in_children
 from .settings import Effort, StudyFolder, StudySettings
 
 LABELS: Final[Mapping[Method, str]] = {"a": "A", "b": "B", "gradient": "gradient"}

@@ -21,14 +21,14 @@ from sim_fixtures.ns16 import CELL_PATH
 
 from . import estimates
 from .campaigns import CLASSES, StudyExecution, execute, plan_study
-from .children import in_children
+from .child_calls import in_children
+from .criteria_relations import design_points, relations_of
 from .estimates import DesignEstimates, HeldOutForms
 from .messages import conclusion_of, effect_words
 from .method_comparison import compared
 from .model_errors import ALL, NONE, Condition, ModelErrors, conditions_of
 from .page import study_page
 from .paper_figures import best_of, parameters_of, printed_rows, shown_condition
-from .relations import design_points, relations_of
 from .results import (
     ConditionResult,
     MotionRow,

@@ -44,8 +44,8 @@ from hil.control.simulated_cell import simulated_link
 from hil.payload.payload_run import NoPayloadError, PayloadFound, find_payload, flange_of
 from hil.precision.requirements import Requirement
 from identification import IdentificationError
-from identification.estimators.payload import ball_radius
-from identification.model.payload import Payload
+from identification.estimators.payload_estimate import ball_radius
+from identification.model.known_payload import Payload
 from identification.model.pseudo_inertia import body
 
 CENTRE: Final = (0.0, 0.0, 0.1)

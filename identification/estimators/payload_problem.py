@@ -1,4 +1,4 @@
-"""The joint problem of recordings without and with a body, see :mod:`.payload`.
+"""The joint problem of recordings without and with a body, see :mod:`.payload_estimate`.
 
 Its unknowns are those of arm and body, and drifts of each recording.
 """

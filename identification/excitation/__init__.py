@@ -35,7 +35,7 @@ from identification.excitation.errors import (
 )
 from identification.excitation.excitation import Excitation, ViaPointMotion
 from identification.excitation.genomes import Genome, SineGenome, ViaPointGenome
-from identification.excitation.precision import LoadQuantities, Precision, Quantities
+from identification.excitation.motion_precision import LoadQuantities, Precision, Quantities
 from identification.excitation.searches.journal import Journal
 from identification.excitation.searches.methods import METHODS, Method, SearchMethod
 from identification.excitation.searches.population import (

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from identification.arrays import Array
 from identification.excitation.constraints import midpoints
-from identification.excitation.precision import Precision
+from identification.excitation.motion_precision import Precision
 from identification.factor.factor import Factor
 from identification.model.friction import JointFriction
 from identification.model.motion import Motion

@@ -11,13 +11,13 @@ from numpy.typing import ArrayLike
 
 from identification.arrays import Array
 from identification.errors import ModelError, ShapeError
-from identification.export.arm import ExportedArm
 from identification.export.controller.reference import pinocchio_bodies
 from identification.export.controller.tables import (
     FRICTION_COLUMNS,
     ControlTables,
     control_tables,
 )
+from identification.export.exported_arm import ExportedArm
 from identification.model.elements import TorqueRipple
 
 

@@ -12,8 +12,8 @@ import pinocchio as pin
 
 from identification.arrays import Array
 from identification.errors import IdentificationError
-from identification.export.arm import ExportedArm
-from identification.export.friction import load_remarks
+from identification.export.exported_arm import ExportedArm
+from identification.export.friction_curve import load_remarks
 from identification.export.urdf import TENSOR, WriteBackError, as_text, comment_text
 from identification.model.motion import Motion
 from identification.model.pseudo_inertia import body

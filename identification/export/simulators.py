@@ -16,8 +16,8 @@ from numpy.typing import NDArray
 from identification.arrays import Array
 from identification.errors import IdentificationError
 from identification.export.actuators import Actuators
-from identification.export.arm import ExportedArm
-from identification.export.friction import load_remarks
+from identification.export.exported_arm import ExportedArm
+from identification.export.friction_curve import load_remarks
 from identification.export.sdf import MissingDrakeError, drake_torque, sdf
 from identification.export.urdf import WriteBackError, as_text, comment_text, rnea, write_urdf
 from identification.model.elements import PlacedElement, TorsionSpring

@@ -18,7 +18,7 @@ import pinocchio as pin
 
 from identification.arrays import Array
 from identification.errors import IdentificationError
-from identification.export.friction import equivalent_coulomb, load_remarks
+from identification.export.friction_curve import equivalent_coulomb, load_remarks
 from identification.model.friction import TERMS
 from identification.model.kinematics import (
     FROM_PINOCCHIO,

@@ -18,8 +18,8 @@ from identification.factor.blocks import FINE_BLOCK, count_by_block, fine_blocks
 from identification.factor.factor import Factor, time_blocks
 from identification.factor.rows import augmented_rows
 from identification.model.friction import FrictionTerm
+from identification.model.known_payload import Load, Payload
 from identification.model.motion import Motion
-from identification.model.payload import Load, Payload
 from identification.model.regressor import RegressorPlan
 from identification.model.robot import RobotModel
 from identification.signals.samples import Samples

@@ -18,9 +18,9 @@ from identification.model.coupling import Coupling
 from identification.model.elements import Element, ElementError, JointElements, TorqueRipple
 from identification.model.friction import OFFSET, FrictionLaw, JointFriction
 from identification.model.kinematics import Chain, chain_from_urdf
+from identification.model.known_payload import Load, Payload
 from identification.model.link_wrenches import LINK_SYMBOLS
 from identification.model.motion import Motion, joint_arrays
-from identification.model.payload import Load, Payload
 from identification.model.regressor import Regressor, RegressorPlan
 
 _N_LINK = len(LINK_SYMBOLS)

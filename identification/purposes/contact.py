@@ -9,7 +9,7 @@ import numpy as np
 
 from identification.arrays import Array
 from identification.model.flange import flange_motion, flange_name
-from identification.model.payload import Load, Payload
+from identification.model.known_payload import Load, Payload
 from identification.model.robot import RobotModel
 from identification.purposes.quiet_torque import PERIOD, SlowResidual, once_in, whole_blocks
 

@@ -13,9 +13,9 @@ from identification.errors import IdentificationError
 from identification.factor.estimate import Estimate
 from identification.model.robot import RobotModel
 from identification.purposes.contact import contact, seen_mass
-from identification.purposes.gravity import gravity_error, workspace
+from identification.purposes.gravity_error import gravity_error, workspace
 from identification.purposes.quiet_torque import PERIOD, SlowResidual, slow_residuals
-from identification.purposes.simulation import HORIZON, flange_error
+from identification.purposes.simulation_error import HORIZON, flange_error
 from identification.purposes.thresholds import ContactThreshold, contact_thresholds
 from identification.signals.samples import Samples
 from identification.validation.evidence import Evidence

@@ -18,16 +18,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from identification.arrays import Array
-from identification.export.arm import ExportedArm
+from identification.export.exported_arm import ExportedArm
 from identification.export.simulators import load_mujoco
-from identification.rollout.comparison import (
+from identification.rollout.mujoco_simulation import LARGEST_ERROR, Feedback
+from identification.rollout.position_errors import (
     RecordedMotion,
     horizon_rows,
     joint_inertia,
     simulate,
 )
-from identification.rollout.servo import LONGEST_DELAY
-from identification.rollout.simulation import LARGEST_ERROR, Feedback
+from identification.rollout.servo_by_torque import LONGEST_DELAY
 
 _WEIGHT: Final = 0.03  # lambda: of a change by one unit, beside an error that stays as it is
 _UNIT: Final = 0.3  # of the logarithm of friction and gains

@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 
 from identification.model.elements import TorqueRipple
 from identification.model.robot import RobotModel
+from identification.selection.averaging import AveragedBandwidth, averaged_bandwidth
 from identification.selection.scores import (
     IMPOSSIBLE_WORTHWHILE,
     MEANINGLESS,
@@ -27,7 +28,7 @@ from identification.selection.scores import (
     SettingDecision,
     SettingsTrial,
 )
-from identification.selection.settings import Choice, Hedge, Settings
+from identification.selection.settings import Choice, Settings
 from identification.signals.masks import LeftOut
 from identification.signals.samples import Preprocessing, VelocitySource
 
@@ -99,9 +100,6 @@ ROTORS_WORTHWHILE: Final = 0.05
 """Rotors far heavier than the links change the error to a fifth or to less than a tenth more."""
 TERM_WORTHWHILE: Final = 0.02
 SPRING_WORTHWHILE: Final = 0.3  # of the error of its own joint
-LEAST_ODDS: Final = 0.05
-"""Odds against a choice from which on it is averaged with what it replaced: at two and a half
-standard deviations these are 0.05, and a share of 5 % moves nothing."""
 _MOST_SWEEPS: Final = 2
 
 LowPasses = Callable[[RobotModel, Preprocessing], Sequence[Preprocessing]]
@@ -168,15 +166,15 @@ def choose_settings(
             now = decision.settings
             choices = [*choices, decision.choice]
     if "bandwidth" in requested:
-        now = replace(now, hedge=_hedge(trial, now))
+        now = replace(now, hedge=_usual_bandwidth(trial, now))
     return replace(now, choices=tuple(choice for choice in choices if len(choice.candidates) > 1))
 
 
-def _hedge(trial: SettingsTrial, now: Settings) -> Hedge | None:
+def _usual_bandwidth(trial: SettingsTrial, now: Settings) -> AveragedBandwidth | None:
     """Return the usual bandwidth with the odds that another motion prefers it to the chosen one."""
     usual = now.preprocessed(rigid_bandwidth=BANDWIDTHS[0])
-    weight = 0.0 if usual == now else trial.odds(usual, now, TRANSFER)
-    return Hedge(BANDWIDTHS[0], weight) if weight > LEAST_ODDS else None
+    odds = 0.0 if usual == now else trial.odds(usual, now, TRANSFER)
+    return averaged_bandwidth(BANDWIDTHS[0], odds)
 
 
 def _first_candidates(start: Settings, questions: Collection[Question]) -> Settings:

@@ -6,6 +6,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from typing import Any
 
+from identification.selection.averaging import AveragedBandwidth
 from identification.signals.samples import Preprocessing
 
 
@@ -40,14 +41,6 @@ class Choice:
 
 
 @dataclass(frozen=True)
-class Hedge:
-    """Usual bandwidth of the motion, in case another motion prefers it to the chosen one."""
-
-    bandwidth: float  #: [Hz]
-    weight: float  #: of its rows, relative to those of the chosen bandwidth; at most 1
-
-
-@dataclass(frozen=True)
 class Settings:
     """Settings of the preprocessing and estimation of an arm's archives; serialisable.
 
@@ -64,7 +57,7 @@ class Settings:
     stated_delay: float = 0.0  #: of the torque, by cell or options [s]
     delay_variance: float = 0.0  #: mean square error of the delay [s²]; zero if it is known
     #: bandwidth that the chosen one is averaged with; None: with none
-    hedge: Hedge | None = None
+    hedge: AveragedBandwidth | None = None
     strength: Strength = Strength()
     choices: tuple[Choice, ...] = ()  #: made by inner prediction
     #: parameters (p,) of bodies and drives that load the gears, for friction that grows with it;
@@ -81,9 +74,7 @@ class Settings:
     @property
     def shares(self) -> tuple[float, ...]:
         """Share of each of the versions in sums over rows."""
-        weight = 0.0 if self.hedge is None else self.hedge.weight
-        shares = (1.0 / (1.0 + weight), weight / (1.0 + weight))
-        return shares[: len(self.versions)]
+        return (1.0,) if self.hedge is None else self.hedge.shares
 
     def preprocessed(self, **changes: Any) -> Settings:
         """Return these settings with changes of the preprocessing."""

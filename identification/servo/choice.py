@@ -14,8 +14,8 @@ from numpy.typing import NDArray
 
 from identification.arrays import Array
 from identification.servo.fit import ServoEstimate, ServoWindows, data_cost, fit
-from identification.servo.motion import ServoMotion
 from identification.servo.parameters import OPTIONAL, PLACE, TERMS
+from identification.servo.recorded_motion import ServoMotion
 from identification.servo.start import STARTS, prior_of, start_of
 
 ITERATIONS: Final = 12

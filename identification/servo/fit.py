@@ -14,7 +14,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from identification.arrays import Array
-from identification.servo.motion import ServoMotion, side_by_side
 from identification.servo.parameters import (
     BUS_DELAY_SPREAD,
     PLACE,
@@ -23,7 +22,8 @@ from identification.servo.parameters import (
     natural,
     without_absent,
 )
-from identification.servo.simulation import JointInputs, simulate
+from identification.servo.recorded_motion import ServoMotion, side_by_side
+from identification.servo.servo_simulation import JointInputs, simulate
 
 _LONGEST: Final = 10.0  # s of a window
 _SHORTEST: Final = 4.0

@@ -12,9 +12,9 @@ import scipy
 from identification.arrays import Array
 from identification.model.motion import Motion
 from identification.model.robot import RobotModel
-from identification.servo.motion import SMOOTHED, Bodies, ServoMotion, side_by_side
 from identification.servo.parameters import in_errors
-from identification.servo.simulation import simulate
+from identification.servo.recorded_motion import SMOOTHED, Bodies, ServoMotion, side_by_side
+from identification.servo.servo_simulation import simulate
 
 _PASSES: Final = 4
 _AGREES: Final = 1e-4  # rad or m between passes

@@ -9,8 +9,8 @@ import numpy as np
 
 from identification.arrays import Array
 from identification.servo.fit import Prior
-from identification.servo.motion import ServoMotion
 from identification.servo.parameters import PLACE, TERMS
+from identification.servo.recorded_motion import ServoMotion
 
 STARTS: Final = ({"delay": 0.01}, {"delay": 0.06, "kd": 0.1})
 """A servo that follows at once, and one that leads a late command: a fit finds the other from

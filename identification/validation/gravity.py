@@ -10,7 +10,7 @@ import numpy as np
 
 from identification.arrays import Array
 from identification.errors import IdentificationError
-from identification.estimators.payload import mass_difference
+from identification.estimators.payload_estimate import mass_difference
 from identification.estimators.payload_problem import Run
 from identification.factor.columns import under_gravity
 from identification.factor.factor import Factor

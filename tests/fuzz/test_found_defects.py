@@ -27,7 +27,7 @@ from hil.new import from_archive
 from hil.plots.archive_view import view_of
 from identification.errors import ModelError
 from identification.model.kinematics import chain_from_urdf
-from identification.model.payload import Payload
+from identification.model.known_payload import Payload
 from tests.fault_matrix.small_cell import URDF
 from tests.fuzz.targets import documents, importers
 from tests.hil.fast_cell import CELL

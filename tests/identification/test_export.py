@@ -18,10 +18,10 @@ from identification.errors import ModelError, ShapeError
 from identification.estimators.consistent import consistent_estimate
 from identification.excitation.collision import CollisionChecker
 from identification.excitation.errors import CollisionModelError
-from identification.export.arm import ExportedArm, Ranges
-from identification.export.friction import friction_curve, median_load
+from identification.export.exported_arm import ExportedArm, Ranges
+from identification.export.friction_curve import friction_curve, median_load
+from identification.export.parameter_files import covariance_csv, parameters_csv, parameters_json
 from identification.export.parameter_table import parameter_table
-from identification.export.parameters import covariance_csv, parameters_csv, parameters_json
 from identification.export.simulators import AGREES, FORMATS, compare, mjcf, random_states
 from identification.export.urdf import NotConsistentError, WriteBackError, not_in_urdf, write_urdf
 from identification.factor.estimate import estimate
@@ -30,8 +30,8 @@ from identification.model.coupling import Coupling
 from identification.model.elements import Anchors, GasCylinder, TorqueRipple, TorsionSpring
 from identification.model.friction import FrictionLaw
 from identification.model.kinematics import MOST_JOINTS, chain_from_urdf
+from identification.model.known_payload import Payload
 from identification.model.motion import Motion
-from identification.model.payload import Payload
 from identification.model.robot import RobotModel
 from identification.model.urdf_text import LONGEST, MOST_LINKS, refusal, urdf_tree
 from identification.model.workspace import Workspace

@@ -17,7 +17,7 @@ from identification.excitation.criteria import (
     correlation,
     log10_det,
 )
-from identification.excitation.precision import Precision, Quantities
+from identification.excitation.motion_precision import Precision, Quantities
 from identification.excitation.searches import search as search_module
 from identification.excitation.searches.bundle_method import Ascent, _Cut, _step, improve
 from identification.excitation.searches.local_change import LocalChange

@@ -12,7 +12,7 @@ from identification.factor.factor import Factor
 from identification.model.coupling import Coupling
 from identification.model.elements import TorqueRipple, TorsionSpring
 from identification.model.friction import FrictionLaw, dissipation
-from identification.model.payload import Payload
+from identification.model.known_payload import Payload
 from identification.model.robot import RobotModel
 from sim_fixtures.ns16 import urdf_text
 from tests.identification.two_link import MODEL, NOISE, URDF, a_motion, simulated, truth

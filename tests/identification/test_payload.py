@@ -7,13 +7,13 @@ import pinocchio as pin
 import pytest
 
 from identification.errors import IdentificationError, ModelError
-from identification.estimators.gains import identify_gains
-from identification.estimators.payload import NAMES, PayloadError, identify_payload
+from identification.estimators.current_gains import identify_gains
+from identification.estimators.payload_estimate import NAMES, PayloadError, identify_payload
 from identification.estimators.payload_problem import Run
 from identification.factor.columns import gain_factor
 from identification.model.friction import FrictionLaw
+from identification.model.known_payload import Load, Payload
 from identification.model.motion import Motion
-from identification.model.payload import Load, Payload
 from identification.model.pseudo_inertia import inertial_parameters, margin
 from identification.model.robot import RobotModel
 from sim_fixtures.ns16 import urdf_text

@@ -14,7 +14,7 @@ from identification.model.kinematics import chain_from_urdf, pinocchio_model
 from identification.model.motion import Motion
 from identification.model.robot import RobotModel
 from identification.purposes.contact import contact, seen_force, seen_mass
-from identification.purposes.gravity import (
+from identification.purposes.gravity_error import (
     gravity_error,
     mixture_limit,
     torque_deviation,
@@ -22,7 +22,7 @@ from identification.purposes.gravity import (
 )
 from identification.purposes.purposes import gravity_compensation, single_parameters
 from identification.purposes.quiet_torque import BLOCK, PERIOD, once_in, slow_residuals
-from identification.purposes.simulation import HORIZON, flange_error
+from identification.purposes.simulation_error import HORIZON, flange_error
 from tests.identification.robots import random_urdf
 from tests.identification.two_link import (
     MODEL,
@@ -198,7 +198,7 @@ def test_a_mass_above_the_smallest_is_seen_and_one_below_is_not() -> None:
     quiet_parts = slow_residuals(MODEL, truth(), [quiet(60.0, 1)])
     mass = seen_mass(MODEL, quiet_parts)
     assert mass is not None
-    from identification.model.payload import Load, Payload
+    from identification.model.known_payload import Load, Payload
 
     load = Load(
         MODEL.chain, MODEL.gravity, Payload(1.0, (0.0, 0.0, 0.0), frame=flange_name(MODEL.chain))

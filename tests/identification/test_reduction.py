@@ -10,7 +10,8 @@ from identification.factor.factor import Factor
 from identification.reduction.intervals import delayed, widened
 from identification.reduction.posterior import Posterior
 from identification.reduction.reduction import Reduction, reduce
-from identification.selection.settings import Hedge, Settings, Strength
+from identification.selection.averaging import AveragedBandwidth
+from identification.selection.settings import Settings, Strength
 from identification.signals.samples import Preprocessing
 from tests.identification.two_link import MODEL, NOISE, four_sines, simulated, truth
 
@@ -121,7 +122,7 @@ def test_versions_are_averaged(halves):
 def test_settings_state_their_versions_and_shares():
     alone = Settings(Preprocessing(rigid_bandwidth=40.0))
     assert (alone.versions, alone.shares) == ((alone,), (1.0,))
-    hedged = replace(alone, hedge=Hedge(14.0, 0.25))
+    hedged = replace(alone, hedge=AveragedBandwidth(14.0, 0.25))
     widths = [each.preprocessing.rigid_bandwidth for each in hedged.versions]
     assert (widths, hedged.shares) == ([40.0, 14.0], (0.8, 0.2))
 

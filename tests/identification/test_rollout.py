@@ -6,12 +6,14 @@ from functools import partial
 import numpy as np
 import pytest
 
-from identification.export.arm import ExportedArm, Ranges
+from identification.export.exported_arm import ExportedArm, Ranges
 from identification.export.simulators import FORMATS, compare, mjcf
 from identification.model.friction import FrictionLaw
 from identification.model.motion import Motion
 from identification.model.robot import RobotModel
-from identification.rollout.comparison import (
+from identification.rollout.mujoco_simulation import LARGEST_ERROR, Feedback, RolloutArm
+from identification.rollout.polish import Driven, polished
+from identification.rollout.position_errors import (
     HORIZONS,
     RecordedMotion,
     coverage,
@@ -23,9 +25,12 @@ from identification.rollout.comparison import (
     recorded_stretches,
     simulate,
 )
-from identification.rollout.polish import Driven, polished
-from identification.rollout.servo import NoServoError, PositionServo, identify_servo, lead_of
-from identification.rollout.simulation import LARGEST_ERROR, Feedback, RolloutArm
+from identification.rollout.servo_by_torque import (
+    NoServoError,
+    PositionServo,
+    identify_servo,
+    lead_of,
+)
 from identification.rollout.windows import (
     NoWindowError,
     mean_about,
@@ -33,7 +38,7 @@ from identification.rollout.windows import (
     windows_of,
 )
 from identification.validation.prediction import driving_residual
-from tests.identification.test_encoders import on_its_servo
+from tests.identification.test_servo_by_positions import on_its_servo
 from tests.identification.two_link import MODEL, URDF, as_samples, four_sines, simulated
 
 mujoco = pytest.importorskip("mujoco", reason="the extra mujoco is not installed")

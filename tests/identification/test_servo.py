@@ -8,11 +8,11 @@ from benchmarks import servo_arm as arm
 from identification import RobotModel
 from identification.servo.choice import fit_servos
 from identification.servo.intervals import intervals_of, sampled
-from identification.servo.motion import Grid, motions_of
 from identification.servo.parameters import NAMES, PLACE, TERMS, in_errors, in_units
 from identification.servo.prediction import predicted
 from identification.servo.pushes import pushes_of
-from identification.servo.simulation import JointInputs, simulate
+from identification.servo.recorded_motion import Grid, motions_of
+from identification.servo.servo_simulation import JointInputs, simulate
 from identification.signals.recording import Recording
 
 STEP = 5e-3

@@ -9,8 +9,8 @@ from identification.errors import ModelError
 from identification.model.coupling import Coupling
 from identification.model.elements import TorqueRipple, TorsionSpring
 from identification.model.friction import FrictionLaw
+from identification.model.known_payload import Payload
 from identification.model.motion import Motion
-from identification.model.payload import Payload
 from identification.model.robot import RobotModel
 from identification.model.single_state import SingleStateTorque
 from sim_fixtures.ns16 import urdf_text

@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from identification.estimators.payload import NAMES, identify_payload
+from identification.estimators.payload_estimate import NAMES, identify_payload
 from identification.estimators.payload_problem import Run
 from identification.estimators.torque_scale import (
     absolute,
@@ -16,7 +16,7 @@ from identification.estimators.torque_scale import (
 )
 from identification.factor.estimate import estimate, joint_weights
 from identification.factor.factor import Factor
-from identification.model.payload import Load, Payload
+from identification.model.known_payload import Load, Payload
 from tests.identification.two_link import MODEL, a_motion, as_samples, four_sines, truth
 
 pytestmark = pytest.mark.long

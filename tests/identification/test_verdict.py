@@ -14,7 +14,7 @@ from identification.estimators.prior import body_prior
 from identification.factor.estimate import Estimate, estimate
 from identification.factor.factor import Factor
 from identification.hypotheses.faults import Fault, Kind, Part
-from identification.model.payload import Payload
+from identification.model.known_payload import Payload
 from identification.model.robot import RobotModel
 from identification.text import percentage
 from identification.validation import causes as causes_module

@@ -8,7 +8,7 @@ import numpy as np
 import pinocchio as pin
 
 from identification.arrays import Array
-from identification.export.arm import ExportedArm
+from identification.export.exported_arm import ExportedArm
 from identification.export.urdf import rnea
 from identification.model.kinematics import FROM_PINOCCHIO, pinocchio_model
 from identification.model.motion import Motion

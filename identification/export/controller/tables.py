@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from identification.arrays import Array, Indices
-from identification.export.arm import ExportedArm
+from identification.export.exported_arm import ExportedArm
 from identification.model.elements import (
     Anchors,
     Coefficient,
@@ -21,7 +21,7 @@ from identification.model.elements import (
     TorsionSpring,
 )
 from identification.model.kinematics import skew
-from identification.model.payload import Payload
+from identification.model.known_payload import Payload
 from identification.model.robot import RobotModel
 
 ELEMENT_KINDS: Final = ("TORSION_SPRING", "EXTENSION_SPRING", "GAS_CYLINDER", "TORQUE_RIPPLE")

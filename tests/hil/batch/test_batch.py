@@ -22,14 +22,14 @@ from hil.archive import ArchiveWriter, ImportedSamples, write_samples
 from hil.archive.repair import repair, repaired_name
 from hil.base.errors import ArchiveError, InputError
 from hil.base.progress import Silent
-from hil.batch import archive_discovery, reduction
+from hil.batch import archive_discovery, archive_reduction
 from hil.batch import graph as batch_run
 from hil.batch.archive_discovery import discover, open_ref
+from hil.batch.archive_reduction import ToReduce, cached_reduction, reduce_archives
 from hil.batch.cache import CacheLocation
 from hil.batch.cluster import Cluster
 from hil.batch.estimates import BatchEstimator
 from hil.batch.graph import reidentify
-from hil.batch.reduction import ToReduce, cached_reduction, reduce_archives
 from hil.campaign.identified_campaign import identify_campaign
 from hil.cell import Cell
 from hil.cli import app
@@ -572,13 +572,13 @@ class TestGroups:
         )
         other.replace(victim)
         used = {}
-        reduce_one = reduction.reduced_archive
+        reduce_one = archive_reduction.reduced_archive
 
         def spied(wanted, settings):
             used[wanted.ref.name] = settings.preprocessing.torque_delay
             return reduce_one(wanted, settings)
 
-        monkeypatch.setattr(reduction, "reduced_archive", spied)
+        monkeypatch.setattr(archive_reduction, "reduced_archive", spied)
         result = batch(loose)
         assert not result.broken
         assert [campaign.repetitions for campaign in result.campaigns] == [2, 1]

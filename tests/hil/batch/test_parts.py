@@ -25,11 +25,7 @@ from hypothesis import strategies as st
 from pyarrow import parquet
 
 from hil.batch.archive_discovery import ArchiveRef, arm_digest
-from hil.batch.cache import HEADER, JSON, NPZ, NUMBERS, CacheError, CacheLocation, code_digest
-from hil.batch.cluster import Cluster, ClusterTask, SkippedArchive, error_of
-from hil.batch.estimates import BatchArm
-from hil.batch.graph import PARTITION, BatchResult, _Campaign
-from hil.batch.reduction import (
+from hil.batch.archive_reduction import (
     ToReduce,
     _matrices,
     _triangles,
@@ -37,11 +33,16 @@ from hil.batch.reduction import (
     reduction_key,
     settings_digest,
 )
+from hil.batch.cache import HEADER, JSON, NPZ, NUMBERS, CacheError, CacheLocation, code_digest
+from hil.batch.cluster import Cluster, ClusterTask, SkippedArchive, error_of
+from hil.batch.estimates import BatchArm
+from hil.batch.graph import PARTITION, BatchResult, _Campaign
 from hil.batch.table import COLUMNS, write_tables
 from hil.cell import Cell
 from hil.cell.schema import PayloadTable, TorsionSpringTable
 from identification.factor.factor import Factor
-from identification.selection.settings import Choice, Hedge, Settings, Strength
+from identification.selection.averaging import AveragedBandwidth
+from identification.selection.settings import Choice, Settings, Strength
 from identification.signals.samples import Preprocessing
 from identification.signals.smoothing import LowPassShape
 from sim_fixtures.ns16 import CELL_PATH
@@ -351,7 +352,7 @@ class TestDigests:
             replace(stated, friction={"presliding": 1e-4}),
             replace(stated, delay_variance=1e-9),
             replace(stated, loading=(1.0, 2.0)),
-            replace(stated, hedge=Hedge(14.0, 0.5)),
+            replace(stated, hedge=AveragedBandwidth(14.0, 0.5)),
         ]
         assert len({settings_digest(settings) for settings in (stated, *others)}) == 1 + len(others)
         both = [ToReduce(a_ref(0)), ToReduce(a_ref(1))]

@@ -36,7 +36,7 @@ from hil.look.look import look_at
 from hil.look.readings import Fact
 from hil.pipeline.identification import identify_archives
 from hil.pipeline.torque_constants import find_gains
-from identification.model.payload import Payload
+from identification.model.known_payload import Payload
 from sim_fixtures.plant import Carried
 from sim_fixtures.ur import (
     CELL_PATH,

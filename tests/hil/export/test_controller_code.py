@@ -20,11 +20,11 @@ from hil.export.controller_code import AGREES, STRICT, CompiledArm, checked, poi
 from hil.importers.recording_import import ImportOptions
 from hil.pipeline.identified_model import model_of
 from identification.errors import ModelError, ShapeError
-from identification.export.arm import ExportedArm
 from identification.export.controller.c_source import Precision, c_source
 from identification.export.controller.reference import pinocchio_bodies, reference_torque
 from identification.export.controller.structured_text import structured_text
 from identification.export.controller.tables import control_tables
+from identification.export.exported_arm import ExportedArm
 from identification.export.observer import MomentumObserver
 from identification.export.simulators import random_states
 from identification.export.urdf import WriteBackError
@@ -37,8 +37,8 @@ from identification.model.elements import (
     TorsionSpring,
 )
 from identification.model.friction import FrictionLaw
+from identification.model.known_payload import Payload
 from identification.model.motion import Motion
-from identification.model.payload import Payload
 from identification.purposes.thresholds import ContactThreshold
 from sim_fixtures.ns16 import urdf_text
 from tests.hil.structured_text_reader import Block, blocks_of

@@ -30,7 +30,7 @@ from hil.pipeline.identification import Identification
 from hil.report.output_files import FILES, Exports
 from hil.results.results import Results
 from hil.results.servo_result import ServoResults
-from identification.export.parameters import parameters_json
+from identification.export.parameter_files import parameters_json
 from identification.model.kinematics import chain_from_urdf
 from identification.model.motion import Motion
 from tests.hil.identified_arm import (

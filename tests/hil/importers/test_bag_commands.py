@@ -26,7 +26,7 @@ from hil.results.provenance import RESULTS
 from hil.results.rollout_result import ROLLOUT, RolloutResult
 from hil.results.servo_result import ServoResults
 from tests.hil.importers.test_rosbag2 import bag
-from tests.identification.test_encoders import DELAY, KD, KP, an_arm, on_its_servo
+from tests.identification.test_servo_by_positions import DELAY, KD, KP, an_arm, on_its_servo
 from tests.identification.two_link import MODEL, URDF, four_sines
 
 STATE = "sensor_msgs/msg/JointState"

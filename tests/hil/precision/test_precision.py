@@ -16,7 +16,7 @@ from hil.cli import app
 from hil.control.motion_checks import MotionChecks
 from hil.design import DesignResult, load_settings, preset, problem_of
 from hil.precision.forecast import PrecisionDesign, short_search
-from hil.precision.predicted import PredictedRows
+from hil.precision.predicted_variances import PredictedRows
 from hil.precision.requirements import FORMS, Requirement, require_known, requirements_from
 from identification.excitation import midpoints
 from tests.hil.fast_cell import QUICK_GRADIENT, fast_cell

@@ -28,7 +28,7 @@ from hil.report.rollout_section import overview_charts, overview_legends
 from hil.results.provenance import PARAMETERS_JSON
 from hil.results.rollout_result import ROLLOUT, ArmErrors, RolloutResult
 from hil.rollout.torque_rollout import POLISHED
-from identification.rollout.servo import PositionServo
+from identification.rollout.servo_by_torque import PositionServo
 from identification.text import percentage
 from tests import messages
 from tests.identification.two_link import MODEL, URDF, four_sines, truth

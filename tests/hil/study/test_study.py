@@ -26,11 +26,11 @@ from hil.control.simulated_cell import planted_values
 from hil.design.messages import NoExcitationError
 from hil.study import FULL, QUICK, StudyResults, StudySettings, run_study, study_settings
 from hil.study.campaigns import CLASSES, StudyExecution, execute
+from hil.study.criteria_relations import relations_of
 from hil.study.estimates import HeldOutForms
 from hil.study.method_comparison import MIN_UNITS, compared, verdict_of
 from hil.study.model_errors import ALL, NONE, Condition
 from hil.study.paper_figures import parameters_of
-from hil.study.relations import relations_of
 from hil.study.results import Criterion, DesignPoint
 from hil.study.searches import SINES, search_plans, take_best
 from hil.study.settings import Effort

@@ -38,8 +38,8 @@ from hil.weighing.payload_campaign import (
     assumed_payload,
     loaded_cell,
 )
-from identification.estimators.payload import PayloadError
-from identification.model.payload import Payload
+from identification.estimators.payload_estimate import PayloadError
+from identification.model.known_payload import Payload
 from tests.hil.fast_cell import fast_campaign, fast_cell, pass_rehearsal
 from tests.messages import COPY_OF_LOADED_SIDE, PAYLOAD_NAME_INVALID
 

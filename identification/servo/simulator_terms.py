@@ -14,8 +14,8 @@ import numpy as np
 from identification.arrays import Array
 from identification.servo.choice import ServoFit, shown_terms
 from identification.servo.fit import ServoWindows, fit
-from identification.servo.motion import ServoMotion
 from identification.servo.parameters import NAMES
+from identification.servo.recorded_motion import ServoMotion
 
 Engine = Literal["mujoco", "physx"]
 ENGINES: Final[tuple[Engine, ...]] = get_args(Engine)

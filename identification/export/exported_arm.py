@@ -8,7 +8,7 @@ from typing import NamedTuple
 import numpy as np
 
 from identification.arrays import Array
-from identification.export.friction import equivalent_coulomb
+from identification.export.friction_curve import equivalent_coulomb
 from identification.model.elements import TorsionSpring
 from identification.model.pseudo_inertia import Body, body
 from identification.model.robot import RobotModel
@@ -33,7 +33,7 @@ class ExportedArm:
     values: Array  # the corresponding parameters (p,) of the model
     ranges: Ranges  # limits of its joints
     # torque of each gear (n,) [N·m, N] at which friction that grows with it is written, see
-    # :func:`identification.export.friction.median_load`; None: zero
+    # :func:`identification.export.friction_curve.median_load`; None: zero
     load: Array | None = field(default=None)
     #: whether bodies that cannot exist are changed by MuJoCo, for nominal arms
     balanced: bool = False

@@ -28,10 +28,10 @@ import scipy
 from numpy.typing import NDArray
 
 from identification.arrays import Array
-from identification.export.arm import ExportedArm
+from identification.export.exported_arm import ExportedArm
 from identification.export.simulators import rigid_torque
 from identification.model.motion import Motion
-from identification.rollout.servo import (
+from identification.rollout.servo_by_torque import (
     BLOCK,
     LONGEST_DELAY,
     NoServoError,

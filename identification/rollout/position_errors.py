@@ -12,14 +12,14 @@ from numpy.typing import NDArray
 
 from identification.arrays import Array
 from identification.distributions import student_limit
-from identification.export.arm import ExportedArm
+from identification.export.exported_arm import ExportedArm
 from identification.export.simulators import unsupported_torque
 from identification.model.flange import flange_motion
 from identification.model.kinematics import Chain
 from identification.model.regressor import RegressorPlan
 from identification.model.robot import RobotModel
-from identification.rollout.servo import PositionServo, command_of
-from identification.rollout.simulation import LARGEST_ERROR, Feedback, RolloutArm
+from identification.rollout.mujoco_simulation import LARGEST_ERROR, Feedback, RolloutArm
+from identification.rollout.servo_by_torque import PositionServo, command_of
 from identification.rollout.windows import Stretch, Windows, stretches_of
 from identification.signals.samples import Samples
 

@@ -12,7 +12,7 @@ import scipy
 from identification.arrays import Array
 from identification.model.motion import Motion
 from identification.model.robot import RobotModel
-from identification.servo.simulation import JointInputs
+from identification.servo.servo_simulation import JointInputs
 from identification.signals.recording import Recording
 
 STEP: Final = 5e-3

@@ -9,9 +9,9 @@ Weighted least squares of the measured currents on one
 
 solved by Gauss-Newton; least squares of :math:`K_m i_m - W_m \pi = t_m` would bias gains towards
 zero by current noise. Friction scale and offset of a motor may differ between recordings, with the
-priors of :mod:`identification.estimators.payload`: without them a gear that warmed by some percent
-between two recordings counts as torque of the payload. The covariance is cluster-robust by time of
-the motion.
+priors of :mod:`identification.estimators.payload_estimate`: without them a gear that warmed by
+some percent between two recordings counts as torque of the payload. The covariance is
+cluster-robust by time of the motion.
 """
 
 from __future__ import annotations

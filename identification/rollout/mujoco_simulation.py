@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from identification.arrays import Array
 from identification.errors import IdentificationError
-from identification.export.arm import ExportedArm
+from identification.export.exported_arm import ExportedArm
 from identification.export.simulators import load_mujoco, mjcf
 
 LARGEST_ERROR: Final = np.pi

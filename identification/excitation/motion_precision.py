@@ -56,7 +56,7 @@ class Precision:
     def has_offsets(self) -> bool:
         """Whether each recording has an unknown offset of every joint's torque.
 
-        As it has where a payload is weighed (:mod:`identification.estimators.payload`).
+        As it has where a payload is weighed (:mod:`identification.estimators.payload_estimate`).
         """
         return isinstance(self.quantities, LoadQuantities)
 

@@ -9,7 +9,7 @@ import scipy
 
 from identification.arrays import Array
 from identification.distributions import normal_limit
-from identification.export.friction import equivalent_coulomb
+from identification.export.friction_curve import equivalent_coulomb
 from identification.factor.estimate import Estimate
 from identification.model.friction import COULOMB, STRIBECK
 from identification.model.motion import Motion

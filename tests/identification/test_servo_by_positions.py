@@ -6,11 +6,11 @@ import numpy as np
 import pytest
 import scipy
 
-from identification.export.arm import ExportedArm, Ranges
+from identification.export.exported_arm import ExportedArm, Ranges
 from identification.export.simulators import mjcf
 from identification.model.motion import Motion
-from identification.rollout.encoders import NAMES, fit_servo
-from identification.rollout.servo import NoServoError, PositionServo
+from identification.rollout.servo_by_positions import NAMES, fit_servo
+from identification.rollout.servo_by_torque import NoServoError, PositionServo
 from identification.rollout.windows import Stretch, stretches_of
 from tests.identification.two_link import MODEL, URDF, as_samples, four_sines
 

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from identification.estimators.payload import parameter_change
+from identification.estimators.payload_estimate import parameter_change
 from identification.excitation import (
     LoadQuantities,
     Precision,
@@ -18,7 +18,7 @@ from identification.excitation import (
     search,
 )
 from identification.excitation.criteria import friction_of_excitation
-from identification.excitation.precision import INTERVAL
+from identification.excitation.motion_precision import INTERVAL
 from identification.excitation.searches.population import Population
 from identification.excitation.searches.sensitivity import gene_slopes
 from tests.identification.searching import problem as small_problem
