@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from os import PathLike
 from pathlib import Path
 
+from hil import plots  # its pictures load matplotlib, on first use
 from hil.archive import Archive
 from hil.base.errors import InputError
 from hil.base.files import make_folder, write_files
@@ -16,8 +17,6 @@ from hil.identified.staging import Staging
 from hil.importers.recording_import import is_archive
 from hil.importers.required_signals import has_servo
 from hil.pipeline.options import Options
-from hil.plots.chart_picture import draw_charts
-from hil.plots.plan_picture import save as save_picture
 from hil.report.output_files import REPORT
 from hil.report.servo_page import LEGENDS, motion_charts, servo_page_bytes
 from hil.results.provenance import RESULTS
@@ -129,7 +128,7 @@ def write_servo(
     write_files(place, files)
     if series:
         charts = motion_charts(results, series[0])
-        save_picture(draw_charts([charts], LEGENDS, enlarged=1.2), place / PICTURE)
+        plots.save(plots.draw_charts([charts], LEGENDS, enlarged=1.2), place / PICTURE)
     reporter.say(f"written to {place}: {RESULTS}, {REPORT}, {PICTURE}")
     return place
 

@@ -9,8 +9,8 @@ from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 
+from hil import plots  # its pictures load matplotlib, on first use
 from hil.base.errors import InputError
-from hil.plots.chart_picture import draw_charts, draw_torque
 from hil.report.figures import MEASURED, NOMINAL, PREDICTED, RESIDUAL, joints_of, torque_charts
 from hil.results.results import Results
 from hil.results.series import ReportSeries
@@ -72,14 +72,14 @@ def torque_plot(
     charts = [chart for chart in torque_charts(series, joints_of(results)) if chart.joint in chosen]
     legends = [MEASURED, PREDICTED, NOMINAL, RESIDUAL]
     if axes is None:
-        figure = draw_charts([charts], legends, size=size)
+        figure = plots.draw_charts([charts], legends, size=size)
     else:
         places = [*axes] if isinstance(axes, Sequence | np.ndarray) else [axes]
         if len(places) != len(charts):
             problem = f"{len(places)} axes are given for {len(charts)} joints"
             raise InputError(None, problem, field="axes", remedy="give one for each joint")
         for place, chart in zip(places, charts, strict=True):
-            draw_torque(place, chart, legends)
+            plots.draw_torque(place, chart, legends)
         figure = places[0].figure.get_figure(root=True)
     return TorquePlot(figure, _frame(results, series, chosen))
 

@@ -18,7 +18,7 @@ from hil.cell import Cell
 from hil.cell.toml_edits import urdf_limits
 from hil.importers.conclusions import Certainty
 from hil.importers.plausibility import limit_excess, whole_turns
-from hil.look.physics import Size, mounted
+from hil.look.physics import Size
 from hil.look.readings import (
     BeyondEffort,
     BeyondMasses,
@@ -107,7 +107,7 @@ class Contradictions:
             size = BeyondEffort(names[joint], float(effort[joint]))
         elif expected.is_off and factor > 1.0 and not expected.is_thousand:
             size = BeyondMasses(factor, expected.by_masses)
-        lengths = _other_lengths(cell, model, samples, score, expected)
+        lengths = _other_lengths(model, samples, score, expected)
         is_open = error > _UNEXPLAINED and lengths is None
         torque = UnexplainedTorque(error) if is_open else None
         axes = OtherAxes(tuple(changed)) if len(changed) > 1 else None
@@ -134,7 +134,7 @@ class Contradictions:
 
 
 def _other_lengths(
-    cell: Cell, model: RobotModel, samples: Samples, score: Score, size: Size
+    model: RobotModel, samples: Samples, score: Score, size: Size
 ) -> OtherLengths | None:
     """Return which lengths of the links the torque fits better than those of the URDF.
 
@@ -142,11 +142,10 @@ def _other_lengths(
     """
     if not np.any(model.gravity):
         return None
-    gravity = model.gravity
-    trials = {factor: _with_lengths(cell, gravity, samples, score, factor) for factor in _LENGTHS}
+    trials = {factor: _with_lengths(model, samples, score, factor) for factor in _LENGTHS}
     best = min(trials, key=lambda factor: trials[factor][1].ratio)
     for factor in (best / _NEARER, best * _NEARER):
-        trials[factor] = _with_lengths(cell, gravity, samples, score, factor)
+        trials[factor] = _with_lengths(model, samples, score, factor)
     best = min(trials, key=lambda factor: trials[factor][1].ratio)
     error, against = trials[best]
     least = 1.0 if best > 1.0 else _SHORTER
@@ -159,13 +158,12 @@ def _other_lengths(
 
 
 def _with_lengths(
-    cell: Cell, gravity: Array, samples: Samples, score: Score, factor: float
+    model: RobotModel, samples: Samples, score: Score, factor: float
 ) -> tuple[float, Comparison]:
     """Return the error of samples with other lengths of all links, and its comparison."""
-    x, y, z = (float(part) / factor for part in gravity)
-    model = mounted(cell, (x, y, z)).model
-    other = score_of(model, samples)
-    return other.overall, compare(other, score, model)
+    longer = model.under_gravity((model.gravity / factor).tolist())
+    other = score_of(longer, samples)
+    return other.overall, compare(other, score, longer)
 
 
 def _largest(values: Array) -> Array:

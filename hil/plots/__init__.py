@@ -1,7 +1,28 @@
-"""Pictures of motions, plans, designs and archives."""
+"""Pictures of motions, plans, designs and archives. Names are imported on first use."""
 
 from __future__ import annotations
 
-from hil.plots.plan_picture import check_format, draw_plan, save
+from importlib import import_module
+from typing import TYPE_CHECKING, Any
 
-__all__ = ["check_format", "draw_plan", "save"]
+if TYPE_CHECKING:
+    from hil.plots.chart_picture import draw_charts, draw_torque
+    from hil.plots.plan_picture import check_format, draw_plan, save
+
+__all__ = ["check_format", "draw_charts", "draw_plan", "draw_torque", "save"]
+_HOME = {
+    **dict.fromkeys(("check_format", "draw_plan", "save"), "hil.plots.plan_picture"),
+    **dict.fromkeys(("draw_charts", "draw_torque"), "hil.plots.chart_picture"),
+}
+
+if not TYPE_CHECKING:  # which would accept any name
+
+    def __getattr__(name: str) -> Any:
+        if name not in _HOME:
+            raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+        return getattr(import_module(_HOME[name]), name)
+
+
+def __dir__() -> list[str]:
+    """Return all names, also those that are not loaded yet."""
+    return [*globals(), *__all__]

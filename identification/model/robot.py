@@ -236,10 +236,13 @@ class RobotModel:
     def under_gravity(self, gravity: Sequence[float]) -> RobotModel:
         """Return the model with another acceleration of gravity (3,) in base axes [m/s²].
 
-        It may have other base parameters: without gravity fewer are determined.
+        It may have other base parameters: without gravity fewer are determined. A weaker or
+        stronger gravity in the same direction determines the same.
         """
         down = np.array(gravity, dtype=np.float64)
-        base = _base_parameters(self.chain, down, self.layout, self.friction, self.elements)
+        base = self.base
+        if not _is_parallel(down, self.gravity):
+            base = _base_parameters(self.chain, down, self.layout, self.friction, self.elements)
         load = None if self.payload is None else Load(self.chain, down, self.payload)
         parts = _parameters(self.chain, down, self.layout, base, self.friction, self.elements)
         return replace(self, base=base, _load=load, **{**parts, "gravity": down})
@@ -417,6 +420,12 @@ class RobotModel:
         """Return which rows can be fitted, shape (m, n); see :meth:`JointFriction.moving`."""
         (qd,) = joint_arrays(self.n_joints, qd=qd)
         return self.friction.moving(qd)
+
+
+def _is_parallel(a: Array, b: Array) -> bool:
+    """Return whether two vectors (3,) have the same direction; none has that of zero."""
+    sizes = float(np.linalg.norm(a) * np.linalg.norm(b))
+    return sizes > 0.0 and float(a @ b) > (1.0 - 1e-12) * sizes
 
 
 def _laws(

@@ -127,15 +127,13 @@ def test_status_takes_at_most_0_8_s_of_processor(campaign: Campaign) -> None:
     assert min(spent) <= 0.8
 
 
-def test_the_demo_writes_results_and_ends_with_the_verdict(tmp_path: Path) -> None:
+def test_the_demo_writes_results_and_begins_with_the_verdict(tmp_path: Path) -> None:
     folder = tmp_path / "runs" / "demo"
     done = hil("demo", "--output", folder, "--repetitions", 2, "--validation", 1)
     assert done.returncode == 0, done.stderr
-    last = done.stdout.strip().splitlines()[-1]
     results = Results.load(folder / "results.json")
-    assert last == results.verdict.line
-    assert "predicts unseen motion well" in last
-    assert "%" in last
+    assert " ".join(done.stdout.split()).startswith(results.verdict.line)
+    assert results.verdict.line.startswith("Good for feed-forward (")
     assert len(list((folder / "archives").glob("excitation_*.mcap"))) == 2
     assert (folder / "report.html").read_text("utf-8").startswith("<!")
 
