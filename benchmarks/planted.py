@@ -192,9 +192,11 @@ def outcome_of(found: Identification, true_factor: float, seconds: float) -> Out
     halves = [] if delays is None else [half for half in delays.interval if half is not None]
     checks = [finding.check for finding in suspicious(results) if finding.check in CAUSES]
     sizes = [
-        (1.0 + cause.size, cause.half_interval)
-        for cause in found.validation.evidence.causes or ()
-        if cause.fault.kind == "gain" and cause.fault.joints == (_JOINT,) and cause.size is not None
+        (1.0 + each.size, each.half_interval)
+        for each in found.validation.evidence.explanations or ()
+        if each.change[:2] == ("scale", (_JOINT,))
+        and not each.change.part
+        and each.size is not None
     ]
     sizes += [
         (change.ratio, 2.0 * change.std)

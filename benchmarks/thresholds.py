@@ -23,7 +23,7 @@ from identification.arrays import Array
 from identification.purposes.contact import residual_peaks
 from identification.purposes.quiet_torque import once_in, slow_residuals
 from identification.purposes.thresholds import SHOWN
-from identification.validation.residuals import BLOCK
+from identification.signals.block_mean import BLOCK
 
 WITHIN: Final = 3.0
 """Factor within which the rate of false alarms is to be."""

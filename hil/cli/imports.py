@@ -10,7 +10,7 @@ from typing import Annotated
 
 import typer
 
-from hil.base.errors import InputError
+from hil.base.errors import InputError, SourceError
 from hil.base.files import write_output
 from hil.base.progress import say
 from hil.base.terminal_text import printable
@@ -42,6 +42,7 @@ from hil.importers.recording_import import (
     import_recording,
 )
 from hil.importers.rosbag2 import CommandStamps, Effort
+from hil.look.before_identification import Asking
 from hil.pipeline.options import friction_from
 from identification import FrictionLaw
 from identification.model.kinematics import MOST_JOINTS
@@ -355,17 +356,20 @@ def rosbag2(
             fer_joint{}=panda_joint{}.
     """
     names = _names(rename or [])
+    options = ImportOptions(outside_limits=outside_limits)
+    asked = Asking(source, arm.robot, options, kind)
     recording = import_bag(
         source,
         output,
         arm.robot,
         BagMap(topic=topic, effort=effort, clock=clock, command_topic=command_topic, rename=names),
-        ImportOptions(outside_limits=outside_limits),
+        options,
         held_joints=held or (),
         use=kind,
         force=force,
+        asked=asked,
     )
-    _print(recording, json=json)
+    _print(recording, asked.refusal, json=json)
 
 
 @with_options(Described, "arm")
@@ -400,20 +404,23 @@ def log(
         uncoupled: Leave the inertia and friction of coupled motors out of the model, to measure
             what they contribute.
     """
+    options = reading.options
+    asked = Asking(source, arm.robot, options, kind)
     recording = import_recording(
         source,
         output or source.with_suffix(".mcap"),
         arm.robot,
-        reading.options,
+        options,
         held_joints=held or (),
         use=kind,
         coupled=not uncoupled,
         force=force,
+        asked=asked,
     )
     proposed = not recording.is_stated and recording.text is not None
     if proposed:
         write_output(recording.archive.path.with_suffix(".map.toml"), recording.text or "")
-    _print(recording, json=json)
+    _print(recording, asked.refusal, json=json)
     if proposed and not json:
         say(f"wrote {recording.archive.path.with_suffix('.map.toml')}")
 
@@ -443,10 +450,11 @@ def maps(
             say(f"{map_name:<18} {purpose}")
 
 
-def _print(recording: ImportedRecording, *, json: bool) -> None:
-    """Print what was concluded of the channels, and what was found in the samples."""
+def _print(recording: ImportedRecording, refusal: SourceError | None, *, json: bool) -> None:
+    """Print what was concluded, what was found, and why an identification would refuse it."""
     found = [*map(sentence, recording.concluded), *map(sentence, recording.examined.found)]
     warnings = [*map(sentence, recording.examined.warnings)]
+    warnings += [] if refusal is None else [str(refusal)]
     if json:
         print_json({"archive": str(recording.archive.path), "found": found, "warnings": warnings})
         return

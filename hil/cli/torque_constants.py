@@ -11,6 +11,7 @@ import typer
 
 from hil.base.errors import InputError
 from hil.base.progress import reporter as make_reporter
+from hil.base.progress import say
 from hil.base.toml_text import comment_lines, inline
 from hil.cli.arguments import JsonOption, QuietOption, numbers, print_json
 from hil.cli.identify_options import delay_from
@@ -68,6 +69,8 @@ def torque_constants(
         print_json(as_dict(result) | {"assumed": assumed})
     else:
         typer.echo(_as_toml(result, assumed))
+        for warning in result.warnings:
+            say(f"warning: {warning}", err=True)
     if not result.gains.determined.all():
         raise typer.Exit(NOT_GOOD)
 
@@ -145,4 +148,5 @@ def as_dict(result: GainsFound) -> dict[str, object]:
         "unit": "N·m/A",
         "side": "motor" if result.motor_side else "joint",
         "payload_kg": loads,
+        "warnings": list(result.warnings),
     }

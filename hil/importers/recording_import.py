@@ -88,6 +88,7 @@ class ImportedRecording:
         map_text: the column map, TOML; None for joint states of a bag, which need none.
         bag: how those were read; None for a log.
         is_stated: whether a whole column map was given.
+        held_joints, coupled: as of :func:`hil.import_log`.
         concluded: the meaning of each group of channels, what was fixed for it, and what the motion
             and the torque say, in this order.
         examined: what was found in its samples, and warnings.
@@ -102,6 +103,8 @@ class ImportedRecording:
     is_stated: bool = False
     #: of a log, parsed
     files: LogFiles = field(default_factory=LogFiles, compare=False, repr=False)
+    held_joints: tuple[str, ...] = ()
+    coupled: bool = True
 
     @property
     def text(self) -> str | None:
@@ -187,7 +190,15 @@ class _Request:
             outside_limits=self.outside_limits,
         )
         return ImportedRecording(
-            archive, content.source, text, concluded, examined, bag, files=self.files
+            archive,
+            content.source,
+            text,
+            concluded,
+            examined,
+            bag,
+            files=self.files,
+            held_joints=self.held_joints,
+            coupled=self.coupled,
         )
 
 
@@ -233,6 +244,10 @@ def read_recording(
     return _of_recorded_joints(partial(_imported, request, options=options), robot_of, source)
 
 
+def _as_it_is(imported: ImportedRecording) -> ImportedRecording:
+    return imported
+
+
 def import_recording(
     source: Path,
     output: Path,
@@ -243,8 +258,12 @@ def import_recording(
     use: Use = "excitation",
     coupled: bool = True,
     force: bool = False,
+    asked: Callable[[ImportedRecording], ImportedRecording] = _as_it_is,
 ) -> ImportedRecording:
     """Read a recording and write its archive; see :func:`read_recording`.
+
+    With `force` the archive replaces another; `asked` returns the recording as its motion and
+    torque say that it is.
 
     Raises:
         SourceError: it cannot be read, or its channels leave a quantity open.
@@ -260,6 +279,7 @@ def import_recording(
         use=use,
         coupled=coupled,
     )
+    imported = asked(imported)
     imported.write(output, force=force)
     return imported
 
@@ -273,7 +293,16 @@ def read_again(
         SourceError: the map leaves a quantity open.
     """
     place = imported.archive.path
-    return read_by_map(source, robot_of, text, place=place, use=use, files=imported.files)
+    return read_by_map(
+        source,
+        robot_of,
+        text,
+        place=place,
+        use=use,
+        files=imported.files,
+        held_joints=imported.held_joints,
+        coupled=imported.coupled,
+    )
 
 
 def read_by_map(
@@ -285,6 +314,8 @@ def read_by_map(
     use: Use = "excitation",
     outside_limits: bool = False,
     files: LogFiles | None = None,
+    held_joints: Sequence[str] = (),
+    coupled: bool = True,
 ) -> ImportedRecording:
     """Read a log or a bag by the text of its map, TOML; see :func:`read_recording`.
 
@@ -293,9 +324,8 @@ def read_by_map(
     """
     tables = parse_toml(text)
     request = _Request(
-        source, place, (), use, coupled=True, outside_limits=outside_limits,
-        files=files or LogFiles(),
-    )  # fmt: skip
+        source, place, tuple(held_joints), use, coupled, outside_limits, files or LogFiles()
+    )
     if (bag := BagMap.of(tables)) is not None:
         return _of_recorded_joints(
             lambda robots: _read_bag(request, robots, bag, None), robot_of, source
@@ -319,6 +349,7 @@ def import_bag(
     held_joints: Sequence[str] = (),
     use: Use = "excitation",
     force: bool = False,
+    asked: Callable[[ImportedRecording], ImportedRecording] = _as_it_is,
 ) -> ImportedRecording:
     """Import the joint states of a bag that `bag` describes; see :func:`import_recording`."""
     require_writable(output, [source], force=force)
@@ -330,7 +361,7 @@ def import_bag(
     def read(robots: RobotOf) -> ImportedRecording:
         return _read_bag(request, robots, bag, options.columns)
 
-    imported = _of_recorded_joints(read, robot_of, source)
+    imported = asked(_of_recorded_joints(read, robot_of, source))
     imported.write(output, force=force)
     return imported
 

@@ -1,8 +1,8 @@
-"""What an identification concludes of a log before it is fitted, by the same search as a look."""
+"""What an identification or an import concludes of a log, by the same search as a look."""
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Final, NamedTuple
 
@@ -25,9 +25,9 @@ from hil.look.result import ChangedReading, Look, Row, TiedReading
 from hil.pipeline.sources import cell_of, source_of
 from identification.errors import IdentificationError
 from identification.estimators.torque_channel import possible_low_passes
-from identification.hypotheses.diagnosis import RigidTorque, diagnose
+from identification.hypotheses.diagnosis import RigidTorque, torque_of
 from identification.hypotheses.scores import Score, compare, score_of
-from identification.hypotheses.search import SURE
+from identification.hypotheses.search import SURE, find_zeros_and_scales
 from identification.signals.recording import STUCK_MOVEMENT
 from identification.signals.samples import Samples, prepare
 from identification.text import percentage
@@ -110,17 +110,50 @@ def concluded(
     return imported
 
 
+@dataclass
+class Asking:
+    """What motion and torque say of a recording, asked before its archive is written.
+
+    Attributes:
+        source: the recording.
+        robot_of: its robot.
+        options: how it is read.
+        use: what identification uses it for.
+        refusal: why an identification would not take it; None if it would.
+    """
+
+    source: Path
+    robot_of: RobotOf
+    options: ImportOptions
+    use: Use
+    refusal: SourceError | None = None
+
+    def __call__(self, imported: ImportedRecording) -> ImportedRecording:
+        """Return a recording as :func:`concluded`, or as it is where that refuses it."""
+        if self.use == "standstill":
+            return imported
+        try:
+            return concluded(imported, self.source, self.robot_of, self.options, self.use)
+        except SourceError as error:
+            self.refusal = error
+            return imported
+
+
 def _is_suspect(cell: Cell, samples: Samples, score: Score, source: Path) -> bool:
     """Return whether a torque does not follow its arm as it is read.
 
     Raises:
         SourceError: there is nothing of bodies in it.
     """
-    diagnosis = diagnose(cell.model, [samples])
-    if diagnosis.rigid.is_nothing:
-        raise _without_bodies(source, diagnosis.rigid)
-    is_off = score.overall > _SUSPECT or bool(np.any(score.friction < _DRIVES))
-    return is_off or any(step.sure for step in diagnosis.zeros)
+    found = torque_of(cell.model, samples, score)
+    if found.rigid.is_nothing:
+        raise _without_bodies(source, found.rigid)
+    if score.overall > _SUSPECT or np.any(score.friction < _DRIVES):
+        return True
+    return not found.is_weightless and any(
+        step.sure and step.change.meaning == "zero"
+        for step in find_zeros_and_scales(cell.model, samples).steps
+    )
 
 
 def _has_no_sign(archive: Archive) -> bool:

@@ -81,8 +81,7 @@ from hil.look.readings import (
     Wrapped,
 )
 from hil.look.result import ChangedReading, Look, Row, TiedReading
-from identification.hypotheses.changes import IN_ORDER, Meaning
-from identification.hypotheses.faults import COUPLED
+from identification.hypotheses.changes import COUPLED, IN_ORDER, Meaning
 from identification.text import percentage
 
 _FACTS: Final[Mapping[Fact, str]] = {

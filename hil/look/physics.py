@@ -58,9 +58,8 @@ from hil.look.result import Aspect, ParameterGroup, Row, TiedReading
 from identification.estimators.delay import DelayEstimate
 from identification.estimators.prior import LEARNED, body_prior, fit_posterior
 from identification.factor.factor import Factor
-from identification.hypotheses.changes import IN_ORDER, Axes, Change, Meaning
+from identification.hypotheses.changes import COUPLED, IN_ORDER, Axes, Change, Meaning
 from identification.hypotheses.diagnosis import RigidTorque, rigid_torque
-from identification.hypotheses.faults import COUPLED
 from identification.hypotheses.search import EXPLAINED, SEPARATE, Readings, Step
 from identification.model.link_wrenches import LINK_SYMBOLS
 from identification.model.motion import Motion

@@ -36,12 +36,12 @@ from identification.estimators.payload_estimate import (
 )
 from identification.estimators.payload_problem import KnownArm, Run
 from identification.factor.columns import standard_factor
+from identification.hypotheses.gravity_direction import find_gravity
 from identification.model.pseudo_inertia import Body
 from identification.model.robot import RobotModel
 from identification.signals.samples import Samples
 from identification.validation.facts.faults import MOUNTING_STEP
 from identification.validation.finding import Thresholds
-from identification.validation.gravity import find_gravity
 
 from .payload_settings import NOT_DETERMINED, ControllerLoad, controller_settings
 
@@ -302,7 +302,7 @@ def find_payload(
     sources = replace(by_side[False], cell=cell, training=first, held_out=first)
     prepared = prepare_sources(sources, options, reporter)
     cell = prepared.sources.cell
-    require_weight(cell.model, prepared.fitted, first[0].path)
+    other_meanings = require_weight(cell.model, prepared.fitted, first[0].path)
     frame = frame or flange_of(cell.model)
     runs = _runs(prepared, last, frame, reporter)
     simulated = all(side.header.only_simulated for side in by_side.values())
@@ -313,7 +313,7 @@ def find_payload(
         task.advance(1)
         estimate, body = weighed(cell.model, runs, scale, frame, sides, training, mounting)
         task.advance(1)
-    warnings = (*prepared.sources.warnings, *by_side[True].warnings)
+    warnings = (*prepared.sources.warnings, *by_side[True].warnings, *other_meanings)
     return PayloadFound(
         estimate=estimate,
         body=body,

@@ -5,12 +5,12 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Literal
+from typing import Literal, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from hil.archive import open_archive
+from hil.base.arrays import Array
 from hil.base.errors import ArchiveError, InputError
 from hil.base.progress import Reporter
 from hil.cell import Cell
@@ -18,11 +18,14 @@ from identification.estimators.current_gains import MOST_BLOCKS, Gains, identify
 from identification.factor.blocks import FINE_BLOCK
 from identification.factor.columns import gain_factor
 from identification.factor.factor import Factor
+from identification.hypotheses.diagnosis import diagnose
 from identification.model.known_payload import Payload
 from identification.model.robot import RobotModel
 from identification.selection.settings import Settings
 from identification.signals.recording import RecordingError
+from identification.signals.samples import Samples
 
+from .carried_weight import other_meanings
 from .options import FIXED
 from .prepared import motor_from_joint, samples_of, stated_settings
 from .sources import Source, aligned, cell_of, source_of
@@ -35,6 +38,7 @@ class GainsFound:
     gains: Gains
     loads: dict[str, Payload | None]  #: payload by archive name (by path if names are not unique)
     motor_side: bool  #: whether gear ratios are known; otherwise gains include them
+    warnings: tuple[str, ...] = ()  #: what the recordings are other than described
 
 
 def find_gains(
@@ -59,9 +63,9 @@ def find_gains(
     lags: list[Settings] = []
     loads: dict[str, Payload | None] = {}
     first: Cell | None = None
-    names = [path.name for path in (*archives, *loaded)]
-    with reporter.task("reading recordings", len(names)) as task:
-        for path in (*archives, *loaded):
+    paths = (*archives, *loaded)
+    with reporter.task("reading recordings", len(paths)) as task:
+        for path in paths:
             archive = open_archive(path)
             cell = cell_of(archive)
             source = source_of(archive, cell)
@@ -86,44 +90,79 @@ def find_gains(
             # A recorded torque may have been computed with other gains.
             without = replace(source.recording, torque=np.zeros_like(current))
             load = loaded.get(path, cell.model.payload)
-            loads[path.name if names.count(path.name) == 1 else str(path)] = load
+            loads[_name_in(path, paths)] = load
             carried.append(load)
             lags.append(stated_settings(cell, replace(FIXED, delay=delay)))
             sources.append(replace(source, recording=without))
             cells.append(cell)
             task.advance(1, path.name)
-    assert first is not None, "the command line asks for an archive"
     _require_load(loads.values())
-    recorded = list(zip(sources, cells, lags, carried, strict=True))
-    gains = identify_gains(model, _reduced(recorded, model, turns, reporter))
-    return GainsFound(gains, loads, not np.array_equal(turns, np.eye(len(turns))))
+    prepared = _prepared([*zip(sources, cells, lags, carried, strict=True)], model)
+    gains = identify_gains(model, _reduced(prepared, model, turns, reporter))
+    has_gears = not np.array_equal(turns, np.eye(len(turns)))
+    return GainsFound(gains, loads, has_gears, _warnings(prepared, model, turns, gains))
+
+
+class _Prepared(NamedTuple):
+    """A recording, prepared."""
+
+    samples: Samples  # without torque
+    current: Array  # of the motors (m, n) [A]
+    load: Payload | None
+    name: str
+
+
+def _prepared(
+    recorded: Sequence[tuple[Source, Cell, Settings, Payload | None]], model: RobotModel
+) -> list[_Prepared]:
+    """Prepare recordings, those of one motion from a common origin."""
+    # Repetitions of a motion begin together: errors of the model repeat at equal times.
+    together, _ = aligned(tuple(source for source, *_ in recorded))
+    prepared = []
+    for source, (_, cell, settings, load) in zip(together, recorded, strict=True):
+        try:
+            samples = samples_of(source, cell, settings, model)
+        except RecordingError as error:
+            raise ArchiveError(source.path, str(error), remedy="leave it out") from error
+        current = source.recording.motor_current
+        assert current is not None, "checked above"
+        prepared.append(_Prepared(samples, current, load, source.name))
+    return prepared
 
 
 def _reduced(
-    recorded: Sequence[tuple[Source, Cell, Settings, Payload | None]],
-    model: RobotModel,
-    turns: NDArray[np.float64],
-    reporter: Reporter,
+    prepared: Sequence[_Prepared], model: RobotModel, turns: Array, reporter: Reporter
 ) -> list[Factor]:
     """Return the factor of each recording, in equal blocks of time."""
-    # Repetitions of a motion begin together: errors of the model repeat at equal times.
-    together, _ = aligned(tuple(source for source, *_ in recorded))
-    longest = max(source.recording.time[-1] - source.recording.time[0] for source in together)
-    block = max(FINE_BLOCK, float(longest) / MOST_BLOCKS)
+    longest = max(float(np.ptp(each.samples.motion.time)) for each in prepared)
+    block = max(FINE_BLOCK, longest / MOST_BLOCKS)
     factors: list[Factor] = []
-    with reporter.task("reducing recordings", len(together)) as task:
-        for source, (_, cell, settings, load) in zip(together, recorded, strict=True):
-            try:
-                samples = samples_of(source, cell, settings, model)
-            except RecordingError as error:
-                raise ArchiveError(source.path, str(error), remedy="leave it out") from error
-            current = source.recording.motor_current
-            assert current is not None, "checked above"
+    with reporter.task("reducing recordings", len(prepared)) as task:
+        for samples, current, load, name in prepared:
             factors.append(
                 gain_factor(model, samples, current, payload=load, transmission=turns, block=block)
             )
-            task.advance(1, source.name)
+            task.advance(1, name)
     return factors
+
+
+def _warnings(
+    prepared: Sequence[_Prepared], model: RobotModel, turns: Array, gains: Gains
+) -> tuple[str, ...]:
+    """Return what recordings without a load are other than described, by the torque found."""
+    bare = [each for each in prepared if each.load is None]
+    if not gains.determined.all() or not bare:
+        return ()
+    torques = [(each.current * gains.values) @ turns for each in bare]
+    samples = [
+        replace(each.samples, torque=torque) for each, torque in zip(bare, torques, strict=True)
+    ]
+    return other_meanings(model, diagnose(model, samples))
+
+
+def _name_in(path: Path, paths: Sequence[Path]) -> str:
+    """Return the name of a path, or all of it if others have that name."""
+    return path.name if sum(each.name == path.name for each in paths) == 1 else str(path)
 
 
 def _require_load(loads: Iterable[Payload | None]) -> None:

@@ -9,13 +9,13 @@ from dataclasses import dataclass, replace
 from hil.base.progress import Reporter
 from hil.cell.nominal import Nominal, nominal_of
 from identification import Estimate, Factor, IdentificationError
+from identification.hypotheses.column_scores import ScorePrior
 from identification.purposes.purposes import Application, purposes_of
 from identification.purposes.thresholds import ContactThreshold
 from identification.selection.essential import Elimination, choose_essential
 from identification.validation.calibration import Calibration, TorqueMeans, calibrate
 from identification.validation.consistency import ConsistencyCheck, check_consistency
 from identification.validation.evidence import Evidence, gather
-from identification.validation.fault_scores import ScorePrior
 from identification.validation.verdict import Verdict, judge
 
 from .cell_context import cell_context_of, joint_ranges

@@ -1,8 +1,13 @@
-"""What a reading changes in a recording: sign, order, unit, zero and scale of joints, mounting."""
+"""What a recording may be other than stated, as changes that undo it.
+
+Signs, orders, units, zeros and coupled angles of joints are changes of what was recorded; delay,
+friction by the load, a load, and scale or friction of joints, throughout or in a part, are linear
+in columns of torque (:mod:`identification.hypotheses.columns`).
+"""
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from typing import Final, Literal, NamedTuple
 
@@ -10,7 +15,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from identification.arrays import Array
-from identification.hypotheses.faults import COUPLED, Fault, corrected
 from identification.model.robot import RobotModel
 from identification.signals.recording import Recording
 from identification.signals.samples import Samples
@@ -30,6 +34,11 @@ Meaning = Literal[
     "scale",
     "no gravity",
     "mounting",
+    "delay",
+    "load friction",
+    "payload",
+    "friction",
+    "arm",
 ]
 DEGREE: Final = np.pi / 180.0
 SIGNS: Final[tuple[Meaning, ...]] = ("torque sign", "position sign", "axis sign")
@@ -37,6 +46,20 @@ IN_ORDER: Final[tuple[Meaning, ...]] = ("torque order", "position order", "joint
 SIZED: Final[tuple[Meaning, ...]] = ("zero", "scale")
 UNITS: Final[tuple[Meaning, ...]] = ("degrees", "radians")
 GRAVITIES: Final[tuple[Meaning, ...]] = ("mounting", "no gravity")
+COUPLED: Final[tuple[Meaning, ...]] = ("angle sum", "angle difference")
+"""The recorded angle of the first joint contains that of the second, added or taken off."""
+DISCRETE: Final[tuple[Meaning, ...]] = (*SIGNS, *IN_ORDER, *COUPLED)
+"""Changes without a size."""
+# An angle contains that of one of these joints before it: parallel axes are neighbours, or have one
+# across them in between.
+_JOINTS_BEFORE: Final = 2
+
+
+class Part(NamedTuple):
+    """Part of the blocks of recordings."""
+
+    name: str  # such as "A.mcap", or "A.mcap from 3 s on"
+    blocks: tuple[bool, ...]  # mask over the blocks (B,)
 
 
 class Change(NamedTuple):
@@ -44,7 +67,8 @@ class Change(NamedTuple):
 
     `size` is an angle [rad] to add to a position, or by how much more than once a torque is
     recorded; `name` that of a mounting; `order` the recorded place of each of the joints, by
-    default those of a pair exchanged.
+    default those of a pair exchanged; `part` where it is, if not throughout. All joints are
+    concerned if none is named. Of a coupled angle `joints` are its own, and the one it contains.
     """
 
     meaning: Meaning
@@ -52,6 +76,12 @@ class Change(NamedTuple):
     size: float = 0.0
     name: str = ""
     order: tuple[int, ...] = ()
+    part: Part | None = None
+
+    @property
+    def is_discrete(self) -> bool:
+        """Whether it has no size, as a sign or an order."""
+        return self.meaning in DISCRETE
 
     @property
     def places(self) -> tuple[int, ...]:
@@ -81,48 +111,39 @@ def mounted_model(
     return mountings[change.name] if change.meaning in GRAVITIES else model
 
 
+def coupled_pairs(model: RobotModel, moved: Sequence[int]) -> Iterator[tuple[int, int]]:
+    """Yield the joints whose angle a controller may state relative to one of the two before it.
+
+    Such as the forearm's to the horizontal: the angle of axis 3 then contains that of axis 2.
+    """
+    turning = [joint for joint in moved if model.chain.revolute[joint]]
+    yield from ((j, k) for j in turning for k in turning if 0 < j - k <= _JOINTS_BEFORE)
+
+
 def changed_samples(model: RobotModel, samples: Samples, change: Change) -> Samples:
-    """Return samples with signs, orders, unit or zero of the joints changed."""
-    meaning = change.meaning
-    joints = change.joints
-    motion = samples.motion
-    if meaning in GRAVITIES:
+    """Return samples with signs, orders, unit, zero, scale or coupling of the joints changed.
+
+    Rows of filtered samples are changed before their filter.
+    """
+    if change.meaning in GRAVITIES:
         return samples
-    if meaning.endswith("order"):
-        return _reordered(model, samples, change)
-    if meaning in ("torque sign", "axis sign", "angle sum", "angle difference"):
-        return corrected(model, samples, Fault(meaning, joints))
-    if meaning == "position sign":
-        turned = corrected(model, samples, Fault("axis sign", joints))
-        return corrected(model, turned, Fault("torque sign", joints))
-    if meaning == "scale":
-        torque = samples.torque.copy()
-        torque[:, list(joints)] /= 1.0 + change.size
-        return replace(samples, torque=torque)
-    if meaning == "zero":
-        position = motion.position.copy()
-        position[:, list(joints)] += change.size
-        motion = replace(motion, position=position)
-    else:
-        factor = DEGREE if meaning == "degrees" else 1.0 / DEGREE
-        motion = motion.converted(lambda states: factor * states)
-    return replace(samples, motion=motion, mask=None).with_friction_direction(model)
-
-
-def _reordered(model: RobotModel, samples: Samples, change: Change) -> Samples:
-    """Return samples with joints read from other places."""
-    order = np.array(whole_order(change, model.n_joints))
+    axes = Axes.of([change], model.n_joints)
+    torque = samples.torque[:, axes.torque_order] * (axes.torque_sign / axes.torque_scale)
+    result = replace(samples, torque=torque)
+    if samples.parent is not None:
+        parent, part = samples.parent
+        result = replace(result, parent=(changed_samples(model, parent, change), part))
+    if change_of_motion(change) == _AS_READ:
+        return result
+    order = axes.position_order
+    read = axes.factor * np.eye(model.n_joints)[order] * axes.position_sign[:, None]
+    uncoupled = np.linalg.inv(axes.coupling) @ read
     motion = samples.motion
-    torque = samples.torque
-    usable = samples.usable
-    if change.meaning != "torque order":
-        load = None if motion.load is None else motion.load[:, order]
-        motion = motion.converted(lambda states: states[:, order])
-        motion = replace(motion, direction=None, load=load)
-        usable = usable[:, order]
-    if change.meaning != "position order":
-        torque = torque[:, order]
-    result = replace(samples, motion=motion, torque=torque, usable=usable, mask=None)
+    load = None if motion.load is None else motion.load[:, order]
+    motion = motion.converted(lambda states: states @ uncoupled.T)
+    motion = replace(motion, position=motion.position + axes.zero, direction=None, load=load)
+    usable = samples.usable[:, order]
+    result = replace(result, motion=motion, usable=usable, mask=None)
     return result.with_friction_direction(model)
 
 

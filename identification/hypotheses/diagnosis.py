@@ -1,7 +1,8 @@
-"""What the torque of prepared recordings says of their meaning, asked once for every use.
+"""What prepared recordings of one arm are other than stated: the one question of every command.
 
-Whether there is gravity in it, whether there are bodies in it at all, and whether the zeros of
-joints are other than those of the arm.
+In this order: whether there are bodies in the torque, and gravity; whether signs, orders, coupled
+angles, zeros and scales of joints are other than stated; then, with a fit whose errors are to be
+explained, delay, friction by the load, load, scale and friction of parts.
 """
 
 from __future__ import annotations
@@ -15,12 +16,20 @@ import numpy as np
 from identification.arrays import Array
 from identification.estimators.prior import body_prior, nominal_ratio, posterior_values
 from identification.factor.factor import Factor
-from identification.hypotheses.scores import ROWS_PER_FACT, Comparison, compare, score_of
+from identification.hypotheses.changes import Change, changed_samples
+from identification.hypotheses.column_search import (
+    ExplainedFit,
+    Explanation,
+    find_columns,
+    find_columns_of_unseen,
+)
+from identification.hypotheses.scores import ROWS_PER_FACT, Comparison, Score, compare, score_of
 from identification.hypotheses.search import (
     EXPLAINED,
     SEPARATE,
     Readings,
     Step,
+    find_readings,
     find_zeros_and_scales,
 )
 from identification.model.motion import Motion
@@ -34,6 +43,9 @@ _SURE: Final = 4.5  # standard errors of it
 _FEWEST_ROWS: Final = 100  # that say something of bodies
 _NO_ARM: Final = 1.0 / 3.0  # of the nominal torque, below which bodies are not those of the arm
 _NO_BODY: Final = 0.5  # torque of bodies over that of friction where there is none of bodies
+# Error of a joint, of its torque, up to which its sign and order are as stated, and noise floors.
+_SMALL_ERROR: Final = 0.02
+_LITTLE_MORE: Final = 1.05
 
 
 @dataclass(frozen=True, eq=False)
@@ -75,13 +87,18 @@ class TorqueDiagnosis:
         weightless: error of a torque without gravity, compared with one with it; None if the model
             has none.
         rigid: how much of the torque is that of bodies, with gravity or without, as fits better.
-        readings: zeros and scales other than stated; None where there is no gravity or no body in
-            the torque.
+        readings: signs, orders, zeros and scales other than stated; None where there is no gravity
+            or no body in the torque.
+        explanations: changes that explain errors of a fit, the signs and orders of which nothing
+            fits alike first; None where that was not asked.
+        begun: changes that begin within unseen recordings.
     """
 
     weightless: Comparison | None
     rigid: RigidTorque
-    readings: Readings | None
+    readings: Readings | None = None
+    explanations: tuple[Explanation, ...] | None = None
+    begun: tuple[Explanation, ...] = ()
 
     @property
     def is_weightless(self) -> bool:
@@ -90,26 +107,94 @@ class TorqueDiagnosis:
         return found is not None and found.ratio < _WEIGHTLESS and found.sigmas < -_SURE
 
     @property
+    def steps(self) -> tuple[Step, ...]:
+        """What is other than stated throughout."""
+        return () if self.readings is None else self.readings.steps
+
+    @property
     def zeros(self) -> tuple[Step, ...]:
         """The zeros that are other than stated."""
-        steps = () if self.readings is None else self.readings.steps
-        return tuple(step for step in steps if step.change.meaning == "zero")
+        return tuple(step for step in self.steps if step.change.meaning == "zero")
+
+    @property
+    def discrete(self) -> tuple[Step, ...]:
+        """The signs, orders and coupled angles that are other than stated."""
+        return tuple(step for step in self.steps if step.change.is_discrete)
 
 
-def diagnose(model: RobotModel, recordings: Sequence[Samples]) -> TorqueDiagnosis:
-    """Ask what prepared recordings of one arm are, by some hundred rows of them."""
+def diagnose(
+    model: RobotModel,
+    recordings: Sequence[Samples],
+    fitted: ExplainedFit | None = None,
+    unseen: Sequence[Samples] = (),
+) -> TorqueDiagnosis:
+    """Ask what prepared recordings of one arm are, and what explains the errors of their fit.
+
+    Signs and orders are searched for in some hundred rows where the arm does not predict them, all
+    else in some thousand.
+
+    Args:
+        model: of the arm.
+        recordings: prepared.
+        fitted: a fit of them; None asks only for what they are throughout.
+        unseen: recordings that it predicts worse, in which something may begin.
+    """
     samples = _few_rows(recordings)
+    score = score_of(model, samples)
+    found = torque_of(model, samples, score)
+    if found.rigid.is_nothing or found.is_weightless:
+        return found
+    if _is_predicted(score, samples, None if fitted is None else fitted.noise):
+        found = replace(found, readings=find_zeros_and_scales(model, samples))
+    else:
+        found = replace(found, readings=find_readings(model, samples, unit_is_open=False))
+    if fitted is None:
+        return found
+    found = replace(found, explanations=_explained(model, recordings, fitted, found))
+    if unseen and not found.explanations:
+        begun = find_columns_of_unseen(model, recordings, unseen, fitted)
+        found = replace(found, begun=begun)
+    return found
+
+
+def torque_of(model: RobotModel, samples: Samples, score: Score) -> TorqueDiagnosis:
+    """Return whether there are bodies in the torque of some rows with this score, and gravity."""
     read = model
     weightless = None
     if np.any(model.gravity):
         without = model.under_gravity((0.0, 0.0, 0.0))
-        weightless = compare(score_of(without, samples), score_of(model, samples), model)
+        weightless = compare(score_of(without, samples), score, model)
         if weightless.ratio < 1.0:
             read = without
-    found = TorqueDiagnosis(weightless, rigid_torque(read, samples), None)
-    if found.rigid.is_nothing or found.is_weightless:
-        return found
-    return replace(found, readings=find_zeros_and_scales(model, samples))
+    return TorqueDiagnosis(weightless, rigid_torque(read, samples))
+
+
+def _is_predicted(score: Score, samples: Samples, noise: Array | None) -> bool:
+    """Return whether the arm predicts all joints as well as no wrong sign or order lets it."""
+    rows = samples.usable.sum(axis=0)
+    floor = np.zeros(len(rows)) if noise is None else np.nan_to_num(noise)
+    small = np.maximum(_LITTLE_MORE * floor * np.sqrt(rows), _SMALL_ERROR * np.sqrt(score.torque))
+    is_small = np.sqrt(score.squares.sum(axis=0)) <= small
+    return bool(is_small.all()) and not score.driven.any()
+
+
+def _explained(
+    model: RobotModel, recordings: Sequence[Samples], fitted: ExplainedFit, found: TorqueDiagnosis
+) -> tuple[Explanation, ...]:
+    """Return what explains the errors of a fit, beside what the recordings are throughout."""
+    certain = [step for step in found.steps if step.sure]
+    discrete = [step for step in certain if step.change.is_discrete]
+    undone: list[Change] = [step.change for step in certain if step.change.meaning != "scale"]
+    for change in undone:
+        recordings = [changed_samples(model, samples, change) for samples in recordings]
+    if undone:
+        factor = sum((Factor.of(model, samples) for samples in recordings), Factor.zero(model))
+        prior = body_prior(model, factor).gaussian
+        fitted = replace(fitted, values=posterior_values(factor, prior, ROWS_PER_FACT)[0])
+    return (
+        *(Explanation(step.change, step.ratio) for step in discrete),
+        *find_columns(model, recordings, fitted),
+    )
 
 
 def rigid_torque(model: RobotModel, samples: Samples) -> RigidTorque:

@@ -22,6 +22,7 @@ from identification.estimators.prior import TorqueSums, body_priors
 from identification.factor.columns import every_torque_factor
 from identification.factor.factor import SMALLEST_NOISE, Factor
 from identification.hypotheses.changes import (
+    COUPLED,
     DEGREE,
     GRAVITIES,
     IN_ORDER,
@@ -34,13 +35,13 @@ from identification.hypotheses.changes import (
     alternatives_to,
     change_of_motion,
     changed_samples,
+    coupled_pairs,
     differs,
     kind_of,
     mounted_model,
     order_change,
     whole_order,
 )
-from identification.hypotheses.faults import COUPLED, coupled_pairs
 from identification.hypotheses.joint_fit import (
     JointFit,
     candidates,
@@ -117,6 +118,12 @@ class Step:
     sigmas: float
     alike: tuple[tuple[Change, float], ...] = ()
     is_adequate: bool = True  # whether no free fit explains the rows much better
+
+    @property
+    def is_explained(self) -> bool:
+        """Whether the arm explains the torque with it, and certainly worse without."""
+        is_certain = not self.by_friction and self.sigmas < -SURE
+        return self.error < EXPLAINED and self.is_adequate and is_certain
 
     @property
     def by_friction(self) -> bool:
@@ -226,8 +233,10 @@ def find_readings(
     adequacy = search.adequacy()
     if not adequacy.is_enough:
         steps = _doubted(steps, search, started())
-    if not all(step.sure for step in steps):  # each was chosen beside the others
-        steps = [replace(step, is_adequate=False) for step in steps]
+    doubted = [step for step in steps if not step.sure]
+    steps = [  # each was chosen beside the others
+        step if doubted in ([], [step]) else replace(step, is_adequate=False) for step in steps
+    ]
     return Readings(
         tuple(steps),
         search.model,

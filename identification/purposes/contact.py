@@ -47,13 +47,17 @@ def residual_peaks(residuals: Sequence[SlowResidual]) -> list[Array]:
 def seen_force(model: RobotModel, torque: Array, postures: Array) -> float:
     """Return the force [N] at the flange that exceeds the torque (n,) of some joint.
 
-    In `SHARE` of directions and postures (m, n), at rest.
+    In `SHARE` of directions and postures (m, n), at rest. A joint without residual did not move,
+    and its threshold is not known.
     """
+    known = np.where(torque > 0.0, torque, np.inf)
+    if not np.isfinite(known).any():
+        return float("inf")
     random = np.random.default_rng(_SEED)
     direction = random.normal(size=(DIRECTIONS, 3))
     direction /= np.linalg.norm(direction, axis=1)[:, None]
     jacobian = flange_motion(model.chain, postures).jacobian
-    shares = np.abs(direction @ jacobian) / torque
+    shares = np.abs(direction @ jacobian) / known
     largest = shares.max(axis=2).ravel()
     weakest = float(np.quantile(largest, 1.0 - SHARE))
     return 1.0 / weakest if weakest > _ROUNDING / float(torque.max()) else float("inf")
@@ -72,7 +76,8 @@ def seen_mass(model: RobotModel, residuals: Sequence[SlowResidual]) -> float | N
     frame = name if name in model.chain.frames else None
     load = Load(model.chain, model.gravity, Payload(1.0, (0.0, 0.0, 0.0), frame=frame))
     every = np.concatenate([part.torque for part in residuals])
-    variance = np.maximum(np.mean(every**2, axis=0), np.finfo(np.float64).tiny)
+    variance = np.mean(every**2, axis=0)
+    variance = np.where(variance > 0.0, variance, np.inf)  # a joint that did not move shows nothing
     sums = [_by_block(part, load.torque(part.motion), variance) for part in residuals]
     product, square = np.concatenate(sums).T
     median = float(np.median(square)) if len(square) else 0.0

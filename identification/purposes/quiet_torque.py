@@ -11,11 +11,11 @@ from identification.arrays import Array, Indices
 from identification.distributions import chi_squared_limit
 from identification.model.motion import Motion
 from identification.model.robot import RobotModel
+from identification.signals.block_mean import BLOCK
 from identification.signals.masks import EDGE, SATURATED
 from identification.signals.samples import Samples
 from identification.signals.smoothing import low_pass
 from identification.validation.prediction import SLOW, driving_residual
-from identification.validation.residuals import BLOCK
 
 PERIOD: Final = 60.0
 """A threshold is exceeded once in this time of motion without contact [s]."""

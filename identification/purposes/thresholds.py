@@ -13,7 +13,7 @@ from identification.model.flange import flange_motion
 from identification.model.robot import RobotModel
 from identification.purposes.contact import residual_peaks, seen_force
 from identification.purposes.quiet_torque import SlowResidual, once_in, once_in_interval
-from identification.validation.residuals import BLOCK
+from identification.signals.block_mean import BLOCK
 
 SHOWN: Final = 3.0
 """Times that unseen motion exceeds the threshold which it shows itself."""
@@ -80,5 +80,6 @@ def contact_thresholds(
 def _seen_weight(model: RobotModel, torque: Array, posture: Array) -> float:
     """Return the mass [kg] at the flange whose weight exceeds the torque (n,) of some joint."""
     jacobian = flange_motion(model.chain, posture[None]).jacobian[0]
-    share = float((np.abs(model.gravity @ jacobian) / torque).max())
+    known = np.where(torque > 0.0, torque, np.inf)
+    share = float((np.abs(model.gravity @ jacobian) / known).max())
     return 1.0 / share if share > 0.0 else float("inf")

@@ -24,9 +24,9 @@ from identification.factor.factor import Factor
 from identification.factor.rows import augmented_rows
 from identification.model.robot import RobotModel
 from identification.selection.folds import FOLDS
+from identification.signals.block_mean import BLOCK, FEWEST_BLOCKS, block_index
 from identification.signals.masks import EDGE, SATURATED
 from identification.signals.samples import Samples
-from identification.validation.residuals import BLOCK, FEWEST_BLOCKS, block_index
 
 Refit = Callable[[Factor], Array]
 """Estimator: factor to parameters (p,)."""

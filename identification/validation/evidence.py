@@ -16,15 +16,16 @@ from identification.estimators.least_squares import RepeatedEstimate
 from identification.factor.columns import standard_factor
 from identification.factor.estimate import Estimate
 from identification.factor.factor import Factor, total_factor
+from identification.hypotheses.carried_load import LOAD, CarriedLoad, find_load
+from identification.hypotheses.column_scores import ScorePrior
+from identification.hypotheses.column_search import ExplainedFit, Explanation
 from identification.hypotheses.diagnosis import TorqueDiagnosis, diagnose
+from identification.hypotheses.gravity_direction import GravityDirection, find_gravity
+from identification.hypotheses.unseen_changes import UnseenChange, find_changes
 from identification.model.robot import RobotModel
 from identification.signals.samples import Samples
-from identification.validation.causes import Cause, find_causes
-from identification.validation.changes import Change, find_changes
 from identification.validation.consistency import ConsistencyCheck
-from identification.validation.fault_scores import ScorePrior
 from identification.validation.finding import Finding, Thresholds
-from identification.validation.gravity import CarriedLoad, GravityDirection, find_gravity, find_load
 from identification.validation.nominal_friction import with_fitted_friction
 from identification.validation.nominal_scale import InertiaRatio, NominalScale
 from identification.validation.physical_signs import (
@@ -46,6 +47,7 @@ from identification.validation.prediction import (
 from identification.validation.residuals import ResidualChecks, check_residuals
 
 SIGMAS: Final = 3.0
+_WORSE: Final = 1.25  # error of unseen over that of fitted motion from which something begins in it
 # Share of the rows in the rarer direction of motion below which friction and offset of a joint are
 # one column: with it their correlation is 0.98.
 _OTHER_WAY: Final = 0.01
@@ -123,12 +125,12 @@ class Evidence:
     #: deviation of the predicted unseen torque by the covariance, as a share of the torque over
     #: all axes; None if parameters are undetermined, or nothing was held out
     open_share: float | None = None
-    causes: tuple[Cause, ...] | None = None  #: faults whose correction reduces errors
     #: joints whose torque or friction on unseen motion differs from the fitted motion
-    changes: tuple[Change, ...] = ()
+    changes: tuple[UnseenChange, ...] = ()
     #: joints that moved in one direction only on the fitted motion (n,); None if not tested
     one_way: NDArray[np.bool_] | None = None
-    diagnosis: TorqueDiagnosis | None = None  #: what the fitted recordings are; None if not asked
+    #: what the fitted recordings are, and what explains their errors; None if not asked
+    diagnosis: TorqueDiagnosis | None = None
     gravity: GravityDirection | None = None  #: the direction of gravity that fits best
     load: CarriedLoad | None = None  #: body on the last link in unseen motion only
     #: error of the nominal (CAD) model on the same unseen motion
@@ -149,6 +151,11 @@ class Evidence:
     def revolute(self, joint: int) -> bool:
         """Return whether a joint is revolute, with torque in N·m, else N."""
         return joint not in self.prismatic
+
+    @property
+    def explanations(self) -> tuple[Explanation, ...] | None:
+        """Changes that explain the errors of the fit; None if not asked."""
+        return None if self.diagnosis is None else self.diagnosis.explanations
 
     @property
     def floor(self) -> float | None:
@@ -226,8 +233,9 @@ def gather(
     speed = np.max([np.abs(run.motion.velocity).max(axis=0) for run in held_out], axis=0)
     others, motors = (() if in_sample else held_out), context.motor_from_joint
     moved = _total_time_moved(training) >= Thresholds().moved
-    scale = context.scale_std
-    causes = find_causes(model, training, values, names, noise=floor, prior=prior, scale_std=scale)
+    fit = ExplainedFit(values, floor, names, prior, context.scale_std)
+    changes = find_changes(model, pooled, training, others, unseen, moved) if others else ()
+    is_worse = error.overall > _WORSE * fitted.overall and load.explained < LOAD and not changes
     return Evidence(
         estimate=pooled,
         held_out=error,
@@ -238,10 +246,9 @@ def gather(
         noise_floor=floor,
         open_share=None if in_sample else _open_share(pooled, unseen),
         disagreement=None if noise is None else _disagreement(result),
-        causes=causes,
-        changes=find_changes(model, pooled, training, others, unseen, moved) if others else (),
+        changes=changes,
         one_way=_one_way(training),
-        diagnosis=diagnose(model, training),
+        diagnosis=diagnose(model, training, fit, others if is_worse else ()),
         gravity=gravity,
         load=load,
         nominal=None if nominal is None else _error(model, nominal, held_out),

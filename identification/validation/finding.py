@@ -9,6 +9,7 @@ from typing import Literal, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
+from identification.hypotheses.carried_load import LOAD
 from identification.hypotheses.little_torque import MINOR
 
 Mask = NDArray[np.bool_]
@@ -49,6 +50,10 @@ class Naming:
     def of(self, mask: Mask) -> str:
         """Return the joints of a mask (n,)."""
         return joined([self.joints[joint] for joint in np.flatnonzero(mask)])
+
+    def all_of(self, joints: Sequence[int]) -> str:
+        """Return joints by their indices."""
+        return joined([self.joints[joint] for joint in joints])
 
     def each(self, mask: Mask, entry: Callable[[int], str]) -> str:
         """Return the joints of a mask (n,), each with its entry: ``joint_1 3 %, joint_2 5 %``."""
@@ -102,9 +107,7 @@ class Thresholds:
     moved: float = 0.5
     gravity: float = 0.5  #: squared error on unseen motion with the best gravity over declared
     gravity_angle: float = 1.0  #: degrees between the two. Other faults on the NS 16: up to 0.06
-    #: share of the additional error on unseen motion that a body on the last link explains. A real
-    #: body: at least 0.99; other faults: at most 0.7
-    load: float = 0.8
+    load: float = LOAD  #: share of the additional error that a body on the last link explains
     outliers: float = 0.05  #: largest share of samples that counts as outliers
     #: their share of the squared residual. Injected spikes: above 0.9; heavy tails (UR10): 0.5
     outlying_power: float = 0.8

@@ -17,15 +17,13 @@ from identification.arrays import Array, Indices
 from identification.distributions import student_limit
 from identification.estimators.friction_drift import PIECES, FrictionDrift, friction_trend
 from identification.model.robot import RobotModel
+from identification.signals.block_mean import BlockMean, block_index, block_mean
 from identification.signals.samples import Samples
 from identification.signals.spectrum import power_density
 from identification.validation.prediction import PredictionError
 
 Rows = NDArray[np.bool_]
 
-# Model errors are correlated over tenths of a second.
-BLOCK: Final = 0.5  # s
-FEWEST_BLOCKS: Final = 5  # fewer blocks give no standard error
 BINS: Final = 12
 CHANCE: Final = 0.001  # probability of a false finding per joint, over all its bins
 # Per motor turn: eccentricity 1; strain wave gears 2; pole pairs and slots of servo motors above.
@@ -37,40 +35,6 @@ _NORMAL: Final = 1.4826
 LONGEST_LAG: Final = 0.5  # s
 _MOST_LAGS: Final = 1000
 _RESOLVED: Final = 4.0  # s, parts of a spectrum of the residual
-
-
-class BlockMean(NamedTuple):
-    """Means over blocks of time; every array has the shape of the averaged values."""
-
-    mean: Array  # NaN with fewer than `FEWEST_BLOCKS` blocks
-    std: Array  # standard error, likewise
-    rows: Array  # samples
-    blocks: Indices  # blocks with at least one sample
-
-
-def block_mean(parts: Sequence[Array], repeated: int = 1) -> BlockMean:
-    """Return sum of values over sum of weights, with standard error by blocks.
-
-    Each part holds both sums by blocks (2, B, ...); the first `repeated` parts share blocks.
-    """
-    shared = np.zeros((2, max(p.shape[1] for p in parts[:repeated]), *parts[0].shape[2:]))
-    for part in parts[:repeated]:
-        shared[:, : part.shape[1]] += part
-    values, weights = np.concatenate([shared, *parts[repeated:]], axis=1)
-    total = weights.sum(axis=0)
-    blocks = np.count_nonzero(weights, axis=0)
-    enough = blocks >= FEWEST_BLOCKS
-    divisor = np.where(enough, total, 1.0)
-    mean = values.sum(axis=0) / divisor
-    scores = (values - mean * weights) / divisor
-    std = np.sqrt((scores**2).sum(axis=0) * blocks / np.maximum(blocks - 1, 1))
-    return BlockMean(np.where(enough, mean, np.nan), np.where(enough, std, np.nan), total, blocks)
-
-
-def block_index(samples: Samples) -> Indices:
-    """Return the block of each row (m,), numbered from the start of the motion."""
-    since = samples.motion.time - samples.origin
-    return np.maximum(np.floor(since / BLOCK + 1e-9).astype(np.intp), 0)
 
 
 class Profile(NamedTuple):

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Final
 
 import numpy as np
 
+from identification.hypotheses.column_search import UNSEEN
 from identification.text import percentage
 from identification.validation.evidence import Evidence
 from identification.validation.facts.diagnosis import ARM, ArmFacts, MeaningFacts
@@ -51,10 +51,6 @@ from identification.validation.purpose import Purpose, PurposeName, good_for
 from identification.validation.purpose_messages import purposes_in_a_sentence
 
 __all__ = ["Finding", "Thresholds", "Verdict", "judge"]
-
-
-UNSEEN: Final = "unseen motion"
-"""What a model is tested on if it is another motion than the fitted one."""
 
 
 @dataclass(frozen=True)

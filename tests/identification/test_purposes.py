@@ -194,6 +194,24 @@ def test_the_force_exceeds_a_threshold_in_most_directions() -> None:
     assert np.mean(np.any(torque > threshold, axis=1)) == pytest.approx(0.95, abs=0.03)
 
 
+def test_a_joint_that_did_not_move_shows_neither_force_nor_mass() -> None:
+    """Its residual is zero throughout: what it would feel of a contact is not known."""
+    model = RobotModel.from_urdf(random_urdf(3), friction=FrictionLaw(third=None))
+    n = model.n_joints
+    postures = workspace(np.full(n, -1.0), np.full(n, 1.0))
+    deaf, still = np.ones((2, n))
+    deaf[1], still[1] = 1e3, 0.0
+    with np.errstate(all="raise"):
+        force = seen_force(model, still, postures)
+        assert force == pytest.approx(seen_force(model, deaf, postures), rel=1e-9)
+        assert seen_force(model, np.zeros(n), postures) == np.inf
+    (part,) = slow_residuals(MODEL, truth(), [quiet(60.0, 1)])
+    with np.errstate(all="raise"):
+        mass = seen_mass(MODEL, [part._replace(torque=part.torque * [1.0, 0.0])])
+    # The flange is on the axis of the second joint, which feels no mass there.
+    assert mass == pytest.approx(seen_mass(MODEL, [part]), rel=1e-6)
+
+
 def test_a_mass_above_the_smallest_is_seen_and_one_below_is_not() -> None:
     quiet_parts = slow_residuals(MODEL, truth(), [quiet(60.0, 1)])
     mass = seen_mass(MODEL, quiet_parts)

@@ -17,6 +17,7 @@ from identification.estimators.prior import NOMINAL_SHARE
 from identification.factor.estimate import Estimate, estimate, joint_weights
 from identification.factor.factor import Factor, total_factor
 from identification.factor.normal_equations import solve
+from identification.hypotheses.unseen_changes import find_changes
 from identification.model.coupling import Coupling
 from identification.model.friction import FrictionLaw
 from identification.model.robot import RobotModel
@@ -24,7 +25,6 @@ from identification.selection.folds import FOLDS
 from identification.signals.masks import EDGE, SATURATED, STANDSTILL, RowMask
 from identification.signals.recording import Recording
 from identification.validation.calibration import TorqueMeans, calibrate, inner_errors
-from identification.validation.changes import find_changes
 from identification.validation.consistency import check_consistency
 from identification.validation.evidence import repetition_noise
 from identification.validation.nominal_scale import inertia_matrices, inertia_ratio, nominal_scale

@@ -2,7 +2,6 @@
 
 import warnings
 from dataclasses import replace
-from typing import get_args
 
 import numpy as np
 import pinocchio as pin
@@ -13,23 +12,28 @@ from identification.estimators.least_squares import estimate_repetitions
 from identification.estimators.prior import body_prior
 from identification.factor.estimate import Estimate, estimate
 from identification.factor.factor import Factor
-from identification.hypotheses.faults import Fault, Kind, Part
+from identification.hypotheses import column_search
+from identification.hypotheses.carried_load import CarriedLoad
+from identification.hypotheses.changes import DISCRETE, Change, Part
+from identification.hypotheses.column_scores import ScorePrior
+from identification.hypotheses.column_search import (
+    ExplainedFit,
+    Explanation,
+    find_columns_of_unseen,
+)
+from identification.hypotheses.columns import ColumnSums
+from identification.hypotheses.diagnosis import RigidTorque, TorqueDiagnosis, diagnose
+from identification.hypotheses.sizes import estimated_size
+from identification.hypotheses.unseen_changes import UnseenChange
 from identification.model.known_payload import Payload
 from identification.model.robot import RobotModel
 from identification.text import percentage
-from identification.validation import causes as causes_module
-from identification.validation.causes import Cause, find_causes
-from identification.validation.changes import Change
 from identification.validation.evidence import CellContext, Evidence, gather
 from identification.validation.facts.errors import LEFT_OPEN
-from identification.validation.fault_scores import ScorePrior
-from identification.validation.fault_sizes import estimated_size
-from identification.validation.fault_tables import FaultTables
 from identification.validation.finding import Thresholds
-from identification.validation.gravity import CarriedLoad
 from identification.validation.nominal_scale import NominalScale
 from identification.validation.physical_signs import Implausible, TopSpeedFriction
-from identification.validation.prediction import PredictionError
+from identification.validation.prediction import PredictionError, noise_floor
 from identification.validation.purpose import Purpose
 from identification.validation.residuals import (
     HARMONICS,
@@ -149,13 +153,12 @@ class TestOneSidedErrors:
         """Neither gravity nor a load; large axes are named."""
         verdict, evidence = campaign(wrong=(what, axis))
         assert not verdict.good and "must not be relied on" in verdict.line
-        assert evidence.causes is not None
         assert evidence.load.explained < Thresholds().load or evidence.load.axes < 3
         assert not {"gravity", "load"} & {finding.check for finding in verdict.findings}
         if what == "gear" and axis < 3:
-            first = evidence.causes[0]
-            assert first.fault.kind == "axis sign"
-            assert first.fault.joints in (((0,), (3,)) if axis == 0 else ((axis,),))
+            first = evidence.diagnosis.steps[0]
+            assert first.change.meaning == "axis sign"
+            assert first.change.joints in (((0,), (3,)) if axis == 0 else ((axis,),))
         if what.startswith("k"):
             assert any("joint_4" in reason or "joint_5" in reason for reason in verdict.reasons)
 
@@ -267,8 +270,20 @@ def finding_of(check, names=AXES, **changes):
     return only_finding
 
 
-def caused(kind, *joints, ratio=0.4):
-    return (Cause(Fault(kind, joints), ratio, 0.01, 0.001),)
+RIGID = RigidTorque(1.0, 0.01, np.full(2, np.inf), 0.05)
+BEGUN = Part("A.mcap from 3 s on", (False, True))
+
+NOTHING = TorqueDiagnosis(None, RIGID, None, ())
+"""That of an arm as described, with nothing that explains an error."""
+
+
+def explained(change, ratio, size=0.01, std=0.001):
+    """The diagnosis of an arm as described, with one change that explains an error."""
+    return TorqueDiagnosis(None, RIGID, None, (Explanation(change, ratio, size, std),))
+
+
+def caused(meaning, *joints, ratio=0.4, part=None):
+    return explained(Change(meaning, joints, part=part), ratio)
 
 
 LATE = DelayEstimate(
@@ -298,19 +313,19 @@ class TestJudgement:
             ({"held_out": HEAVY}, "model of one predicts no better than the mean torque"),
             ({"estimate": an_estimate(undetermined=MANY)}, ", ".join(MANY)),
             ({"nominal": an_error(0.03)}, "nominal model predicts better"),
-            ({"causes": caused("axis sign", 0)}, "one probably turns opposite to the URDF"),
-            ({"causes": caused("torque sign", 1)}, "torque of two has probably the wrong sign"),
+            ({"diagnosis": caused("axis sign", 0)}, "one probably turns opposite to the URDF"),
+            ({"diagnosis": caused("torque sign", 1)}, "torque of two has probably the wrong sign"),
             (
-                {"causes": caused("torque order", 0, 1)},
+                {"diagnosis": caused("torque order", 0, 1)},
                 "torques of one and two are probably interchanged",
             ),
-            ({"causes": caused("joint order", 0, 1)}, "positions and torques of one and two"),
-            ({"causes": caused("delay")}, "of all axes lags the position by 10 ± 2 ms more"),
-            ({"causes": caused("gain", 1)}, "the torque of two is 1.01 ± 0.002 times"),
+            ({"diagnosis": caused("joint order", 0, 1)}, "positions and torques of one and two"),
+            ({"diagnosis": caused("delay")}, "of all axes lags the position by 10 ± 2 ms more"),
+            ({"diagnosis": caused("scale", 1)}, "the torque of two is 1.01 ± 0.002 times"),
             ({"disagreement": np.array([0.2, 0.0])}, "single repetitions differ by more than 10 %"),
             ({"implausible": Implausible(("m1 is negative",), ())}, "m1 is negative"),
             (
-                {"held_out": an_error(0.12), "noise_floor": np.full(2, 0.1), "causes": ()},
+                {"held_out": an_error(0.12), "noise_floor": np.full(2, 0.1), "diagnosis": NOTHING},
                 "is 12.0 %, 12.0 times the noise floor of 1.0 %; none",
             ),
         ],
@@ -356,7 +371,7 @@ class TestJudgement:
     def test_a_fault_comes_before_any_purpose(self):
         purposes = (Purpose("feed-forward", True, 0.05, 0.2, references={"none": 1.0}),)
         verdict = judged(
-            causes=caused("torque sign", 1), purposes=purposes, asked=("feed-forward",)
+            diagnosis=caused("torque sign", 1), purposes=purposes, asked=("feed-forward",)
         )
         assert not verdict.good
         assert "torque of two has probably the wrong sign" in verdict.line
@@ -365,7 +380,7 @@ class TestJudgement:
     @pytest.mark.parametrize(
         ("changes", "message"),
         [
-            ({"causes": caused("gain", 1, ratio=0.85)}, "torque of two is 1.01"),
+            ({"diagnosis": caused("scale", 1, ratio=0.85)}, "torque of two is 1.01"),
             ({"controller": an_error(0.02)}, "controller's own dynamic model predicts better"),
             ({"saturated": np.array([0.0, 0.04])}, "two in 4.0 % of its samples"),
             ({"estimate": an_estimate(condition=450.0)}, "excites the parameters poorly"),
@@ -380,11 +395,17 @@ class TestJudgement:
         verdict = judged(**changes)
         assert verdict.good and any(message in warning for warning in verdict.warnings)
 
-    @pytest.mark.parametrize("kind", get_args(Kind))
-    def test_each_kind_of_cause_has_a_message_and_a_step(self, kind):
+    @pytest.mark.parametrize(
+        ("meaning", "part"),
+        [
+            *((meaning, None) for meaning in (*DISCRETE, "delay", "load friction", "scale")),
+            *((meaning, BEGUN) for meaning in ("payload", "scale", "friction", "arm")),
+        ],
+    )
+    def test_each_explanation_has_a_message_and_a_step(self, meaning, part):
         (cause,) = (
             finding
-            for finding in judged(causes=caused(kind, 0, 1)).findings
+            for finding in judged(diagnosis=caused(meaning, 0, 1, part=part)).findings
             if finding.role == "cause"
         )
         assert not {"{", "}"} & {*cause.words, *cause.next_step} and cause.next_step
@@ -470,13 +491,13 @@ class TestJudgement:
     @pytest.mark.parametrize(
         ("change", "error", "level", "message"),
         [
-            (Change("gain", 1, 0.91, 0.001, 0.01), 0.1, "wrong", "two 0.91 ± 0.002"),
-            (Change("gain", 1, 0.95, 0.001, 0.01), 0.05, "doubtful", "two 0.95 ± 0.002"),
-            (Change("friction", 0, 1.3, 0.01, 0.01), 0.1, "wrong", "one +30 %"),
-            (Change("friction", 0, 1.3, 0.01, 0.01), 0.03, "wrong", "one +30 %"),
-            (Change("friction", 0, 1.3, 0.01, 0.01), 0.01, "wrong", "one +30 %"),
-            (Change("friction", 0, 1.3, 0.01, 0.01), 0.004, "doubtful", "one +30 %"),
-            (Change("friction", 0, 0.92, 0.01, 0.01), 0.1, "doubtful", "one -8 %"),
+            (UnseenChange("gain", 1, 0.91, 0.001, 0.01), 0.1, "wrong", "two 0.91 ± 0.002"),
+            (UnseenChange("gain", 1, 0.95, 0.001, 0.01), 0.05, "doubtful", "two 0.95 ± 0.002"),
+            (UnseenChange("friction", 0, 1.3, 0.01, 0.01), 0.1, "wrong", "one +30 %"),
+            (UnseenChange("friction", 0, 1.3, 0.01, 0.01), 0.03, "wrong", "one +30 %"),
+            (UnseenChange("friction", 0, 1.3, 0.01, 0.01), 0.01, "wrong", "one +30 %"),
+            (UnseenChange("friction", 0, 1.3, 0.01, 0.01), 0.004, "doubtful", "one +30 %"),
+            (UnseenChange("friction", 0, 0.92, 0.01, 0.01), 0.1, "doubtful", "one -8 %"),
         ],
     )
     def test_what_changed_is_named(self, change, error, level, message):
@@ -485,24 +506,24 @@ class TestJudgement:
         assert cause.level == level and message in cause.words
 
     def test_torque_and_friction_that_are_alike_are_both_named(self):
-        changes = (Change("friction", 1, 1.1001, 0.001, 0.01, alike=True),)
+        changes = (UnseenChange("friction", 1, 1.1001, 0.001, 0.01, alike=True),)
         (cause,) = (each for each in judged(changes=changes).findings if each.role == "cause")
         assert "another torque constant of two explains it as well" in cause.words
 
     def test_a_gain_of_the_fitted_motion_alone_has_changed(self):
         """The fit shows it against the other axes, unseen motion shows that it is gone."""
-        changes = (Change("gain", 1, 0.91, 0.001, 0.01),)
-        causes = (Cause(Fault("gain", (1,)), 0.4, 0.1, 0.001),)
+        changes = (UnseenChange("gain", 1, 0.91, 0.001, 0.01),)
+        found = explained(Change("scale", (1,)), 0.4, 0.1)
         assumed = {"scale_std": np.full(2, 0.03), "held_out": an_error(0.1)}
-        verdict = judged(causes=causes, changes=changes, **assumed)
+        verdict = judged(diagnosis=found, changes=changes, **assumed)
         assert any("differs from that of the fitted motion" in each for each in verdict.reasons)
 
     @pytest.mark.parametrize(("changed", "named"), [(0, False), (1, True), (None, True)])
     def test_a_torque_that_changed_is_no_reference_of_constants(self, changed, named):
         """The constant of axis 1 is relative to axis 0."""
-        changes = () if changed is None else (Change("gain", changed, 0.91, 0.001, 0.01),)
-        causes = caused("gain", 1, ratio=0.86)
-        findings = judged(causes=causes, changes=changes, held_out=an_error(0.1)).findings
+        changes = () if changed is None else (UnseenChange("gain", changed, 0.91, 0.001, 0.01),)
+        found = caused("scale", 1, ratio=0.86)
+        findings = judged(diagnosis=found, changes=changes, held_out=an_error(0.1)).findings
         assert named == any(finding.check == "torque constant" for finding in findings)
 
     @pytest.mark.parametrize(
@@ -520,15 +541,15 @@ class TestJudgement:
         The scale of the other torque is in the deviation of the factor. The ratio is that of both
         axes: the error of the second is multiplied by its square.
         """
-        causes = (Cause(Fault("gain", (1,)), ratio, size, 0.03),)
+        found = explained(Change("scale", (1,)), ratio, size, 0.03)
         errors = {"held_out": an_error(error), "training": an_error(error)}
-        verdict = judged(causes=causes, scale_std=np.full(2, 0.03), **errors)
+        verdict = judged(diagnosis=found, scale_std=np.full(2, 0.03), **errors)
         (finding,) = (each for each in verdict.findings if each.check == "torque constant")
         assert finding.level == level
         assert ("assumed uncertainty" in finding.words) == (level == "information")
 
     def test_a_body_that_explains_the_error_is_not_unexplained(self):
-        changes = {"held_out": an_error(0.1), "noise_floor": np.full(2, 0.1), "causes": ()}
+        changes = {"held_out": an_error(0.1), "noise_floor": np.full(2, 0.1), "diagnosis": NOTHING}
         load = CarriedLoad(mass=2.0, explained=0.98, axes=2, half_interval=0.1)
         reasons = " ".join(judged(**changes, load=load).reasons)
         assert "explains 98 %" in reasons and "none of the tested faults" not in reasons
@@ -572,7 +593,7 @@ class TestJudgement:
         nominal = NominalScale(np.full(2, -1.0), np.full(2, 0.1))
         driving = TopSpeedFriction(np.full(2, -3.0), np.full(2, 0.1))
         for symptom in ({"nominal_scale": nominal}, {"dissipation": driving}):
-            verdict = judged(implausible=signs, causes=caused("axis sign", 0), **symptom)
+            verdict = judged(implausible=signs, diagnosis=caused("axis sign", 0), **symptom)
             (reason,) = verdict.reasons
             assert "all torques have the opposite sign" in reason
             assert verdict.next_steps[0].startswith("set scale = -1")
@@ -765,14 +786,15 @@ def of_one_kilogram(motion):
     )
 
 
-def causes(recordings, *, alone=False):
-    """Return the causes beside the prior of the bodies, without it if `alone`."""
+def causes(recordings):
+    """Return what explains the errors of a fit."""
     factors = (Factor.of(MODEL, samples) for samples in recordings)
     total = sum(factors, Factor.zero(MODEL))
     prior = ScorePrior(body_prior(MODEL, total).gaussian, ROWS_AS_ONE)
     values = estimate(MODEL, total).values
     names = [f"{k}.mcap" for k in range(len(recordings))]
-    return find_causes(MODEL, recordings, values, names, prior=None if alone else prior)
+    noise = noise_floor(MODEL, values, recordings)
+    return diagnose(MODEL, recordings, ExplainedFit(values, noise, names, prior)).explanations
 
 
 def first_rows(samples, stop):
@@ -817,7 +839,7 @@ def with_axis_2(values):
 GAIN = np.array([1.0, 1.15, 1.0, 1.0, 1.0, 1.0])
 FAULTS = {
     "delay": ((), late),
-    "gain": ((1,), lambda samples: replace(samples, torque=GAIN * samples.torque)),
+    "scale": ((1,), lambda samples: replace(samples, torque=GAIN * samples.torque)),
     "torque sign": ((2,), lambda samples: replace(samples, torque=turned(samples.torque))),
     "torque order": ((1, 2), lambda samples: replace(samples, torque=swapped(samples.torque))),
     "axis sign": ((2,), lambda samples: moved(samples, turned)),
@@ -825,7 +847,7 @@ FAULTS = {
     "joint order": ((1, 2), lambda samples: moved(samples, swapped)),
     "angle sum": ((2, 1), lambda samples: moved(samples, with_axis_2, torque=False)),
 }
-SIZES = {"delay": DELAY, "gain": 0.15}
+SIZES = {"delay": DELAY, "scale": 0.15}
 
 
 class TestCausesOfWholeRecordings:
@@ -841,7 +863,7 @@ class TestCausesOfWholeRecordings:
         """With its size within four standard deviations."""
         joints, spoil = FAULTS[kind]
         (cause,) = causes([spoil(recorded(seed))])
-        assert (cause.fault.kind, cause.fault.joints) == (kind, joints)
+        assert (cause.change.meaning, cause.change.joints) == (kind, joints)
         if size := SIZES.get(kind):
             assert cause.size == pytest.approx(size, abs=4.0 * cause.std + 0.02 * size)
 
@@ -852,8 +874,7 @@ class TestCausesOfWholeRecordings:
         short = first_rows(recorded(seed), 250)
         assert causes([short]) == ()
         (cause,) = causes([turn(short)])
-        assert (cause.fault.kind, cause.fault.joints) == ("torque sign", (2,))
-        assert causes([turn(short)], alone=True) == ()
+        assert (cause.change.meaning, cause.change.joints) == ("torque sign", (2,))
 
 
 CONSTANT = 1.5  # of a motor, wrong by this factor
@@ -892,7 +913,7 @@ def misfit(samples, joint, factor):
 def size_of(fault, samples, **known):
     """Return the size that is estimated of a fault."""
     values = estimate(MODEL, Factor.of(MODEL, samples)).values
-    tables = FaultTables.of(MODEL, [samples], values, divided=4)
+    tables = ColumnSums.of(MODEL, [samples], values, divided=4)
     return estimated_size(fault, tables, MODEL, values, **known)
 
 
@@ -903,7 +924,7 @@ class TestPrintedSizes:
     def test_dividing_by_the_printed_factor_heals_the_recording(self, joint):
         spoilt = of_another_constant(recorded(1), joint)
         cause = causes([spoilt])[0]
-        assert (cause.fault.kind, cause.fault.joints) == ("gain", (joint,))
+        assert (cause.change.meaning, cause.change.joints) == ("scale", (joint,))
         factor = 1.0 + cause.size
         assert factor == pytest.approx(CONSTANT, abs=cause.half_interval)
         assert cause.half_interval < 0.15
@@ -915,7 +936,7 @@ class TestPrintedSizes:
 
     def test_the_interval_of_a_factor_is_that_of_noise(self):
         """Its deviation over the claimed one, of 16 motions: a chi-square of 16."""
-        fault = Fault("gain", (1,))
+        fault = Change("scale", (1,))
         deviations = []
         for seed in range(16):
             found = size_of(fault, of_another_constant(recorded(seed), 1))
@@ -924,7 +945,7 @@ class TestPrintedSizes:
 
     def test_the_interval_of_a_factor_is_that_of_the_other_torques(self):
         """They are known to 3 %, which is more than the noise."""
-        fault = Fault("gain", (1,))
+        fault = Change("scale", (1,))
         deviations = []
         for seed in range(16):
             samples = recorded(seed)
@@ -939,7 +960,7 @@ class TestPrintedSizes:
         part = Part("later", (False,) * 6 + (True,) * 4)
         # Rows of blocks, of which there are ten.
         spoilt = of_another_constant(recorded(1), 1, first=750)
-        found = size_of(Fault("changed gain", (1,), part), spoilt)
+        found = size_of(Change("scale", (1,), part=part), spoilt)
         half = found.interval_factor * found.std
         assert 1.0 + found.size == pytest.approx(CONSTANT, abs=half)
         assert half < 0.02
@@ -954,16 +975,16 @@ class TestPrintedSizes:
         usable = np.zeros(torque.shape, dtype=np.bool_)
         usable[:, 5] = True
         samples = as_samples(MODEL, motion, torque, usable=usable)
-        assert size_of(Fault("gain", (5,)), samples) is None
+        assert size_of(Change("scale", (5,)), samples) is None
 
 
 class TestErrorsWithoutCause:
     def test_a_load_whose_interval_contains_zero_is_none(self, monkeypatch):
         loaded = [recorded(1, LOAD * (np.arange(1250) >= 625))]
         (cause,) = causes(loaded)
-        assert cause.fault.kind == "payload"
-        monkeypatch.setattr(causes_module, "size_of_fault", lambda *_: (cause.size, cause.size))
-        assert not any(each.fault.kind == "payload" for each in causes(loaded))
+        assert cause.change.meaning == "payload"
+        monkeypatch.setattr(column_search, "rough_size", lambda *_: (cause.size, cause.size))
+        assert not any(each.change.meaning == "payload" for each in causes(loaded))
 
     def test_a_joint_that_stands_is_not_interchanged(self):
         """Not with joint 5, whose torque is small noise, either."""
@@ -977,7 +998,7 @@ class TestErrorsWithoutCause:
         )
         torque[:, 1] = np.random.default_rng(4).permutation(torque[:, 1])
         samples = as_samples(MODEL, motion, torque, usable=np.ones(torque.shape, dtype=np.bool_))
-        assert not any(4 in cause.fault.joints for cause in causes([samples]))
+        assert not any(4 in cause.change.joints for cause in causes([samples]))
 
     @pytest.mark.parametrize("seed", [1, 2])
     def test_friction_that_grows_with_the_load_is_named(self, seed):
@@ -987,7 +1008,7 @@ class TestErrorsWithoutCause:
         direction = np.sign(samples.motion.velocity)
         load = np.abs(MODEL.torque(rigid, replace(samples.motion, direction=direction)))
         (cause,) = causes([replace(samples, torque=samples.torque + 0.2 * load * direction)])
-        assert cause.fault.kind == "load friction"
+        assert cause.change.meaning == "load friction"
         assert cause.size == pytest.approx(0.2, abs=0.03)
 
     def test_an_error_that_no_fault_explains_has_none(self):
@@ -1007,6 +1028,19 @@ class TestErrorsWithoutCause:
             causes([replace(samples, torque=torque, usable=usable)])
 
 
+def test_a_load_that_begins_within_unseen_motion_is_named():
+    """From its third second on, which the fitted motion does not show."""
+    seen = [recorded(1)]
+    values = estimate(MODEL, Factor.of(MODEL, seen[0])).values
+    unseen = [recorded(2, LOAD * (np.arange(1250) >= 375))]
+    fitted = ExplainedFit(values, noise_floor(MODEL, values, seen))
+    (found,) = find_columns_of_unseen(MODEL, seen, unseen, fitted)
+    assert found.change.meaning == "payload"
+    assert found.change.part.name == "unseen motion from 3 s on"
+    assert found.size == pytest.approx(LOAD, abs=4.0 * found.std + 0.1)
+    assert find_columns_of_unseen(MODEL, seen, [recorded(2)], fitted) == ()
+
+
 class TestCausesOfParts:
     """Faults of some recordings."""
 
@@ -1020,8 +1054,8 @@ class TestCausesOfParts:
         if count == 4:
             runs = [recorded(k, whole if k in (1, 3) else None) for k in range(4)]
         (cause,) = causes(runs)
-        assert cause.fault.kind == "payload"
-        assert cause.fault.part.name == part_name
+        assert cause.change.meaning == "payload"
+        assert cause.change.part.name == part_name
         assert cause.size == pytest.approx(LOAD, abs=4.0 * cause.std + 0.1)
 
     def test_friction_of_one_recording(self):
@@ -1029,8 +1063,8 @@ class TestCausesOfParts:
         velocity = runs[1].motion.velocity[:, 1]
         runs[1].torque[:, 1] += 0.4 * (COULOMB[1] * np.sign(velocity) + VISCOUS[1] * velocity)
         (cause,) = causes(runs)
-        assert (cause.fault.kind, cause.fault.joints) == ("changed friction", (1,))
-        assert cause.fault.part.name == "1.mcap"
+        assert (cause.change.meaning, cause.change.joints) == ("friction", (1,))
+        assert cause.change.part.name == "1.mcap"
         assert cause.size == pytest.approx(0.4, abs=0.05)
 
     def test_another_arm_in_the_second_half(self):
@@ -1038,5 +1072,5 @@ class TestCausesOfParts:
         scale = np.array([1.4, 0.8, 1.3, 0.7, 1.5, 0.8])
         runs[2:] = [replace(samples, torque=scale * samples.torque) for samples in runs[2:]]
         first = causes(runs)[0]
-        assert first.fault.kind == "changed arm"
-        assert first.fault.part.name == "2.mcap and what follows it"
+        assert first.change.meaning == "arm"
+        assert first.change.part.name == "2.mcap and what follows it"

@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
 
+from identification.hypotheses.changes import COUPLED, IN_ORDER, SIGNS, Change, Meaning
 from identification.hypotheses.diagnosis import RigidTorque, TorqueDiagnosis
+from identification.hypotheses.search import Step
 from identification.text import percentage
 from identification.validation.evidence import Evidence
 from identification.validation.finding import Finding, Naming
@@ -19,11 +21,24 @@ ARM: Final = "arm of the URDF"
 """Name of the check whether the model is that of the described arm."""
 _OTHER_SCALE: Final = 3.0  # of the torque to that of the masses; descriptions in use are closer
 _SIGMAS: Final = 3.0
+_CHECKS: Final[Mapping[Meaning, str]] = {
+    **dict.fromkeys(SIGNS, "direction of axes"),
+    **dict.fromkeys(IN_ORDER, "order of joints"),
+    **dict.fromkeys(COUPLED, "coupled angles"),
+}
+_QUANTITIES: Final[Mapping[Meaning, str]] = {
+    "torque sign": "torque",
+    "position sign": "position",
+    "axis sign": "position and torque",
+    "torque order": "torques",
+    "position order": "positions",
+    "joint order": "positions and torques",
+}
 
 
 @dataclass(frozen=True, eq=False)
 class MeaningFacts:
-    """What the torque is: without bodies, without gravity, or at other zeros."""
+    """What the torque is: without bodies or gravity, of other zeros, or of open signs."""
 
     diagnosis: TorqueDiagnosis
 
@@ -57,6 +72,9 @@ class MeaningFacts:
                 "cause",
             )
         yield from self._zeros(naming)
+        for step in self.diagnosis.discrete:
+            if not step.sure:
+                yield _open(step, naming)
 
     def _zeros(self, naming: Naming) -> Iterator[Finding]:
         steps = self.diagnosis.zeros
@@ -86,6 +104,41 @@ class MeaningFacts:
                 f" joints other than those of the URDF ({named})",
                 "compare a posture of the arm with that of the URDF at the same angles",
             )
+
+
+def _open(step: Step, naming: Naming) -> Finding:
+    """Return that a sign or an order is other than stated, or the nearest to an explanation."""
+    change = step.change
+    if step.is_explained and step.alike:
+        alike = [change, *(other for other, _ in step.alike if other.is_discrete)]
+        others = " or ".join(_words(each, naming) for each in alike)
+        return Finding(
+            _CHECKS[change.meaning],
+            "wrong",
+            f"several explanations fit alike: {others}; with each of them, rows that did not choose"
+            f" it are predicted with {percentage(step.error / max(step.before, 1e-300))} of the"
+            " error",
+            f"jog {naming.all_of(change.joints)} and compare direction, order and torque with the"
+            " column map",
+            "cause",
+        )
+    return Finding(
+        _CHECKS[change.meaning],
+        "doubtful",
+        "none of the tested explanations fits the recording; the nearest is"
+        f" {_words(change, naming)}",
+        f"compare direction and order of {naming.all_of(change.joints)} with the column map",
+    )
+
+
+def _words(change: Change, naming: Naming) -> str:
+    joints = naming.all_of(change.joints)
+    if change.meaning in _QUANTITIES:
+        done = "negated" if change.meaning in SIGNS else "interchanged"
+        return f"{_QUANTITIES[change.meaning]} of {joints} {done}"
+    joint, other = (naming.joints[index] for index in change.joints)
+    sign = "plus" if change.meaning == "angle sum" else "less"
+    return f"an angle of {joint} {sign} that of {other}"
 
 
 def without_bodies(rigid: RigidTorque) -> str:

@@ -186,8 +186,8 @@ class UnexplainedFacts:
     def of(cls, evidence: Evidence, limits: Thresholds) -> UnexplainedFacts | None:
         """Compare the error with the noise; None if faults were found, or not tested."""
         floor = evidence.floor
-        causes = evidence.causes
-        if floor is None or causes is None or causes:
+        found = evidence.explanations
+        if floor is None or found is None or found:
             return None
         overall = evidence.held_out.overall
         large = overall > max(limits.unexplained, limits.multiple * floor)

@@ -4,14 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass
-from typing import Final, NamedTuple, assert_never
+from typing import Final, NamedTuple
 
 import numpy as np
 
 from identification.arrays import Array
-from identification.hypotheses.faults import Kind
+from identification.hypotheses.changes import SIGNS, Change
+from identification.hypotheses.column_search import Explanation
 from identification.text import percentage
-from identification.validation.causes import Cause
 from identification.validation.evidence import Evidence
 from identification.validation.facts.scale import SignFacts
 from identification.validation.finding import Finding, Mask, Naming, Thresholds
@@ -21,7 +21,6 @@ MOUNTING_STEP: Final = (
     " of [robot] in the cell file"
 )
 _SIGMAS: Final = 3.0  # standard deviations of a scale that is not as assumed
-_SIGN_OR_SCALE: Final[tuple[Kind, ...]] = ("torque sign", "axis sign", "gain")
 
 
 @dataclass(frozen=True, eq=False)
@@ -116,11 +115,16 @@ def _vector(values: Array) -> str:
     return ", ".join(f"{value + 0.0:.2f}" for value in np.round(values, 2))
 
 
+def is_constant(change: Change) -> bool:
+    """Whether a change is that of a torque constant: a scale throughout."""
+    return change.meaning == "scale" and change.part is None
+
+
 @dataclass(frozen=True)
 class FaultFacts:
-    """Faults whose correction makes parts of the fitted recordings more predictable."""
+    """Changes of the fitted recordings that make parts of them more predictable."""
 
-    causes: tuple[Cause, ...]
+    found: tuple[Explanation, ...]
     certain_below: float  # ratio of the errors
     scale_std: Array  # of each joint's torque, as it is assumed, relative (n,)
     matters: Mask  # joints with an error that has to be explained (n,)
@@ -135,37 +139,40 @@ class FaultFacts:
         signs: SignFacts,
     ) -> FaultFacts:
         """Leave out what outliers, gravity, opposite or changed torques explain better."""
-        causes = evidence.causes or ()
-        if outliers is not None and outliers.decide:
-            causes = ()
-        if evidence.context.commanded_positions:  # the lag is that of the servo
-            causes = tuple(cause for cause in causes if cause.fault.kind != "delay")
-        if gravity is not None and gravity.off:
-            causes = tuple(cause for cause in causes if not cause.ratio > gravity.error)
-        if signs.all_opposite:
-            causes = tuple(cause for cause in causes if cause.fault.kind not in _SIGN_OR_SCALE)
         # A constant is relative to those of the other axes, of which one is wrong in one motion.
         changed = {change.joint for change in evidence.changes if change.kind == "gain"}
-        causes = tuple(
-            cause
-            for cause in causes
-            if cause.fault.kind != "gain"
-            or cause.ratio < limits.cause
-            or changed <= {*cause.fault.joints}
-        )
+
+        def is_left_out(each: Explanation) -> bool:
+            change = each.change
+            if outliers is not None and outliers.decide:
+                return True
+            # The lag of commanded positions is that of the servo.
+            if evidence.context.commanded_positions and change.meaning == "delay":
+                return True
+            if gravity is not None and gravity.off and each.ratio > gravity.error:
+                return True
+            if signs.all_opposite and (change.meaning in SIGNS or is_constant(change)):
+                return True
+            is_strong = each.ratio < limits.cause or changed <= {*change.joints}
+            return is_constant(change) and not is_strong
+
+        begun = () if evidence.diagnosis is None else evidence.diagnosis.begun
+        found = (*(evidence.explanations or ()), *begun)
+        found = tuple(each for each in found if not is_left_out(each))
         std = evidence.context.scale_std
         std = np.zeros(len(evidence.held_out.rows)) if std is None else std
         matters = np.nan_to_num(evidence.held_out.relative) > limits.unexplained
-        return cls(causes, limits.cause, std, matters)
+        return cls(found, limits.cause, std, matters)
 
     def findings(self, naming: Naming) -> Iterator[Finding]:
-        """Yield each fault."""
-        for cause in self.causes:
-            joints = [naming.joints[joint] for joint in cause.fault.joints] or ["all axes"]
-            text = _text(cause, " and ".join(joints), naming)
-            certain = cause.fault.discrete or self._ratio_of(cause) < self.certain_below
-            if self._is_assumed(cause):
-                std = percentage(self._scale_std_of(cause), 1)
+        """Yield each change."""
+        for each in self.found:
+            text = text_of(each, naming)
+            begins = each.change.part is not None
+            motion = "the recordings" if begins else "the fitted motion"
+            certain = each.change.is_discrete or self._ratio_of(each) < self.certain_below
+            if self._is_assumed(each):
+                std = percentage(self._scale_std_of(each), 1)
                 yield Finding(
                     text.check,
                     "information",
@@ -176,52 +183,59 @@ class FaultFacts:
             yield Finding(
                 text.check,
                 "wrong" if certain else "doubtful",
-                f"{text.message}; correcting this multiplies the error of predicted parts of the"
-                f" fitted motion by {cause.ratio:.2f}",
+                f"{text.message}; correcting this multiplies the error of predicted parts of"
+                f" {motion} by {each.ratio:.2f}",
                 text.step,
                 "cause",
-                explains=1.0 - cause.ratio**2,
+                explains=1.0 - each.ratio**2,
             )
 
-    def _ratio_of(self, cause: Cause) -> float:
-        """Return the ratio of the errors, of a gain that matters that of its joint alone.
+    def _ratio_of(self, each: Explanation) -> float:
+        """Return the ratio of the errors, of a constant that matters that of its joint alone.
 
-        It is a geometric mean over all joints, of which a gain of one hardly changes the others.
+        It is a geometric mean over all joints, of which a scale of one hardly changes the others.
         """
-        alone = cause.fault.kind == "gain" and bool(self.matters[[*cause.fault.joints]].any())
-        return cause.ratio ** (len(self.matters) if alone else 1)
+        alone = is_constant(each.change) and bool(self.matters[[*each.change.joints]].any())
+        return each.ratio ** (len(self.matters) if alone else 1)
 
-    def _is_assumed(self, cause: Cause) -> bool:
+    def _is_assumed(self, each: Explanation) -> bool:
         """Return whether a torque is off by no more than the scale of torques may be."""
-        if cause.fault.kind != "gain" or cause.fault.part is not None:
+        if not is_constant(each.change):
             return False
-        return abs(cause.size or 0.0) <= _SIGMAS * self._scale_std_of(cause)
+        return abs(each.size or 0.0) <= _SIGMAS * self._scale_std_of(each)
 
-    def _scale_std_of(self, cause: Cause) -> float:
+    def _scale_std_of(self, each: Explanation) -> float:
         """Return the standard deviation of a torque's scale over those of the others.
 
-        Their scales are in that of the cause.
+        Their scales are in that of the change.
         """
-        return float(np.hypot(self.scale_std[[*cause.fault.joints]].max(), cause.std))
+        return float(np.hypot(self.scale_std[[*each.change.joints]].max(), each.std))
 
 
-class _Text(NamedTuple):
+class FaultText(NamedTuple):
+    """A change in words."""
+
     check: str
     message: str
     step: str
 
 
-def _text(cause: Cause, joints: str, naming: Naming) -> _Text:
-    """Return the message on a cause of each kind."""
-    match cause.fault.kind:
+def text_of(each: Explanation, naming: Naming) -> FaultText:
+    """Return the message on a change, by its meaning."""
+    named = [naming.joints[joint] for joint in each.change.joints] or ["all axes"]
+    joints = " and ".join(named)
+    is_of_part = each.change.part is not None
+    match each.change.meaning:
         case "delay":
-            return _delay(cause, joints)
-        case "gain":
-            return _gain(cause, joints)
+            return _delay(each, joints)
+        case "scale":
+            return _changed("torque", each, joints) if is_of_part else _gain(each, joints)
         case "load friction":
-            return _load_friction(cause)
+            return _load_friction(each)
         case "torque sign":
             return _torque_sign(joints)
+        case "position sign":
+            return _position_sign(joints)
         case "axis sign":
             return _axis_sign(joints)
         case "torque order":
@@ -231,90 +245,96 @@ def _text(cause: Cause, joints: str, naming: Naming) -> _Text:
         case "joint order":
             return _order("positions and torques", joints)
         case "angle sum":
-            return _coupled_angle(cause, naming, "plus", 1)
+            return _coupled_angle(each, naming, "plus", 1)
         case "angle difference":
-            return _coupled_angle(cause, naming, "less", -1)
+            return _coupled_angle(each, naming, "less", -1)
         case "payload":
-            return _payload(cause)
-        case "changed gain":
-            return _changed("torque", cause, joints)
-        case "changed friction":
-            return _changed("friction", cause, joints)
-        case "changed arm":
-            return _changed_arm(cause)
-        case kind:
-            assert_never(kind)
+            return _payload(each)
+        case "friction":
+            return _changed("friction", each, joints)
+        case "arm":
+            return _changed_arm(each)
+        case meaning:
+            raise ValueError(f"{meaning} explains no error of a fit")
 
 
-def _size(cause: Cause, scale: float = 1.0, offset: float = 0.0) -> str:
-    """Return offset + scale * size of a cause, with its 95 % interval."""
-    size = offset + scale * (cause.size or 0.0)
-    return f"{abs(size):.3g} ± {scale * cause.half_interval:.2g}"
+def _size(each: Explanation, scale: float = 1.0, offset: float = 0.0) -> str:
+    """Return offset + scale * size of a change, with its 95 % interval."""
+    size = offset + scale * (each.size or 0.0)
+    return f"{abs(size):.3g} ± {scale * each.half_interval:.2g}"
 
 
-def _more(cause: Cause) -> str:
-    return "more" if (cause.size or 0.0) > 0.0 else "less"
+def _more(each: Explanation) -> str:
+    return "more" if (each.size or 0.0) > 0.0 else "less"
 
 
-def _part(cause: Cause) -> str:
-    return "" if cause.fault.part is None else cause.fault.part.name
+def _part(each: Explanation) -> str:
+    return "" if each.change.part is None else each.change.part.name
 
 
-def _delay(cause: Cause, joints: str) -> _Text:
-    return _Text(
+def _delay(each: Explanation, joints: str) -> FaultText:
+    return FaultText(
         "delay",
-        f"the torque of {joints} lags the position by {_size(cause, scale=1e3)} ms {_more(cause)}"
+        f"the torque of {joints} lags the position by {_size(each, scale=1e3)} ms {_more(each)}"
         " than assumed",
         "run `hil identify --delay auto`, or correct the delay at its source",
     )
 
 
-def _gain(cause: Cause, joints: str) -> _Text:
-    return _Text(
+def _gain(each: Explanation, joints: str) -> FaultText:
+    return FaultText(
         "torque constant",
-        f"the torque of {joints} is {_size(cause, offset=1.0)} times the value consistent with the"
+        f"the torque of {joints} is {_size(each, offset=1.0)} times the value consistent with the"
         " other axes",
         f"check torque constant and gear ratio of {joints}; recordings with and without a known"
         " payload determine the constant (`hil torque-constants --loaded`)",
     )
 
 
-def _load_friction(cause: Cause) -> _Text:
-    return _Text(
+def _load_friction(each: Explanation) -> FaultText:
+    return FaultText(
         "friction over load",
-        f"friction grows with the load, by {_size(cause)} of the transmitted torque (median axis)",
+        f"friction grows with the load, by {_size(each)} of the transmitted torque (median axis)",
         "fit it: add `load` to the terms of `--friction`, as in"
         " `--friction coulomb,viscous,load,offset`",
     )
 
 
-def _torque_sign(joints: str) -> _Text:
-    return _Text(
+def _torque_sign(joints: str) -> FaultText:
+    return FaultText(
         "direction of axes",
         f"the torque of {joints} has probably the wrong sign",
         f"check the sign of the torque of {joints} in the column map, or of its torque constant",
     )
 
 
-def _axis_sign(joints: str) -> _Text:
-    return _Text(
+def _position_sign(joints: str) -> FaultText:
+    return FaultText(
+        "direction of axes",
+        f"the position of {joints} has probably the wrong sign",
+        f"check the sign of the position of {joints} in the column map",
+    )
+
+
+def _axis_sign(joints: str) -> FaultText:
+    return FaultText(
         "direction of axes",
         f"{joints} probably turns opposite to the URDF: wrong sign of gear ratio or direction",
         f"jog {joints} by hand and compare its direction of rotation with the URDF's",
     )
 
 
-def _order(quantity: str, joints: str) -> _Text:
-    return _Text(
+def _order(quantity: str, joints: str) -> FaultText:
+    return FaultText(
         "order of joints",
         f"the {quantity} of {joints} are probably interchanged",
         "check the order of the columns in the column map against the joints of the URDF",
     )
 
 
-def _coupled_angle(cause: Cause, naming: Naming, sign: str, factor: int) -> _Text:
-    joint, other = cause.fault.joints
-    return _Text(
+def _coupled_angle(each: Explanation, naming: Naming, sign: str, factor: int) -> FaultText:
+    joint, other = each.change.joints
+    return FaultText(
         "coupled angles",
         f"the recorded angle of {naming.joints[joint]} is probably its own {sign} that of"
         f" {naming.joints[other]}",
@@ -324,29 +344,28 @@ def _coupled_angle(cause: Cause, naming: Naming, sign: str, factor: int) -> _Tex
     )
 
 
-def _payload(cause: Cause) -> _Text:
-    return _Text(
+def _payload(each: Explanation) -> FaultText:
+    return FaultText(
         "sameness",
-        f"in {_part(cause)} the arm carried {_size(cause)} kg {_more(cause)} than in the other"
-        " data",
+        f"in {_part(each)} the arm carried {_size(each)} kg {_more(each)} than in the other data",
         "identify the recordings of each payload separately, or state a known payload in their"
         " cell file ([robot.payload])",
     )
 
 
-def _changed(quantity: str, cause: Cause, joints: str) -> _Text:
-    return _Text(
+def _changed(quantity: str, each: Explanation, joints: str) -> FaultText:
+    return FaultText(
         "sameness",
-        f"in {_part(cause)} the {quantity} of {joints} is {_size(cause, offset=1.0)} times that of"
+        f"in {_part(each)} the {quantity} of {joints} is {_size(each, offset=1.0)} times that of"
         " the other data",
         "check what changed between the recordings: temperature, brakes, drive settings of"
         f" {joints}",
     )
 
 
-def _changed_arm(cause: Cause) -> _Text:
-    return _Text(
+def _changed_arm(each: Explanation) -> FaultText:
+    return FaultText(
         "sameness",
-        f"{_part(cause)} is probably of another arm, tool or setting than the other data",
+        f"{_part(each)} is probably of another arm, tool or setting than the other data",
         "identify from recordings of one arm in one condition",
     )

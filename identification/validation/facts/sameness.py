@@ -9,10 +9,10 @@ from typing import Final
 import numpy as np
 
 from identification.arrays import Array
+from identification.hypotheses.unseen_changes import ChangeKind
 from identification.text import percentage
-from identification.validation.changes import ChangeKind
 from identification.validation.evidence import Evidence
-from identification.validation.facts.faults import GravityFacts
+from identification.validation.facts.faults import GravityFacts, is_constant
 from identification.validation.finding import Finding, Mask, Naming, Thresholds
 from identification.validation.prediction import FRICTION_CHANGE
 
@@ -83,8 +83,10 @@ class ChangeFacts:
         if (load is not None and load.carried) or (gravity is not None and gravity.off):
             return None
         # A gain of the fitted motion has not: of that motion only, it is what changed.
-        causes = [cause for cause in evidence.causes or () if cause.fault.kind != "gain"]
-        if any(cause.fault.discrete or cause.ratio < limits.cause for cause in causes):
+        others = [each for each in evidence.explanations or () if not is_constant(each.change)]
+        if any(each.change.is_discrete or each.ratio < limits.cause for each in others):
+            return None
+        if evidence.diagnosis is not None and evidence.diagnosis.begun:
             return None
         error = evidence.held_out
         ratio, half_interval = np.full((2, len(error.rows)), np.nan)

@@ -47,9 +47,9 @@ class ScaleFacts:
         if scale is None:
             return None
         negated = scale.negated
-        if evidence.causes is not None and not negated:
+        if evidence.explanations is not None and not negated:
             # Torques of another joint or with the wrong sign have no nominal size.
-            scale = scale.without(j for cause in evidence.causes for j in cause.fault.joints)
+            scale = scale.without(j for each in evidence.explanations for j in each.change.joints)
         common = scale.common
         off = np.isfinite(scale.scale) if common != 1.0 else scale.off
         near = np.abs(scale.scale + 1.0) < _NEAR

@@ -1,4 +1,4 @@
-"""Errors of blocks that are predicted from the others, with faults corrected and without."""
+"""Errors of blocks that are predicted from the others, with columns of changes and without."""
 
 from __future__ import annotations
 
@@ -10,9 +10,9 @@ import numpy as np
 from identification.arrays import Array
 from identification.estimators.prior import GaussianPrior
 from identification.factor.normal_equations import solve_with_ridge
-from identification.hypotheses.faults import Fault
+from identification.hypotheses.changes import Change
+from identification.hypotheses.columns import FOLDS, ColumnSums, folded
 from identification.model.link_wrenches import LINK_SYMBOLS
-from identification.validation.fault_tables import FOLDS, FaultTables, folded
 
 _SIGMAS: Final = 3.0  # standard errors over the blocks of a significant correction
 # Ratio of the fit's error on the affected joints, with the correction over that without: 0.55 is
@@ -50,7 +50,7 @@ class ScorePrior(NamedTuple):
         return total
 
 
-class FaultScore(NamedTuple):
+class ColumnScore(NamedTuple):
     """Squared errors of predicted blocks, and parameters and added coefficients by fold."""
 
     squares: Array  # (B, n)
@@ -65,7 +65,7 @@ class FaultScore(NamedTuple):
         return np.where(loaded, squares / np.where(loaded, self.torque, 1.0), 0.0)
 
     def explains(
-        self, joints: Sequence[int], usual: FaultScore, noise: Array, separate: FaultScore | None
+        self, joints: Sequence[int], usual: ColumnScore, noise: Array, separate: ColumnScore | None
     ) -> bool:
         """Return whether the error of the fit on some joints, all if none, is explained.
 
@@ -99,12 +99,12 @@ class FaultScore(NamedTuple):
             np.sqrt(mine[positive] / least[positive])
         ) <= (_NEAR_SEPARATE)
 
-    def fit_ratio_to(self, other: FaultScore) -> float:
+    def fit_ratio_to(self, other: ColumnScore) -> float:
         """Return the ratio of the errors of the fits, geometric mean over the joints."""
         positive = (self.fitted > 0.0) & (other.fitted > 0.0)
         return _geometric_mean(np.sqrt(self.fitted[positive] / other.fitted[positive]))
 
-    def ratio_to(self, other: FaultScore) -> tuple[float, float]:
+    def ratio_to(self, other: ColumnScore) -> tuple[float, float]:
         """Return the error ratio, geometric mean over the joints, and its upper limit by blocks."""
         tested = np.isfinite(self.squares) & np.isfinite(other.squares)
         tested &= (self.squares > 0.0) & (other.squares > 0.0)
@@ -128,9 +128,9 @@ def _geometric_mean(ratios: Array) -> float:
     return float(np.exp(np.mean(np.log(np.maximum(ratios, 1e-12)))))
 
 
-def fault_score(
-    tables: FaultTables, added: Array, target: Array, prior: ScorePrior | None = None
-) -> FaultScore:
+def column_score(
+    tables: ColumnSums, added: Array, target: Array, prior: ScorePrior | None = None
+) -> ColumnScore:
     """Predict every fifth block from the others.
 
     Of the parameters with `added` columns (B, n, q, r), to the `target` of each joint (n, q), both
@@ -165,7 +165,7 @@ def fault_score(
     squares = np.where(tables.rows >= _FEWEST_ROWS, np.maximum(squares, floor / blocks), 0.0)
     fitted = np.maximum(whole.squares(solved(total)), floor)
     fold_values = np.array(coefficients)
-    return FaultScore(squares, fitted, torque, fold_values[:, :p], fold_values[:, p:])
+    return ColumnScore(squares, fitted, torque, fold_values[:, :p], fold_values[:, p:])
 
 
 class _Sums(NamedTuple):
@@ -205,17 +205,17 @@ def _solved(gram: Array) -> Array:
     return solve_with_ridge(gram[:-1, :-1], gram[:-1, -1], _RIDGE)
 
 
-def size_of_fault(
-    fault: Fault, score: FaultScore, tables: FaultTables
+def rough_size(
+    change: Change, score: ColumnScore, tables: ColumnSums
 ) -> tuple[float | None, float]:
-    """Return about the size of a fault that adds a torque, and its jackknife deviation.
+    """Return about the size of a change that adds a torque, and its jackknife deviation.
 
-    None of others; :mod:`~identification.validation.fault_sizes` has the size to be stated.
+    None of others; :mod:`~identification.hypotheses.sizes` has the size to be stated.
     """
-    if fault.kind not in ("delay", "payload", "load friction"):
+    if change.meaning not in ("delay", "payload", "load friction"):
         return None, 0.0
-    sizes = score.added[:, MASS if fault.kind == "payload" else 0]
-    if fault.kind == "load friction":
+    sizes = score.added[:, MASS if change.meaning == "payload" else 0]
+    if change.meaning == "load friction":
         loaded = np.median(score.added[:, : tables.gram.shape[1]], axis=1)
         return float(loaded.mean()), float(np.sqrt((FOLDS - 1) * loaded.var()))
     return float(sizes.mean()), float(np.sqrt((FOLDS - 1) * sizes.var()))

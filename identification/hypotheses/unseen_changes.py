@@ -21,8 +21,8 @@ from identification.arrays import Array
 from identification.factor.estimate import Estimate
 from identification.factor.factor import Factor
 from identification.model.robot import RobotModel
+from identification.signals.block_mean import BlockMean, block_index, block_mean
 from identification.signals.samples import Samples
-from identification.validation.residuals import BlockMean, block_index, block_mean
 
 ChangeKind = Literal["gain", "friction"]
 
@@ -47,7 +47,7 @@ _EXPLAINED: Final = 2.0 / 3.0
 _ALIKE: Final = 1.1
 
 
-class Change(NamedTuple):
+class UnseenChange(NamedTuple):
     """Factor by which a joint's torque or friction on unseen motion differs from the fitted one."""
 
     kind: ChangeKind
@@ -127,7 +127,7 @@ def find_changes(
     held_out: Sequence[Samples],
     held_out_factor: Factor,
     moved: NDArray[np.bool_],
-) -> tuple[Change, ...]:
+) -> tuple[UnseenChange, ...]:
     """Compare unseen with fitted motion under an estimate; return the joints that changed.
 
     The factor is that of the usable held-out rows. A joint that the fitted motion has not `moved`
@@ -159,7 +159,7 @@ def find_changes(
             size = abs(ratio - 1.0)
             # A factor below zero is no change of one quantity.
             if ratio > 0.0 and explains and size > max(_LEAST, _SIGMAS * deviation):
-                trials.append(Change(kind, joint, ratio, deviation, left))
+                trials.append(UnseenChange(kind, joint, ratio, deviation, left))
         if trials:
             least = min(trial.relative for trial in trials)
             alike = [trial for trial in trials if trial.relative <= _ALIKE * least]

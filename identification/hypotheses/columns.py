@@ -1,4 +1,4 @@
-"""Columns in which faults of recordings are linear, as sums of products by joint and block."""
+"""Columns in which changes of recordings are linear, as sums of products by joint and block."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from identification.arrays import Array
-from identification.hypotheses.faults import Fault
+from identification.hypotheses.changes import Change
 from identification.model.link_wrenches import LINK_SYMBOLS
 from identification.model.regressor import RegressorPlan
 from identification.model.robot import RobotModel
@@ -25,7 +25,7 @@ _LOAD: Final = len(LINK_SYMBOLS)
 
 
 @dataclass(frozen=True, eq=False)
-class FaultTables:
+class ColumnSums:
     """Sums of products of columns over the rows of B blocks, joint by joint.
 
     Columns: parameters (p), payload (10), rate of the predicted torque, friction in proportion to
@@ -60,15 +60,15 @@ class FaultTables:
         """The same of each fold (F, n, p, p)."""
         return folded(self.of_parameters)
 
-    def mask_of(self, fault: Fault) -> Array:
-        """Return 1 for the blocks (B,) that a fault affects, 0 for the others.
+    def mask_of(self, change: Change) -> Array:
+        """Return 1 for the blocks (B,) that a change concerns, 0 for the others.
 
         Its part is one of undivided blocks.
         """
         blocks = len(self.gram)
-        if fault.part is None:
+        if change.part is None:
             return np.ones(blocks)
-        mask = np.array(fault.part.blocks, dtype=np.float64)
+        mask = np.array(change.part.blocks, dtype=np.float64)
         return np.repeat(mask, blocks // len(mask))
 
     @classmethod
@@ -78,10 +78,19 @@ class FaultTables:
         recordings: Sequence[Samples],
         values: Array,
         *,
+        blocks: int = BLOCKS,
         divided: int = 1,
-    ) -> FaultTables:
-        """Reduce some thousand rows, with each block `divided` into so many."""
-        count = divided * -(-BLOCKS // len(recordings))
+    ) -> ColumnSums:
+        """Reduce some thousand rows to so many blocks, each `divided` into so many.
+
+        Args:
+            model: of the arm.
+            recordings: prepared.
+            values: parameters (p,) of the rate and the load of its torque.
+            blocks: of all recordings together.
+            divided: parts of each block.
+        """
+        count = divided * -(-blocks // len(recordings))
         step = row_step(recordings, _MOST_ROWS)
         grams = []
         rows = []
@@ -174,22 +183,22 @@ def folded(blocks: Array) -> Array:
     return np.array([blocks[k::FOLDS].sum(axis=0) for k in range(FOLDS)])
 
 
-def columns_of_fault(tables: FaultTables, model: RobotModel, values: Array, fault: Fault) -> Array:
-    """Return the columns of a fault as combinations of those of a table (B, n, q, r)."""
+def columns_of(tables: ColumnSums, model: RobotModel, values: Array, change: Change) -> Array:
+    """Return the columns of a change as combinations of those of a table (B, n, q, r)."""
     _, n, width, _ = tables.gram.shape
     p = model.n_parameters
-    joints = list(fault.joints or range(model.n_joints))
-    count = {"payload": _LOAD, "changed arm": p, "load friction": n}.get(fault.kind, 1)
+    joints = list(change.joints or range(model.n_joints))
+    count = {"payload": _LOAD, "arm": p, "load friction": n}.get(change.meaning, 1)
     columns = np.zeros((n, width, count))
-    if fault.kind == "delay":
+    if change.meaning == "delay":
         columns[joints, p + _LOAD, 0] = -1.0
-    elif fault.kind == "load friction":
+    elif change.meaning == "load friction":
         columns[joints, p + _LOAD + 1, joints] = 1.0
-    elif fault.kind == "payload":
+    elif change.meaning == "payload":
         columns[:, p : p + _LOAD] = np.eye(_LOAD)
-    elif fault.kind == "changed arm":
+    elif change.meaning == "arm":
         columns[:, :p] = np.eye(p)
     else:
-        friction = fault.kind == "changed friction"
+        friction = change.meaning == "friction"
         columns[joints, :p, 0] = values * model.friction_columns if friction else values
-    return np.asarray(tables.mask_of(fault)[:, None, None, None] * columns)
+    return np.asarray(tables.mask_of(change)[:, None, None, None] * columns)

@@ -1,11 +1,11 @@
-r"""Sizes of faults, estimated by least squares together with all parameters of the arm.
+r"""Sizes of changes, estimated by least squares together with all parameters of the arm.
 
-The torque of joint j in block b, where a fault multiplies a part of it by 1 + s, is
+The torque of joint j in block b, where a change multiplies a part of it by 1 + s, is
 
 .. math:: \tau_{jb} = (1 + u_j \sigma_j)\, W_j \, ((1 + m_{jb} s)\circ\pi) + C_{jb}\, c + e
 
-with m = 1 where the fault is, for parameters that it concerns (all, or friction); C are the columns
-of faults that add a torque (payload, delay, friction by the load), their size among the c. Gauss-
+with m = 1 where the change is, for parameters that it concerns (all, or friction); C are columns of
+changes that add a torque (payload, delay, friction by the load), their size among the c. Gauss-
 Newton on s, parameters, c and the scales of the other torques, with what is believed of the arm and
 of scales (standard deviations u). So s is the number by which one has to divide the torque to make
 it consistent with the others: where the parameters were fitted to it, their torque is no reference.
@@ -24,12 +24,12 @@ from numpy.typing import NDArray
 from identification.arrays import Array
 from identification.estimators.covariance import cluster_covariance, solve_with_prior
 from identification.factor.normal_equations import NormalEquations
-from identification.hypotheses.faults import Fault
+from identification.hypotheses.changes import Change
+from identification.hypotheses.column_scores import MASS, ScorePrior
+from identification.hypotheses.columns import ColumnSums, columns_of
 from identification.model.robot import RobotModel
-from identification.validation.fault_scores import MASS, ScorePrior
-from identification.validation.fault_tables import FaultTables, columns_of_fault
 
-_SCALING: Final = ("gain", "changed gain", "changed friction")
+_SCALING: Final = ("scale", "friction")
 _SIZED: Final = (*_SCALING, "delay", "load friction", "payload")
 _ITERATIONS: Final = 30
 _CONVERGED: Final = 1e-3  # of an unknown and its deviation
@@ -37,8 +37,8 @@ _LEAST_STEP: Final = 0.1  # factor of a factor, in one step
 _LEAST_NOISE: Final = 1e-6  # of the torque
 
 
-class FaultSize(NamedTuple):
-    """Size of a fault: delay [s], factor less one, mass [kg] or share of the load."""
+class ChangeSize(NamedTuple):
+    """Size of a change: delay [s], factor less one, mass [kg] or share of the load."""
 
     size: float
     std: float  # cluster-robust, with that of the prior
@@ -46,29 +46,29 @@ class FaultSize(NamedTuple):
 
 
 def estimated_size(
-    fault: Fault,
-    tables: FaultTables,
+    change: Change,
+    tables: ColumnSums,
     model: RobotModel,
     values: Array,
     *,
-    known: Sequence[Fault] = (),
+    known: Sequence[Change] = (),
     prior: ScorePrior | None = None,
     scale_std: Array | None = None,
-) -> FaultSize | None:
-    """Return the size of a fault, None of one without size or that the motion does not determine.
+) -> ChangeSize | None:
+    """Return the size of a change, None of one without size or that the motion does not determine.
 
     Args:
-        fault: to be sized.
+        change: to be sized.
         tables: of the recordings, with the rate and the load of `values`.
         model: of the arm.
         values: parameters (p,) near those of the arm, where the estimate begins.
-        known: faults that are corrected, too.
+        known: changes that are there as well.
         prior: what is believed of the arm.
         scale_std: relative standard deviations (n,) of the torques' scales, by default exact.
     """
-    if fault.kind not in _SIZED:
+    if change.meaning not in _SIZED:
         return None
-    problem = _Problem.of(fault, tables, model, values, known, prior, scale_std)
+    problem = _Problem.of(change, tables, model, values, known, prior, scale_std)
     return problem.size(values)
 
 
@@ -81,7 +81,7 @@ class _Problem:
 
     gram: Array  # (B, n, p + r + 1, p + r + 1)
     rows: NDArray[np.intp]  # (n,)
-    concerned: Array  # m as parts of the parameters (B, n, p), zero of faults that add a torque
+    concerned: Array  # m as parts of the parameters (B, n, p), zero of changes that add a torque
     scale_std: Array  # (n,), zero of the torques whose scale is s
     information: Array  # of the prior of all unknowns (k, k)
     mean: Array  # of it (k,)
@@ -90,35 +90,35 @@ class _Problem:
     @classmethod
     def of(
         cls,
-        fault: Fault,
-        tables: FaultTables,
+        change: Change,
+        tables: ColumnSums,
         model: RobotModel,
         values: Array,
-        known: Sequence[Fault],
+        known: Sequence[Change],
         prior: ScorePrior | None,
         scale_std: Array | None,
     ) -> _Problem:
         """Reduce the tables."""
         blocks, n, width, _ = tables.gram.shape
         p = tables.n_parameters
-        scaling = fault.kind in _SCALING
-        added = [columns_of_fault(tables, model, values, each) for each in known]
+        scaling = change.meaning in _SCALING
+        added = [columns_of(tables, model, values, each) for each in known]
         if not scaling:
-            added.insert(0, columns_of_fault(tables, model, values, fault))
+            added.insert(0, columns_of(tables, model, values, change))
         parameters = np.broadcast_to(np.eye(width, p), (blocks, n, width, p))
         torque = np.broadcast_to(tables.torques[:, :, None], (blocks, n, width, 1))
         wide = np.concatenate([parameters, *added, torque], axis=3)
         r = wide.shape[3] - p - 1
         concerned = np.zeros((blocks, n, p))
         if scaling:
-            friction_only = fault.kind == "changed friction"
-            mask = tables.mask_of(fault)
-            concerned[:, [*fault.joints]] = mask[:, None, None] * (
+            friction_only = change.meaning == "friction"
+            mask = tables.mask_of(change)
+            concerned[:, [*change.joints]] = mask[:, None, None] * (
                 model.friction_columns if friction_only else np.ones(p)
             )
         std = np.zeros(n) if scale_std is None else scale_std.copy()
-        if fault.kind == "gain":
-            std[[*fault.joints]] = 0.0
+        if change.meaning == "scale" and change.part is None:
+            std[[*change.joints]] = 0.0
         tempering = 1.0 if prior is None else max(1.0, prior.design_effect / tables.step)
         information = np.zeros((p + 1 + n + r,) * 2)
         mean = np.zeros(len(information))
@@ -140,10 +140,10 @@ class _Problem:
             scale_std=std,
             information=information,
             mean=mean,
-            sizes=coefficients.get(fault.kind, np.array([p])),
+            sizes=coefficients.get(change.meaning, np.array([p])),
         )
 
-    def size(self, values: Array) -> FaultSize | None:
+    def size(self, values: Array) -> ChangeSize | None:
         """Estimate the size from parameters (p,) on."""
         p = self.concerned.shape[2]
         unknowns = np.zeros(len(self.mean))
@@ -180,7 +180,7 @@ class _Problem:
         used = np.flatnonzero(row)
         variance = float(row[used] @ clustered.covariance[np.ix_(used, used)] @ row[used])
         half = float(clustered.interval_factors(row[None])[0])
-        return FaultSize(float(row @ unknowns), math.sqrt(max(variance, 0.0)), half)
+        return ChangeSize(float(row @ unknowns), math.sqrt(max(variance, 0.0)), half)
 
     def _linearised(self, unknowns: Array) -> tuple[Array, Array]:
         """Return the columns of the unknowns (B, n, q, k) and the residual (B, n, q)."""

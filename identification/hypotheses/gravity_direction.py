@@ -1,24 +1,17 @@
-"""Gravity and load that recordings show: its direction, and a body on the last link."""
+"""The direction of gravity that recordings show."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Final, NamedTuple
+from typing import Final
 
 import numpy as np
 
 from identification.arrays import Array
-from identification.errors import IdentificationError
-from identification.estimators.payload_estimate import mass_difference
-from identification.estimators.payload_problem import Run
 from identification.factor.columns import under_gravity
 from identification.factor.factor import Factor
 from identification.factor.normal_equations import solve_with_ridge
-from identification.model.link_wrenches import LINK_SYMBOLS
 from identification.model.robot import RobotModel
-from identification.signals.samples import Samples
-from identification.validation.finding import Thresholds
 
 _STANDARD: Final = 9.81  # m/s²
 _PASSES: Final = 2
@@ -28,8 +21,6 @@ _SAME_FIT: Final = 0.1  # difference of twice the log likelihood that is none
 # Of each column's information: combinations of standard parameters of a condition above 10^4.5
 # count as undetermined.
 _RIDGE: Final = 1e-9
-_FEWEST_ROWS: Final = 50  # of a joint whose usual error is known
-_GROWN: Final = 4.0  # power ratio beyond which a joint's error exceeds that of the fit
 
 
 @dataclass(frozen=True, eq=False)
@@ -51,7 +42,7 @@ class GravityDirection:
         return float(np.arccos(np.clip(self.declared @ self.best / size, -1.0, 1.0)))
 
 
-def _solved(factor: Factor, weights: Array) -> Array:
+def standard_parameters(factor: Factor, weights: Array) -> Array:
     """Return standard parameters, of about least norm where they are undetermined."""
     equations = factor.weighted(weights)
     return solve_with_ridge(equations.A, equations.b, _RIDGE)
@@ -67,7 +58,7 @@ def find_gravity(model: RobotModel, training: Factor, held_out: Factor) -> Gravi
         values = np.empty(0)
         floor = 1e-12 * errors + 1e-300
         for _ in range(_PASSES):
-            values = _solved(factor, training.samples / np.maximum(errors, floor))
+            values = standard_parameters(factor, training.samples / np.maximum(errors, floor))
             errors = factor.squared_errors(values)
         return values, np.maximum(errors, floor)
 
@@ -135,7 +126,9 @@ def _turn(factor: Factor, gravity: Array, values: Array, weights: Array) -> Arra
     change[s : 4 * s, s : s + 2] = np.kron(across.T, values[:, None])
     change[-1, -1] = 1.0
     names = (*factor.parameter_names[:s], "turn 1", "turn 2")
-    both = _solved(Factor.of_gram(factor.products(change), factor.samples, names), weights)
+    both = standard_parameters(
+        Factor.of_gram(factor.products(change), factor.samples, names), weights
+    )
     return np.asarray(both[s:] @ across)
 
 
@@ -144,57 +137,3 @@ def _turned(gravity: Array, turn: Array) -> Array:
     size = float(np.linalg.norm(gravity))
     turn = turn * min(1.0, size / max(float(np.linalg.norm(turn)), 1e-300))
     return np.asarray(size * (gravity + turn) / np.linalg.norm(gravity + turn))
-
-
-class CarriedLoad(NamedTuple):
-    """Body on the last link that explains errors on unseen motion only."""
-
-    mass: float  # mass difference to the fitted motion [kg]
-    explained: float  # share of the additional error on unseen motion that it explains
-    axes: int  # number of joints whose error is far above that of the fit
-    half_interval: float = np.inf  # of the mass, 95 % [kg]; infinite if unknown
-
-
-def find_load(
-    model: RobotModel,
-    training: Sequence[Samples],
-    held_out: Sequence[Samples],
-    fitted: Factor,
-    predicted: Factor,
-) -> CarriedLoad:
-    """Fit the training motion, then ten parameters of the last link to the unseen motion."""
-    seen, unseen = (under_gravity(factor, model.gravity) for factor in (fitted, predicted))
-    values = _solved(seen, fitted.samples / np.maximum(seen.gram[:, -1, -1], 1e-300))
-    # Squared error of the fit, scaled to as many rows.
-    floor = 1e-12 * unseen.gram[:, -1, -1] + 1e-300
-    usual = seen.squared_errors(values) * predicted.samples / np.maximum(fitted.samples, 1.0)
-    # What the fitted motion did not move has no usual error.
-    fits = fitted.samples >= _FEWEST_ROWS
-    weights = np.where(fits, predicted.samples / np.maximum(usual, floor), 0.0)
-    before = unseen.squared_errors(values)
-    last = model.layout.links[-1]
-    # Columns [last link | residual].
-    change = np.zeros((unseen.n_parameters + 1, len(last) + 1))
-    change[last, range(len(last))] = 1.0
-    change[:, -1] = np.append(-values, 1.0)
-    left = Factor.of_gram(unseen.products(change), unseen.samples, LINK_SYMBOLS)
-    body = _solved(left, weights)
-    after = left.squared_errors(body)
-    beyond = weights @ np.maximum(before - usual, 0.0)
-    load = CarriedLoad(
-        mass=float(body[LINK_SYMBOLS.index("m")]),
-        explained=float(weights @ (before - after) / beyond) if beyond > 0.0 else 0.0,
-        axes=int(np.count_nonzero(fits & (before > _GROWN * np.maximum(usual, floor)))),
-    )
-    if load.explained <= Thresholds().load:
-        return load
-    try:
-        runs = [
-            Run.of(str(k), model, samples, None, loaded=loaded)
-            for loaded, some in ((False, training), (True, held_out))
-            for k, samples in enumerate(some)
-        ]
-        mass, _, high = mass_difference(model, runs)
-    except IdentificationError:
-        return load
-    return load._replace(mass=mass, half_interval=high - mass) if np.isfinite(high) else load

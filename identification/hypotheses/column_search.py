@@ -1,0 +1,290 @@
+"""Changes of recordings that are linear in columns of torque, and predict parts of them better.
+
+Delay, scale and friction of a joint, friction by the load, a load, and all of these in a part of
+the recordings only. The torque of every fifth block is predicted from the others, as it is and with
+one change after the other. The change that reduces the error most is named if the reduction is
+significant and explains the error of the fit: what is left is near the noise, near the error of the
+other joints, or near that of separate parameters for the part. The search is repeated with it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, field, replace
+from typing import Final, NamedTuple
+
+import numpy as np
+
+from identification.arrays import Array
+from identification.hypotheses.changes import Change, Meaning, Part
+from identification.hypotheses.column_scores import (
+    FEWEST_BLOCKS,
+    MASS,
+    ColumnScore,
+    ScorePrior,
+    column_score,
+    rough_size,
+)
+from identification.hypotheses.columns import BLOCKS, ColumnSums, columns_of
+from identification.hypotheses.sizes import estimated_size
+from identification.model.robot import RobotModel
+from identification.signals.recording import STUCK_MOVEMENT
+from identification.signals.samples import Samples
+
+UNSEEN: Final = "unseen motion"
+"""What a model is tested on if it is another motion than the fitted one."""
+_LEAST_GAIN: Final = 0.1  # relative reduction of the error by a significant change
+_ALIKE: Final = 1.05  # error ratio up to which a change with fewer coefficients is preferred
+_CHANGED: Final = 2.0  # standard deviations of a payload that is one
+_MOST: Final = 4  # changes
+_DIVIDED: Final = 4  # parts of a block whose scatter gives the interval of a size
+_OF_ARM: Final[tuple[Meaning, ...]] = ("payload", "arm")  # that may be of a part
+_OF_JOINT: Final[tuple[Meaning, ...]] = ("scale", "friction")
+
+
+class Explanation(NamedTuple):
+    """A change that explains errors.
+
+    Attributes:
+        change: of the recordings, with its joints and part.
+        ratio: error of predicted blocks with it over that without, geometric mean over the joints.
+        size: delay [s], factor less one, mass [kg] or share of the load; None without a size.
+        std: standard deviation of it over the blocks.
+        interval_factor: standard deviations in half a 95 % interval.
+    """
+
+    change: Change
+    ratio: float
+    size: float | None = None
+    std: float = 0.0
+    interval_factor: float = 2.0
+
+    @property
+    def half_interval(self) -> float:
+        """Half a 95 % interval of the size."""
+        return self.interval_factor * self.std
+
+
+@dataclass(frozen=True, eq=False)
+class ExplainedFit:
+    """A fit of recordings whose errors are to be explained.
+
+    Attributes:
+        values: its parameters (p,).
+        noise: standard deviation of each joint's torque noise (n,) [N·m or N], NaN where unknown;
+            None if it has none.
+        names: of the recordings, by default numbers.
+        prior: what is believed of the arm.
+        scale_std: relative standard deviations (n,) of the torques' scales, which the intervals of
+            sizes include; None: exact.
+    """
+
+    values: Array
+    noise: Array | None = None
+    names: Sequence[str] = ()
+    prior: ScorePrior | None = None
+    scale_std: Array | None = None
+
+    def name_of(self, recording: int) -> str:
+        """Return the name of a recording."""
+        named = recording < len(self.names)
+        return self.names[recording] if named else f"recording {recording + 1}"
+
+
+def find_columns(
+    model: RobotModel, recordings: Sequence[Samples], fitted: ExplainedFit
+) -> tuple[Explanation, ...]:
+    """Find changes of fitted recordings, or of parts of them, that explain their errors."""
+    return _Search.of(model, recordings, fitted).explanations()
+
+
+def find_columns_of_unseen(
+    model: RobotModel, seen: Sequence[Samples], unseen: Sequence[Samples], fitted: ExplainedFit
+) -> tuple[Explanation, ...]:
+    """Find changes that begin within unseen recordings, from `seen` ones that have none.
+
+    `fitted` names the seen ones.
+    """
+    names = [fitted.name_of(recording) for recording in range(len(seen))]
+    several = len(unseen) > 1
+    names += [f"{UNSEEN} ({k + 1})" if several else UNSEEN for k in range(len(unseen))]
+    fitted = replace(fitted, names=names)
+    recordings = [*seen, *unseen]
+    blocks = BLOCKS * len(recordings)
+    return _Search.of(model, recordings, fitted, seen=len(seen), blocks=blocks).explanations(1)
+
+
+class _Trial(NamedTuple):
+    """A change, tried."""
+
+    explanation: Explanation
+    highest: float  # upper limit of its ratio
+    coefficients: int  # added coefficients
+    values: Array  # parameters (p,) fitted with it
+    explains: bool  # whether it explains the error of the fit
+
+    @property
+    def is_better(self) -> bool:
+        """Whether it reduces the error significantly, and explains it."""
+        return self.explains and self.explanation.ratio < 1.0 - _LEAST_GAIN and self.highest < 1.0
+
+
+def _best(trials: Sequence[_Trial]) -> _Trial | None:
+    """Return the significant trial of least error, with few coefficients preferred."""
+    better = [trial for trial in trials if trial.is_better]
+    least = min((trial.explanation.ratio for trial in better), default=0.0)
+    alike = [trial for trial in better if trial.explanation.ratio <= _ALIKE * least]
+    return min(alike, key=lambda trial: (trial.coefficients, trial.explanation.ratio), default=None)
+
+
+@dataclass(eq=False)
+class _Search:
+    """Recordings as sums over columns, and the changes that were found in them."""
+
+    model: RobotModel
+    recordings: Sequence[Samples]
+    fitted: ExplainedFit
+    tables: ColumnSums
+    moved: list[int]  # joints whose scale and friction the fitted rows show
+    seen: int  # recordings without a change that begins in them
+    blocks: int
+    known: list[Change] = field(default_factory=list)
+
+    @classmethod
+    def of(
+        cls,
+        model: RobotModel,
+        recordings: Sequence[Samples],
+        fitted: ExplainedFit,
+        *,
+        seen: int = 0,
+        blocks: int = BLOCKS,
+    ) -> _Search:
+        fit = recordings[:seen] or recordings
+        travel = np.max([np.ptp(samples.motion.position, axis=0) for samples in fit], axis=0)
+        usable = np.any([samples.usable.any(axis=0) for samples in fit], axis=0)
+        moved = np.flatnonzero((travel > STUCK_MOVEMENT) & usable).tolist()
+        tables = ColumnSums.of(model, recordings, fitted.values, blocks=blocks)
+        return cls(model, recordings, fitted, tables, moved, seen, blocks)
+
+    def explanations(self, most: int = _MOST) -> tuple[Explanation, ...]:
+        """Return the changes found, one after the other."""
+        found: list[Explanation] = []
+        while len(found) < most and (trial := _best(self.trials())) is not None:
+            found.append(self._resized(trial))
+            if trial.explanation.change.meaning == "arm":
+                break  # with separate parameters nothing is left to compare
+            self.known.append(trial.explanation.change)
+        return tuple(found)
+
+    def trials(self) -> list[_Trial]:
+        """Try each change."""
+        model = self.model
+        tables = self.tables
+        values = self.fitted.values
+        target = tables.torques
+        none = np.zeros((*tables.gram.shape[:3], 0))
+        known = [columns_of(tables, model, values, earlier) for earlier in self.known]
+        before = np.concatenate([none, *known], axis=3)
+        usual = column_score(tables, before, target)
+        noise = np.zeros(model.n_joints) if self.fitted.noise is None else self.fitted.noise
+        noise = np.nan_to_num(noise) ** 2 * tables.rows.sum(axis=0)
+        separate: dict[Part | None, ColumnScore] = {}
+        trials = []
+        for change in self._changes():
+            if change.part is not None:
+                if change.part not in separate:
+                    every = columns_of(tables, model, values, Change("arm", part=change.part))
+                    columns = np.concatenate([every, before], axis=3)
+                    separate[change.part] = column_score(tables, columns, target)
+                # All that may have changed is within separate parameters.
+                if separate[change.part].fit_ratio_to(usual) > 1.0 - _LEAST_GAIN:
+                    continue
+            added = columns_of(tables, model, values, change)
+            if not added.any():
+                continue  # such as friction of a frictionless joint
+            score = column_score(tables, np.concatenate([added, before], axis=3), target)
+            explains = score.explains(change.joints, usual, noise, separate.get(change.part))
+            size, std = rough_size(change, score, tables)
+            if change.meaning == "load friction" and (size or 0.0) <= 0.0:
+                continue  # friction dissipates
+            if size is not None and change.meaning == "payload" and abs(size) < _CHANGED * std:
+                continue  # the interval of its mass contains zero
+            ratio, highest = score.ratio_to(usual)
+            found = Explanation(change, ratio, size, std)
+            trials.append(
+                _Trial(found, highest, added.shape[3], score.values.mean(axis=0), explains)
+            )
+        return trials
+
+    def _resized(self, trial: _Trial) -> Explanation:
+        """Return the explanation of a trial with the size that is most probable of all."""
+        explanation = trial.explanation
+        if explanation.change.meaning == "arm":
+            return explanation
+        tables = ColumnSums.of(
+            self.model, self.recordings, trial.values, blocks=self.blocks, divided=_DIVIDED
+        )
+        found = estimated_size(
+            explanation.change,
+            tables,
+            self.model,
+            trial.values,
+            known=self.known,
+            prior=self.fitted.prior,
+            scale_std=self.fitted.scale_std,
+        )
+        if found is None:
+            return explanation._replace(size=None, std=0.0)
+        return explanation._replace(
+            size=found.size, std=found.std, interval_factor=found.interval_factor
+        )
+
+    def _changes(self) -> Iterator[Change]:
+        """Yield the changes to try: throughout, then in parts."""
+        # What a joint that stands still does says nothing about its scale.
+        of_parts = [Change(meaning) for meaning in _OF_ARM]
+        of_parts += [Change(meaning, (joint,)) for joint in self.moved for meaning in _OF_JOINT]
+        if not self.seen:
+            yield from (Change("delay"), Change("load friction"))
+            for joint in self.moved:
+                yield from (Change("delay", (joint,)), Change("scale", (joint,)))
+        for part in self._later_parts():
+            yield from (change._replace(part=part) for change in of_parts)
+        if not self.seen and len(self.recordings) > 2:
+            for change in of_parts:
+                yield change._replace(part=self._other_recordings(change))
+
+    def _other_recordings(self, change: Change) -> Part:
+        """Return the recordings in which a change is largest, estimated separately in each."""
+        tables = self.tables
+        alike = Change("payload") if change.meaning == "arm" else change
+        columns = []
+        for k in range(1, len(self.recordings)):
+            part = Part(self.fitted.name_of(k), tuple((tables.recording == k).tolist()))
+            one = alike._replace(part=part)
+            columns.append(columns_of(tables, self.model, self.fitted.values, one))
+        score = column_score(tables, np.concatenate(columns, axis=3), tables.torques)
+        sizes = score.added.mean(axis=0).reshape(len(columns), -1)
+        sizes = np.append(0.0, sizes[:, MASS if alike.meaning == "payload" else 0])
+        order = np.argsort(sizes)
+        cut = int(np.argmax(np.diff(sizes[order]))) + 1
+        those = sorted(min(order[cut:], order[:cut], key=len).tolist())
+        blocks = np.isin(tables.recording, those)
+        name = ", ".join(self.fitted.name_of(k) for k in those)
+        return Part(name, tuple(blocks.tolist()))
+
+    def _later_parts(self) -> Iterator[Part]:
+        """Yield the blocks from each time on, in recordings that are not known to be without."""
+        tables = self.tables
+        blocks = len(tables.recording)
+        for first in range(FEWEST_BLOCKS, blocks - FEWEST_BLOCKS + 1):
+            k = int(tables.recording[first])
+            if k < self.seen:
+                continue
+            start = tables.start[first]
+            name = self.fitted.name_of(k)
+            description = f"{name} from {start:.3g} s on" if start > 0.0 else name
+            if k < len(self.recordings) - 1:
+                description += " and what follows it"
+            yield Part(description, tuple((np.arange(blocks) >= first).tolist()))
