@@ -18,7 +18,7 @@ SHELL = ("", "sh", "bash", "shell", "console")
 PROGRAMS = {"hil", "make", "python", "pip", "sudo", "ip", "printf", "echo", "candump",
             "ssh", ".", "cp", "cd", "dask"}  # fmt: skip
 _REDIRECTION = re.compile(r" > \S+$")
-_BLOCK = re.compile(r"^```(\w*)\n(.*?)^```$", re.MULTILINE | re.DOTALL)
+_BLOCK = re.compile(r"^( *)```([^\n]*)\n(.*?)^\1```$", re.MULTILINE | re.DOTALL)
 
 
 def section(page: Path, heading: str) -> str:
@@ -32,7 +32,7 @@ def section(page: Path, heading: str) -> str:
 def commands(page: Path, text: str | None = None) -> list[list[str]]:
     """The commands of a page, or of its text given, in order, without output and comments."""
     lines = []
-    for language, block in _BLOCK.findall(text or page.read_text(encoding="utf-8")):
+    for _, language, block in _BLOCK.findall(text or page.read_text(encoding="utf-8")):
         if language in SHELL:
             lines += _of_block(page, block)
     return lines
