@@ -24,12 +24,14 @@ from numpy.typing import NDArray
 from scipy.signal import lfilter
 
 from hil.compare.comparison import LEAST, holm
-from hil.fleet.series_changes import Course, Series, courses
+from hil.fleet.series_changes import Course, Series, common_course, courses
 from hil.fleet.trend import FALSE_ALARMS
 
 Array = NDArray[np.float64]
 FaultKind = Literal["wear", "lubricant", "replacement", "tool"]
 
+EVERY: Final = -1
+"""Number in place of that of a robot: what happens to all of them."""
 FIRST: Final = datetime(2024, 1, 15, 8, tzinfo=UTC)
 MONTH: Final = timedelta(days=30.44)
 JOINTS: Final = ("shoulder_pan", "shoulder_lift", "elbow", "wrist_1", "wrist_2", "wrist_3")
@@ -45,7 +47,7 @@ class Fault:
     """What happens to one joint of one robot.
 
     Attributes:
-        robot: its number.
+        robot: its number, or `EVERY`.
         kind: wear grows by `size` of the friction a month; a lost lubricant is a step of it, a
             replaced gear one downwards; a tool weighs `size` [kg], which no log states.
         joint: its number; of no meaning for a tool.
@@ -158,7 +160,7 @@ class Fleet:
         share = self.of_robot[robot] * (1.0 + plan.season * season + plan.warm_up * cold)
         share = share * (1.0 + plan.day * random.standard_normal(6))
         for fault in plan.faults:
-            if fault.robot == robot:
+            if fault.robot in (robot, EVERY):
                 share[fault.joint] *= 1.0 + fault.share(month)
         return Condition(
             when=FIRST + month * MONTH + timedelta(hours=float(random.uniform(0.0, 8.0))),
@@ -244,7 +246,10 @@ class Outcome(NamedTuple):
 
 
 def planned(seed: int, *, faulty: bool) -> FleetPlan:
-    """Return a fleet with one to three faults of different robots, or with none."""
+    """Return a fleet with one to three faults of different robots, or with none.
+
+    Every second fleet with faults also changes as a whole, when a year has passed.
+    """
     random = np.random.default_rng(seed)
     faults = []
     robots = random.permutation(20)
@@ -258,6 +263,9 @@ def planned(seed: int, *, faulty: bool) -> FleetPlan:
         }[kind]
         month = float(random.uniform(6.0, 15.0))
         faults.append(Fault(int(robot), kind, int(random.integers(6)), month, float(size)))
+    if faulty and seed % 2:
+        month, size = random.uniform(12.0, 19.0), random.uniform(0.1, 0.3)
+        faults.append(Fault(EVERY, "lubricant", int(random.integers(6)), month, size))
     return FleetPlan(faults=tuple(faults), seed=seed)
 
 
@@ -274,7 +282,7 @@ def watched(plan: FleetPlan, *, heat: bool = True) -> Outcome:
     first: dict[tuple[int, int], int] = {}
     last: dict[tuple[int, int], Course] = {}
     for month in range(_FIRST_ASKED, plan.months + 1):
-        found: list[Course] = []
+        found: dict[tuple[int, int], Course] = {}
         for joint in range(6):
             family = []
             for robot in range(plan.robots):
@@ -283,10 +291,13 @@ def watched(plan: FleetPlan, *, heat: bool = True) -> Outcome:
                 columns = temperature[robot, :month, None][:, : int(heat)]
                 variance = np.full(month, _MEASURED**2)
                 family.append(Series(months[robot, :month], relative, variance, columns))
-            found += [each for each in courses(family) if each is not None]
-        adjusted = holm(np.array([each.p_value for each in found]))
-        for number, (each, p_value) in enumerate(zip(found, adjusted.tolist(), strict=True)):
-            place = (number % plan.robots, number // plan.robots)
+            for robot, course in enumerate(courses(family)):
+                if course is not None:
+                    found[robot, joint] = course
+            if (common := common_course(family)) is not None:
+                found[EVERY, joint] = common.course
+        adjusted = holm(np.array([each.p_value for each in found.values()]))
+        for (place, each), p_value in zip(found.items(), adjusted.tolist(), strict=True):
             if p_value < FALSE_ALARMS and each.largest >= LEAST:
                 first.setdefault(place, month - 1)
                 last[place] = each
@@ -325,7 +336,8 @@ def main() -> None:
         for fault, month, error in due:
             alarm = "no alarm" if month is None else f"alarm {month}"
             when = f"10 % at {fault.passes_tenth:.1f}, begin off by {error:.2f} months"
-            print(f"  {fault.kind} {fault.size:+.3f} at {fault.month:.1f}: {alarm}, {when}")
+            whose = " of all" if fault.robot == EVERY else ""
+            print(f"  {fault.kind}{whose} {fault.size:+.3f} at {fault.month:.1f}: {alarm}, {when}")
     print(f"{process_time() - begun:.0f} s of processor time")
 
 

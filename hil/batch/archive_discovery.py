@@ -53,9 +53,10 @@ _UNCHECKED: Final = (
 )
 _UNTOUCHED: Final = 2_000_000_000
 """Age of time stamps [ns] from which on they show the next change; some have steps of 2 s."""
+JOINT_TEMPERATURE: Final = "joint_temperature"
 _FIELDS: Final = (
     *("cycle", "gap", "position", "torque"),
-    *("target_current", "motor_current", "commanded_position"),
+    *("target_current", "motor_current", "commanded_position", JOINT_TEMPERATURE),
 )
 
 

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Iterable, Sequence
-from dataclasses import asdict, dataclass, replace
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import asdict, dataclass, field, replace
 from functools import lru_cache
 from sys import intern
 from typing import Any, Final, NamedTuple, TypeVar
@@ -27,7 +27,7 @@ from identification.factor.factor import Factor
 from identification.reduction.reduction import ALIKE, Reduction, Unmodelled
 from identification.selection.settings import Settings
 
-from .archive_discovery import ArchiveRef, cell_in, errors_of_origin, open_ref
+from .archive_discovery import JOINT_TEMPERATURE, ArchiveRef, cell_in, errors_of_origin, open_ref
 from .cache import Arrays, CacheLocation, code_digest
 from .cluster import SkippedArchive, reason_of
 
@@ -46,6 +46,14 @@ class Summary:
     fit: Estimate | None
     scatter: ScoreScatter | None  #: for the estimate with a prior; None of a validation run
     warnings: tuple[str, ...] = ()  #: about the archive
+    #: what else it has: mean temperature of each joint [°C], by name
+    facts: Mapping[str, float] = field(default_factory=dict)
+
+    @property
+    def numbers(self) -> dict[str, float]:
+        """What the archive and its log have in addition to the motion, numbers by name."""
+        of_log = {name: value for name, value in self.ref.facts.items() if isinstance(value, float)}
+        return {**self.facts, **of_log}
 
 
 @dataclass(frozen=True, eq=False)
@@ -143,8 +151,21 @@ def reduced_archive(wanted: ToReduce, settings: Settings) -> tuple[Summary, Redu
         warnings.append(source.merged)
     if archive.outcome is not None and archive.outcome.repaired:
         warnings.append("it was repaired with loss")
-    summary = Summary(ref, factor.parts(wanted.parts), fit, scatter, tuple(warnings))
+    parts = factor.parts(wanted.parts)
+    summary = Summary(ref, parts, fit, scatter, tuple(warnings), _temperatures(archive))
     return summary, reduction
+
+
+def _temperatures(archive: Archive) -> dict[str, float]:
+    """Return the mean temperature of each joint that has one, by names numbered from 1."""
+    column = archive.columns.get(JOINT_TEMPERATURE)
+    if column is None:
+        return {}
+    means = {
+        f"{JOINT_TEMPERATURE}{number}": values[np.isfinite(values)]
+        for number, values in enumerate(column.T, 1)
+    }
+    return {name: float(values.mean()) for name, values in means.items() if len(values)}
 
 
 def summarise(
@@ -365,6 +386,7 @@ def _entry(summary: Summary) -> dict[str, Any]:
     entry: dict[str, Any] = {
         "warnings": summary.warnings,
         "blocks": len(summary.total),
+        "facts": dict(summary.facts),
     }
     if fit is not None and scatter is not None:
         entry["fit"] = {
@@ -425,6 +447,7 @@ def _unpacked(
                 fit=fit,
                 scatter=scatter,
                 warnings=tuple(map(intern, entry["warnings"])),
+                facts=entry["facts"],
             )
         )
     total = None

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import math
 from collections import Counter
-from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from typing import Final, Literal
 
 import numpy as np
@@ -84,6 +84,8 @@ class BatchEstimate:
     #: location and digest of the archive of a repetition; "" otherwise
     archive: str = ""
     sha256: str = ""
+    #: of a repetition what its recording has in addition to its motion, such as temperatures
+    facts: Mapping[str, float] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)
@@ -352,6 +354,7 @@ class Estimator:
             setup=ref.setup,
             archive=ref.origin,
             sha256=ref.sha256,
+            facts=summary.numbers,
         )
 
     def sum(

@@ -24,6 +24,7 @@ from hil.cli.fleet_options import Fleet, RecordingsArgument, last, map_lines
 from hil.cli.identify_options import Identifying
 from hil.cli.imports import Described, Reading
 from hil.fleet.logs import LogMap, write_maps
+from hil.fleet.table import write_batch
 from identification.text import percentage
 
 SOME_BROKEN: Final = 5
@@ -126,7 +127,8 @@ def _tables(folder: Path | None, result: BatchResult, maps: Mapping[LogMap, int]
     if folder is None:
         return []
     with convert_write_errors(folder):
-        return [*write_tables(folder, result), *write_maps(folder, maps)]
+        tables = [*write_tables(folder, result), *write_batch(folder, result)]
+        return [*tables, *write_maps(folder, maps)]
 
 
 def result_lines(result: BatchResult) -> Iterator[str]:

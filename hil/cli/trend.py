@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping, Sequence
+from functools import partial
 from pathlib import Path
 from typing import Annotated, Final
 
@@ -16,8 +17,12 @@ from hil.cli.arguments import JsonOption, QuietOption, VerboseOption, print_json
 from hil.cli.fleet_options import Fleet, RecordingsArgument, last, map_lines
 from hil.cli.identify_options import Identifying
 from hil.cli.imports import Described, Reading
-from hil.fleet.documents import as_dict, write_table
-from hil.fleet.messages import notes, robot_sentence, verdict
+from hil.fleet.conditions import Conditions
+from hil.fleet.documents import as_dict
+from hil.fleet.estimated import estimated_fleet
+from hil.fleet.logs import LogMap
+from hil.fleet.messages import notes, sentences, verdict
+from hil.fleet.table import is_table, read_table, write_trend
 from hil.fleet.trend import FleetTrend, fleet_trend
 from hil.fleet.trend_limits import TrendLimit
 from hil.fleet.trend_page import trend_page
@@ -38,6 +43,7 @@ def trend(
     table: Annotated[Path | None, typer.Option(metavar="FILE.csv")] = None,
     limit: Annotated[list[str] | None, typer.Option(metavar="QUANTITY+PER_CENT")] = None,
     covariate: Annotated[list[str] | None, typer.Option(metavar="COLUMN")] = None,
+    conditions: Annotated[Path | None, typer.Option(metavar="FILE.csv")] = None,
     fail_on_change: bool = False,
     *,
     fleet: Fleet,
@@ -52,51 +58,69 @@ def trend(
 
     Recordings are those of `hil batch`; only new ones are read. Friction, Coulomb and viscous
     friction, gravity load, torque scale, and the torque error of the model of the first months are
-    followed by robot and joint; temperatures in the logs and what moves all robots at once are
-    taken into account. Exit status 0 for any result, unless --fail-on-change is given.
+    followed by robot and joint; temperatures and what moves all robots at once are taken into
+    account. Exit status 0 for any result, unless --fail-on-change is given.
 
     **Example:** `hil trend logs --urdf arm.urdf --robot '{robot}/{date}.csv' -o trend.html`
 
     Options:
         places: Folders with recordings at any depth, files, patterns such as 'robot*/*.csv', or
-            URLs of archives.
+            URLs of archives; or a table of quantities that `hil batch` or `hil trend` wrote.
         output: HTML file for the report. Default: no report.
         table: CSV file with every value of every series. Default: none.
         limit: Change whose date is foreseen, such as 'friction +50 %' (repeatable).
         covariate: Column that may explain a change, such as minutes since the start (repeatable).
             Temperatures are found by their names.
+        conditions: CSV file of what the logs lack: dates (column when), robots (column robot, if
+            the rows are not of all), and columns of numbers such as ambient temperature.
         fail_on_change: Return exit status 5 if something has changed.
     """
-    reporter = make_reporter(quiet=quiet or json, messages=verbose)
     limits = [TrendLimit.parse(text) for text in limit or []]
-    options = how.options(estimator="wls")
-    columns = tuple(covariate or [])
-    with fleet.opened(arm, reading, reporter, columns=columns) as work:
-        result = fleet_trend(
-            places, options, work.cluster, reporter,
-            cache=work.cache, naming=work.naming, importing=work.logs,
-            limits=limits, covariates=columns,
-        )  # fmt: skip
+    stated = Conditions() if conditions is None else Conditions.load(conditions)
+    maps: Mapping[LogMap, int] = {}
+    judge = partial(fleet_trend, limits=limits, covariates=(*(covariate or []), *stated.names))
+    if len(places) == 1 and is_table(Path(places[0])):
+        result = judge(read_table(Path(places[0]), stated))
+    else:
+        reporter = make_reporter(quiet=quiet or json, messages=verbose)
+        with fleet.opened(arm, reading, reporter, columns=tuple(covariate or [])) as work:
+            estimated = estimated_fleet(
+                places, how.options(estimator="wls"), work.cluster, reporter,
+                cache=work.cache, naming=work.naming, importing=work.logs, conditions=stated,
+            )  # fmt: skip
+        maps = work.maps
+        result = estimated.judged(judge(estimated.types))
     written = _written(result, output, table)
     if json:
         print_json({**as_dict(result), "written": [str(path) for path in written]})
     else:
-        lines = [] if quiet else [*map_lines(work.maps, verbose=verbose), *_lines(result)]
-        broken = [f"{each.path} could not be used: {each.message}" for each in result.broken]
-        for line in last(broken, _MOST_BROKEN, "--json"):
-            typer.echo(printable(line), err=True)
-        if written and not quiet:
-            lines.append(f"written: {', '.join(map(str, written))}")
-        lines = [f"{verdict(result)}.", *lines, _counts(result)]
-        for line in lines if verbose else brief(lines, last=_TAIL):
-            typer.echo(printable(line))
+        _print(result, maps, written, quiet=quiet, verbose=verbose)
     if fail_on_change and result.changed:
         raise typer.Exit(CHANGED)
 
 
+def _print(
+    result: FleetTrend,
+    maps: Mapping[LogMap, int],
+    written: Sequence[Path],
+    *,
+    quiet: bool,
+    verbose: bool,
+) -> None:
+    """Print the verdict, the robots and what was written; the rest goes to standard error."""
+    lines = [] if quiet else [*map_lines(maps, verbose=verbose), *_lines(result)]
+    broken = [f"{each.path} could not be used: {each.message}" for each in result.broken]
+    for line in last(broken, _MOST_BROKEN, "--json"):
+        typer.echo(printable(line), err=True)
+    if written and not quiet:
+        lines.append(f"written: {', '.join(map(str, written))}")
+    lines = [f"{verdict(result)}.", *lines, _counts(result)]
+    for line in lines if verbose else brief(lines, last=_TAIL):
+        typer.echo(printable(line))
+
+
 def _lines(result: FleetTrend) -> Iterator[str]:
-    for robot in result.robots:
-        yield robot_sentence(robot, result)
+    yield from sentences(result)
     for note in notes(result):
         yield f"note: {note}"
 
@@ -117,6 +141,6 @@ def _written(result: FleetTrend, output: Path | None, table: Path | None) -> lis
     if table is not None:
         make_folder(table.parent)
         with convert_write_errors(table.parent):
-            write_table(table, result)
+            write_trend(table, result)
         written.append(table)
     return written

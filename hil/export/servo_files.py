@@ -151,7 +151,7 @@ def export_servo(folder: Path, to: str, export: WhatToExport) -> tuple[ExportedS
     form = SERVO_FORMATS[to]
     servo = results.simulators[form.engine]
     cell, held_out = _archives(folder, results)
-    actuators = actuators_of(servo, cell, export.count or 0, export.seed)
+    actuators = actuators_of(servo, cell, results.windows, export.count or 0, export.seed)
     remarks = _remarks(results)
     target = export.into or export.output or folder / f"identified{form.suffix}"
     files: dict[str, str | bytes | None] = {}
@@ -178,8 +178,18 @@ def export_servo(folder: Path, to: str, export: WhatToExport) -> tuple[ExportedS
     return ExportedServo(paths, checked, played, results.verdict.line), results.verdict.good
 
 
-def actuators_of(servo: SimulatorServo, cell: Cell, count: int, seed: int) -> Actuators:
-    """Return the servo with the terms of an engine as fields of simulators, with draws."""
+def actuators_of(
+    servo: SimulatorServo, cell: Cell, windows: int, count: int, seed: int
+) -> Actuators:
+    """Return the servo with the terms of an engine as fields of simulators, with draws.
+
+    Args:
+        servo: with the terms of the engine.
+        cell: of the arm.
+        windows: that were fitted.
+        count: number of draws.
+        seed: of the draws.
+    """
     names = cell.joint_names
     rows = {(value.name, value.joint): value for value in servo.servo}
 
@@ -198,6 +208,7 @@ def actuators_of(servo: SimulatorServo, cell: Cell, count: int, seed: int) -> Ac
         np.array(posterior.coordinates),
         np.array(posterior.present),
         np.array(posterior.covariance),
+        max(1, windows - 1),
         max(count, _DRAWS),
         seed,
     )

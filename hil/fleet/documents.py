@@ -1,19 +1,11 @@
-"""A trend of a fleet for programs: JSON, and a table of every value."""
+"""A trend of a fleet for programs: JSON."""
 
 from __future__ import annotations
 
-import csv
 import math
-from pathlib import Path
-from typing import Any, Final
+from typing import Any
 
-from hil.base.files import replace_file
-from hil.fleet.trend import FleetTrend, QuantityTrend
-
-COLUMNS: Final = (
-    *("robot", "joint", "quantity", "unit", "speed", "when", "value", "std", "adjusted", "fitted"),
-    *("change", "half", "rate", "rate_half", "p_value", "changed", "explained"),
-)
+from hil.fleet.trend import FleetTrend, QuantityTrend, RobotTrend
 
 
 def as_dict(fleet: FleetTrend) -> dict[str, Any]:
@@ -28,17 +20,24 @@ def as_dict(fleet: FleetTrend) -> dict[str, Any]:
         "robots": [
             {
                 "robot": robot.robot,
+                "type": robot.kind,
                 "changed": robot.changed,
-                "recordings": robot.recordings,
-                "first": robot.first,
-                "last": robot.last,
+                "recordings": len(robot.recordings),
+                "first": robot.recordings[0].when,
+                "last": robot.recordings[-1].when,
                 "trends": [_trend(each) for each in robot.trends],
             }
             for robot in fleet.robots
         ],
+        "all_robots": [_together(robot) for robot in fleet.together],
         "broken": [each.as_json() for each in fleet.broken],
         "skipped": [each.as_json() for each in fleet.skipped],
     }
+
+
+def _together(robots: RobotTrend) -> dict[str, Any]:
+    trends = [_trend(each) for each in robots.trends]
+    return {"type": robots.kind, "changed": robots.changed, "trends": trends}
 
 
 def _trend(trend: QuantityTrend) -> dict[str, Any]:
@@ -81,30 +80,3 @@ def vars_of(change: Any) -> dict[str, Any]:
 
 def _known(value: float) -> float | None:
     return float(value) if math.isfinite(value) else None
-
-
-def write_table(path: Path, fleet: FleetTrend) -> None:
-    """Write every value of every series as CSV, a row each; the file is replaced atomically.
-
-    Raises:
-        OSError: it cannot be written.
-    """
-    with (
-        replace_file(path) as temporary,
-        temporary.open("w", encoding="utf-8", newline="") as file,
-    ):
-        writer = csv.writer(file, lineterminator="\n")
-        writer.writerow(COLUMNS)
-        for robot in fleet.robots:
-            for trend in robot.trends:
-                of_series = (
-                    trend.change, trend.half, trend.rate, trend.rate_half, trend.p_value,
-                    str(trend.changed).lower(), str(trend.explained).lower(),
-                )  # fmt: skip
-                names = (robot.robot, trend.joint, trend.quantity, trend.unit)
-                speed = "" if trend.speed is None else trend.speed
-                rows = zip(
-                    trend.dates, trend.values.tolist(), trend.stds.tolist(),
-                    trend.adjusted.tolist(), trend.fitted.tolist(), strict=True,
-                )  # fmt: skip
-                writer.writerows([*names, speed, *row, *of_series] for row in rows)

@@ -1,25 +1,31 @@
-"""What a log says beside its motion: temperatures, and of which robot it is."""
+"""What a log contains in addition to its motion: temperatures, and the name of its robot."""
 
 from __future__ import annotations
 
 import re
-from collections.abc import Iterator
+from collections.abc import Collection, Iterable, Iterator
 from pathlib import Path
 from typing import Final, NamedTuple
 
 import numpy as np
 from mcap.reader import make_reader
 
+from hil.base.arrays import Array
 from hil.base.errors import SourceError
 from hil.base.safe_input import open_file
 from hil.importers.array_files import ArrayFile
+from hil.importers.bags import SUFFIXES as BAGS
+from hil.importers.bags import BagMessage, open_bag
 from hil.importers.channels import channels_of
 from hil.importers.column_map import Format
 from hil.importers.log_files import LogFiles
+from hil.importers.mcap_messages import Topic
 from hil.importers.text_table import TextTable
 
-_TEMPERATURE: Final = re.compile(r"temp(?!late|orary|lat)|celsius|°c", re.IGNORECASE)
+_TEMPERATURE: Final = re.compile(r"temp(?!late|orary|lat|t)|celsius|°c", re.IGNORECASE)
 _MOST_COLUMNS: Final = 64
+_JOINTS: Final = ("name", "joint_names")  # fields of a message that name joints
+_NO_FACTS: Final = (*_JOINTS, "header", "layout", "variance")
 
 
 class WantedFacts(NamedTuple):
@@ -42,12 +48,13 @@ def facts_of(source: Path, wanted: WantedFacts, files: LogFiles) -> dict[str, fl
     facts: dict[str, float | str] = {}
     if wanted.entry and source.suffix.lower() == ".mcap":
         facts.update(_entries(source, wanted.entry))
-    if source.is_dir():
+    if source.is_dir() or source.suffix.lower() in (*BAGS, ".zst", ".zstd"):
+        facts.update(_of_topics(source, wanted.columns))
         return facts
     try:
         channels = channels_of(source, files=files)
         table = files.file(source, Format())
-    except SourceError:  # a bag, whose topics have no columns
+    except SourceError:
         return facts
     for channel in channels:
         is_wanted = channel.name in wanted.columns
@@ -56,6 +63,62 @@ def facts_of(source: Path, wanted: WantedFacts, files: LogFiles) -> dict[str, fl
         elif is_wanted or _TEMPERATURE.search(f"{channel.name} {channel.unit or ''}"):
             facts.update(_means(table, channel.name))
     return facts
+
+
+def _of_topics(source: Path, columns: Collection[str]) -> Iterator[tuple[str, float]]:
+    """Yield the means of temperatures in the topics of a bag, and of what `columns` name.
+
+    Names are of topic and field, ``/motor/temperature``, those of several values end with the joint
+    where the message names joints, else with a number from 1.
+    """
+    try:
+        with open_bag(source) as bag:
+            for topic, kind in bag.topics.items():
+                if kind.is_ros and (_is_of_heat(topic, kind) or _is_named(topic, columns)):
+                    yield from _of_messages(topic, bag.messages(topic), columns)
+    except SourceError:
+        return
+
+
+def _is_of_heat(topic: str, kind: Topic) -> bool:
+    definition = kind.definition.decode(errors="replace")
+    return _TEMPERATURE.search(f"{topic} {kind.kind} {definition}") is not None
+
+
+def _is_named(topic: str, columns: Collection[str]) -> bool:
+    return any(name == topic or name.startswith(f"{topic}/") for name in columns)
+
+
+def _of_messages(
+    topic: str, messages: Iterable[BagMessage], columns: Collection[str]
+) -> Iterator[tuple[str, float]]:
+    found: dict[str, list[float]] = {}
+    for message in messages:
+        content = vars(message.content)
+        joints = next((content[name] for name in _JOINTS if name in content), ())
+        for field, value in content.items():
+            alone = field == "data" or topic.endswith(f"/{field}")
+            name = topic if alone else f"{topic}/{field}"
+            if field in _NO_FACTS or not (name in columns or _TEMPERATURE.search(name)):
+                continue
+            values = _numbers(value)
+            ends = [str(k) for k in range(1, len(values) + 1)] if len(values) > 1 else [""]
+            if len(joints) == len(values):
+                ends = [f"/{joint}" for joint in joints]
+            for end, number in zip(ends, values.tolist(), strict=False):
+                if np.isfinite(number):
+                    found.setdefault(f"{name}{end}", []).append(number)
+    for name, numbers in found.items():
+        yield name, float(np.mean(numbers))
+
+
+def _numbers(value: object) -> Array:
+    """Return the numbers of a field (k,), none of a field of another kind."""
+    try:
+        numbers = np.atleast_1d(np.asarray(value, dtype=np.float64))
+    except (TypeError, ValueError):
+        return np.empty(0)
+    return numbers if numbers.ndim == 1 and len(numbers) <= _MOST_COLUMNS else np.empty(0)
 
 
 def _means(table: TextTable | ArrayFile, name: str) -> Iterator[tuple[str, float]]:

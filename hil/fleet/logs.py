@@ -48,7 +48,7 @@ _ARCHIVE: Final = ".recording"
 """Suffix of an archive in the cache, which no search takes for one of the user's."""
 _LOG_SUFFIXES: Final = frozenset((*TEXTS, *READERS, *BAGS)) - {SUFFIX, ".json"}  # else settings
 _PACKED: Final = (".zst", ".zstd")
-_TABLES: Final = ("parameters", "axes", "not_used")  # that a batch writes
+_TABLES: Final = ("parameters", "axes", "not_used", "quantities")  # that a batch writes
 _TRIED: Final = 3
 """Logs with the same channels from which a map is tried to be concluded, before all are refused."""
 

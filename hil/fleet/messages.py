@@ -37,25 +37,45 @@ def name_of(trend: QuantityTrend) -> str:
 
 def verdict(fleet: FleetTrend) -> str:
     """Return one line about the fleet."""
-    count = len(fleet.changed)
     robots = plural(len(fleet.robots), "robot")
-    if not count:
+    if not fleet.changed:
         return f"No significant change in {robots}"
-    return f"Changed: {', '.join(robot.robot for robot in fleet.changed)} ({count} of {robots})"
+    changed = [name_of_robot(robot, fleet) for robot in fleet.changed]
+    own = sum(robot.changed for robot in fleet.robots)
+    count = f" ({own} of {robots})" if own else ""
+    return f"Changed: {', '.join(changed)}{count}"
+
+
+def name_of_robot(robot: RobotTrend, fleet: FleetTrend) -> str:
+    """Return the name of a robot, or of all of a type together."""
+    if robot.robot:
+        return robot.robot
+    several = len({each.kind for each in fleet.robots}) > 1
+    return f"all robots of type {robot.kind[:8]}" if several else "all robots together"
+
+
+def sentences(fleet: FleetTrend) -> Iterator[str]:
+    """Yield a sentence about all robots together, if there is something to say, and about each."""
+    for robots in fleet.together:
+        if robots.main is not None and (robots.main.changed or robots.main.explained):
+            yield robot_sentence(robots, fleet)
+    for robot in fleet.robots:
+        yield robot_sentence(robot, fleet)
 
 
 def robot_sentence(robot: RobotTrend, fleet: FleetTrend) -> str:
     """Return the sentence about a robot: what changed, since when, how fast, and why not."""
     trend = robot.main
+    name = name_of_robot(robot, fleet)
     if trend is None:
-        recordings = plural(robot.recordings, "recording")
-        return f"{robot.robot}: {recordings}, too few to say whether anything changes"
+        recordings = plural(len(robot.recordings), "recording")
+        return f"{name}: {recordings}, too few to say whether anything changes"
     if trend.changed:
-        return f"{robot.robot}, {trend_sentence(trend, fleet)}"
+        return f"{name}, {trend_sentence(trend, fleet)}"
     if trend.explained:
-        explanation = _explanation(fleet)
-        return f"{robot.robot}, {trend.joint}: {name_of(trend)} varies; {explanation} explains it"
-    return f"{robot.robot}: no significant change"
+        explanation = "a season" if not robot.robot else _explanation(fleet)
+        return f"{name}, {trend.joint}: {name_of(trend)} varies; {explanation} explains it"
+    return f"{name}: no significant change"
 
 
 def trend_sentence(trend: QuantityTrend, fleet: FleetTrend) -> str:
@@ -66,11 +86,11 @@ def trend_sentence(trend: QuantityTrend, fleet: FleetTrend) -> str:
     if trend.rate:
         parts.append(f"{signed(trend.rate)} a month")
     elif last.kind == "step":
-        parts.append(f"at once on {last.begin[:10]}")
+        parts.append(f"in one step about {last.begin[:10]}")
     if fleet.covariates:
         parts.append("not explained by temperature")
     elif fleet.seasonal:
-        parts.append("not by a season of all robots")
+        parts.append("not explained by a season" + (" of all robots" if trend.robot else ""))
     parts += [limit_text(limit) for limit in trend.limits if limit.date is not None]
     return ", ".join(parts)
 

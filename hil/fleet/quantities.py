@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Final, Literal, get_args
+from typing import Final, Literal, NamedTuple, get_args
 
 import numpy as np
 
@@ -29,41 +29,51 @@ _SHOWN: Final = 40  # recordings that choose the speed of friction
 _LEAST_LOAD: Final = 0.02  # of the largest joint's gravity, below which a joint carries none
 
 
-@dataclass(frozen=True, eq=False)
-class TrackedQuantity:
+class FollowedQuantity(NamedTuple):
     """One quantity of one joint.
 
     Attributes:
         joint: its name.
-        number: of the joint, from 0.
         quantity: what it is.
         unit: of its values.
         speed: of friction [rad/s or m/s], None of others.
+    """
+
+    joint: str
+    quantity: QuantityName
+    unit: str
+    speed: float | None = None
+
+
+@dataclass(frozen=True, eq=False)
+class TrackedQuantity:
+    """A quantity as a function of estimates.
+
+    Attributes:
+        followed: the quantity.
+        number: of the joint, from 0.
         weights: (p,); their product with the parameters is the value; empty for the error of the
             reference model.
     """
 
-    joint: str
+    followed: FollowedQuantity
     number: int
-    quantity: QuantityName
-    unit: str
-    speed: float | None
     weights: Array
+
+    def in_estimates(self, estimates: Sequence[Estimate]) -> tuple[Array, Array]:
+        """Return values and variances (m,) in estimates, NaN where unknown."""
+        pairs = [projected(estimate, self.weights[None]) for estimate in estimates]
+        values, variances = np.array(pairs)[:, :, 0].T
+        return values, variances
 
     def of(self, summaries: Sequence[Summary], first: int) -> tuple[Array, Array]:
         """Return values and variances (m,) of the recordings of a robot, NaN where unknown.
 
         The reference model is the mean of the `first` recordings.
         """
-        if self.quantity == "reference error":
+        if self.followed.quantity == "reference error":
             return self._reference_errors(summaries, first)
-        pairs = [
-            projected(summary.fit, self.weights[None])
-            for summary in summaries
-            if summary.fit is not None
-        ]
-        values, variances = np.array(pairs)[:, :, 0].T
-        return values, variances
+        return self.in_estimates([each.fit for each in summaries if each.fit is not None])
 
     def _reference_errors(self, summaries: Sequence[Summary], first: int) -> tuple[Array, Array]:
         """Return the torque errors of one model in all recordings; their noise is that of days."""
@@ -80,7 +90,12 @@ class TrackedQuantity:
 def tracked_quantities(
     model: RobotModel, fits: Sequence[Estimate], reference: Array
 ) -> Iterator[TrackedQuantity]:
-    """Yield the quantities of each joint; `reference` are parameters (p,) near those of all robots.
+    """Yield the quantities of each joint.
+
+    Args:
+        model: of the type.
+        fits: estimates that choose the speed of friction.
+        reference: parameters (p,) near those of all robots.
 
     Friction is that at the speed at which the recordings determine it best; Coulomb friction that
     of a joint that begins to move, viscous friction what it gains up to that speed. Gravity load
@@ -97,19 +112,31 @@ def tracked_quantities(
             best = _best_speed(fits, friction[:, j])
             speed = float(SPEEDS[best])
             weights = friction[best, j]
-            yield TrackedQuantity(joint, j, "friction", unit, speed, weights)
+            yield TrackedQuantity(FollowedQuantity(joint, "friction", unit, speed), j, weights)
             if at_rest[j].any():
-                yield TrackedQuantity(joint, j, "coulomb", unit, None, at_rest[j])
+                yield TrackedQuantity(FollowedQuantity(joint, "coulomb", unit), j, at_rest[j])
             slope = (weights - at_rest[j]) / speed
             if slope.any():
-                yield TrackedQuantity(joint, j, "viscous", f"{unit} / ({speed_unit})", None, slope)
+                viscous = FollowedQuantity(joint, "viscous", f"{unit} / ({speed_unit})")
+                yield TrackedQuantity(viscous, j, slope)
         if loads[j] > _LEAST_LOAD * loads.max():
             weights = gravity[j] / loads[j]
-            yield TrackedQuantity(joint, j, "gravity load", unit, None, weights)
+            yield TrackedQuantity(FollowedQuantity(joint, "gravity load", unit), j, weights)
         size = float(motion[j] @ reference)
         if size > 0.0:
-            yield TrackedQuantity(joint, j, "torque scale", "1", None, motion[j] / size)
-        yield TrackedQuantity(joint, j, "reference error", unit, None, np.empty(0))
+            scale = FollowedQuantity(joint, "torque scale", "1")
+            yield TrackedQuantity(scale, j, motion[j] / size)
+        yield TrackedQuantity(FollowedQuantity(joint, "reference error", unit), j, np.empty(0))
+
+
+def mean_parameters(fits: Sequence[Estimate]) -> Array:
+    """Return the mean parameters of estimates (p,), each where it is determined."""
+    values = np.array([fit.values for fit in fits])
+    stds = np.array([fit.std for fit in fits])
+    usable = np.isfinite(stds) & (stds > 0.0)
+    weights = np.where(usable, 1.0 / np.maximum(stds, 1e-300) ** 2, 0.0)
+    total = weights.sum(axis=0)
+    return np.asarray((weights * values).sum(axis=0) / np.where(total > 0.0, total, 1.0))
 
 
 def _best_speed(fits: Sequence[Estimate], weights: Array) -> int:

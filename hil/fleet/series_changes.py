@@ -17,6 +17,7 @@ from itertools import pairwise
 from typing import Final, Literal, NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.stats import f as fisher
 from scipy.stats import t as student
 
@@ -39,6 +40,8 @@ _OWN: Final = 10.0  # recordings that the noise of the type counts as beside tha
 _MOST_CORRELATION: Final = 0.9
 _LIKELY: Final = 3.84  # twice the log-likelihood within which a begin is in its 95 % interval
 _LEAST_EFFECT: Final = 0.1  # of all friction, that heat and season leave
+_YEAR: Final = 12.0  # months
+_LASTING: Final = 0.8  # of the whole time, that a robot was there for what all have in common
 _ENTRY: Final = 1e-3  # p value of one series from which on a change enters its model
 
 
@@ -149,16 +152,8 @@ class _Noise(NamedTuple):
 
 def courses(family: Sequence[Series]) -> list[Course | None]:
     """Return the model of each series of robots of one type; None of those that are too short."""
-    centred = [
-        replace(each, covariates=each.covariates - each.covariates.mean(axis=0)) for each in family
-    ]
-    priors = _effects(centred)
+    without, priors = _without_effects(family)
     known = [prior.mean for prior in priors]
-    # Heat and season act on the friction that there is, which may have doubled.
-    without = [
-        replace(each, value=_divided(each.value, each.covariates @ mean))
-        for each, mean in zip(centred, known, strict=True)
-    ]
     rest = [prior._replace(mean=np.zeros_like(prior.mean)) for prior in priors]
     found, noise = _fitted(_without_common(without), rest)
     adjusted: list[Course | None] = []
@@ -178,6 +173,57 @@ def courses(family: Sequence[Series]) -> list[Course | None]:
             )
         )
     return adjusted
+
+
+class CommonCourse(NamedTuple):
+    """What robots of one type have in common over time, and its model with a season of a year."""
+
+    series: Series
+    course: Course
+
+
+def common_course(family: Sequence[Series]) -> CommonCourse | None:
+    """Return the course of all robots together, of those that were there all the time.
+
+    A year's season, a sine of any phase, is taken into account. None for fewer robots than show
+    what they have in common, and before a year has passed: a season is none until then.
+    """
+    without, _ = _without_effects(family)
+    if not without:
+        return None
+    begin = min(float(each.time[0]) for each in without)
+    end = max(float(each.time[-1]) for each in without)
+    lasting = [
+        each
+        for each in without
+        if each.time[-1] - each.time[0] >= _LASTING * (end - begin) and len(each.time) >= FEWEST
+    ]
+    if len(lasting) <= SIBLINGS or end - begin < _YEAR:
+        return None
+    time = max(lasting, key=lambda each: len(each.time)).time
+    value, variance, count = _median_of([(each, each.value) for each in lasting], time)
+    measured = float(np.mean(np.concatenate([each.variance for each in lasting])))
+    enough = count > SIBLINGS
+    angle = 2.0 * np.pi * time[enough] / _YEAR
+    season = np.column_stack([np.cos(angle), np.sin(angle)])
+    variance = variance[enough] + 0.5 * np.pi * measured / count[enough]
+    series = Series(time[enough], value[enough], variance, season)
+    (course,) = courses([series])
+    return None if course is None else CommonCourse(series, course)
+
+
+def _without_effects(family: Sequence[Series]) -> tuple[list[Series], list[_Prior]]:
+    """Return series without what siblings say of the effects of covariates, and these effects."""
+    centred = [
+        replace(each, covariates=each.covariates - each.covariates.mean(axis=0)) for each in family
+    ]
+    priors = _effects(centred)
+    # Heat and season act on the friction that there is, which may have doubled.
+    without = [
+        replace(each, value=_divided(each.value, each.covariates @ prior.mean))
+        for each, prior in zip(centred, priors, strict=True)
+    ]
+    return without, priors
 
 
 def _divided(value: Array, effect: Array) -> Array:
@@ -277,24 +323,34 @@ def _without_common(family: Sequence[Series]) -> list[Series]:
     subtracted = []
     for number, each in enumerate(family):
         others = [
-            _at(each.time, other.time, rest[k])
+            (other, rest[k])
             for k, other in enumerate(family)
             if k != number and len(other.time) >= FEWEST
         ]
-        courses_of_others = np.array(others)
-        count = np.isfinite(courses_of_others).sum(axis=0) if others else np.zeros(len(each.time))
-        enough = count >= SIBLINGS
-        common = np.zeros(len(each.time))
-        variance = np.zeros(len(each.time))
-        if enough.any():
-            shown = courses_of_others[:, enough]
-            common[enough] = np.nanmedian(shown, axis=0)
-            deviation = np.nanmedian(np.abs(shown - common[enough]), axis=0) / _NORMAL_MAD
-            variance[enough] = 0.5 * np.pi * deviation**2 / count[enough]
+        common, variance, count = _median_of(others, each.time)
+        common = np.where(count >= SIBLINGS, common, 0.0)
+        variance = np.where(count >= SIBLINGS, variance, 0.0)
         subtracted.append(
             replace(each, value=_divided(each.value, common), variance=each.variance + variance)
         )
     return subtracted
+
+
+def _median_of(
+    robots: Sequence[tuple[Series, Array]], time: Array
+) -> tuple[Array, Array, NDArray[np.intp]]:
+    """Return at some times (m,) the median of values of robots, its variance, and their number."""
+    values = np.array([_at(time, each.time, value) for each, value in robots])
+    values = values.reshape(len(robots), len(time))
+    count = np.isfinite(values).sum(axis=0)
+    median = np.zeros(len(time))
+    variance = np.zeros(len(time))
+    if (some := count > 0).any():
+        shown = values[:, some]
+        median[some] = np.nanmedian(shown, axis=0)
+        deviation = np.nanmedian(np.abs(shown - median[some]), axis=0) / _NORMAL_MAD
+        variance[some] = 0.5 * np.pi * deviation**2 / count[some]
+    return median, variance, count
 
 
 def _at(time: Array, known: Array, values: Array) -> Array:

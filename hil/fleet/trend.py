@@ -1,55 +1,36 @@
 """Which robot of a fleet changes: in which joint, how fast, since when, and whether by heat.
 
-Each recording is estimated by itself; each quantity of each joint is a series over time, and the
-series of robots of one type are modelled together (:mod:`hil.fleet.series_changes`). p values are
-adjusted for all robots, joints and quantities (Holm 1979).
+The series of robots of one type are modelled together (:mod:`hil.fleet.series_changes`). p values
+are adjusted for all robots, joints and quantities (Holm 1979).
 """
 
 from __future__ import annotations
 
-import re
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
-from datetime import UTC, datetime, timedelta
-from itertools import groupby
+from datetime import datetime
 from typing import Final, Literal, NamedTuple
 
 import numpy as np
 
 from hil.base.arrays import Array
-from hil.base.errors import InputError
-from hil.base.progress import Reporter
-from hil.base.threads import one_thread
-from hil.batch.archive_discovery import ArchiveRef, LogImport, cell_in, discover, open_ref
-from hil.batch.archive_reduction import Summary, summarise
-from hil.batch.cache import CacheLocation
-from hil.batch.cluster import Cluster, ClusterTask, SkippedArchive
-from hil.batch.graph import archives_for_settings, cached_settings, decide_settings
+from hil.batch.cluster import SkippedArchive
 from hil.compare.comparison import LEAST, holm
-from hil.fleet.naming import RobotNaming
-from hil.fleet.quantities import (
-    CAUSES,
-    QuantityName,
-    TrackedQuantity,
-    tracked_quantities,
+from hil.fleet.quantities import CAUSES, FollowedQuantity, QuantityName
+from hil.fleet.series import (
+    MONTH,
+    DatedRecording,
+    QuantityFamily,
+    RelativeSeries,
+    TypeSeries,
 )
-from hil.fleet.series_changes import FEWEST, SIBLINGS, Course, Series, courses
+from hil.fleet.series_changes import SIBLINGS, Course, common_course, courses
 from hil.fleet.trend_limits import TrendLimit
-from hil.pipeline.options import Options
-from identification import RobotModel
-from identification.factor.estimate import Estimate
-from identification.selection.settings import Settings
 
 FALSE_ALARMS: Final = 0.01
 """Probability of any change in a fleet that has none, at one time of asking."""
-REFERENCE: Final = 3.0
-"""First months of a robot, against which it has changed."""
-_FIRST: Final = 3  # recordings that these have at least
-_CHUNK: Final = 16  # recordings of one task
-_MONTH: Final = timedelta(days=365.25 / 12.0)
-_DETERMINED: Final = 4.0  # standard deviations that a value exceeds
-_MOST_COMMON: Final = 2  # covariates that concern all joints
 _LONGEST: Final = 240.0  # months within which a limit is foreseen
+_SEASON: Final = ("cosine of a year", "sine of a year")
 
 
 @dataclass(frozen=True)
@@ -136,12 +117,18 @@ class QuantityTrend:
 
 @dataclass(frozen=True, eq=False)
 class RobotTrend:
-    """All quantities of a robot, the greatest concern first."""
+    """All quantities of a robot, the greatest concern first; or of all robots of a type together.
+
+    Attributes:
+        robot: its name.
+        kind: digest of its type, "" if unknown.
+        recordings: in order of time.
+        trends: of its quantities.
+    """
 
     robot: str
-    recordings: int
-    first: str  #: date of the first recording, ISO 8601
-    last: str
+    kind: str
+    recordings: tuple[DatedRecording, ...]
     trends: tuple[QuantityTrend, ...]
 
     @property
@@ -166,96 +153,95 @@ class RobotTrend:
 
 @dataclass(frozen=True, eq=False)
 class FleetTrend:
-    """The robots of a fleet, the greatest concern first, and what could not be used."""
+    """The robots of a fleet, the greatest concern first, and what could not be used.
+
+    Attributes:
+        robots: each by itself.
+        together: all robots of a type, of each type that has enough of them for a year.
+        covariates: names of temperatures and other columns that were used.
+        seasonal: whether the robots are enough to show what moves all of them at once.
+        dated_by_file: recordings that have only the date of their file.
+        simulated: whether no robot moved.
+        broken, skipped: what could not be used, and what is not for it.
+    """
 
     robots: tuple[RobotTrend, ...]
-    covariates: tuple[str, ...]  #: names of temperatures and other columns that were used
-    seasonal: bool  #: whether the robots are enough to show what moves all of them at once
-    dated_by_file: int  #: recordings that have only the date of their file
-    simulated: bool
-    recordings: int
-    broken: tuple[SkippedArchive, ...]
-    skipped: tuple[SkippedArchive, ...]
+    together: tuple[RobotTrend, ...]
+    covariates: tuple[str, ...]
+    seasonal: bool
+    dated_by_file: int = 0
+    simulated: bool = False
+    broken: tuple[SkippedArchive, ...] = ()
+    skipped: tuple[SkippedArchive, ...] = ()
+
+    @property
+    def recordings(self) -> int:
+        """Number of recordings."""
+        return sum(len(robot.recordings) for robot in self.robots)
 
     @property
     def changed(self) -> tuple[RobotTrend, ...]:
-        """Robots that have changed."""
-        return tuple(robot for robot in self.robots if robot.changed)
+        """Robots that have changed, after all robots of a type if these have together."""
+        return tuple(robot for robot in (*self.together, *self.robots) if robot.changed)
 
 
-@one_thread()
 def fleet_trend(
-    roots: Sequence[str],
-    options: Options,
-    cluster: Cluster,
-    reporter: Reporter,
+    types: Sequence[TypeSeries],
     *,
-    cache: CacheLocation,
-    naming: RobotNaming,
-    importing: LogImport | None = None,
     limits: Sequence[TrendLimit] = (),
     covariates: Sequence[str] = (),
 ) -> FleetTrend:
-    """Estimate every recording, and find what changes over time.
+    """Find what changes over time in the series of robots, each type by itself.
 
     Args:
-        roots: folders, files, patterns or URLs.
-        options: how recordings are identified; each by least squares without prior.
-        cluster: whose workers read and estimate them.
-        reporter: of progress.
-        cache: of logs and estimates.
-        naming: which robot a recording is of, and when it was made.
-        importing: of logs and bags, which count only with it.
+        types: their series.
         limits: of which the dates are foreseen.
-        covariates: columns of logs that may explain a change, beside temperatures.
-
-    Raises:
-        InputError: a place does not exist, nothing can be used, or no recording has a date.
-        ClusterError: the cluster cannot be used, or ended.
-        CacheError: the cache cannot be written.
+        covariates: numbers that may explain a change, in addition to those that all recordings
+            have.
     """
-    found = discover(roots, cache, cluster, reporter, importing, naming.place)
-    refs = [ref for ref in found.refs if ref.use == "excitation" and ref.when]
-    undated = [
-        SkippedArchive(ref.origin, "has no date")
-        for ref in found.refs
-        if ref.use == "excitation" and not ref.when
+    found = [
+        (number, each)
+        for number, series in enumerate(types)
+        for family in series.families
+        for each in _family_trends(series, family, limits, covariates)
     ]
-    broken = [*found.broken, *undated]
-    if not refs:
-        first = [f"{each.path} could not be used: {each.message}" for each in broken[:1]]
-        raise InputError(None, "; ".join(["there is no recording with a date", *first]))
-    types = _types(refs, options, cluster, reporter, cache, broken)
-    found_trends = [each for fits in types for each in fits.trends(limits, covariates)]
+    judged = _judged([each for _, each in found])
+    by_type: list[list[QuantityTrend]] = [[] for _ in types]
+    for (number, _), trend in zip(found, judged, strict=True):
+        by_type[number].append(trend)
+    robots = [
+        _robot_trend(robot, series.digest, recordings, trends)
+        for series, trends in zip(types, by_type, strict=True)
+        for robot, recordings in series.recordings.items()
+    ]
+    together = [
+        _robot_trend("", series.digest, (), trends)
+        for series, trends in zip(types, by_type, strict=True)
+    ]
+    names = {name for series in types for name in series.covariates(covariates)}
     return FleetTrend(
-        robots=_by_robot(_judged(found_trends), types),
-        covariates=tuple(sorted({name for each in types for name in each.covariates(covariates)})),
-        seasonal=any(len(each.by_robot) > SIBLINGS for each in types),
-        dated_by_file=sum(ref.dated_by == "file" for each in types for ref in each.refs),
-        simulated=all(ref.simulated for each in types for ref in each.refs),
-        recordings=sum(len(each.refs) for each in types),
-        broken=tuple(broken),
-        skipped=found.skipped,
+        robots=_ranked(robots),
+        together=_ranked([each for each in together if each.trends]),
+        covariates=tuple(sorted(names)),
+        seasonal=any(len(series.recordings) > SIBLINGS for series in types),
     )
 
 
-def _types(
-    refs: Sequence[ArchiveRef],
-    options: Options,
-    cluster: Cluster,
-    reporter: Reporter,
-    cache: CacheLocation,
-    broken: list[SkippedArchive],
-) -> list[_TypeFits]:
-    """Return the estimates of each type; InputError without any."""
-    types: list[_TypeFits] = []
-    for _, members in groupby(sorted(refs, key=lambda ref: ref.order), lambda ref: ref.type_key):
-        fits = _TypeFits.of([*members], options, cluster, reporter, cache, broken)
-        types += [] if fits is None else [fits]
-    if not types:
-        first = [f"{each.path} could not be used: {each.message}" for each in broken[:1]]
-        raise InputError(None, "; ".join(["no recording can be estimated", *first]))
-    return types
+def _robot_trend(
+    robot: str,
+    kind: str,
+    recordings: Sequence[DatedRecording],
+    trends: Sequence[QuantityTrend],
+) -> RobotTrend:
+    own = sorted((each for each in trends if each.robot == robot), key=lambda each: each.concern)
+    return RobotTrend(robot, kind, tuple(recordings), tuple(own))
+
+
+def _ranked(robots: Sequence[RobotTrend]) -> tuple[RobotTrend, ...]:
+    quiet = (True, True, 0.0, 1.0)
+    return tuple(
+        sorted(robots, key=lambda robot: (robot.main.concern if robot.main else quiet, robot.robot))
+    )
 
 
 class _FoundTrend(NamedTuple):
@@ -283,248 +269,49 @@ def _judged(found: Sequence[_FoundTrend]) -> list[QuantityTrend]:
     return judged
 
 
-def _by_robot(
-    trends: Sequence[QuantityTrend], types: Sequence[_TypeFits]
-) -> tuple[RobotTrend, ...]:
-    robots = []
-    for fits in types:
-        for name, summaries in fits.by_robot.items():
-            of_robot = [trend for trend in trends if trend.robot == name]
-            dates = sorted(summary.ref.when for summary in summaries)
-            ordered = tuple(sorted(of_robot, key=lambda trend: trend.concern))
-            robots.append(RobotTrend(name, len(summaries), dates[0], dates[-1], ordered))
-    quiet = (True, True, 0.0, 1.0)
-    return tuple(
-        sorted(robots, key=lambda robot: (robot.main.concern if robot.main else quiet, robot.robot))
-    )
-
-
-def _time_of(ref: ArchiveRef) -> datetime:
-    moment = datetime.fromisoformat(ref.when)
-    return moment if moment.tzinfo is not None else moment.replace(tzinfo=UTC)
-
-
-@dataclass(frozen=True, eq=False)
-class _TypeFits:
-    """Estimates of all recordings of robots of one type, each by itself."""
-
-    model: RobotModel
-    by_robot: Mapping[str, Sequence[Summary]]  #: in order of time
-
-    @property
-    def refs(self) -> list[ArchiveRef]:
-        """The recordings."""
-        return [summary.ref for summaries in self.by_robot.values() for summary in summaries]
-
-    @classmethod
-    def of(
-        cls,
-        refs: Sequence[ArchiveRef],
-        options: Options,
-        cluster: Cluster,
-        reporter: Reporter,
-        cache: CacheLocation,
-        broken: list[SkippedArchive],
-    ) -> _TypeFits | None:
-        """Return the estimates of recordings of one type; add to `broken` those without one."""
-        settings = _settings(refs, options, cluster, cache, broken)
-        if settings is None:
-            return None
-        unusable = {each.path for each in broken}
-        refs = [ref for ref in refs if ref.origin not in unusable]
-        chunks = [refs[k : k + _CHUNK] for k in range(0, len(refs), _CHUNK)]
-        tasks = [
-            ClusterTask(chunk[0].origin, summarise, (chunk, settings, cache)) for chunk in chunks
-        ]
-        with reporter.task("estimating recordings", len(refs)) as progress:
-            results = cluster.results(tasks, lambda _: progress.advance(_CHUNK), archives=len(refs))
-        summaries: list[Summary] = []
-        for result in results:
-            for each in [result] if isinstance(result, SkippedArchive) else result:
-                if isinstance(each, SkippedArchive):
-                    broken.append(each)
-                else:
-                    summaries.append(replace(each, scatter=None))
-        if not summaries:
-            return None
-        by_robot: dict[str, list[Summary]] = {}
-        for summary in sorted(summaries, key=lambda each: (each.ref.when, each.ref.order)):
-            by_robot.setdefault(summary.ref.robot or cls._name_of(summary.ref), []).append(summary)
-        model = cell_in(open_ref(summaries[0].ref), settings).model
-        return cls(model, dict(sorted(by_robot.items())))
-
-    @staticmethod
-    def _name_of(ref: ArchiveRef) -> str:
-        return f"arm {ref.arm[:8]}"
-
-    def covariates(self, more: Sequence[str]) -> list[str]:
-        """Return the names of temperatures, and of the columns that were asked for."""
-        counts: dict[str, int] = {}
-        for ref in self.refs:
-            for name, value in ref.facts.items():
-                if isinstance(value, float):
-                    counts[name] = counts.get(name, 0) + 1
-        every = len(self.refs)
-        return [name for name, count in counts.items() if count == every or name in more]
-
-    def trends(self, limits: Sequence[TrendLimit], more: Sequence[str]) -> Iterator[_FoundTrend]:
-        """Yield the trend of each quantity of each robot."""
-        reference = self._reference()
-        names = self.covariates(more)
-        for tracked in tracked_quantities(self.model, self._fits(), reference):
-            yield from self._family(
-                tracked, names_of_joint(names, tracked.number, self.model), limits
-            )
-
-    def _fits(self) -> list[Estimate]:
-        summaries = (each for group in self.by_robot.values() for each in group)
-        return [summary.fit for summary in summaries if summary.fit is not None]
-
-    def _reference(self) -> Array:
-        """Return the mean of the parameters of all recordings (p,), where they are determined."""
-        values = np.array([fit.values for fit in self._fits()])
-        stds = np.array([fit.std for fit in self._fits()])
-        weights = np.where(
-            np.isfinite(stds) & (stds > 0.0), 1.0 / np.maximum(stds, 1e-300) ** 2, 0.0
+def _family_trends(
+    types: TypeSeries,
+    family: QuantityFamily,
+    limits: Sequence[TrendLimit],
+    covariates: Sequence[str],
+) -> Iterator[_FoundTrend]:
+    """Yield one quantity of one joint of all robots, modelled together, then of all together."""
+    followed = family.followed
+    names = types.covariates_of(followed.joint, covariates)
+    origin = min(recordings[0].moment for recordings in types.recordings.values())
+    series: dict[str, RelativeSeries] = {}
+    for robot, (values, variances) in family.values.items():
+        recordings = types.recordings[robot]
+        relative = RelativeSeries.of(recordings, values, variances, names, origin)
+        if relative is not None:
+            series[robot] = relative
+    members = [each.series for each in series.values()]
+    for (robot, each), course in zip(series.items(), courses(members), strict=True):
+        if course is not None:
+            trend = _trend(robot, followed, each, course, origin, names, limits)
+            yield _FoundTrend(trend, course.unadjusted_p, course.unadjusted_largest)
+    if (common := common_course(members)) is not None:
+        reference = float(np.mean([each.reference for each in series.values()]))
+        whole = RelativeSeries(
+            common.series,
+            tuple(_date(origin, time) for time in common.series.time.tolist()),
+            (1.0 + common.series.value) * reference,
+            np.sqrt(common.series.variance) * abs(reference),
+            reference,
         )
-        total = weights.sum(axis=0)
-        return np.asarray((weights * values).sum(axis=0) / np.where(total > 0.0, total, 1.0))
-
-    def _family(
-        self, tracked: TrackedQuantity, names: Sequence[str], limits: Sequence[TrendLimit]
-    ) -> Iterator[_FoundTrend]:
-        """Yield one quantity of one joint of all robots, modelled together."""
-        starts = {robot: _time_of(group[0].ref) for robot, group in self.by_robot.items()}
-        origin = min(starts.values())
-        measured = {
-            robot: tracked.of(group, _first_of(group)) for robot, group in self.by_robot.items()
-        }
-        series: dict[str, _RelativeSeries] = {}
-        for robot, group in self.by_robot.items():
-            relative = _RelativeSeries.of(group, *measured[robot], names, origin)
-            if relative is not None:
-                series[robot] = relative
-        family = [each.series for each in series.values()]
-        for (robot, each), course in zip(series.items(), courses(family), strict=True):
-            if course is not None:
-                trend = _trend(robot, tracked, each, course, origin, names, limits)
-                yield _FoundTrend(trend, course.unadjusted_p, course.unadjusted_largest)
+        course = common.course
+        trend = _trend("", followed, whole, course, origin, _SEASON, limits)
+        yield _FoundTrend(trend, course.unadjusted_p, course.unadjusted_largest)
 
 
-def _settings(
-    refs: Sequence[ArchiveRef],
-    options: Options,
-    cluster: Cluster,
-    cache: CacheLocation,
-    broken: list[SkippedArchive],
-) -> Settings | None:
-    """Return the settings of a type: those of its robot whose first recording is readable.
-
-    Decided by the earliest recordings of one robot, so that a later month changes no estimate.
-    """
-    for _, members in groupby(refs, lambda ref: ref.key):
-        remaining = [*members]
-        while remaining:
-            chosen = archives_for_settings(remaining, None)
-            settings = cached_settings(chosen, options, None, cache)
-            if settings is not None:
-                return settings
-            task = ClusterTask(chosen[0].origin, decide_settings, (chosen, options, None, cache))
-            (decision,) = cluster.results([task], archives=len(refs))
-            if isinstance(decision, SkippedArchive):
-                broken.append(decision)
-                unusable = {chosen[0].origin}
-            else:
-                settings, lost = decision
-                if settings is not None:
-                    broken += lost
-                    return settings
-                broken += lost
-                unusable = {each.path for each in lost} or {ref.origin for ref in chosen}
-            remaining = [ref for ref in remaining if ref.origin not in unusable]
-    return None
-
-
-def _first_of(group: Sequence[Summary]) -> int:
-    """Return how many recordings are of the first months."""
-    start = _time_of(group[0].ref)
-    within = sum(_time_of(each.ref) - start < REFERENCE * _MONTH for each in group)
-    return max(min(_FIRST, len(group)), within)
-
-
-class _RelativeSeries(NamedTuple):
-    """A series as shares of its first months."""
-
-    series: Series
-    dates: tuple[str, ...]
-    values: Array
-    stds: Array
-    reference: float
-
-    @classmethod
-    def of(
-        cls,
-        group: Sequence[Summary],
-        values: Array,
-        variances: Array,
-        names: Sequence[str],
-        origin: datetime,
-    ) -> _RelativeSeries | None:
-        """Return a series of values (m,); None if it is too short, or zero within its errors."""
-        known = np.flatnonzero(np.isfinite(values) & np.isfinite(variances))
-        if len(known) < FEWEST:
-            return None
-        group = [group[k] for k in known.tolist()]
-        values = values[known]
-        variances = variances[known]
-        first = _first_of(group)
-        reference = float(np.mean(values[:first]))
-        error = float(np.sqrt(np.mean(variances[:first]) / first))
-        if not abs(reference) > _DETERMINED * error:
-            return None
-        times = np.array([(_time_of(each.ref) - origin) / _MONTH for each in group])
-        columns = np.array(
-            [[_number(each.ref.facts.get(name)) for name in names] for each in group]
-        ).reshape(len(group), len(names))
-        series = Series(times, values / reference - 1.0, variances / reference**2, _filled(columns))
-        dates = tuple(each.ref.when for each in group)
-        return cls(series, dates, values, np.sqrt(variances), reference)
-
-
-def _number(value: float | str | None) -> float:
-    return value if isinstance(value, float) else np.nan
-
-
-def _filled(columns: Array) -> Array:
-    """Return covariates with the mean of the others where one is missing, 0 where all are."""
-    counts = np.isfinite(columns).sum(axis=0)
-    means = np.nansum(columns, axis=0) / np.maximum(counts, 1)
-    return np.where(np.isfinite(columns), columns, means)
-
-
-def names_of_joint(names: Sequence[str], joint: int, model: RobotModel) -> list[str]:
-    """Return those of some covariates that concern a joint: its own, and those of no joint.
-
-    Covariates of joints end with their numbers, from 0 or 1; the first two of no joint are taken.
-    """
-    numbered: dict[str, dict[int, str]] = {}
-    for name in names:
-        if (match := re.fullmatch(r"(.*?)_?(\d+)", name)) is not None:
-            numbered.setdefault(match[1], {})[int(match[2])] = name
-    of_joints = {
-        stem: numbers
-        for stem, numbers in numbered.items()
-        if sorted(numbers) in ([*range(model.n_joints)], [*range(1, model.n_joints + 1)])
-    }
-    own = [numbers[joint + min(numbers)] for numbers in of_joints.values()]
-    of_any = {name for numbers in of_joints.values() for name in numbers.values()}
-    return [*own[:1], *[name for name in names if name not in of_any][:_MOST_COMMON]]
+def _date(origin: datetime, month: float) -> str:
+    return (origin + month * MONTH).isoformat(timespec="seconds")
 
 
 def _trend(
     robot: str,
-    tracked: TrackedQuantity,
-    each: _RelativeSeries,
+    followed: FollowedQuantity,
+    each: RelativeSeries,
     course: Course,
     origin: datetime,
     names: Sequence[str],
@@ -535,20 +322,20 @@ def _trend(
     scale = 1.0 / level if level > 0.1 else 1.0
 
     def date(month: float) -> str:
-        return (origin + month * _MONTH).isoformat(timespec="seconds")
+        return _date(origin, month)
 
     last = float(each.series.time[-1])
     reached = [
         _reached(limit, course, scale, last, date)
         for limit in limits
-        if limit.quantity == tracked.quantity
+        if limit.quantity == followed.quantity
     ]
     return QuantityTrend(
         robot=robot,
-        joint=tracked.joint,
-        quantity=tracked.quantity,
-        unit=tracked.unit,
-        speed=tracked.speed,
+        joint=followed.joint,
+        quantity=followed.quantity,
+        unit=followed.unit,
+        speed=followed.speed,
         reference=each.reference,
         dates=each.dates,
         values=each.values,

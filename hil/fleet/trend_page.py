@@ -10,8 +10,16 @@ import numpy as np
 from hil.base.arrays import Array
 from hil.base.version import software
 from hil.compare.comparison import LEAST
-from hil.fleet.messages import month, name_of, notes, robot_sentence, verdict
-from hil.fleet.trend import FALSE_ALARMS, REFERENCE, FleetTrend, QuantityTrend, RobotTrend
+from hil.fleet.messages import (
+    month,
+    name_of,
+    name_of_robot,
+    notes,
+    robot_sentence,
+    verdict,
+)
+from hil.fleet.series import REFERENCE
+from hil.fleet.trend import FALSE_ALARMS, FleetTrend, QuantityTrend, RobotTrend
 from hil.report.chart import Caption, Chart, Legend, Plot
 from hil.report.drawing import Panel, chart_panel
 from hil.report.rendering import environment, page_bytes
@@ -28,7 +36,8 @@ def trend_page(fleet: FleetTrend) -> bytes:
     """Return the trend of a fleet as one HTML file; the same input gives the same bytes."""
     template = environment().get_template("trend.html.j2")
     rules = {"alarms": FALSE_ALARMS, "least": LEAST, "reference": REFERENCE}
-    robots = [_robot(number, robot, fleet) for number, robot in enumerate(fleet.robots)]
+    shown = [each for each in fleet.together if each.changed]
+    robots = [_robot(number, each, fleet) for number, each in enumerate((*shown, *fleet.robots))]
     text = template.render(
         fleet=fleet,
         verdict=verdict(fleet),
@@ -48,6 +57,7 @@ def _robot(number: int, robot: RobotTrend, fleet: FleetTrend) -> dict[str, Any]:
     return {
         "key": f"robot-{number}",
         "robot": robot,
+        "name": name_of_robot(robot, fleet),
         "sentence": robot_sentence(robot, fleet),
         "panel": None if main is None else _panel(f"main-{number}", main),
         "panels": [_panel(f"r{number}-{k}", each) for k, each in enumerate(shown)],

@@ -34,7 +34,7 @@ from hil.servo.maker_file import maker_parameters
 from hil.servo.messages import verdict_of
 from identification.servo.choice import ServoFit, fit_servos, steps_of_a_fit
 from identification.servo.fit import ServoEstimate
-from identification.servo.intervals import intervals_of
+from identification.servo.intervals import intervals_of, widened_covariance
 from identification.servo.parameters import TERMS, in_units
 from identification.servo.prediction import predicted
 from identification.servo.pushes import pushes_of
@@ -305,5 +305,5 @@ def _posterior(estimate: ServoEstimate) -> ServoPosterior:
     return ServoPosterior(
         coordinates=estimate.coordinates.tolist(),
         present=estimate.present.tolist(),
-        covariance=estimate.covariance.tolist(),
+        covariance=widened_covariance(estimate).tolist(),
     )

@@ -66,14 +66,22 @@ def intervals_of(fit: ServoFit) -> ServoIntervals:
 
 
 def sampled(
-    coordinates: Array, present: NDArray[np.bool_], covariance: Array, count: int, seed: int
+    coordinates: Array,
+    present: NDArray[np.bool_],
+    covariance: Array,
+    freedom: int,
+    count: int,
+    seed: int,
 ) -> Array:
     """Return parameters in SI units (count, n, P) drawn from the posterior, correlated.
+
+    Student's distribution, as of the intervals.
 
     Args:
         coordinates: of the estimate (n, P).
         present: terms of the model (n, P).
         covariance: of the coordinates and of the delay of the bus (n P + 1, n P + 1).
+        freedom: windows that were fitted, less one.
         count: number of draws.
         seed: of them.
     """
@@ -81,33 +89,55 @@ def sampled(
     values, vectors = np.linalg.eigh(0.5 * (covariance + covariance.T))
     root = vectors * np.sqrt(np.maximum(values, 0.0))
     shifts = generator.standard_normal((count, len(values))) @ root.T
+    shifts *= np.sqrt(freedom / generator.chisquare(freedom, (count, 1)))
     samples = coordinates + shifts[:, :-1].reshape(count, *coordinates.shape)
     return in_units(without_absent(natural(samples), present))
 
 
-def _spread(estimate: ServoEstimate) -> Array:
-    """Return standard deviations of the parameters (n, P), logarithms of positive ones.
+def widened_covariance(estimate: ServoEstimate) -> Array:
+    """Return the covariance of the coordinates and of the delay of the bus (n P + 1, n P + 1).
 
     Residuals of a window are alike for longer in some directions than in others. So what they add
-    to the variance of a parameter is at least its scatter when a window each is left out.
+    to the variance is in no direction less than its scatter when a window each is left out.
     """
+    n, count = estimate.coordinates.shape
+    widened = estimate.covariance.copy()
+    for joint in range(n):
+        places = joint * count + np.flatnonzero(estimate.present[joint])
+        inside = np.ix_(places, places)
+        own = np.ix_(places - joint * count, places - joint * count)
+        whole = estimate.covariance[inside]
+        spread = estimate.prior.spread[joint, places - joint * count]
+        of_residuals = whole - (whole * spread**-2.0) @ whole
+        widened[inside] += _excess(of_residuals, estimate.between[joint][own])
+    return widened
+
+
+def _excess(covariance: Array, other: Array) -> Array:
+    """Return what is lacking of a covariance (k, k) to be no less than another in any direction."""
+    values, vectors = np.linalg.eigh(0.5 * (covariance + covariance.T))
+    size = np.sqrt(np.maximum(values, 1e-12 * values.max(initial=0.0)))
+    known = size > 0.0
+    root = vectors[:, known] * size[known]
+    inverse = vectors[:, known] / size[known]
+    relative, directions = np.linalg.eigh(inverse.T @ other @ inverse)
+    lacking = root @ directions
+    return np.asarray((lacking * np.maximum(relative - 1.0, 0.0)) @ lacking.T)
+
+
+def _spread(estimate: ServoEstimate) -> Array:
+    """Return standard deviations of the parameters (n, P), logarithms of positive ones."""
     n, count = estimate.coordinates.shape
     combinations = np.eye(count)
     combinations[_POWER == 1, PLACE["kp"]] -= 1.0
-    deviations = np.empty((n, count))
+    covariance = widened_covariance(estimate)
+    variances = []
     for joint in range(n):
         part = slice(joint * count, (joint + 1) * count)
-        whole = estimate.covariance[part, part]
         present = np.outer(estimate.present[joint], estimate.present[joint])
-        whole = np.where(present, whole, 0.0)
-        of_prior = (whole * estimate.prior.spread[joint] ** -2.0) @ whole
-        variance, by_prior, between = (
-            np.einsum("pa,ab,pb->p", combinations, matrix, combinations)
-            for matrix in (whole, of_prior, estimate.between[joint])
-        )
-        by_windows = np.maximum(variance - by_prior, between)
-        deviations[joint] = np.sqrt(np.maximum(by_prior + by_windows, 0.0))
-    return deviations
+        whole = np.where(present, covariance[part, part], 0.0)
+        variances.append(np.einsum("pa,ab,pb->p", combinations, whole, combinations))
+    return np.sqrt(np.maximum(variances, 0.0))
 
 
 def _prior_spread(estimate: ServoEstimate) -> Array:

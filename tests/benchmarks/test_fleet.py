@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from benchmarks.fleet import Fault, Fleet, FleetPlan, planned, watched
+from benchmarks.fleet import EVERY, Fault, Fleet, FleetPlan, planned, watched
 
 LOST = Fault(1, "lubricant", 2, 6.5, 0.25)
 
@@ -33,5 +33,7 @@ def test_a_fault_acts_on_its_joint_from_its_month_on() -> None:
 
 
 def test_fleets_are_drawn_with_one_to_three_faults() -> None:
-    assert {len(planned(seed, faulty=True).faults) for seed in range(20)} == {1, 2, 3}
+    faults = [planned(seed, faulty=True).faults for seed in range(20)]
+    assert {sum(each.robot != EVERY for each in some) for some in faults} == {1, 2, 3}
+    assert [any(each.robot == EVERY for each in some) for some in faults] == [False, True] * 10
     assert planned(3, faulty=False).faults == ()

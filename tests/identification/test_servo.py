@@ -7,7 +7,7 @@ import scipy
 from benchmarks import servo_arm as arm
 from identification import RobotModel
 from identification.servo.choice import fit_servos
-from identification.servo.intervals import intervals_of, sampled
+from identification.servo.intervals import intervals_of, sampled, widened_covariance
 from identification.servo.parameters import NAMES, PLACE, TERMS, in_errors, in_units
 from identification.servo.prediction import predicted
 from identification.servo.pushes import pushes_of
@@ -151,11 +151,34 @@ def test_a_limit_that_no_motion_reaches_is_not_determined(planted):
 def test_draws_scatter_as_the_intervals_say(planted):
     _, fit, intervals, *_ = planted
     estimate = fit.estimate
-    draws = sampled(estimate.coordinates, estimate.present, estimate.covariance, 400, 1)
-    kp = PLACE["kp"]
-    inside = (draws[:, :, kp] > intervals.lower[:, kp]) & (draws[:, :, kp] < intervals.upper[:, kp])
-    assert 0.9 < inside.mean() < 1.0
+    covariance = widened_covariance(estimate)
+    draws = sampled(estimate.coordinates, estimate.present, covariance, fit.windows - 1, 4000, 1)
     assert len(NAMES) == draws.shape[2]
+    for name in ("kp", "armature", "viscous", "coulomb"):
+        place = PLACE[name]
+        lower, upper = np.quantile(draws[:, :, place], [0.025, 0.975], axis=0)
+        # ends of logarithms, from quantiles of 4000 draws
+        np.testing.assert_allclose(
+            np.log(upper / lower),
+            np.log(intervals.upper[:, place] / intervals.lower[:, place]),
+            rtol=0.1,
+        )
+
+
+@pytest.mark.long
+def test_intervals_are_no_narrower_than_the_scatter_between_windows(planted):
+    """In every direction of the parameters of a joint, not only along each of them."""
+    _, fit, *_ = planted
+    estimate = fit.estimate
+    covariance = widened_covariance(estimate)
+    count = len(NAMES)
+    for joint in range(3):
+        own = slice(joint * count, (joint + 1) * count)
+        for least in (estimate.between[joint], estimate.covariance[own, own]):
+            present = np.outer(estimate.present[joint], estimate.present[joint])
+            excess = np.where(present, covariance[own, own] - least, 0.0)
+            scale = np.sqrt(np.diag(covariance[own, own]))
+            assert np.linalg.eigvalsh(excess / np.outer(scale, scale)).min() > -1e-6
 
 
 @pytest.mark.long

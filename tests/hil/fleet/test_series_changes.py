@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from hil.compare.comparison import holm
-from hil.fleet.series_changes import FEWEST, Series, courses
+from hil.fleet.series_changes import FEWEST, SIBLINGS, Series, common_course, courses
 
 MONTHS = 24
 SEASON = 0.06
@@ -131,3 +131,56 @@ def test_effect_of_heat_is_that_of_the_siblings():
     found = courses(fleet(5))
     effects = [course.effects[0] for course in found if course is not None]
     np.testing.assert_allclose(effects, -0.0070, atol=0.0012)
+
+
+class TestAllTogether:
+    """What moves all robots at once: a season is no change, another gearbox oil in all is one."""
+
+    @staticmethod
+    def moved(seed, *, months=MONTHS, begin=14.5, size=0.15, robots=8, heat=True):
+        """A fleet whose friction changes in every robot at the same time."""
+        return [
+            Series(
+                each.time,
+                (1.0 + each.value) * (1.0 + size * (each.time > begin)) - 1.0,
+                each.variance,
+                each.covariates,
+            )
+            for each in fleet(seed, months=months, robots=robots, heat=heat)
+        ]
+
+    @pytest.mark.parametrize("heat", [True, False])
+    def test_is_found_and_dated_though_no_robot_differs_from_the_others(self, heat):
+        for seed in range(5):
+            family = self.moved(seed, heat=heat)
+            common = common_course(family)
+            assert common is not None
+            (change,) = common.course.changes
+            assert change.shape.begin == pytest.approx(14.5, abs=1.0)
+            assert change.size == pytest.approx(0.15, abs=0.05)
+            assert min(holm(np.array([each.p_value for each in courses(family)]))) > 0.01
+
+    @pytest.mark.parametrize("heat", [True, False])
+    @pytest.mark.parametrize("months", [13, 18, 24, 36])
+    def test_is_not_invented(self, months, heat):
+        p_values = [
+            common_course(fleet(seed, months=months, heat=heat)).course.p_value
+            for seed in range(60)
+        ]
+        assert np.mean(np.array(p_values) < 0.05) < 0.05 + 3.0 * np.sqrt(0.05 * 0.95 / 60)
+        assert min(p_values) > 1e-4
+
+    def test_is_unknown_before_a_year_and_of_few_robots(self):
+        assert common_course(fleet(1, months=12)) is None
+        assert common_course(fleet(1, robots=SIBLINGS)) is None
+        assert common_course([]) is None
+
+    def test_robots_that_came_later_do_not_count(self):
+        """Their first months are others, to which their values are relative."""
+        family = self.moved(2)
+        late = [
+            Series(each.time[-6:], 0.0 * each.value[-6:], each.variance[-6:], each.covariates[-6:])
+            for each in fleet(9, robots=8)
+        ]
+        (change,) = common_course([*family, *late]).course.changes
+        assert change.size == pytest.approx(0.15, abs=0.05)

@@ -12,7 +12,7 @@ from typer.testing import CliRunner
 from benchmarks.fleet import Fault, Fleet, FleetPlan, urdf, write_fleet
 from hil.base.errors import InputError
 from hil.cli import app
-from hil.fleet.trend import names_of_joint
+from hil.fleet.series import names_of_joint
 from hil.fleet.trend_limits import TrendLimit
 from tests.hil.batch_work import NOTHING_OPEN
 from tests.hil.report.test_report import Page, assert_inert, assert_stands_alone
@@ -104,6 +104,20 @@ def test_the_first_screen_has_a_sentence_for_each_robot(done, logs):
     assert len(lines) <= 24
 
 
+def test_a_table_of_a_batch_gives_the_same_robots(done, logs, tmp_path):
+    """What `hil batch` writes is read by `hil trend`, without robot, logs or cache."""
+    places = [str(logs), *OPTIONS, *NOTHING_OPEN]
+    ran = CliRunner().invoke(app, ["batch", *places, "-o", str(tmp_path / "tables")])
+    assert ran.exit_code == 0, ran.output
+    table = str(tmp_path / "tables" / "quantities.csv")
+    ran = CliRunner().invoke(app, ["trend", table, "--fail-on-change", "--json"])
+    assert ran.exit_code == 5, ran.output
+    printed = json.loads(ran.stdout)
+    changed = {robot["robot"] for robot in printed["robots"] if robot["changed"]}
+    assert changed == {"robot02", "robot00"}
+    assert printed["covariates"] == ["temperature"]
+
+
 class TestLimit:
     def test_is_a_quantity_and_a_change(self):
         assert TrendLimit.parse("friction+50%") == ("friction", 0.5)
@@ -116,17 +130,17 @@ class TestLimit:
 
 
 class TestCovariates:
-    class Model:
-        n_joints = 3
+    JOINTS = ("shoulder", "elbow", "wrist")
 
     @pytest.mark.parametrize(
         ("names", "joint", "expected"),
         [
-            (["temp1", "temp2", "temp3", "ambient"], 1, ["temp2", "ambient"]),
-            (["T_0", "T_1", "T_2"], 2, ["T_2"]),
-            (["temp1", "temp2"], 0, ["temp1", "temp2"]),
-            ([], 0, []),
+            (["temp1", "temp2", "temp3", "ambient"], "elbow", ["temp2", "ambient"]),
+            (["T_0", "T_1", "T_2"], "wrist", ["T_2"]),
+            (["m/wrist", "m/elbow", "m/shoulder", "ambient"], "elbow", ["m/elbow", "ambient"]),
+            (["temp1", "temp2"], "shoulder", ["temp1", "temp2"]),
+            ([], "shoulder", []),
         ],
     )
     def test_of_a_joint_are_its_own_and_those_of_none(self, names, joint, expected):
-        assert names_of_joint(names, joint, self.Model()) == expected
+        assert names_of_joint(names, joint, self.JOINTS) == expected

@@ -20,7 +20,9 @@ from hil.archive import open_archive
 from hil.archive.recording_of_archive import open_recording
 from hil.base.errors import InputError
 from hil.cli import app
+from hil.fleet.extra_channels import WantedFacts, facts_of
 from hil.importers.bag_map import BagMap
+from hil.importers.log_files import LogFiles
 from hil.importers.ros_messages import CONTROLLER_STATE, definitions_of
 from hil.results.provenance import RESULTS
 from hil.results.rollout_result import ROLLOUT, RolloutResult
@@ -547,3 +549,41 @@ class TestServo:
         )
         assert look.exit_code == 0, look.exception
         assert "none, and no motor current" in " ".join(look.output.split())
+
+
+class TestTemperatures:
+    """What a fleet reads of a bag in addition to the motion."""
+
+    HEAT = "sensor_msgs/msg/Temperature"
+
+    def heat(self, messages: Messages, value: float) -> Any:
+        return messages.of(self.HEAT, header=messages.header(0), temperature=value, variance=0.0)
+
+    @pytest.mark.parametrize("kind", ["mcap", "db3", "ros1"])
+    def test_are_the_means_of_their_topics(self, tmp_path, kind) -> None:
+        messages = Messages("ros1" if kind == "ros1" else "iron")
+        moved = a_motion(0.1)
+        warm = [(k, self.heat(messages, 30.0 + k)) for k in range(3)]
+        topics = {"/joint_states": measured(messages, moved), "/gear": (self.HEAT, warm)}
+        source = written(tmp_path / "bag", messages, topics, kind)
+        assert facts_of(source, WantedFacts(), LogFiles()) == {"/gear/temperature": 31.0}
+
+    def test_of_joints_have_their_names_or_numbers(self, tmp_path) -> None:
+        messages = Messages()
+        states = [(k, messages.state(k, [40.0, 50.0 + k], names=JOINTS[::-1])) for k in (0, 2)]
+        heats = [(k, messages.array([20.0, 21.0])) for k in (0, 1)]
+        topics = {"/motor_temperatures": (STATE, states), "/temperature": (ARRAY, heats)}
+        source = written(tmp_path / "bag", messages, topics)
+        assert facts_of(source, WantedFacts(), LogFiles()) == {
+            f"/motor_temperatures/position/{JOINTS[1]}": 40.0,
+            f"/motor_temperatures/position/{JOINTS[0]}": 51.0,
+            "/temperature1": 20.0,
+            "/temperature2": 21.0,
+        }
+
+    def test_other_topics_are_read_where_they_are_named(self, tmp_path) -> None:
+        messages = Messages()
+        topics = {"/minutes": (ARRAY, [(0, messages.array([5.0]))])}
+        source = written(tmp_path / "bag", messages, topics)
+        assert facts_of(source, WantedFacts(), LogFiles()) == {}
+        assert facts_of(source, WantedFacts(("/minutes",)), LogFiles()) == {"/minutes": 5.0}

@@ -1,0 +1,107 @@
+"""What it costs to watch a fleet: processor time, memory, a new month, and a Dask scheduler.
+
+Run with ``python -m benchmarks.fleet_logs [--months N]``: 20 robots, a log of 30 s at 100 Hz of
+each in every month, read by `hil trend` for the first time, again, and with one month more; then
+the same logs by the workers of a scheduler, with a cache of their own.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import resource
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import Any, Final
+
+from benchmarks.fleet import Fleet, FleetPlan, urdf, write_fleet
+
+ROBOTS: Final = 20
+_PORT: Final = 18786
+
+
+@dataclass(frozen=True)
+class Cost:
+    """Of one command: seconds, and megabytes of its largest process."""
+
+    wall: float
+    processor: float
+    memory: float
+    printed: dict[str, Any]
+
+
+def asked(logs: Path, *options: str) -> Cost:
+    """Run `hil trend` on logs in a process of its own, with the processes that it starts."""
+    command = [sys.executable, "-m", "hil", "trend", str(logs), "--urdf", str(urdf())]
+    command += ["--robot", "{robot}/{date}.csv", "--json", *options]
+    before = resource.getrusage(resource.RUSAGE_CHILDREN)
+    started = time.perf_counter()
+    ran = subprocess.run(command, check=True, capture_output=True, text=True)
+    wall = time.perf_counter() - started
+    after = resource.getrusage(resource.RUSAGE_CHILDREN)
+    processor = after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime
+    return Cost(wall, processor, after.ru_maxrss / 1024.0, json.loads(ran.stdout))
+
+
+@contextmanager
+def scheduler() -> Iterator[str]:
+    """Start a scheduler with two workers on this PC, and provide its address."""
+    address = f"tcp://127.0.0.1:{_PORT}"
+    dask = [sys.executable, "-m", "distributed.cli"]
+    started = [
+        [*dask[:-1], "distributed.cli.dask_scheduler", "--host", "127.0.0.1", "--port", str(_PORT)],
+        [*dask[:-1], "distributed.cli.dask_worker", address, "--nworkers", "2", "--nthreads", "1"],
+    ]
+    processes = []
+    try:
+        for command in started:
+            quiet = subprocess.DEVNULL
+            processes.append(subprocess.Popen(command, stdout=quiet, stderr=quiet))
+            time.sleep(8.0)
+        yield address
+    finally:
+        for process in reversed(processes):
+            process.terminate()
+            process.wait()
+
+
+def _shown(title: str, cost: Cost, logs: int) -> None:
+    print(
+        f"{title}: {cost.processor:.0f} s of processor time, {cost.processor / logs:.2f} s a log;"
+        f" {cost.wall:.0f} s wall; largest process so far {cost.memory:.0f} MB",
+        flush=True,
+    )
+
+
+def main() -> None:
+    """Print the costs."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--months", type=int, default=5)
+    months = parser.parse_args().months
+    fleet = Fleet(FleetPlan(robots=ROBOTS, months=months + 1))
+    with TemporaryDirectory() as folder:
+        logs = Path(folder) / "logs"
+        write_fleet(logs, fleet, months=range(months))
+        time.sleep(2.5)  # a log written a moment ago is read again
+        count = ROBOTS * months
+        _shown(f"{count} logs, first time", asked(logs), count)
+        _shown(f"{count} logs, again", asked(logs), count)
+        write_fleet(logs, fleet, months=[months])
+        time.sleep(2.5)
+        local = asked(logs)
+        _shown(f"one month of {ROBOTS} robots more", local, ROBOTS)
+        with scheduler() as address:
+            cache = str(Path(folder) / "cache")
+            remote = asked(logs, "--scheduler", address, "--cache", cache)
+        same = remote.printed["robots"] == local.printed["robots"]
+        print(f"by a scheduler's workers the same result to the bit: {same}")
+
+
+if __name__ == "__main__":
+    main()
