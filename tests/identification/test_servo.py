@@ -166,7 +166,7 @@ def test_draws_scatter_as_the_intervals_say(planted):
 
 
 @pytest.mark.long
-def test_intervals_are_no_narrower_than_the_scatter_between_windows(planted):
+def test_intervals_are_as_wide_as_the_scatter_of_windows(planted):
     """In every direction of the parameters of a joint, not only along each of them."""
     _, fit, *_ = planted
     estimate = fit.estimate

@@ -150,7 +150,7 @@ class TestAllTogether:
         ]
 
     @pytest.mark.parametrize("heat", [True, False])
-    def test_is_found_and_dated_though_no_robot_differs_from_the_others(self, heat):
+    def test_is_dated_though_no_robot_differs_from_others(self, heat):
         for seed in range(5):
             family = self.moved(seed, heat=heat)
             common = common_course(family)
