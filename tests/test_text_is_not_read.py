@@ -62,7 +62,6 @@ FOREIGN: Final[Mapping[str, str]] = {
 OURS: Final[Mapping[str, str]] = {
     "hil.control.errors": "an outcome that begins the reason is not said twice",
     "hil.control.simulator_process": "the last error that the simulated controller printed",
-    "hil.report.drawing": "the lines of a label make its height",
     "hil.report.numbers": "figures are typeset",
     "hil.campaign.screen": "the colour of a refusal, which begins with one word in capitals",
     "hil.base.terminal_text": "joints get their names in what the drivers say",

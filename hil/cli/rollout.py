@@ -25,8 +25,8 @@ from hil.cli.identify_options import EstimatorOption, Identifying, servo_from
 from hil.cli.verdict import NOT_GOOD
 from hil.pipeline.options import Options
 from hil.pipeline.stored_identification import read_or_identify
-from hil.plots.chart_picture import draw_charts
 from hil.plots.plan_picture import save
+from hil.report.chart_picture import draw_charts
 from hil.report.output_files import REPORT
 from hil.report.rollout_section import overview_charts, overview_legends
 from hil.results.rollout_result import ROLLOUT, ArmErrors, RolloutResult, milli

@@ -21,7 +21,7 @@ from hil.fleet.messages import (
 from hil.fleet.series import REFERENCE
 from hil.fleet.trend import FALSE_ALARMS, FleetTrend, QuantityTrend, RobotTrend
 from hil.report.chart import Caption, Chart, Legend, Plot
-from hil.report.drawing import Panel, chart_panel
+from hil.report.panels import Panel, chart_panel
 from hil.report.rendering import environment, page_bytes
 from identification.text import percentage
 

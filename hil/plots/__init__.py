@@ -6,13 +6,13 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from hil.plots.chart_picture import draw_charts, draw_torque
     from hil.plots.plan_picture import check_format, draw_plan, save
+    from hil.report.chart_picture import draw_charts, draw_torque
 
 __all__ = ["check_format", "draw_charts", "draw_plan", "draw_torque", "save"]
 _HOME = {
     **dict.fromkeys(("check_format", "draw_plan", "save"), "hil.plots.plan_picture"),
-    **dict.fromkeys(("draw_charts", "draw_torque"), "hil.plots.chart_picture"),
+    **dict.fromkeys(("draw_charts", "draw_torque"), "hil.report.chart_picture"),
 }
 
 if not TYPE_CHECKING:  # which would accept any name

@@ -19,8 +19,8 @@ from hil.base.arrays import Array
 from hil.base.errors import ArchiveError, HilError, InputError
 from hil.base.terminal_text import plural
 from hil.cell import AngleFrame, Cell
-from hil.plots import style
 from hil.plots.plan_picture import wrapped
+from hil.report import picture_style as style
 from hil.report.chart import thinned
 from identification.errors import ModelError
 from identification.model.kinematics import chain_from_urdf

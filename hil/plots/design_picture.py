@@ -14,8 +14,8 @@ from matplotlib.figure import Figure
 
 from hil.cell import AngleFrame, Cell
 from hil.design.messages import criteria_text
-from hil.plots import style
 from hil.plots.plan_picture import draw_motion
+from hil.report import picture_style as style
 from hil.report.chart import label
 from identification.excitation import (
     CRITERIA,

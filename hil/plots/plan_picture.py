@@ -15,7 +15,7 @@ from hil.base.arrays import Array
 from hil.base.errors import InputError
 from hil.base.files import write_atomically
 from hil.cell import AngleFrame
-from hil.plots import style
+from hil.report import picture_style as style
 from hil.report.chart import label, thinned
 from identification.text import percentage
 from planner import JointLimits, Trajectory

@@ -1,7 +1,7 @@
-"""Charts: plots of lines and dots over one quantity, described once for all drawings of them.
+"""Charts, described once: plots of lines and dots over one quantity, boxes, and matrices.
 
-A page shows a chart as SVG (:mod:`hil.report.drawing`) and, with its script, for dragging
-(:mod:`hil.report.interactive`); a picture file has it from :mod:`hil.plots.chart_picture`.
+:mod:`hil.report.chart_picture` draws them with matplotlib, for picture files and for pages without
+their script; :mod:`hil.report.interactive` gives charts to BokehJS, which draws them in a page.
 """
 
 from __future__ import annotations
@@ -14,6 +14,11 @@ import numpy as np
 
 from hil.base.arrays import Array
 
+INK, MUTED, BAND, FIRST, SECOND, WIDE = (
+    f"var(--{name})" for name in ("ink", "muted", "band", "first", "second", "wide")
+)
+"""Variables of the style sheet (light, dark, print); `WIDE` is a light colour for a broad line
+below another one."""
 _MARGIN: Final = 0.05  # free on both sides of the values, as a share of their range
 _LABEL_LENGTH: Final = 28
 
@@ -106,6 +111,8 @@ class Plot:
     reach: float | None = None
     limits: tuple[float, float] | None = None  #: the range, if neither
     origin: bool = False  #: whether lines are drawn through x = 0 and y = 0
+    band: tuple[float, float] | None = None  #: shaded interval of y
+    names: Sequence[tuple[float, str]] = ()  #: of places on the vertical axis, in place of ticks
 
     @property
     def y_limits(self) -> tuple[float, float]:
@@ -125,22 +132,68 @@ class Plot:
 
 @dataclass(frozen=True, eq=False)
 class Chart:
-    """Plots over the same quantity, one above the other: drawn as SVG, or by the page's script."""
+    """Plots over the same quantity, one above the other."""
 
     caption: Caption
     x: Array  #: (m,)
     plots: Sequence[Plot]
     foot: str = "time [s]"  #: quantity and unit of x
-    joint: int = 0  #: number of the joint, from 0
+    joint: int | None = None  #: number of the joint, from 0
     log: bool = False  #: whether both axes are logarithmic
     ticks: Sequence[float] = ()  #: of x, in place of round ones
+    tick_names: Sequence[str] = ()  #: their texts, if not the numbers themselves
+    x_range: tuple[float, float] | None = None  #: of the horizontal axis, if not that of the lines
+    shares_x: bool = True  #: whether a page moves the axes of a figure's charts together
 
     @property
     def x_limits(self) -> tuple[float, float]:
         """Range of the horizontal axis."""
+        if self.x_range is not None:
+            return self.x_range
         if any(trace.x is not None for plot in self.plots for trace in plot.traces):
             return padded(joined(t.x for p in self.plots for t in p.traces if t.x is not None))
         return float(self.x[0]), max(float(self.x[-1]), float(self.x[0]) + 1e-9)
+
+
+@dataclass(frozen=True, eq=False)
+class Boxes:
+    """Columns of values: dots, with a box of quartiles and median for five and more."""
+
+    caption: Caption
+    columns: Sequence[Array]  #: values (m,) of each
+    colours: Sequence[str]  #: of the palette
+    heading: str  #: quantity and unit of the values
+    names: Sequence[str]  #: of the columns
+
+
+@dataclass(frozen=True, eq=False)
+class Matrix:
+    """Absolute correlations between pairs, white for 0 and black for 1."""
+
+    caption: Caption
+    values: Array  #: (n, n), 0 to 1
+    names: Sequence[str]  #: of the rows, which are those of the columns
+
+
+def correlations(values: Array, names: Sequence[str], key: str, title: str) -> Matrix:
+    """Return the matrix of a normalised covariance (n, n), with a name for each row."""
+    n = len(names)
+    absolute = np.abs(values)
+    note = f"{int(np.sum(np.triu(absolute, 1) > 0.9))} of {n * (n - 1) // 2} pairs above 0.9"
+    what = f"absolute correlation between {n} base parameters, white for 0 and black for 1"
+    return Matrix(Caption(key, title, note, what), absolute, names)
+
+
+def error_bars(at: Array, ends: Array, colour: str, width: float) -> Trace:
+    """Return vertical lines at places (m,), each from one end to the other (m, 2)."""
+    gap = np.full((len(at), 1), np.nan)
+    places = np.column_stack([at, at, gap[:, 0]]).ravel()
+    return Trace(np.hstack([ends, gap]).ravel(), colour, width, x=places)
+
+
+def rule(y: float, x_limits: tuple[float, float]) -> Trace:
+    """Return a thin line at a height, across the whole plot."""
+    return Trace(np.full(2, y), MUTED, 0.9, x=np.array(x_limits))
 
 
 class Legend(NamedTuple):

@@ -9,8 +9,20 @@ from typing import Final, NamedTuple
 import numpy as np
 
 from hil.base.arrays import Array
-from hil.report.chart import Caption, Chart, Legend, Plot, padded
-from hil.report.drawing import BAND, FIRST, MUTED, Panel, matrix_panel, panel, single
+from hil.report.chart import (
+    FIRST,
+    MUTED,
+    Caption,
+    Chart,
+    Legend,
+    Matrix,
+    Plot,
+    Trace,
+    correlations,
+    error_bars,
+    padded,
+    rule,
+)  # fmt: skip
 from hil.report.numbers import MISSING, fixed, percent, significant
 from hil.results.results import FittedResult, Results, ValidationResult, by_id
 from hil.results.series import ReportSeries
@@ -18,6 +30,7 @@ from hil.results.series import ReportSeries
 _INTERVAL: Final = 1.96  # Half a 95 % interval, in standard errors
 # Percentiles of the torque inside the axes; outliers may lie outside.
 _SHOWN: Final = (0.5, 99.5)
+_MOST_REPETITIONS: Final = 6  # with a tick each
 
 
 class Joint(NamedTuple):
@@ -229,71 +242,78 @@ def friction_charts(series: ReportSeries, joints: Sequence[Joint]) -> list[Chart
             limits=(float(values.min()) - room, float(values.max()) + room), origin=True,
         )  # fmt: skip
         foot = f"speed [{joints[j].angle}/s]"
-        charts.append(Chart(caption, speed, [plot], foot, joint=j))
+        charts.append(Chart(caption, speed, [plot], foot, joint=j, shares_x=False))
     return charts
 
 
-def residual_panels(results: Results, only: int | None = None) -> dict[str, list[Panel]]:
-    """Draw the mean residual of each joint, or of one, over speed and over position."""
+def residual_charts(results: Results) -> dict[str, list[Chart]]:
+    """Return the mean residual of each joint over speed and over position."""
     judgement = results.judgement
-    panels_by_kind: dict[str, list[Panel]] = {"speed_panels": [], "position_panels": []}
+    charts: dict[str, list[Chart]] = {"speed": [], "position": []}
     for what, per, profiles in (
         ("speed", "/s", judgement.speed),
         ("position", "", judgement.position),
     ):
-        panels = panels_by_kind[f"{what}_panels"]
         for j, (joint, profile) in enumerate(zip(judgement.joints, profiles, strict=True)):
             mean = np.array(profile.mean, np.float64)
             std = np.array(profile.std, np.float64)
-            if only not in (None, j) or not np.isfinite(mean + std).any():
+            if not np.isfinite(mean + std).any():
                 continue
             angle = "rad" if joint.unit == "N·m" else "m"
             note = f"RMS error {significant(joint.rms)} {joint.unit}"
-            key = f"{'' if only is None else 'found-'}{what[0]}{j}"
-            caption = Caption(key, joint.joint, note, f"mean residual over {what}")
-            heading = f"mean residual [{joint.unit}]"
-            foot = f"{what} [{angle}{per}]"
-            axes = single(170.0, heading, foot, x_ticks=6)
+            caption = Caption(f"{what[0]}{j}", joint.joint, note, f"mean residual over {what}")
             centre = np.array(profile.centre, np.float64)
-            endless = np.array([-np.inf, np.inf])
-            axes.bands(endless[None], np.array([[-joint.rms, joint.rms]]), BAND)
             reach = np.where(np.isfinite(std), _INTERVAL * std, 0.0)
             ends = np.stack([mean - reach, mean + reach], axis=1)
-            axes.y_limits = padded(np.concatenate([ends.ravel(), [0.0, -joint.rms, joint.rms]]))
-            axes.x_limits = padded(centre[np.isfinite(mean)])
-            axes.segments(endless[None], np.zeros((1, 2)), MUTED, 0.9)
-            axes.segments(np.stack([centre, centre], axis=1), ends, FIRST, 1.2)
-            axes.line(centre, mean, FIRST, 1.2)
-            axes.dots(centre, mean, FIRST, 4.5)
-            panels.append(panel([axes], caption))
-    return panels_by_kind
+            x_range = padded(centre[np.isfinite(mean)])
+            traces = [
+                rule(0.0, x_range),
+                error_bars(centre, ends, FIRST, 1.2),
+                Trace(mean, FIRST, 1.2, name="mean"),
+                Trace(mean, FIRST, 4.5, dots=True),
+            ]
+            plot = Plot(
+                110.0, f"mean residual [{joint.unit}]", traces, band=(-joint.rms, joint.rms),
+                limits=padded(np.concatenate([ends.ravel(), [0.0, -joint.rms, joint.rms]])),
+            )  # fmt: skip
+            foot = f"{what} [{angle}{per}]"
+            charts[what].append(
+                Chart(caption, centre, [plot], foot, joint=j, x_range=x_range, shares_x=False)
+            )
+    return charts
 
 
-def precision_panels(results: Results) -> list[Panel]:
-    """Draw each required precision over the repetitions, with what the design promised."""
-    panels = []
+def precision_charts(results: Results) -> list[Chart]:
+    """Return each required precision over the repetitions, with what the design promised."""
+    charts = []
     required = results.conduct.precision if results.conduct is not None else []
     for k, requirement in enumerate(required):
         count = np.array(requirement.repetitions, np.float64)
         ratio = np.array(requirement.ratio)
         note = f"{requirement.worst} is worst"
         what = "95 % interval over the required one, over repetitions"
-        whole = min(6, int(count.max()))  # so many ticks at most are whole numbers
-        axes = single(170.0, "interval / required", "repetitions", x_ticks=whole)
-        axes.x_limits = 0.5, float(count.max()) + 0.5
-        promised = np.full(2, np.nan if requirement.promised is None else requirement.promised)
-        shown = np.concatenate([ratio, promised, [0.0, 1.1]])
-        axes.y_limits = padded(shown[np.isfinite(shown)])
-        axes.segments(np.array([[-np.inf, np.inf]]), np.ones((1, 2)), MUTED, 0.9)
-        axes.line(np.array(axes.x_limits), promised, MUTED, 1.4, dashed=True)
-        axes.line(count, ratio, FIRST, 1.2)
-        axes.dots(count, ratio, FIRST, 4.5)
-        panels.append(panel([axes], Caption(f"q{k}", requirement.requirement, note, what)))
-    return panels
+        x_range = 0.5, float(count.max()) + 0.5
+        traces = [rule(1.0, x_range)]
+        shown = [*ratio, 0.0, 1.1]
+        if requirement.promised is not None:
+            promised = np.full(2, requirement.promised)
+            traces.append(Trace(promised, MUTED, 1.4, dashed=True, x=np.array(x_range)))
+            shown.append(requirement.promised)
+        traces += [Trace(ratio, FIRST, 1.2, name="ratio"), Trace(ratio, FIRST, 4.5, dots=True)]
+        limits = padded(np.array(shown))
+        step = max(1, -(-int(count.max()) // _MOST_REPETITIONS))
+        charts.append(
+            Chart(
+                Caption(f"q{k}", requirement.requirement, note, what), count,
+                [Plot(110.0, "interval / required", traces, limits=limits)], "repetitions",
+                ticks=range(step, int(count.max()) + 1, step), x_range=x_range, shares_x=False,
+            )
+        )  # fmt: skip
+    return charts
 
 
-def correlation_matrix(results: Results) -> Panel | None:
-    """Draw |Ψ_ij| / sqrt(Ψ_ii Ψ_jj) of the base parameters, 0 white, 1 black (paper, Fig. 2)."""
+def correlation_matrix(results: Results) -> Matrix | None:
+    """Return |Ψ_ij| / sqrt(Ψ_ii Ψ_jj) of the base parameters, 0 white, 1 black (paper, Fig. 2)."""
     n = results.n_base
     if n == 0:
         return None
@@ -301,4 +321,4 @@ def correlation_matrix(results: Results) -> Panel | None:
     base = results.parameters[:n]
     order = [base.index(parameter) for parameter in by_id(base)]
     labels = [base[k].label for k in order]
-    return matrix_panel(matrix[np.ix_(order, order)], labels, "c", "Base parameters")
+    return correlations(matrix[np.ix_(order, order)], labels, "c", "Base parameters")

@@ -71,6 +71,7 @@ def _chart(chart: Chart, most: int) -> dict[str, Any]:
         "joint": chart.joint,
         "foot": chart.foot,
         "log": chart.log,
+        "own": not chart.shares_x,
         "x": encoded(_shared_x(chart.x, most)),
         "range": list(chart.x_limits),
         "plots": [
@@ -82,6 +83,7 @@ def _chart(chart: Chart, most: int) -> dict[str, Any]:
                 "limits": list(plot.y_limits),
                 "fixed": plot.limits is not None or plot.reach is not None,
                 "origin": plot.origin,
+                "band": plot.band,
             }
             for plot in chart.plots
         ],

@@ -3,16 +3,16 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from functools import partial
-from typing import Final, NamedTuple
+from typing import TYPE_CHECKING, Final, NamedTuple
 
 import numpy as np
 
+from hil import report  # its pictures load matplotlib, on first use
 from hil.report import figures
 from hil.report.chart import Chart
-from hil.report.drawing import Panel, chart_panel
 from hil.report.interactive import chart_data, library
 from hil.report.numbers import capitalised
 from hil.report.rendering import environment, page_bytes, template_text
@@ -26,11 +26,14 @@ from identification.selection.settings import Choice
 from identification.validation.finding import Level
 from identification.validation.purpose_messages import TITLES, figure, requirement
 
+if TYPE_CHECKING:
+    from hil.report.panels import Panel
+
 _MOST_CANDIDATES: Final = 6
 """Candidates shown of one choice: the first, and the best of the others."""
 
-_BINS: Final = 2000
-"""Intervals of all drawn lines of one kind, with two points in each; a page has at most 3 MB."""
+_BINS: Final = 1500
+"""Intervals of all pictured lines of one kind, with two points in each."""
 _FEWEST_BINS = 80  # of one line
 _MOST_BINS = 300
 
@@ -58,7 +61,12 @@ _PICTURES: Final = {
     "clock": "excitation",
 }
 """Section of the figure that shows what a check found."""
-_CHARTS: Final = {"torque": "torques", "friction": "friction", "excitation": "excitation"}
+_CHARTS: Final = {
+    "torque": "torques",
+    "friction": "friction",
+    "residuals": "speed",
+    "excitation": "excitation",
+}
 """Charts of these sections, with one for each joint."""
 
 
@@ -76,6 +84,7 @@ def report_bytes(
     joints = figures.joints_of(results)
     runs = results.validation
     bins = min(_MOST_BINS, max(_FEWEST_BINS, _BINS // len(joints)))
+    draw = partial(report.chart_panel, bins=bins)
     charts = {
         "torques": figures.torque_charts(series, joints),
         "parts": figures.part_charts(series, joints),
@@ -83,7 +92,10 @@ def report_bytes(
         "friction": figures.friction_charts(series, joints),
         "excitation": figures.excitation_charts(series, joints),
         "rollout_errors": [] if rollout is None else rollout_charts(rollout),
+        "precision": figures.precision_charts(results),
+        **figures.residual_charts(results),
     }
+    correlation = figures.correlation_matrix(results)
     errors = np.array([[r.overall_relative_error, r.all_rows_relative_error] for r in runs])
     context = {
         "results": results,
@@ -94,7 +106,7 @@ def report_bytes(
         "has_truth": any(p.truth is not None for p in results.parameters),
         "has_ids": any(p.table2_id is not None for p in results.parameters),
         "has_prior": any(p.data_share is not None for p in results.parameters),
-        "found": found_rows(results, charts, bins),
+        "found": found_rows(results, charts, draw),
         "passed": [
             finding
             for finding in results.judgement.worst_first
@@ -116,12 +128,10 @@ def report_bytes(
         "unseen": np.median(errors, axis=0).tolist() if runs else None,
         "worst": max(runs, key=lambda run: run.overall_relative_error) if runs else None,
         "every_row_errors": every_row_errors(results),
-        "correlation": figures.correlation_matrix(results),
+        "correlation": None if correlation is None else report.matrix_panel(correlation),
         "legend": figures.LEGENDS,
         "part_legends": figures.known_parts(series),
-        "precision": figures.precision_panels(results),
-        **figures.residual_panels(results),
-        **{name: [chart_panel(chart, bins) for chart in group] for name, group in charts.items()},
+        **{name: [draw(chart) for chart in group] for name, group in charts.items()},
         "chart_data": chart_data(charts, results.joint_names),
     }
     scripts = (*library(), template_text("charts.js"))
@@ -178,7 +188,7 @@ class FoundRow(NamedTuple):
 
 
 def found_rows(
-    results: Results, charts: Mapping[str, Sequence[Chart]], bins: int
+    results: Results, charts: Mapping[str, Sequence[Chart]], draw: Callable[[Chart], Panel]
 ) -> list[FoundRow]:
     """Return what is wrong or doubtful, the most consequential first; then remarks."""
     worst = worst_joint(results)
@@ -190,7 +200,7 @@ def found_rows(
         panel = None
         shown = {row.section for row in rows}
         if section not in shown:
-            panel = _panel_of(section, worst, results, charts, bins)
+            panel = _panel_of(section, worst, charts, draw)
         rows.append(FoundRow(finding.level, finding.words, finding.next_step, section, panel))
     return rows + [FoundRow("doubtful", remark, "", "", None) for remark in results.remarks]
 
@@ -202,20 +212,13 @@ def worst_joint(results: Results) -> int:
 
 
 def _panel_of(
-    section: str,
-    joint: int,
-    results: Results,
-    charts: Mapping[str, Sequence[Chart]],
-    bins: int,
+    section: str, joint: int, charts: Mapping[str, Sequence[Chart]], draw: Callable[[Chart], Panel]
 ) -> Panel | None:
     """Return a panel of a joint out of the figure of a section, None where it has no such."""
     for chart in charts.get(_CHARTS.get(section, ""), ()):
         if chart.joint == joint:
             key = f"found-{chart.caption.key}"
-            return chart_panel(replace(chart, caption=chart.caption._replace(key=key)), bins)
-    if section == "residuals":
-        panels = figures.residual_panels(results, only=joint)["speed_panels"]
-        return panels[0] if panels else None
+            return draw(replace(chart, caption=chart.caption._replace(key=key)))
     return None
 
 

@@ -7,8 +7,8 @@ from typing import Final
 
 import numpy as np
 
+from hil import report  # its pictures load matplotlib, on first use
 from hil.report.chart import Caption, Chart, Legend, Plot, label
-from hil.report.drawing import chart_panel
 from hil.report.interactive import chart_data, library
 from hil.report.rendering import environment, page_bytes, template_text
 from hil.results.servo_result import ServoResults
@@ -62,7 +62,7 @@ def servo_page_bytes(results: ServoResults, series: Sequence[ServoSeries]) -> by
     context = {
         "results": results,
         "by_joint": by_joint,
-        "motions": [chart_panel(chart, _BINS) for chart in charts],
+        "motions": [report.chart_panel(chart, _BINS) for chart in charts],
         "legends": [
             legend
             for legend in LEGENDS

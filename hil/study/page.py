@@ -7,9 +7,22 @@ from typing import Final, get_args
 
 import numpy as np
 
-from hil.report import drawing
-from hil.report.chart import Caption, Chart, Plot, Trace
+from hil.report.chart import (
+    FIRST,
+    INK,
+    MUTED,
+    SECOND,
+    WIDE,
+    Boxes,
+    Caption,
+    Chart,
+    Plot,
+    Trace,
+    correlations,
+    joined,
+)  # fmt: skip
 from hil.report.numbers import fixed, significant
+from hil.report.panels import Panel, box_panel, chart_panel, matrix_panel
 from hil.report.rendering import environment, page_bytes
 from identification.excitation import Method
 
@@ -19,7 +32,7 @@ from .model_errors import ALL, NONE
 from .results import Criterion, DesignPoint, Quantity, ShownCondition, StudyResults
 from .searches import LABELS
 
-COLOURS: Final = (drawing.FIRST, drawing.SECOND, drawing.INK)
+COLOURS: Final = (FIRST, SECOND, INK)
 _VARIABLES: Final = ("--first", "--second", "--ink")
 _TICKS: Final = (
     (0.7, 0.8, 0.9, 1.0, 1.1, 1.2, 1.3),
@@ -28,6 +41,8 @@ _TICKS: Final = (
 )
 """Of ratios of errors, the first that reach far enough."""
 _NAMES: Final = 150.0  # width of the names of conditions, px
+_POINTS_HEIGHT: Final = 180.0  # of a plot, px
+_POSITION_HEIGHT: Final = 110.0
 
 
 def study_page(results: StudyResults) -> bytes:
@@ -48,7 +63,9 @@ def study_page(results: StudyResults) -> bytes:
         ),
         trajectories=_trajectories(first, results.joint_names),
         correlations=[
-            drawing.matrix_panel(np.array(method.correlation)[:n, :n], names, f"c{k}", method.label)
+            matrix_panel(
+                correlations(np.array(method.correlation)[:n, :n], names, f"c{k}", method.label)
+            )
             for k, method in enumerate(first.methods)
         ],
         boxes={shown.condition: _boxes(shown, results.joint_names) for shown in results.shown},
@@ -76,33 +93,34 @@ _RATIOS: Final[tuple[tuple[tuple[Method, Method], str, str, float], ...]] = (
 """First and second method, label, colour, and place in the row of a condition."""
 
 
-def _ratios(results: StudyResults, motions: str) -> drawing.Panel:
+def _ratios(results: StudyResults, motions: str) -> Panel:
     """Draw the ratio of errors under each condition, with intervals, on one class of motions."""
-    conditions = results.conditions
-    rows = [(float(-k), condition_words(one)) for k, one in enumerate(conditions)]
-    axes = drawing.Axes(
-        _NAMES, 20.0, 560.0 - _NAMES, 22.0 * len(rows), "", f"error over that of A, {motions}",
-        y_limits=(0.6 - len(rows), 0.6), y_names=rows, grid="both",
-    )  # fmt: skip
-    axes.segments(np.array([[0.0, 0.0]]), np.array([[-np.inf, np.inf]]), drawing.MUTED, 1.2)
-    reached = list[float]()
+    rows = [(float(-k), condition_words(one)) for k, one in enumerate(results.conditions)]
+    y_limits = 0.6 - len(rows), 0.6
+    traces = [Trace(np.array(y_limits), MUTED, 1.2, x=np.zeros(2))]
     for (first, second), _, variable, side in _RATIOS:
-        found = [one.comparison(first, second, motions) for one in conditions]
+        found = [one.comparison(first, second, motions) for one in results.conditions]
         colour = f"var({variable})"
         places = np.array([place + side for place, _ in rows])
         ends = np.log10([(row.low or row.ratio, row.high or row.ratio) for row in found])
-        axes.segments(ends, np.column_stack([places, places]), colour, 1.6)
-        axes.dots(np.log10([row.ratio for row in found]), places, colour, 6.0)
-        reached += ends.ravel().tolist()
-    margin = 0.04 * (max(reached) - min(reached)) or 0.1
-    axes.x_limits = (min(reached) - margin, max(reached) + margin)
-    axes.x_names = [
-        (math.log10(tick), f"{tick:g}")
-        for tick in _ticks(*axes.x_limits)
-        if axes.x_limits[0] <= math.log10(tick) <= axes.x_limits[1]
-    ]
+        gap = np.full(len(rows), np.nan)
+        bars = np.column_stack([ends, gap]).ravel()
+        traces.append(Trace(np.column_stack([places, places, gap]).ravel(), colour, 1.6, x=bars))
+        ratios = np.log10([row.ratio for row in found])
+        traces.append(Trace(places, colour, 6.0, x=ratios, dots=True))
+    reached = joined(trace.x for trace in traces[1:] if trace.x is not None)
+    low, high = float(np.nanmin(reached)), float(np.nanmax(reached))
+    margin = 0.04 * (high - low) or 0.1
+    low, high = low - margin, high + margin
+    ticks = [tick for tick in _ticks(low, high) if low <= math.log10(tick) <= high]
     what = "error of torque with B and with the gradient over that with A, by error of the model"
-    return drawing.panel([axes], Caption(f"r{motions}", motions, "", what), 580.0)
+    chart = Chart(
+        Caption(f"r{motions}", motions, "", what), np.empty(0),
+        [Plot(22.0 * len(rows), "", traces, limits=y_limits, names=rows)],
+        f"error over that of A, {motions}", x_range=(low, high),
+        ticks=[math.log10(tick) for tick in ticks], tick_names=[f"{tick:g}" for tick in ticks],
+    )  # fmt: skip
+    return chart_panel(chart, width=560.0, left=_NAMES)
 
 
 def _ticks(low: float, high: float) -> tuple[float, ...]:
@@ -130,21 +148,23 @@ def _figure(point: DesignPoint, quantity: Quantity, condition: str) -> float:
 
 def _points(
     results: StudyResults, criterion: Criterion, quantity: Quantity, condition: str, heading: str
-) -> drawing.Panel:
+) -> Panel:
     """Draw a point for each design: a criterion and what it is meant to foretell."""
-    axes = drawing.single(240.0, heading, CRITERION_WORDS[criterion])
+    traces = []
     for method, colour in zip(LABELS, COLOURS, strict=True):
         points = [point for point in results.designs if point.method == method]
         x = np.array([point.criteria[criterion] for point in points])
         y = np.array([_figure(point, quantity, condition) for point in points])
-        axes.dots(x, y, colour, 6.0, opacity=0.85)
+        traces.append(Trace(y, colour, 6.0, x=x, dots=True))
     relation = results.relation(criterion, quantity, condition)
     note = (
         f"rank correlation {fixed(relation.correlation, 2)}"
         f" ({fixed(relation.low, 2)} to {fixed(relation.high, 2)})"
     )
     key = f"q{criterion}{quantity}"
-    return drawing.panel([axes], Caption(key, "", note, f"{heading} against criterion"))
+    caption = Caption(key, "", note, f"{heading} against criterion")
+    plot = Plot(_POINTS_HEIGHT, heading, traces)
+    return chart_panel(Chart(caption, np.empty(0), [plot], CRITERION_WORDS[criterion]))
 
 
 def _relation_rows(
@@ -163,9 +183,9 @@ def _relation_rows(
     return table
 
 
-def _trajectories(condition: ShownCondition, joint_names: list[str]) -> list[drawing.Panel]:
+def _trajectories(condition: ShownCondition, joint_names: list[str]) -> list[Panel]:
     """Draw the position of each joint in each excitation, on common scales (Fig. 1)."""
-    panels: list[drawing.Panel] = []
+    panels: list[Panel] = []
     for j, name in enumerate(joint_names):
         spans = [
             f"{method.label} {math.degrees(min(method.position[j])):.0f}° to"
@@ -173,14 +193,16 @@ def _trajectories(condition: ShownCondition, joint_names: list[str]) -> list[dra
             for method in condition.methods
         ]
         caption = Caption(f"x{j}", name, "; ".join(spans), "position in each excitation")
-        axes = drawing.single(170.0, "position [rad]", "time [s]", x_ticks=6)
-        for method, colour in zip(condition.methods, COLOURS, strict=True):
-            axes.line(np.array(method.time), np.array(method.position[j]), colour, 1.3)
-        panels.append(drawing.panel([axes], caption))
+        traces = [
+            Trace(np.array(method.position[j]), colour, 1.3, x=np.array(method.time))
+            for method, colour in zip(condition.methods, COLOURS, strict=True)
+        ]
+        plot = Plot(_POSITION_HEIGHT, "position [rad]", traces)
+        panels.append(chart_panel(Chart(caption, np.empty(0), [plot])))
     return panels
 
 
-def _boxes(condition: ShownCondition, joint_names: list[str]) -> list[drawing.Panel]:
+def _boxes(condition: ShownCondition, joint_names: list[str]) -> list[Panel]:
     """Draw mean |e| on the held-out motions, a box per estimate and a panel per joint (Fig. 3)."""
     labels = [method.label for method in condition.methods]
     errors = [np.array(condition.held_out.mean_abs[method.key]) for method in condition.methods]
@@ -194,11 +216,11 @@ def _boxes(condition: ShownCondition, joint_names: list[str]) -> list[drawing.Pa
         key = f"b{condition.condition}{j}"
         what = "mean |e| in N·m"
         caption = Caption(key, name, f"medians {medians}", what)
-        panels.append(drawing.box_panel(caption, columns, COLOURS, "mean |e| [N·m]", labels))
+        panels.append(box_panel(Boxes(caption, columns, COLOURS, "mean |e| [N·m]", labels)))
     return panels
 
 
-def _examples(condition: ShownCondition, joint_names: list[str]) -> list[drawing.Panel]:
+def _examples(condition: ShownCondition, joint_names: list[str]) -> list[Panel]:
     """Draw one held-out motion in time: measured, predicted by each, and the errors (Fig. 4)."""
     held_out = condition.held_out
     time = np.array(held_out.time)
@@ -212,7 +234,7 @@ def _examples(condition: ShownCondition, joint_names: list[str]) -> list[drawing
         ]
         errors = [measured - line.values for line in lines]
         reach = 1.05 * max(float(np.abs(error).max()) for error in errors) or 1.0
-        both = [Trace(measured, drawing.WIDE, 4.0), *lines]
+        both = [Trace(measured, WIDE, 4.0), *lines]
         plots = [Plot(128.0, "torque [N·m]", both)]
         rms = []
         # A row for each error: where there is noise, one line over another would hide it.
@@ -223,5 +245,5 @@ def _examples(condition: ShownCondition, joint_names: list[str]) -> list[drawing
         note = f"RMS error {', '.join(rms)} N·m"
         what = "measured and predicted torque"
         caption = Caption(f"e{condition.condition}{j}", name, note, what)
-        panels.append(drawing.chart_panel(Chart(caption, time, plots)))
+        panels.append(chart_panel(Chart(caption, time, plots)))
     return panels

@@ -1,4 +1,4 @@
-/* Interactive charts in place of the drawings, with BokehJS. Without it the drawings stay.
+/* Interactive charts in place of the pictures, with BokehJS. Without it the pictures stay.
    Text only ever enters as text. */
 (function () {
   "use strict";
@@ -41,13 +41,13 @@
   }
 
   /* Axes of time are linked over all figures but the excitation's, those of frequency within one,
-     and those of speed within a chart. A document of Bokeh's has models of its own, so the axes
+     and a chart may have its own. A document of Bokeh's has models of its own, so the axes
      of two figures follow each other here. */
   var axes = [];
 
   function axisOf(group, chart) {
     var link = chart.foot.indexOf("time") === 0 && group.name !== "excitation" ? "time" : group.name;
-    var key = group.name + (chart.plots[0].origin ? chart.key : "");
+    var key = group.name + (chart.own ? chart.key : "");
     var axis = axes.find(function (other) { return other.key === key; });
     if (axis) return axis;
     var range = new Bokeh.Range1d({ start: chart.range[0], end: chart.range[1] });
@@ -181,6 +181,9 @@
           x1: plot.shaded.map(function (ends) { return ends[1]; })
         }));
       }
+      if (plot.band) {
+        view.strips.push(figure.hstrip({ y0: [plot.band[0]], y1: [plot.band[1]] }));
+      }
       if (plot.origin) {
         ["width", "height"].forEach(function (dimension) {
           var zero = new Bokeh.Span({ location: 0, dimension: dimension, line_width: 1 });
@@ -297,7 +300,7 @@
       item.setAttribute("data-joint-button", String(joint));
       joints.appendChild(item);
     });
-    if (data.joints.length > 1) bar.appendChild(joints);
+    if (data.joints.length > 1 && group.charts[0].joint !== null) bar.appendChild(joints);
     group.figure.insertBefore(bar, group.figure.firstChild);
   }
 

@@ -11,8 +11,9 @@ from matplotlib.figure import Figure
 from matplotlib.text import Text
 
 from hil.cell import Cell
-from hil.plots import save, style
+from hil.plots import save
 from hil.plots.design_picture import draw_design
+from hil.report import picture_style as style
 from identification.excitation import CRITERIA, Design, Objective
 from identification.excitation.constraints import midpoints
 from identification.excitation.criteria import Criterion, friction_of_excitation

@@ -162,7 +162,7 @@ class TestCharts:
 
 
 class TestWithoutScript:
-    def test_has_the_drawings_and_the_views(self, browser, path):
+    def test_has_the_pictures_and_the_views(self, browser, path):
         opened = OpenedPage(browser, path, java_script_enabled=False)
         page = opened.page
         assert page.locator('[data-chart="t0"] > svg').is_visible()
@@ -176,10 +176,10 @@ class TestWithoutScript:
 
 
 class TestPaper:
-    def test_has_the_drawings_of_all_views_and_no_controls(self, opened):
+    def test_has_the_pictures_of_the_chosen_view_and_no_controls(self, opened):
         page = opened.page
         page.emulate_media(media="print")
-        for chart in ("t0", "d0", "f0", "k0"):
+        for chart in ("t0", "k0"):
             assert page.locator(f'[data-chart="{chart}"] > svg').is_visible()
         assert not page.locator(".live, .tools, .tabs").locator("visible=true").count()
 

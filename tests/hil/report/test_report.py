@@ -18,15 +18,15 @@ from typing import Any
 import matplotlib as mpl
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 from matplotlib.image import imread
 
 from hil.report import figures, numbers, page
-from hil.report.chart import thinned
-from hil.report.drawing import _decades, chart_panel, round_ticks, single
+from hil.report.chart import Caption, Chart, Plot, Trace, thinned
 from hil.report.interactive import chart_data, encoded
 from hil.report.page import report_bytes
+from hil.report.panels import chart_panel, matrix_panel
 from hil.report.rendering import environment
 from hil.results.results import Results
 from hil.results.series import ReportSeries, SeriesError
@@ -631,7 +631,7 @@ class TestParameters:
         assert 'class="share"' not in render(make_results(parameters=parameters))
 
     def test_have_a_matrix_of_correlation_from_white_to_black(self, results):
-        svg = figures.correlation_matrix(results).svg
+        svg = matrix_panel(figures.correlation_matrix(results)).svg
         image = re.findall(r"data:image/png;base64,\s*([^\"]*)", svg)[0]
         pixels = imread(io.BytesIO(base64.b64decode(image)))[..., :3]
         assert pixels.shape == (40, 40, 3)
@@ -648,7 +648,7 @@ class TestParameters:
             values = {"estimate": 0.0, "std": 1.0, "truth": -4.0}
             parameter |= {"table2_id": number, **values}
         exchanged = make_results(parameters=parameters)
-        svg = figures.correlation_matrix(exchanged).svg
+        svg = matrix_panel(figures.correlation_matrix(exchanged)).svg
         pattern = rf">(\d+ (?:{first['name']}|{last['name']}))<"
         labels = [*dict.fromkeys(re.findall(pattern, svg))]  # beside rows and columns
         assert labels == [f"{ids[1]} {last['name']}", f"{ids[0]} {first['name']}"]
@@ -850,35 +850,50 @@ class TestNumbers:
         assert numbers.beside(value, std) == text
 
 
-class TestDrawing:
-    @given(st.floats(-1e9, 1e9), st.floats(1e-6, 1e9), st.integers(2, 8))
-    def test_ticks_are_round_in_the_range_and_read_back(self, low, span, most):
-        high = low + max(span, 1e-6 * abs(low))
-        ticks, texts = round_ticks(low, high, most)
-        assert 1 <= len(ticks) <= most + 1
-        assert len(set(texts)) == len(texts)
-        assert all(low - 1e-6 * span <= tick <= high + 1e-6 * span for tick in ticks)
-        read = [float(text.replace("−", "-")) for text in texts]
-        np.testing.assert_allclose(read, ticks, rtol=1e-9, atol=1e-7 * span)
+def one_chart(values, x=None, **changes):
+    """A chart of one line in black."""
+    x = np.arange(float(len(values))) if x is None else x
+    plot = Plot(110.0, "torque [N·m]", [Trace(np.asarray(values), "var(--ink)", 1.0)])
+    return Chart(Caption("t0", "joint_1", "", "torque over time"), x, [plot], **changes)
 
-    @given(st.floats(-9.0, 9.0), st.floats(0.01, 12.0))
-    def test_ticks_of_a_logarithmic_axis_are_in_its_range(self, low, span):
-        names = _decades(low, low + span)
-        assert 1 <= len(names) <= 7
-        for place, text in names:
-            assert low <= place <= low + span
-            assert float(text) == pytest.approx(10.0**place, rel=0.01)
 
-    def test_a_line_is_interrupted_at_nan(self):
-        axes = single(170.0, "torque", "time")
-        axes.line(np.arange(5.0), np.array([0.0, 1.0, np.nan, 1.0, 0.0]), "black", 1.0)
-        (line,) = re.findall(r'd="([^"]*)" style="fill:none;stroke:black', axes.svg("c"))
-        assert (line.count("M"), line.count("L")) == (2, 2)
-        axes.line(np.arange(3.0), np.array([np.nan, 1.0, np.nan]), "red", 1.0)
-        (dot,) = re.findall(r'd="([^"]*)" style="fill:none;stroke:red', axes.svg("c"))
-        assert re.fullmatch(r"M[\d.]+ [\d.]+h0", dot)
+def texts_of(panel, anchor):
+    """Texts of a picture with this anchor: those of the vertical axis end at it."""
+    return re.findall(rf"<text style=[^>]*text-anchor:{anchor}[^>]*>([^<]*)<", panel.svg)
 
-    def test_of_a_report_loads_no_plotting_library(self):
+
+class TestPictures:
+    @given(st.floats(-1e6, 1e6), st.floats(1e-3, 1e6))
+    @settings(max_examples=25)
+    def test_have_at_least_three_ticks_of_y_that_differ(self, low, span):
+        texts = texts_of(chart_panel(one_chart([low, low + max(span, 1e-6 * abs(low))])), "end")
+        assert len(texts) >= 3 and len(set(texts)) == len(texts)
+
+    @pytest.mark.parametrize("values", [[0.3, 40.0], [1e-9, 1e9], [1.2, 1.9]])
+    def test_of_spectra_have_ticks_of_both_axes(self, values):
+        chart = one_chart(values, np.array([1.0, 80.0]), log=True)
+        limits = 0.8 * min(values), 1.25 * max(values)
+        panel = chart_panel(replace(chart, plots=[replace(chart.plots[0], limits=limits)]))
+        shown = [float(text.replace("−", "-")) for text in texts_of(panel, "end") if text]
+        assert shown and all(0.5 * values[0] <= value <= 2.0 * values[1] for value in shown)
+
+    def test_interrupt_a_line_at_nan(self):
+        panel = chart_panel(one_chart([0.0, 1.0, np.nan, 1.0, 0.0]))
+        (line,) = re.findall(r'd="([^"]*)"[^>]*stroke:var\(--ink\)', panel.svg)
+        assert [len(part.split()) for part in line.split("M")] == [0, 4, 4]
+
+    def test_have_the_colours_of_the_page_and_no_id_twice(self, html):
+        panel = chart_panel(one_chart([0.0, 1.0]))
+        assert not re.search(r":#[0-9a-f]{6}|font-family|<style", panel.svg)
+        ids = re.findall(r' id="([^"]*)"', html)
+        assert len(set(ids)) == len(ids) > 50
+
+    def test_do_not_depend_on_what_was_drawn_before(self):
+        alone = chart_panel(one_chart([0.0, 1.0])).svg
+        chart_panel(one_chart([-1e6, 5.0, 2e3]))
+        assert chart_panel(one_chart([0.0, 1.0])).svg == alone
+
+    def test_load_no_plotting_library_before_the_first(self):
         code = (
             "import sys, hil.report.interactive as i, hil.report.output_files; i.library();"
             " sys.exit(bool({'matplotlib', 'bokeh'} & {*sys.modules}))"

@@ -22,7 +22,7 @@ from hil.cli import app
 from hil.identified.annotate import FOLDER, PREDICTED, RESIDUAL
 from hil.pipeline import stored_identification
 from hil.pipeline.identified_model import predicted_parts
-from hil.plots.chart_picture import draw_charts
+from hil.report.chart_picture import draw_charts
 from hil.report.output_files import REPORT
 from hil.report.rollout_section import overview_charts, overview_legends
 from hil.results.provenance import PARAMETERS_JSON

@@ -1,4 +1,4 @@
-"""Charts of a report as a picture."""
+"""Charts as pictures, by matplotlib."""
 
 from __future__ import annotations
 
@@ -13,8 +13,8 @@ from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 from matplotlib.ticker import NullFormatter, NullLocator, StrMethodFormatter
 
-from hil.plots import style
-from hil.report.chart import Chart, Legend, Plot
+from hil.report import picture_style as style
+from hil.report.chart import Chart, Legend, Plot, thinned
 
 _WIDTH: Final = 9.0  # inch
 _PIXELS: Final = 110.0  # of a page, per inch of height
@@ -61,7 +61,7 @@ def draw_charts(
 def draw_torque(axes: Axes, chart: Chart, legends: Sequence[Legend]) -> None:
     """Draw the first plot of a chart into axes of somebody's own figure."""
     plot = chart.plots[0]
-    _draw_plot(axes, plot, chart)
+    draw_plot(axes, plot, chart, _POINTS)
     axes.set_title(chart.caption.title)
     axes.set_xlabel(chart.foot)
     axes.set_ylabel(plot.heading)
@@ -95,32 +95,53 @@ def _draw(chart: Chart, rows: Sequence[Axes], *, is_last: bool) -> None:
     rows[0].set_title(chart.caption.title)
     rows[0].set_title(chart.caption.note, loc="right", fontsize=style.SMALL, color=style.MUTED)
     for axes, plot in zip(rows, chart.plots, strict=True):
-        _draw_plot(axes, plot, chart)
+        draw_plot(axes, plot, chart, _POINTS)
         axes.set_title(plot.heading, loc="left", fontsize=style.SMALL, color=style.MUTED)
         axes.tick_params(labelbottom=is_last and axes is rows[-1])
     if is_last:
         rows[-1].set_xlabel(chart.foot)
 
 
-def _draw_plot(axes: Axes, plot: Plot, chart: Chart) -> None:
+def draw_plot(axes: Axes, plot: Plot, chart: Chart, scale: float, bins: int | None = None) -> None:
+    """Draw a plot of a chart into axes, without its texts.
+
+    Args:
+        axes: of matplotlib.
+        plot: one of the chart's.
+        chart: its horizontal axis.
+        scale: points of a pixel.
+        bins: intervals of x, in each of which a line has at most two points; None: all.
+    """
     for start, stop in plot.shaded:
-        axes.axvspan(start, stop, color=style.colour("band"), linewidth=0.0)
+        axes.axvspan(start, stop, color=style.colour("band"), linewidth=0.0, zorder=0.2)
+    if plot.band is not None:
+        axes.axhspan(*plot.band, color=style.colour("band"), linewidth=0.0, zorder=0.2)
+    if plot.origin:
+        axes.axhline(0.0, color=style.colour("muted"), linewidth=scale)
+        axes.axvline(0.0, color=style.colour("muted"), linewidth=scale)
     for trace in plot.traces:
         x = chart.x if trace.x is None else trace.x
-        size = trace.width * _POINTS
+        values = trace.values
+        size = trace.width * scale
         colour = style.colour(trace.colour)
         if trace.dots:
-            axes.plot(x, trace.values, "o", color=colour, markersize=size, markeredgewidth=0.0)
-        else:
-            line = "--" if trace.dashed else "-"
-            axes.plot(x, trace.values, line, color=colour, linewidth=size)
+            axes.plot(x, values, "o", color=colour, markersize=size, markeredgewidth=0.0)
+            continue
+        if bins is not None and trace.x is None:
+            x, values = thinned(x, values, bins)
+        line = "--" if trace.dashed else "-"
+        axes.plot(x, values, line, color=colour, linewidth=size)
     if chart.log:
-        axes.loglog()
+        if axes.get_yscale() != "log":
+            axes.loglog()
         axes.yaxis.set_major_formatter(StrMethodFormatter("{x:g}"))
         few = plot.y_limits[1] < 20.0 * plot.y_limits[0]
         axes.yaxis.set_minor_formatter(StrMethodFormatter("{x:g}") if few else NullFormatter())
     axes.set_xlim(*chart.x_limits)
     axes.set_ylim(*plot.y_limits)
     if chart.ticks:
-        axes.set_xticks(chart.ticks, [f"{tick:g}" for tick in chart.ticks])
+        names = chart.tick_names or [f"{tick:g}" for tick in chart.ticks]
+        axes.set_xticks(chart.ticks, names)
         axes.xaxis.set_minor_locator(NullLocator())
+    if plot.names:
+        axes.set_yticks([at for at, _ in plot.names], [text for _, text in plot.names])

@@ -5,7 +5,7 @@ from __future__ import annotations
 import re
 import threading
 import warnings
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from functools import cache
 from typing import Any
@@ -45,7 +45,7 @@ _STYLE = {
 
 
 @cache
-def _palette() -> dict[str, str]:
+def palette() -> Mapping[str, str]:
     """Return the colours of the pages on paper, by variable of their style sheet."""
     root = template_text("report.css").partition("}")[0]
     return dict(re.findall(r"--([\w-]+): (#[0-9a-f]+);", root))
@@ -53,19 +53,22 @@ def _palette() -> dict[str, str]:
 
 def colour(variable: str) -> str:
     """Return the colour of a variable of the style sheet: ``ink``, ``--ink`` or ``var(--ink)``."""
-    return _palette()[variable.removeprefix("var(").removesuffix(")").removeprefix("--")]
+    return palette()[variable.removeprefix("var(").removesuffix(")").removeprefix("--")]
 
 
 _settings = threading.RLock()
 
 
 @contextmanager
-def page() -> Iterator[None]:
-    """Draw with fixed settings of matplotlib, one thread at a time (settings are global)."""
+def page(**changes: Any) -> Iterator[None]:
+    """Draw with fixed settings of matplotlib and these changes, one thread at a time.
+
+    The settings of matplotlib are global.
+    """
     with _settings, warnings.catch_warnings(), mpl.rc_context():
         # A name may have glyphs that are missing in DejaVu.
         warnings.filterwarnings("ignore", message=r"Glyph \d+")
         mpl.rcdefaults()
-        settings: Any = {"svg.fonttype": "none", "svg.hashsalt": "hil", "text.parse_math": False}
-        mpl.rcParams.update(settings | _STYLE)
+        fixed: Any = {"svg.fonttype": "none", "svg.hashsalt": "hil", "text.parse_math": False}
+        mpl.rcParams.update(fixed | _STYLE | changes)
         yield
