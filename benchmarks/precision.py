@@ -252,7 +252,7 @@ def _ended(
     scale[model.friction_part] = [
         drift[term.owner] if term.term.is_friction else 1.0 for term in model.friction.terms
     ]
-    quantities = measured.wanted.quantities
+    quantities = measured.required.quantities
     planted = dict(zip(model.parameter_names, scale * planted_values(cell), strict=True))
     estimate = measured.estimate
     # A chosen effect, such as torque ripple, has no planted parameters: it counts as estimated.
@@ -266,11 +266,11 @@ def _ended(
         reached=[quantity.half for quantity in record.looks[-1].reached],
         largest=[
             requirement.value
-            * float(np.max((error / quantities.allowed)[measured.wanted.owners == k]))
+            * float(np.max((error / quantities.allowed)[measured.required.owners == k]))
             for k, requirement in enumerate(requirements)
         ],
         inside=[
-            float(np.mean((error <= measured.half)[measured.wanted.owners == k]))
+            float(np.mean((error <= measured.half)[measured.required.owners == k]))
             for k in range(len(requirements))
         ],
         within=float(np.mean(within)),

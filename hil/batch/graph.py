@@ -275,10 +275,10 @@ class _Batch:
                 for campaign in reversed(waiting)
                 if types[campaign.key] not in arms
             }
-            asked = list(first.values()) or waiting
-            waiting = [campaign for campaign in waiting if campaign not in asked]
-            while asked:
-                asked = self._decide(asked, arms)
+            undecided = list(first.values()) or waiting
+            waiting = [campaign for campaign in waiting if campaign not in undecided]
+            while undecided:
+                undecided = self._decide(undecided, arms)
             arms |= {
                 arm: campaign.settings
                 for arm, campaign in first.items()
@@ -288,18 +288,20 @@ class _Batch:
 
     def _decide(self, campaigns: Sequence[_Campaign], arms: dict[str, Settings]) -> list[_Campaign]:
         """Decide settings; return the campaigns to repeat without archives that are unusable."""
-        asked = []
+        undecided = []
         for campaign in campaigns:
             arm_settings = arms.get(campaign.arm_type)
             refs = archives_for_settings(campaign.refs, arm_settings)
             campaign.settings = cached_settings(refs, self.options, arm_settings, self.cache)
             if campaign.settings is None:
-                asked.append((campaign, (refs, self.options, arm_settings, self.cache)))
-        tasks = [ClusterTask(c.key.campaign, decide_settings, arguments) for c, arguments in asked]
+                undecided.append((campaign, (refs, self.options, arm_settings, self.cache)))
+        tasks = [
+            ClusterTask(c.key.campaign, decide_settings, arguments) for c, arguments in undecided
+        ]
         again = []
-        archives = sum(len(refs) for _, (refs, *_) in asked)
+        archives = sum(len(refs) for _, (refs, *_) in undecided)
         results = self._results(tasks, "deciding settings", archives)
-        for (campaign, (refs, *_)), decision in zip(asked, results, strict=True):
+        for (campaign, (refs, *_)), decision in zip(undecided, results, strict=True):
             if isinstance(decision, SkippedArchive):  # perhaps an archive ends its process
                 alone = [ClusterTask(ref.origin, open_only, (ref,)) for ref in refs]
                 opened = self._results(alone, "opening archives one by one", len(alone))

@@ -1,4 +1,4 @@
-"""Identification of a campaign: the estimate from its archives, with its conduct."""
+"""Identification of a campaign: the estimate from its archives, with its execution log."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from hil.pipeline.identify_folder import identify_recorded
 from hil.pipeline.options import Options
 
 from .folder import CampaignFolder
-from .status import conduct_of
+from .status import execution_log_of
 
 
 @one_thread()
@@ -25,12 +25,12 @@ def identify_campaign(
     Raises:
         InputError: the folder has no complete excitation.
     """
-    return with_conduct(identify_recorded(root, reporter, options, predict=predict), root)
+    return with_execution_log(identify_recorded(root, reporter, options, predict=predict), root)
 
 
-def with_conduct(identification: Identification, root: Path) -> Identification:
-    """Return an identification of a campaign folder with the conduct of the campaign."""
-    conduct = conduct_of(CampaignFolder(root))
+def with_execution_log(identification: Identification, root: Path) -> Identification:
+    """Return an identification of a campaign folder with the execution log of the campaign."""
+    execution_log = execution_log_of(CampaignFolder(root))
     return replace(
-        identification, results=identification.results.model_copy(update={"conduct": conduct})
+        identification, results=identification.results.model_copy(update={"conduct": execution_log})
     )

@@ -36,7 +36,7 @@ from hil.pipeline.prepared import (
 )
 from hil.pipeline.sources import Source, gather_sources
 from hil.precision.given_recordings import given_sources
-from hil.precision.required_quantities import ReferenceMotions, Wanted
+from hil.precision.required_quantities import ReferenceMotions, RequiredQuantities
 from hil.precision.requirements import Requirement, require_known, requirements_from
 from identification.estimators.delay import CombinedDelay, delay_sensitivity
 from identification.estimators.torque_scale import absolute
@@ -56,7 +56,7 @@ _REFERENCE_PERIOD: Final = 0.04  # s
 class MeasuredMotion:
     """Required quantities (k,) by some repetitions, with halves of their 95 % intervals."""
 
-    wanted: Wanted
+    required: RequiredQuantities
     values: Array  #: (k,)
     half: Array  #: (k,)
     noise: Array  #: share of the variance that falls with repetitions (k,)
@@ -97,10 +97,10 @@ class PrecisionMeter:
     def measure(self, paths: Sequence[Path]) -> PrecisionLook:
         """Return the precision that some repetitions give together; archives are read once."""
         measured = self.estimate(paths)
-        ratios = measured.half / measured.wanted.quantities.allowed
+        ratios = measured.half / measured.required.quantities.allowed
         reached = []
         for k, requirement in enumerate(self._requirements):
-            mine = np.flatnonzero(measured.wanted.owners == k)
+            mine = np.flatnonzero(measured.required.owners == k)
             worst = int(mine[np.argmax(ratios[mine])])
             more = [
                 further(len(paths), ratios[direction], measured.noise[direction])
@@ -109,7 +109,7 @@ class PrecisionMeter:
             counts = [count for count in more if count is not None]
             most = max(counts) if len(counts) == len(more) else None
             half = float(ratios[worst]) * requirement.value
-            reached.append(Reached(str(requirement), measured.wanted.labels[worst], half, most))
+            reached.append(Reached(str(requirement), measured.required.labels[worst], half, most))
         return PrecisionLook(len(paths), tuple(reached))
 
     def estimate(self, paths: Sequence[Path]) -> MeasuredMotion:
@@ -140,12 +140,12 @@ class PrecisionMeter:
         values = pooled.values
         weights = inverse_variance(pooled.noise_std**2)
         information = estimation.result.factor.weighted(weights).A + posterior.precision
-        wanted = self._reference.wanted(
+        required = self._reference.required(
             self._requirements, values, information / posterior.design_effect
         )
-        directions = wanted.quantities.directions
+        directions = required.quantities.directions
         own, with_scale = (_variances(directions, each) for each in (stated, absolute(stated)))
-        variance = np.where(wanted.absolute, with_scale, own)
+        variance = np.where(required.absolute, with_scale, own)
         # The errors of delay, gears and torque scale, which are in it as well, do not fall.
         of_rows = _variances(directions, posterior.free(estimation.result.factor).estimate)
         moved = np.asarray(np.linalg.solve(information, directions.T))
@@ -154,7 +154,7 @@ class PrecisionMeter:
         of_repetitions = [factor.of_blocks(longest) for factor in of_repetitions]
         earlier = [recording.reduction.factor for recording in self._earlier]
         return MeasuredMotion(
-            wanted=wanted,
+            required=required,
             values=directions @ values,
             half=stated.interval_factor * np.sqrt(variance),
             noise=np.minimum(of_rows / variance, 1.0)

@@ -1,4 +1,4 @@
-"""Progress of a campaign with the next command, and its conduct for the report."""
+"""Progress of a campaign with the next command, and its execution log for the report."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from hil.base.safe_input import path_exists
 from hil.base.terminal_text import plural, typed
 from hil.cell import Cell
 from hil.design.result import RESULT, DesignResult
-from hil.results.results import ConductResult, PrecisionResult, Results, StepResult
+from hil.results.results import ExecutionLogResult, PrecisionResult, Results, StepResult
 from identification.text import percentage
 
 from .dry_run import DryRunRecord
@@ -287,8 +287,8 @@ def _reported(folder: CampaignFolder) -> CampaignStep:
     return CampaignStep("done", str(folder.report))
 
 
-def conduct_of(folder: CampaignFolder) -> ConductResult:
-    """Return the conduct of a campaign from its files; one that cannot be read is in its step.
+def execution_log_of(folder: CampaignFolder) -> ExecutionLogResult:
+    """Return the execution log of a campaign by its files; an unreadable one is in its step.
 
     Raises:
         CampaignFolderError: the manifest cannot be read.
@@ -305,7 +305,7 @@ def conduct_of(folder: CampaignFolder) -> ConductResult:
         repeated = steps["repetitions"]
         details = (*repeated.details, record.message)
         steps["repetitions"] = replace(repeated, details=details)
-    return ConductResult(
+    return ExecutionLogResult(
         steps=[
             StepResult(
                 step=name,

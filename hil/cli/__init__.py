@@ -91,26 +91,26 @@ def as_json(error: BaseException) -> dict[str, Any]:
 
 
 @contextmanager
-def errors_as_json(asked: bool) -> Iterator[None]:
-    """Print an exception of the block as JSON if `asked`; Ctrl-C is an `OperatorStopError`."""
+def errors_as_json(requested: bool) -> Iterator[None]:
+    """Print an exception of the block as JSON if `requested`; Ctrl-C is an `OperatorStopError`."""
     try:
         yield
     except typer.Exit:  # the command has printed its result
         raise
     except KeyboardInterrupt as interrupt:
         stopped = OperatorStopError("interrupted")
-        _print(stopped, asked)
+        _print(stopped, requested)
         raise stopped from interrupt
     except Exception as error:
         improve(error)
         if isinstance(error, typer.BadParameter):  # typer checks choices by pydantic
             error.message = error.message.removeprefix("Value error, ")
-        _print(error, asked)
+        _print(error, requested)
         raise
 
 
-def _print(error: Exception, asked: bool) -> None:
-    if asked:
+def _print(error: Exception, requested: bool) -> None:
+    if requested:
         with suppress(OSError):  # the reader has closed the pipe; the exit status remains
             typer.echo(json.dumps(as_json(error)))
 
@@ -244,14 +244,16 @@ class CommandGroup(TyperGroup):
 
     def make_context(self, info_name: str | None, args: list[str], *more: Any, **extra: Any) -> Any:
         """Return the context of one call; it records whether JSON is requested."""
-        asked = asks_for_json(args)
+        requested = asks_for_json(args)
         args, notes = with_present_names(args)
         for note in notes:
             typer.echo(f"note: {note}", err=True)
-        with errors_as_json(asked):
+        with errors_as_json(requested):
             context = super().make_context(info_name, args, *more, **extra)
-        context.meta[_JSON] = asked
-        quiet = asked or bool({"-q", "--quiet"} & {*args}) or args[:1] == [] or args[0] in OWN_LINES
+        context.meta[_JSON] = requested
+        quiet = (
+            requested or bool({"-q", "--quiet"} & {*args}) or args[:1] == [] or args[0] in OWN_LINES
+        )
         context.meta[_LINES] = "" if quiet else args[0]
         return context
 
@@ -265,8 +267,8 @@ class CommandGroup(TyperGroup):
             return super().invoke(ctx)
 
 
-def _print_versions(asked: bool) -> None:
-    if asked:
+def _print_versions(requested: bool) -> None:
+    if requested:
         hil, *others = (f"{name} {number}" for name, number in software().items())
         typer.echo(f"{hil} ({', '.join(others)})")
         raise typer.Exit

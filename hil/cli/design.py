@@ -157,39 +157,39 @@ def design(
     stated = bool(precision)
     if purpose is not None:
         precision = precision or ["mass of payload 1 %"]
-        asked = there or (
+        requested = there or (
             payload_search(loaded.joint_limits) if settings is None else load_settings(settings)
         )
     elif quick:
-        asked = short_search() if precision else quick_settings(loaded)
+        requested = short_search() if precision else quick_settings(loaded)
     elif settings is not None:
-        asked = load_settings(settings)
+        requested = load_settings(settings)
     else:
-        asked = preset(method or "gradient") if method or there is None else there
+        requested = preset(method or "gradient") if method or there is None else there
     if given:
-        asked = asked.replaced(objective={"given": [str(path.resolve()) for path in given]})
+        requested = requested.replaced(objective={"given": [str(path.resolve()) for path in given]})
     if precision:
         requirements = [str(requirement) for requirement in requirements_from(precision)]
-        asked = asked.replaced(objective={"precision": requirements})
+        requested = requested.replaced(objective={"precision": requirements})
     if seed is not None:
-        asked = asked.replaced(seed=seed)
+        requested = requested.replaced(seed=seed)
     if limits_only:
-        asked = asked.kinematic()
+        requested = requested.kinematic()
     if payload_centre is not None and purpose is None:
         remedy = "add --for payload"
         raise InputError(None, "needs a payload", field="--payload-centre", remedy=remedy)
 
-    recordings = [Path(name) for name in asked.objective.given]
+    recordings = [Path(name) for name in requested.objective.given]
     prior_knowledge = given_of(loaded, recordings) if recordings else None
     assumed = None
     if purpose is not None:
         assumed = assumed_payload(loaded, payload_mass, centre_from(payload_centre))
-    promise = _promise(loaded, asked.objective.precision, recordings, reporter, assumed)
+    promise = _promise(loaded, requested.objective.precision, recordings, reporter, assumed)
     planned = 1 if promise is None else 2 if purpose else loaded.campaign.repetitions
     if promise is not None and purpose is None and settings is None and there is None:
-        usual_length = asked.constraints.max_duration
-        asked = promise.lengthened(asked, planned)
-        if (longest := asked.constraints.max_duration) > usual_length:
+        usual_length = requested.constraints.max_duration
+        requested = promise.lengthened(requested, planned)
+        if (longest := requested.constraints.max_duration) > usual_length:
             reporter.say(
                 f"repetitions of a motion of {usual_length:g} s would not meet the precision: one "
                 f"of at most {longest:g} s is searched"
@@ -245,7 +245,7 @@ def design(
         done = run_design(
             folder,
             loaded,
-            asked,
+            requested,
             reporter,
             workers=workers or len(os.sched_getaffinity(0)),
             stop=lambda: stop.requested,

@@ -113,8 +113,8 @@ def screen(result: Look) -> list[str]:
 
 def question(choices: Sequence[TiedReading]) -> list[Paragraph]:
     """Return a question about readings that fit alike, and the setting for each of them."""
-    asked = f"{choices[0].aspect}: {fit_alike(choices)}; choose one line for the map:"
-    parts = [Paragraph(asked)]
+    question = f"{choices[0].aspect}: {fit_alike(choices)}; choose one line for the map:"
+    parts = [Paragraph(question)]
     for number, choice in enumerate(choices, 1):
         error = "" if choice.error is None else f" (error {percentage(choice.error, 2)})"
         reading = choice_text(choice)

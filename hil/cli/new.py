@@ -116,8 +116,8 @@ def new(
     fixed = figures(fix or [], "--fix", "--fix finger=0.02 (rad or m)")
     described: NewCell | None = None
     if urdf is not None:
-        asked = (from_controller, from_archive_file, controller)
-        moved = design_only or any(source is not None for source in asked)
+        sources = (from_controller, from_archive_file, controller)
+        moved = design_only or any(source is not None for source in sources)
         described = cell_of_urdf(urdf, fixed, base=base, tip=tip, moved=moved)
     elif dh is not None:
         described = cell_of_dh(dh, convention_of(convention), fixed)

@@ -64,20 +64,20 @@ class Required:
         contact = quantity(self.contact, "N", "--contact")
         payload = quantity(self.payload_change, "kg", "--payload-change")
         distance = quantity(self.flange_error, "m", "--flange-error")
-        asked = tuple(map(_purpose, self.purposes or []))
+        requested = tuple(map(_purpose, self.purposes or []))
         for name, limit, option in (
             ("contact", contact, "--contact 50N"),
             ("payload", payload, "--payload-change 0.5kg"),
         ):
-            if name in asked and limit is None:
+            if name in requested and limit is None:
                 problem = f"{name} needs a limit to be judged by"
                 raise InputError(None, problem, field="--for", remedy=f"add {option}")
-        if "parameters" in asked:
+        if "parameters" in requested:
             problem = "single parameters are counted, not judged"
             remedy = "require a precision of them with `hil design --precision`"
             raise InputError(None, problem, field="--for", remedy=remedy)
         limits = PurposeLimits(contact=contact, payload=payload, distance=distance or 0.0)
-        return {"purposes": asked, "required": limits}
+        return {"purposes": requested, "required": limits}
 
 
 def _purpose(text: str) -> PurposeName:

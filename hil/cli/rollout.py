@@ -89,7 +89,7 @@ def rollout(
         again: Identify again even if results.json and parameters.json are there.
     """
     reporter = make_reporter(quiet=quiet or json, messages=verbose)
-    asked = RolloutOptions(samples, seed, feedback, servo_from(servo), polish)
+    requested = RolloutOptions(samples, seed, feedback, servo_from(servo), polish)
     options = how.options(split=split, estimator=estimator)
     output = _folder(output, archives)
     as_usual = options == Options() and not again
@@ -102,7 +102,7 @@ def rollout(
     else:
         arm = read_or_identify(archives, options, reporter, reuse=as_usual, predict=predict or ())
         good = arm.good
-        simulated = roll_out(arm, asked, reporter)
+        simulated = roll_out(arm, requested, reporter)
     if output is not None:
         _write(output, simulated, reporter)
     if json:

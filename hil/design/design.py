@@ -227,7 +227,7 @@ def _searched(
 
 def run_search(
     cell: Cell,
-    asked: DesignSettings,
+    requested: DesignSettings,
     reporter: Reporter,
     *,
     workers: int = 2,
@@ -242,8 +242,8 @@ def run_search(
         OperatorStopError: it was stopped before there was a feasible motion.
         SettingsError, CellError: the settings do not fit the cell.
     """
-    problem = problem or problem_of(cell, asked)
-    settings = search_settings(asked)
+    problem = problem or problem_of(cell, requested)
+    settings = search_settings(requested)
     checker = problem.constraints.checker
     total = excitation.most_evaluations(settings)
     if checker is not None and checker.exceptions is not None:
@@ -272,7 +272,7 @@ def run_search(
                 population, settings, journal=journal, progress=update, scored=scored, stop=stop
             )
         except excitation.NoFeasibleMotionError as error:
-            raise _without_motion(error, cell, asked, checker) from error
+            raise _without_motion(error, cell, requested, checker) from error
         if design.complete:  # with fewer motions than the limit
             task.advance(total - done, "done")
     if design.exhausted:
@@ -286,13 +286,13 @@ def run_search(
 def _without_motion(
     error: excitation.NoFeasibleMotionError,
     cell: Cell,
-    asked: DesignSettings,
+    requested: DesignSettings,
     checker: excitation.CollisionChecker | None,
 ) -> HilError:
     """Return the error about a search that was stopped, or ended, without a feasible motion."""
     frame = AngleFrame.of(cell)
     if not error.stopped:
-        return no_excitation(error, frame, checker, asked, cell.model.chain)
+        return no_excitation(error, frame, checker, requested, cell.model.chain)
     text = infeasible_text(error, frame)
     return OperatorStopError(f"stopped before a feasible motion was found: {text}")
 

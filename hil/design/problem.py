@@ -172,7 +172,7 @@ def _genome(
     )
 
 
-def _inside(cell: Cell, asked: list[float], shown: Array) -> Array:
+def _inside(cell: Cell, requested: list[float], shown: Array) -> Array:
     """Return the URDF angles (n,) of a posture that must be within the limits."""
     frame = AngleFrame.of(cell)
     limits = cell.joint_limits
@@ -183,7 +183,7 @@ def _inside(cell: Cell, asked: list[float], shown: Array) -> Array:
             None,
             f"{cell.joint_names[joint]} = {shown[joint]:g} deg is outside its limits, {ends[0]:g} "
             f"to {ends[1]:g} deg ({frame.whose})",
-            field=f"sines.offset = {asked}",
+            field=f"sines.offset = {requested}",
             remedy="choose a posture within the limits",
         )
     return np.asarray(angles)

@@ -197,12 +197,12 @@ class DesignSettings(Table):
             )
             remedy = "choose the method gradient, or make it 100 with [via_points]"
             raise FieldError(problem, remedy)
-        asked = self.constraints
+        requested = self.constraints
         length = None if self.sines is None else self.sines.length
-        if length is not None and not asked.min_duration <= length <= asked.max_duration:
+        if length is not None and not requested.min_duration <= length <= requested.max_duration:
             problem = (
                 f"[sines] length = {length:g} s is not between [constraints] min_duration = "
-                f"{asked.min_duration:g} s and max_duration = {asked.max_duration:g} s"
+                f"{requested.min_duration:g} s and max_duration = {requested.max_duration:g} s"
             )
             raise FieldError(problem, "change one")
         return self

@@ -28,7 +28,7 @@ _JOINTS: Final = ("name", "joint_names")  # fields of a message that name joints
 _NO_FACTS: Final = (*_JOINTS, "header", "layout", "variance")
 
 
-class WantedFacts(NamedTuple):
+class ExtraChannels(NamedTuple):
     """What is read of each log beside its motion; temperatures are found by their names.
 
     Attributes:
@@ -40,16 +40,16 @@ class WantedFacts(NamedTuple):
     entry: str = ""
 
 
-def facts_of(source: Path, wanted: WantedFacts, files: LogFiles) -> dict[str, float | str]:
+def facts_of(source: Path, extra: ExtraChannels, files: LogFiles) -> dict[str, float | str]:
     """Return the means of columns of numbers, and the texts of others, by their names.
 
     What cannot be read is left out: the motion has been read, and counts without it.
     """
     facts: dict[str, float | str] = {}
-    if wanted.entry and source.suffix.lower() == ".mcap":
-        facts.update(_entries(source, wanted.entry))
+    if extra.entry and source.suffix.lower() == ".mcap":
+        facts.update(_entries(source, extra.entry))
     if source.is_dir() or source.suffix.lower() in (*BAGS, ".zst", ".zstd"):
-        facts.update(_of_topics(source, wanted.columns))
+        facts.update(_of_topics(source, extra.columns))
         return facts
     try:
         channels = channels_of(source, files=files)
@@ -57,10 +57,10 @@ def facts_of(source: Path, wanted: WantedFacts, files: LogFiles) -> dict[str, fl
     except SourceError:
         return facts
     for channel in channels:
-        is_wanted = channel.name in wanted.columns
-        if is_wanted and channel.text:
+        is_named = channel.name in extra.columns
+        if is_named and channel.text:
             facts[channel.name] = channel.text
-        elif is_wanted or _TEMPERATURE.search(f"{channel.name} {channel.unit or ''}"):
+        elif is_named or _TEMPERATURE.search(f"{channel.name} {channel.unit or ''}"):
             facts.update(_means(table, channel.name))
     return facts
 

@@ -24,7 +24,7 @@ from hil.batch.cache import CacheError, CacheLocation, cache_errors, code_digest
 from hil.batch.cluster import Cluster, ClusterTask, SkippedArchive, reason_of
 from hil.batch.places import SUFFIX, Stamp, name_of, stamp_of
 from hil.cell import Cell
-from hil.fleet.extra_channels import WantedFacts, facts_of
+from hil.fleet.extra_channels import ExtraChannels, facts_of
 from hil.importers.array_files import READERS
 from hil.importers.bag_map import BagMap
 from hil.importers.bags import SUFFIXES as BAGS
@@ -125,7 +125,7 @@ class LogReading:
     robot_of: RobotOf
     options: ImportOptions
     robot: str
-    facts: WantedFacts = field(default_factory=WantedFacts)
+    facts: ExtraChannels = field(default_factory=ExtraChannels)
 
     @classmethod
     def of(
@@ -133,7 +133,7 @@ class LogReading:
         robot_of: RobotOf,
         options: ImportOptions,
         description: str,
-        facts: WantedFacts = WantedFacts(),  # noqa: B008 - frozen
+        facts: ExtraChannels = ExtraChannels(),  # noqa: B008 - frozen
     ) -> LogReading:
         """Return how logs are read of a robot, described by this text beside its files.
 

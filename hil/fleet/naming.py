@@ -15,7 +15,7 @@ from hil.base.errors import InputError
 from hil.base.files import digest
 from hil.batch.archive_discovery import ArchiveRef
 from hil.batch.places import as_file
-from hil.fleet.extra_channels import WantedFacts
+from hil.fleet.extra_channels import ExtraChannels
 
 ROBOT: Final = "{robot}"
 DATE: Final = "{date}"
@@ -74,10 +74,10 @@ class RobotNaming:
         return cls("path", text)
 
     @property
-    def facts(self) -> WantedFacts:
+    def facts(self) -> ExtraChannels:
         """What is read of each log for it."""
         columns = (self.name,) if self.by == "column" else ()
-        return WantedFacts(columns, self.name if self.by == "metadata" else "")
+        return ExtraChannels(columns, self.name if self.by == "metadata" else "")
 
     @cached_property
     def _pattern(self) -> re.Pattern[str]:

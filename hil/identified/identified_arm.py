@@ -458,10 +458,10 @@ def _identified(
     if not RecordedCampaign(first).sealed:
         return identification
     from hil.campaign.identified_campaign import (
-        with_conduct,  # which loads what executes a campaign
+        with_execution_log,  # which loads what executes a campaign
     )
 
-    return with_conduct(identification, first)
+    return with_execution_log(identification, first)
 
 
 def write_arm(

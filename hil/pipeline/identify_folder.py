@@ -53,7 +53,7 @@ def identify_recorded(
 ) -> Identification:
     """Identify from the complete archives of a campaign folder; `predict` adds held-out archives.
 
-    How it was conducted is added by :func:`hil.campaign.identified_campaign.with_conduct`.
+    How it was conducted is added by :func:`hil.campaign.identified_campaign.with_execution_log`.
 
     Raises:
         InputError: the folder has no complete excitation.

@@ -119,6 +119,7 @@ def _consistency(model: RobotModel, check: ConsistencyCheck) -> results.Consiste
         unconstrained_in_sample=consistent.unconstrained_relative_error,
         shift=consistent.shift,
         status=consistent.status,
+        moved=check.shifted_parameters,
         bounds=check.violations,
         links=results.LinkResult.rows(
             joint=model.joint_names,
@@ -126,7 +127,7 @@ def _consistency(model: RobotModel, check: ConsistencyCheck) -> results.Consiste
             centre=inertial[:, 6:9] / inertial[:, 9:],
             rotor_inertia=[standard.get(f"I{k + 1}m") for k in range(model.n_joints)],
             rotor_at_bound=model.layout.rotors_at_bound(consistent.standard).tolist(),
-            room=check.room,
+            room=check.margin,
             reference=consistent.reference,
         ),
     )

@@ -25,7 +25,7 @@ from hil.pipeline.estimating import posterior_of
 from hil.pipeline.options import FIXED
 from hil.pipeline.prepared import reduction_of, stated_settings, versions_of
 from hil.precision.given_recordings import given_sources
-from hil.precision.required_quantities import ReferenceMotions, Wanted
+from hil.precision.required_quantities import ReferenceMotions, RequiredQuantities
 from identification.estimators.payload_estimate import parameter_change
 from identification.estimators.payload_problem import DRIFT
 from identification.excitation import Excitation, LoadQuantities, Objective, midpoints
@@ -136,7 +136,7 @@ class PrecisionDesign:
     """Requirements about an arm, and what is known of its parameters and its torque error."""
 
     cell: Cell
-    wanted: Wanted
+    required: RequiredQuantities
     subject: Array  #: parameters (p,) that the torque's scale multiplies: the arm's, or a load's
     values: Array  #: parameters of the arm (p,), as far as they are known
     prior: Array  #: information of prior and recordings (p, p)
@@ -196,12 +196,12 @@ class PrecisionDesign:
         information = prior + reference.information(error)
         subject = values
         if payload is None:
-            wanted = reference.wanted(requirements, values, information)
+            required = reference.required(requirements, values, information)
         else:
             information = prior if given else prior + _ARM_TIME * reference.information(error)
-            wanted, subject = _load(cell.model, requirements[0], payload, values, information)
+            required, subject = _load(cell.model, requirements[0], payload, values, information)
         made = cls(
-            cell, wanted, subject, values, prior, error, noise, reference, scale, source, exact
+            cell, required, subject, values, prior, error, noise, reference, scale, source, exact
         )
         made._require_possible()
         return made
@@ -209,7 +209,7 @@ class PrecisionDesign:
     def precision(self, repetitions: float) -> Precision:
         """Return the criterion of a search for so many repetitions of a motion."""
         density = self.error + self.noise / repetitions
-        return Precision(self.wanted.quantities, density, self.prior)
+        return Precision(self.required.quantities, density, self.prior)
 
     def lengthened(self, settings: DesignSettings, repetitions: float) -> DesignSettings:
         """Return settings of a longer motion, if repetitions of one as long as theirs are too few.
@@ -236,9 +236,9 @@ class PrecisionDesign:
         shown = self._shown(midpoints(excitation.trajectory))
         limits = self._of_scale(shown, repetitions, _ENDLESS)
         forecasts = []
-        worst = self.wanted.worst(self._ratios(shown, repetitions, 1.0))
+        worst = self.required.worst(self._ratios(shown, repetitions, 1.0))
         for k, (requirement, label, ratio) in enumerate(worst):
-            mine = self.wanted.owners == k
+            mine = self.required.owners == k
             repeated = partial(self._meets, shown, mine, motions=1.0)
             various = partial(self._meets, shown, mine, repetitions)
             forecasts.append(
@@ -255,7 +255,7 @@ class PrecisionDesign:
 
     def _shown(self, motion: Motion) -> _Shown:
         """Return what a sampled motion shows; a payload is seen by two recordings of the arm."""
-        if isinstance(self.wanted.quantities, LoadQuantities):
+        if isinstance(self.required.quantities, LoadQuantities):
             step = float(motion.time[1] - motion.time[0])
             objective = Objective(self.cell.model, precision=self.precision(1.0))
             return _Shown(step * objective.precise_grams(motion), None)
@@ -275,7 +275,7 @@ class PrecisionDesign:
         `motions` is the number of different motions of its kind.
         """
         precision = self.precision(repetitions)
-        quantities = self.wanted.quantities
+        quantities = self.required.quantities
         if shown.rows is None or not isinstance(quantities, Quantities):
             by_joint = motions * shown.grams / precision.density[:, None, None]
             ratios = precision.ratios(by_joint.sum(axis=0))
@@ -289,7 +289,7 @@ class PrecisionDesign:
 
     def _of_scale(self, shown: _Shown, repetitions: float, motions: float) -> Array:
         """Return the part of the ratios (k,) by the torque's scale; zero if it is no error."""
-        is_absolute = self.wanted.absolute
+        is_absolute = self.required.absolute
         if not self.scale.std.any() or not is_absolute.any():
             return np.zeros(len(is_absolute))
         precision = self.precision(repetitions)
@@ -297,14 +297,14 @@ class PrecisionDesign:
         pulls = (by_joint @ self.subject).T
         slope = precision.spread(by_joint.sum(axis=0)).slope
         moved = slope @ pulls * self.scale.std
-        by_scale = _NORMAL * np.linalg.norm(moved, axis=1) / self.wanted.quantities.allowed
+        by_scale = _NORMAL * np.linalg.norm(moved, axis=1) / self.required.quantities.allowed
         return np.where(is_absolute, by_scale, 0.0)
 
     def _require_possible(self) -> None:
         """Raise InputError for a requirement beyond what a year of different motions gives."""
         precision = self.precision(1.0)
         rate = self.reference.information(precision.density, has_offsets=precision.has_offsets)
-        for requirement, worst, ratio in self.wanted.worst(precision.ratios(_YEAR * rate)):
+        for requirement, worst, ratio in self.required.worst(precision.ratios(_YEAR * rate)):
             if ratio > 1.0:
                 year = ratio * requirement.value
                 raise InputError(
@@ -330,7 +330,7 @@ def _load(
     payload: Payload,
     values: Array,
     arm_information: Array,
-) -> tuple[Wanted, Array]:
+) -> tuple[RequiredQuantities, Array]:
     """Return the mass of a payload as what is wanted, and its change of the parameters (p,).
 
     The arm is known with the information `arm_information` (p, p); its friction may drift.
@@ -347,7 +347,9 @@ def _load(
     allowed = np.array([requirement.value * (payload.mass if requirement.relative else 1.0)])
     quantities = LoadQuantities(direction, allowed, change, root)
     owners = np.zeros(1, dtype=np.intp)
-    return Wanted((requirement,), quantities, ("mass",), owners), change @ payload.parameters
+    return RequiredQuantities(
+        (requirement,), quantities, ("mass",), owners
+    ), change @ payload.parameters
 
 
 def payload_search(limits: JointLimits) -> DesignSettings:

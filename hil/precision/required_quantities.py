@@ -24,7 +24,7 @@ _Row = tuple[str, Array, float]  # label, direction (p,), wanted half of the int
 
 
 @dataclass(frozen=True, eq=False)
-class Wanted:
+class RequiredQuantities:
     """Quantities of some requirements."""
 
     requirements: tuple[Requirement, ...]
@@ -85,9 +85,9 @@ class ReferenceMotions:
         total = np.einsum("jmp,jmq->pq", rows / density[:, None, None], rows)
         return np.asarray(total / self.motion.n_samples)
 
-    def wanted(
+    def required(
         self, requirements: Sequence[Requirement], values: Array, information: Array
-    ) -> Wanted:
+    ) -> RequiredQuantities:
         """Return the quantities of requirements about an arm of parameters (p,).
 
         `information` (p, p) decides at which instants the bands of torque are the widest.
@@ -100,7 +100,9 @@ class ReferenceMotions:
             owners += [k] * len(quantity_rows)
         labels, directions, allowed = zip(*rows, strict=True)
         quantities = Quantities(np.array(directions), np.array(allowed))
-        return Wanted(tuple(requirements), quantities, labels, np.array(owners, dtype=np.intp))
+        return RequiredQuantities(
+            tuple(requirements), quantities, labels, np.array(owners, dtype=np.intp)
+        )
 
     def _quantities(
         self, requirement: Requirement, values: Array, information: Array

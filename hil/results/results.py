@@ -97,7 +97,7 @@ class PrecisionResult(Frozen):
     promised: float | None = None  #: Ratio that the design promised for the planned repetitions
 
 
-class ConductResult(Frozen):
+class ExecutionLogResult(Frozen):
     """Execution of a campaign."""
 
     steps: list[StepResult]
@@ -543,7 +543,7 @@ class Results(Frozen):
     consistency: ConsistencyResult | None = None
     exports: ExportResult | None = None
     judgement: JudgementResult
-    conduct: ConductResult | None = None  #: Null without a campaign folder
+    conduct: ExecutionLogResult | None = None  #: Null without a campaign folder
     recordings: list[RecordingResult] = []  #: Imported ones; empty of archives
     occasion: OccasionResult | None = None  #: Null in files of earlier versions
     settings: SettingsResult | None = None  #: Likewise

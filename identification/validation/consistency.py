@@ -51,8 +51,8 @@ class ConsistencyCheck:
     held_out_rise: Array  # rise per joint (n,), NaN without rows or with little torque
     # smallest second moment of each link over the nominal body's in the same direction (n,), zero
     # at the bound
-    room: Array
-    moved: tuple[str, ...]  # parameters changed by more than three standard deviations
+    margin: Array
+    shifted_parameters: tuple[str, ...]  # changed by more than three standard deviations
     # messages on impossible parameters of the unconstrained estimate, by rise of the joint's error
     violations: tuple[str, ...]
     judged_on: str = "held-out"  # "held-out" or "in-sample"
@@ -149,7 +149,7 @@ def check_consistency(
     frames = reference_bodies(model.nominal[links], model.chain.translation).frames
     inner = np.linalg.solve(frames, pseudo_inertia(consistent.standard[links]))
     inner = np.linalg.solve(frames, inner.transpose(0, 2, 1))
-    room = np.asarray(np.linalg.eigvalsh(inner)[:, 0])
+    margin = np.asarray(np.linalg.eigvalsh(inner)[:, 0])
     violations: list[str] = []
     single = np.count_nonzero(model.base.grouping, axis=1) == 1
     for joint in np.argsort(-np.nan_to_num(rise), kind="stable").tolist():
@@ -160,15 +160,15 @@ def check_consistency(
                 alone = k >= model.base.rank or bool(single[k])
                 if alone and free[k] < -SIGMAS * unconstrained.std[k]:
                     violations.append(f"{what} of {name} would be negative ({free[k]:.3g})")
-        if room[joint] < _EDGE:
+        if margin[joint] < _EDGE:
             violations.append(f"the link of {name} would need a negative mass or moment of inertia")
     return ConsistencyCheck(
         consistent=consistent,
         held_out=held_out.relative_error(values),
         unconstrained_held_out=held_out.relative_error(free),
         held_out_rise=rise,
-        room=room,
-        moved=tuple(
+        margin=margin,
+        shifted_parameters=tuple(
             unconstrained.names[k] for k in np.argsort(-shift, kind="stable") if shift[k] > SIGMAS
         ),
         violations=tuple(violations),

@@ -570,7 +570,7 @@ class TestConsistencyCheck:
         check = consistency_of(runs())
         assert abs(check.cost) < 0.001
         assert not check.costly and not check.impossible
-        assert check.violations == () and np.all(check.room > 0.1)
+        assert check.violations == () and np.all(check.margin > 0.1)
         assert "consistent parameters predict as well" in check.sentence
 
     def test_the_cost_is_the_rise_of_the_error(self):
@@ -623,7 +623,7 @@ class TestConsistencyCheck:
     def test_a_negative_second_moment_is_an_active_bound(self):
         """That of the elbow's link about its own centre."""
         check = consistency_of(runs(I2yy=0.05, I2m=0.0))
-        assert check.room[1] < 0.01
+        assert check.margin[1] < 0.01
         assert any("link of elbow" in bound for bound in check.violations)
 
 

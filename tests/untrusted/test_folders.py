@@ -35,7 +35,7 @@ from hil.campaign.folder import LOCK, CampaignFolder
 from hil.campaign.joint_warm_up import FrictionMeter, WarmUpRecord
 from hil.campaign.quality import Executed
 from hil.campaign.rehearsal_record import Rehearsal
-from hil.campaign.status import conduct_of
+from hil.campaign.status import execution_log_of
 from hil.cell import Cell
 from hil.cli import app
 from hil.cli.plan import read_via_points
@@ -388,7 +388,7 @@ def read(folder: Path) -> list[str]:
     refused = []
     for read_it in (
         lambda: Campaign.open(folder).status(),
-        lambda: conduct_of(CampaignFolder(folder)),
+        lambda: execution_log_of(CampaignFolder(folder)),
     ):
         try:
             read_it()
@@ -511,7 +511,7 @@ def test_changed_value_is_refused_or_read(
         with pytest.raises(InputError, match=re.escape(message)):
             FILES[file](folder)
         if file == "dry_run.json":
-            assert not conduct_of(CampaignFolder(folder)).steps[1].done
+            assert not execution_log_of(CampaignFolder(folder)).steps[1].done
     read(folder)
 
 

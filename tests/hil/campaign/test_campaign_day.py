@@ -25,7 +25,7 @@ from hil.campaign.dry_run import Acceptance, DryRunRecord
 from hil.campaign.folder import CampaignFolder
 from hil.campaign.identified_campaign import identify_campaign
 from hil.campaign.joint_warm_up import WarmMotion, WarmUpRecord
-from hil.campaign.status import conduct_of, status_of
+from hil.campaign.status import execution_log_of, status_of
 from hil.cell import Cell
 from hil.cli import app
 from hil.control.motion_checks import MotionChecks
@@ -167,7 +167,7 @@ def folder(ran: Campaign, tmp_path: Path) -> CampaignFolder:
 
 def test_the_conduct_has_what_was_left_out(ran: Campaign) -> None:
     conduct = identify_campaign(ran.folder.root, Silent()).results.conduct
-    assert conduct == conduct_of(ran.folder)
+    assert conduct == execution_log_of(ran.folder)
     steps = {step.step: step for step in conduct.steps}
     assert not steps["rehearsal"].done and steps["rehearsal"].words.startswith("not rehearsed")
     assert not steps["dry run"].done
@@ -187,7 +187,7 @@ def test_the_page_has_rehearsal_dry_run_warm_up_and_rejections(folder: CampaignF
     name = "excitation_001_a9.mcap"
     shutil.copy(folder.archives / "excitation_001_a1.mcap", folder.archives / name)
     folder.add(name, "rejected", "it was held")
-    steps = {step.step: step for step in conduct_of(folder).steps}
+    steps = {step.step: step for step in execution_log_of(folder).steps}
     assert steps["rehearsal"].done
     assert "accepted by ada at 2026-03-01" in steps["dry run"].words
     assert "shoulder 30 %, elbow 12 %" in steps["dry run"].details[0]
@@ -205,7 +205,7 @@ def test_the_conduct_has_killed_attempts_and_no_wanted_warm_up(
     name = "excitation_001_a9.mcap"
     whole = (folder.archives / "excitation_001_a1.mcap").read_bytes()
     (folder.archives / name).write_bytes(whole[: len(whole) // 2])
-    steps = {step.step: step for step in conduct_of(folder).steps}
+    steps = {step.step: step for step in execution_log_of(folder).steps}
     assert steps["repetitions"].words == "2 complete; 1 rejected or ended early"
     assert steps["repetitions"].details[0].startswith(f"{name} killed: ")
     assert steps["validation"].details == []
@@ -218,7 +218,7 @@ def test_ended_attempts_are_in_the_order_of_their_names(folder: CampaignFolder) 
     for name in ("excitation_001_a8.mcap", "excitation_001_a9.mcap"):
         (folder.archives / name).write_bytes(whole)
     folder.add("excitation_001_a9.mcap", "rejected", "it was held")
-    steps = {step.step: step for step in conduct_of(folder).steps}
+    steps = {step.step: step for step in execution_log_of(folder).steps}
     assert steps["repetitions"].details == [
         "excitation_001_a8.mcap killed: the program ended before it checked the motion "
         "(completed: the motion is complete)",
@@ -229,11 +229,11 @@ def test_ended_attempts_are_in_the_order_of_their_names(folder: CampaignFolder) 
 def test_steps_of_another_plan_or_unreadable_are_not_done(folder: CampaignFolder) -> None:
     pass_rehearsal(folder)
     folder.cell.write_text(folder.cell.read_text() + "\n# another\n")
-    step = conduct_of(folder).steps[0]
+    step = execution_log_of(folder).steps[0]
     assert not step.done and ANOTHER_CELL_OR_PLAN in step.words
     for path in (folder.rehearsal, folder.dry_run, folder.warmup):
         path.write_text("{")
-    steps = conduct_of(folder).steps[:3]
+    steps = execution_log_of(folder).steps[:3]
     assert all(not step.done for step in steps)
     assert all("cannot be read" in step.words for step in steps[:2])
 

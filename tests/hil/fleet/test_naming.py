@@ -14,7 +14,7 @@ from hil.base.progress import Silent
 from hil.batch.archive_discovery import ArchiveRef
 from hil.batch.cache import CacheLocation
 from hil.batch.graph import reidentify
-from hil.fleet.extra_channels import WantedFacts, facts_of
+from hil.fleet.extra_channels import ExtraChannels, facts_of
 from hil.fleet.logs import LogReading, LogsOfBatch
 from hil.fleet.naming import RobotNaming, date_in
 from hil.importers.imported_robot import Robot
@@ -119,14 +119,14 @@ class TestFacts:
         path = tmp_path / "log.csv"
         rows = [f"{k},{0.1 * k},K2,{20 + k},7,1.5" for k in range(3)]
         path.write_text("\n".join(["t,q1,serial,joint_temp1,load,temporary", *rows]))
-        wanted = WantedFacts(("serial", "load"))
-        facts = facts_of(path, wanted, LogFiles())
+        extra = ExtraChannels(("serial", "load"))
+        facts = facts_of(path, extra, LogFiles())
         assert facts == {"serial": "K2", "joint_temp1": 21.0, "load": 7.0}
 
     def test_of_arrays_each_column(self, tmp_path):
         path = tmp_path / "log.npz"
         np.savez(path, t=np.arange(3.0), temperature=np.array([[1.0, 2.0]] * 3))
-        facts = facts_of(path, WantedFacts(), LogFiles())
+        facts = facts_of(path, ExtraChannels(), LogFiles())
         assert facts == {"temperature1": 1.0, "temperature2": 2.0}
 
 

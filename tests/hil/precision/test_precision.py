@@ -215,18 +215,18 @@ class TestPromise:
     def test_friction_counts_in_both_directions_at_three_speeds(self, cell, motions) -> None:
         made = promise(cell, motions, "friction of elbow 5%")
         speed = max(np.abs(motion.extrema().velocity[1]) for motion in motions)
-        coulomb, viscous = made.wanted.quantities.directions[:3, [-3, -1]].T
+        coulomb, viscous = made.required.quantities.directions[:3, [-3, -1]].T
         np.testing.assert_allclose(coulomb, 1.0)
         np.testing.assert_allclose(viscous, np.array([0.25, 0.5, 1.0]) * speed, rtol=0.02)
         np.testing.assert_allclose(
-            made.wanted.quantities.allowed[:3], 0.05 * (3.0 + 1.5 * viscous), rtol=1e-6
+            made.required.quantities.allowed[:3], 0.05 * (3.0 + 1.5 * viscous), rtol=1e-6
         )
 
 
 def variances(made: PrecisionDesign, trajectory, repetitions: float):
     rows = PredictedRows.of(made.cell, midpoints(trajectory), made.values, rigid=made.rigid)
     density = made.precision(repetitions).density
-    return rows.variances(made.wanted.quantities.directions, made.prior, density)
+    return rows.variances(made.required.quantities.directions, made.prior, density)
 
 
 class _Excitation:
