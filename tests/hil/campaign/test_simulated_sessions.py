@@ -6,7 +6,6 @@ from dataclasses import replace
 from pathlib import Path
 
 import pytest
-from hil.control.simulation import simulated_provenance
 
 from hil.archive.check import check_archive
 from hil.base.errors import ExecutionError, OperatorStopError
@@ -21,6 +20,7 @@ from hil.campaign.simulated_sessions import (
     run_simulated,
 )
 from hil.control.motion_watch import Stop
+from hil.control.simulated_cell import simulated_provenance
 from tests.hil.fast_cell import fast_campaign, fast_cell
 
 pytestmark = pytest.mark.long

@@ -20,7 +20,7 @@ from hil.archive import open_archive
 from hil.archive.recording_of_archive import open_recording
 from hil.base.errors import InputError
 from hil.cli import app
-from hil.fleet.extra_channels import WantedFacts, facts_of
+from hil.fleet.extra_channels import ExtraChannels, facts_of
 from hil.importers.bag_map import BagMap
 from hil.importers.log_files import LogFiles
 from hil.importers.ros_messages import CONTROLLER_STATE, definitions_of
@@ -566,7 +566,7 @@ class TestTemperatures:
         warm = [(k, self.heat(messages, 30.0 + k)) for k in range(3)]
         topics = {"/joint_states": measured(messages, moved), "/gear": (self.HEAT, warm)}
         source = written(tmp_path / "bag", messages, topics, kind)
-        assert facts_of(source, WantedFacts(), LogFiles()) == {"/gear/temperature": 31.0}
+        assert facts_of(source, ExtraChannels(), LogFiles()) == {"/gear/temperature": 31.0}
 
     def test_of_joints_have_their_names_or_numbers(self, tmp_path) -> None:
         messages = Messages()
@@ -574,7 +574,7 @@ class TestTemperatures:
         heats = [(k, messages.array([20.0, 21.0])) for k in (0, 1)]
         topics = {"/motor_temperatures": (STATE, states), "/temperature": (ARRAY, heats)}
         source = written(tmp_path / "bag", messages, topics)
-        assert facts_of(source, WantedFacts(), LogFiles()) == {
+        assert facts_of(source, ExtraChannels(), LogFiles()) == {
             f"/motor_temperatures/position/{JOINTS[1]}": 40.0,
             f"/motor_temperatures/position/{JOINTS[0]}": 51.0,
             "/temperature1": 20.0,
@@ -585,5 +585,5 @@ class TestTemperatures:
         messages = Messages()
         topics = {"/minutes": (ARRAY, [(0, messages.array([5.0]))])}
         source = written(tmp_path / "bag", messages, topics)
-        assert facts_of(source, WantedFacts(), LogFiles()) == {}
-        assert facts_of(source, WantedFacts(("/minutes",)), LogFiles()) == {"/minutes": 5.0}
+        assert facts_of(source, ExtraChannels(), LogFiles()) == {}
+        assert facts_of(source, ExtraChannels(("/minutes",)), LogFiles()) == {"/minutes": 5.0}
