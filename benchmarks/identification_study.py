@@ -26,7 +26,8 @@ from benchmarks import parser_of, show
 from hil.base.progress import Silent
 from hil.campaign import Campaign, CampaignPlan, design
 from hil.cell import Cell
-from hil.control.simulated_cell import planted_values, simulated_link
+from hil.control.planted_arm import planted_values
+from hil.control.simulated_cell import simulated_link
 from hil.pipeline.sources import Sources, gather_sources
 from identification.estimators.least_squares import estimate_repetitions
 from identification.signals.samples import Preprocessing, prepare

@@ -48,10 +48,9 @@ from hil.campaign.reached_precision import PrecisionMeter
 from hil.cell import Cell
 from hil.control.link import MotionLink
 from hil.control.motion_checks import MotionChecks
+from hil.control.planted_arm import planted_truth, planted_values
 from hil.control.simulated_cell import (
     controller_settings,
-    planted_truth,
-    planted_values,
     simulated_controller,
     simulated_link,
     simulated_provenance,

@@ -16,9 +16,9 @@ from typing import Any, Final
 
 import numpy as np
 
-from drivers import open_mode, packets, safe_reply, session
+from drivers import c4g_wire, open_mode, session
 from drivers.cycle_records import CycleRing
-from drivers.drive_train import ArmWire
+from drivers.drive_train import MotorSide
 from drivers.exchange import loop
 from drivers.execution import Execution
 from drivers.guard import Guard
@@ -30,9 +30,9 @@ CAPACITY: Final = 200_000
 STAGES: Final[tuple[tuple[str, tuple[tuple[type, str], ...]], ...]] = (
     ("wake-up", ()),
     ("receive", ((UdpTransport, "receive"), (loop.ReceiveQueue, "receive"))),
-    ("decode", ((packets.CyclicPacket, "decode"), (safe_reply.PacketClassifier, "classify"))),
+    ("decode", ((c4g_wire.C4gWire, "receive"),)),
     ("decide", ((session.Session, "_apply"),)),
-    ("record", ((session.Session, "_record"), (ArmWire, "read"), (CycleRing, "commit"))),
+    ("record", ((session.Session, "_record"), (MotorSide, "to_joints"), (CycleRing, "commit"))),
     ("session", ((session.Session, "reply"),)),
     ("open mode", ((open_mode.SetPointGenerator, "reply"),)),
     ("motion", ((Execution, "advance"),)),
@@ -47,9 +47,9 @@ STAGES: Final[tuple[tuple[str, tuple[tuple[type, str], ...]], ...]] = (
     (
         "pack",
         (
-            (safe_reply.ReplyBuilder, "fill_safe"),
-            (safe_reply.ReplyBuilder, "finish"),
-            (ArmWire, "write"),
+            (c4g_wire.C4gWire, "fill_safe"),
+            (c4g_wire.C4gWire, "finish"),
+            (c4g_wire.C4gWire, "write"),
         ),
     ),
     ("send", ((UdpTransport, "send"),)),

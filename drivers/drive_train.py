@@ -20,12 +20,10 @@ from dataclasses import dataclass, field
 from typing import Final
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from drivers.arrays import Array
-from drivers.errors import DriveTrainError, PacketError
-from drivers.packets import InitPacket
-from drivers.safe_reply import D1, Floats
+from drivers.errors import DriveTrainError
 
 TURN: Final = 2.0 * np.pi
 WRIST_AXES: Final = 6
@@ -154,46 +152,20 @@ def _checked(name: str, value: ArrayLike, n: int) -> Array:
     return _frozen(array)
 
 
-class ArmWire:
-    """Conversion between joints of one arm and slots of a packet.
+class MotorSide:
+    """An arm on the motor side: conversions, and the values read last.
 
     Attributes:
-        joint_slots: (n,) slot of each joint.
-        opened: (n,) joints that are to be open; only these are written into a frame.
-        raw: (8, n) D1..D5, extra1..3 of the packet read last, in wire units.
-
-    Raises:
-        PacketError: the init packet's axis map is invalid or lacks one of the joints.
+        raw: (8, n) target position and velocity, position and velocity [motor revolutions, and per
+            cycle], current [A], and three values that are recorded only.
     """
 
-    def __init__(
-        self, drive_train: DriveTrain, init: InitPacket, arm: int, only_axis: int | None = None
-    ) -> None:
+    def __init__(self, drive_train: DriveTrain, period: float) -> None:
         n = drive_train.n_joints
-        slot_of = {axis.axis: axis.slot for axis in init.open_axes() if axis.arm == arm}
-        missing = [joint + 1 for joint in range(n) if joint not in slot_of]
-        if missing:
-            raise PacketError(
-                "open_axes_map", init.open_axes_map[arm - 1].tolist(), f"axes {missing} open"
-            )
-        self.joint_slots = np.array([slot_of[joint] for joint in range(n)], np.intp)
-        first = int(self.joint_slots[0])
-        contiguous = np.array_equal(self.joint_slots, np.arange(first, first + n))
-        # A slice makes a view where an index array would make a copy.
-        self._pick: slice | NDArray[np.intp] = (
-            slice(first, first + n) if contiguous else self.joint_slots
-        )
-        self.opened = np.ones(n, dtype=np.bool_)
-        self._written: slice | NDArray[np.intp] = slice(None)
-        self._slots = self._pick
-        if only_axis is not None:
-            self._written = np.array([only_axis - 1])
-            self.opened[...] = np.arange(n) == self._written
-            self._slots = self.joint_slots[self._written]
         self._to_joint = TURN * drive_train.joint_from_motor.T
         self._to_motor = drive_train.motor_from_joint.T / TURN
         self._motor_offset = drive_train.motor_offset
-        per_second = 1.0 / init.period
+        per_second = 1.0 / period
         # As large as what it scales: numpy takes three times as long where it repeats columns.
         self._scale = np.tile([[1.0], [per_second], [1.0], [per_second]], n)
         zero = np.zeros(n)
@@ -202,15 +174,13 @@ class ArmWire:
         self.raw = np.zeros((8, n))
         self._kinematics = self.raw[:4]
 
-    def read(self, received: Floats, measured: Array) -> None:
-        """Read a packet's axis blocks (n_axes, 9) into `raw`, and (8, n) into `measured` in SI."""
-        raw = self.raw
-        raw[...] = received[self._pick, D1:].T
+    def to_joints(self, measured: Array) -> None:
+        """Convert `raw` to joint side in SI (8, n)."""
         kinematics = measured[:4]
         self._kinematics.dot(self._to_joint, kinematics)
         kinematics *= self._scale
         kinematics += self._offset
-        measured[4:] = raw[4:]
+        measured[4:] = self.raw[4:]
 
     def motor(self, q: Array) -> Array:
         """Convert joint positions (n,) to motor revolutions (n,)."""
@@ -218,21 +188,7 @@ class ArmWire:
         motor += self._motor_offset
         return motor
 
-    def motor_difference(self, dq: Array) -> Array:
-        """Convert differences of joint positions (n,) rad to motor revolutions (n,)."""
-        difference: Array = np.dot(dq, self._to_motor)
-        return difference
-
     def joint_difference(self, motor: Array) -> Array:
         """Convert differences of motor revolutions (n,) to those of joint positions (n,) rad."""
         difference: Array = np.dot(motor, self._to_joint)
         return difference
-
-    def put(self, frame: Floats, column: int, values: Array) -> None:
-        """Write values (n,) into one column of a frame."""
-        frame[self._slots, column] = values[self._written]
-
-    def write(self, frame: Floats, position: Array, step: Array) -> None:
-        """Write set-points (n,), motor revolutions and per cycle, into D1 and D2 of a frame."""
-        self.put(frame, D1, position)
-        self.put(frame, D1 + 1, step)

@@ -3,13 +3,36 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from typing import ClassVar, Literal, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
+from drivers.arrays import Array
 from drivers.errors import RefusalError
-from drivers.packets import InitPacket
 from drivers.states import Outcome, State
+
+
+class ControllerDescription(Protocol):
+    """What a controller states of itself before the cyclic exchange.
+
+    Attributes:
+        attachment: name of the file of an archive that has it.
+    """
+
+    attachment: ClassVar[str]
+
+    @property
+    def period(self) -> float:
+        """Cycle, s."""
+
+    def encode(self) -> bytes:
+        """Return the content of that file."""
+
+    def stated(
+        self, limit: Literal["current_limit", "following_error"], arm: int, n_joints: int
+    ) -> Array:
+        """Return its limit of an arm, from 1, by joint [A, motor revolutions]; NaN for none."""
 
 
 @dataclass
@@ -39,7 +62,7 @@ class InitReceived:
     both values.
     """
 
-    init: InitPacket = field(repr=False)
+    init: ControllerDescription = field(repr=False)
     unusable: str | None
     differences: tuple[str, ...] = ()
 
@@ -124,6 +147,14 @@ class PacketRejected:
     reason: str = field(default="", compare=False)
 
 
+@dataclass(frozen=True)
+class ControllerRemark:
+    """What a controller says in words, in `cycle`."""
+
+    text: str
+    cycle: int
+
+
 @dataclass(frozen=True, eq=False)
 class Refused:
     """A set-point was not sent, because of `error`.
@@ -162,6 +193,7 @@ Event = (
     | HoldChanged
     | MotionEnded
     | PacketRejected
+    | ControllerRemark
     | Refused
     | LinkLost
 )

@@ -39,7 +39,7 @@ from typing import Final, NamedTuple
 import numpy as np
 
 from drivers.arrays import Array
-from drivers.drive_train import ArmWire
+from drivers.drive_train import MotorSide
 from drivers.errors import (
     AxisNotInMode,
     Check,
@@ -50,9 +50,8 @@ from drivers.errors import (
 from drivers.execution import Execution
 from drivers.guard import FIRST_FRACTION, Guard, Joints, all_true, require
 from drivers.losses import LossTracker
-from drivers.packets import Mode
-from drivers.safe_reply import D1, D2, PacketStatus, ReplyBuilder
-from drivers.states import State
+from drivers.states import AxesReport, State
+from drivers.wire import Wire
 
 MAX_TARGET_JUMP: Final = 0.25
 """Share of the following-error threshold allowed between target and set-point sent last."""
@@ -117,7 +116,7 @@ class OpenCycle(NamedTuple):
         entered_at: cycle in which that state was entered.
         exit_requested_at: cycle in which the end of open mode was requested last, or in which its
             end began.
-        packet: status and modes.
+        packet: what it says of the axes.
         measured: (8, n) values of the packet in SI, joint side.
         commanded: (2, n) record of the reply, NaN, to be filled where set-points are sent.
         losses: before this packet.
@@ -131,7 +130,7 @@ class OpenCycle(NamedTuple):
     cycle: int
     entered_at: int
     exit_requested_at: int
-    packet: PacketStatus
+    packet: AxesReport
     measured: Array
     commanded: Array
     losses: LossTracker
@@ -154,13 +153,17 @@ class SentSetPoints:
     becomes late at speed is a loss in every second cycle, which soon stops the motion; while
     stopping it counts as late.
 
+    To a controller that continues by itself and uses the newest set-point, without `resends`,
+    nothing is sent again; it states itself what it did not use.
+
     Attributes:
         resend_needed: the controller did not accept the last one: it is to be sent once more.
         target_latency: cycles by which the controller reports its target late.
     """
 
-    def __init__(self, guard: Guard, depth: int) -> None:
+    def __init__(self, guard: Guard, depth: int, *, resends: bool = True) -> None:
         n = guard.limits.n_joints
+        self._resends = resends
         self._guard = guard
         self._depth = depth
         # One more than allowed, so that one too many can be counted.
@@ -218,8 +221,7 @@ class SentSetPoints:
 
         Args:
             target: (n,) D1 received, motor revolutions.
-            missed: packets before this one without a reply: the controller may have extrapolated
-                by as many steps, but less than `depth`.
+            missed: packets before this one without a reply: up to so many steps extrapolated.
             cycle: for the error.
             where: (n,) which joints; None for all.
             stopping: the motion is being brought to rest.
@@ -258,7 +260,8 @@ class SentSetPoints:
         lag = int(late.argmin(axis=0)[behind].max(initial=0))
         more = max(0, lag - self.target_latency)
         known_late = stopping and self._resent_before
-        if not more or known_late or np.abs(newest - rows[1]).max() <= SLOW * standstill:
+        slow = np.abs(newest - rows[1]).max() <= SLOW * standstill
+        if not more or known_late or slow or not self._resends:
             self.target_latency = lag
             return 0 if known_late else more
         self.resend_needed = True
@@ -267,7 +270,7 @@ class SentSetPoints:
         return 1 if self._resent else more
 
 
-# Rows of `ArmWire.raw`.
+# Rows of `MotorSide.raw`.
 TARGET, TARGET_VELOCITY, ACTUAL, ACTUAL_VELOCITY, CURRENT = range(5)
 SPREAD: Final = 2
 """Cycles, per step that a controller extrapolated, in which the motion returns to its path.
@@ -292,28 +295,23 @@ class SetPointGenerator:
         rejected: replies that were not used according to the last packet.
     """
 
-    def __init__(
-        self, guard: Guard, wire: ArmWire, builder: ReplyBuilder, mode: int, max_gap: int
-    ) -> None:
+    def __init__(self, guard: Guard, wire: Wire, motors: MotorSide, max_gap: int) -> None:
         n = guard.limits.n_joints
         self._guard = guard
         self._wire = wire
-        self._raw = wire.raw
-        self._builder = builder
-        self._mode = mode
+        self._motors = motors
+        self._raw = motors.raw
         self._still = np.zeros(n)
         self._every = np.ones(n, dtype=np.bool_)
         self._exit_cycles = round(EXIT_TIMEOUT / guard.period)
         self.set_point = self._still
         self.rejected = 0
-        self._history = SentSetPoints(guard, max_gap + 1)
+        self._history = SentSetPoints(guard, max_gap + 1, resends=not wire.reports_use)
         self._sent = self._still
         self._step = self._still
         self._velocity = self._still
         # Least share of that velocity that the arm had since the set-point was sent again.
         self._arm_share = 1.0
-        self._slots = wire.joint_slots[wire.opened]
-        self._last_reply = builder.floats[self._slots]
         self._continuing = wire.opened.copy()
         self._all_opened = bool(wire.opened.all())
 
@@ -326,7 +324,7 @@ class SetPointGenerator:
             self._measured = now.measured
             self._commanded = now.commanded
             self._check_losses(now)
-            self._builder.require_targets(now.packet.other_slots, now.cycle)
+            self._wire.require_other_targets(now.cycle)
             if now.state is State.OPEN:
                 return self._reply_open(now)
             if now.state is State.EXITING and now.in_interval:
@@ -334,7 +332,7 @@ class SetPointGenerator:
             else:
                 # Left before the last axis opened, axes have been sent only their own targets.
                 self.opening()
-            self._builder.require_targets(now.packet.reply.held_slots, now.cycle)
+            self._wire.require_targets(now.cycle)
             return self._leave(now) if now.state is State.EXITING else self._wait(now)
         except BaseException as error:
             return Refuse(as_refusal(error, now.cycle))
@@ -393,7 +391,7 @@ class SetPointGenerator:
         hint = f": if axis {axes[0]} alone is to open, use --only-axis" if len(axes) == 1 else ""
         return Exit(reason=f"some axes did not open within {EXIT_TIMEOUT:g} s{hint}")
 
-    def hold_in_pause(self, packet: PacketStatus, cycle: int) -> None:
+    def hold_in_pause(self, packet: AxesReport, cycle: int) -> None:
         """Require, in a pause, that open axes can hold their targets; raises `GuardError`."""
         self._cycle = cycle
         self.require_holdable(packet.held_joints)
@@ -456,12 +454,11 @@ class SetPointGenerator:
             self._guard.check_set_point(self.set_point, self._still, "plan", cycle)
             self._rest()
             return
-        frame = self._builder.floats
         if self._history.is_resent:
             self._arm_share = min(self._arm_share, self._share_of_arm())
         if self._history.resend_needed:
             # The controller holds the target before the last one: send that once more.
-            frame[self._slots] = self._last_reply
+            self._wire.write(self._sent, self._step)
             self._history.resend()
             commanded[0] = self.set_point
             commanded[1] = self._velocity
@@ -470,17 +467,16 @@ class SetPointGenerator:
             self._slow_down(execution)
         position, velocity, bounds = execution.advance(cycle)
         self._guard.check_set_point(position, velocity, bounds, cycle)
-        motor = self._wire.motor(position)
+        motor = self._motors.motor(position)
         self._require_closed_still(motor)
         self._step = step = motor - self._sent
         self._velocity = (position - self.set_point) / self._guard.period
         commanded[0], commanded[1] = position, self._velocity
-        self._wire.write(frame, motor, step)
+        self._wire.write(motor, step)
         self.set_point = position
         self._sent = motor
         self._history.add(motor)
         self._arm_share = 1.0
-        self._last_reply = frame[self._slots]
 
     def _share_of_arm(self) -> float:
         """Share of the speed sent last at which the joint that slowed down least moves (D4).
@@ -516,16 +512,16 @@ class SetPointGenerator:
         opened = self._wire.opened
         off = np.abs(motor - self._raw[TARGET]) > self._guard.limits.standstill
         if (off & ~opened).any():
-            joint = int(np.argmax(off & ~opened)) + 1
-            wanted = int(self._mode)
-            message = f"joint {joint} is in mode {int(Mode.CLOSED)}; the motion needs {wanted}"
-            raise AxisNotInMode(message, self._cycle)
+            joint = int(np.argmax(off & ~opened))
+            raise AxisNotInMode(self._packet.misplacement(joint), self._cycle)
 
     def _check_accepted(self, where: Joints | None = None, *, stopping: bool = False) -> None:
         """Check the target received against the set-points sent, and count lost replies."""
         self.rejected = self._history.check(
             self._raw[TARGET], self._now.losses.gap, self._cycle, where, stopping=stopping
         )
+        if self._wire.reports_use:
+            self.rejected = self._wire.not_used()
 
     def check_after_gap(self, execution: Execution | None) -> None:
         """Compare target and velocity with the set-point sent last, after a long gap.
@@ -551,8 +547,8 @@ class SetPointGenerator:
         step = self._still if not moves and (moved or steps == 0) else step
         self._guard.check_after_gap(target, velocity, ahead[steps], step, cycle, where)
         step = velocity[0] if moves else step
-        position = self.set_point + self._wire.joint_difference(target - self._sent)
-        speed = self._wire.joint_difference(step) / self._guard.period
+        position = self.set_point + self._motors.joint_difference(target - self._sent)
+        speed = self._motors.joint_difference(step) / self._guard.period
         spread = min(SPREAD * steps, round(RETURN / self._guard.period))
         execution.resume_from(position, speed, spread, cycle)
         self._guard.resume_from(position, speed, spread)
@@ -563,7 +559,7 @@ class SetPointGenerator:
     def check_after_pause(self) -> None:
         """Require after a late packet that the arm moves as the set-points sent last."""
         where = self._continuing & self._packet.ready
-        velocity = self._wire.joint_difference(self._raw[ACTUAL_VELOCITY])
+        velocity = self._motors.joint_difference(self._raw[ACTUAL_VELOCITY])
         self._guard.check_after_pause(velocity / self._guard.period, self._cycle, where)
 
     def leaving(self) -> None:
@@ -581,14 +577,12 @@ class SetPointGenerator:
             self._guard.check_set_point(self.set_point, self._still, "plan", self._cycle)
         self._history.add(self._sent)
         self._step = self._still
-        slots = self._wire.joint_slots[continuing]
-        self._builder.floats[slots, D1] = self._sent[continuing]
-        self._builder.floats[slots, D2] = 0.0
+        self._wire.write_rest(self._sent, continuing)
         self._commanded[0, continuing] = self.set_point[continuing]
 
     def _rest(self) -> None:
         self._step = self._still
         self._history.add(self._sent)
-        self._wire.write(self._builder.floats, self._sent, self._still)
+        self._wire.write(self._sent, self._still)
         self._commanded[0] = self.set_point
         self._commanded[1] = 0.0

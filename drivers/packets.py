@@ -12,11 +12,12 @@ import struct
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from enum import IntEnum
-from typing import Final, NamedTuple
+from typing import ClassVar, Final, Literal, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from drivers.arrays import Array
 from drivers.errors import PacketError
 
 LAST_NUMBER: Final = 0x7FFF
@@ -209,6 +210,7 @@ class InitPacket:
         following_error: thresholds in motor revolutions.
     """
 
+    attachment: ClassVar[str] = "init_packet.bin"
     record: NDArray[np.void] = field(repr=False)
     open_axes_map = _per_axis("open_axes_map")
     calibration = _per_axis("calibration")
@@ -289,6 +291,13 @@ class InitPacket:
         """Return (k54, k64, k65) of one arm."""
         k54, k64, k65 = (float(k) for k in self.kinematic_influence[arm - 1, 3:6])
         return k54, k64, k65
+
+    def stated(
+        self, limit: Literal["current_limit", "following_error"], arm: int, n_joints: int
+    ) -> Array:
+        """Return a limit of the first joints of an arm, from 1 (n,) [A, motor revolutions]."""
+        values = self.current_limit if limit == "current_limit" else self.following_error
+        return np.asarray(values[arm - 1, :n_joints], dtype=np.float64)
 
     def open_axes(self) -> Sequence[OpenAxis]:
         """Return the open axes of all arms in slot order; PacketError for an invalid map."""

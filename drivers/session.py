@@ -1,4 +1,6 @@
-"""The PC's end of a C4G Open session: packets in, replies and events out. No socket, no clock.
+"""The PC's end of a controller's session: packets in, replies and events out. No socket, no clock.
+
+Packets and replies are those of a `drivers.wire.Wire`; with C4G Open:
 
 ====================  ======================================  =====================================
 state                 what the controller reports             reply
@@ -44,12 +46,11 @@ from __future__ import annotations
 
 import math
 from collections.abc import Collection
-from functools import partial
 from typing import Final
 
 import numpy as np
 
-from drivers.controller_description import Controller, connect
+from drivers.c4g_wire import C4gProtocol
 from drivers.cycle_records import CycleRing
 from drivers.drive_train import DriveTrain
 from drivers.errors import (
@@ -63,10 +64,13 @@ from drivers.errors import (
     as_refusal,
 )
 from drivers.events import (
+    ControllerDescription,
+    ControllerRemark,
     Counters,
     Event,
     GapSeen,
     HoldChanged,
+    InitReceived,
     LinkLost,
     MotionEnded,
     MotionStarted,
@@ -80,30 +84,27 @@ from drivers.execution import Execution, execution_of
 from drivers.guard import Guard
 from drivers.losses import LossTracker
 from drivers.motion_source import MotionSource
-from drivers.open_mode import Exit, OpenCycle, OpenReply, Refuse, Reply
-from drivers.packets import (
-    DRIVE_ON,
-    INIT_LENGTH,
-    INIT_NUMBER,
-    N_ARMS,
-    CyclicPacket,
-    InitPacket,
-    Mode,
-    PacketSequence,
-    echo,
-    is_init,
-    packet_number,
-)
-from drivers.safe_reply import MODE, PacketStatus, ReplyBuilder, Words, words_of
+from drivers.open_mode import Exit, OpenCycle, OpenReply, Refuse, Reply, SetPointGenerator
+from drivers.packets import Mode
 from drivers.states import (
     HAS_SET_POINTS,
     POSITION_MODES,
-    Axes,
+    AxesReport,
     Decision,
     Input,
     Outcome,
     State,
     decide,
+)
+from drivers.wire import (
+    ArmSettings,
+    ControllerProtocol,
+    Handshake,
+    MeasuredCycle,
+    Remark,
+    Repeated,
+    Stale,
+    Wire,
 )
 
 FLIGHT_RECORDER: Final = 50
@@ -114,7 +115,6 @@ MAX_GAP: Final = 100
 """Largest `max_gap`."""
 SERVED_MODES: Final = tuple(sorted(POSITION_MODES))
 """Open modes in which a motion can run."""
-_SYNC_AFTER_INIT: Final = (INIT_NUMBER + 1, INIT_NUMBER + 2)
 _NO_MOTION: Final = "no motion was requested"
 
 
@@ -124,7 +124,6 @@ def _check_arguments(
     ring: CycleRing,
     mode: int,
     max_gap: int,
-    arm: int,
     only_axis: int | None,
 ) -> None:
     """Raise ValueError for arguments of a session that are out of range or do not fit together."""
@@ -136,8 +135,6 @@ def _check_arguments(
         raise ValueError(f"motion in mode {mode} is not served; modes {served} are")
     if not 0 <= max_gap <= MAX_GAP:
         raise ValueError(f"a gap of {max_gap} packets is not one of 0..{MAX_GAP}")
-    if not 1 <= arm <= N_ARMS:
-        raise ValueError(f"arm {arm} is not one of 1..{N_ARMS}")
     if only_axis is not None and not (1 <= only_axis <= n):
         raise ValueError(f"only axis {only_axis} is not one of 1..{n}")
 
@@ -158,6 +155,7 @@ class Session:
         other_axes: (arm, axis), both from 1, that may be open although the cell has no such joint.
         only_axis: the only joint, from 1, that the controller opens; the others have to stay
             closed. None where it opens all.
+        protocol: of the controller.
 
     Attributes:
         deadline: when silence becomes a fault, on the clock of `now`. Each new packet replied to
@@ -188,8 +186,9 @@ class Session:
         silence_timeout: float = 1.0,
         other_axes: Collection[tuple[int, int]] = (),
         only_axis: int | None = None,
+        protocol: ControllerProtocol | None = None,
     ) -> None:
-        _check_arguments(drive_train, guard, ring, mode, max_gap, arm, only_axis)
+        _check_arguments(drive_train, guard, ring, mode, max_gap, only_axis)
         self.deadline = math.inf
         self.state = State.SYNC
         self.counters = Counters()
@@ -211,38 +210,31 @@ class Session:
         self._drive_train = drive_train
         self._guard = guard
         self._ring = ring
-        self._mode = mode
         self._settle_cycles = settle_cycles
         self._init_timeout = init_timeout
         self._silence_timeout = silence_timeout
-        self._connect = partial(
-            connect,
-            drive_train=drive_train,
-            guard=guard,
-            arm=arm,
-            mode=mode,
-            other_axes=frozenset(other_axes),
-            max_gap=max_gap,
-            only_axis=only_axis,
+        spoken: ControllerProtocol = C4gProtocol() if protocol is None else protocol
+        self.wire: Wire = spoken.wire(
+            ArmSettings(
+                drive_train, guard.period, mode, arm, other_axes, only_axis, silence_timeout
+            )
         )
-        self._sequence = PacketSequence()
-        self._controller: Controller | None = None
-        self._cold_start = False
+        self._received: InitReceived | None = None
+        self._open_mode: SetPointGenerator | None = None
         self._silent_since: float | None = None
         self._arrived_at = -math.inf
-        self._last_packet = b""
         self._last_reply = b""
         # Number and last reason of packets without a reply, by kind, since the last drain.
         self._unreported: dict[str, tuple[int, str]] = {}
 
     @property
-    def init(self) -> InitPacket | None:
-        """The controller's init packet, None before it."""
-        return None if self._controller is None else self._controller.init
+    def init(self) -> ControllerDescription | None:
+        """What the controller stated of itself, with C4G its init packet; None before it."""
+        return self.wire.description
 
     @property
     def period(self) -> float:
-        """The controller's cycle, s; before its init packet the guard's."""
+        """The controller's cycle, s; before it is known the guard's."""
         init = self.init
         return self._guard.period if init is None else init.period
 
@@ -286,8 +278,8 @@ class Session:
             reason = "the controller has to report its axes closed first"
         elif self.state is State.EXITING or self.stop_reason is not None:
             reason = "open mode is being left; wait for closed axes"
-        elif self._controller is not None:
-            reason = self._controller.received.unusable
+        elif self._received is not None:
+            reason = self._received.unusable
         if reason is not None:
             raise self._request_error(reason)
         self.execution = execution
@@ -376,7 +368,7 @@ class Session:
         silence = now - self._silent_since
         self._events.append(LinkLost(silence, self.state, self.losses.stale))
         self.deadline = math.inf
-        self._sequence.broken = True
+        self.wire.lost()
         self._apply(Input.SILENCE)
 
     def reply(self, packet: bytes, now: float) -> bytes | None:
@@ -395,88 +387,64 @@ class Session:
         try:
             # Values that are not finite are checked by the guard.
             with np.errstate(all="ignore"):
-                if is_init(packet):
-                    return self._start_over(packet, now)
-                number = packet_number(packet)
-                powered = DRIVE_ON in packet[4 : 4 + N_ARMS]
-                if self._expects_sync(number, powered):
-                    return self._sync(packet, number, now, powered)
-                if number < INIT_NUMBER and not powered and self._sequence.is_stale(number):
-                    # It gets a reply once silence has ended the session before.
-                    self.losses.restarting = True
-                return self._cyclic(packet, number, now)
+                match received := self.wire.receive(packet, self.state, self.losses):
+                    case MeasuredCycle():
+                        return self._cyclic(received, now)
+                    case Handshake():
+                        return self._shake_hands(received, now)
+                    case Repeated():
+                        self.counters.duplicates += 1
+                        return self._last_reply
+                    case Stale(reason):
+                        self.losses.stale += 1
+                        self.counters.stale += 1
+                        self._report("stale", 1, reason)
+                        return None
+                    case Remark(text):
+                        self._events.append(ControllerRemark(text, self.cycle))
+                        return None
         except PacketError as error:
             self.counters.malformed += 1
             self._report("malformed", 1, f"{len(packet)} bytes: {error}")
             return None
 
-    def _start_over(self, packet: bytes, now: float) -> bytes:
-        if self.state is State.INIT and packet == self._last_packet:
-            self.counters.duplicates += 1
-            return self._last_reply
-        init = InitPacket.decode(packet)
-        syncing = self.state is State.SYNC
-        self._cold_start = syncing and self._sequence.last > 0
-        if syncing and not self._sequence.leads_to(INIT_NUMBER, self.losses.max_gap):
+    def _shake_hands(self, packet: Handshake, now: float) -> bytes:
+        """Follow a controller that starts a session."""
+        if packet.restarted:
             self._end("lost", "the controller restarted: sync packets are missing")
-        self._apply(Input.INIT)
-        self._controller = self._connect(init)
+        self._apply(packet.cause)
+        if packet.received is not None:
+            self._meet(packet.received)
+        elif self.state is State.SYNC:
+            self.wire.forget()
+            self._received = self._open_mode = None
+        return self._finish(packet.reply, now)
+
+    def _meet(self, received: InitReceived) -> None:
+        """Prepare for the cycles of a controller; the guard is narrowed to its own limits."""
+        self._received = received
+        self._open_mode = None
         self._holds_targets = True
-        self._sequence.restart(INIT_NUMBER, self._silence_timeout / max(init.period, 1e-3))
         self.cycle = 0
-        self._events.append(self._controller.received)
-        return self._finish(packet, echo(packet), now)
+        if self.wire.motors is not None:
+            self._open_mode = SetPointGenerator(
+                self._guard, self.wire, self.wire.motors, self.losses.max_gap
+            )
+            self._guard.narrow(*self.wire.limits())
+        self._events.append(received)
 
-    def _expects_sync(self, number: int, powered: bool) -> bool:
-        if self.state is State.SYNC:
-            return True
-        if powered:
-            return False
-        if self.state is State.INIT:
-            return self._cold_start and number in _SYNC_AFTER_INIT
-        # A controller that was silent and counts from the beginning has restarted.
-        sequence = self._sequence
-        return sequence.broken and number < INIT_NUMBER and sequence.distance(number) != 1
-
-    def _sync(self, packet: bytes, number: int, now: float, powered: bool) -> bytes:
-        if powered:
-            # The controller is in mid-session, and an echo would send set-points to open axes.
-            # Without replies its own watchdog acts.
-            raise PacketError("status", packet[4 : 4 + N_ARMS].hex(), "no drive on before init")
-        if len(packet) >= INIT_LENGTH:
-            raise PacketError("length", len(packet), f"less than {INIT_LENGTH} bytes")
-        self._apply(Input.SYNC)
-        if self.state is State.SYNC:
-            self._controller = None
-        self._sequence.accept(number)
-        return self._finish(packet, echo(packet), now)
-
-    def _cyclic(self, packet: bytes, number: int, now: float) -> bytes | None:
-        """Run one cycle: decode, record, change state, reply; an error becomes drive-off or 508."""
-        controller = self._controller
+    def _cyclic(self, packet: MeasuredCycle, now: float) -> bytes:
+        """Run one cycle: record, change state, reply; an error becomes drive-off or 508."""
         ring = self._ring
-        assert controller is not None
-        decoded = CyclicPacket.decode(packet, controller.init.n_axes)
-        if self._sequence.is_duplicate(number) and packet == self._last_packet:
-            self.counters.duplicates += 1
-            return self._last_reply
-        if self._sequence.is_stale(number):
-            self.losses.stale += 1
-            self.counters.stale += 1
-            self._report("stale", 1, f"number {number} does not follow {self._sequence.last}")
-            return None
-        missed = self._sequence.accept(number)
-        self.cycle = self._sequence.cycle
+        number, self.cycle, missed, axes = packet
         self.losses.receive(missed, now - self._arrived_at)
-        words = words_of(decoded)
-        status = controller.classifier.classify(decoded.status, words[:, MODE])
         row = ring.slot
         ring.arrival[row] = now
         ring.number[row] = number
         ring.gap[row] = missed
         ring.cycle[row] = self.cycle
-        refusal = self._fill_reply(controller, status, words, row)
-        self.in_interval = self.in_interval and status.any_open
+        refusal = self._fill_reply(axes, row)
+        self.in_interval = self.in_interval and axes.any_open
         ring.interval[row] = self.interval if self.in_interval else -1
         ring.state[row] = self.state
         ring.commit()
@@ -484,29 +452,24 @@ class Session:
             self.counters.refused += 1
             self._events.append(Refused(refusal, ring.last(FLIGHT_RECORDER)))
             self._end("refused", str(refusal))
-        return self._finish(packet, controller.builder.finish(number), now)
+        return self._finish(self.wire.finish(), now)
 
-    def _fill_reply(
-        self,
-        controller: Controller,
-        status: PacketStatus,
-        words: Words,
-        row: int,
-    ) -> RefusalError | None:
+    def _fill_reply(self, axes: AxesReport, row: int) -> RefusalError | None:
         """Fill in the reply and row `row` of the ring; return why a set-point was refused."""
         refusal: RefusalError | None = None
         try:
-            self._record(controller, status, words, row)
+            self._record(axes, row)
             if self.losses.missed:
                 self.counters.missed += self.losses.missed
                 self._events.append(GapSeen(self.losses.missed, self.cycle))
             before = self.state
-            decision = self._apply(status.input, status)
+            decision = self._apply(axes.input, axes)
             if decision.misplaced is not None:
-                raise self._axis_error(decision.misplaced, status)
+                raise AxisNotInMode(axes.misplacement(decision.misplaced), self.cycle)
             if self.state is State.FAULTED and before is not State.FAULTED:
-                refusal = ModeRefused(status.fault, self.cycle)
-            answer = self._reply_in_state(controller, status, words, row)
+                refusal = ModeRefused(axes.fault, self.cycle)
+                refusal.remedy = axes.remedy or refusal.remedy
+            answer = self._reply_in_state(axes, row)
         except BaseException as error:
             # Any error becomes a reply in this cycle that asks the controller to stop.
             answer = Refuse(as_refusal(error, self.cycle))
@@ -517,60 +480,48 @@ class Session:
             self._ring.commanded[row] = math.nan
             self._apply(Input.REFUSAL)
             self._offending = _offending(refusal)
-            self._fill_refusal(controller, self._offending, status, words)
+            self.wire.fill_refusal(self._offending)
         elif answer is not None:
-            self._follow(answer, controller.builder)
+            self._follow(answer)
         return refusal
 
-    def _record(
-        self,
-        controller: Controller,
-        status: PacketStatus,
-        words: Words,
-        row: int,
-    ) -> None:
-        """Write the axis blocks of a packet, `words` (n_axes, 9), into a row of the ring.
-
-        Commanded values are NaN.
-        """
+    def _record(self, axes: AxesReport, row: int) -> None:
+        """Write what a packet says into a row of the ring; commanded values are NaN."""
         ring = self._ring
-        wire = controller.wire
-        ring.status[row] = status.status
+        ring.status[row] = axes.status
         ring.commanded[row] = math.nan
-        if wire is None:
+        if self._open_mode is None:
             ring.mode[row] = -1
             ring.measured[row] = math.nan
             return
-        ring.mode[row] = status.modes
-        wire.read(words.view(np.float32), ring.measured[row])
+        ring.mode[row] = axes.modes
+        self.wire.record(ring.measured[row])
 
-    def _reply_in_state(
-        self, controller: Controller, status: PacketStatus, words: Words, row: int
-    ) -> OpenReply | None:
+    def _reply_in_state(self, axes: AxesReport, row: int) -> OpenReply | None:
         """Fill in the reply for the state that the packet leads to.
 
         Returns what open mode did, None outside it. Raises RefusalError if nothing may be sent.
         """
-        builder = controller.builder
+        wire = self.wire
         state = self.state
-        if state is State.FAULTED and status.powered:
-            self._fill_refusal(controller, self._offending, status, words)
+        if state is State.FAULTED and axes.powered:
+            wire.fill_refusal(self._offending)
             return None
-        builder.fill_safe(status.reply, words)
+        wire.fill_safe(self.execution is not None, self.cycle)
         if state not in HAS_SET_POINTS:
-            self._hold_without_motion(controller, status, words)
+            self._hold_without_motion(axes)
             return None
-        if controller.open_mode is None:
-            reason = controller.received.unusable
+        if self._open_mode is None:
+            reason = None if self._received is None else self._received.unusable
             raise RefusalError(f"this arm cannot be moved: {reason}", self.cycle)
         ring = self._ring
-        return controller.open_mode.reply(
+        return self._open_mode.reply(
             OpenCycle(
                 state,
                 self.cycle,
                 self.entered_at,
                 self._exit_requested_at,
-                status,
+                axes,
                 ring.measured[row],
                 ring.commanded[row],
                 self.losses,
@@ -581,43 +532,24 @@ class Session:
             )
         )
 
-    def _hold_without_motion(
-        self, controller: Controller, status: PacketStatus, words: Words
-    ) -> None:
+    def _hold_without_motion(self, axes: AxesReport) -> None:
         """Return open axes their target if that is possible, else request drive-off.
 
         Raises RefusalError in the first cycle of these.
         """
         try:
-            controller.builder.require_targets(status.reply.held_slots, self.cycle)
-            if self.state is State.FREEZING and controller.open_mode is not None:
-                controller.open_mode.hold_in_pause(status, self.cycle)
+            self.wire.require_targets(self.cycle)
+            if self.state is State.FREEZING and self._open_mode is not None:
+                self._open_mode.hold_in_pause(axes, self.cycle)
         except RefusalError as error:
             if self._holds_targets:
                 self._holds_targets = False
                 raise
-            self._fill_refusal(controller, _offending(error), status, words)
+            self.wire.fill_refusal(_offending(error))
         else:
             self._holds_targets = True
 
-    @staticmethod
-    def _fill_refusal(
-        controller: Controller, offending: int | None, status: PacketStatus, words: Words
-    ) -> None:
-        """Report a following error of joint `offending`, or request drive-off of all."""
-        slot = None
-        if offending is not None and controller.wire is not None:
-            slot = int(controller.wire.joint_slots[offending])
-        controller.builder.fill_refusal(status.reply, words, slot)
-
-    def _axis_error(self, joint: int, status: PacketStatus) -> AxisNotInMode:
-        mode = int(status.modes[joint])
-        expected = self._mode
-        wanted = int(Mode.CLOSED if mode == expected else expected)
-        message = f"joint {joint + 1} is in mode {mode}; the motion needs {wanted}"
-        return AxisNotInMode(message, self.cycle)
-
-    def _follow(self, answer: Reply, builder: ReplyBuilder) -> None:
+    def _follow(self, answer: Reply) -> None:
         """Apply what open mode did."""
         if self.state is State.OPEN:
             self._entering = False
@@ -632,7 +564,7 @@ class Session:
         if self.state is not State.EXITING:
             self._apply(Input.EXIT)
         self._exit_requested_at = self.cycle
-        builder.request_exit()
+        self.wire.request_exit()
 
     def _count_rejected(self, count: int) -> None:
         """Count replies that were not used; too many of them stop a motion on its path.
@@ -646,7 +578,7 @@ class Session:
         if reason is not None and self.state is State.OPEN and self.execution is not None:
             self.stop(reason)
 
-    def _apply(self, cause: Input, axes: Axes | None = None) -> Decision:
+    def _apply(self, cause: Input, axes: AxesReport | None = None) -> Decision:
         """Change to the state that an input leads to; the only place where states change."""
         decision = decide(self.state, cause, self.losses, self.execution, axes)
         if decision.stop is not None:
@@ -656,7 +588,10 @@ class Session:
         if cause in (Input.INIT, Input.SILENCE):
             self.in_interval = False
         if decision.ending is not None:
-            self._end(*decision.ending)
+            outcome, reason = decision.ending
+            if outcome == "lost" and axes is not None and axes.cause:
+                reason = axes.cause
+            self._end(outcome, reason)
         return decision
 
     def _enter(self, after: State) -> None:
@@ -683,10 +618,9 @@ class Session:
         self.execution = None
         self._events.append(MotionEnded(outcome, reason, interval, self.cycle))
 
-    def _finish(self, packet: bytes, reply: bytes, now: float) -> bytes:
+    def _finish(self, reply: bytes, now: float) -> bytes:
         self.counters.replied += 1
         self.losses.restarting = False
-        self._last_packet = packet
         self._last_reply = reply
         self._arrived_at = now
         self._restart_deadline(now)

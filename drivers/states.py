@@ -13,6 +13,9 @@ from dataclasses import dataclass
 from enum import IntEnum
 from typing import Final, Literal, Protocol
 
+import numpy as np
+from numpy.typing import NDArray
+
 from drivers.losses import LossTracker
 from drivers.packets import MODE_FIELDS, Mode
 
@@ -191,6 +194,56 @@ _LOSS: Final = {
 """Reason for the loss of a motion."""
 
 
+@dataclass(frozen=True, eq=False)
+class AxesReport:
+    """What a packet says of the axes of an arm.
+
+    Attributes:
+        input: of the state machine.
+        status: of the arm's drive, as the controller codes it.
+        modes: (n,) mode of each joint, likewise.
+        ready: (n,) joints in the wanted mode; closed ones where they are to stay closed.
+        held_joints: (n,) joints in an open mode whose safe reply is the target received.
+        powered: some wanted axis is in an open mode and the drive is on.
+        any_open: some wanted axis is in an open mode.
+        unwanted: first joint in an open mode other than the wanted one, or None.
+        cause: what ends a motion that this input ends, as the controller states it; "" where the
+            input says it all.
+        remedy: what the operator should do then; "" for the remedy of the refusal.
+    """
+
+    input: Input
+    status: int
+    modes: NDArray[np.int32]
+    ready: NDArray[np.bool_]
+    held_joints: NDArray[np.bool_]
+    powered: bool
+    any_open: bool
+    unwanted: int | None
+    cause: str
+    remedy: str
+
+    @property
+    def fault(self) -> str:
+        """Why these modes are refused."""
+        return self.cause
+
+    def misplacement(self, joint: int) -> str:
+        """Return why a joint, from 0, is not in the mode that the motion needs."""
+        return self.cause or f"joint {joint + 1} is in mode {self.modes[joint]}"
+
+    def misplaced(self, in_motion: bool) -> int | None:
+        """Return a joint that is not in the mode a requested motion needs, or None.
+
+        Before the motion an axis may still be closed; `in_motion` every one has to be open.
+        """
+        if not self.powered:
+            return None
+        if in_motion and self.input is not Input.OPEN:
+            return int(np.argmin(self.ready))
+        return self.unwanted
+
+
 class RequestedMotion(Protocol):
     """What a decision reads of the requested motion, an `Execution`."""
 
@@ -212,7 +265,7 @@ class RequestedMotion(Protocol):
 
 
 class Axes(Protocol):
-    """What a decision reads of the modes of the axes, a `PacketStatus`."""
+    """What a decision reads of the modes of the axes, an `AxesReport`."""
 
     def misplaced(self, in_motion: bool) -> int | None:
         """Return a joint that is not in the mode a requested motion needs, or None."""

@@ -57,6 +57,7 @@ FOREIGN: Final[Mapping[str, str]] = {
     "identification.excitation.collision_bodies": "errors of pinocchio",
     "identification.export.urdf": "URDFs",
     "sim_fixtures.ns16": "a URDF",
+    "sim_fixtures.ur.program": "programs of clients",
 }
 """Modules that read text of others."""
 OURS: Final[Mapping[str, str]] = {

@@ -70,7 +70,11 @@ def main(arguments: Sequence[str]) -> int:
         processors = os.sched_getaffinity(0)
         report = realtime.enter(settings.realtime)
         warm_up = WarmUp(
-            settings.drive_train, settings.guard_limits, settings.period, _loopback(transport)
+            settings.drive_train,
+            settings.guard_limits,
+            settings.period,
+            _loopback(transport),
+            settings.session.get("protocol"),
         )
         warm_up.polls = may_poll(report.scheduling, processors)
     except Exception as error:

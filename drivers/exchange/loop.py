@@ -7,18 +7,10 @@ from collections.abc import Callable
 from typing import Final, NamedTuple
 
 from drivers.errors import TransportClosed
-from drivers.packets import (
-    AXIS_LENGTH,
-    HEADER_LENGTH,
-    LAST_NUMBER,
-    MAX_AXES,
-    N_ARMS,
-    cyclic_length,
-    is_init,
-)
 from drivers.session import Session
 from drivers.states import HAS_SET_POINTS, State
 from drivers.transports.base import Transport
+from drivers.wire import Wire
 
 POLL: Final = 0.1
 """Longest wait for a packet, s."""
@@ -47,8 +39,8 @@ have been full when newer ones arrived."""
 _NUMBER_WINDOW: Final = 1000
 """Largest difference of two packet numbers of one session; beyond it neither is the newer."""
 
-_Kind = tuple[int, int, bytes]
-"""Session within the backlog, length, status and modes."""
+_Kind = tuple[int, bytes]
+"""Session within the backlog, and kind of packet."""
 
 
 def _accepts_any_peer(session: Session) -> bool:
@@ -155,8 +147,7 @@ class ReceiveQueue:
     def _newest(self, first: Arrival, period: float) -> tuple[Arrival, ...]:
         """Return the newest of each kind among a packet and those queued behind it."""
         transport = self._transport
-        init = self._session.init
-        backlog = _Backlog(MAX_AXES if init is None else init.n_axes)
+        backlog = _Backlog(self._session.wire)
         backlog.add(first)
         for _ in range(_MAX_BACKLOG):
             packet = transport.receive(0.0)
@@ -190,54 +181,46 @@ class _Backlog:
     """The newest packet of each kind, in the order of arrival.
 
     Two packets whose numbers are far apart are both retained: one is of another session, or its
-    number is corrupt, which the session can decide. Bytes behind `n_axes` axes make no kind.
+    number is corrupt, which the session can decide.
 
     Attributes:
         newest: kind and packet.
         dropped: packets not retained, without repetitions of one that was.
     """
 
-    def __init__(self, n_axes: int) -> None:
+    def __init__(self, wire: Wire) -> None:
         self.dropped = 0
         self.newest: list[tuple[_Kind, Arrival]] = []
-        self._modes = slice(HEADER_LENGTH, cyclic_length(n_axes), AXIS_LENGTH)
+        self._wire = wire
+        self._numbers: list[int] = []  # of the newest
         self._sessions = 0
 
     def add(self, arrival: Arrival) -> None:
         """Add a packet that came after the others."""
         packet = arrival.packet
-        if is_init(packet):
-            self._sessions += 1
-        status = packet[4 : 4 + N_ARMS]
-        # The lowest byte of a mode identifies it.
-        kind = (self._sessions, len(packet), status + packet[self._modes])
+        starts, sort, number = self._wire.sort(packet)
+        self._sessions += starts
+        kind = self._sessions, sort
+        ahead = self._wire.ahead
         for place, (other, earlier) in enumerate(self.newest):
             if other != kind:
                 continue
             if packet == earlier.packet:
                 return
-            if _ahead(_number(earlier.packet), _number(packet)) <= _NUMBER_WINDOW:
+            if ahead(self._numbers[place], number) <= _NUMBER_WINDOW:
                 self.dropped += 1  # it was overtaken on its way
                 return
-            if _ahead(_number(packet), _number(earlier.packet)) <= _NUMBER_WINDOW:
+            if ahead(number, self._numbers[place]) <= _NUMBER_WINDOW:
                 self._drop(place)
                 break
         if len(self.newest) >= MAX_KINDS:
             self._drop(0)
         self.newest.append((kind, arrival))
+        self._numbers.append(number)
 
     def _drop(self, place: int) -> None:
-        del self.newest[place]
+        del self.newest[place], self._numbers[place]
         self.dropped += 1
-
-
-def _number(packet: bytes) -> int:
-    return int.from_bytes(packet[:4], "little")
-
-
-def _ahead(later: int, earlier: int) -> int:
-    """Difference of two packet numbers, modulo their range."""
-    return (later - earlier) % LAST_NUMBER
 
 
 class _LatenessMonitor:

@@ -15,7 +15,15 @@ import numpy as np
 
 from drivers.cycle_records import MEASURED, CycleRing
 from drivers.errors import DriverError, RequestError
-from drivers.events import Event, GapSeen, LinkLost, MotionEnded, PacketRejected, RepliesLost
+from drivers.events import (
+    ControllerDescription,
+    Event,
+    GapSeen,
+    LinkLost,
+    MotionEnded,
+    PacketRejected,
+    RepliesLost,
+)
 from drivers.exchange.control import (
     HEARTBEAT_TIMEOUT,
     IDLE_HEARTBEAT_TIMEOUT,
@@ -37,7 +45,6 @@ from drivers.exchange.event_log import (
 from drivers.exchange.loop import POLL
 from drivers.exchange.motion_transfer import READ, WITHDRAWN, Inbox, unpack
 from drivers.motion_source import MotionSource, progress_of
-from drivers.packets import InitPacket
 from drivers.session import Session
 from drivers.states import State
 from drivers.transports.base import Transport
@@ -165,7 +172,7 @@ class CommandHandler:
         self._arm_moved_at = -math.inf
         self._limiter = EventLimiter()
         self._offered: MotionSource | None = None
-        self._offered_to: InitPacket | None = None
+        self._offered_to: ControllerDescription | None = None
         self._source: object = None
 
     def __call__(self) -> bool:

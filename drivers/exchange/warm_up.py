@@ -7,25 +7,17 @@ from contextlib import suppress
 from typing import Final
 
 import numpy as np
-from numpy.typing import ArrayLike
 
 from drivers.arrays import Array
+from drivers.c4g_wire import C4gProtocol
 from drivers.cycle_records import CycleRing
 from drivers.drive_train import DriveTrain
 from drivers.guard import Guard, GuardLimits
 from drivers.motion_source import BoundsName
-from drivers.packets import (
-    DRIVE_ON,
-    INIT_NUMBER,
-    N_ARMS,
-    CyclicPacket,
-    InitPacket,
-    Mode,
-    next_number,
-)
 from drivers.session import Session
 from drivers.states import State
 from drivers.transports.base import PollingTransport, Transport
+from drivers.wire import ControllerProtocol
 
 _CYCLES: Final = 200
 """Cycles before the first packet."""
@@ -34,7 +26,6 @@ LEAD: Final = 3e-4
 packet may come some 0.05 ms early."""
 _MOST_SLOW: Final = 3
 """Cycles in a row that took longer than `LEAD`: a processor on which they would delay replies."""
-_STATUS: Final = bytes((DRIVE_ON, 0, 0, 0))
 
 
 def may_poll(scheduling: str, processors: set[int]) -> bool:
@@ -80,6 +71,7 @@ class WarmUp:
         limits: of the guard.
         period: the controller's cycle, s.
         link: one that receives what it sends, by the code of the real one; None without.
+        protocol: of the controller.
 
     Attributes:
         session: open unless something is wrong.
@@ -93,38 +85,30 @@ class WarmUp:
         limits: GuardLimits,
         period: float,
         link: Transport | None = None,
+        protocol: ControllerProtocol | None = None,
     ) -> None:
         self.polls = False
         self._link = link
         self._slow = 0
         n = drives.n_joints
         position = 0.5 * (limits.lower + limits.upper)
-        self.session = Session(drives, Guard(limits, period), CycleRing(n, 16))
         self.reply: bytes | None = None
         self._period = period
-        self._number = INIT_NUMBER
-        self._axes = CyclicPacket.zeros(1, n).axes
-        self._axes["d"][:, 0] = self._axes["d"][:, 2] = drives.motor_revolutions(position)
-        values: dict[str, ArrayLike] = {
-            "gear_ratio": drives.gear_ratio,
-            "calibration": drives.calibration,
-            "kinematic_influence": [0.0, 0.0, 0.0, drives.k54, drives.k64, drives.k65],
-            "current_limit": limits.current,
-            "following_error": limits.following_error,
-        }
-        self.session.reply(InitPacket.build(n, round(1000.0 * period), values).encode(), 0.0)
+        own: ControllerProtocol = C4gProtocol() if protocol is None else protocol
+        self._packets = own.own_packets(
+            drives, position, period, (limits.following_error, limits.current)
+        )
+        self.session = Session(drives, Guard(limits, period), CycleRing(n, 16), protocol=own)
+        self.session.reply(self._packets.first(), 0.0)
         self.session.request(_Rest(position))
-        self._axes["mode"] = Mode.CLOSED
-        self.cycle()
-        self._axes["mode"] = Mode.POSITION
+        self.cycle(opened=False)
         for _ in range(_CYCLES):
             self.cycle()
         self.session.events()
 
-    def cycle(self) -> None:
+    def cycle(self, *, opened: bool = True) -> None:
         """Let the session reply to one more packet."""
-        self._number = next_number(self._number)
-        packet = CyclicPacket(self._number, _STATUS, bytes(N_ARMS), self._axes).encode()
+        packet = self._packets.next(opened=opened)
         if self._link is not None:
             self._link.send(packet)
             self._link.receive(0.0)  # whatever comes

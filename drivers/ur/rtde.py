@@ -28,6 +28,8 @@ VERSION: Final = 2
 """Of the protocol, that has a frequency and numbered recipes."""
 LONGEST_NAMES: Final = 2048
 """Bytes of the list of names in a request."""
+LONGEST_TEXT: Final = 255
+"""Bytes of a line of text from the controller."""
 _HEADER: Final = struct.Struct(">HB")
 LONGEST: Final = 0xFFFF
 """Bytes of the longest frame, header included."""
@@ -41,6 +43,7 @@ class FrameType(IntEnum):
     TEXT = ord("M")
     DATA = ord("U")
     OUTPUTS = ord("O")
+    INPUTS = ord("I")
     START = ord("S")
     PAUSE = ord("P")
 
@@ -59,7 +62,9 @@ _NUMPY_TYPES: Final[dict[str, Any]] = {
 }
 """Types of values by their names in the protocol."""
 NOT_FOUND: Final = "NOT_FOUND"
-"""Type of an output that this controller does not have."""
+"""Type of an output or input that this controller does not have."""
+IN_USE: Final = "IN_USE"
+"""Type of an input that another client of the controller writes."""
 
 
 class RtdeError(DriverError):
@@ -71,6 +76,14 @@ class OutputsMissingError(RtdeError):
 
     def __init__(self, names: Sequence[str]) -> None:
         super().__init__(f"the controller does not send {', '.join(names)}")
+        self.names = tuple(names)
+
+
+class InputsInUseError(RtdeError):
+    """Inputs that another client of the controller writes; `names` are theirs."""
+
+    def __init__(self, names: Sequence[str]) -> None:
+        super().__init__(f"another program writes {', '.join(names)}")
         self.names = tuple(names)
 
 
@@ -170,6 +183,31 @@ def outputs_request(frequency: float, names: Sequence[str]) -> bytes:
     return frame(FrameType.OUTPUTS, struct.pack(">d", frequency) + joined)
 
 
+def inputs_request(names: Sequence[str]) -> bytes:
+    """Return the request to write inputs, in this order."""
+    return frame(FrameType.INPUTS, ",".join(names).encode("ascii"))
+
+
+def confirmed_inputs(names: Sequence[str], payload: bytes) -> int:
+    """Return the number of the recipe in a reply to `inputs_request` with these names.
+
+    Raises:
+        InputsInUseError: another client writes some of them.
+        RtdeError: the controller lacks some of them, or replies something else.
+    """
+    number, types = payload[0] if payload else 0, payload[1:].decode("latin-1").split(",")
+    if len(types) != len(names):
+        raise RtdeError(f"{len(names)} inputs were requested, {len(types)} confirmed")
+    pairs = [*zip(names, types, strict=True)]
+    if used := [name for name, kind in pairs if kind == IN_USE]:
+        raise InputsInUseError(used)
+    if missing := [name for name, kind in pairs if kind == NOT_FOUND]:
+        raise RtdeError(f"the controller does not have {', '.join(missing)}")
+    if number == 0:
+        raise RtdeError("the controller refuses to have its inputs written")
+    return number
+
+
 @dataclass(frozen=True)
 class OutputRecipe:
     """Outputs that the controller confirmed, in the order of their values.
@@ -228,6 +266,13 @@ class ControllerText:
     message: str
     source: str
     level: int
+
+
+def text_frame(message: str, source: str, level: int = 3) -> bytes:
+    """Return a frame with a line of text, cut to the length that a frame can have."""
+    words = (message.encode()[:LONGEST_TEXT], source.encode()[:LONGEST_TEXT])
+    packed = b"".join(bytes([len(word)]) + word for word in words)
+    return frame(FrameType.TEXT, packed + bytes([level]))
 
 
 def controller_text(payload: bytes) -> ControllerText:

@@ -17,12 +17,12 @@ from drivers.open_mode import MAX_TARGET_JUMP
 from drivers.transports.simulated import Delay, Duplicate, Fault, Lose, SimulatedTransport
 from hil.base.arrays import Array
 from hil.cell import Cell
+from hil.control.planted_arm import planted_values
 from hil.control.simulated_cell import (
     NOISE_SHARE,
     RESOLUTION_SHARE,
     assumed_simulation,
     controller_settings,
-    planted_values,
     simulated_controller,
     simulated_provenance,
 )

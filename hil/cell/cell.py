@@ -16,6 +16,9 @@ from drivers.drive_train import DriveTrain
 from drivers.errors import DriverError
 from drivers.guard import GuardLimits
 from drivers.transports.base import TransportError, TransportSpec
+from drivers.ur.expected import ExpectedArm
+from drivers.ur.script import StreamProgram
+from drivers.ur.wire import UrProtocol
 from hil.base.arrays import Array
 from hil.base.safe_input import parse_toml, read_text, remedy_for_missing
 from hil.base.terminal_text import typed
@@ -41,6 +44,11 @@ from .toml_edits import urdf_limits, with_values
 
 T = TypeVar("T")
 
+UR_MAX_GAP: Final = 4
+"""`max_gap` of Universal Robots controllers without another: a set-point is used some two cycles
+after it was sent, and a computer without a real-time system is late now and then."""
+UR_FLANGES: Final = ("tool0", "flange")
+"""Frames in which such a controller states a payload."""
 ASSUMED_PAYLOAD: Final = "robot.payload"
 """Entry of `[cell] assumed` in the cell of an arm with a payload that is to be weighed."""
 
@@ -278,6 +286,47 @@ class Cell:
         """
         return spec is None or (spec.is_local and self.file.simulation is not None)
 
+    @property
+    def is_ur(self) -> bool:
+        """Whether the controller is one of Universal Robots, real or simulated."""
+        table = self.controller
+        return table.transport == "rtde" or "rtde" in table.model_fields_set
+
+    @property
+    def expected_arm(self) -> ExpectedArm:
+        """The arm that must be at the other end of a link to Universal Robots."""
+        table, payload = self.controller.rtde, self.file.robot.payload
+        at_flange = payload is not None and payload.frame in UR_FLANGES
+        return ExpectedArm(
+            serial_number=self.file.cell.serial_number,
+            model=table.model,
+            calibration=table.calibration,
+            payload=0.0 if payload is None else payload.mass,
+            centre=payload.centre if payload is not None and at_flange else None,
+        )
+
+    @property
+    def ur_protocol(self) -> UrProtocol:
+        """Protocol of a controller of Universal Robots, with the program that moves the arm."""
+        limits = self.guard_limits
+        ratio = np.abs(self.drive_train.gear_ratio)
+        program = StreamProgram(
+            token=1,
+            period=self.period,
+            patience=self.max_gap + 1,
+            velocity=tuple(limits.velocity.tolist()),
+            deviation=tuple((2.0 * np.pi * limits.following_error / ratio).tolist()),
+            deceleration=float(limits.stop_acceleration * limits.acceleration.min()),
+        )
+        return UrProtocol(self.expected_arm, program)
+
+    @property
+    def max_gap(self) -> int:
+        """Consecutive missed packets that a motion tolerates."""
+        table = self.controller
+        given = "max_gap" in table.model_fields_set
+        return UR_MAX_GAP if self.is_ur and not given else table.max_gap
+
     def session_settings(self, *, only_axis: int | None = None) -> dict[str, Any]:
         """Keyword arguments of `drivers.Session`."""
         table = self.controller
@@ -285,9 +334,11 @@ class Cell:
         settings: dict[str, Any] = {
             "mode": table.mode,
             "arm": table.arm,
-            "max_gap": table.max_gap,
+            "max_gap": self.max_gap,
             "other_axes": frozenset(table.other_axes),
         }
+        if self.is_ur:
+            settings["protocol"] = self.ur_protocol
         if only_axis is not None:
             settings["only_axis"] = only_axis
         if campaign is not None:

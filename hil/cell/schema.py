@@ -23,8 +23,8 @@ from pydantic import (
 from drivers.transports.base import TransportSpec
 from drivers.transports.udp import UdpSpec
 from drivers.ur.identity import DASHBOARD_PORT, PRIMARY_PORT
-from drivers.ur.reader import RtdeSpec
 from drivers.ur.rtde import PORT as RTDE_PORT
+from drivers.ur.transport import RtdeSpec
 from hil.base.safe_input import parse_port
 from hil.cell.field_error import FieldError
 
@@ -417,7 +417,7 @@ class ControllerTable(Table):
     """`[controller]`: the link to the controller."""
 
     transport: Literal["simulated", "udp", "can", "rtde"] = field(
-        '"simulated", "udp", "can" or "rtde" (Universal Robots, recorded only)'
+        '"simulated", "udp", "can" or "rtde" (Universal Robots)'
     )
     cycle_ms: Literal[1, 2, 4, 8] = field(
         "the controller's cycle, 1, 2 or 4 ms; with rtde 2, or 8 of a CB3"
@@ -430,7 +430,10 @@ class ControllerTable(Table):
     rtde: RtdeTable = field("a table of the Universal Robots arm", RtdeTable())
     arm: Whole = field("arm of the controller, 1 to 4", 1, ge=1, le=4)
     max_gap: Whole = field(
-        "consecutive missed packets that a motion tolerates, 0 to 5", 2, ge=0, le=5
+        "consecutive missed packets that a motion tolerates, 0 to 5; with rtde 4 by default",
+        2,
+        ge=0,
+        le=5,
     )
     other_axes: list[ArmAxis] = field(
         "pairs [arm, axis], from 1, of axes that are not joints of this cell and may be open, "
@@ -510,7 +513,8 @@ def _can_address(text: str) -> dict[str, Any] | None:
 
 def _rtde(table: ControllerTable, n_axes: int) -> TransportSpec:
     del n_axes
-    return RtdeSpec(table.host, table.rtde.port)
+    ports = table.rtde
+    return RtdeSpec(table.host, ports.port, ports.primary_port, ports.dashboard_port)
 
 
 def _rtde_address(text: str) -> dict[str, Any] | None:

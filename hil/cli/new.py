@@ -9,7 +9,7 @@ from typing import Annotated, Literal
 import typer
 
 from drivers.transports.udp import UdpSpec
-from drivers.ur.reader import RtdeSpec
+from drivers.ur.transport import RtdeSpec
 from hil.base.errors import InputError
 from hil.base.files import convert_write_errors, write_atomically
 from hil.base.progress import say

@@ -9,6 +9,7 @@ from typing import Final, Literal
 import numpy as np
 
 from drivers.events import (
+    ControllerDescription,
     InitReceived,
     LinkLost,
     MotionEnded,
@@ -20,7 +21,6 @@ from drivers.events import (
 from drivers.exchange.event_log import EventsLost, ExchangeEvent
 from drivers.guard import Guard
 from drivers.init_check import float32_text, is_narrower
-from drivers.packets import InitPacket
 from drivers.states import State
 from hil.archive import ArchiveSpec
 from hil.base.arrays import Array
@@ -58,7 +58,7 @@ class Connection:
         cell: of the link, for these lines.
     """
 
-    init: InitPacket | None = None
+    init: ControllerDescription | None = None
     inits: int = 0
     unusable: str | None = None
     differences: tuple[str, ...] = ()
@@ -184,14 +184,14 @@ def not_ready(state: State, waited: float, why_off: str = "") -> ControllerError
 
 
 def described(spec: ArchiveSpec, connection: Connection) -> ArchiveSpec:
-    """Return the archive with the init packet."""
+    """Return the archive with what the controller stated of itself."""
     if connection.init is None:
         return spec
-    packet = {"init_packet.bin": connection.init.encode()}
-    return replace(spec, attachments={**spec.attachments, **packet})
+    stated = {connection.init.attachment: connection.init.encode()}
+    return replace(spec, attachments={**spec.attachments, **stated})
 
 
-def active_guard(cell: Cell, init: InitPacket | None) -> Guard:
+def active_guard(cell: Cell, init: ControllerDescription | None) -> Guard:
     """Return a guard with the narrower limits of the cell and the controller."""
     guard = Guard(cell.guard_limits, cell.period)
     if init is not None:
@@ -233,7 +233,6 @@ def narrower_limits(cell: Cell, connection: Connection, limit: Limit) -> tuple[s
     )
 
 
-def _stated(cell: Cell, init: InitPacket, limit: Limit) -> Array:
-    """Return a limit of the cell's arm in an init packet (n,), NaN where it has none."""
-    values = getattr(init, limit)[cell.controller.arm - 1, : len(cell.joint_names)]
-    return np.asarray(values, dtype=np.float64)
+def _stated(cell: Cell, init: ControllerDescription, limit: Limit) -> Array:
+    """Return a limit of the cell's arm that its controller states (n,), NaN where it has none."""
+    return init.stated(limit, cell.controller.arm, len(cell.joint_names))

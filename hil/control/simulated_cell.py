@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 from collections.abc import Sequence
 from dataclasses import replace
-from typing import Any, Final, Literal
+from typing import Any, Final
 
 import numpy as np
 
@@ -14,9 +14,9 @@ from hil.base.arrays import Array
 from hil.cell import AngleFrame, Cell, CellError
 from hil.control.motion_checks import collision_checker
 from hil.control.own_moves import InterpolatedMoves
+from hil.control.planted_arm import carried, planted_truth
+from hil.control.ur_simulation import ur_link
 from hil.control.virtual_link import VirtualLink
-from identification.model.known_payload import Payload
-from identification.model.pseudo_inertia import body
 from identification.text import percentage
 from sim_fixtures import (
     ControllerSettings,
@@ -26,7 +26,6 @@ from sim_fixtures import (
     UnmodelledEffects,
 )
 from sim_fixtures.faults import InjectedFault
-from sim_fixtures.plant import Carried
 from sim_fixtures.servo import loops_per_cycle
 
 NOISE_SHARE: Final = 0.005  # Noise of the current, rms, as a share of the weakest motor's limit
@@ -73,6 +72,8 @@ def simulated_link(
             "a cell of real hardware is not simulated",
             'set it to "simulated" to run without hardware',
         )
+    if cell.is_ur:
+        return ur_link(cell, session=session)
     settings = replace(controller_settings(cell, effects=effects), only_axis=only_axis)
     controller = simulated_controller(
         cell, effects=effects, drive=drive, truth=truth, settings=settings, session=session
@@ -212,47 +213,6 @@ def simulated_drive(cell: Cell) -> SimulatedDrive:
     )
 
 
-def planted_truth(cell: Cell) -> PlantTruth:
-    """Return the true rotor inertias, friction and link inertias, or raise CellError.
-
-    The simulated arm carries `[robot.payload]`, and its controller knows it.
-    """
-    settings = cell.simulation
-    return PlantTruth(
-        rotor_inertia=np.array(settings.rotor_inertia),
-        coulomb=np.array(settings.coulomb),
-        viscous=np.array(settings.viscous),
-        third=np.array(settings.third),
-        third_law=_third_law(cell),
-        inertia_scale=np.array(settings.inertia_scale or [1.0]),
-        carried=carried(cell, cell.model.payload),
-    )
-
-
-def carried(cell: Cell, payload: Payload | None) -> Carried | None:
-    """Return a payload as what the simulated arm carries (ModelError: not on a moving link)."""
-    if payload is None or payload.mass == 0.0:
-        return None
-    joint, inertial = payload.carried_by(cell.model.chain)
-    return Carried(joint, *body(inertial))
-
-
-def _third_law(cell: Cell) -> Literal["quadratic", "cubic"]:
-    """Return the third friction term of the simulated arm."""
-    joints = zip(cell.joint_names, cell.model.friction.laws, cell.simulation.third, strict=True)
-    planted = {name: law.third for name, law, third in joints if third}
-    laws = set(planted.values()) - {None}
-    if len(laws) > 1:
-        raise CellError(
-            cell.path,
-            "robot.friction.joints",
-            None,
-            f"quadratic and cubic terms in {', '.join(planted)}; a simulated arm has only one",
-            "give all joints of the simulated arm the same third term",
-        )
-    return "cubic" if laws == {"cubic"} else "quadratic"
-
-
 def unmodelled_effects(cell: Cell) -> UnmodelledEffects:
     """Return the unmodelled effects with the sizes of the cell."""
     settings = cell.simulation
@@ -283,15 +243,3 @@ def simulated_provenance(cell: Cell, effects: bool) -> dict[str, str]:
         "seed": str(cell.simulation.seed),
         "effects": json.dumps(switched_on),
     }
-
-
-def planted_values(cell: Cell) -> Array:
-    """Return the true parameters (p,) in the order of the cell's model."""
-    truth = planted_truth(cell)
-    return cell.parameter_values(
-        rotor_inertia=truth.rotor_inertia,
-        coulomb=truth.coulomb,
-        viscous=truth.viscous,
-        third=truth.third,
-        inertia_scale=truth.inertia_scale,
-    )

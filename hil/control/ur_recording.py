@@ -7,17 +7,18 @@ from __future__ import annotations
 
 import json
 import time
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass, fields, is_dataclass, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, Final, Self
+from typing import Final, Self
 
 import numpy as np
 
 from drivers.errors import DriverError
 from drivers.states import State
 from drivers.ur.cycles import CycleCounter, CycleFrames
+from drivers.ur.description import UrDescription, identity_document
 from drivers.ur.identity import ArmIdentity, ask_identity
 from drivers.ur.outputs import (
     FREEDRIVE_BIT,
@@ -27,8 +28,9 @@ from drivers.ur.outputs import (
     SAFETY_MODES,
     SAFETY_NORMAL,
 )
-from drivers.ur.reader import OutputFrames, RtdeReader, RtdeSpec
+from drivers.ur.reader import OutputFrames, RtdeReader
 from drivers.ur.torque_constants import UNCERTAINTY, by_size, stated_constants
+from drivers.ur.transport import RtdeSpec
 from hil.archive import CONTROLLER_PROGRAM, open_archive
 from hil.archive.recorder import Recorded
 from hil.archive.schema import UR_STATE, Level
@@ -40,8 +42,6 @@ from hil.control.link import Progress, Watch, recording_end
 from hil.control.motion_watch import Stop
 from hil.control.record import archive_spec, kind_entry, origin_of
 
-IDENTITY: Final = "ur_arm.json"
-"""Attachment with what the arm states of itself."""
 _LOOK: Final = 0.1
 """Time between two looks at what arrived, s."""
 _FIRST: Final = 5.0
@@ -50,8 +50,6 @@ _RETRY: Final = 0.5
 """Time between two attempts to connect, s."""
 _SAME: Final = 0.01
 """Relative difference of torque constants that is not reported."""
-_PAYLOAD_TOLERANCE: Final = 0.02
-"""Difference of payloads that is reported, kg."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -145,8 +143,8 @@ def record_arm(
         **_statements(arm),
     }
     spec = archive_spec(cell, path, metadata, durable=durable, states=(UR_STATE,))
-    identity = json.dumps(_document(arm.identity)).encode()
-    spec = replace(spec, attachments={**spec.attachments, IDENTITY: identity})
+    identity = json.dumps(identity_document(arm.identity)).encode()
+    spec = replace(spec, attachments={**spec.attachments, UrDescription.attachment: identity})
     with spec.open() as writer:
         recording = _Recording(cell, writer, report)
         return recording.run(arm.reader, first, stop, duration, watch)
@@ -309,15 +307,11 @@ def _changes(before: np.void | None, now: np.void) -> Iterator[tuple[str, str, L
 
 def _payload_difference(cell: Cell, state: np.void) -> str:
     """Return how the payload of the controller differs from that of the cell, or ""."""
-    mass = float(state["payload_mass"])
-    table = cell.file.robot.payload
-    stated = 0.0 if table is None else table.mass
-    if np.isnan(mass) or abs(mass - stated) <= _PAYLOAD_TOLERANCE:
-        return ""
-    return (
-        f"the controller is set to a payload of {mass:g} kg, [robot.payload] of the cell to "
-        f"{stated:g} kg; what is identified is the arm with all that it carries beyond the cell's"
+    difference = cell.expected_arm.payload_difference(
+        float(state["payload_mass"]), tuple(state["payload_centre"])
     )
+    consequence = "what is identified is the arm with all that it carries beyond the cell's"
+    return f"{difference}; {consequence}" if difference else ""
 
 
 def _spec_of(cell: Cell) -> RtdeSpec:
@@ -364,38 +358,15 @@ def _require_same_arm(cell: Cell, reader: RtdeReader, identity: ArmIdentity) -> 
         problem = f"the controller's cycle is {cycle_ms} ms, that of the cell"
         remedy = f"write cycle_ms = {cycle_ms} in [controller]"
         raise ControllerError(f"{problem} {cell.controller.cycle_ms} ms; {remedy}")
-    stated, found = _of_cell(cell), _of_arm(identity, reader.version.major)
-    different = [name for name, text in stated.items() if found.get(name, text) != text]
-    if different:
-        name = different[0]
-        problem = f"this is another arm: its {name} is {found[name]}, that of the cell"
-        raise ControllerError(f"{problem} {stated[name]}; correct the cell file, or the address")
-
-
-def _of_cell(cell: Cell) -> dict[str, str]:
-    table = cell.controller.rtde
-    texts = {
-        "serial number": cell.file.cell.serial_number,
-        "type": table.model,
-        "calibration": table.calibration,
-    }
-    return {name: text for name, text in texts.items() if text}
-
-
-def _of_arm(identity: ArmIdentity, major: int) -> dict[str, str]:
-    texts = {
-        "serial number": identity.serial_number,
-        "type": identity.named(major),
-        "calibration": identity.calibration,
-    }
-    return {name: text for name, text in texts.items() if text is not None}
+    if different := cell.expected_arm.differences(identity, reader.version.major):
+        problem = f"this is another arm: {different[0]}"
+        raise ControllerError(f"{problem}; correct the cell file, or the address")
 
 
 def _unchecked(cell: Cell, identity: ArmIdentity) -> Iterator[str]:
     """Yield a sentence if the cell states something that the arm could not be asked."""
-    missing = _of_cell(cell).keys() - _of_arm(identity, 5).keys()
-    if missing:
-        yield f"the arm was not compared with the cell by {' and '.join(sorted(missing))}"
+    if missing := cell.expected_arm.unchecked(identity):
+        yield f"the arm was not compared with the cell by {' and '.join(missing)}"
 
 
 def _statements(arm: ArmListener) -> dict[str, str]:
@@ -411,14 +382,3 @@ def _statements(arm: ArmListener) -> dict[str, str]:
         "not_sent": ", ".join(arm.reader.absent) or None,
     }
     return {f"ur.{name}": text for name, text in texts.items() if text is not None}
-
-
-def _document(value: Any) -> Any:
-    """Convert to JSON types."""
-    if is_dataclass(value):
-        return {field.name: _document(getattr(value, field.name)) for field in fields(value)}
-    if isinstance(value, np.ndarray):
-        return value.tolist()
-    if isinstance(value, Mapping | tuple):
-        return [*value]
-    return value

@@ -3,27 +3,138 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 
-from drivers.ur.identity import MODELS
+from drivers.transports.simulated import SimulatedTransport
+from drivers.ur.description import UrDescription
+from drivers.ur.identity import MODELS, REQUESTS, ArmIdentity, with_replies, with_state
 from drivers.ur.outputs import N_JOINTS
+from drivers.ur.registers import INPUTS
+from drivers.ur.rtde import ControllerVersion, OutputRecipe
+from drivers.ur.wire import OPTIONAL, REQUIRED
 from hil.base.errors import InputError
 from hil.cell import Cell
-from hil.control.simulated_cell import planted_truth
+from hil.control.planted_arm import planted_truth
+from hil.control.virtual_link import VirtualLink
 from sim_fixtures.settings import SettingError, SimulationError
 from sim_fixtures.ur import (
     SimulatedUr,
     UrArmTruth,
+    UrFault,
     UrProgram,
     UrServer,
     UrSettings,
+    wire,
 )
-from sim_fixtures.ur.controller import parse_ur_fault
+from sim_fixtures.ur.controller import UrPayload, parse_ur_fault
+from sim_fixtures.ur.server import dashboard_reply, state_of
 
 _CB3 = (3, 15, 8, 0)
 _WITHIN = 0.9
 """Share of the distance to the limits that the program's motion uses."""
+
+
+class UrPeer:
+    """A simulated controller and arm as the peer of a session, in virtual time.
+
+    The first packet is what the controller states of itself; then each cycle is a frame of its
+    outputs, and the reply a frame of inputs with, at times, a program behind it. All bytes of both
+    directions are those of a real link.
+    """
+
+    def __init__(self, controller: SimulatedUr) -> None:
+        self.controller = controller
+        self.ended = False
+        self._introduced = False
+        self._data = wire.DataPackages(1, (*REQUIRED, *OPTIONAL))
+        self._inputs = wire.InputRecipe(1, INPUTS)
+
+    @property
+    def period(self) -> float:
+        """Cycle [s]."""
+        return self.controller.period
+
+    def finish(self) -> None:
+        """End the session, as its operator would."""
+        self.ended = True
+
+    def next_packet(self) -> bytes | None:
+        """See `drivers.transports.simulated.Peer`."""
+        controller = self.controller
+        if not self._introduced:
+            self._introduced = True
+            return self._introduction()
+        if self.ended:
+            return None
+        controller.step()
+        controller.said.clear()
+        return self._data.package(controller.outputs())
+
+    def accept(self, reply: bytes | None) -> None:
+        """See `drivers.transports.simulated.Peer`."""
+        if not reply:
+            return
+        received = bytearray(reply)
+        length = int.from_bytes(received[:2], "big")
+        program = bytes(received[length:])
+        frame = bytearray(received[:length])
+        for kind, payload in wire.packages(frame):
+            if kind == "U":
+                self.controller.write_inputs(self._inputs.values(payload))
+        if program:
+            self.controller.upload(program.decode())
+
+    def _introduction(self) -> bytes:
+        settings = self.controller.settings
+        identity = with_state(ArmIdentity(), state_of(settings)[5:])
+        identity = with_replies(
+            identity, {name: dashboard_reply(self.controller, name) for name in REQUESTS}
+        )
+        names = (*REQUIRED, *OPTIONAL)
+        recipe = OutputRecipe(1, names, tuple(wire.TYPES[name] for name in names))
+        version = ControllerVersion(*settings.version)
+        return UrDescription(identity, version, settings.frequency, recipe, 1).encode()
+
+
+def ur_link(cell: Cell, *, session: int = 0) -> VirtualLink:
+    """Return a link in virtual time to the simulated controller and arm of a cell."""
+    peer = UrPeer(simulated_ur(cell, session=session))
+    return VirtualLink.over(SimulatedTransport(peer), cell, finish=peer.finish)
+
+
+def simulated_ur(
+    cell: Cell,
+    *,
+    faults: Sequence[UrFault] = (),
+    seed: int | None = None,
+    session: int = 0,
+    truth: UrArmTruth | None = None,
+) -> SimulatedUr:
+    """Return controller and arm of a cell, at rest at its initial posture.
+
+    Args:
+        cell: with the true parameters in `[simulation]`.
+        faults: of the controller.
+        seed: of the noise, that of the cell by default.
+        session: number of earlier sessions; each has noise of its own.
+        truth: what the arm is; by default that of the cell.
+    """
+    return SimulatedUr(
+        replace(_settings(cell), remote_control=True, payload=_payload(cell)),
+        at=cell.initial,
+        truth=truth or _truth(cell),
+        faults=faults,
+        seed=(cell.simulation.seed if seed is None else seed) + 1000 * session,
+        urdf=cell.urdf,
+    )
+
+
+def _payload(cell: Cell) -> UrPayload:
+    """Return the payload of the cell as it is entered at the controller."""
+    expected = cell.expected_arm
+    return UrPayload(expected.payload, expected.centre or (0.0, 0.0, 0.0))
 
 
 def served_arm(

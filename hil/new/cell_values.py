@@ -298,7 +298,7 @@ def _waited_for(exchange: ExchangeProcess, wait: float, stop: Stop) -> InitPacke
     deadline = time.monotonic() + wait
     connection = Connection()
     monitor = ExchangeMonitor(exchange)
-    while connection.init is None:
+    while not isinstance(connection.init, InitPacket):
         exchange.send_heartbeat()
         for event in monitor.poll():
             connection.update(event)

@@ -13,8 +13,9 @@ from numpy.typing import NDArray
 from drivers.errors import DriverError
 from drivers.ur.identity import ArmIdentity, DhParameters, ask_identity
 from drivers.ur.outputs import GEAR_RATIO, N_JOINTS, TORQUES
-from drivers.ur.reader import RtdeReader, RtdeSpec
+from drivers.ur.reader import RtdeReader
 from drivers.ur.torque_constants import UNCERTAINTY, by_size, stated_constants
+from drivers.ur.transport import RtdeSpec
 from hil.base.arrays import Array
 from hil.base.errors import ControllerError, InputError
 from hil.cell.errors import UNKNOWN

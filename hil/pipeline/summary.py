@@ -158,7 +158,7 @@ def true_values(cell: Cell, header: ArchiveHeader) -> Array | None:
         return np.array([planted.get(name, np.nan) for name in model.parameter_names])
     if cell.file.simulation is None:
         return None
-    from hil.control.simulated_cell import planted_values  # only for a simulated arm
+    from hil.control.planted_arm import planted_values  # only for a simulated arm
 
     values = planted_values(cell)
     for ripple in model.elements.identified:

@@ -22,7 +22,8 @@ from scipy.signal import lfilter
 
 from hil.base.arrays import Array
 from hil.cell import Cell
-from hil.control.simulated_cell import planted_truth, simulated_drive
+from hil.control.planted_arm import planted_truth
+from hil.control.simulated_cell import simulated_drive
 from planner import FourierSeries, PiecewiseCubic
 from sim_fixtures import PlantTruth, SimulatedDrive
 from sim_fixtures.arm import RIPPLES_PER_TURN, WARM_SPEED, WARM_UP_TIME

@@ -15,7 +15,8 @@ from hil.base.threads import one_thread
 from hil.base.version import software
 from hil.batch.cluster import Cluster
 from hil.cell import Cell
-from hil.control.simulated_cell import planted_values, simulated_link
+from hil.control.planted_arm import planted_values
+from hil.control.simulated_cell import simulated_link
 from identification.excitation import Method
 from sim_fixtures.ns16 import CELL_PATH
 

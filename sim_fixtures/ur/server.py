@@ -17,7 +17,7 @@ from typing import Final, Self
 
 from sim_fixtures.settings import SimulationError
 from sim_fixtures.ur import wire
-from sim_fixtures.ur.controller import SimulatedUr
+from sim_fixtures.ur.controller import SimulatedUr, UrSettings
 
 RTDE_PORT: Final = 30004
 _MOST_UNREAD: Final = 1 << 19
@@ -54,6 +54,8 @@ class _Client:
     unread_since: float | None = None
     held_until: int = -1  # cycle before which nothing is sent
     greeted: bool = False
+    inputs: list[wire.InputRecipe] = field(default_factory=list)
+    program: bytearray = field(default_factory=bytearray)
     closing: bool = False
 
 
@@ -249,6 +251,13 @@ class UrServer:
                 return wire.package("v", struct.pack(">4I", *self.controller.settings.version))
             case "O":
                 return self._set_up(client, payload)
+            case "I":
+                return self._claim(client, payload)
+            case "U":
+                for recipe in client.inputs:
+                    if payload[:1] == bytes([recipe.number]):
+                        self.controller.write_inputs(recipe.values(payload))
+                return b""
             case "S":
                 client.started = client.data is not None
                 return wire.package("S", bytes([client.started]))
@@ -271,15 +280,37 @@ class UrServer:
             client.data = wire.DataPackages(1, names)
         return wire.package("O", bytes([client.data is not None]) + ",".join(types).encode())
 
+    def _claim(self, client: _Client, payload: bytes) -> bytes:
+        """Let a client write inputs that no other client writes."""
+        names = [name for name in payload.decode("ascii", "replace").split(",") if name]
+        others = {
+            name
+            for other in self._clients
+            if other is not client
+            for recipe in other.inputs
+            for name in recipe.names
+        }
+        others |= {*self.controller.settings.inputs_in_use}
+        types = [
+            "IN_USE" if name in others else wire.INPUT_TYPES.get(name, "NOT_FOUND")
+            for name in names
+        ]
+        number = 0
+        if not {"IN_USE", "NOT_FOUND"} & {*types}:
+            number = len(client.inputs) + 1
+            client.inputs.append(wire.InputRecipe(number, tuple(names)))
+        return wire.package("I", bytes([number]) + ",".join(types).encode())
+
     def _serve_primary(self, client: _Client) -> None:
+        client.program += client.received
         client.received.clear()
+        if client.program[-5:] == b"\nend\n":
+            program = bytes(client.program)
+            client.program.clear()
+            self.controller.upload(program.decode("utf-8", "replace"))
         if not client.greeted:
             client.greeted = True
-            client.waiting += wire.message_package("URControl") + self._state()
-
-    def _state(self) -> bytes:
-        kind = self.controller.settings.kind
-        return wire.state_package(kind, _LIMITS, _RATES, _DH, _CHECKSUMS)
+            client.waiting += wire.message_package("URControl") + state_of(self.controller.settings)
 
     def _serve_dashboard(self, client: _Client) -> None:
         if not client.greeted:
@@ -288,29 +319,24 @@ class UrServer:
         while b"\n" in client.received:
             line, _, rest = bytes(client.received).partition(b"\n")
             client.received[:] = rest
-            client.waiting += self._dashboard_reply(line.decode("utf-8", "replace")).encode()
+            client.waiting += dashboard_reply(
+                self.controller, line.decode("utf-8", "replace")
+            ).encode()
             client.waiting += b"\n"
-
-    def _dashboard_reply(self, request: str) -> str:
-        settings = self.controller.settings
-        version = ".".join(map(str, settings.version[:3]))
-        replies = {
-            "PolyscopeVersion": f"URSoftware {version}.0 (simulated)",
-            "get serial number": settings.serial_number,
-            "get robot model": settings.model,
-            "is in remote control": "true" if settings.remote_control else "false",
-            "robotmode": "Robotmode: RUNNING",
-            "quit": "Disconnected",
-        }
-        return replies.get(request.strip(), f"could not understand: '{request.strip()}'")
 
     def _send_cycle(self) -> None:
         controller = self.controller
         cycle = controller.cycle
         outputs = None
+        said, controller.said = controller.said, []
         for client in [*self._clients]:
-            if client.serve == self._serve_primary and controller.time >= self._next_state:
-                client.waiting += self._state()
+            if client.serve == self._serve_primary:
+                for error in said:
+                    client.waiting += wire.error_package(*error)
+                if controller.time >= self._next_state:
+                    client.waiting += state_of(self.controller.settings)
+                if client.waiting:
+                    self._write(client)
             if not client.started or client.data is None or cycle % client.every:
                 continue
             outputs = outputs or controller.outputs()
@@ -349,3 +375,26 @@ class UrServer:
         client.waiting += frame
         if not self._holds(client):
             self._write(client)
+
+
+def state_of(settings: UrSettings) -> bytes:
+    """Return a robot state of the primary interface."""
+    return wire.state_package(settings.kind, _LIMITS, _RATES, _DH, _CHECKSUMS)
+
+
+def dashboard_reply(controller: SimulatedUr, request: str) -> str:
+    """Return the reply of the dashboard server to a line."""
+    settings = controller.settings
+    version = ".".join(map(str, settings.version[:3]))
+    replies = {
+        "PolyscopeVersion": f"URSoftware {version}.0 (simulated)",
+        "get serial number": settings.serial_number,
+        "get robot model": settings.model,
+        "is in remote control": "true" if settings.remote_control else "false",
+        "robotmode": f"Robotmode: {controller.robot_mode_name}",
+        "safetystatus": f"Safetystatus: {controller.safety_name}",
+        "running": f"Program running: {str(controller.playing).lower()}",
+        "programState": f"{'PLAYING' if controller.playing else 'STOPPED'} program",
+        "quit": "Disconnected",
+    }
+    return replies.get(request.strip(), f"could not understand: '{request.strip()}'")

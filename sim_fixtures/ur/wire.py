@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import struct
 from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
@@ -68,10 +69,44 @@ TYPES: Final[Mapping[str, str]] = {
 }
 """Type of each output by its name."""
 _FORMATS: Final = {
-    "UINT32": "I", "INT32": "i", "UINT64": "Q", "DOUBLE": "d",
+    "UINT8": "B", "UINT32": "I", "INT32": "i", "UINT64": "Q", "DOUBLE": "d",
     "VECTOR3D": "3d", "VECTOR6D": "6d", "VECTOR6INT32": "6i",
 }  # fmt: skip
 _SIZES: Final = {"VECTOR3D": 3, "VECTOR6D": 6, "VECTOR6INT32": 6}
+
+
+INPUT_TYPES: Final[Mapping[str, str]] = {
+    **{f"input_int_register_{k}": "INT32" for k in range(48)},
+    **{f"input_double_register_{k}": "DOUBLE" for k in range(48)},
+    "speed_slider_mask": "UINT32", "speed_slider_fraction": "DOUBLE",
+    "standard_digital_output_mask": "UINT8", "standard_digital_output": "UINT8",
+    "configurable_digital_output_mask": "UINT8", "configurable_digital_output": "UINT8",
+    "tool_digital_output_mask": "UINT8", "tool_digital_output": "UINT8",
+    "standard_analog_output_mask": "UINT8", "standard_analog_output_type": "UINT8",
+    "standard_analog_output_0": "DOUBLE", "standard_analog_output_1": "DOUBLE",
+    "external_force_torque": "VECTOR6D",
+}  # fmt: skip
+"""Type of each input by its name."""
+
+
+@dataclass(frozen=True)
+class InputRecipe:
+    """Inputs that a client writes, in the order of their values."""
+
+    number: int
+    names: tuple[str, ...]
+
+    def values(self, payload: bytes) -> Mapping[str, float]:
+        """Return the values of a data package by name; none of one of another length."""
+        packed = struct.Struct(">B" + "".join(_FORMATS[INPUT_TYPES[name]] for name in self.names))
+        if packed.size != len(payload):
+            return {}
+        flat = iter(packed.unpack(payload)[1:])
+        values: dict[str, float] = {}
+        for name in self.names:
+            count = _SIZES.get(INPUT_TYPES[name], 1)
+            values[name], *_ = (next(flat) for _ in range(count))
+        return values
 
 
 def package(kind: str, payload: bytes = b"") -> bytes:
@@ -149,4 +184,14 @@ def state_package(
 def message_package(text: str) -> bytes:
     """Return a message of the primary interface, which comes before states and between them."""
     content = bytes(8) + bytes([254, 3, len(text)]) + text.encode() + bytes(2)
+    return struct.pack(">IB", 5 + len(content), 20) + content
+
+
+def error_package(words: str, code: int, argument: int) -> bytes:
+    """Return an error of the primary interface: one with a code, or one of a program without."""
+    if code:
+        body = struct.pack(">QbB", 0, -2, 6) + struct.pack(">iiiiI", code, argument, 3, 0, 0)
+    else:
+        body = struct.pack(">QbB", 0, -2, 10) + struct.pack(">ii", 1, 1)
+    content = body + words.encode()
     return struct.pack(">IB", 5 + len(content), 20) + content

@@ -27,7 +27,8 @@ from drivers.packets import next_number
 from drivers.transports.can.frames import DOWN, PAYLOADS_FD, UP, BusRates, CanEndpoint
 from drivers.transports.can.transport import CanTransport
 from hil.cell import Cell
-from hil.control.simulated_cell import planted_truth, simulated_drive
+from hil.control.planted_arm import planted_truth
+from hil.control.simulated_cell import simulated_drive
 from sim_fixtures import ControllerSettings, SimulatedController, ns16
 from sim_fixtures.can_link import CanControllerLink
 from tests.drivers.rig import MOVE, limits, smooth_move

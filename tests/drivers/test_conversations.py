@@ -10,7 +10,7 @@ import pytest
 
 import drivers.states
 from drivers import Guard, State
-from drivers.safe_reply import PacketStatus
+from drivers.c4g_wire import PacketStatus
 from drivers.states import TRANSITIONS, Input
 from tests.drivers.sources import Breaks, ScriptedMotion, smooth
 from tests.fuzz.draw import Draw

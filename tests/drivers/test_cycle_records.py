@@ -220,6 +220,7 @@ def test_events_of_a_session_pickle():
     rig.cycle()
     rig.session.tick(rig.now + 5.0)
     rig.events += rig.session.events()
+    rig.events.append(events.ControllerRemark("a C4G has none", rig.session.cycle))
     assert {type(event) for event in rig.events} == set(get_args(events.Event))
     for event in rig.events:
         assert_same(event, through_pickle(event))

@@ -205,7 +205,7 @@ class TestOwner:
 
 
 IN_THE_SESSION = {
-    "session", "packets", "safe_reply", "open_mode", "guard", "drive_train", "execution",
+    "session", "packets", "c4g_wire", "open_mode", "guard", "drive_train", "execution",
 }  # fmt: skip
 BESIDE = {"states", "losses", "cycle_records"}
 """The session's table, what it counts as lost, and the ring that receives the record."""

@@ -20,8 +20,21 @@ from drivers import (
     TransportClosed,
     exchange,
 )
+from drivers.c4g_wire import C4gProtocol
 from drivers.exchange.loop import MAX_KINDS
-from tests.drivers.rig import MOVE, PERIOD, START, Cruise, N, Rig, closed, moving, smooth_move
+from drivers.wire import ArmSettings
+from tests.drivers.rig import (
+    MOVE,
+    PERIOD,
+    START,
+    Cruise,
+    N,
+    Rig,
+    closed,
+    drive_train,
+    moving,
+    smooth_move,
+)
 from tests.messages import LEFT_TOO_LATE
 
 pytestmark = pytest.mark.safety
@@ -388,6 +401,7 @@ class EchoSession:
     state = State.OPEN
     period = PERIOD
     init = None
+    wire = C4gProtocol().wire(ArmSettings(drive_train(), PERIOD, Mode.POSITION, 1, (), None, 1.0))
     deadline = 1e9
 
     def __init__(self):

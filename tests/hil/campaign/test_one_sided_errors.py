@@ -19,12 +19,8 @@ from hil.base.progress import Silent
 from hil.campaign import CampaignPlan
 from hil.campaign.identified_campaign import identify_campaign
 from hil.cell import Cell, CellError
-from hil.control.simulated_cell import (
-    planted_truth,
-    planted_values,
-    simulated_controller,
-    simulated_drive,
-)
+from hil.control.planted_arm import planted_truth, planted_values
+from hil.control.simulated_cell import simulated_controller, simulated_drive
 from identification.model.friction import COULOMB
 from sim_fixtures.ns16 import CELL_PATH, load_truth, urdf_text
 from tests.sim_fixtures.bench import base_from_standard, standard_parameters

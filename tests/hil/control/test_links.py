@@ -11,7 +11,7 @@ import pytest
 from drivers import Transport
 from drivers.transports.base import TransportSpec
 from hil.base.errors import InputError
-from hil.cell import Cell, CellError
+from hil.cell import Cell
 from hil.cell.schema import LINKS, CanTable, ControllerTable
 from hil.control.simulated_cell import controller_settings
 from hil.control.simulator_on_link import open_controller_link
@@ -41,13 +41,15 @@ class TestLinks:
         names = get_args(ControllerTable.model_fields["transport"].annotation)
         assert {*names} == {"simulated", *LINKS} == {"simulated", *HERE, "rtde"}
 
-    def test_a_link_that_is_only_listened_to_refuses_motions(self) -> None:
+    def test_an_arm_of_universal_robots_is_reached_by_its_own_ports(self) -> None:
         here, away = (
             CELL.with_link(transport="rtde", host=host) for host in ("127.0.0.1", "192.0.2.1")
         )
         assert here.only_simulated and not away.only_simulated
-        with pytest.raises(CellError, match=r"cannot be commanded yet; record .* `hil record`"):
-            away.transport_spec()
+        spec = away.transport_spec()
+        assert pickle.loads(pickle.dumps(spec)) == spec
+        settings = away.session_settings()
+        assert settings["max_gap"] == settings["protocol"].program.patience - 1 == 4
 
     @pytest.mark.parametrize("name", HERE)
     def test_a_row_serves_cell_doctor_and_controller(self, name: str) -> None:

@@ -19,6 +19,7 @@ import pytest
 
 from drivers.packets import DRIVE_ON
 from drivers.states import State
+from drivers.ur.description import UrDescription
 from hil.archive import Archive, open_archive
 from hil.archive.check import check_archive
 from hil.archive.recorder import Recorded
@@ -28,8 +29,8 @@ from hil.cell import Cell, CellError
 from hil.cli.record import with_rtde
 from hil.control.link import Progress
 from hil.control.motion_watch import Stop
-from hil.control.simulated_cell import planted_truth
-from hil.control.ur_recording import IDENTITY, listening, record_arm
+from hil.control.planted_arm import planted_truth
+from hil.control.ur_recording import listening, record_arm
 from hil.importers.conclusions import Certainty
 from hil.importers.recording_import import ImportOptions
 from hil.look.look import look_at
@@ -114,7 +115,7 @@ def test_the_arm_is_named_in_the_archive(recorded: Path) -> None:
     assert entries["ur.serial_number"] == "20235500123"
     assert (entries["ur.model"], entries["ur.version"]) == ("UR5e", "5.15.2.0")
     assert archive.header.by_controller_program and archive.header.only_simulated
-    identity = json.loads(archive.attachments[IDENTITY])
+    identity = json.loads(archive.attachments[UrDescription.attachment])
     assert identity["calibrated"]["a"][1] == -0.425
     assert [event.text for event in archive.events] == [
         "the robot mode is running",

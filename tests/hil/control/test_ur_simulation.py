@@ -17,8 +17,9 @@ from typer.testing import CliRunner
 
 from drivers.transports.base import TransportError
 from drivers.ur.identity import ask_identity
-from drivers.ur.reader import RtdeReader, RtdeSpec
+from drivers.ur.reader import RtdeReader
 from drivers.ur.torque_constants import stated_constants
+from drivers.ur.transport import RtdeSpec
 from hil.base.errors import InputError
 from hil.cell import Cell
 from hil.cli import app

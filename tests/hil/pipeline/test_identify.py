@@ -21,7 +21,7 @@ from hil.base.progress import Silent
 from hil.campaign.identified_campaign import identify_campaign
 from hil.cli import app
 from hil.cli.verdict import NOT_GOOD, as_json, finish, screen, sentences, table, whole
-from hil.control.simulated_cell import planted_values
+from hil.control.planted_arm import planted_values
 from hil.importers.imported_robot import Robot
 from hil.pipeline.estimating import estimate_with
 from hil.pipeline.estimators import ESTIMATORS

@@ -13,7 +13,8 @@ from hil.base.progress import Silent
 from hil.campaign import Campaign, CampaignPlan, Stop
 from hil.campaign.plan import design
 from hil.cell import Cell
-from hil.control.simulated_cell import planted_values, simulated_link
+from hil.control.planted_arm import planted_values
+from hil.control.simulated_cell import simulated_link
 from hil.study.estimates import low_passed, prepared_archives
 from hil.study.model_errors import ALL, Condition, ErrorName, ModelErrors, PlannedTorque
 from identification import Motion

@@ -22,7 +22,7 @@ from hil.base.errors import InputError
 from hil.base.interrupt import descendants
 from hil.base.progress import Silent
 from hil.cell import Cell
-from hil.control.simulated_cell import planted_values
+from hil.control.planted_arm import planted_values
 from hil.design.messages import NoExcitationError
 from hil.study import FULL, QUICK, StudyResults, StudySettings, run_study, study_settings
 from hil.study.campaigns import CLASSES, StudyExecution, execute

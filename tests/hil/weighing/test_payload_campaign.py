@@ -26,7 +26,8 @@ from hil.campaign.folder import SIDES, CampaignFolder
 from hil.cli import app
 from hil.control.errors import MotionFailedError
 from hil.control.motion_watch import OperatorRequest, Stop
-from hil.control.simulated_cell import carried, planted_truth, simulated_controller
+from hil.control.planted_arm import carried, planted_truth
+from hil.control.simulated_cell import simulated_controller
 from hil.control.virtual_link import VirtualLink
 from hil.payload.payload_run import find_payload
 from hil.precision.requirements import requirements_from

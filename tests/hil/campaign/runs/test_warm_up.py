@@ -23,7 +23,8 @@ from hil.campaign.joint_warm_up import (
     change_per_motion,
 )
 from hil.control.motion_checks import MotionChecks
-from hil.control.simulated_cell import planted_truth, simulated_link
+from hil.control.planted_arm import planted_truth
+from hil.control.simulated_cell import simulated_link
 from tests.hil.campaign.runs.rig import Array, Make, Operator, kinds, slowing
 from tests.hil.fast_cell import fast_cell
 

@@ -1,0 +1,205 @@
+"""What becomes of a motion of a UR5e, whatever happens to controller, operator, link or PC."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from drivers.states import State
+from drivers.transports.simulated import Delay, Duplicate, Lose
+from sim_fixtures.ur import UrProgram
+from tests.drivers.ur.ur_bench import MIDST, PERIOD, UrBench, ur_cell
+
+pytestmark = pytest.mark.safety
+
+SILENT = 10
+"""Cycles in 20 ms."""
+
+
+def test_a_motion_arrives_where_it_was_planned_to() -> None:
+    bench = UrBench().move(by=20.0)
+    assert (bench.ended.outcome, bench.state) == ("completed", State.CLOSED)
+    bench.run(100)
+    there = bench.cell.initial + np.radians([20.0, 0, 0, 0, 0, 0])
+    assert bench.robot.arm.plant.position == pytest.approx(there, abs=2e-3)
+    assert bench.rests
+    assert bench.robot.stream is None and not bench.robot.playing
+
+
+def test_the_target_is_the_set_point_of_two_cycles_before() -> None:
+    bench = UrBench().move()
+    records = bench.ring.last(4000)
+    open_ = records["state"] == State.OPEN
+    commanded = records["commanded_position"][open_]
+    target = records["target_position"][open_]
+    assert np.abs(target[10:] - commanded[8:-2]).max() < 1e-14
+    assert np.ptp(commanded[:, 0]) > 0.3
+
+
+def test_each_motion_has_a_program_of_its_own() -> None:
+    bench = UrBench().move()
+    first = bench.robot.output_registers.ints[27]
+    bench.run(200)
+    bench.events.clear()
+    bench.session.request(bench.player())
+    bench.run(4000, until=lambda: not bench.session.requested)
+    assert bench.robot.output_registers.ints[27] != first
+    # This plan begins where the arm is not any more.
+    assert (bench.ended.outcome, "StartMismatch" in bench.ended.reason) == ("refused", True)
+    assert bench.run(200).rests and not bench.robot.playing
+
+
+@pytest.mark.parametrize(
+    ("faults", "outcome", "reason"),
+    [
+        (("stop@{c}",), "lost", "protective stop"),
+        (("emergency-stop@{c}",), "lost", "robot emergency stop"),
+        (("power-off@{c}",), "lost", "power off"),
+        (("safeguard@{c}",), "lost", "safeguard stop"),
+        (("pause@{c}",), "lost", "paused"),
+        (("halt@{c}",), "lost", "was stopped there"),
+        (("freedrive@{c}x50",), "refused", "freedrive"),
+        (("slider@{c}x50",), "refused", "speed slider is at 50 %"),
+        (("push@{c}x90",), "refused", "deviation that stops it"),
+        (("push@{c}x300",), "lost", "too far from its set-point"),
+    ],
+)
+def test_what_happens_at_the_controller_ends_the_motion(
+    faults: tuple[str, ...], outcome: str, reason: str
+) -> None:
+    bench = UrBench(*(fault.format(c=MIDST) for fault in faults)).move()
+    assert (bench.ended.outcome, reason in bench.ended.reason) == (outcome, True), bench.ended
+    assert bench.started
+    bench.run(400)
+    assert bench.rests
+    # Nothing is unlocked, switched on or played again from here.
+    assert bench.robot.playing is False
+    safety = {"stop": 3, "emergency-stop": 7, "safeguard": 5}
+    assert bench.robot.outputs()["safety_mode"] == safety.get(faults[0].partition("@")[0], 1)
+
+
+@pytest.mark.parametrize("first", ["stop", "safeguard", "pause"])
+@pytest.mark.parametrize("pc_lives", [True, False])
+def test_a_program_that_an_operator_resumes_ends_without_moving(first: str, pc_lives: bool) -> None:
+    bench = UrBench(f"{first}@{MIDST}", f"resume@{MIDST + 400}")
+    bench.silent_from = None if pc_lives else MIDST
+    bench.move()
+    assert bench.ended.outcome == "lost"
+    bench.run(900 - bench.robot.cycle)
+    assert bench.travel(MIDST + 399) < 2e-3
+    assert bench.rests and not bench.robot.playing
+
+
+def test_without_the_pc_the_program_stops_the_arm_within_20_ms() -> None:
+    bench = UrBench()
+    bench.silent_from = MIDST
+    bench.move()
+    bench.run(300)
+    # The last reply is used two cycles after it was sent.
+    used = next(k for k in range(MIDST, len(bench.stages)) if bench.stages[k] == 3)
+    assert used - (MIDST + 1) <= SILENT
+    assert bench.rests and not bench.robot.playing
+    assert (bench.ended.outcome, "no new set-point" in bench.ended.reason) == ("lost", True)
+    limits = ur_cell().guard_limits
+    assert (bench.robot.arm.plant.position < limits.upper).all()
+
+
+@pytest.mark.parametrize("gap", [1, 2, 3, 4])
+@pytest.mark.parametrize("direction", ["to_controller", "to_pc"])
+def test_a_short_gap_is_bridged_on_the_path(gap: int, direction: str) -> None:
+    bench = UrBench(link=[Lose(MIDST, direction, gap)]).move()
+    assert bench.ended.outcome == "completed", bench.ended
+    assert bench.run(100).rests
+
+
+@pytest.mark.parametrize("gap", [5, 6, 20])
+@pytest.mark.parametrize("direction", ["to_controller", "to_pc"])
+def test_a_longer_one_ends_in_the_stop_of_the_program(gap: int, direction: str) -> None:
+    bench = UrBench(link=[Lose(MIDST, direction, gap)]).move()
+    assert bench.ended.outcome in ("lost", "refused"), bench.ended
+    assert bench.run(300).rests
+    assert not bench.robot.playing
+
+
+def test_replies_lost_again_and_again_stop_the_motion() -> None:
+    faults = [Lose(MIDST + 8 * k, "to_controller", 1) for k in range(5)]
+    bench = UrBench(link=faults).move()
+    assert (bench.ended.outcome, "5 replies were lost" in bench.ended.reason) == ("stopped", True)
+    assert bench.run(100).rests
+
+
+def test_frames_twice_and_late_replies_change_nothing() -> None:
+    bench = UrBench(link=[Duplicate(MIDST, count=5), Delay(MIDST + 20, cycles=0.5, count=20)])
+    assert bench.move().ended.outcome == "completed"
+
+
+class TestBefore:
+    """What keeps a motion from beginning; the arm does not move."""
+
+    @pytest.mark.parametrize(
+        ("settings", "reason"),
+        [
+            ({"slider": 0.5}, "speed slider is at 50 %"),
+            ({"slider": 0.0}, "speed slider is at 0 %"),
+        ],
+    )
+    def test_state_of_the_controller(self, settings: dict[str, float], reason: str) -> None:
+        bench = UrBench(**settings).move()
+        assert (bench.ended.outcome, reason in bench.ended.reason) == ("refused", True)
+        assert bench.stages[-1] == 0 and bench.travel(0) < 1e-3
+
+    @pytest.mark.parametrize(
+        ("table", "reason"),
+        [
+            ({"cell.serial_number": "20999999999"}, "serial number"),
+            ({"controller.rtde.model": "UR10e"}, "type"),
+            ({"controller.rtde.calibration": "00ff"}, "calibration"),
+        ],
+    )
+    def test_another_arm(self, table: dict[str, str], reason: str) -> None:
+        wrong = ur_cell().with_values(table)
+        bench = UrBench(cell=wrong, serial_number="20235500123", kind=1)
+        bench.run(5)
+        assert bench.session.init is not None
+        with pytest.raises(Exception, match=reason):
+            bench.session.request(bench.player())
+
+    @pytest.mark.parametrize(
+        ("settings", "reason"),
+        [
+            ({"remote_control": False}, "local mode"),
+            ({"version": (5, 9, 4, 0)}, "5.10"),
+            ({"version": (3, 15, 8, 0)}, "8 ms in the controller"),
+            ({"version": (10, 7, 0, 0)}, "PolyScope 5"),
+        ],
+    )
+    def test_a_controller_that_is_not_moved(self, settings: dict, reason: str) -> None:
+        bench = UrBench(**settings).run(5)
+        with pytest.raises(Exception, match=reason):
+            bench.session.request(bench.player())
+
+    def test_another_payload(self) -> None:
+        bench = UrBench()
+        bench.cell = ur_cell()
+        heavy = ur_cell().with_values({"robot.payload": {"mass": 2.0, "centre": [0.0, 0.0, 0.05]}})
+        light = UrBench(cell=heavy)
+        light.robot.settings = bench.robot.settings
+        light.move()
+        assert (light.ended.outcome, "payload of 0 kg" in light.ended.reason) == ("refused", True)
+
+    def test_another_program(self) -> None:
+        bench = UrBench()
+        still = np.zeros((6, 1))
+        bench.robot._program = UrProgram(bench.cell.initial, still, period=60.0)
+        bench.move()
+        assert (bench.ended.outcome, "another program" in bench.ended.reason) == ("refused", True)
+
+    def test_a_program_that_does_not_run(self) -> None:
+        bench = UrBench()
+        bench.robot.upload = lambda text: None  # type: ignore[method-assign]
+        bench.move()
+        assert (bench.ended.outcome, "did not run within 5 s" in bench.ended.reason) == (
+            "refused",
+            True,
+        )
+        assert bench.transport.cycle * PERIOD < 6.0
