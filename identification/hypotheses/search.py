@@ -85,6 +85,7 @@ _CLOSER: Final = 12  # changes of least error on fewer rows, which are compared
 _MOST_STEPS: Final = 6
 _SAME_SIZE: Final = 0.3  # rad, or of a scale: difference of two fits that are one
 _FAR_WORSE: Final = 0.5  # error ratio to a zero far away, of which no better fit is expected
+_OTHER_SIDE: Final = 60.0 * DEGREE  # between two zeros that are not one
 _FAR_STARTS: Final = 2  # zeros far from what is stated at which a fit starts
 _NEEDED: Final = 2.0  # standard errors of one of several zeros and scales that its fit needs
 _ADEQUATE: Final = 1.2  # error ratio to a free fit, of a reading that explains the rows
@@ -368,7 +369,8 @@ class _Search:
             compare(joints.score, trial.score, self.model).ratio < 1.0 - _ALIKE for trial in good
         ):
             others = [trial for trial in better if trial.change.meaning not in SIZED]
-            return self._adopt_joints(joints, [*others, *self._singles(joints)])
+            others += [*self._singles(joints), *self._other_sides(joints)]
+            return self._adopt_joints(joints, others)
         if not good:
             return []
         best = min(good, key=lambda trial: trial.against.ratio)
@@ -392,6 +394,27 @@ class _Search:
                 known.append(change)
                 singles.append(self._try(change))
         return singles
+
+    def _other_sides(self, joints: _Joints) -> list[Trial]:
+        """Return the best zero far from a single one that was found, where the motion has two.
+
+        Such as a joint whose body hangs: turned to either side it loads the others alike.
+        """
+        (change, *more) = joints.changes
+        if more or change.meaning != "zero":
+            return []
+        angles = [angle * DEGREE for angle in _ZEROS]
+        far = [angle for angle in angles if _apart(angle, change.size) > _OTHER_SIDE]
+        trials = [self._try(change._replace(size=angle)) for angle in far]
+        best = min(trials, key=lambda trial: trial.score.overall)
+        zero = np.zeros(self.model.n_joints)
+        zero[list(change.joints)] = best.change.size
+        free = np.isin(np.arange(2 * len(zero)), change.joints)
+        start = starting_at(self.model, self.samples, zero, np.zeros_like(zero))
+        size = float(fit_joints(self.model, self.samples, free, start).zero[change.joints[0]])
+        if _apart(size, change.size) < _OTHER_SIDE:
+            return [best]
+        return [self._try(change._replace(size=size))]
 
     def by_joint_fit(self, near: Sequence[Step]) -> list[Step]:
         """Adopt zeros and scales of all joints at once, near those found before, if any fit."""
@@ -750,6 +773,11 @@ def _exchanged(order: tuple[int, ...], pair: tuple[int, int]) -> tuple[int, ...]
     first, second = pair
     places[first], places[second] = places[second], places[first]
     return tuple(places)
+
+
+def _apart(angle: float, other: float) -> float:
+    """Return the size of the angle between two [rad], at most half a turn."""
+    return float(abs((angle - other + np.pi) % (2.0 * np.pi) - np.pi))
 
 
 def _is_better(against: Comparison) -> bool:
