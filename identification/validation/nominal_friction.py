@@ -2,12 +2,18 @@
 
 from __future__ import annotations
 
+from typing import Final
+
 import numpy as np
 
 from identification.arrays import Array
 from identification.factor.estimate import joint_weights
 from identification.factor.factor import Factor
+from identification.factor.normal_equations import solve_with_ridge
 from identification.model.robot import RobotModel
+
+# Of each column's information, for terms that the motion hardly tells apart or does not show.
+_RIDGE: Final = 1e-6
 
 
 def with_fitted_friction(model: RobotModel, nominal: Array, factor: Factor) -> Array:
@@ -22,7 +28,6 @@ def with_fitted_friction(model: RobotModel, nominal: Array, factor: Factor) -> A
     gram = np.tensordot(joint_weights(factor), factor.gram, axes=1)
     left = gram[:-1, -1] - gram[:-1, :-1] @ given
     square = gram[:-1, :-1][np.ix_(fitted, fitted)]
-    friction = np.linalg.lstsq(square, left[fitted], rcond=None)[0]
     values = given.copy()
-    values[fitted] = friction
+    values[fitted] = solve_with_ridge(square, left[fitted], _RIDGE)
     return values
