@@ -27,6 +27,7 @@ from identification.signals.recording import Recording
 from identification.validation.calibration import TorqueMeans, calibrate, inner_errors
 from identification.validation.consistency import check_consistency
 from identification.validation.evidence import repetition_noise
+from identification.validation.nominal_friction import with_fitted_friction
 from identification.validation.nominal_scale import inertia_matrices, inertia_ratio, nominal_scale
 from identification.validation.physical_signs import Implausible, implausibilities
 from identification.validation.position_jumps import position_jumps, position_steps
@@ -969,3 +970,22 @@ class TestInertia:
         assert finding.level == "doubtful"
         assert "wrist_3_joint 1.43" in finding.words and "wrist_2_joint" not in finding.words
         assert inertia_ratio(model, values, position, 0.0 * diagonal) is None
+
+
+def test_nominal_friction_stays_small_where_its_terms_are_one() -> None:
+    """A joint at one speed tells Coulomb friction, viscous friction and offset not apart."""
+    model = RobotModel.from_urdf(URDF, friction=FrictionLaw())
+    motion = four_sines(np.arange(0.0, 4.0, 0.005))
+    velocity = motion.velocity.copy()
+    velocity[:, 1] = 0.5 + 1e-7 * np.sin(motion.time)
+    motion = replace(motion, velocity=velocity)
+    friction = values_of(model, [4.0, 2.0, 1.5, 0.8, 0.0, 0.0])
+    noise = NOISE * np.random.default_rng(0).standard_normal(velocity.shape)
+    samples = as_samples(model, motion, model.torque(friction, motion) + noise)
+    nominal = values_of(model, np.zeros(6))
+    fitted = with_fitted_friction(model, nominal, Factor.of(model, samples))
+    faster = replace(motion, velocity=2.0 * velocity)
+    fitted[~model.friction_columns] = 0.0
+    friction[~model.friction_columns] = 0.0
+    largest = np.abs(model.torque(friction, motion)[:, 1]).max()
+    assert np.abs(model.torque(fitted, faster)[:, 1]).max() < 3.0 * largest
