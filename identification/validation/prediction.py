@@ -21,6 +21,9 @@ from identification.signals.smoothing import low_pass
 FRICTION_CHANGE: Final = 0.10
 # Hz. The torque of a rigid arm lies below, torque ripple and current noise above.
 SLOW: Final = 10.0
+_FLOOR_BLOCK: Final = 0.1  # s, shorter than what lies between two reversals, jumps or spikes
+_FLOOR_ROWS: Final = 10  # of a block, at least
+_FEWEST_BLOCKS: Final = 5  # of which a median says more than a mean
 _ROWS_AT_ONCE: Final = 30_000  # of a low-pass
 _ROWS_COMPARED: Final = 8192  # at once
 FIGURE_BANDWIDTH: Final = 30.0  # Hz, the paper's Fig. 4
@@ -154,20 +157,40 @@ def noise_floor(
     """Return the standard deviation of torque noise per joint (n,) [N·m or N], NaN without rows.
 
     It is that of the residual of parameters (p,) above `SLOW`, as of white noise, and that between
-    repetitions (n,) below, if given; None if the torque has no noise because it was filtered.
+    repetitions (n,) below, if given; None if the torque has no noise because it was filtered. The
+    median over short blocks: play, spikes and jumps of some blocks are faults, no noise.
     """
     first = recordings[0]
     if repeated is None and noiseless_above(first.motion.time, first.torque, first.segments):
         return None
-    squares, rows = np.zeros((2, model.n_joints))
+    parts = []
     for samples in recordings:
         fast = residual(model, values, samples) - residual(model, values, samples, SLOW)
-        nyquist = 0.5 / float(np.median(np.diff(samples.motion.time)))
-        share = max(1.0 - SLOW / nyquist, 0.5)  # share of white noise above the bandwidth
-        squares += np.where(samples.usable, fast**2, 0.0).sum(axis=0) / share
-        rows += np.count_nonzero(samples.usable, axis=0)
-    white = squares / np.where(rows > 0.0, rows, np.nan)
+        step = float(np.median(np.diff(samples.motion.time)))
+        share = max(1.0 - 2.0 * step * SLOW, 0.5)  # share of white noise above the bandwidth
+        length = max(_FLOOR_ROWS, round(_FLOOR_BLOCK / step))
+        edges = np.arange(0, len(fast), length)
+        squares = np.add.reduceat(np.where(samples.usable, fast**2, 0.0), edges, axis=0) / share
+        parts.append((squares, np.add.reduceat(samples.usable.astype(np.intp), edges, axis=0)))
+    white = _usual_mean(*map(np.concatenate, zip(*parts, strict=True)))
     return np.sqrt(white if repeated is None else white + np.nan_to_num(repeated) ** 2)
+
+
+def _usual_mean(sums: Array, rows: NDArray[np.intp]) -> Array:
+    """Return the mean square of a usual block (n,), of sums and rows by block (B, n).
+
+    The median, over that of chi-squared of as many rows (Wilson and Hilferty 1931); of joints with
+    few such blocks the mean.
+    """
+    usual = np.full(rows.shape[1], np.nan)
+    for joint, (column, counts) in enumerate(zip(sums.T, rows.T, strict=True)):
+        whole = counts >= _FLOOR_ROWS // 2
+        if np.count_nonzero(whole) >= _FEWEST_BLOCKS:
+            median = (1.0 - 2.0 / (9.0 * counts[whole])) ** 3
+            usual[joint] = np.median(column[whole] / counts[whole] / median)
+        elif counts.any():
+            usual[joint] = column.sum() / counts.sum()
+    return usual
 
 
 class SlowError(NamedTuple):

@@ -11,6 +11,7 @@ from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 from scipy.signal import lfilter
 
+from identification.arrays import Array
 from identification.estimators.covariance import with_block_covariance
 from identification.estimators.least_squares import estimate_repetitions
 from identification.estimators.prior import NOMINAL_SHARE
@@ -24,6 +25,7 @@ from identification.model.robot import RobotModel
 from identification.selection.folds import FOLDS
 from identification.signals.masks import EDGE, SATURATED, STANDSTILL, RowMask
 from identification.signals.recording import Recording
+from identification.signals.samples import Preprocessing, prepare
 from identification.validation.calibration import TorqueMeans, calibrate, inner_errors
 from identification.validation.consistency import check_consistency
 from identification.validation.evidence import repetition_noise
@@ -33,6 +35,7 @@ from identification.validation.physical_signs import Implausible, implausibiliti
 from identification.validation.position_jumps import position_jumps, position_steps
 from identification.validation.prediction import (
     PredictionError,
+    noise_floor,
     pooled_error,
     prediction_error,
     slow_error,
@@ -989,3 +992,39 @@ def test_nominal_friction_stays_small_where_its_terms_are_one() -> None:
     friction[~model.friction_columns] = 0.0
     largest = np.abs(model.torque(friction, motion)[:, 1]).max()
     assert np.abs(model.torque(fitted, faster)[:, 1]).max() < 3.0 * largest
+
+
+class TestNoiseFloor:
+    """What no fault raises: 1.4 % of each torque."""
+
+    NOISE = 0.014
+
+    def floor(self, position: Array | float = 0.0, torque: Array | float = 0.0) -> Array:
+        """The floor of an arm whose recorded position and torque have more in them (m, 2)."""
+        motion = four_sines(np.arange(0.0, 12.0, 0.004), 0.5)
+        clean = MODEL.torque(truth(), motion)
+        noise = self.NOISE * clean.std(axis=0) * np.random.default_rng(0).normal(size=clean.shape)
+        recording = Recording(
+            motion.time, motion.position + position, MODEL.joint_names, clean + noise + torque
+        )
+        samples = prepare(recording, MODEL, options=Preprocessing(14.0))
+        values = estimate(MODEL, Factor.of(MODEL, samples)).values
+        floor = noise_floor(MODEL, values, [samples])
+        assert floor is not None
+        return np.asarray(floor / clean.std(axis=0))
+
+    def test_it_is_that_of_the_noise(self) -> None:
+        assert self.floor() == pytest.approx(self.NOISE, rel=0.1)
+
+    def test_play_does_not_raise_it(self) -> None:
+        """A fifth of a degree, taken up where the torque of the second joint reverses."""
+        motion = four_sines(np.arange(0.0, 12.0, 0.004), 0.5)
+        torque = MODEL.torque(truth(), motion)[:, 1]
+        side = np.tanh(torque / (0.05 * torque.std()))
+        play = np.radians(0.1) * side[:, None] * [0.0, 1.0]
+        assert self.floor(position=play) == pytest.approx(self.NOISE, rel=0.15)
+
+    def test_spikes_do_not_raise_it(self) -> None:
+        random = np.random.default_rng(1)
+        spikes = 50.0 * random.normal(size=(3000, 2)) * (random.random((3000, 2)) < 0.002)
+        assert self.floor(torque=spikes) == pytest.approx(self.NOISE, rel=0.2)
