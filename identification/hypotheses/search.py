@@ -74,6 +74,7 @@ _LARGE: Final = 0.15  # relative reduction of the error that chance alone does n
 _LEAST_GAIN: Final = 0.02  # relative reduction of the error of a reading that is adopted
 _ALIKE: Final = 0.05  # the same, of readings that fit alike
 _HARM: Final = 1.1  # error ratio of a joint beyond which a reading spoils it
+_HALVES: Final = 0.5  # error ratio over all joints from which it may
 _ROWS: Final = 700
 _FEWER_ROWS: Final = 250  # on which all readings are tried first
 # Of the search for an order: as read, then at random until the best order is reached twice. From a
@@ -601,7 +602,9 @@ class _Search:
         if int(trial.score.driven.sum()) > int(self.score.driven.sum()):
             return True
         most = _HARM if beside is None else _HARM * np.maximum(1.0, beside.against.joints)
-        spoils = bool(np.any(trial.against.joints > most))
+        # What a second fault leaves may fit a joint worse where the first one is corrected.
+        halves = trial.against.ratio < _HALVES and beside is None
+        spoils = bool(np.any(trial.against.joints > most)) and not halves
         return spoils and trial.change.meaning not in COUPLED
 
     def _adopt(self, best: Trial, others: Sequence[Trial]) -> Step:

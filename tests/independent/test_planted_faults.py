@@ -23,6 +23,7 @@ from benchmarks.coverage import (
     drawn_motion,
     logged,
 )
+from benchmarks.diagnosis import judged
 from benchmarks.joint_log import JointLog
 from hil.base.progress import Silent
 from hil.importers.imported_robot import IMPORTED_LAW, Robot
@@ -158,3 +159,11 @@ def test_rest_hides_no_fault(
     assert not identification.verdict.good
     named = findings(identification, *checks)
     assert any(f"panda_joint{joint + 1} " in finding.words for finding in named)
+
+
+@pytest.mark.parametrize("seed", [0, 2, 7])
+def test_several_faults_of_an_arm_are_named_at_once(seed: int, tmp_path: Path) -> None:
+    """A joint turned the other way from another zero; with a scale; three zeros and two scales."""
+    outcome = judged(seed, tmp_path)
+    assert outcome["whole"], outcome["said"]
+    assert not outcome["wrong"]
