@@ -75,15 +75,8 @@ audit: $(STAMP)  ## known vulnerabilities of every pinned dependency (asks the P
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check --constraint constraints.txt pip-audit==2.10.1
 	$(BIN)/pip-audit --requirement constraints.txt --no-deps --disable-pip --strict
 
-bench: $(STAMP)  ## every benchmark that needs no data beside the project
-	$(BIN)/python -m benchmarks.regressor
-	$(BIN)/python -m benchmarks.identification
-	$(BIN)/python -m benchmarks.session
-	$(BIN)/python -m benchmarks.planner
-	$(BIN)/python -m benchmarks.design
-	$(BIN)/python -m benchmarks.live_motion
-	$(BIN)/python -m benchmarks.archive --sizes
-	$(BIN)/python -m benchmarks.turnaround --busy
+bench: $(STAMP)  ## list the benchmarks, and what each measures
+	@$(BIN)/python -m benchmarks
 
 clean:  ## remove .venv, runs, mutants and caches
 	rm -rf $(VENV) runs build dist *.egg-info .mypy_cache .ruff_cache .pytest_cache .hypothesis .import_linter_cache

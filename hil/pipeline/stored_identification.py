@@ -100,7 +100,7 @@ class StoredIdentification:
             verdict.good,
             verdict.line,
             tuple(verdict.reasons),
-            tuple(verdict.warnings),
+            tuple(verdict.warnings[: len(judgement.doubtful)]),  # remarks of the files follow them
             tuple(judgement.next_steps),
             tuple(judgement.findings),
             tuple(verdict.purposes),

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import inspect
+import json
 import pickle
 import shutil
 import subprocess
@@ -248,14 +249,25 @@ class TestLoaded:
         assert isinstance(loaded, hil.IdentifiedArm)
         assert repr(loaded) == repr(result)
         assert loaded.parameters.equals(result.parameters)
-        assert loaded.verdict.findings == result.verdict.findings
-        assert loaded.verdict.next_steps == result.verdict.next_steps
+        assert loaded.verdict == result.verdict
         assert loaded.channels == result.channels
         q, v, a = np.random.default_rng(1).uniform(-1.0, 1.0, (3, 20, 3))
         np.testing.assert_array_equal(loaded.predict(q, v, a), result.predict(q, v, a))
         rigid = [pin.rnea(each.model, each.model.createData(), q[0], v[0], a[0])
                  for each in (loaded, result)]  # fmt: skip
         np.testing.assert_allclose(*rigid, rtol=1e-9)
+
+    def test_a_remark_on_its_recordings_is_none_of_its_verdict(
+        self, saved: Path, result: Any, tmp_path: Path
+    ) -> None:
+        place = tmp_path / "arm"
+        shutil.copytree(saved, place)
+        content = json.loads((place / "results.json").read_text())
+        content["verdict"]["warnings"].append("a.mcap: the clock jumps")
+        (place / "results.json").write_text(json.dumps(content))
+        loaded = hil.load(place)
+        assert loaded.verdict == result.verdict
+        assert loaded.results.remarks == ["a.mcap: the clock jumps"]
 
     def test_its_plot_and_its_page_are_the_same(self, result: Any, loaded: Any) -> None:
         assert loaded.plot().series.equals(result.plot().series)
