@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 import os
+import re
 import signal
 from pathlib import Path
 
@@ -25,6 +26,27 @@ settings.load_profile("hil")
 # Tests of other folders import them, too, some before those of tests/drivers.
 _OF_DRIVERS = ("transport_contract", "can_bench", "rig", "judge", "oracle")
 pytest.register_assert_rewrite(*(f"tests.drivers.{name}" for name in _OF_DRIVERS))
+
+
+def pytest_ignore_collect(collection_path: Path, config: pytest.Config) -> bool | None:
+    """Whether a file is of a tier that `-m` excludes: it is not even imported, half of the time."""
+    if collection_path.suffix != ".py":
+        return None
+    excluded = excluded_tiers(config.getoption("markexpr", default=""))
+    return bool(excluded & tiers_of(collection_path.read_text("utf-8"))) or None
+
+
+def excluded_tiers(expression: str) -> set[str]:
+    """Marks that each test must not have by an expression such as "not slow and not long"."""
+    if re.search(r"\bor\b|\(", expression):
+        return set()
+    return set(re.findall(r"\bnot (\w+)", expression))
+
+
+def tiers_of(module: str) -> set[str]:
+    """Marks of all tests of a module, by its line with `pytestmark`."""
+    marks = re.findall(r"^pytestmark = (.*)", module, re.MULTILINE)
+    return {name for line in marks for name in re.findall(r"pytest\.mark\.(\w+)", line)}
 
 
 _LONGEST = (
