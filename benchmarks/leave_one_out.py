@@ -31,7 +31,7 @@ from identification.selection import folds, questions, scores
 ALTERNATIVES: Final[Mapping[str, tuple[Any, ...]]] = {
     "WORTHWHILE": (0.0, 0.03),
     "TERM_WORTHWHILE": (0.0, 0.05),
-    "LOW_PASS_WORTHWHILE": (0.02, 0.10),
+    "REVERSAL_WORTHWHILE": (0.02, 0.10),
     "LEFT_OUT": (("halts", "rests", "slow"),),
     "BANDWIDTHS": ((10.0, 14.0, 7.0, 20.0, 40.0), (20.0, 14.0, 40.0, 10.0, 7.0)),
     "VELOCITIES": (("position", "measured"),),

@@ -95,7 +95,7 @@ FRICTION_TERMS: Final[tuple[Mapping[str, Any], ...]] = (
     {"third": "cubic", "stribeck": 0.0},
     {"third": "none", "stribeck": 0.1},
 )
-LOW_PASS_WORTHWHILE: Final = 0.05
+REVERSAL_WORTHWHILE: Final = 0.05
 ROTORS_WORTHWHILE: Final = 0.05
 """Rotors far heavier than the links change the error to a fifth or to less than a tenth more."""
 TERM_WORTHWHILE: Final = 0.02
@@ -346,9 +346,8 @@ def _compare_low_passes(
     certainty = CERTAIN if delayed else 1.0
 
     def compare(first: Settings, other: Settings) -> SettingDecision:
-        return trial.decide(
-            LOW_PASS, [first, other], LOW_PASS_WORTHWHILE, by_joint=True, certainty=certainty
-        )
+        # That there is one, its gain has shown (`possible_low_passes`).
+        return trial.decide(LOW_PASS, [first, other], by_joint=True, certainty=certainty)
 
     likely = compare(start, trial.best(candidates))
     if not likely.choice.chosen:
@@ -361,8 +360,8 @@ def _compare_low_passes(
     if decision.choice.chosen and filtered.preprocessing.torque_shape.causal:
         # A lag that predicts as well is called a delay.
         late = trial.decide("", _nearby_lags(now, filtered), share=0.0).settings
-        delay = trial.decide(DELAY, [now, late], LOW_PASS_WORTHWHILE, by_joint=True)
-        both = trial.decide(LOW_PASS, [late, filtered], LOW_PASS_WORTHWHILE, by_joint=True)
+        delay = trial.decide(DELAY, [now, late], by_joint=True)
+        both = trial.decide(LOW_PASS, [late, filtered], by_joint=True)
         if delay.choice.chosen and not both.choice.chosen:
             return late, [*choices, delay.choice, both.choice]
     if decision.choice.chosen and "friction" in questions:
@@ -385,7 +384,7 @@ def _smooth_reversal(trial: SettingsTrial, now: Settings, filtered: Settings) ->
         speed = float(best.friction["tanh"])
         best = trial.best([best, *(_with_tanh(now, speed * part) for part in (1.0 / step, step))])
     return trial.decide(
-        REVERSAL, [filtered, best], LOW_PASS_WORTHWHILE, by_joint=True, certainty=CERTAIN
+        REVERSAL, [filtered, best], REVERSAL_WORTHWHILE, by_joint=True, certainty=CERTAIN
     )
 
 

@@ -42,8 +42,7 @@ Relative standard deviation, root mean square over eight real arms (60 splits, c
 10 % of the chosen one by inner prediction): 8 % for bandwidths (0 to 14 % by arm), 6 % for
 presliding displacements (1 to 12 %). Measured once, at ab6d0d94."""
 
-# Improvement required to replace the first, simpler candidate, beside its standard error; more for
-# a low-pass, which correlates with other settings.
+# Improvement required to replace the first, simpler candidate, beside its standard error.
 WORTHWHILE: Final = 0.01
 # Bodies that cannot exist are of no use in a simulator, so they must predict much better.
 IMPOSSIBLE_WORTHWHILE: Final = 0.05
