@@ -58,26 +58,23 @@ def identify(
 ) -> None:
     """Estimate the dynamic parameters from recordings and judge the result.
 
-    A log (CSV and other text, .npz, .mat, .mcap) or a bag needs the URDF of its arm; what its
-    channels are is concluded from their names and units, and printed. Archives contain all inputs:
-    URDF, friction law, drive train. Validation runs are predicted and never fitted. Recordings
-    with commanded positions and without torque give servo and friction of each joint, with the
-    masses of the URDF. Exit status 0 if the model is good for the purposes of --for, 5 if it is
-    not; without --for, if it predicts unseen motion to a tenth of the torque or to twice its
-    noise, better than the nominal model.
+    A log (CSV and other text, .npz, .mat, .mcap) or a bag needs the URDF of its arm; the meaning of
+    its channels is inferred from names and units, and printed. Archives contain all inputs.
+    Validation runs are predicted, never fitted. Commanded positions without torque give servo and
+    friction of each joint. Exit status 5 if the model is not good for the purposes of --for, or,
+    without it, predicts unseen motion neither to a tenth of the torque nor to twice its noise.
 
     **Examples:** `hil identify log.csv --urdf arm.urdf`, `hil identify runs/demo`
 
     Options:
-        output: Folder for all files. Default: the campaign folder (with --paper its subfolder
-            paper), else one beside the first recording, named after it.
+        output: Folder for all files. Default: the campaign folder (--paper: its subfolder), else
+            one named after the first recording, next to it.
         predict: Recording to predict and not to fit, of any kind (repeatable).
-        paper: Preprocess as in the paper: filter positions, torques and regressor alike.
+        paper: Filter torques and regressor alike, as in the paper.
         split: Fraction that is fitted if there is no validation run; the rest is predicted.
-        fit_all: Fit all recordings and hold nothing out: no model can then be judged good.
-        annotate: Also write copies of the archives for viewers, with predicted torque and
-            residual, into the subfolder annotated.
-        compare: MJCF whose servo parameters are compared, where there is no torque.
+        fit_all: Fit everything and hold nothing out; no model is then judged good.
+        annotate: Also write archives with predicted torque, for viewers.
+        compare: MJCF to compare servo parameters with, without torque.
     """
     reporter = make_reporter(quiet=quiet or json, messages=verbose)
     stated = {"in_sample": fit_all, "estimator": estimator, **required.options()}

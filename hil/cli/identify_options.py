@@ -28,8 +28,8 @@ DelayOption = Annotated[
     str | None,
     typer.Option(
         metavar="SECONDS",
-        help="Delay of the torque relative to the position, s; or auto, stated. Default: that of "
-        "the cell, unless the recordings contradict it.",
+        help="Delay of the torque after the position, s; or auto, stated. Default: that of the "
+        "cell, unless contradicted.",
         rich_help_panel=ESTIMATION,
     ),
 ]
@@ -46,7 +46,7 @@ class Identifying:
         str,
         typer.Option(
             metavar="TERMS",
-            help="Friction law in place of the archive's, such as coulomb,viscous,offset; or auto.",
+            help="Friction law, such as coulomb,viscous,offset; or auto.",
             rich_help_panel=ESTIMATION,
         ),
     ] = "auto"
@@ -55,7 +55,7 @@ class Identifying:
         str,
         typer.Option(
             metavar="HZ",
-            help="Largest bandwidth of the position smoothing; or auto.",
+            help="Largest bandwidth of the smoothed positions; or auto.",
             rich_help_panel=ESTIMATION,
         ),
     ] = "auto"
@@ -79,8 +79,7 @@ class Identifying:
         str,
         typer.Option(
             metavar="HZ",
-            help="Bandwidth of a low-pass filter that the recorded torque passed through; or none, "
-            "auto. The model is filtered alike.",
+            help="Of a low-pass filter that the recorded torque has passed; or none, auto.",
             rich_help_panel=ESTIMATION,
         ),
     ] = "auto"

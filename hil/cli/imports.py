@@ -71,7 +71,7 @@ OutsideOption = Annotated[
     bool,
     typer.Option(
         "--outside-limits",
-        help="Write the archive even if no row is within the limits of the URDF.",
+        help="Accept positions outside the limits of the URDF.",
         rich_help_panel=CHANNELS,
     ),
 ]
@@ -94,8 +94,8 @@ class Described:
         tuple[float, float, float] | None,
         typer.Option(
             metavar="X Y Z",
-            help="Gravity in the base frame, m/s²: 0 0 9.81 if mounted upside down, 0 0 0 for "
-            "torques without gravity. Default: that of the cell, else upright.",
+            help="Gravity in the base frame, m/s²: 0 0 9.81 upside down, 0 0 0 for torques without "
+            "it. Default: that of the cell.",
             rich_help_panel=ARM,
         ),
     ] = None
@@ -117,8 +117,7 @@ class Described:
         list[str] | None,
         typer.Option(
             metavar="NAME[=POSITION]",
-            help="Joint of the URDF that was not recorded, fixed at 0 or at a position in rad or m "
-            "(repeatable).",
+            help="Joint of the URDF that was not recorded, fixed at 0 or a position (repeatable).",
             rich_help_panel=ARM,
         ),
     ] = None
@@ -215,7 +214,7 @@ class Reading:
     topic: Annotated[
         str | None,
         typer.Option(
-            help="Topic of the joint states of a bag; needed if it has several.",
+            help="Topic of the joint states, of a bag with several.",
             rich_help_panel=CHANNELS,
         ),
     ] = None
@@ -223,8 +222,8 @@ class Reading:
         str | None,
         typer.Option(
             metavar="TOPIC",
-            help="Topic of the commanded positions of a bag, or none. Default: the state of a "
-            "controller, else a topic of commands that the positions follow.",
+            help="Topic of the commanded positions of a bag, or none. Default: that which the "
+            "positions follow.",
             rich_help_panel=CHANNELS,
         ),
     ] = None
@@ -232,7 +231,7 @@ class Reading:
         list[str] | None,
         typer.Option(
             metavar="RECORDED=URDF",
-            help="Joint whose name in a bag differs from the URDF (repeatable); {} is its number: "
+            help="Joint named differently in a bag (repeatable); {} is its number, as in "
             "fer_joint{}=panda_joint{}.",
             rich_help_panel=CHANNELS,
         ),
@@ -241,7 +240,7 @@ class Reading:
         Path | None,
         typer.Option(
             metavar="FILE",
-            help="Commanded positions of a log in a file of their own, joined by time stamps.",
+            help="Commanded positions of a log in a file of their own.",
             rich_help_panel=CHANNELS,
         ),
     ] = None
@@ -249,7 +248,7 @@ class Reading:
         Path | None,
         typer.Option(
             metavar="FILE",
-            help="LeRobot's calibration of the arm (JSON), for a data set with joints -100 to 100.",
+            help="LeRobot's calibration of a data set (JSON).",
             rich_help_panel=CHANNELS,
         ),
     ] = None
@@ -257,8 +256,7 @@ class Reading:
         EpisodeUnit | None,
         typer.Option(
             metavar="UNIT",
-            help="Of the joints of a LeRobot data set: deg, or range for -100 to 100 of their "
-            "range. Default: concluded.",
+            help="Of a LeRobot data set: deg, or range for -100 to 100.",
             rich_help_panel=CHANNELS,
         ),
     ] = None
@@ -267,7 +265,7 @@ class Reading:
         bool,
         typer.Option(
             "--drop-missing",
-            help="Leave out rows of a log in which a number is missing or is other text.",
+            help="Leave out rows of a log in which a number is missing.",
             rich_help_panel=CHANNELS,
         ),
     ] = False

@@ -25,6 +25,7 @@ from hil.pipeline.options import FRICTION_TERMS
 
 WIDTH = "100"
 MOST_LINES = 3
+TWO_SCREENS = 100  # lines
 
 
 def invoke(*arguments: str) -> Any:
@@ -53,6 +54,10 @@ def entries(text: str) -> dict[str, list[str]]:
         else:
             lines.append(line)
     return lines_of
+
+
+def test_the_help_of_an_identification_fits_two_screens() -> None:
+    assert len(invoke("identify", "--help").output.splitlines()) <= TWO_SCREENS
 
 
 @pytest.mark.parametrize("path", EVERY, ids=" ".join)
