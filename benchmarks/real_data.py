@@ -42,7 +42,7 @@ from hil.pipeline.prepared import prepare_sources, samples_of
 from hil.pipeline.sources import gather_sources
 from identification.estimators.consistent import consistent_estimate
 from identification.estimators.least_squares import fit_least_squares
-from identification.estimators.losses import Huber, Tukey
+from identification.estimators.loss_functions import Huber, Tukey
 from identification.estimators.prior import body_prior, fit_posterior
 from identification.estimators.robust import robust_estimate
 from identification.estimators.torque_channel import possible_low_passes

@@ -24,7 +24,7 @@ from drivers.errors import PacketError, RefusalError
 from drivers.events import InitReceived
 from drivers.guard import Joints
 from drivers.init_check import verify_controller
-from drivers.losses import LossTracker
+from drivers.packet_losses import LossTracker
 from drivers.packets import (
     AXIS_LENGTH,
     DRIVE_ON,

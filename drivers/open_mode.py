@@ -49,7 +49,7 @@ from drivers.errors import (
 )
 from drivers.execution import Execution
 from drivers.guard import FIRST_FRACTION, Guard, Joints, all_true, require
-from drivers.losses import LossTracker
+from drivers.packet_losses import LossTracker
 from drivers.states import AxesReport, State
 from drivers.wire import Wire
 

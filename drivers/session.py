@@ -82,9 +82,9 @@ from drivers.events import (
 )
 from drivers.execution import Execution, execution_of
 from drivers.guard import Guard
-from drivers.losses import LossTracker
 from drivers.motion_source import MotionSource
 from drivers.open_mode import Exit, OpenCycle, OpenReply, Refuse, Reply, SetPointGenerator
+from drivers.packet_losses import LossTracker
 from drivers.packets import Mode
 from drivers.states import (
     HAS_SET_POINTS,

@@ -16,7 +16,7 @@ from typing import Final, Literal, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from drivers.losses import LossTracker
+from drivers.packet_losses import LossTracker
 from drivers.packets import MODE_FIELDS, Mode
 
 Outcome = Literal["completed", "stopped", "refused", "lost"]

@@ -15,7 +15,7 @@ from drivers.arrays import Array
 from drivers.drive_train import DriveTrain, MotorSide
 from drivers.events import ControllerDescription, InitReceived
 from drivers.guard import Joints
-from drivers.losses import LossTracker
+from drivers.packet_losses import LossTracker
 from drivers.states import AxesReport, Input, State
 
 

@@ -21,7 +21,7 @@ from identification.estimators.least_squares import (
     estimate_repetitions,
     fit_least_squares,
 )
-from identification.estimators.losses import Huber, Tukey
+from identification.estimators.loss_functions import Huber, Tukey
 from identification.estimators.prior import (
     BodyPrior,
     GaussianPrior,

@@ -32,7 +32,7 @@ from drivers.drive_train import TURN, DriveTrain, MotorSide
 from drivers.errors import PacketError, RefusalError
 from drivers.events import InitReceived
 from drivers.guard import Joints
-from drivers.losses import LossTracker
+from drivers.packet_losses import LossTracker
 from drivers.packets import DRIVE_ON
 from drivers.states import AxesReport, Input, State
 from drivers.ur.description import START, UrDescription

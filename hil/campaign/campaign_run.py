@@ -18,13 +18,14 @@ from hil.control.link import MotionLink
 from hil.control.motion_checks import MotionChecks
 from hil.control.motions import CampaignMotion, CheckedMoves, require_allowed
 
-from .dry_run import OVERRIDE, DryRunState
+from .dry_run_record import OVERRIDE, DryRunState
+from .dry_run_stage import DryRunStage
 from .gates import require_as_rehearsed, require_dry_run, require_gates
 from .motion_runner import RunArchives, Runner, RunOptions
 from .operator import RunWatch
 from .quality import Rejected
-from .stages import DryRunStage, WarmUpStage
 from .state import CampaignState
+from .warm_up_stage import WarmUpStage
 
 
 @dataclass(frozen=True)

@@ -12,7 +12,7 @@ from hil.cell import Cell
 from hil.control.connection import Connection, narrower_limits
 from hil.control.link import MotionLink
 
-from .dry_run import DryRunRecord, not_accepted, yes_or_no
+from .dry_run_record import DryRunRecord, not_accepted, yes_or_no
 from .errors import DryRunError, NotRehearsedError
 from .folder import CampaignFolder
 from .motion_runner import RunOptions

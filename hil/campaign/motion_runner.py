@@ -29,7 +29,7 @@ from hil.control.slips import CHECKED, require_no_slip
 from hil.precision.requirements import Requirement
 from identification.excitation.excitation import trajectory_from_dict
 
-from .dry_run import OVERRIDE, SIMULATED, yes_or_no
+from .dry_run_record import OVERRIDE, SIMULATED, yes_or_no
 from .errors import RepetitionsRejectedError
 from .folder import CampaignFolder
 from .operator import ExpectedMotion, RunWatch

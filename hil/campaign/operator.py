@@ -12,7 +12,7 @@ from hil.archive.header import KIND_NAMES
 from hil.control.motion_watch import MotionProgress, OperatorRequest, Stop
 
 if TYPE_CHECKING:
-    from .dry_run import DryRunRecord
+    from .dry_run_record import DryRunRecord
 
 
 @dataclass(frozen=True, eq=False)

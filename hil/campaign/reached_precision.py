@@ -103,7 +103,7 @@ class PrecisionMeter:
             mine = np.flatnonzero(measured.required.owners == k)
             worst = int(mine[np.argmax(ratios[mine])])
             more = [
-                further(len(paths), ratios[direction], measured.noise[direction])
+                further_repetitions(len(paths), ratios[direction], measured.noise[direction])
                 for direction in mine.tolist()
             ]
             counts = [count for count in more if count is not None]
@@ -254,7 +254,7 @@ def noise_shares(
     return np.asarray(np.clip(scatter / np.where(whole > 0.0, whole, 1.0), 0.0, 1.0))
 
 
-def further(repetitions: int, ratio: float, share: float) -> int | None:
+def further_repetitions(repetitions: int, ratio: float, share: float) -> int | None:
     """Return how many more repetitions bring a ratio to one, None if none do.
 
     `share` of its square falls with the number of repetitions, the rest does not.

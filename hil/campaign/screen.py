@@ -30,7 +30,7 @@ from rich.text import Text
 from hil.base.progress import Silent, Task, put
 from hil.base.progress_lines import LINE_PERIOD, progress_console
 from hil.base.terminal_text import plural, printable
-from hil.campaign.dry_run import DryRunRecord
+from hil.campaign.dry_run_record import DryRunRecord
 from hil.campaign.operator import RunStatus
 from hil.campaign.operator_keys import ACTIONS, HELP, POLL, Keyboard, after, can_read
 from hil.cell import Cell

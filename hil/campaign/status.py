@@ -16,7 +16,7 @@ from hil.design.result import RESULT, DesignResult
 from hil.results.results import ExecutionLogResult, PrecisionResult, Results, StepResult
 from identification.text import percentage
 
-from .dry_run import DryRunRecord
+from .dry_run_record import DryRunRecord
 from .folder import PAYLOAD_RESULT, PAYLOADS, SIDES, CampaignFolder
 from .joint_warm_up import WarmUpRecord, drift_wanted
 from .precision_record import PrecisionRecord

@@ -22,7 +22,7 @@ from identification.estimators.instrumental import (
 )
 from identification.estimators.least_squares import RepeatedEstimate, estimate_repetitions
 from identification.estimators.load_friction import LoadFit, fit_with_load
-from identification.estimators.losses import Huber, Loss, Tukey
+from identification.estimators.loss_functions import Huber, Loss, Tukey
 from identification.estimators.prior import BODY_SHARE, NOMINAL_SHARE, PosteriorEstimate
 from identification.estimators.robust import RobustEstimate, robust_estimate
 from identification.factor.columns import instrument_factor

@@ -32,7 +32,7 @@ from hil.campaign.folder import PAYLOAD_RESULT, PAYLOADS, SIDES, CampaignFolder
 from hil.campaign.gates import require_rehearsed
 from hil.campaign.plan import CampaignPlan
 from hil.campaign.precision_record import PrecisionLook, PrecisionRecord, Reached
-from hil.campaign.reached_precision import further
+from hil.campaign.reached_precision import further_repetitions
 from hil.cell import Cell
 from hil.cell.cell import ASSUMED_PAYLOAD
 from hil.cell.schema import CellFile
@@ -505,5 +505,5 @@ def _look(result: PayloadFound, pairs: int, requirement: Requirement) -> Precisi
     """Return the precision of the mass after some pairs."""
     low, high = result.estimate.intervals[0].tolist()
     half = (high - low) / 2.0 / (result.body.mass if requirement.relative else 1.0)
-    more = further(pairs, half / requirement.value, 1.0 - result.estimate.scale_share)
+    more = further_repetitions(pairs, half / requirement.value, 1.0 - result.estimate.scale_share)
     return PrecisionLook(pairs, (Reached(str(requirement), "mass", half, more),))

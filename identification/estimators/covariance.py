@@ -28,7 +28,7 @@ from numpy.typing import NDArray
 
 from identification.arrays import Array
 from identification.distributions import student_limit
-from identification.estimators.losses import Loss
+from identification.estimators.loss_functions import Loss
 from identification.factor.blocks import FINE_BLOCK, block_slices, fine_blocks, merged
 from identification.factor.estimate import Estimate, mark_undetermined
 from identification.factor.factor import Factor

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from identification.arrays import Array
 from identification.estimators.covariance import clustered_covariance
-from identification.estimators.losses import Huber, Loss, Tukey
+from identification.estimators.loss_functions import Huber, Loss, Tukey
 from identification.factor.estimate import Estimate, estimate_of, inverse_variance
 from identification.factor.factor import Factor, reduced, total_factor
 from identification.factor.normal_equations import Solution

@@ -14,7 +14,7 @@ from pathlib import Path
 import pytest
 
 from drivers.exchange.loop import exchange
-from drivers.losses import LOSS_WINDOW, LossTracker
+from drivers.packet_losses import LOSS_WINDOW, LossTracker
 from drivers.session import Session
 from drivers.states import (
     HAS_SET_POINTS,
@@ -207,7 +207,7 @@ class TestOwner:
 IN_THE_SESSION = {
     "session", "packets", "c4g_wire", "open_mode", "guard", "drive_train", "execution",
 }  # fmt: skip
-BESIDE = {"states", "losses", "cycle_records"}
+BESIDE = {"states", "packet_losses", "cycle_records"}
 """The session's table, what it counts as lost, and the ring that receives the record."""
 
 

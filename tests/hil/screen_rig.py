@@ -24,7 +24,7 @@ import numpy as np
 
 from drivers.states import State
 from hil.campaign import stop_on_interrupt
-from hil.campaign.dry_run import DryRunRecord
+from hil.campaign.dry_run_record import DryRunRecord
 from hil.campaign.operator import RunStatus
 from hil.campaign.screen import Screen
 from hil.control.motion_watch import MotionProgress, OperatorRequest

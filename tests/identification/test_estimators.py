@@ -54,7 +54,7 @@ from identification.estimators.covariance import (
     spread,
 )
 from identification.estimators.delay import LONGEST_DELAY, delay_sensitivity
-from identification.estimators.losses import Loss
+from identification.estimators.loss_functions import Loss
 from identification.estimators.prior import (
     OFFSET_SHARE,
     body_lengths,

@@ -11,7 +11,7 @@ import pytest
 
 from drivers.execution import Execution
 from drivers.guard import Guard
-from drivers.losses import LossTracker
+from drivers.packet_losses import LossTracker
 from drivers.packets import PacketSequence
 from hil.archive.recorder import Recorder
 from hil.campaign.folder import CampaignFolder

@@ -29,7 +29,7 @@ from hil.base.progress import Silent
 from hil.campaign import Campaign, VirtualLink
 from hil.campaign import folder as campaign_folder
 from hil.campaign.campaign_run import RunResult
-from hil.campaign.dry_run import DryRunRecord
+from hil.campaign.dry_run_record import DryRunRecord
 from hil.campaign.errors import RepetitionsRejectedError
 from hil.campaign.folder import CampaignFolder
 from hil.campaign.operator import RunStatus

@@ -30,7 +30,7 @@ from hil.base.errors import ArchiveError, HilError, InputError
 from hil.base.files import write_atomically, write_files
 from hil.base.safe_input import parse_toml, read_text
 from hil.campaign import Campaign, CampaignFolderError
-from hil.campaign.dry_run import Acceptance, DryRunRecord
+from hil.campaign.dry_run_record import Acceptance, DryRunRecord
 from hil.campaign.folder import LOCK, CampaignFolder
 from hil.campaign.joint_warm_up import FrictionMeter, WarmUpRecord
 from hil.campaign.quality import Executed

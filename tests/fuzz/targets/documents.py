@@ -9,7 +9,7 @@ from functools import lru_cache, partial
 from pathlib import Path
 
 from hil.base.errors import CampaignFolderError, InputError
-from hil.campaign.dry_run import DryRunRecord
+from hil.campaign.dry_run_record import DryRunRecord
 from hil.campaign.errors import NotRehearsedError
 from hil.campaign.folder import CampaignFolder
 from hil.campaign.joint_warm_up import WarmUpRecord

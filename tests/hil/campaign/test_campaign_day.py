@@ -21,7 +21,7 @@ import hil
 from hil.base.progress import Silent
 from hil.campaign import Campaign, CampaignFolderError, MotionRefusedError
 from hil.campaign.campaign import campaign_of_design
-from hil.campaign.dry_run import Acceptance, DryRunRecord
+from hil.campaign.dry_run_record import Acceptance, DryRunRecord
 from hil.campaign.folder import CampaignFolder
 from hil.campaign.identified_campaign import identify_campaign
 from hil.campaign.joint_warm_up import WarmMotion, WarmUpRecord

@@ -14,7 +14,12 @@ from hil.campaign import Campaign
 from hil.campaign.identified_campaign import identify_campaign
 from hil.campaign.plan import design
 from hil.campaign.precision_record import PrecisionLook, PrecisionRecord, Reached
-from hil.campaign.reached_precision import PrecisionMeter, further, noise_shares, requirements_of
+from hil.campaign.reached_precision import (
+    PrecisionMeter,
+    further_repetitions,
+    noise_shares,
+    requirements_of,
+)
 from hil.cli import app
 from hil.control.motion_watch import Stop
 from identification.estimators.elasticity import ElasticTorque
@@ -205,13 +210,13 @@ class TestRecord:
 
 class TestForecast:
     def test_noise_alone_falls_with_the_number_of_repetitions(self) -> None:
-        assert further(4, 2.0, 1.0) == 12
-        assert further(4, 0.9, 1.0) == 0
+        assert further_repetitions(4, 2.0, 1.0) == 12
+        assert further_repetitions(4, 0.9, 1.0) == 0
 
     def test_what_repeats_does_not(self) -> None:
-        assert further(4, 2.0, 0.5) is None
-        assert further(4, 1.1, 0.5) == 3  # (0.5 * 4 / 7 + 0.5) * 1.1**2 is below one
-        assert further(1, 2.0, np.nan) is None
+        assert further_repetitions(4, 2.0, 0.5) is None
+        assert further_repetitions(4, 1.1, 0.5) == 3  # (0.5 * 4 / 7 + 0.5) * 1.1**2 is below one
+        assert further_repetitions(1, 2.0, np.nan) is None
 
 
 class Repetition:

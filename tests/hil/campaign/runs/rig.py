@@ -15,7 +15,7 @@ from hil.campaign import (
     Campaign,
     VirtualLink,
 )
-from hil.campaign.dry_run import DryRunRecord
+from hil.campaign.dry_run_record import DryRunRecord
 from hil.campaign.operator import RunStatus
 from hil.campaign.campaign_run import RunResult
 from hil.control.motion_watch import OperatorRequest

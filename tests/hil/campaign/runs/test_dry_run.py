@@ -13,7 +13,7 @@ from hil.campaign import (
     Campaign,
     CampaignFolderError,
 )
-from hil.campaign.dry_run import OVERRIDE, DryRunRecord, agreement, not_accepted
+from hil.campaign.dry_run_record import OVERRIDE, DryRunRecord, agreement, not_accepted
 from hil.campaign.errors import (
     AgainstGravityError,
     DryRunError,

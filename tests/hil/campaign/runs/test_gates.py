@@ -20,7 +20,7 @@ from hil.campaign import (
     NotRehearsedError,
     VirtualLink,
 )
-from hil.campaign.dry_run import DryRunRecord
+from hil.campaign.dry_run_record import DryRunRecord
 from hil.campaign.folder import CampaignFolder
 from hil.campaign.gates import require_rehearsed
 from hil.campaign.rehearsal_record import Rehearsal

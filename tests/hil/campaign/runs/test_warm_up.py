@@ -15,7 +15,7 @@ from hil.campaign import (
 )
 from hil.campaign.operator import RunStatus
 from hil.campaign.campaign_run import RunResult
-from hil.campaign.stages import WarmUpStage
+from hil.campaign.warm_up_stage import WarmUpStage
 from hil.campaign.joint_warm_up import (
     COLD_AFTER,
     FrictionMeter,
@@ -108,7 +108,7 @@ def test_an_arm_that_rests_for_hours_is_warmed_up_again(
     campaign = make(warmup_drift=0.9, warmup_least=4, repetitions=2)
     clock = time.time
     passed = [0.0]
-    monkeypatch.setattr("hil.campaign.stages.time.time", lambda: clock() + passed[0])
+    monkeypatch.setattr("hil.campaign.warm_up_stage.time.time", lambda: clock() + passed[0])
 
     class Leaves(Operator):
         def show(self, status: RunStatus) -> None:

@@ -1,4 +1,4 @@
-"""The dry run: every motion of the plan at 20 % of its speed, accepted by the operator."""
+"""Record of a dry run: every motion of the plan at 20 % of its speed, accepted by the operator."""
 
 from __future__ import annotations
 
