@@ -97,7 +97,8 @@ def export(
         ensemble: Write so many arms drawn from the posterior, all of them physically consistent;
             for isaaclab and genesis in NAME.ranges.json.
         seed: Of the draws.
-        into: Your own MJCF or URDF: change its friction, armature and servos in place.
+        into: Your own MJCF or URDF: change its friction, armature and servos, in place or as
+            --output.
         precision: Of the numbers in code for a controller.
         again: Identify again even if results are there.
     """

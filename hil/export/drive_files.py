@@ -57,7 +57,7 @@ class WhatToExport:
         ranges: whether a file of ranges is written next to it.
         count: of draws from the posterior, None for none.
         seed: of the draws.
-        into: MJCF or URDF that is changed in place, None for a new file.
+        into: MJCF or URDF that is changed, in place unless there is an output; None for a new file.
     """
 
     output: Path | None = None
@@ -141,11 +141,14 @@ def patch_drives(model: IdentifiedModel, into: Path, what: WhatToExport) -> Expo
         text = patched(read_input(into, OWN_FILE), actuators)
     except PatchError as error:
         raise InputError(into, str(error), field="--into", remedy=OWN_FILE) from error
-    files = {into.name: text}
+    target = what.output or into
+    files = {target.name: text}
     if what.ranges:
-        files |= _ranges_file(actuators, model, into, "urdf" if into.suffix == ".urdf" else "mjcf")
-    write_files(into.parent, files)
-    paths = tuple(into.parent / name for name in files)
+        kind = "urdf" if into.suffix == ".urdf" else "mjcf"
+        files |= _ranges_file(actuators, model, target, kind)
+    make_folder(target.parent)
+    write_files(target.parent, files)
+    paths = tuple(target.parent / name for name in files)
     said = "not read back: the bodies of the file stay, and are not known here"
     return ExportedDrives(paths, said, model.verdict, model.origin)
 

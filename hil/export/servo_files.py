@@ -153,13 +153,13 @@ def export_servo(folder: Path, to: str, export: WhatToExport) -> tuple[ExportedS
     cell, held_out = _archives(folder, results)
     actuators = actuators_of(servo, cell, results.windows, export.count or 0, export.seed)
     remarks = _remarks(results)
-    target = export.into or export.output or folder / f"identified{form.suffix}"
+    target = export.output or export.into or folder / f"identified{form.suffix}"
     files: dict[str, str | bytes | None] = {}
     played: tuple[PlayedBack, ...] = ()
     if to in ("mjcf", "urdf"):
         text, checked = _description(cell, actuators, remarks, to, export.into)
         if to == "mjcf":
-            place = None if export.into is None else target.parent
+            place = None if export.into is None else export.into.parent
             played, checked = _played(text, actuators, held_out, results, place, checked)
         if export.into is None:
             files |= _sampled_arms(cell, actuators, remarks, to, export, target)

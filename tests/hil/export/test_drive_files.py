@@ -84,8 +84,13 @@ def test_an_own_urdf_gets_friction_and_stays_otherwise(folder: Path, tmp_path: P
     joint = "<joint name='{}' type='revolute'><axis xyz='0 1 0'/></joint>"
     joints = "".join(joint.format(link["joint"]) for link in links_of(folder))
     path.write_text(f"<robot name='own'>{joints}<link name='camera'/></robot>")
-    done = run("export", folder, "--to", "urdf", "--into", path)
+    before = path.read_text()
+    copy = tmp_path / "copy.urdf"
+    done = run("export", folder, "--to", "urdf", "--into", path, "-o", copy)
     assert done.exit_code in (0, 5), done.output
+    assert path.read_text() == before
+    done = run("export", folder, "--to", "urdf", "--into", path)
+    assert path.read_text() == copy.read_text()
     root = ElementTree.parse(path).getroot()
     assert root.find("link[@name='camera']") is not None
     for joint in root.findall("joint"):

@@ -299,6 +299,17 @@ class TestExports:
         assert by_joint["pan"].get("name") == "m1" and by_joint["pan"].get("ctrlrange") == "-1 1"
         assert "dampratio" not in by_joint["pan"].attrib
 
+    def test_a_changed_copy_of_an_own_file_is_the_output(
+        self, identified: tuple[Path, str, int], tmp_path: Path
+    ) -> None:
+        folder, _, _ = identified
+        own, changed = tmp_path / "own.xml", tmp_path / "changed" / "arm.xml"
+        own.write_text(OWN)
+        status, output = exported(folder, "--to", "mjcf", "--into", own, "-o", changed)
+        assert status == 0, output
+        assert own.read_text() == OWN
+        assert "<!-- my arm -->" in changed.read_text() and changed.read_text() != OWN
+
     def test_a_file_without_the_joints_is_left_as_it_is(
         self, identified: tuple[Path, str, int], tmp_path: Path
     ) -> None:
