@@ -1,6 +1,7 @@
 """What a model is good for, on arms whose truth is planted."""
 
 from dataclasses import replace
+from functools import cache
 
 import numpy as np
 import pinocchio as pin
@@ -158,6 +159,7 @@ def exceeded(peaks: Array, limit: Array) -> Array:
     return np.count_nonzero(peaks > limit, axis=0) / (BLOCK * len(peaks)) * PERIOD
 
 
+@cache
 def peaks_of(duration: float, seed: int) -> Array:
     (part,) = slow_residuals(MODEL, truth(), [quiet(duration, seed)])
     size = np.abs(part.torque)

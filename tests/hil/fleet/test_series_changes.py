@@ -89,9 +89,16 @@ class TestFound:
 class TestNotInvented:
     """Fleets without a fault."""
 
-    @pytest.mark.parametrize("heat", [True, False])
-    @pytest.mark.parametrize("memory", [0.0, 0.5])
-    def test_p_values_are_at_most_uniform(self, heat, memory):
+    @pytest.mark.parametrize(
+        ("memory", "heat"),
+        [
+            (0.5, True),
+            pytest.param(0.5, False, marks=pytest.mark.long),
+            pytest.param(0.0, True, marks=pytest.mark.long),
+            pytest.param(0.0, False, marks=pytest.mark.long),
+        ],
+    )
+    def test_p_values_are_at_most_uniform(self, memory, heat):
         p_values = np.array(
             [
                 course.p_value

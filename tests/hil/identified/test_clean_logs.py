@@ -58,7 +58,13 @@ LIFT = (
 ARMS = ["three joints", "on a lift", "UR5", "UR5, stamps repeated", "smooth 0.05", "smooth 0.2"]
 
 
-@pytest.fixture(scope="module", params=ARMS)
+@pytest.fixture(
+    scope="module",
+    params=[
+        pytest.param(name, marks=pytest.mark.long) if name == "UR5, stamps repeated" else name
+        for name in ARMS
+    ],
+)
 def arm(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> IdentifiedArm:
     folder = tmp_path_factory.mktemp("clean")
     urdf = urdf_path("ur5_robot.urdf")

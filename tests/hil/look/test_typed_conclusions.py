@@ -189,7 +189,14 @@ def without_messages(value: Any) -> Any:
     return kept
 
 
-@pytest.mark.parametrize("log", LOGS)
+@pytest.mark.parametrize(
+    "log",
+    [
+        pytest.param("negated torque", marks=pytest.mark.long),
+        "degrees and milliseconds",
+        pytest.param("motor side", marks=pytest.mark.long),
+    ],
+)
 def test_sentences_decide_nothing(
     tmp_path: Path, urdf: Path, columns: tuple[Floats, ...], log: str
 ) -> None:
