@@ -26,6 +26,7 @@ from hil.control.simulated_cell import (
     simulated_controller,
     simulated_provenance,
 )
+from hil.control.ur_simulation import UrPeer, arm_truth, simulated_ur
 from hil.control.virtual_link import VirtualLink
 from identification.text import percentage
 from sim_fixtures import ServoSettings, UnmodelledEffects
@@ -72,6 +73,7 @@ class Twin:
             {
                 **{f"simulation.{key}": value for key, value in settings.items()},
                 "controller.transport": "simulated",
+                **_ur_table(cell),
                 "campaign.repetitions": min(repetitions, cell.campaign.repetitions),
             }
         )
@@ -81,6 +83,8 @@ class Twin:
 
     def link(self, seconds: float, *, effects: bool) -> VirtualLink:
         """Return a link in virtual time to the arm, with random faults."""
+        if self.cell.is_ur:
+            return self._ur_link(seconds)
         table = self.cell.controller
         # The current loop has the delay of `[controller] current_delay_cycles`.
         lag = (LOOP_CYCLES - table.current_delay_cycles) * self.cell.period
@@ -99,6 +103,16 @@ class Twin:
             SimulatedTransport(controller, faults), self.cell, finish=controller.finish
         )
 
+    def _ur_link(self, seconds: float) -> VirtualLink:
+        """Return one to a controller of Universal Robots: its servoj lags by some 30 ms.
+
+        Its torque constants are those of the cell.
+        """
+        robot = simulated_ur(self.cell, seed=self.seed, truth=arm_truth(self.cell, exact=True))
+        peer = UrPeer(robot)
+        faults = link_faults(self.cell, _HORIZON * seconds, self.seed)
+        return VirtualLink.over(SimulatedTransport(peer, faults), self.cell, finish=peer.finish)
+
     @property
     def provenance(self) -> dict[str, str]:
         """Metadata of a rehearsal's archive, with the simulated parameters."""
@@ -110,12 +124,17 @@ class Twin:
         }
 
 
+def _ur_table(cell: Cell) -> dict[str, Any]:
+    """Return what makes a simulated controller one of Universal Robots."""
+    return {"controller.rtde.port": cell.controller.rtde.port} if cell.is_ur else {}
+
+
 def link_faults(cell: Cell, seconds: float, seed: int) -> tuple[Fault, ...]:
     """Return single packets doubled, late or, where a motion survives it, lost within `seconds`."""
     rng = np.random.default_rng([seed, 7])
     cycles = round(seconds / cell.period)
     count = max(1, round(seconds / FAULT_EVERY))
-    survived = cell.controller.max_gap > 0 and too_far_without_a_packet(cell) is None
+    survived = cell.max_gap > 0 and too_far_without_a_packet(cell) is None
     kinds = ["delay", "duplicate", *(["lose"] if survived else [])]
     faults: list[Fault] = []
     # Not in the packets of the start.
@@ -135,7 +154,7 @@ def too_far_without_a_packet(cell: Cell) -> str | None:
 
     A controller that extrapolates is then one step ahead of the set-point sent last.
     """
-    if not cell.controller.max_gap:
+    if not cell.max_gap:
         return None
     share = MAX_TARGET_JUMP * np.array(cell.drive_table.following_error)
     speeds = np.diag(cell.joint_limits.velocity)

@@ -1,11 +1,11 @@
-"""`hil demo`: run a complete campaign on the simulated NS 16."""
+"""`hil demo`: run a complete campaign on a simulated NS 16, or a UR5e."""
 
 from __future__ import annotations
 
 import shutil
 import time
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Literal
 
 import typer
 
@@ -31,10 +31,12 @@ from hil.report.output_files import FILES, REPORT
 from hil.results.provenance import RESULTS
 from hil.results.series import SERIES
 from sim_fixtures.ns16 import CELL_PATH
+from sim_fixtures.ur import CELL_PATH as UR_CELL_PATH
 
 
 def demo(
     output: Annotated[Path, typer.Option("--output", "-o")] = Path("runs/demo"),
+    controller: Annotated[Literal["c4g", "ur"], typer.Option()] = "c4g",
     repetitions: Annotated[int | None, typer.Option(min=2)] = None,
     validation: Annotated[int | None, typer.Option(min=1)] = None,
     seed: Annotated[int | None, typer.Option(min=0)] = None,
@@ -46,7 +48,7 @@ def demo(
     verbose: VerboseOption = False,
     json: JsonOption = False,
 ) -> None:
-    """Design, run, archive, identify and report a campaign on the simulated COMAU NS 16.
+    """Design, run, archive, identify and report a campaign on a simulated arm.
 
     Writes `archives/*.mcap`, `results.json` and `report.html` to OUTPUT. Prints first
     what the identified model is good for, judged on motions that were not fitted. No hardware is
@@ -54,6 +56,7 @@ def demo(
 
     Options:
         output: Campaign folder to create.
+        controller: c4g: a COMAU NS 16 with its C4G Open; ur: a UR5e, by RTDE.
         repetitions: Number of repetitions of the excitation. Default: 30, as in the paper.
         validation: Number of validation runs, which are never fitted.
         seed: Seed of the simulated cell; runs with the same seed are identical.
@@ -74,7 +77,7 @@ def demo(
         _require_same(campaign, repetitions=repetitions, validation=validation, seed=seed)
     else:
         _require_replaceable(output, force=force)
-        cell = Cell.load(CELL_PATH).with_campaign(
+        cell = simulated_arm(controller).with_campaign(
             repetitions=repetitions, validation_runs=validation, simulation_seed=seed
         )
         plan = (
@@ -89,6 +92,13 @@ def demo(
     results = campaign.identify(reporter=reporter).results
     written = (output, output / REPORT)
     finish(results, json=json, quiet=quiet, verbose=verbose, written=written)
+
+
+def simulated_arm(controller: Literal["c4g", "ur"]) -> Cell:
+    """Return the cell of a simulated arm with this controller."""
+    if controller == "c4g":
+        return Cell.load(CELL_PATH)
+    return Cell.load(UR_CELL_PATH).with_values({"controller.transport": "simulated"})
 
 
 def _require_same(

@@ -199,11 +199,13 @@ def simulate(
         others = {
             "--udp": udp, "--can": can, "--cycle": cycle, "--mode": mode, "--only-axis": only_axis,
             "--warm-start": warm_start, "--intervals": intervals, "--effects": effects,
-            "--repeat": repeat, "--patience": patience,
+            "--repeat": repeat,
         }  # fmt: skip
         serve_rtde(
             with_rtde(read, link),
-            ArmOnRtde(own_speed if own_motion else None, fault or [], seed, duration, priority),
+            ArmOnRtde(
+                own_speed if own_motion else None, fault or [], seed, duration, priority, patience
+            ),
             [option for option, value in others.items() if value],
             json=json,
         )
@@ -284,13 +286,14 @@ def simulate(
 
 @dataclass(frozen=True)
 class ArmOnRtde:
-    """How an arm is simulated: speed of its program, faults, seed, s, and priority."""
+    """How an arm is simulated: speed of its program, faults, seed, s, priority and patience, s."""
 
     own_speed: float | None
     faults: list[str]
     seed: int | None
     duration: float | None
     priority: int | None
+    patience: float
 
 
 def serve_rtde(cell: Cell, arm: ArmOnRtde, others: list[str], *, json: bool) -> None:
@@ -299,12 +302,18 @@ def serve_rtde(cell: Cell, arm: ArmOnRtde, others: list[str], *, json: bool) -> 
         problem = "does not apply to a Universal Robots controller"
         raise InputError(None, problem, field=others[0], remedy="leave it out")
     loaded = with_simulation(cell)
-    server = served_arm(loaded, own_speed=arm.own_speed, faults=arm.faults, seed=arm.seed)
+    server = served_arm(
+        loaded,
+        own_speed=arm.own_speed,
+        faults=arm.faults,
+        seed=arm.seed,
+        cycle_extension=arm.patience,
+    )
     if not json:
         ports = ", ".join(f"{name} {port}" for name, port in server.ports.items())
         say_at_once(
             f"{cell.name}: a SIMULATED Universal Robots controller at {cell.controller.host}; "
-            f"nothing moves.\nports: {ports}; process {os.getpid()}"
+            f"no real arm moves.\nports: {ports}; process {os.getpid()}"
         )
     try:
         with buttons(arm.duration) as pressed, realtime_process(arm.priority):

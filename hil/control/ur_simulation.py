@@ -124,7 +124,7 @@ def simulated_ur(
     return SimulatedUr(
         replace(_settings(cell), remote_control=True, payload=_payload(cell)),
         at=cell.initial,
-        truth=truth or _truth(cell),
+        truth=truth or arm_truth(cell),
         faults=faults,
         seed=(cell.simulation.seed if seed is None else seed) + 1000 * session,
         urdf=cell.urdf,
@@ -143,6 +143,7 @@ def served_arm(
     own_speed: float | None = None,
     faults: Sequence[str] = (),
     seed: int | None = None,
+    cycle_extension: float = 0.0,
 ) -> UrServer:
     """Return a server of the arm of a cell at its address; it listens already.
 
@@ -151,6 +152,7 @@ def served_arm(
         own_speed: share of the velocity limits at which its own program moves it; None for rest.
         faults: KIND@CYCLE[xCOUNT], see `UrFault`.
         seed: of the noise, that of the cell by default.
+        cycle_extension: longest extension of a cycle to wait for a set-point [s].
 
     Raises:
         InputError: another number of joints, an invalid fault, or a port that cannot be opened.
@@ -160,10 +162,13 @@ def served_arm(
         raise cell.error("cell.urdf", cell.file.cell.urdf, problem, "name a cell of six joints")
     table = cell.controller
     try:
+        settings = replace(_settings(cell), payload=_payload(cell))
         robot = SimulatedUr(
-            _settings(cell),
+            # An arm that runs its own program is one that its operator works with.
+            replace(settings, remote_control=own_speed is None),
             _program(cell, own_speed),
-            truth=_truth(cell),
+            at=cell.initial,
+            truth=arm_truth(cell),
             faults=[parse_ur_fault(text) for text in faults],
             seed=cell.simulation.seed if seed is None else seed,
             repeats=True,
@@ -175,6 +180,7 @@ def served_arm(
             rtde=table.rtde.port,
             primary=table.rtde.primary_port,
             dashboard=table.rtde.dashboard_port,
+            cycle_extension=cycle_extension,
         )
     except (SettingError, SimulationError) as error:
         raise InputError(None, str(error)) from error
@@ -193,15 +199,21 @@ def _settings(cell: Cell) -> UrSettings:
     )
 
 
-def _truth(cell: Cell) -> UrArmTruth:
-    """Return the planted arm: its torque constants differ from those of the cell as a UR5e's do."""
+def arm_truth(cell: Cell, *, exact: bool = False) -> UrArmTruth:
+    """Return the planted arm: its torque constants differ from those of the cell as a UR5e's do.
+
+    With `exact` they are those of the cell.
+    """
     default = UrArmTruth()
     drives = cell.drive_train
     stated = drives.torque_constant * np.abs(np.diag(drives.motor_from_joint))
+    factor = default.torque_constant / default.stated_constant
+    if exact:
+        factor = np.ones(N_JOINTS)
     nominal = cell.nominal
     return UrArmTruth(
         plant=planted_truth(cell),
-        torque_constant=stated * default.torque_constant / default.stated_constant,
+        torque_constant=stated * factor,
         stated_constant=stated,
         coulomb=np.array(nominal.coulomb),
         viscous=np.array(nominal.viscous),

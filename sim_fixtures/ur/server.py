@@ -25,6 +25,7 @@ _MOST_UNREAD: Final = 1 << 19
 _MOST_AHEAD: Final = 1 << 16
 """Bytes by which the controller runs ahead of its clients in virtual time."""
 _IDLE: Final = 0.01  # s between two looks at `close` in virtual time
+_POLL: Final = 5e-4  # s between two looks at the clock while a set-point is waited for
 _STATE_EVERY: Final = 0.1  # s between two states of the primary interface
 _DEAD_AFTER: Final = 10.0  # s after which a client that does not read is disconnected
 _CHECKSUMS: Final = (0x1F2E3D4C, 0x5B6A7988, 0x97A6B5C4, 0xD3E2F100, 0x0F1E2D3C, 0x4B5A6978)
@@ -54,6 +55,7 @@ class _Client:
     unread_since: float | None = None
     held_until: int = -1  # cycle before which nothing is sent
     greeted: bool = False
+    written_in: int = -1  # cycle in which it wrote inputs last
     inputs: list[wire.InputRecipe] = field(default_factory=list)
     program: bytearray = field(default_factory=bytearray)
     closing: bool = False
@@ -66,6 +68,8 @@ class UrServer:
         controller: the controller, which is stepped here.
         host: address to listen at.
         rtde, primary, dashboard: ports; 0 for a free one, None for none.
+        cycle_extension: longest time by which a cycle is extended to wait for the set-point of a
+            client, while a program takes set-points [s]: the computers of tests are busy.
         real_time: cycles last their period; otherwise as long as the clients read, and none pass
             without a client.
 
@@ -88,8 +92,10 @@ class UrServer:
         primary: int | None = 0,
         dashboard: int | None = 0,
         real_time: bool = True,
+        cycle_extension: float = 0.0,
     ) -> None:
         self.controller = controller
+        self._extension = cycle_extension
         self.ports: dict[str, int] = {}
         self.skipped = 0
         self.late = 0
@@ -174,16 +180,28 @@ class UrServer:
         now = time.monotonic()
         if now < self._due:
             return False
+        if now < self._due + self._extension and self._waits:
+            return False
         self.late += now - self._due >= self.controller.period
         # After a delay of this program cycles are shifted; they are not sent in a burst.
         self._due = max(self._due, now - 10 * self.controller.period) + self.controller.period
         return True
+
+    @property
+    def _waits(self) -> bool:
+        """Whether a program takes set-points and that of this cycle has not come."""
+        controller = self.controller
+        return controller.stream is not None and any(
+            client.inputs and client.started and client.written_in < controller.cycle
+            for client in self._clients
+        )
 
     def _exchange(self) -> None:
         """Accept, read and write what is possible until the next cycle."""
         wait = 0.0 if self._are_ready else _IDLE
         if self._real_time:
             wait = max(0.0, self._due - time.monotonic())
+            wait = max(wait, _POLL) if self._waits else wait
         for client in self._clients:
             writes = bool(client.waiting) and not self._holds(client)
             events = selectors.EVENT_READ | (selectors.EVENT_WRITE if writes else 0)
@@ -257,6 +275,7 @@ class UrServer:
                 for recipe in client.inputs:
                     if payload[:1] == bytes([recipe.number]):
                         self.controller.write_inputs(recipe.values(payload))
+                        client.written_in = self.controller.cycle
                 return b""
             case "S":
                 client.started = client.data is not None

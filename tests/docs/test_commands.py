@@ -61,6 +61,7 @@ OTHER_PROGRAMS = {
 
 NOT_TYPED = {
     "hil demo --effects": "minutes",
+    "hil demo --controller ur": "half a minute; tests/hil/campaign/test_ur_twin.py moves that arm",
     "hil demo --resume": "resumes a stopped one; tests/hil/cli/test_cli.py stops one",
     "hil demo --excitation": "the whole NS 16 campaign: minutes",
     "hil demo --output runs/": "a campaign of the fixture stands in its place",
