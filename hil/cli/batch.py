@@ -53,7 +53,7 @@ def batch(
     """Identify every arm from all recordings below given folders, campaign by campaign.
 
     Recordings are archives, and with --urdf also logs and bags. One column map describes all logs
-    with the same channels: --map, or what is concluded from the first of them as by `hil identify`.
+    with the same channels: --map, or one inferred from the first of them, as by `hil identify`.
     The factor of each recording is cached, so another run with other estimators or more recordings
     reads only new ones. The cache survives Ctrl-C.
 

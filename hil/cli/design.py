@@ -125,7 +125,7 @@ def design(
         quick: Run a short search: method b with the number of motions in `candidates` of
             [campaign].
         given: Archive or campaign folder of earlier recordings of this arm (repeatable): the motion
-            adds what they lack, and the criteria are those of all.
+            adds what they lack; criteria are computed for all recordings together.
         precision: Required halves of 95 % intervals, such as "parameters 5 %, torque 2": the motion
             minimises the largest ratio of predicted to required interval.
         purpose: payload: a motion of at most ten seconds that weighs a payload (`hil payload`), on

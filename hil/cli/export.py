@@ -76,13 +76,13 @@ def export(
 ) -> None:
     """Write the identified arm for a simulator or a controller, and verify the file.
 
-    The physically consistent parameters are those of results.json and parameters.json in a folder
-    of archives, if these are of its archives. Otherwise, or with an option of the identification,
-    they are identified as by `hil identify`. Inverse dynamics of the file, by MuJoCo (extra
-    `mujoco`) or pinocchio, must equal those of the model at 1000 random states. Effects that the
-    format cannot express are listed with their torque over the recorded motion. Code for a
-    controller has every effect; C is compiled, where a compiler is found, and compared with
-    pinocchio likewise. Exit status 5 if the model is not good.
+    The physically consistent parameters come from results.json and parameters.json in a folder of
+    archives, if they were identified from these. Otherwise, or with an option of the
+    identification, the command first identifies, as `hil identify` does. The inverse dynamics of
+    the file, by MuJoCo (extra `mujoco`) or pinocchio, must match the model at 1000 random states.
+    Effects that the format cannot express are listed with their torque over the recorded motion.
+    Code for a controller has every effect; C is compiled, if there is a compiler, and compared with
+    pinocchio. Exit status 5 if the model is not good.
 
     Results of recordings without torque give position servos, which MuJoCo plays back.
 

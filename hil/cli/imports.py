@@ -189,7 +189,7 @@ class Reading:
         typer.Option(
             "--map",
             help="Column map, a TOML file or a ready one by name (`hil import maps`). Default: "
-            "concluded from names and units, and printed.",
+            "inferred from names and units, and printed.",
             rich_help_panel=CHANNELS,
         ),
     ] = None
@@ -376,7 +376,9 @@ def log(
     source: Source,
     output: Annotated[
         Path | None,
-        typer.Option("--output", "-o", help="The archive to write (*.mcap). Default: beside it."),
+        typer.Option(
+            "--output", "-o", help="The archive to write (*.mcap). Default: next to the log."
+        ),
     ] = None,
     *,
     arm: Described,
@@ -391,9 +393,8 @@ def log(
 
     A column map names columns or arrays, their units and sides: `docs/archive-format.md`. It can
     also name a separate file per quantity or per joint; the source is then a folder. Without --map
-    it is concluded from the names and units of the channels, printed, and written beside the
-    archive. Warnings report probable errors of the map, with the error of each of two
-    interpretations.
+    it is inferred from the names and units of the channels, printed, and written next to the
+    archive. Warnings report probable errors of the map, with the errors of both interpretations.
 
     **Example:** `hil import log log.csv --urdf arm.urdf -o log.mcap`, with `--map map.toml` of
     `[time] column = "t"`, `[position] columns = "q{}"`, `[torque] columns = "tau{}"`

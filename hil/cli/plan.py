@@ -84,8 +84,8 @@ def plan(
 ) -> None:
     """Plan a motion through via points and report how each of them is passed. Nothing moves.
 
-    Angles are in the frame of the cell's limits: those of the teach pendant if it is "controller".
-    Only joint limits are checked here: not floor, walls, currents or self-collision.
+    Angles are in the frame of the cell's limits: teach pendant angles if it is "controller". Only
+    joint limits are checked, not floor, walls, currents or self-collision.
 
     **Example:** `hil plan cell.toml --random 6 --fly 50 --picture plan.png`
 
@@ -101,7 +101,7 @@ def plan(
     if picture is not None:
         check_format(picture)
     exactly_one(
-        "--random 6 plans through six random points, --via FILE through those of a table",
+        "--random 6 plans through six random points, --via FILE through the points of a table",
         via=via,
         random=random,
     )

@@ -60,7 +60,7 @@ def record(
 
     Each reply repeats the set-point that the controller sent, so the arm follows its own program
     and every cycle is archived. It is the safest first test with a robot. `hil identify` reads the
-    archives like those of a campaign: record fast motions over the whole range of every joint, some
+    archives like a campaign's: record fast motions over the whole range of every joint, some
     with --kind validation, and a few seconds at rest with --kind standstill.
 
     **Example:** `hil record cell.toml -o archives --duration 60`, then `hil identify archives/*`.
@@ -73,9 +73,9 @@ def record(
     REFUSED), no controller came within --wait, or the session ended before --duration; 130 Ctrl-C
     ended the recording before --duration, or the wait for the controller.
 
-    A Universal Robots arm (transport rtde, or --link) is only listened to: in any mode, beside a
-    running program and beside other clients. Nothing is claimed, and nothing waits for this PC.
-    Each of its outputs is archived, and a frame that did not come is a gap by its time stamps.
+    With a Universal Robots arm (transport rtde, or --link), this PC only listens: in any mode,
+    while programs and other clients run. It claims nothing, and nothing waits for it. Every output
+    is archived; a missing frame shows as a gap in the time stamps.
 
     Options:
         cell: The cell file.
@@ -133,7 +133,7 @@ def with_rtde(cell: Cell, link: str | None) -> Cell:
     name, _, address = link.partition(":")
     fields = LINKS["rtde"].parse(address) if name == "rtde" else None
     if fields is None:
-        remedy = "write rtde:HOST or rtde:HOST:PORT; other links are those of the cell file"
+        remedy = "write rtde:HOST or rtde:HOST:PORT; the cell file describes other links"
         problem = f"{link!r} is no link that is only listened to"
         raise InputError(None, problem, field="--link", remedy=remedy)
     table = cell.file.controller

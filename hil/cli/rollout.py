@@ -65,10 +65,10 @@ def rollout(
     Windows start at measured states; after 0.1, 0.2, 0.5 and 1 s the positions are compared with
     the measured ones, for the identified arm, the nominal one, and arms drawn from the posterior.
     The arm is driven by the recorded torque and a light feedback, or by a servo. Parameters and
-    settings are those of results.json and parameters.json in a folder, as for `hil export`; its
-    report receives a section. Of archives without torque, --polish identifies servo, friction and
-    rotors from commanded and measured positions, with the masses of the URDF. Writes rollout.json
-    and rollout.png. Exit status 5 if the model is not good.
+    settings come from results.json and parameters.json in a folder, as for `hil export`; its report
+    gets a section. From archives without torque, --polish identifies servo, friction and rotors by
+    commanded and measured positions, with the masses of the URDF. Writes rollout.json and
+    rollout.png. Exit status 5 if the model is not good.
 
     **Example:** `hil rollout runs/demo`
 

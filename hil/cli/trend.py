@@ -56,10 +56,10 @@ def trend(
 ) -> None:
     """Watch a fleet: which robot changes, in which joint, how fast, and since when.
 
-    Recordings are those of `hil batch`; only new ones are read. Friction, Coulomb and viscous
-    friction, gravity load, torque scale, and the torque error of the model of the first months are
-    followed by robot and joint; temperatures and what moves all robots at once are taken into
-    account. Exit status 0 for any result, unless --fail-on-change is given.
+    Reads the same recordings as `hil batch`, and only new ones. Tracks friction (also its Coulomb
+    and viscous parts), gravity load, torque scale, and the torque error of the first months' model
+    for each robot and joint; corrects for temperature and for changes that all robots share. Exit
+    status 0 for any result, unless --fail-on-change is given.
 
     **Example:** `hil trend logs --urdf arm.urdf --robot '{robot}/{date}.csv' -o trend.html`
 
