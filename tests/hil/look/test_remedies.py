@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 import shlex
+import warnings
 from pathlib import Path
 from typing import Any
 from xml.etree import ElementTree
@@ -150,3 +151,98 @@ def test_two_topics_in_one_table_need_no_remedy(cases: Path, tmp_path: Path) -> 
     found = np.searchsorted(torques[:, 0], read["stamp"] * 1e-9 - 1e-6)
     assert len(read["stamp"]) > 0.98 * len(torques)
     assert read["torque"] == pytest.approx(torques[np.clip(found, 0, len(torques) - 1), 7:])
+
+
+STATED = """
+[time]
+column = "{}"
+[position]
+columns = "{}"
+{zeros}
+[torque]
+columns = "{}"
+"""
+"""A whole column map, which is taken as it is: the verdict alone says what it has wrong."""
+
+
+def stated_map(folder: Path, *columns: str, zeros: str = "") -> Path:
+    """Write the map of a log whose time, positions and torques are these columns."""
+    text = STATED.format(*columns, zeros=zeros)
+    path = folder / f"map{len(zeros)}.toml"
+    path.write_text(text)
+    return path
+
+
+def test_zeros_that_a_verdict_prints_make_the_model_good(cases: Path, tmp_path: Path) -> None:
+    log = cases / "09-several-zeros" / "three.csv"
+    line = ("identify", log, "--urdf", cases / "arm.urdf")
+    stated = stated_map(tmp_path, "t", "q{}", "tau{}")
+    code, shown = typed(*line, "--map", stated, "-o", tmp_path / "wrong", "-v")
+    assert code == 5
+    (offset,) = set(re.findall(r"\[position\] (offset = \[[^]]*\])", shown))
+    corrected = stated_map(tmp_path, "t", "q{}", "tau{}", zeros=offset)
+    code, shown = typed(*line, "--map", corrected, "-o", tmp_path / "right")
+    assert code == 0
+    assert "Good for feed-forward" in shown
+
+
+def test_gravity_that_a_verdict_prints_makes_the_model_good(cases: Path, tmp_path: Path) -> None:
+    log = cases / "06-torque-already-compensated" / "bare_g.csv"
+    stated = stated_map(tmp_path, "timestamp", "actual_q_{}", "actual_torque_{}")
+    line = ("identify", log, "--urdf", cases / "arm.urdf", "--map", stated)
+    code, shown = typed(*line, "-o", tmp_path / "wrong", "-v")
+    assert code == 5
+    (option,) = set(re.findall(r"`(--gravity 0 0 0)` where a log", shown))
+    code, shown = typed(*line, *shlex.split(option), "-o", tmp_path / "right")
+    assert code == 0
+    assert "Good for feed-forward" in shown
+
+
+def test_the_entries_of_a_load_with_its_sign_in_a_bit(cases: Path, tmp_path: Path) -> None:
+    """The refusals lead from a log without a torque to one in newton metres."""
+    log = cases / "14-torque-encodings" / "present_load.csv"
+    line = ("identify", log, "--urdf", cases / "arm.urdf", "-o", tmp_path / "found")
+    code, refused = typed(*line)
+    assert code == 2
+    (option,) = re.findall(r"state (--columns '[^']*')", refused)
+    code, refused = typed(*line, *shlex.split(option))
+    assert code == 2
+    (entries,) = re.findall(r"\[torque\] (columns = .*), the N.m of each joint", refused)
+    rated = "[60.0, 180.0, 90.0, 12.0, 12.0, 6.0]"
+    torque = entries.replace("[...]", rated).replace(", ", "\n", 3).replace("\nrated", "\nrated")
+    path = tmp_path / "map.toml"
+    path.write_text(
+        '[time]\ncolumn = "timestamp"\n[position]\ncolumns = "j{}_present_position"\n'
+        f"[torque]\n{torque}\n"
+    )
+    code, shown = typed(*line, "--map", path)
+    assert code == 0, shown
+
+
+def test_a_load_that_begins_in_the_unseen_part_is_named_with_its_time(
+    cases: Path, tmp_path: Path
+) -> None:
+    """2.0 kg from 13.6 s on, of which the unseen part begins at 11.2 s."""
+    log = cases / "12-motion-kinds" / "payload_late.csv"
+    code, shown = typed("identify", log, "--urdf", cases / "arm.urdf", "-o", tmp_path / "found")
+    assert code == 5
+    ((start, mass, half),) = re.findall(
+        r"in unseen motion from ([\d.]+) s on the arm carried ([\d.]+) ± ([\d.]+) kg more", shown
+    )
+    assert float(start) == pytest.approx(13.6 - 11.2, abs=0.3)
+    assert float(mass) == pytest.approx(2.0, abs=max(0.02, float(half)))
+
+
+def test_a_log_of_one_joint_after_the_other_has_no_absurd_figure(
+    cases: Path, tmp_path: Path
+) -> None:
+    """No joint that the fitted part did not move has a change of friction, of gain or a load."""
+    log = cases / "12-motion-kinds" / "single.csv"
+    line = ("identify", log, "--urdf", cases / "arm.urdf", "-o", tmp_path / "found", "-v")
+    with warnings.catch_warnings():
+        warnings.simplefilter("error", RuntimeWarning)
+        code, shown = typed(*line)
+    assert code == 5
+    assert max(float(share) for share in re.findall(r"([\d.]+) ?%", shown)) < 200.0
+    assert "the arm carried" not in shown
+    assert "friction on" not in shown
