@@ -21,13 +21,13 @@ from identification.estimators.torque_scale import DATA_SHEET, described
 from identification.factor.estimate import Estimate
 from identification.model.friction import TERMS, FrictionLaw
 from identification.selection.questions import FRICTION_AT_SPEED, LOAD, LOW_PASS, REVERSAL
-from identification.signals.masks import SATURATED
+from identification.signals.masks import SATURATED, SPIKE
 from identification.signals.recording import UNWRAPPED, Recording
 from identification.signals.row_faults import RowFaultKind
 from identification.signals.samples import Samples
 from identification.text import percentage
 from identification.validation.evidence import CellContext
-from identification.validation.finding import Finding, Thresholds, joined
+from identification.validation.finding import Finding, Naming, Thresholds, joined
 from identification.validation.nominal_scale import InertiaRatio, inertia_ratio, nominal_scale
 from identification.validation.position_jumps import PositionJump, position_steps
 from identification.validation.prediction import PredictionError, pooled_error
@@ -136,6 +136,7 @@ def cell_context_of(prepared: Prepared, estimate: Estimate) -> CellContext:
         assumed_delay=prepared.assumed_delay,
         corrections=(
             *_rows(recorded),
+            *_spikes(prepared),
             *_commanded(recorded, prepared),
             *_row_counters(recorded),
             *_clock(prepared),
@@ -192,6 +193,20 @@ def _rows(sources: Sequence[Source]) -> Iterator[Finding]:
         for fault in source.faults:
             text = f"{source.path.name}: {fault.describe()}"
             yield _condition("rows", text, _ROW_ADVICE[fault.kind])
+
+
+def _spikes(prepared: Prepared) -> Iterator[Finding]:
+    """Yield a finding about samples of torque that stand out alone."""
+    counts = prepared.masked.get(SPIKE)
+    if counts is None or not counts.any():
+        return
+    naming = Naming(tuple(prepared.sources.cell.joint_names), "")
+    each = naming.each(counts > 0, lambda joint: str(int(counts[joint])))
+    text = (
+        f"samples of the torque stand out alone and are left out of fit and error: {each} of"
+        f" {prepared.rows} of the fitted motion"
+    )
+    yield _condition("rows", text, "check for damaged packets; all other samples are used")
 
 
 def _are_commands(source: Source) -> bool:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Final, Literal
 
@@ -43,6 +43,14 @@ LONGEST_HALT: Final = 0.25  # s
 # faster recording leaves out as much as was judged.
 TURN: Final = 0.016  # s
 
+# Torque that stands out alone, as damaged packets leave it: from its neighbours by so many robust
+# standard deviations, and by so much of its range.
+_STANDS_OUT: Final = 15.0
+_OF_RANGE: Final = 0.5
+_TAIL: Final = 0.01  # of the samples at either end, which are no range
+_LONGEST_SPIKE: Final = 2  # samples
+_NORMAL: Final = 1.4826  # standard deviation over median absolute value
+
 LeftOut = Literal["rests", "halts", "slow", "none"]
 
 EDGE: Final = "beside a gap or an end of the recording"
@@ -50,6 +58,7 @@ SATURATED: Final = "torque or current saturated"
 REST: Final = "at rest"
 STANDSTILL: Final = "slower than standstill"
 REVERSAL: Final = "near a velocity reversal"
+SPIKE: Final = "torque or current stands out alone"
 
 
 @dataclass(frozen=True, eq=False)
@@ -111,10 +120,11 @@ def mask_rows(
     """
     shape = recording.position.shape
     still = ~model.moving(motion.velocity)
-    saturated = np.zeros(shape, dtype=np.bool_)
+    saturated, spikes = np.zeros((2, *shape), dtype=np.bool_)
     for values in (recording.torque, recording.motor_current):
         if values is not None:
             saturated |= flat_topped(values, ~still)
+            spikes |= spiking(values, recording.segments())
     if current_limit is not None and recording.motor_current is not None:
         saturated |= np.abs(recording.motor_current) >= AT_LIMIT * current_limit
     slowest = float(bandwidth[np.ptp(recording.position, axis=0) > 0.0].min(initial=np.inf))
@@ -136,7 +146,8 @@ def mask_rows(
     elif left_out == "slow":
         reasons |= {STANDSTILL: still, REVERSAL: reversal}
     reasons[SATURATED] = saturated
-    moving = ~(reasons[EDGE] | saturated | still | reversal)
+    reasons[SPIKE] = spikes
+    moving = ~(reasons[EDGE] | saturated | spikes | still | reversal)
     return RowMask(reasons, (shape[0], shape[1]), moving)
 
 
@@ -168,6 +179,32 @@ def flat_topped(values: Array, moving: Rows) -> Rows:
                 if stop - start >= SHORTEST_TOP and _leaves_peak(channel, start, stop, resolution):
                     clipped[start:stop, j] = True
     return clipped & moving
+
+
+def spiking(values: Array, segments: Sequence[slice]) -> Rows:
+    """Return samples (m, n) of channels that stand out alone: one or two, and then as before.
+
+    By half of what the channel ranges over, and beyond that range, as no motor does from one sample
+    to the next and back. What lasts is a step, as of dry friction or of another load.
+    """
+    found = np.zeros(values.shape, dtype=np.bool_)
+    side = _LONGEST_SPIKE + 1
+    for segment in segments:
+        part = values[segment]
+        if len(part) < SHORTEST_STRETCH:
+            continue
+        padded = np.pad(part, ((side, side), (0, 0)), mode="edge")
+        windows = np.lib.stride_tricks.sliding_window_view(padded, 2 * side + 1, axis=0)
+        apart = np.abs(part - np.median(windows, axis=-1))
+        spread = _NORMAL * np.median(apart, axis=0)
+        low, high = np.quantile(part, [_TAIL, 1.0 - _TAIL], axis=0)
+        least = np.maximum(_STANDS_OUT * spread, _OF_RANGE * (high - low))
+        beyond = np.maximum(part - high, low - part) > 0.5 * _OF_RANGE * (high - low)
+        for joint, far in enumerate(((apart > least) & beyond).T):
+            for start, stop in _runs(far):
+                if stop - start <= _LONGEST_SPIKE:
+                    found[segment.start + start : segment.start + stop, joint] = True
+    return found
 
 
 def near_reversal(time: Array, speed: Array, reach: Array) -> Rows:

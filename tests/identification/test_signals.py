@@ -28,6 +28,7 @@ from identification.signals.masks import (
     TURN,
     flat_topped,
     mask_rows,
+    spiking,
 )
 from identification.signals.noise import (
     difference_variance,
@@ -804,3 +805,23 @@ class TestExcludedRows:
         saturated = mask.reasons[SATURATED]
         np.testing.assert_array_equal(saturated[:, 0], np.abs(driven.motor_current[:, 0]) >= 17.91)
         assert not saturated[:, 1].any()
+
+
+def test_torque_that_stands_out_alone_is_left_out() -> None:
+    """One or two samples beyond the range of the channel; no step, and no noise."""
+    random = np.random.default_rng(0)
+    time = np.arange(0.0, 8.0, 0.004)
+    torque = 10.0 * np.sin(2.0 * time) + 3.0 * np.sign(np.cos(2.0 * time))
+    torque += 0.3 * random.normal(size=len(time))
+    clean = np.column_stack([torque, torque])
+    spoilt = clean.copy()
+    rows = np.array([200, 201, 777, 1500])
+    spoilt[rows, 1] += [40.0, 35.0, -60.0, 45.0]
+    segments = [slice(0, 1000), slice(1000, len(time))]
+    assert not spiking(clean, segments).any()
+    found = spiking(spoilt, segments)
+    assert not found[:, 0].any()
+    assert np.flatnonzero(found[:, 1]).tolist() == rows.tolist()
+    lasting = clean.copy()
+    lasting[900:950] += 40.0
+    assert not spiking(lasting, segments).any()

@@ -246,3 +246,21 @@ def test_a_log_of_one_joint_after_the_other_has_no_absurd_figure(
     assert max(float(share) for share in re.findall(r"([\d.]+) ?%", shown)) < 200.0
     assert "the arm carried" not in shown
     assert "friction on" not in shown
+
+
+def test_damaged_samples_of_torque_are_left_out_and_counted(cases: Path, tmp_path: Path) -> None:
+    """Five of 1 750, in the fitted and the unseen part: the model is as good as without them."""
+    log = cases / "11-urdf-units" / "log.csv"
+    header = log.read_text().split("\n", 1)[0]
+    table = np.loadtxt(log, delimiter=",", skiprows=1)
+    column = header.split(",").index("tau2")
+    rows = np.array([300, 301, 620, 900, 1500])
+    table[rows, column] += np.array([3.0, 3.0, -4.0, 3.0, -3.0]) * np.ptp(table[:, column])
+    damaged = tmp_path / "damaged.csv"
+    np.savetxt(damaged, table, delimiter=",", header=header, comments="", fmt="%.10g")
+    line = ("identify", damaged, "--urdf", cases / "arm.urdf", "-o", tmp_path / "found", "-v")
+    code, shown = typed(*line)
+    assert code == 0
+    (count,) = re.findall(r"left out of fit and error: j2 (\d) of \d+ of the fitted motion", shown)
+    assert count == "4"
+    assert "isolated outliers" not in shown
