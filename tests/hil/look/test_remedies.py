@@ -219,9 +219,7 @@ def test_the_entries_of_a_load_with_its_sign_in_a_bit(cases: Path, tmp_path: Pat
     assert code == 0, shown
 
 
-def test_a_load_that_begins_in_the_unseen_part_is_named_with_its_time(
-    cases: Path, tmp_path: Path
-) -> None:
+def test_a_load_that_begins_in_the_unseen_part_has_its_time(cases: Path, tmp_path: Path) -> None:
     """2.0 kg from 13.6 s on, of which the unseen part begins at 11.2 s."""
     log = cases / "12-motion-kinds" / "payload_late.csv"
     code, shown = typed("identify", log, "--urdf", cases / "arm.urdf", "-o", tmp_path / "found")
