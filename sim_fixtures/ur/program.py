@@ -183,6 +183,7 @@ class RegisterProgram:
         constants = self.constants
         first = self._confirmed == 0
         ahead = 1 if first or number < self._number else number - self._number
+        ahead = min(ahead, constants.patience)
         reach = constants.velocity * constants.period * ahead * _REACH_MARGIN + _REACH_OFFSET
         if first:
             reach = np.full(6, constants.start_distance)

@@ -193,6 +193,41 @@ def test_another_text_is_refused_by_the_simulated_controller(text: str) -> None:
         ProgramConstants.of(text)
 
 
+@pytest.mark.parametrize("leap", [1, 2, 5, 6, 1000, 1 << 23])
+def test_a_number_far_ahead_permits_no_further_step(leap: int) -> None:
+    """A number may be ahead by what can be missed; a set-point may be away by no more."""
+    machine = Machine(PROGRAM)
+    for number in range(1, CONFIRMED + 5):
+        write(machine.inputs, np.zeros(6), number, Demand.STREAM)
+        machine.cycle()
+    reach = PROGRAM.velocity[0] * PROGRAM.period * min(leap, PROGRAM.patience)
+    for away, ends in ((0.99 * reach, False), (1.05 * reach, True)):
+        q = np.array([away, 0, 0, 0, 0, 0])
+        machine.actual = q
+        write(machine.inputs, q, CONFIRMED + 4 + leap, Demand.STREAM)
+        machine.cycle()
+        assert machine.over == ends
+        if not ends:
+            machine = Machine(PROGRAM)
+            for number in range(1, CONFIRMED + 5):
+                write(machine.inputs, np.zeros(6), number, Demand.STREAM)
+                machine.cycle()
+    assert machine.outputs.ints[28] == Ending.STEP
+
+
+@pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf, 1e300])
+def test_numbers_that_are_none_move_nothing(value: float) -> None:
+    machine = Machine(PROGRAM)
+    for number in range(1, CONFIRMED + 5):
+        write(machine.inputs, np.zeros(6), number, Demand.STREAM)
+        machine.cycle()
+    for number in range(CONFIRMED + 5, CONFIRMED + 15):
+        write(machine.inputs, np.array([value, 0, 0, 0, 0, 0]), number, Demand.STREAM)
+        machine.cycle()
+    assert machine.over
+    assert all(call[1] == [0.0] * 6 for call in machine.calls if call[0] == "servoj")
+
+
 def test_it_is_short_and_has_only_known_functions() -> None:
     text = PROGRAM.text()
     assert len(text.splitlines()) < 150 and len(text) < 8000
