@@ -124,6 +124,17 @@ class CanBus:
     data_bitrate: int | None = None
 
 
+@dataclass(frozen=True)
+class RtdeServer:
+    """A controller that serves real-time data (RTDE) on a TCP port."""
+
+    host: str
+    port: int
+
+
+Need = DirectRoute | FreePort | CanBus | RtdeServer
+
+
 class TransportSpec(ABC):
     """Settings of a link; pickles, so that another process can open it.
 
@@ -145,7 +156,7 @@ class TransportSpec(ABC):
         return False
 
     @property
-    def needs(self) -> tuple[DirectRoute | FreePort | CanBus, ...]:
+    def needs(self) -> tuple[Need, ...]:
         """What this computer must offer, for checks that do not open the link."""
         return ()
 

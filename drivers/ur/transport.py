@@ -17,7 +17,14 @@ from dataclasses import dataclass
 from typing import Final
 
 from drivers.errors import TransportClosed
-from drivers.transports.base import Transport, TransportError, TransportSpec
+from drivers.transports.base import (
+    DirectRoute,
+    Need,
+    RtdeServer,
+    Transport,
+    TransportError,
+    TransportSpec,
+)
 from drivers.ur import rtde
 from drivers.ur.connection import TIMEOUT, RtdeConnection, connected, link_name, no_reply, reason
 from drivers.ur.description import UrDescription
@@ -91,6 +98,12 @@ class RtdeSpec(TransportSpec):
                 reason(error),
                 "enable it at the controller (Settings, Security, Services)",
             ) from error
+
+    @property
+    def needs(self) -> tuple[Need, ...]:
+        """A route to the controller, and its server."""
+        server = RtdeServer(self.host, self.port)
+        return (server,) if self.is_local else (DirectRoute(self.host), server)
 
     @property
     def address(self) -> str:

@@ -9,13 +9,25 @@ import resource
 import shutil
 import socket
 import subprocess
+from contextlib import closing
 from dataclasses import dataclass
 from enum import StrEnum
 from pathlib import Path
 from typing import Any
 
+from drivers.errors import DriverError
 from drivers.exchange.realtime import LIMITS_FILE, RealTimeReport, RealTimeSettings
-from drivers.transports.base import CanBus, DirectRoute, FreePort, TransportSpec
+from drivers.transports.base import (
+    CanBus,
+    DirectRoute,
+    FreePort,
+    Need,
+    RtdeServer,
+    TransportError,
+    TransportSpec,
+)
+from drivers.ur.connection import RtdeConnection, connected
+from drivers.ur.wire import NEWEST_MAJOR, OLDEST
 from hil.archive.process import STALL_LIMIT
 
 
@@ -350,7 +362,7 @@ def link_checks(link: TransportSpec | None, system: System) -> list[DoctorCheck]
     return [_check_of(need, system) for need in link.needs]
 
 
-def _check_of(need: DirectRoute | FreePort | CanBus, system: System) -> DoctorCheck:
+def _check_of(need: Need, system: System) -> DoctorCheck:
     match need:
         case DirectRoute():
             return route_check(need.host, system)
@@ -358,3 +370,26 @@ def _check_of(need: DirectRoute | FreePort | CanBus, system: System) -> DoctorCh
             return port_check(need, try_port(need))
         case CanBus():
             return can_check(need, system)
+        case RtdeServer():
+            return rtde_check(need)
+
+
+def rtde_check(server: RtdeServer) -> DoctorCheck:
+    """Connect to a controller and ask for its version; nothing is claimed by that."""
+    where = f"{server.host}:{server.port}"
+    try:
+        with closing(connected(server)) as connection:
+            version = RtdeConnection(connection).version
+    except TransportError as error:
+        return DoctorCheck(
+            "RTDE", CheckStatus.BAD, f"{where}: {error.reason}", (f"# {error.remedy}",)
+        )
+    except (DriverError, OSError) as error:
+        remedy = "# make sure that the port is that of RTDE (30004)"
+        return DoctorCheck("RTDE", CheckStatus.BAD, f"{where}: {error}", (remedy,))
+    facts = f"{where} replies: software {version}"
+    if (version.major, version.minor) < OLDEST or version.major > NEWEST_MAJOR:
+        oldest = ".".join(map(str, OLDEST))
+        note = f"recorded only; motions need {oldest} or newer of PolyScope 5"
+        return DoctorCheck("RTDE", CheckStatus.WARN, f"{facts} ({note})")
+    return DoctorCheck("RTDE", CheckStatus.OK, facts)

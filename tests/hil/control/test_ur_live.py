@@ -23,6 +23,7 @@ from hil.control.live_link import LiveLink
 from hil.control.motion_watch import Stop
 from hil.control.move import plan_move, send
 from hil.control.ur_simulation import served_arm
+from hil.doctor.checks import CheckStatus, System, link_checks
 from sim_fixtures.ur import CELL_PATH, UrServer
 
 pytestmark = pytest.mark.safety
@@ -102,6 +103,16 @@ def test_registers_of_another_program_are_not_taken(served) -> None:
             spec_of(cell).open()
         refused = str(caught.value)
     assert "another program writes input_double_register_24" in refused
+
+
+def test_the_doctor_asks_the_controller_for_its_version(served) -> None:
+    cell, _ = served
+    (check,) = link_checks(cell.link_spec, System())
+    assert (check.name, check.status) == ("RTDE", CheckStatus.OK)
+    assert "5.15.2.0" in check.facts
+    wrong = cell.with_values({"controller.rtde.port": cell.controller.rtde.dashboard_port})
+    (check,) = link_checks(wrong.link_spec, System())
+    assert check.status is CheckStatus.BAD
 
 
 def test_a_motion_over_the_ports_is_archived_cycle_by_cycle(served, tmp_path: Path) -> None:
