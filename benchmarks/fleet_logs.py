@@ -1,8 +1,8 @@
 """What it costs to watch a fleet: processor time, memory, a new month, and a Dask scheduler.
 
-Run with ``python -m benchmarks.fleet_logs [--months N]``: 20 robots, a log of 30 s at 100 Hz of
-each in every month, read by `hil trend` for the first time, again, and with one month more; then
-the same logs by the workers of a scheduler, with a cache of their own.
+Run with ``python -m benchmarks.fleet_logs [--robots N] [--months N]``: a log of 30 s at 100 Hz of
+each robot in every month, read by `hil trend` for the first time, again, and with one month more;
+then the same logs by the workers of a scheduler, with a cache of their own.
 """
 
 from __future__ import annotations
@@ -22,7 +22,6 @@ from typing import Any, Final
 
 from benchmarks.fleet import Fleet, FleetPlan, urdf, write_fleet
 
-ROBOTS: Final = 20
 _PORT: Final = 18786
 
 
@@ -83,19 +82,21 @@ def main() -> None:
     """Print the costs."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--months", type=int, default=5)
-    months = parser.parse_args().months
-    fleet = Fleet(FleetPlan(robots=ROBOTS, months=months + 1))
+    parser.add_argument("--robots", type=int, default=20)
+    options = parser.parse_args()
+    months, robots = options.months, options.robots
+    fleet = Fleet(FleetPlan(robots=robots, months=months + 1))
     with TemporaryDirectory() as folder:
         logs = Path(folder) / "logs"
         write_fleet(logs, fleet, months=range(months))
         time.sleep(2.5)  # a log written a moment ago is read again
-        count = ROBOTS * months
+        count = robots * months
         _shown(f"{count} logs, first time", asked(logs), count)
         _shown(f"{count} logs, again", asked(logs), count)
         write_fleet(logs, fleet, months=[months])
         time.sleep(2.5)
         local = asked(logs)
-        _shown(f"one month of {ROBOTS} robots more", local, ROBOTS)
+        _shown(f"one month of {robots} robots more", local, robots)
         with scheduler() as address:
             cache = str(Path(folder) / "cache")
             remote = asked(logs, "--scheduler", address, "--cache", cache)

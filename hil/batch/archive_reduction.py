@@ -168,6 +168,15 @@ def _temperatures(archive: Archive) -> dict[str, float]:
     return {name: float(values.mean()) for name, values in means.items() if len(values)}
 
 
+def _summary_key(ref: ArchiveRef, settings: Settings) -> str:
+    return json_digest(["summary", ref.sha256, settings_digest(settings)])
+
+
+def has_summary(ref: ArchiveRef, settings: Settings, cache: CacheLocation) -> bool:
+    """Return whether what an archive says by itself is cached, so that it need not be read."""
+    return cache.has(ref.origin, _summary_key(ref, settings))
+
+
 def summarise(
     refs: Sequence[ArchiveRef], settings: Settings, cache: CacheLocation
 ) -> list[Summary | SkippedArchive]:
@@ -180,7 +189,7 @@ def summarise(
     """
     summaries: list[Summary | SkippedArchive] = []
     for ref in refs:
-        key = json_digest(["summary", ref.sha256, settings_digest(settings)])
+        key = _summary_key(ref, settings)
         try:
             entry = cache.read(ref.origin, key)
             known = None if entry is None else _unpacked([ref], *entry)

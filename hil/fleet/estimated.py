@@ -11,7 +11,7 @@ from hil.base.errors import InputError
 from hil.base.progress import Reporter
 from hil.base.threads import one_thread
 from hil.batch.archive_discovery import ArchiveRef, LogImport, cell_in, discover, open_ref
-from hil.batch.archive_reduction import Summary, summarise
+from hil.batch.archive_reduction import Summary, has_summary, summarise
 from hil.batch.cache import CacheLocation
 from hil.batch.cluster import Cluster, ClusterTask, SkippedArchive
 from hil.batch.graph import archives_for_settings, cached_settings, decide_settings
@@ -156,8 +156,9 @@ class _TypeFits:
         tasks = [
             ClusterTask(chunk[0].origin, summarise, (chunk, settings, cache)) for chunk in chunks
         ]
+        new = sum(not has_summary(ref, settings, cache) for ref in refs)
         with reporter.task("estimating recordings", len(refs)) as progress:
-            results = cluster.results(tasks, lambda _: progress.advance(_CHUNK), archives=len(refs))
+            results = cluster.results(tasks, lambda _: progress.advance(_CHUNK), archives=new)
         summaries: list[Summary] = []
         for result in results:
             for each in [result] if isinstance(result, SkippedArchive) else result:
@@ -224,7 +225,7 @@ def _settings(
             if settings is not None:
                 return settings
             task = ClusterTask(chosen[0].origin, decide_settings, (chosen, options, None, cache))
-            (decision,) = cluster.results([task], archives=len(refs))
+            (decision,) = cluster.results([task], archives=len(chosen))
             if isinstance(decision, SkippedArchive):
                 broken.append(decision)
                 unusable = {chosen[0].origin}

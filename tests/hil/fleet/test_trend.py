@@ -11,6 +11,7 @@ from typer.testing import CliRunner
 
 from benchmarks.fleet import Fault, Fleet, FleetPlan, urdf, write_fleet
 from hil.base.errors import InputError
+from hil.batch.cluster import Cluster
 from hil.cli import app
 from hil.fleet.series import names_of_joint
 from hil.fleet.trend_limits import TrendLimit
@@ -102,6 +103,20 @@ def test_the_first_screen_has_a_sentence_for_each_robot(done, logs):
     assert "since January 2024" in ran.stdout or "since February 2024" in ran.stdout
     assert "a month" in ran.stdout
     assert len(lines) <= 24
+
+
+def test_a_new_month_starts_no_cluster(done, logs, monkeypatch):
+    """Recordings whose estimates are cached are not read, and count as none."""
+    counts = []
+    client = Cluster.client
+
+    def counted(self, archives):
+        counts.append(archives)
+        return client(self, archives)
+
+    monkeypatch.setattr(Cluster, "client", counted)
+    assert run(logs).exit_code == 0
+    assert counts and max(counts) == 0
 
 
 def test_a_table_of_a_batch_gives_the_same_robots(done, logs, tmp_path):
