@@ -6,11 +6,16 @@ import subprocess
 import sys
 import time
 from collections.abc import Iterator
+from contextlib import closing, suppress
 
 import numpy as np
 import pinocchio as pin
 import pytest
 
+from drivers.ur.connection import RtdeConnection, connected
+from drivers.ur.registers import INPUTS
+from drivers.ur.rtde import InputsInUseError
+from drivers.ur.transport import RtdeSpec
 from sim_fixtures.plant import Carried, build_model
 from sim_fixtures.ur import (
     UR5E_URDF,
@@ -173,6 +178,28 @@ def test_another_client_reads_the_same(served: None) -> None:
         assert client.getTargetMoment()[1] < -10.0
     finally:
         client.disconnect()
+
+
+def test_another_client_writes_registers_of_its_own(served: None) -> None:
+    """Inputs of ur-rtde are its own until it disconnects; those of our program stay free."""
+    io = pytest.importorskip("rtde_io", reason="ur-rtde is not installed (extra `ur`)")
+    client = io.RTDEIOInterface("127.0.0.1")
+    theirs = ["input_int_register_18"]
+    try:
+        assert client.setInputIntRegister(18, 4711)
+        with closing(connected(RtdeSpec("127.0.0.1"))) as connection:
+            ours = RtdeConnection(connection)
+            with pytest.raises(InputsInUseError, match="another program writes input_int_regis"):
+                ours.claim_inputs(theirs)
+            assert ours.claim_inputs(INPUTS) == 1
+    finally:
+        client.disconnect()
+    deadline = time.monotonic() + 10.0
+    number = 0
+    while not number and time.monotonic() < deadline:
+        with closing(connected(RtdeSpec("127.0.0.1"))) as connection, suppress(InputsInUseError):
+            number = RtdeConnection(connection).claim_inputs(theirs)
+    assert number == 1
 
 
 def test_the_makers_client_reads_the_same(served: None) -> None:
