@@ -47,6 +47,7 @@ TURN: Final = 0.016  # s
 # standard deviations, and by so much of its range.
 _STANDS_OUT: Final = 15.0
 _OF_RANGE: Final = 0.5
+_UNDISTURBED: Final = 0.1  # of it, that the samples beside it differ
 _TAIL: Final = 0.01  # of the samples at either end, which are no range
 _LONGEST_SPIKE: Final = 2  # samples
 _NORMAL: Final = 1.4826  # standard deviation over median absolute value
@@ -184,8 +185,9 @@ def flat_topped(values: Array, moving: Rows) -> Rows:
 def spiking(values: Array, segments: Sequence[slice]) -> Rows:
     """Return samples (m, n) of channels that stand out alone: one or two, and then as before.
 
-    By half of what the channel ranges over, and beyond that range, as no motor does from one sample
-    to the next and back. What lasts is a step, as of dry friction or of another load.
+    By half of what the channel ranges over, and beyond that range, between samples that know
+    nothing of it: no motor does that. What lasts is a step, as of dry friction or of another load,
+    and a pulse of the arm begins and ends in more than one sample.
     """
     found = np.zeros(values.shape, dtype=np.bool_)
     side = _LONGEST_SPIKE + 1
@@ -202,7 +204,12 @@ def spiking(values: Array, segments: Sequence[slice]) -> Rows:
         beyond = np.maximum(part - high, low - part) > 0.5 * _OF_RANGE * (high - low)
         for joint, far in enumerate(((apart > least) & beyond).T):
             for start, stop in _runs(far):
-                if stop - start <= _LONGEST_SPIKE:
+                if stop - start > _LONGEST_SPIKE:
+                    continue
+                around = np.delete(part[:, joint], slice(start, stop))[
+                    max(0, start - 2) : start + 2
+                ]
+                if np.ptp(around) < _UNDISTURBED * apart[start:stop, joint].min():
                     found[segment.start + start : segment.start + stop, joint] = True
     return found
 

@@ -822,6 +822,9 @@ def test_torque_that_stands_out_alone_is_left_out() -> None:
     found = spiking(spoilt, segments)
     assert not found[:, 0].any()
     assert np.flatnonzero(found[:, 1]).tolist() == rows.tolist()
+    pulse = clean.copy()
+    pulse[900:907] += np.array([[9.0, 36.0, 47.0, 40.0, -24.0, -20.0, -9.0]]).T
+    assert not spiking(pulse, segments).any()
     lasting = clean.copy()
     lasting[900:950] += 40.0
     assert not spiking(lasting, segments).any()
