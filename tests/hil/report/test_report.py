@@ -704,7 +704,7 @@ class TestParameters:
         table = Page(html[html.index('<section id="trust">') :]).table("With all parameters")
         remarks = [row["Remark"].replace("\xa0", " ") for row in table]
         assert remarks == ["beyond 3σ by the selection", "beyond 3σ, with all parameters, too", ""]
-        assert "has gone into the others" in Page(html).text
+        assert "the others absorb the effect" in Page(html).text
 
 
 class TestFigures:
