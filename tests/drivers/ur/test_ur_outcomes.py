@@ -133,6 +133,26 @@ def test_frames_twice_and_late_replies_change_nothing() -> None:
     assert bench.move().ended.outcome == "completed"
 
 
+def test_the_operator_slows_holds_releases_and_stops_it() -> None:
+    bench = UrBench()
+    bench.run(3)
+    bench.session.request(bench.player(by=40.0))
+    bench.run(MIDST - 3)
+    bench.session.override(0.5)
+    bench.run(100)
+    bench.session.hold()
+    bench.run(400)
+    assert bench.rests and bench.state is State.OPEN and bench.robot.playing
+    bench.session.resume()
+    bench.run(150)
+    assert not bench.rests
+    bench.session.stop()
+    bench.run(2000, until=lambda: not bench.session.requested)
+    assert (bench.ended.outcome, bench.state) == ("stopped", State.CLOSED)
+    assert bench.run(100).rests and not bench.robot.playing
+    assert not bench.session.counters.rejected
+
+
 class TestBefore:
     """What keeps a motion from beginning; the arm does not move."""
 
