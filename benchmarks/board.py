@@ -6,8 +6,8 @@ Run with ``python -m benchmarks.board [--data FOLDER] [--only NAME] [--splits WH
 (`benchmarks.fetch`); ``--page docs/board.md`` writes the page (`benchmarks.board_page`), with
 ``--rows FILE`` from a saved line of JSON instead of measuring. With ``--splits short`` the first
 and the last 40 % of each log are fitted and its rest is predicted; with ``--splits perturbed``
-other pairs of motions, halves of logs, their first 10, 20 and 30 s, and one row in two: none of
-these is used in the choice of any default, so that they show what becomes of other recordings.
+other pairs of motions, halves of logs, their first 10, 20 and 30 s, and one row in two, which show
+what becomes of other recordings of these robots.
 
 Errors are ||tau - tau_hat|| / ||tau|| over all joints and every row of what is predicted, of the
 torque as it was recorded. *hil* imports a recording and identifies from the archive as `hil
