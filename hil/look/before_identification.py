@@ -195,6 +195,8 @@ def _few_rows(archive: Archive) -> tuple[Cell, Samples, Score] | None:
         recording = source_of(archive, cell).recording
         samples = prepare(recording, cell.model, options=SETTINGS)
         few = samples.thinned(max(1, len(samples.torque) // _ROWS))
+        if not few.usable.any():
+            return None  # nothing moves
         return cell, few, score_of(cell.model, few)
     except (IdentificationError, ValueError):
         return None  # the identification says what is wrong

@@ -285,7 +285,7 @@ class TestFirstHour:
 
 ROOT = Path(__file__).resolve().parents[2]
 EXAMPLES = sorted((ROOT / "examples").glob("[0-9]*.py"))
-SLOW = ("01", "03", "04", "06")
+SLOW = ("01", "03", "04", "06", "08")
 LAST_LINE = {
     "01": "report.html",
     "02": "completed",
@@ -294,6 +294,7 @@ LAST_LINE = {
     "05": "largest distance from the planned path",
     "06": "N·m",
     "07": "packets",
+    "08": "30 recordings of 5 robots",
 }  # Something that stands in what it prints
 
 
