@@ -125,7 +125,7 @@ def best_of(folder: Path, method: str) -> Any:
 
 
 def main() -> None:
-    """Print the errors of each method over those of A."""
+    """Print the error of each method as a ratio to method A."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("study", type=Path)
     parser.add_argument("--designs", type=int, default=10, help="of each method")

@@ -221,7 +221,7 @@ class SentSetPoints:
 
         Args:
             target: (n,) D1 received, motor revolutions.
-            missed: packets before this one without a reply: up to so many steps extrapolated.
+            missed: packets without a reply before this one, and so the most steps to extrapolate.
             cycle: for the error.
             where: (n,) which joints; None for all.
             stopping: the motion is being brought to rest.

@@ -1,6 +1,6 @@
 """The PC's end of a controller's session: packets in, replies and events out. No socket, no clock.
 
-Packets and replies are those of a `drivers.wire.Wire`; with C4G Open:
+A `drivers.wire.Wire` reads packets and packs replies; with C4G Open:
 
 ====================  ======================================  =====================================
 state                 what the controller reports             reply

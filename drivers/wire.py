@@ -205,5 +205,5 @@ class ControllerProtocol(Protocol):
     ) -> OwnPackets:
         """Return packets of an arm at rest at a position (n,) [rad].
 
-        `limits` are those of following error and current (n,).
+        `limits`: largest following error and current of each joint (n,).
         """

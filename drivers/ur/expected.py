@@ -43,7 +43,7 @@ class ExpectedArm:
         """Return what the arm states otherwise, a sentence each; what it leaves out does not."""
         found = stated_by(identity, major)
         return tuple(
-            f"its {name} is {found[name]}, that of the cell {text}"
+            f"its {name} is {found[name]}, but the cell states {text}"
             for name, text in self.stated().items()
             if found.get(name, text) != text
         )

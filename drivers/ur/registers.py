@@ -18,7 +18,7 @@ POSITIONS: Final = tuple(range(FIRST, FIRST + N_JOINTS))
 CHECK: Final = FIRST + N_JOINTS
 """Float register of the sum of set-point and number, so that no half of a frame is used."""
 NUMBER: Final = FIRST
-"""Integer register of the set-point's number; in the output that of the one used last."""
+"""Integer register: number of the set-point; as an output, of the set-point used last."""
 DEMAND: Final = FIRST + 1
 """Input: integer register of a `Demand`."""
 STAGE: Final = FIRST + 1

@@ -106,7 +106,7 @@ class Twin:
     def _ur_link(self, seconds: float) -> VirtualLink:
         """Return one to a controller of Universal Robots: its servoj lags by some 30 ms.
 
-        Its torque constants are those of the cell.
+        It has the torque constants of the cell.
         """
         robot = simulated_ur(self.cell, seed=self.seed, truth=arm_truth(self.cell, exact=True))
         peer = UrPeer(robot)

@@ -28,7 +28,7 @@ DelayOption = Annotated[
     str | None,
     typer.Option(
         metavar="SECONDS",
-        help="Delay of the torque after the position, s; or auto, stated. Default: that of the "
+        help="Delay of the torque after the position, s; or auto, stated. Default: as in the "
         "cell, unless contradicted.",
         rich_help_panel=ESTIMATION,
     ),

@@ -95,7 +95,7 @@ class Described:
         typer.Option(
             metavar="X Y Z",
             help="Gravity in the base frame, m/s²: 0 0 9.81 upside down, 0 0 0 for torques without "
-            "it. Default: that of the cell.",
+            "it. Default: as in the cell.",
             rich_help_panel=ARM,
         ),
     ] = None

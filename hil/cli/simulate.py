@@ -172,8 +172,8 @@ def simulate(
         udp: Address of the PC program.
         can: CAN bus in place of UDP, in python-can names, such as socketcan:can0.
         link: Either of them, such as udp:127.0.0.1:2001; or rtde:HOST[:PORT].
-        cycle: Cycle, ms. Default: that of the cell.
-        mode: Open mode: 1, 2, 4, 5, 7, 8 or 9. Default: that of the cell.
+        cycle: Cycle, ms. Default: as in the cell.
+        mode: Open mode: 1, 2, 4, 5, 7, 8 or 9. Default: as in the cell.
         stagger: Cycles between two axes entering open mode.
         only_axis: Open this axis only.
         missed: Consecutive missing replies that end open mode (unknown for a real controller).

@@ -49,7 +49,7 @@ def torque_constants(
         inertia: Its inertia tensor about the centre of mass, xx,xy,xz,yy,yz,zz in kg·m² in the axes
             of the frame.
         frame: URDF link of that frame. Default: the link of the last joint.
-        delay: Delay of the current relative to the position, s. Default: that of the cell.
+        delay: Delay of the current relative to the position, s. Default: as in the cell.
     """
     bare = [*archives_in(archives)]
     full = [*archives_in(loaded or [])]

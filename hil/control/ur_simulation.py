@@ -41,7 +41,7 @@ class UrPeer:
 
     The first packet is what the controller states of itself; then each cycle is a frame of its
     outputs, and the reply a frame of inputs with, at times, a program behind it. All bytes of both
-    directions are those of a real link.
+    directions are the same as on a real link.
     """
 
     def __init__(self, controller: SimulatedUr) -> None:
@@ -200,9 +200,9 @@ def _settings(cell: Cell) -> UrSettings:
 
 
 def arm_truth(cell: Cell, *, exact: bool = False) -> UrArmTruth:
-    """Return the planted arm: its torque constants differ from those of the cell as a UR5e's do.
+    """Return the planted arm: its torque constants differ from the cell's as a UR5e's do.
 
-    With `exact` they are those of the cell.
+    With `exact` it has the torque constants of the cell.
     """
     default = UrArmTruth()
     drives = cell.drive_train

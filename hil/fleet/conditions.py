@@ -70,8 +70,8 @@ class Conditions:
     def of(self, robot: str, when: datetime) -> dict[str, float]:
         """Return the numbers of a robot at a time, interpolated; none where none is stated.
 
-        Those of the robot go before those of all. Before the first and after the last row a day
-        is allowed for.
+        A row for the robot takes precedence over a row for all robots. Up to a day before the
+        first row and after the last one counts as well.
         """
         found: dict[str, float] = {}
         for whose in ("", robot):

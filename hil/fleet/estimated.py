@@ -213,9 +213,9 @@ def _settings(
     cache: CacheLocation,
     broken: list[SkippedArchive],
 ) -> Settings | None:
-    """Return the settings of a type: those of its robot whose first recording is readable.
+    """Return the settings of a type of robot; None if no recording can be read.
 
-    Decided by the earliest recordings of one robot, so that a later month changes no estimate.
+    The earliest recordings of one robot decide them, so that a later month changes no estimate.
     """
     for _, members in groupby(refs, lambda ref: ref.key):
         remaining = [*members]

@@ -68,8 +68,8 @@ def facts_of(source: Path, extra: ExtraChannels, files: LogFiles) -> dict[str, f
 def _of_topics(source: Path, columns: Collection[str]) -> Iterator[tuple[str, float]]:
     """Yield the means of temperatures in the topics of a bag, and of what `columns` name.
 
-    Names are of topic and field, ``/motor/temperature``, those of several values end with the joint
-    where the message names joints, else with a number from 1.
+    A name joins topic and field, such as ``/motor/temperature``. Fields of several values end with
+    the joint where the message names joints, else with a number from 1.
     """
     try:
         with open_bag(source) as bag:

@@ -99,7 +99,7 @@ def as_findings(examined: Examined) -> Findings:
 @singledispatch
 def worded(conclusion: Conclusion) -> str:
     """Return the words of a type of conclusion; other rooms register theirs."""
-    raise NotImplementedError(type(conclusion).__name__)
+    raise TypeError(f"{type(conclusion).__name__} has no words")
 
 
 @worded.register

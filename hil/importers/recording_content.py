@@ -196,7 +196,7 @@ def write_to(output: Path, archive: Archive, *, force: bool) -> None:
 
 @contextmanager
 def _replaced(output: Path) -> Iterator[Path]:
-    """Replace an archive by the yielded one; errors of that are those of the archive."""
+    """Replace an archive by the yielded one; errors then name the archive."""
     try:
         with replace_file(output) as temporary:
             yield temporary

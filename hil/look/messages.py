@@ -324,7 +324,7 @@ def _expected(size: SizeRatio | BeyondMasses) -> str:
 
 @singledispatch
 def _worded(value: object) -> str:
-    raise NotImplementedError(type(value).__name__)
+    raise TypeError(f"{type(value).__name__} has no words in a row of a look")
 
 
 def worded(value: object) -> str:

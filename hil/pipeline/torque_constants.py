@@ -115,7 +115,7 @@ class _Prepared(NamedTuple):
 def _prepared(
     recorded: Sequence[tuple[Source, Cell, Settings, Payload | None]], model: RobotModel
 ) -> list[_Prepared]:
-    """Prepare recordings, those of one motion from a common origin."""
+    """Prepare recordings; recordings of the same motion share an origin."""
     # Repetitions of a motion begin together: errors of the model repeat at equal times.
     together, _ = aligned(tuple(source for source, *_ in recorded))
     prepared = []

@@ -172,7 +172,7 @@ class Matrix:
 
     caption: Caption
     values: Array  #: (n, n), 0 to 1
-    names: Sequence[str]  #: of the rows, which are those of the columns
+    names: Sequence[str]  #: of rows and columns
 
 
 def correlations(values: Array, names: Sequence[str], key: str, title: str) -> Matrix:

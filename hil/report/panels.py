@@ -85,7 +85,7 @@ def chart_panel(
         sheet = _new_sheet if has_names else _sheet
         figure, rows = sheet(width, left, height, heights, chart.log)
         for axes, plot in zip(rows, chart.plots, strict=True):
-            for artist in (*axes.lines, *axes.patches, *axes.texts):
+            for artist in (*axes.lines, *axes.patches, *axes.collections, *axes.texts):
                 artist.remove()
             draw_plot(axes, plot, chart, 1.0, bins)
             _head(axes, plot.heading)
@@ -183,7 +183,7 @@ def matrix_panel(matrix: Matrix) -> Panel:
 
 
 def _page(key: str) -> AbstractContextManager[None]:
-    """Return the settings of a picture; ids in its SVG are those of the key alone."""
+    """Return the settings of a picture; the key alone determines the ids in its SVG."""
     grid = style.colour("grid")
     muted = style.colour("muted")
     ink = style.colour("ink")
@@ -255,7 +255,7 @@ def _panel(
 def _of_page(svg: ElementTree.Element) -> ElementTree.Element:
     """Return matplotlib's SVG with the colours and the font of the page, without what it repeats.
 
-    Colours of the palette become its variables, so that a dark page has those of the dark one;
+    Colours of the palette become its variables, so that a dark page uses the dark palette;
     groups lose their ids, which would not be unique in the page, and coordinates their further
     digits.
     """

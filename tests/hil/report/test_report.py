@@ -858,7 +858,7 @@ def one_chart(values, x=None, **changes):
 
 
 def texts_of(panel, anchor):
-    """Texts of a picture with this anchor: those of the vertical axis end at it."""
+    """Texts of a picture with this anchor; labels of the vertical axis end at it."""
     return re.findall(rf"<text style=[^>]*text-anchor:{anchor}[^>]*>([^<]*)<", panel.svg)
 
 
