@@ -71,8 +71,8 @@ def trend(
         limit: Change whose date is foreseen, such as 'friction +50 %' (repeatable).
         covariate: Column that may explain a change, such as minutes since the start (repeatable).
             Temperatures are found by their names.
-        conditions: CSV file of what the logs lack, by date (column when) and, if it is not of all,
-            robot: columns of numbers such as ambient temperature.
+        conditions: CSV file of what the logs lack, by date (column when) and,
+            unless it is the same for all, robot: columns of numbers such as ambient temperature.
         fail_on_change: Return exit status 5 if something has changed.
     """
     limits = [TrendLimit.parse(text) for text in limit or []]

@@ -115,7 +115,7 @@ def notes(fleet: FleetTrend) -> Iterator[str]:
     if not fleet.covariates:
         yield (
             "no recording has a temperature: warm-up and season count as noise from day to day"
-            + (", but for what all robots have in common" if fleet.seasonal else "")
+            + (", except for what all robots have in common" if fleet.seasonal else "")
         )
     if fleet.dated_by_file:
         recordings = plural(fleet.dated_by_file, "recording")

@@ -184,14 +184,13 @@ class FoundRow(NamedTuple):
     words: str
     step: str
     section: str  #: whose figure shows it; empty without one
-    panel: Panel | None  #: of the joint with the largest error
+    panel: Panel | None  #: of the joint with the largest error that it names
 
 
 def found_rows(
     results: Results, charts: Mapping[str, Sequence[Chart]], draw: Callable[[Chart], Panel]
 ) -> list[FoundRow]:
     """Return what is wrong or doubtful, the most consequential first; then remarks."""
-    worst = worst_joint(results)
     rows: list[FoundRow] = []
     for finding in results.judgement.worst_first:
         if finding.level not in ("wrong", "doubtful"):
@@ -200,15 +199,16 @@ def found_rows(
         panel = None
         shown = {row.section for row in rows}
         if section not in shown:
-            panel = _panel_of(section, worst, charts, draw)
+            joint = worst_joint(results, finding.joints)
+            panel = _panel_of(section, joint, charts, draw)
         rows.append(FoundRow(finding.level, finding.words, finding.next_step, section, panel))
     return rows + [FoundRow("doubtful", remark, "", "", None) for remark in results.remarks]
 
 
-def worst_joint(results: Results) -> int:
-    """Return the joint with the largest relative error, from 0."""
-    errors = [joint.relative or 0.0 for joint in results.judgement.joints]
-    return int(np.argmax(np.nan_to_num(errors)))
+def worst_joint(results: Results, joints: Sequence[int] = ()) -> int:
+    """Return the joint with the largest relative error of these, or of all, from 0."""
+    errors = np.nan_to_num([joint.relative or 0.0 for joint in results.judgement.joints])
+    return max(joints or range(len(errors)), key=lambda joint: errors[joint])
 
 
 def _panel_of(

@@ -32,6 +32,13 @@ class Finding:
     reservation: str = ""
     # share of the squared error that is gone with this corrected, 0 to 1; None: not measured
     explains: float | None = None
+    # indices of the joints that it names; empty if it names none
+    joints: tuple[int, ...] = ()
+
+
+def indices(mask: Mask) -> tuple[int, ...]:
+    """Return the joints of a mask (n,), from 0."""
+    return tuple(np.flatnonzero(mask).tolist())
 
 
 def joined(names: Sequence[str], most: int = 6) -> str:

@@ -13,7 +13,7 @@ from identification.hypotheses.little_torque import little_torque
 from identification.text import percentage
 from identification.validation.consistency import ELEMENTS
 from identification.validation.evidence import Evidence
-from identification.validation.finding import Finding, Mask, Naming, Thresholds
+from identification.validation.finding import Finding, Mask, Naming, Thresholds, indices
 
 UNEXPLAINED: Final = "unexplained error"
 """Name of the check whether any fault explains the error."""
@@ -143,6 +143,7 @@ class ErrorFacts:
                 f"check sign, gear ratio and torque constant of {naming.of(covered)}, and whether"
                 " the torque exceeds its noise",
                 "symptom",
+                joints=indices(covered),
             )
         minor = self.large & self.minor
         beyond = minor & (self.relative > _NOISE_ALONE)
@@ -161,6 +162,7 @@ class ErrorFacts:
                 f" {shares}",
                 step(naming.of(joints)),
                 "symptom",
+                joints=indices(joints),
             )
         grown = self.large & self.grown & ~self.minor
         if grown.any():
@@ -170,6 +172,7 @@ class ErrorFacts:
                 f"the torque error on {naming.motion} exceeds {limit}: {naming.each(grown, share)}",
                 _NOT_COVERED,
                 "symptom",
+                joints=indices(grown),
             )
 
 
@@ -343,6 +346,7 @@ class GeneralisationFacts:
             f"{_NOT_COVERED}; if it does, check what changed for {naming.of(joints)} between the"
             " recordings",
             "symptom",
+            joints=indices(joints),
         )
 
 
@@ -389,6 +393,7 @@ class SystematicFacts:
                 self._message(naming, self.large, self.limits.systematic),
                 f"check sign, gear ratio, coupling and torque constant of {naming.of(self.large)}",
                 "symptom",
+                joints=indices(self.large),
             )
         if self.noticeable.any():
             yield Finding(
@@ -398,6 +403,7 @@ class SystematicFacts:
                 f"check the torque constant of {naming.of(self.noticeable)} with a known payload"
                 " (`hil torque-constants`), or without gravity load against the drive's data sheet",
                 "symptom",
+                joints=indices(self.noticeable),
             )
 
     def _message(self, naming: Naming, joints: Mask, limit: float) -> str:

@@ -14,7 +14,7 @@ from identification.hypotheses.column_search import Explanation
 from identification.text import percentage
 from identification.validation.evidence import Evidence
 from identification.validation.facts.scale import SignFacts
-from identification.validation.finding import Finding, Mask, Naming, Thresholds
+from identification.validation.finding import Finding, Mask, Naming, Thresholds, indices
 
 MOUNTING_STEP: Final = (
     "state how the arm is mounted: `--gravity X Y Z` where a log is read with its URDF, or gravity"
@@ -67,6 +67,7 @@ class OutlierFacts:
             " or use a robust estimator (`hil identify --estimator tukey` or huber)",
             "cause",
             explains=self.explains,
+            joints=indices(self.few),
         )
 
 

@@ -12,7 +12,7 @@ from identification.arrays import Array
 from identification.text import percentage
 from identification.validation.evidence import Evidence
 from identification.validation.facts.sameness import WARMER
-from identification.validation.finding import Finding, Mask, Naming, Thresholds
+from identification.validation.finding import Finding, Mask, Naming, Thresholds, indices
 from identification.validation.residuals import Profile, ResidualChecks, Ripple
 
 
@@ -130,7 +130,7 @@ class ProfileFacts:
                 f"try further friction terms for {naming.of(self.joints)} (Stribeck, asymmetric,"
                 " third)"
             )
-        yield Finding(check, "doubtful", message, step, "symptom")
+        yield Finding(check, "doubtful", message, step, "symptom", joints=indices(self.joints))
 
 
 @dataclass(frozen=True, eq=False)
@@ -237,4 +237,5 @@ class DriftFacts:
                 WARMER,
                 "cause",
                 reservation=f"friction of {naming.of(self.large)} changed during the recordings",
+                joints=indices(self.large),
             )

@@ -13,7 +13,7 @@ from identification.hypotheses.unseen_changes import ChangeKind
 from identification.text import percentage
 from identification.validation.evidence import Evidence
 from identification.validation.facts.faults import GravityFacts, is_constant
-from identification.validation.finding import Finding, Mask, Naming, Thresholds
+from identification.validation.finding import Finding, Mask, Naming, Thresholds, indices
 from identification.validation.prediction import FRICTION_CHANGE
 
 WARMER: Final = "warm the arm up by moving it before recording"
@@ -205,6 +205,7 @@ class FrictionFacts:
                 f" error of {naming.of(self.axes)}{other}",
                 WARMER + step,
                 "cause",
+                joints=indices(self.joints),
             )
         else:
             yield Finding(
@@ -215,4 +216,5 @@ class FrictionFacts:
                 WARMER + step,
                 "cause",
                 reservation=f"friction of {naming.of(self.joints)} changed",
+                joints=indices(self.joints),
             )

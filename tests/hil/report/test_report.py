@@ -490,7 +490,7 @@ class TestPage:
         assert "whole recording" in Page(html).text and "in motion" in Page(html).text
 
     def test_has_findings_with_next_step_and_figure(self):
-        """The figure is that of the joint with the largest error, and stands in its section."""
+        """Without joints of its own, it shows the joint with the largest error."""
         step = "fit a longer motion"
         finding = {"check": "generalisation", "level": "wrong", "words": "it grew"}
         passed = {"check": "saturation", "level": "good", "words": "none saturated"}
@@ -502,6 +502,20 @@ class TestPage:
         assert "none saturated" not in Page(section).text
         assert html.count("it grew") == 1
         assert [row["Finding"] for row in Page(html).table("Check")] == ["none saturated"]
+
+    def test_a_finding_is_shown_by_a_joint_that_it_names(self):
+        """The worst of its joints, also where another joint has a larger error."""
+        judgement = _judgement()
+        for error, joint in zip(
+            (0.02, 0.05, 0.04, 0.09, 0.02, 0.02), judgement["joints"], strict=True
+        ):
+            joint["relative"] = error
+        finding = {"check": "generalisation", "level": "doubtful", "words": "it grew"}
+        for named, shown in (([0, 1, 2], JOINTS[1]), ([], JOINTS[3])):
+            judgement["findings"] = [finding | {"joints": named}]
+            html = render(make_results(judgement=judgement))
+            section = html[html.index('<ol class="found">') :].split("</ol>")[0]
+            assert f"{shown} in torque" in Page(section).text
 
     def test_ranks_findings_by_role_and_by_what_they_explain(self):
         found = {
