@@ -5,24 +5,17 @@
 
 from __future__ import annotations
 
-import shutil
 import sys
 from pathlib import Path
 
-from playwright.sync_api import sync_playwright
-from report_picture import save
+from report_picture import opened, save
 
 
 def photograph(page_of_fleet: Path) -> None:
     """Write the picture of a page."""
-    with sync_playwright() as driver:
-        program = shutil.which("chromium") or shutil.which("google-chrome")
-        browser = driver.chromium.launch(executable_path=program, args=["--no-sandbox"])
-        page = browser.new_page(viewport={"width": 1280, "height": 860}, color_scheme="light")
-        page.goto(page_of_fleet.resolve().as_uri())
+    with opened(page_of_fleet, 860) as page:
         page.wait_for_timeout(500)
         save(page.screenshot(), "fleet.png")
-        browser.close()
 
 
 if __name__ == "__main__":

@@ -8,6 +8,8 @@ from __future__ import annotations
 import io
 import shutil
 import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, Final
 
@@ -17,6 +19,18 @@ from playwright.sync_api import sync_playwright
 HERE: Final = Path(__file__).parent
 DRAWN: Final = "() => hilCharts.find(group => group.name === 'torques')?.ready"
 CHART: Final = '[data-chart="t1"] .plot-holder'
+
+
+@contextmanager
+def opened(page_of_hil: Path, height: int = 1010) -> Iterator[Any]:
+    """Open a page that `hil` wrote in a window of headless Chromium."""
+    with sync_playwright() as driver:
+        program = shutil.which("chromium") or shutil.which("google-chrome")
+        browser = driver.chromium.launch(executable_path=program, args=["--no-sandbox"])
+        page = browser.new_page(viewport={"width": 1280, "height": height}, color_scheme="light")
+        page.goto(page_of_hil.resolve().as_uri())
+        yield page
+        browser.close()
 
 
 def save(photograph: bytes, name: str) -> None:
@@ -39,18 +53,13 @@ def zoom(page: Any) -> None:
 
 def photograph(report: Path) -> None:
     """Write both pictures of a report."""
-    with sync_playwright() as driver:
-        program = shutil.which("chromium") or shutil.which("google-chrome")
-        browser = driver.chromium.launch(executable_path=program, args=["--no-sandbox"])
-        page = browser.new_page(viewport={"width": 1280, "height": 1010}, color_scheme="light")
-        page.goto(report.resolve().as_uri())
+    with opened(report) as page:
         page.wait_for_function(DRAWN)
         page.wait_for_timeout(800)
         save(page.screenshot(), "report.png")
         page.evaluate("document.getElementById('torque').scrollIntoView()")
         zoom(page)
         save(page.locator("#torque").screenshot(), "report_zoom.png")
-        browser.close()
 
 
 if __name__ == "__main__":
