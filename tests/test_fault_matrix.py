@@ -8,11 +8,13 @@ from __future__ import annotations
 
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 
 from drivers import SimulatedTransport
+from drivers.ur.wire import UrWire
 from hil.archive import Archive, ArchiveSpec, open_archive
 from hil.campaign import Stop, VirtualLink
 from hil.cell import Cell
@@ -23,6 +25,8 @@ from identification.text import percentage
 from planner import PiecewiseCubic, plan
 from sim_fixtures.faults import parse_fault, split_faults
 from sim_fixtures.ns16 import CELL_PATH
+from sim_fixtures.ur import SimulatedUr
+from tests.fault_matrix import ur_runs
 from tests.fault_matrix.__main__ import expected
 from tests.fault_matrix.faulty_runs import (
     BEHAVIOURS,
@@ -46,6 +50,7 @@ pytestmark = pytest.mark.safety
 EXPECTED = expected(SITUATIONS[0])
 SHARES = [percentage(share) for share in SPEEDS]
 AT_SPEED = expected(SHARES[0])
+OF_UR = expected(ur_runs.SITUATIONS[0])
 
 
 def test_the_table_has_every_fault_in_every_situation() -> None:
@@ -74,6 +79,54 @@ def test_fault(fault: str, situation: str, while_silent: str) -> None:
     assert run.broken == []
     if outcome != "no start":
         assert run.recovery.startswith("completed")
+
+
+def test_a_ur_controller_has_every_fault_in_every_situation() -> None:
+    assert list(OF_UR) == list(ur_runs.FAULTS)
+    assert all(tuple(outcomes) == ur_runs.SITUATIONS for outcomes in OF_UR.values())
+    for is_held in (False, True):
+        wanted = {*ur_runs.SITUATIONS} - ({"held"} if not is_held else set())
+        assert wanted <= set(ur_runs.cycles_without_a_fault(is_held))
+
+
+@pytest.mark.parametrize(("fault", "situation"), [*ur_runs.cases()])
+def test_fault_of_a_ur_controller(fault: str, situation: str) -> None:
+    run = ur_runs.play(fault, situation)
+    assert [run.outcome] == [*OF_UR[fault][situation]]
+    assert run.broken == []
+    assert run.recovery.startswith("completed")
+
+
+@pytest.mark.parametrize(
+    ("defect", "law"),
+    [
+        ("write", "sent and recorded differ"),
+        ("finish", "its sum is another one"),
+        ("_require_undisturbed", "the arm is slowed down"),
+        ("_require_startable", "a program over another one"),
+    ],
+)
+def test_the_judge_of_a_ur_session_finds_defects(
+    defect: str, law: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    ur_runs.cycles_without_a_fault(False)  # with a sound one
+    sound = getattr(UrWire, defect)
+
+    def broken_one(wire: UrWire, *arguments: Any) -> Any:
+        if defect == "write":
+            return sound(wire, arguments[0] + 0.5 * (wire._cycle > 150), arguments[1])
+        if defect == "finish":
+            frame = bytearray(sound(wire))
+            frame[20] ^= 1
+            return bytes(frame)
+        return None
+
+    monkeypatch.setattr(UrWire, defect, broken_one)
+    if defect == "_require_startable":
+        playing = property(lambda robot: True)
+        monkeypatch.setattr(SimulatedUr, "playing", playing)
+    run = ur_runs.play("slider at 50 %", "moving")
+    assert any(law in text for _, text in run.broken), run.broken
 
 
 @pytest.mark.parametrize("while_silent", BEHAVIOURS)

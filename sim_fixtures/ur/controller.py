@@ -468,6 +468,15 @@ class SimulatedUr:
                 plant = self.arm.plant
                 plant.set_state(plant.position + 1e-3 * fault.count, plant.velocity)
 
+    def make_ready(self) -> None:
+        """Do what an operator does after a stop: power, unlocking, full speed, no program."""
+        self._power = True
+        self._safety = _NORMAL
+        self._stopped_for = None
+        self._freedrive_until = -1
+        self.slider = 1.0
+        self._leave_program()
+
     @property
     def playing(self) -> bool:
         """Whether a program runs."""

@@ -14,6 +14,7 @@ import numpy as np
 from drivers import CycleRing, DriveTrain, GuardLimits, InitReceived, MotionEnded, Session, State
 from tests.drivers import oracle
 from tests.drivers.oracle import Reception, number_of
+from tests.drivers.set_points import EPS, SetPointLaws
 
 REFUSALS = (oracle.DRIVE_OFF_REQUEST, oracle.FOLLOWING_ERROR)
 MODE_FIELDS = {1: (1, 2, 4, 5), 2: (4, 5), 4: (1, 2), 5: (1, 2), 7: (1,), 8: (4,), 9: (5,)}
@@ -21,11 +22,10 @@ MODE_FIELDS = {1: (1, 2, 4, 5), 2: (4, 5), 4: (1, 2), 5: (1, 2), 7: (1,), 8: (4,
 POSITION_MODES = (1, 4, 5)
 LOSS_WINDOW = 100
 """Cycles in which more than `max_gap` replies that were not accepted stop a motion."""
-EPS = np.finfo(np.float64).eps
 
 
 @dataclass
-class Conduct:
+class Conduct(SetPointLaws):
     """Allowed contents of the replies to cyclic packets, after an init packet.
 
     Args:
@@ -183,9 +183,6 @@ class Conduct:
         self.stopping = self.held = self.overridden = False
         self._count(what)
 
-    def _count(self, what: str) -> None:
-        self.tally[what] = self.tally.get(what, 0) + 1
-
     def _status(self, answer: oracle.Packet, safe: oracle.Packet, in_open_mode: bool) -> None:
         expected = bytearray(safe.status)
         if answer.status != safe.status:
@@ -299,13 +296,7 @@ class Conduct:
             slack = 3 * rounding + np.spacing(np.float32(np.abs(a[1]))) + rounding_of_target
             assert (np.abs(a[1] - step) <= slack).all(), "D2 is not the step"
             self.sent.append(q)
-        if np.any(q != self.sent[-2]):
-            assert self.entitled, "moved without a motion requested"
-            self._count("moving")
-        self._differences(np.array(self.sent[-4:]), first_order=1)
-        span = 0.5 * (self.limits.upper - self.limits.lower)
-        assert (q >= self.limits.lower - 2e-6 * span).all(), "position"
-        assert (q <= self.limits.upper + 2e-6 * span).all(), "position"
+        self._within(q)
         if self.motor is not None:
             self._count_lost(r[0])
         self.repeats = 0
@@ -410,36 +401,6 @@ class Conduct:
         self.lost.append((self.cycle, count))
         self.lost = [loss for loss in self.lost if loss[0] > self.cycle - LOSS_WINDOW]
         self.stopping = self.stopping or sum(number for _, number in self.lost) > self.max_gap
-
-    def _factors(self) -> tuple[float, float]:
-        """Return the factors on acceleration and jerk."""
-        limits = self.limits
-        if self.stopping or self.held:
-            return limits.stop_acceleration, limits.stop_jerk
-        if self.overridden:
-            return limits.override_acceleration, limits.override_jerk
-        return 1.0, 1.0
-
-    def _differences(self, rows: np.ndarray, first_order: int, noise: float = 0.0) -> None:
-        """Of the last four rows of a position (first order 1) or of a velocity (0)."""
-        factor_a, factor_j = self._factors()
-        limits = self.limits
-        bounds = (limits.velocity, factor_a * limits.acceleration, factor_j * limits.jerk)
-        for k, (bound, name) in enumerate(
-            zip(bounds, ("velocity", "acceleration", "jerk"), strict=True)
-        ):
-            order = first_order + k
-            if name == "jerk" and self.without_jerk_bound:
-                self.without_jerk_bound -= 1
-                continue
-            rates = np.abs(np.diff(rows, order, axis=0)[-1]) / self.period**order
-            rounding = 2**order * (8 * EPS * np.abs(rows).max() + noise) / self.period**order
-            assert (rates <= bound * (1 + 2e-6) + rounding).all(), (name, rates / bound)
-
-    def _advance(self, row: np.ndarray, first_order: int, noise: float) -> None:
-        self.sent.append(row)
-        self._differences(np.array(self.sent[-4:]), first_order, noise)
-        del self.sent[:-3]
 
 
 SILENCE = 301.0

@@ -232,7 +232,7 @@ class Run:
     of a motion requested afterwards with the drive on.
     """
 
-    controller: SimulatedController
+    controller: Any
     requested_first: bool
     current_share: float = 1.0
     speed: float = 1.0  # share of full speed that the first motion is planned with
@@ -243,22 +243,54 @@ class Run:
     cycles: dict[str, int] = field(default_factory=dict)  # first cycle of each situation
 
     def __post_init__(self) -> None:
+        self.session = self._make_session()
+        self.events: list[Any] = []
+
+    def _make_session(self) -> Any:
         made = session(self.current_share, max_gap=MAX_GAP, silence_timeout=SILENCE)
         self.logged = LoggedSession(made)
-        self.session = JudgedSession(self.logged, made._guard.limits)
-        self.events: list[Any] = []
+        return JudgedSession(self.logged, made._guard.limits)
+
+    def _first_motion(self) -> TrajectoryPlayer:
+        return motion(np.array(small_cell.HOME), WAY, self.speed)
+
+    def _motion_afterwards(self) -> TrajectoryPlayer:
+        return motion(self.controller.plant.position.copy(), -0.4 * WAY)
+
+    @property
+    def _no_controller(self) -> bool:
+        """Whether the controller has ended the session."""
+        return self.controller.phase is Phase.ENDED
+
+    def _make_ready(self) -> None:
+        """Do what a person does at the cabinet after a fault."""
+        self.controller.drive_on()
+
+    def _speed(self) -> float:
+        return float(np.abs(self.controller.plant.velocity).max())
+
+    def _is_fast(self, speed: Array) -> bool:
+        """Whether the set-points have the speed at which a fault strikes a motion."""
+        return bool(np.all(speed > self.moving * LIMITS.velocity))
+
+    def _lost(self, reason: str) -> str:
+        """Why a motion was lost, in short."""
+        return _SHORT[reason]
+
+    def _operate(self) -> None:
+        """Do what an operator does meanwhile."""
 
     def play(self, faults: tuple[Any, ...], fault_cycle: int = 0, over: int = 0) -> None:
         """The whole run: the first motion, the fault, what follows, a motion afterwards."""
         self._over = over
         self.transport = SimulatedTransport(self.controller, faults)
         if self.requested_first:
-            self.session.request(motion(np.array(small_cell.HOME), WAY, self.speed))
+            self.session.request(self._first_motion())
         patience = fault_cycle + 150
         self._exchange(lambda: self.transport.cycle > patience and self._calm(), 1500)
         self.outcome = self._describe()
         self._check_calm()
-        if self.session.state is not State.ENDED and self.controller.phase is not Phase.ENDED:
+        if self.session.state is not State.ENDED and not self._no_controller:
             self.recovery = self._recover()
 
     @property
@@ -273,6 +305,7 @@ class Run:
             self._note_events()
             if not self._over:
                 self._note_situation()
+            self._operate()
             return until() or self.transport.cycle >= end
 
         exchange(self.transport, cast(Session, self.session), ends_when=done)
@@ -287,7 +320,7 @@ class Run:
         if state is State.OPEN:
             if self.session.requested:
                 speed = np.abs(self.session._ring.last(1)["commanded_velocity"][0])
-                name = "moving" if np.all(speed > self.moving * LIMITS.velocity) else "under way"
+                name = "moving" if self._is_fast(speed) else "under way"
             else:
                 name = "open at rest"
         self.cycles.setdefault(name, self.transport.cycle)
@@ -298,7 +331,7 @@ class Run:
         return waiting or not self.session.requested
 
     def _describe(self) -> str:
-        if self.controller.phase is Phase.ENDED:
+        if self._no_controller:
             return "no start"
         gaps = sum(event.missed for event in self.events if isinstance(event, GapSeen))
         note = "" if not gaps else f" ({gaps})" if gaps <= TOLERATED + 1 else " (many)"
@@ -313,7 +346,7 @@ class Run:
                 return f"{self._asked_for()} {kind}"
             if isinstance(event, MotionEnded):
                 lost = event.outcome == "lost"
-                return f"lost: {_SHORT[event.reason]}" if lost else event.outcome
+                return f"lost: {self._lost(event.reason)}" if lost else event.outcome
             if not self.requested_first and isinstance(event, LinkLost):
                 return "silence"
             if not self.requested_first and _leaves_open(event):
@@ -334,7 +367,7 @@ class Run:
     def _recover(self) -> str:
         """Switch the drive on, request a new motion if none is waiting, and return its outcome."""
         self._exchange(lambda: self.transport.cycle >= self._over + 50, 500)
-        self.controller.drive_on()
+        self._make_ready()
         before = len(self.events)
         if self.session.requested and self.session.state is State.OPENING:
             self.session.stop("it was not started")
@@ -342,7 +375,7 @@ class Run:
         if not self.session.requested:
             self._exchange(self._ready, 1500)
             try:
-                self.session.request(motion(self.controller.plant.position.copy(), -0.4 * WAY))
+                self.session.request(self._motion_afterwards())
             except RequestError as error:
                 return f"no: {error}"
         self._exchange(lambda: not self.session.requested, 2500)
@@ -353,9 +386,6 @@ class Run:
         ready = (State.CLOSED, State.OPENING, State.OPEN)
         return self.session.state in ready and self._speed() < AT_REST
 
-    def _speed(self) -> float:
-        return float(np.abs(self.controller.plant.velocity).max())
-
     def _check_calm(self) -> None:
         """After the outcome the arm comes to rest, and stays there."""
         rested = 0
@@ -365,7 +395,7 @@ class Run:
             rested = rested + 1 if self._speed() < AT_REST else 0
             return rested >= 60
 
-        if self.session.state is not State.ENDED and self.controller.phase is not Phase.ENDED:
+        if self.session.state is not State.ENDED and not self._no_controller:
             self._exchange(long_at_rest, 900)
             if not self.session.requested and rested < 60:
                 self.rests.append(Rest("900 cycles after its motion", self._speed(), 0.0))
