@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass, fields
+from dataclasses import asdict, dataclass, field, fields
 from typing import Any, ClassVar, Final, Literal, Self
 
 import numpy as np
@@ -30,6 +30,7 @@ class UrDescription:
         frequency: frames per second.
         recipe: outputs of each frame.
         inputs: number of the recipe of inputs.
+        period: cycle, s.
     """
 
     attachment: ClassVar[str] = "ur_arm.json"
@@ -38,11 +39,10 @@ class UrDescription:
     frequency: float
     recipe: OutputRecipe
     inputs: int
+    period: float = field(init=False)
 
-    @property
-    def period(self) -> float:
-        """Cycle, s."""
-        return 1.0 / self.frequency
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "period", 1.0 / self.frequency)
 
     def encode(self) -> bytes:
         """Return the packet, which is also the file of an archive."""
@@ -85,20 +85,20 @@ class UrDescription:
 def identity_document(identity: ArmIdentity) -> dict[str, Any]:
     """Return an identity in JSON types."""
     document: dict[str, Any] = {}
-    for field in fields(identity):
-        value = getattr(identity, field.name)
+    for entry in fields(identity):
+        value = getattr(identity, entry.name)
         if isinstance(value, DhParameters):
             value = {name: array.tolist() for name, array in asdict(value).items()}
         elif isinstance(value, np.ndarray):
             value = value.tolist()
         elif isinstance(value, Sequence) and not isinstance(value, str):
             value = [*value]
-        document[field.name] = value
+        document[entry.name] = value
     return document
 
 
 def _identity(document: dict[str, Any]) -> ArmIdentity:
-    names = [field.name for field in fields(ArmIdentity)]
+    names = [entry.name for entry in fields(ArmIdentity)]
     values: dict[str, Any] = {name: document.get(name) for name in names}
     for name in _VECTORS:
         if values[name] is not None:

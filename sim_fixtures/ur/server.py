@@ -101,7 +101,8 @@ class UrServer:
         self.late = 0
         self.most_clients = 0
         self._real_time = real_time
-        self._selector = selectors.DefaultSelector()
+        # epoll rounds its timeout up to a millisecond, half a cycle.
+        self._selector = selectors.SelectSelector()
         self._clients: list[_Client] = []
         self._over = threading.Event()
         self._due = time.monotonic()
@@ -184,7 +185,8 @@ class UrServer:
             return False
         self.late += now - self._due >= self.controller.period
         # After a delay of this program cycles are shifted; they are not sent in a burst.
-        self._due = max(self._due, now - 10 * self.controller.period) + self.controller.period
+        due = self._due + self.controller.period
+        self._due = due if now < due else now + self.controller.period
         return True
 
     @property

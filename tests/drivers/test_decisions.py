@@ -10,6 +10,7 @@ from collections.abc import Iterator
 from contextlib import closing, contextmanager
 from dataclasses import dataclass
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 
@@ -26,7 +27,11 @@ from drivers.states import (
     keeps_request,
 )
 from drivers.transports.udp import UdpSpec
+from drivers.ur.description import UrDescription
+from drivers.ur.rtde import FrameSplitter
+from drivers.ur.transport import UrTransport
 from tests.drivers.rig import PERIOD, Cruise, Rig, moving
+from tests.drivers.ur.ur_bench import MIDST, UrBench
 from tests.messages import MISSED_IN_A_ROW, RESTARTED_WITH_SYNC
 
 pytestmark = pytest.mark.safety
@@ -266,3 +271,50 @@ def test_a_packet_from_the_network_passes_nine_files():
     assert rig.session.execution is not None
     assert passed == BEFORE | IN_THE_SESSION | BESIDE
     assert len(BEFORE | IN_THE_SESSION) == 9
+
+
+FROM_RTDE = {"transport", "rtde", "loop", "session", "wire", "open_mode", "guard", "drive_train",
+             "execution"}  # fmt: skip
+"""The nine files from frame to reply at a UR controller."""
+
+
+def connection() -> tuple[socket.socket, socket.socket]:
+    """Both ends of a connection by TCP."""
+    with socket.create_server(("127.0.0.1", 0)) as server:
+        ours = socket.create_connection(server.getsockname())
+        return ours, server.accept()[0]
+
+
+def test_a_frame_from_a_ur_controller_passes_nine_files():
+    """From the stream of RTDE to the frame of inputs, in motion."""
+    bench = UrBench()
+    bench.run(3)
+    bench.session.request(bench.player())
+    bench.run(MIDST)
+    assert bench.state is State.OPEN
+    ours, theirs = connection()
+    primary, spare = connection()
+    description = bench.session.init
+    assert isinstance(description, UrDescription)
+    agreed = SimpleNamespace(splitter=FrameSplitter(), frames=())
+
+    class InVirtualTime(UrTransport):
+        now = bench.transport.now + bench.cell.period
+
+    transport = InVirtualTime(ours, primary, agreed, description)  # type: ignore[arg-type]
+    with closing(transport), theirs, spare:
+        assert transport.receive(1.0) == description.encode()
+        theirs.settimeout(10.0)
+        theirs.sendall(bench.peer.next_packet() or b"")
+        replied = bench.session.counters.replied
+        with files_passed() as passed:
+            exchange(
+                transport,
+                bench.session,
+                ends_when=lambda: bench.session.counters.replied > replied,
+            )
+        assert theirs.recv(2048)[2:3] == b"U"
+    assert bench.state is State.OPEN
+    assert bench.session.execution is not None
+    assert passed == FROM_RTDE | BESIDE
+    assert len(FROM_RTDE) == 9
