@@ -57,8 +57,7 @@ from hil.pipeline.identification import identify_archives
 from hil.pipeline.options import Options
 from hil.results.results import Results
 from identification.errors import IdentificationError
-from identification.validation.facts.errors import LEFT_OPEN
-from identification.validation.finding import Finding
+from identification.validation.finding_messages import LEFT_OPEN, WordedFinding
 
 DATA: Final = Path(__file__).resolve().parents[2] / "shared" / "data"
 SIMULATED: Final = "simulated"
@@ -302,7 +301,7 @@ def degraded_row(name: str, case: str, whole: Identified, outcome: Identified | 
     }
 
 
-def suspicious(results: Results) -> list[Finding]:
+def suspicious(results: Results) -> list[WordedFinding]:
     """Findings that are neither good nor mere information."""
     return [
         finding

@@ -85,7 +85,7 @@ from hil.results.results import Results
 from identification.model.friction import FrictionLaw
 from identification.model.motion import Motion as SampledMotion
 from identification.model.robot import RobotModel
-from identification.validation.facts.form import FORM
+from identification.validation.finding_messages import FORM
 
 Array = NDArray[np.float64]
 

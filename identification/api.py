@@ -57,7 +57,8 @@ from identification.signals.noise import standstill_variance
 from identification.signals.recording import Recording, RecordingError
 from identification.signals.samples import Preprocessing, Samples, prepare, smooth
 from identification.validation.evidence import Evidence, gather
+from identification.validation.finding import Thresholds
 from identification.validation.prediction import PredictionError, prediction_error
-from identification.validation.verdict import Thresholds, Verdict, judge
+from identification.validation.verdict import Verdict, judge
 
 __all__ = [name for name in globals() if name[0].isalpha()]

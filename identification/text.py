@@ -1,6 +1,8 @@
-"""Numbers in messages, written as in tables and on pages."""
+"""Numbers and names in messages, written as in tables and on pages."""
 
 from __future__ import annotations
+
+from collections.abc import Sequence
 
 
 def percentage(share: float, decimals: int = 0, *, signed: bool = False) -> str:
@@ -15,3 +17,9 @@ def percentage(share: float, decimals: int = 0, *, signed: bool = False) -> str:
 def unit_text(unit: str) -> str:
     """Replace blanks of a unit, as files of earlier versions have: N·m for `N m`."""
     return unit.replace(" ", "·")
+
+
+def joined(names: Sequence[str], most: int = 6) -> str:
+    """Return names separated by commas, the first few of many."""
+    omitted = len(names) - most
+    return ", ".join(names[:most]) + (f" and {omitted} more" if omitted > 0 else "")

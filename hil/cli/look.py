@@ -28,8 +28,7 @@ from hil.look.messages import (
     setting_text,
 )
 from hil.look.readings import Fact
-from identification.text import percentage
-from identification.validation.finding import joined
+from identification.text import joined, percentage
 
 IN_DOUBT = 2
 """Exit status of a recording with two readings that fit alike."""

@@ -31,7 +31,8 @@ from identification.hypotheses.search import SURE, find_zeros_and_scales
 from identification.signals.recording import STUCK_MOVEMENT
 from identification.signals.samples import Samples, prepare
 from identification.text import percentage
-from identification.validation.facts.diagnosis import RECORD_ALL_TORQUE, without_bodies
+from identification.validation.finding_messages import Naming, worded
+from identification.validation.findings.diagnosis import without_bodies
 
 _SUSPECT: Final = 0.15
 """Error of the torque, predicted from other parts, above which a log is looked at closely. Right
@@ -316,11 +317,12 @@ def undecided(
 
 
 def _without_bodies(source: Path, rigid: RigidTorque) -> SourceError:
+    finding = worded(without_bodies(rigid), Naming())
     remedy = (
-        f"{RECORD_ALL_TORQUE}; to identify in spite of that, give the column map (`hil look LOG"
+        f"{finding.next_step}; to identify in spite of that, give the column map (`hil look LOG"
         " --urdf ARM.urdf -o map.toml`, --map map.toml)"
     )
-    return SourceError(source, without_bodies(rigid), field="torque", remedy=remedy)
+    return SourceError(source, finding.words, field="torque", remedy=remedy)
 
 
 def _other_arm(source: Path, error: float) -> SourceError:

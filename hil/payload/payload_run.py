@@ -40,8 +40,8 @@ from identification.hypotheses.gravity_direction import find_gravity
 from identification.model.pseudo_inertia import Body
 from identification.model.robot import RobotModel
 from identification.signals.samples import Samples
-from identification.validation.facts.faults import MOUNTING_STEP
 from identification.validation.finding import Thresholds
+from identification.validation.finding_messages import MOUNTING_STEP
 
 from .payload_settings import NOT_DETERMINED, ControllerLoad, controller_settings
 

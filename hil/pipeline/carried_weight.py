@@ -7,17 +7,14 @@ from pathlib import Path
 from typing import Final
 
 from hil.base.errors import InputError
-from identification.hypotheses.column_search import Explanation
+from identification.hypotheses.changes import Change
 from identification.hypotheses.diagnosis import TorqueDiagnosis, diagnose
 from identification.model.robot import RobotModel
 from identification.signals.samples import Samples
-from identification.validation.facts.diagnosis import (
-    RECORD_ALL_TORQUE,
-    MeaningFacts,
-    without_bodies,
-)
-from identification.validation.facts.faults import text_of
-from identification.validation.finding import Naming
+from identification.validation.finding import Finding
+from identification.validation.finding_messages import Naming, worded
+from identification.validation.findings.diagnosis import of_diagnosis, without_bodies
+from identification.validation.findings.faults import fault_keys
 
 _MOTION: Final = "the recordings"
 
@@ -25,11 +22,15 @@ _MOTION: Final = "the recordings"
 def other_meanings(model: RobotModel, found: TorqueDiagnosis) -> tuple[str, ...]:
     """Return what recordings are other than described, as sentences with what to do about each."""
     naming = Naming(tuple(model.joint_names), _MOTION)
-    certain = [Explanation(step.change, step.ratio) for step in found.discrete if step.sure]
-    texts = [text_of(each, naming) for each in certain]
-    pairs = [(text.message, text.step) for text in texts]
-    pairs += [(each.words, each.next_step) for each in MeaningFacts(found).findings(naming)]
-    return tuple(f"{words}: {step}" for words, step in pairs)
+    certain = [_certain(step.change) for step in found.discrete if step.sure]
+    findings = [worded(each, naming) for each in (*certain, *of_diagnosis(found))]
+    return tuple(f"{each.words}: {each.next_step}" for each in findings)
+
+
+def _certain(change: Change) -> Finding:
+    """Return a sign, an order or a coupled angle that is other than described."""
+    key, remedy = fault_keys(change)
+    return Finding(key, "wrong", remedy, "cause", joints=change.joints)
 
 
 def require_weight(
@@ -50,8 +51,8 @@ def require_weight(
     """
     found = diagnose(model, recordings)
     if found.rigid.is_nothing:
-        problem = without_bodies(found.rigid)
-        raise InputError(path, problem, field="torque", remedy=RECORD_ALL_TORQUE)
+        finding = worded(without_bodies(found.rigid), Naming())
+        raise InputError(path, finding.words, field="torque", remedy=finding.next_step)
     if found.is_weightless:
         assert found.weightless is not None
         problem = (

@@ -25,9 +25,15 @@ from identification.signals.masks import SATURATED, SPIKE
 from identification.signals.recording import UNWRAPPED, Recording
 from identification.signals.row_faults import RowFaultKind
 from identification.signals.samples import Samples
-from identification.text import percentage
 from identification.validation.evidence import CellContext
-from identification.validation.finding import Finding, Naming, Thresholds, joined
+from identification.validation.finding import (
+    Finding,
+    FindingKey,
+    RemedyKey,
+    RepeatedSamples,
+    Thresholds,
+    Value,
+)
 from identification.validation.nominal_scale import InertiaRatio, inertia_ratio, nominal_scale
 from identification.validation.position_jumps import PositionJump, position_steps
 from identification.validation.prediction import PredictionError, pooled_error
@@ -176,23 +182,24 @@ def joint_ranges(sources: Sources) -> tuple[Array, Array]:
     return np.where(bounded, stated.lower, ends[0]), np.where(bounded, stated.upper, ends[1])
 
 
-_ROW_ADVICE: Final[Mapping[RowFaultKind, str]] = {
-    RowFaultKind.FROZEN: "find out why the logger stopped; the rest of the recording is used",
-    RowFaultKind.WRITTEN_TWICE: "check what wrote rows twice; they were used once",
-    RowFaultKind.JUMP: "give the motions as files of their own if they are of different days",
+_ROW_REMEDIES: Final[Mapping[RowFaultKind, RemedyKey]] = {
+    RowFaultKind.FROZEN: "find why the logger stopped",
+    RowFaultKind.WRITTEN_TWICE: "check what wrote rows twice",
+    RowFaultKind.JUMP: "separate the motions",
 }
 
 
-def _condition(check: str, text: str, advice: str) -> Finding:
-    return Finding(check, "doubtful", text, advice, "condition")
+def _doubtful(key: FindingKey, remedy: RemedyKey, **values: Value) -> Finding:
+    return Finding(key, "doubtful", remedy, values=values)
 
 
 def _rows(sources: Sequence[Source]) -> Iterator[Finding]:
     """Yield findings about rows that are not of one motion, once for both parts of a recording."""
     for source in {source.path: source for source in sources}.values():
         for fault in source.faults:
-            text = f"{source.path.name}: {fault.describe()}"
-            yield _condition("rows", text, _ROW_ADVICE[fault.kind])
+            name, described_fault = source.path.name, fault.describe()
+            remedy = _ROW_REMEDIES[fault.kind]
+            yield _doubtful("faulty rows", remedy, recording=name, fault=described_fault)
 
 
 def _spikes(prepared: Prepared) -> Iterator[Finding]:
@@ -200,13 +207,8 @@ def _spikes(prepared: Prepared) -> Iterator[Finding]:
     counts = prepared.masked.get(SPIKE)
     if counts is None or not counts.any():
         return
-    naming = Naming(tuple(prepared.sources.cell.joint_names), "")
-    each = naming.each(counts > 0, lambda joint: str(int(counts[joint])))
-    text = (
-        f"samples of the torque stand out alone and are left out of fit and error: {each} of"
-        f" {prepared.rows} of the fitted motion"
-    )
-    yield _condition("rows", text, "check for damaged packets; all other samples are used")
+    found = _doubtful("spikes", "check for damaged packets", rows=prepared.rows)
+    yield found.about(counts > 0, count=counts)
 
 
 def _are_commands(source: Source) -> bool:
@@ -225,19 +227,12 @@ def _commanded(sources: Sequence[Source], prepared: Prepared) -> Iterator[Findin
     copies = [source for source in sources if _are_commands(source)]
     if not copies:
         return
-    names = joined(list(dict.fromkeys(source.path.name for source in copies)))
+    names = tuple(dict.fromkeys(source.path.name for source in copies))
+    values: dict[str, Value] = {"recordings": names}
     delays = prepared.delays
-    lag = ""
     if delays is not None and delays.significant:
-        lag = f", here by about {1e3 * delays.delay:.0f} ms"
-    yield Finding(
-        "positions",
-        "wrong",
-        f"the positions of {names} are the commands, bit for bit: the arm follows them late{lag}, "
-        "and every speed and acceleration is that of the plan, not of the arm",
-        "give the column of the measured positions (--columns 'position=NAME{}'), or record it",
-        "cause",
-    )
+        values["delay"] = 1e3 * delays.delay
+    yield Finding("commanded positions", "wrong", "record the positions", "cause", values)
 
 
 def _row_counters(sources: Sequence[Source]) -> Iterator[Finding]:
@@ -245,43 +240,35 @@ def _row_counters(sources: Sequence[Source]) -> Iterator[Finding]:
     for source in {source.path: source for source in sources}.values():
         unit = source.recording.provenance.get(ROW_COUNTER)
         if unit is not None:
-            text = (
-                f"the times of {source.path.name} count its rows, and the map reads them in {unit}:"
-                " with another cycle of the controller, speeds and accelerations are wrong by the "
-                "same factor in all joints"
-            )
-            advice = "state the rate of the controller: sample_rate = HZ and no [time]"
-            yield Finding("time", "doubtful", text, advice, "cause")
+            values: dict[str, Value] = {"recording": source.path.name, "unit": unit}
+            yield Finding("counted rows", "doubtful", "state the sampling rate", "cause", values)
 
 
 def _clock(prepared: Prepared) -> Iterator[Finding]:
     retimed = [source for source in prepared.sources.training if source.retimed]
     if retimed and (times := retimed[0].times) is not None:
-        text = f"{joined([source.name for source in retimed])}: {'; '.join(times.describe())}"
-        yield _condition("clock", text, "log the controller's time with each sample")
+        names = tuple(source.name for source in retimed)
+        described_times = "; ".join(times.describe())
+        yield _doubtful("retimed", "log the time", recordings=names, times=described_times)
 
 
 def _log(steps: Sequence[PositionJump]) -> Iterator[Finding]:
     """Yield a finding about samples that the log repeats or has late."""
     if steps:
         counts = Counter((step.recording, step.joint) for step in steps)
-        each = joined([f"{joint} {count} in {name}" for (name, joint), count in counts.items()])
-        first = min(steps, key=lambda step: step.time)
-        yield _condition(
-            "clock",
-            f"the log repeats position samples, has them late or lacks rows: {each} (first:"
-            f" {first.joint} after {first.time:.3f} s of {first.recording}); the arm moved on",
-            "log every sample of the controller once, with the controller's time",
+        samples = tuple(
+            RepeatedSamples(joint, count, name) for (name, joint), count in counts.items()
         )
+        first = min(steps, key=lambda step: step.time)
+        yield _doubtful("repeated samples", "log each sample once", samples=samples, first=first)
 
 
 def _wrapped(sources: Sequence[Source]) -> Iterator[Finding]:
     """Yield a finding about angles that were unwrapped."""
     joints = {source.name: source.recording.provenance.get(UNWRAPPED) for source in sources}
-    each = [f"{names} of {name}" for name, names in joints.items() if names]
-    if each:
-        text = f"angles that wrap at a whole turn were unwrapped: {joined(each)}"
-        yield Finding("wrapped angles", "information", text, "", "condition")
+    angles = tuple(f"{names} of {name}" for name, names in joints.items() if names)
+    if angles:
+        yield Finding("unwrapped angles", "information", values={"angles": angles})
 
 
 def _added_friction(prepared: Prepared) -> tuple[str, ...]:
@@ -309,21 +296,15 @@ def _friction_law(prepared: Prepared) -> Iterator[Finding]:
     law = cell.model.friction.laws[0]
     table = cell.stated.robot.friction
     stated = law.changed({term.option: getattr(table, term.option) for term in TERMS})
-    text = (
-        f"the friction law is {law.summary()[0]}, chosen by inner prediction; the recordings state"
-        f" {stated.summary()[0]}"
-    )
+    laws: dict[str, Value] = {"law": law.summary()[0], "stated": stated.summary()[0]}
     removed = [term.label.lower() for term in stated.terms if term not in law.terms]
     if law.tanh is not None and law.coulomb:
         removed = [label for label in removed if label != "coulomb"]  # it reverses smoothly
     if removed:
-        yield _condition(
-            "friction law",
-            f"{text}, which predicts parts of the fitted motion worse",
-            f"keep it with `hil identify --friction {_option(stated)}` if it is known",
-        )
+        key: FindingKey = "chosen friction law in place of the stated"
+        yield _doubtful(key, "keep the stated friction", option=_option(stated), **laws)
     else:
-        yield Finding("friction law", "information", text, "", "condition")
+        yield Finding("chosen friction law", "information", values=laws)
 
 
 def _option(law: FrictionLaw) -> str:
@@ -339,33 +320,19 @@ def _torque_channel(prepared: Prepared) -> Iterator[Finding]:
     chosen = [choice.name for choice in prepared.settings.choices if choice.chosen]
     how = prepared.settings.preprocessing
     if prepared.delays is None and how.torque_delay != prepared.settings.stated_delay:
-        yield _condition(
-            "delay",
-            f"the torque lags the position by {1e3 * how.torque_delay:.3g} ms (chosen by inner"
-            " prediction); this was compensated",
-            "state it (`hil identify --delay SECONDS`), or correct it in the recording program",
-        )
+        remedy: RemedyKey = "state the delay, or correct the program"
+        yield _doubtful("delay chosen by prediction", remedy, delay=1e3 * how.torque_delay)
     width = how.torque_bandwidth
-    advice = "record the torque unfiltered, or state its low-pass with --torque-bandwidth"
+    remedy = "record the torque unfiltered"
     if LOW_PASS in chosen and width is not None:
-        yield _condition(
-            "torque bandwidth",
-            f"the recorded torque is probably filtered by a low-pass of {width:.3g} Hz"
-            f" ({how.torque_shape}); the model is filtered in the same way",
-            advice,
-        )
+        yield _doubtful("filtered torque", remedy, bandwidth=width, shape=str(how.torque_shape))
         return
     exact = any(choice.errors[choice.chosen] < _EXACT for choice in prepared.settings.choices)
     if exact or REVERSAL in chosen:
         return  # computed for this motion, or it would not be predicted to rounding
     above = torque_noiseless_above(prepared.sources.training[0].recording)
     if above is not None and width is None and above < _FAST * how.rigid_bandwidth:
-        yield _condition(
-            "torque bandwidth",
-            f"the recorded torque has no noise above {above:.2g} Hz: it was filtered by a low-pass"
-            " or computed",
-            advice,
-        )
+        yield _doubtful("filtered or computed torque", remedy, bandwidth=above)
 
 
 def _resolution(prepared: Prepared) -> Iterator[Finding]:
@@ -378,43 +345,30 @@ def _resolution(prepared: Prepared) -> Iterator[Finding]:
     """
     names = prepared.sources.cell.joint_names
     model = prepared.sources.cell.model
-    coarse = dict[str, float]()
-    reversing = dict[str, float]()
+    coarse, reversing = np.zeros((2, len(names)))
     for source, samples in zip(prepared.sources.training, prepared.fitted, strict=True):
         recording = source.recording
         interval = float(np.median(np.diff(recording.time)))
         resting = np.any(samples.usable & ~model.moving(samples.motion.velocity), axis=0)
-        for j, name in enumerate(names):
+        for j in range(len(names)):
             step = grid_step(recording.position[:, j])
             if step is None:
                 continue
             width = min(samples.position_bandwidth[j], 0.5 / interval)
             noise = step**2 / 12.0 * 2.0 * interval * (2.0 * np.pi) ** 4 * width**5 / 5.0
             if np.sqrt(noise) > _MAX_ROUNDING * samples.motion.acceleration[:, j].std():
-                coarse[name] = max(step, coarse.get(name, 0.0))
+                coarse[j] = max(step, coarse[j])
             law = model.friction.laws[j]
             if law.coulomb and resting[j] and 0.0 < (law.presliding or 0.0) < step:
-                reversing[name] = max(step, reversing.get(name, 0.0))
-    if coarse:
-        yield _condition(
-            "resolution",
-            f"the positions have a coarse resolution [rad or m]: {_steps(coarse)}; more than"
-            f" {percentage(_MAX_ROUNDING)} of the accelerations is rounding error",
-            "record positions with more digits, or identify with a lower --bandwidth",
-        )
-    elif reversing:
+                reversing[j] = max(step, reversing[j])
+    if coarse.any():
+        found = _doubtful("coarse positions", "record more digits", limit=_MAX_ROUNDING)
+        yield found.about(coarse > 0.0, step=coarse)
+    elif reversing.any():
         presliding = max(law.presliding or 0.0 for law in model.friction.laws)
-        yield _condition(
-            "resolution",
-            f"the positions have a coarse resolution [rad or m]: {_steps(reversing)}; friction"
-            f" reverses over {presliding:.2g}, so that its direction at rest is that of rounding",
-            "record positions with more digits, or leave slow rows out"
-            " (`hil identify --exclude-rows slow`)",
-        )
-
-
-def _steps(steps: Mapping[str, float]) -> str:
-    return joined([f"{name} {step:.2g}" for name, step in steps.items()])
+        remedy: RemedyKey = "record more digits, or leave slow rows out"
+        found = _doubtful("coarse positions at rest", remedy, presliding=presliding)
+        yield found.about(reversing > 0.0, step=reversing)
 
 
 def _sampling_rate(prepared: Prepared, estimate: Estimate) -> Iterator[Finding]:
@@ -427,12 +381,12 @@ def _sampling_rate(prepared: Prepared, estimate: Estimate) -> Iterator[Finding]:
     noise = folded_noise(model, estimate.values, few, how.rigid_bandwidth)
     if noise.share > _MOST and noise.error > Thresholds().unexplained:
         rate = 1.0 / float(np.median(np.diff(few[0].motion.time)))
-        yield _condition(
-            "sampling rate",
-            f"at {rate:.3g} Hz the torque has noise up to half this rate; sampling folds it to"
-            f" below {how.rigid_bandwidth:g} Hz, where it is {percentage(noise.share)} of the"
-            " squared residual",
-            "log at a higher rate, or filter the torque below half the rate before it is sampled",
+        yield _doubtful(
+            "folded noise",
+            "log at a higher rate",
+            rate=rate,
+            bandwidth=how.rigid_bandwidth,
+            noise=noise.share,
         )
 
 

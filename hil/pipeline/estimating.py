@@ -33,9 +33,8 @@ from identification.reduction.posterior import Posterior
 from identification.reduction.reduction import Reduction
 from identification.selection.settings import Settings, Strength
 from identification.signals.samples import Samples
-from identification.text import percentage
+from identification.text import joined, percentage
 from identification.validation.calibration import Refit
-from identification.validation.finding import joined
 
 from .cell_context import TorqueScale, torque_scale_of
 from .estimators import OF_PRIOR, Estimator, fit_of, values_of

@@ -24,7 +24,7 @@ from identification.purposes.thresholds import ContactThreshold
 from identification.selection.essential import EliminationStep
 from identification.selection.settings import Choice, Settings
 from identification.text import percentage
-from identification.validation.finding import Finding
+from identification.validation.finding_messages import WordedFinding
 from identification.validation.purpose import Purpose
 
 
@@ -151,7 +151,7 @@ class JudgementResult(Frozen):
 
     in_sample: bool = False  #: Whether nothing was held out; errors are those of the fit then
     nominal: str | None = None  #: Description of the nominal model
-    findings: list[Finding]
+    findings: list[WordedFinding]
     next_steps: list[str]
     joints: list[JointJudgement]
     all_joints: OverallJudgement | None = None  #: Null in earlier files
@@ -159,7 +159,7 @@ class JudgementResult(Frozen):
     position: list[ProfileResult]  #: Over rad or m
 
     @property
-    def worst_first(self) -> list[Finding]:
+    def worst_first(self) -> list[WordedFinding]:
         """Findings in descending order of severity.
 
         Causes, the one that explains most of the error first, then symptoms, then conditions.
@@ -167,14 +167,14 @@ class JudgementResult(Frozen):
         levels = ("wrong", "doubtful", "information", "good")
         roles = ("cause", "symptom", "condition")
 
-        def rank(finding: Finding) -> tuple[int, int, float]:
+        def rank(finding: WordedFinding) -> tuple[int, int, float]:
             explained = finding.explains or 0.0
             return levels.index(finding.level), roles.index(finding.role), -explained
 
         return sorted(self.findings, key=rank)
 
     @property
-    def doubtful(self) -> list[Finding]:
+    def doubtful(self) -> list[WordedFinding]:
         """Findings that are warnings, the most consequential first."""
         return [finding for finding in self.worst_first if finding.level == "doubtful"]
 

@@ -17,7 +17,7 @@ from identification.hypotheses.little_torque import little_torque
 from identification.model.motion import Motion
 from identification.model.pseudo_inertia import pseudo_inertia, reference_bodies
 from identification.model.robot import RobotModel
-from identification.validation.finding import joined
+from identification.text import joined
 from identification.validation.physical_signs import SIGMAS
 
 # Smallest second moment of a link relative to the nominal body's at which a bound counts as active.

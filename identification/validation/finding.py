@@ -1,77 +1,266 @@
-"""Findings of a verdict, how they name joints and motion, and the thresholds of its checks."""
+"""Findings of a verdict, as values, and the thresholds of its checks."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass
-from typing import Literal, Protocol
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
 from identification.hypotheses.carried_load import LOAD
+from identification.hypotheses.changes import Change
 from identification.hypotheses.little_torque import MINOR
+from identification.validation.position_jumps import PositionJump
 
 Mask = NDArray[np.bool_]
 Level = Literal["good", "information", "doubtful", "wrong"]
 Role = Literal["condition", "cause", "symptom"]
 
 
+FindingKey = Literal[
+    # the recordings
+    "nothing held out",
+    "joints at rest",
+    "no torque",
+    "position jumps",
+    "faulty rows",
+    "spikes",
+    "commanded positions",
+    "counted rows",
+    "retimed",
+    "repeated samples",
+    "unwrapped angles",
+    "coarse positions",
+    "coarse positions at rest",
+    "folded noise",
+    "saturation",
+    "no saturation",
+    # excitation
+    "undetermined",
+    "undetermined in one direction",
+    "poor excitation",
+    "one direction",
+    "good excitation",
+    # what the recordings are
+    "no bodies",
+    "no gravity",
+    "zeros",
+    "zeros, nearest",
+    "alike",
+    "nearest",
+    "another arm",
+    "gravity",
+    "scale of the torque",
+    "all torques opposite",
+    "all axes driven by friction",
+    "torque opposite",
+    "outliers",
+    # what explains the error
+    "delay of the torque",
+    "torque constant",
+    "torque constant, as assumed",
+    "load friction",
+    "torque sign",
+    "position sign",
+    "axis sign",
+    "torque order",
+    "position order",
+    "joint order",
+    "angle sum",
+    "angle difference",
+    "payload of a part",
+    "torque of a part",
+    "friction of a part",
+    "arm of a part",
+    # what differs on unseen motion
+    "load",
+    "changed torque",
+    "changed friction",
+    "slightly changed friction",
+    # bodies and friction
+    "negative Coulomb friction",
+    "little friction at speed",
+    "little friction at speed by a chosen term",
+    "negative parameter",
+    "no consistent parameters",
+    "friction law lacks a term",
+    "complete friction law",
+    "chosen friction law",
+    "chosen friction law in place of the stated",
+    # errors
+    "overall error",
+    "axis error",
+    "axis error of little torque",
+    "axis error on unseen motion alone",
+    "unexplained error",
+    "left open by the motion",
+    "nothing explained",
+    "little explained",
+    "explained",
+    "generalisation",
+    "no repetitions",
+    "systematic error",
+    "different repetitions",
+    # other models
+    "nominal model better",
+    "nominal model worse",
+    "controller's model better",
+    "controller's model worse",
+    "controller's inertia differs",
+    "controller's inertia agrees",
+    # delay and filter
+    "compensated delay",
+    "delay chosen by prediction",
+    "suspected delay",
+    "other delay",
+    "assumed delay",
+    "filtered torque",
+    "filtered or computed torque",
+    # the residual
+    "short recordings",
+    "correlated residual",
+    "residual over speed",
+    "no residual over speed",
+    "residual over position",
+    "no residual over position",
+    "large ripple",
+    "usual ripple",
+    "no ripple",
+    "large friction drift",
+    "small friction drift",
+    "no friction drift",
+]
+"""What a finding is; `identification.validation.finding_messages` has the sentence of each."""
+
+RemedyKey = Literal[
+    "hold out a motion",
+    "move the joints",
+    "resolve the torque",
+    "check the encoder",
+    "find why the logger stopped",
+    "check what wrote rows twice",
+    "separate the motions",
+    "check for damaged packets",
+    "record the positions",
+    "state the sampling rate",
+    "log the time",
+    "log each sample once",
+    "record more digits",
+    "record more digits, or leave slow rows out",
+    "log at a higher rate",
+    "slow the motion down",
+    "design a motion",
+    "move in both directions",
+    "record all torque",
+    "state that gravity was removed",
+    "correct the zeros",
+    "compare a posture",
+    "jog and compare",
+    "compare with the map",
+    "check masses and units",
+    "state the mounting",
+    "check the scale",
+    "negate all torques",
+    "check the sign of the torque",
+    "check the torque for spikes",
+    "use the delay found",
+    "check the constant",
+    "fit load friction",
+    "check the sign in the map",
+    "check the sign of the position",
+    "jog the axes",
+    "check the order",
+    "state the coupled angle",
+    "state the coupled difference",
+    "separate the payloads",
+    "check what changed in between",
+    "separate the arms",
+    "record with one payload",
+    "check what changed",
+    "warm the arm up",
+    "warm the arm up, and check what else changed",
+    "check all signs",
+    "describe a balancer",
+    "use the consistent estimate",
+    "compare with basic friction",
+    "describe the friction",
+    "keep the stated friction",
+    "describe elements, or check the drives",
+    "cover the motion",
+    "cover the motion in both directions",
+    "cover the motion, or check what changed",
+    "check the drives",
+    "check the drives and the unit",
+    "move faster",
+    "check for missing effects",
+    "repeat the motion",
+    "check the coupling",
+    "check the constant with a payload",
+    "compare the repetitions",
+    "use the nominal model",
+    "fit more before replacing the controller's",
+    "check the constant and the payload",
+    "state the delay",
+    "state the delay, or correct the program",
+    "compare with the delay found",
+    "compare with the delay found, or correct the cell",
+    "record the torque unfiltered",
+    "record a longer motion",
+    "try friction terms",
+    "check the geometry",
+    "average the ripple",
+]
+"""What to do about a finding; likewise."""
+
+Figure = float | str
+
+
+@dataclass(frozen=True)
+class RepeatedSamples:
+    """Samples of a joint that a log repeats, has late or lacks."""
+
+    joint: str
+    count: int
+    recording: str
+
+
+Value = (
+    Figure
+    | Change
+    | PositionJump
+    | tuple[str, ...]
+    | tuple[int, ...]
+    | tuple[float, ...]
+    | tuple[Change, ...]
+    | tuple[PositionJump, ...]
+    | tuple[RepeatedSamples, ...]
+)
+
+
 @dataclass(frozen=True)
 class Finding:
-    """Outcome of one check."""
+    """Outcome of one check, as values; `finding_messages` makes the sentences."""
 
-    check: str  # name of the check
+    key: FindingKey
     # "wrong": the model must not be used; "doubtful": a warning; "information": neutral
     level: Level
-    words: str  # message without full stop
-    next_step: str = ""  # remedy; empty if none is needed
+    remedy: RemedyKey | None = None
     # a "cause" explains errors; the step of a "symptom" is given only if no cause was found
     role: Role = "condition"
-    # what a model that predicts well must not be used for without care, for the verdict's sentence
-    reservation: str = ""
+    values: Mapping[str, Value] = field(default_factory=dict)
     # share of the squared error that is gone with this corrected, 0 to 1; None: not measured
     explains: float | None = None
     # indices of the joints that it names; empty if it names none
     joints: tuple[int, ...] = ()
+    each: Mapping[str, tuple[Figure, ...]] = field(default_factory=dict)  # of each of these
 
-
-def indices(mask: Mask) -> tuple[int, ...]:
-    """Return the joints of a mask (n,), from 0."""
-    return tuple(np.flatnonzero(mask).tolist())
-
-
-def joined(names: Sequence[str], most: int = 6) -> str:
-    """Return names separated by commas, the first few of many."""
-    omitted = len(names) - most
-    return ", ".join(names[:most]) + (f" and {omitted} more" if omitted > 0 else "")
-
-
-@dataclass(frozen=True)
-class Naming:
-    """Names in messages: those of the joints, and of the motion that was predicted."""
-
-    joints: tuple[str, ...]
-    motion: str  # such as "unseen motion"
-
-    def of(self, mask: Mask) -> str:
-        """Return the joints of a mask (n,)."""
-        return joined([self.joints[joint] for joint in np.flatnonzero(mask)])
-
-    def all_of(self, joints: Sequence[int]) -> str:
-        """Return joints by their indices."""
-        return joined([self.joints[joint] for joint in joints])
-
-    def each(self, mask: Mask, entry: Callable[[int], str]) -> str:
-        """Return the joints of a mask (n,), each with its entry: ``joint_1 3 %, joint_2 5 %``."""
-        return joined([f"{self.joints[j]} {entry(j)}" for j in np.flatnonzero(mask).tolist()])
-
-
-class Facts(Protocol):
-    """What evidence says about one subject, with the findings that follow from it."""
-
-    def findings(self, naming: Naming) -> Iterator[Finding]:
-        """Yield the findings in the order of the verdict's reasons."""
+    def about(self, joints: Mask, **each: NDArray[Any] | Sequence[Figure]) -> Finding:
+        """Return the finding about the joints of a mask (n,), with figures of all joints (n,)."""
+        indices = np.flatnonzero(joints)
+        figures = {name: tuple(np.asarray(all_)[indices].tolist()) for name, all_ in each.items()}
+        return replace(self, joints=tuple(indices.tolist()), each=figures)
 
 
 @dataclass(frozen=True)

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Collection, Iterator
-from typing import Final, NamedTuple
+from collections.abc import Collection, Iterator, Mapping
+from typing import Final, Literal, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,12 +21,38 @@ SIGMAS: Final = 3.0  # standard deviations of a significant wrong sign or change
 _NEVER_NEGATIVE: Final = re.compile(r"m\d+|I\d+(m|xx|yy|zz)")
 
 
-class Implausible(NamedTuple):
-    """Messages on wrong signs of an estimate."""
+SignKind = Literal[
+    "negative Coulomb friction",
+    "little friction at speed",
+    "little friction at speed by a chosen term",
+    "negative parameter",
+]
 
-    impossible: tuple[str, ...]  # wrong signs with a torque above the prediction error
-    doubtful: tuple[str, ...]  # wrong signs with a smaller torque
-    added: tuple[str, ...] = ()  # friction that falls by a term that nobody stated
+
+class WrongSign(NamedTuple):
+    """One physically impossible sign.
+
+    Attributes:
+        kind: what is wrong.
+        name: of the joint or the parameter.
+        figures: `value`; of friction at speed also `speed` and `coulomb`, of a parameter `std`.
+        unit: of a parameter.
+        joints: that it is of, if it is friction of one.
+    """
+
+    kind: SignKind
+    name: str
+    figures: Mapping[str, float]
+    unit: str = ""
+    joints: tuple[int, ...] = ()
+
+
+class Implausible(NamedTuple):
+    """Wrong signs of an estimate."""
+
+    impossible: tuple[WrongSign, ...]  # with a torque above the prediction error
+    doubtful: tuple[WrongSign, ...]  # with a smaller torque
+    added: tuple[WrongSign, ...] = ()  # friction that falls by a term that nobody stated
 
 
 def implausibilities(
@@ -38,7 +64,7 @@ def implausibilities(
     speed: Array,
     added: Collection[str] = (),
 ) -> Implausible:
-    """Return messages on what is physically impossible in an estimate.
+    """Return what is physically impossible in an estimate.
 
     The torque of wrong signs on a `motion` is compared with the error of its prediction (n,), of
     which it must be a multiple on axes of little torque; friction is evaluated up to the highest
@@ -46,20 +72,20 @@ def implausibilities(
     chosen, not stated: they follow the friction within the fitted speeds and are no reason against
     a model.
     """
-    impossible: list[str] = []
-    doubtful: list[str] = []
-    chosen: list[str] = []
+    impossible: list[WrongSign] = []
+    doubtful: list[WrongSign] = []
+    chosen: list[WrongSign] = []
     torque_rms = np.sqrt(motion.gram[:, -1, -1] / np.maximum(motion.samples, 1))
     little = little_torque(torque_rms, ~model.chain.revolute)
     limit = np.where(little, _FAR_ABOVE, 1.0) * error_rms
-    for message, part, by_added in _wrong_signs(model, estimate, speed, added):
-        if by_added:
-            chosen.append(message)
+    for sign, part in _wrong_signs(model, estimate, speed, added):
+        if sign.kind == "little friction at speed by a chosen term":
+            chosen.append(sign)
             continue
         part_values = np.where(part, estimate.values, 0.0)
         squares = np.einsum("i,jik,k->j", part_values, motion.gram[:, :-1, :-1], part_values)
         torque = np.sqrt(np.maximum(squares, 0.0) / np.maximum(motion.samples, 1))
-        (impossible if np.any(torque > limit) else doubtful).append(message)
+        (impossible if np.any(torque > limit) else doubtful).append(sign)
     return Implausible(tuple(impossible), tuple(doubtful), tuple(chosen))
 
 
@@ -75,8 +101,8 @@ def _is_negative(estimate: Estimate, direction: Array) -> bool:
 
 def _wrong_signs(
     model: RobotModel, estimate: Estimate, speed: Array, added: Collection[str] = ()
-) -> Iterator[tuple[str, NDArray[np.bool_], bool]]:
-    """Yield messages on wrong signs, the parameters (p,) that cause them, and if by added terms."""
+) -> Iterator[tuple[WrongSign, NDArray[np.bool_]]]:
+    """Yield wrong signs, with the parameters (p,) that cause them."""
     values = estimate.values
     first = model.base.rank
     count = len(estimate.values)
@@ -89,20 +115,22 @@ def _wrong_signs(
                 coulomb[k] = term == COULOMB
                 stated[k] = term.symbol not in added
         if _is_negative(estimate, coulomb):
-            message = (
-                f"Coulomb friction of {name} is negative ({coulomb @ values:.3g}): a torque or a"
-                " direction has the wrong sign"
+            negative = {"value": float(coulomb @ values)}
+            yield (
+                WrongSign("negative Coulomb friction", name, negative, joints=(joint,)),
+                top != 0.0,
             )
-            yield message, top != 0.0, False
         elif _is_negative(estimate, top - 0.5 * coulomb):
             by_added = not _is_negative(estimate, stated * top - 0.5 * coulomb)
-            message = (
-                f"friction of {name} is {top @ values:.3g} at its top speed of {speed[joint]:.3g},"
-                f" less than half of its Coulomb friction {coulomb @ values:.3g}"
-            )
+            figures = {
+                "value": float(top @ values),
+                "speed": float(speed[joint]),
+                "coulomb": float(coulomb @ values),
+            }
+            kind: SignKind = "little friction at speed"
             if by_added:
-                message += ", by a friction term that was chosen by inner prediction"
-            yield message, top != 0.0, by_added
+                kind = "little friction at speed by a chosen term"
+            yield WrongSign(kind, name, figures, joints=(joint,)), top != 0.0
     alone = {  # names of single parameters
         k: f"friction {term.name} of {'motor' if term.motor else 'joint'} {term.owner + 1}"
         for k, term in enumerate(model.friction.terms, start=first)
@@ -114,8 +142,8 @@ def _wrong_signs(
     for k, name in alone.items():
         direction = np.arange(count) == k
         if _is_negative(estimate, direction.astype(np.float64)):
-            figures = f"{values[k]:.3g} ± {estimate.std[k]:.2g} {estimate.units[k]}"
-            yield f"{name} is negative: {figures}", direction, False
+            figures = {"value": float(values[k]), "std": float(estimate.std[k])}
+            yield WrongSign("negative parameter", name, figures, estimate.units[k]), direction
 
 
 class TopSpeedFriction(NamedTuple):
@@ -135,12 +163,6 @@ class TopSpeedFriction(NamedTuple):
         determined = self.known
         most = np.count_nonzero(determined) >= max(2, 0.5 * len(determined))
         return determined & bool(most and np.all(self.torque[determined] < 0.0))
-
-    @property
-    def described(self) -> NDArray[np.object_]:
-        """Torques with their standard deviations as text (n,)."""
-        pairs = zip(self.torque, self.std, strict=True)
-        return np.array([f"{torque:.3g} ± {2.0 * std:.2g}" for torque, std in pairs], dtype=object)
 
 
 def dissipation_of(model: RobotModel, estimate: Estimate, speed: Array) -> TopSpeedFriction:

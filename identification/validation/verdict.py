@@ -10,47 +10,18 @@ import numpy as np
 from identification.hypotheses.column_search import UNSEEN
 from identification.text import percentage
 from identification.validation.evidence import Evidence
-from identification.validation.facts.diagnosis import ARM, ArmFacts, MeaningFacts
-from identification.validation.facts.errors import (
-    UNEXPLAINED,
-    ErrorFacts,
-    ExplainedFacts,
-    GeneralisationFacts,
-    OpenFacts,
-    RepetitionFacts,
-    SystematicFacts,
-    UnexplainedFacts,
-)
-from identification.validation.facts.excitation import ExcitationFacts
-from identification.validation.facts.faults import FaultFacts, GravityFacts, OutlierFacts
-from identification.validation.facts.form import FormFacts
-from identification.validation.facts.patterns import (
-    DriftFacts,
-    ProfileFacts,
-    RippleFacts,
-    WhitenessFacts,
-)
-from identification.validation.facts.recordings import (
-    UNTESTED,
-    CorrectionFacts,
-    DelayFacts,
-    JumpFacts,
-    SaturationFacts,
-    TestedFacts,
-)
-from identification.validation.facts.references import ControllerFacts, InertiaFacts, NominalFacts
-from identification.validation.facts.sameness import ChangeFacts, FrictionFacts, LoadFacts
-from identification.validation.facts.scale import (
+from identification.validation.finding import Thresholds
+from identification.validation.finding_messages import (
+    ARM,
     IMPOSSIBLE,
-    PhysicalSignFacts,
-    ScaleFacts,
-    SignFacts,
+    UNTESTED,
+    Naming,
+    WordedFinding,
+    worded,
 )
-from identification.validation.finding import Facts, Finding, Naming, Thresholds
+from identification.validation.findings.table import find
 from identification.validation.purpose import Purpose, PurposeName, good_for
 from identification.validation.purpose_messages import purposes_in_a_sentence
-
-__all__ = ["Finding", "Thresholds", "Verdict", "judge"]
 
 
 @dataclass(frozen=True)
@@ -64,7 +35,7 @@ class Verdict:
     #: of causes, then of the other wrong findings, or of doubtful ones if none is wrong; of
     #: symptoms only if no cause was found
     next_steps: tuple[str, ...] = ()
-    findings: tuple[Finding, ...] = ()  #: every check with its outcome
+    findings: tuple[WordedFinding, ...] = ()  #: every check with its outcome
     purposes: tuple[Purpose, ...] = ()  #: what the model is good for; empty if not examined
 
 
@@ -88,10 +59,7 @@ def judge(
         asked: purposes that decide; by default the error on unseen motion and every check does.
     """
     naming = Naming(tuple(joint_names), tested_on)
-    facts = facts_in_order(evidence, thresholds)
-    findings = _without_explained(
-        [finding for group in facts for finding in group.findings(naming)]
-    )
+    findings = [worded(finding, naming) for finding in find(evidence, thresholds)]
     wrong = [finding for finding in findings if finding.level == "wrong"]
     doubtful = [finding for finding in findings if finding.level == "doubtful"]
     measure = _measure(naming.joints, evidence)
@@ -127,7 +95,9 @@ def judge(
     )
 
 
-def _next_steps(wrong: Sequence[Finding], doubtful: Sequence[Finding]) -> tuple[str, ...]:
+def _next_steps(
+    wrong: Sequence[WordedFinding], doubtful: Sequence[WordedFinding]
+) -> tuple[str, ...]:
     causes = [finding for finding in (*wrong, *doubtful) if finding.role == "cause"]
     explained = bool(causes) and (not wrong or causes[0].level == "wrong")
     roles = ("condition",) if explained else ("condition", "symptom")
@@ -136,7 +106,7 @@ def _next_steps(wrong: Sequence[Finding], doubtful: Sequence[Finding]) -> tuple[
     return tuple(step for step in steps if step)
 
 
-def fault_of(findings: Sequence[Finding]) -> Finding | None:
+def fault_of(findings: Sequence[WordedFinding]) -> WordedFinding | None:
     """Return the first wrong finding for which a model is good for no purpose."""
     return next(
         (
@@ -149,65 +119,12 @@ def fault_of(findings: Sequence[Finding]) -> Finding | None:
     )
 
 
-def facts_in_order(evidence: Evidence, limits: Thresholds) -> tuple[Facts, ...]:
-    """Return all facts in the order of the verdict's reasons: its line has the first one."""
-    outliers = OutlierFacts.of(evidence, limits)
-    gravity = GravityFacts.of(evidence, limits)
-    meaning = MeaningFacts.of(evidence)
-    scale = None if meaning is not None and meaning.is_other else ScaleFacts.of(evidence)
-    signs = SignFacts.of(evidence, scale)
-    load = LoadFacts.of(evidence, limits)
-    changes = ChangeFacts.of(evidence, limits, load, gravity)
-    ordered: tuple[Facts | None, ...] = (
-        TestedFacts.of(evidence, limits),
-        JumpFacts.of(evidence),
-        ExcitationFacts.of(evidence, limits),
-        outliers,
-        meaning,
-        gravity,
-        signs,
-        FaultFacts.of(evidence, limits, outliers, gravity, signs),
-        ArmFacts.of(evidence, meaning),
-        scale,
-        load,
-        changes,
-        FrictionFacts.of(evidence, limits, changes),
-        PhysicalSignFacts.of(evidence, signs),
-        ErrorFacts.of(evidence, limits),
-        UnexplainedFacts.of(evidence, limits),
-        OpenFacts.of(evidence, limits),
-        ExplainedFacts.of(evidence, limits),
-        GeneralisationFacts.of(evidence, limits),
-        SystematicFacts.of(evidence, limits),
-        RepetitionFacts.of(evidence, limits),
-        NominalFacts.of(evidence, limits),
-        ControllerFacts.of(evidence, limits),
-        InertiaFacts.of(evidence),
-        DelayFacts.of(evidence, limits),
-        CorrectionFacts.of(evidence),
-        SaturationFacts.of(evidence, limits),
-        WhitenessFacts.of(evidence, limits),
-        FormFacts.of(evidence, limits),
-        ProfileFacts.of_speed(evidence, limits),
-        ProfileFacts.of_position(evidence, limits),
-        RippleFacts.of(evidence, limits),
-        DriftFacts.of(evidence, limits),
-    )
-    return tuple(facts for facts in ordered if facts is not None)
-
-
-def _of_no_arm(tested_on: str, fault: Finding | None, evidence: Evidence) -> str:
+def _of_no_arm(tested_on: str, fault: WordedFinding | None, evidence: Evidence) -> str:
     """Return that a model predicts and is of no arm, or not of the described one; else ""."""
     if fault is None or fault.check not in (ARM, IMPOSSIBLE):
         return ""
     share = percentage(evidence.held_out.overall, 1)
     return f"it predicts {tested_on} to {share} of the torque, but is not the arm of the URDF: "
-
-
-def _without_explained(findings: Sequence[Finding]) -> list[Finding]:
-    """Leave out that nothing explains the error, if a wrong cause does."""
-    explained = any(finding.role == "cause" and finding.level == "wrong" for finding in findings)
-    return [finding for finding in findings if not (explained and finding.check == UNEXPLAINED)]
 
 
 def _measure(names: Sequence[str], evidence: Evidence) -> str:

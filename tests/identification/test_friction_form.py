@@ -20,8 +20,7 @@ from identification.factor.columns import friction_factor
 from identification.factor.factor import Factor
 from identification.model.friction import ASYMMETRIC, QUADRATIC, STRIBECK, FrictionLaw
 from identification.model.robot import RobotModel
-from identification.validation.facts.form import FORM
-from tests.identification.test_verdict import finding_of, judged
+from tests.identification.evidence import found, judged
 from tests.identification.two_link import MODEL, NOISE, URDF, P, a_motion, as_samples, truth
 
 MOTION = a_motion(20.0)
@@ -202,8 +201,9 @@ class TestVerdict:
         verdict = judged(form=self.uncertainty(0.999, 0.2))
         assert verdict.good
         assert "well, but the friction law of two is uncertain: " in verdict.line
-        (warning,) = [text for text in verdict.warnings if "lacks a term" in text]
-        assert "Stribeck (0.1 rad/s), 20 % of its friction" in warning
+        finding = found(form=self.uncertainty(0.999, 0.2))["friction law lacks a term"]
+        assert (finding.level, finding.joints) == ("doubtful", (1,))
+        assert finding.each == {"term": ("Stribeck (0.1 rad/s)",), "friction": (0.2,)}
 
     def test_nor_is_one_whose_friction_changed(self):
         verdict = judged(friction_change=np.array([0.0, 0.1]))
@@ -213,9 +213,9 @@ class TestVerdict:
     @pytest.mark.parametrize(("probability", "share"), [(0.9, 0.2), (0.999, 0.01)])
     def test_neither_chance_nor_a_trifle_counts(self, probability, share):
         """A term that is not certain, or changes friction by less than temperature does."""
-        finding = finding_of(FORM, form=self.uncertainty(probability, share))
+        finding = found(form=self.uncertainty(probability, share))["complete friction law"]
         assert finding.level == "good"
         assert "well: " in judged(form=self.uncertainty(probability, share)).line
 
     def test_without_a_test_nothing_is_said(self):
-        assert all(finding.check != FORM for finding in judged().findings)
+        assert not {"complete friction law", "friction law lacks a term"} & found().keys()

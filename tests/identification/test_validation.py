@@ -50,8 +50,8 @@ from identification.validation.residuals import (
 )
 from tests.hil.identified_arm import a_motion as sines
 from tests.hil.identified_arm import packaged_urdf
+from tests.identification.evidence import an_error, found, judged
 from tests.identification.test_selection import ARM_NOISE, three_sines
-from tests.identification.test_verdict import an_error, finding_of, judged
 from tests.identification.two_link import (
     MODEL,
     NOISE,
@@ -502,15 +502,15 @@ def signs(estimated, model=MODEL, *, error=0.1):
 
 class TestSigns:
     @pytest.mark.parametrize(
-        ("estimated", "message"),
+        ("estimated", "kind", "name"),
         [
-            (with_value("f0_1", -4.0), "Coulomb friction of shoulder is negative"),
-            (with_value("f1_2", -1.0), "friction of elbow is"),
-            (with_value("I2m", -0.1), "I2m is negative"),
+            (with_value("f0_1", -4.0), "negative Coulomb friction", "shoulder"),
+            (with_value("f1_2", -1.0), "little friction at speed", "elbow"),
+            (with_value("I2m", -0.1), "negative parameter", "I2m"),
         ],
     )
-    def test_impossible_signs_are_named(self, estimated, message):
-        assert any(message in sentence for sentence in signs(estimated).impossible)
+    def test_impossible_signs_are_named(self, estimated, kind, name):
+        assert (kind, name) in {(sign.kind, sign.name) for sign in signs(estimated).impossible}
 
     def test_signs_within_the_uncertainty_are_possible(self):
         """So are undetermined parameters, and friction that falls from 2 to 1.3 N·m."""
@@ -526,7 +526,7 @@ class TestSigns:
     def test_signs_of_a_torque_below_the_error_are_doubtful(self):
         implausible = signs(with_value("I2m", -0.01), error=5.0)
         assert implausible.impossible == ()
-        assert any("I2m is negative" in sentence for sentence in implausible.doubtful)
+        assert "I2m" in {sign.name for sign in implausible.doubtful}
 
     def test_a_term_that_nobody_stated_is_no_reason(self):
         """It follows friction within the fitted speeds; a stated one is."""
@@ -536,23 +536,23 @@ class TestSigns:
         factor = Factor.from_samples(model, motion, np.zeros((2000, 2)))
         speed = np.abs(motion.velocity).max(axis=0)
 
-        def found(*added):
+        def with_added(*added):
             return implausibilities(
                 model, falling, factor, np.full(2, 0.1), speed=speed, added=added
             )
 
-        (message,) = found().impossible
-        assert "less than half of its Coulomb friction" in message
-        assert found("f2").impossible == found("f2").doubtful == ()
-        (message,) = found("f2").added
-        assert "chosen by inner prediction" in message
+        (stated,) = with_added().impossible
+        assert stated.kind == "little friction at speed"
+        assert with_added("f2").impossible == with_added("f2").doubtful == ()
+        (chosen,) = with_added("f2").added
+        assert chosen.kind == "little friction at speed by a chosen term"
 
     def test_negative_friction_of_a_coupled_motor_is_named(self):
         coupling = Coupling(np.array([[1.0, 0.0], [0.5, 1.0]]), inertia=False)
         coupled = RobotModel.from_urdf(URDF, friction=MODEL.friction.laws[0], coupling=coupling)
         arm = partial(parameters, coupled)
-        (message,) = signs(known(arm(f1_m2=-1.0), coupled), coupled).impossible
-        assert message.startswith("friction f1_m2 of motor 2 is negative: -1")
+        (sign,) = signs(known(arm(f1_m2=-1.0), coupled), coupled).impossible
+        assert (sign.name, sign.figures["value"]) == ("friction f1_m2 of motor 2", -1.0)
         assert signs(known(arm(), coupled), coupled) == Implausible((), ())
 
 
@@ -618,9 +618,9 @@ class TestConsistencyCheck:
         check = consistency_of(sprung)
         assert check.impossible and check.overloaded == "elbow"
         assert "[[robot.elements]]" in check.remedy and "elbow" in check.remedy
-        verdict = judged(consistency=check)
-        assert verdict.reasons == (f"{check.sentence}: {check.remedy}",)
-        assert "[[robot.elements]]" in verdict.next_steps[0]
+        finding = found(consistency=check)["no consistent parameters"]
+        assert (finding.level, finding.remedy) == ("wrong", "describe a balancer")
+        assert judged(consistency=check).reasons == (f"{check.sentence}: {check.remedy}",)
         clean = consistency_of(runs())
         assert clean.remedy == "check signs, torque constants, coupling and URDF"
 
@@ -668,8 +668,8 @@ class TestPositionJumps:
         assert (jump.recording, jump.joint) == ("log.mcap", "knee")
         assert jump.time == pytest.approx(smooth.time[at] - smooth.time[0])
         assert jump.size == pytest.approx(size, abs=2e-3)
-        finding = finding_of("position jumps", ("hip", "knee"), jumps=(jump,))
-        assert finding.level == "wrong" and "knee" in finding.words and "knee" in finding.next_step
+        finding = found(jumps=(jump,))["position jumps"]
+        assert (finding.level, finding.values["jumping"]) == ("wrong", ("knee",))
 
     @pytest.mark.parametrize("rate", [100.0, 500.0, 5000.0])
     @pytest.mark.parametrize("jitter", [0.0, 0.3])
@@ -854,11 +854,11 @@ LOADED_AXES = range(1, 4)  # of the UR5, whose rigid torque exceeds their fricti
 
 
 def findings(model, **context):
-    """Findings of a verdict with this context."""
+    """Findings that follow from this context."""
     error = an_error(0.05, joints=model.n_joints)
-    usual = judged(model.joint_names, held_out=error, training=error).findings
-    of_context = judged(model.joint_names, held_out=error, training=error, **context).findings
-    return [finding for finding in of_context if finding not in usual]
+    usual = found(held_out=error, training=error)
+    of_context = found(held_out=error, training=error, **context)
+    return [finding for key, finding in of_context.items() if finding != usual.get(key)]
 
 
 @pytest.fixture(scope="module")
@@ -924,8 +924,8 @@ class TestNominalScale:
         assert np.flatnonzero(scale.off).tolist() == [axis]
         assert scale.scale[axis] == pytest.approx(factor, rel=0.1)
         (finding,) = findings(model, nominal_scale=scale)
-        name = model.joint_names[axis]
-        assert finding.level == "doubtful" and name in finding.words and name in finding.next_step
+        assert (finding.key, finding.level) == ("scale of the torque", "doubtful")
+        assert finding.joints == (axis,)
 
     @pytest.mark.parametrize("factor", [0.01, 1000.0, -1.0])
     def test_torques_with_another_factor_are_wrong(self, model, factor):
@@ -934,11 +934,8 @@ class TestNominalScale:
         scaled = [replace(run, torque=factor * run.torque) for run in runs]
         (finding,) = findings(model, nominal_scale=nominal_scale(model, nominal(model), scaled))
         assert finding.level == "wrong"
-        if factor > 0.0:
-            assert "unit" in finding.next_step and "side" in finding.next_step
-        else:
-            assert finding.check == "direction of axes"
-            assert "all torques have the opposite sign" in finding.words
+        expected = "scale of the torque" if factor > 0.0 else "all torques opposite"
+        assert finding.key == expected
         massless = nominal_scale(model, 0.0 * nominal(model), scaled)
         assert np.isnan(massless.scale).all() and findings(model, nominal_scale=massless) == []
 
@@ -970,8 +967,8 @@ class TestInertia:
         np.testing.assert_allclose(ratio.ratio, [1.0, 1.1, 0.9, 1.0, np.nan, 1.0 / 0.7], rtol=1e-9)
         np.testing.assert_allclose(ratio.spread[:4], 0.0, atol=1e-9)
         (finding,) = findings(model, controller_inertia=ratio)
-        assert finding.level == "doubtful"
-        assert "wrist_3_joint 1.43" in finding.words and "wrist_2_joint" not in finding.words
+        assert (finding.level, finding.joints) == ("doubtful", (5,))
+        assert finding.each["ratio"] == pytest.approx((1.0 / 0.7,))
         assert inertia_ratio(model, values, position, 0.0 * diagonal) is None
 
 

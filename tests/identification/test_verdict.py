@@ -7,10 +7,9 @@ import numpy as np
 import pinocchio as pin
 import pytest
 
-from identification.estimators.delay import DelayEstimate
 from identification.estimators.least_squares import estimate_repetitions
 from identification.estimators.prior import body_prior
-from identification.factor.estimate import Estimate, estimate
+from identification.factor.estimate import estimate
 from identification.factor.factor import Factor
 from identification.hypotheses import column_search
 from identification.hypotheses.carried_load import CarriedLoad
@@ -18,22 +17,21 @@ from identification.hypotheses.changes import DISCRETE, Change, Part
 from identification.hypotheses.column_scores import ScorePrior
 from identification.hypotheses.column_search import (
     ExplainedFit,
-    Explanation,
     find_columns_of_unseen,
 )
 from identification.hypotheses.columns import ColumnSums
-from identification.hypotheses.diagnosis import RigidTorque, TorqueDiagnosis, diagnose
+from identification.hypotheses.diagnosis import diagnose
 from identification.hypotheses.sizes import estimated_size
 from identification.hypotheses.unseen_changes import UnseenChange
 from identification.model.known_payload import Payload
 from identification.model.robot import RobotModel
 from identification.text import percentage
-from identification.validation.evidence import CellContext, Evidence, gather
-from identification.validation.facts.errors import LEFT_OPEN
+from identification.validation.evidence import gather
 from identification.validation.finding import Thresholds
+from identification.validation.finding_messages import LEFT_OPEN
 from identification.validation.nominal_scale import NominalScale
 from identification.validation.physical_signs import Implausible, TopSpeedFriction
-from identification.validation.prediction import PredictionError, noise_floor
+from identification.validation.prediction import noise_floor
 from identification.validation.purpose import Purpose
 from identification.validation.residuals import (
     HARMONICS,
@@ -47,6 +45,17 @@ from identification.validation.verdict import judge
 from sim_fixtures.ns16 import load_truth, urdf_text
 from tests import messages
 from tests.identification import two_link
+from tests.identification.evidence import (
+    LATE,
+    NOTHING,
+    an_error,
+    an_estimate,
+    caused,
+    explained,
+    found,
+    judged,
+    negative,
+)
 from tests.identification.robots import ns16_values
 from tests.identification.two_link import as_samples, four_sines, sine_motion
 
@@ -123,7 +132,7 @@ class TestValidCampaign:
         assert "predicts unseen motion well" in verdict.line
         assert percentage(evidence.held_out.overall, 1) in verdict.line
         assert evidence.systematic.max() < 0.5 * Thresholds().systematic
-        assert not {"gravity", "load", "outliers"} & {finding.check for finding in verdict.findings}
+        assert not {"gravity", "load", "outliers"} & {finding.key for finding in verdict.findings}
         assert np.degrees(evidence.gravity.angle) < 0.5
 
     def test_unmodelled_effects_stay_good(self):
@@ -154,7 +163,7 @@ class TestOneSidedErrors:
         verdict, evidence = campaign(wrong=(what, axis))
         assert not verdict.good and "must not be relied on" in verdict.line
         assert evidence.load.explained < Thresholds().load or evidence.load.axes < 3
-        assert not {"gravity", "load"} & {finding.check for finding in verdict.findings}
+        assert not {"gravity", "load"} & {finding.key for finding in verdict.findings}
         if what == "gear" and axis < 3:
             first = evidence.diagnosis.steps[0]
             assert first.change.meaning == "axis sign"
@@ -233,66 +242,18 @@ class TestUnseenMotion:
 
 # Verdicts on given evidence
 
-AXES = ("one", "two")
-
-
-def an_error(relative, joints=2):
-    """Prediction error of given relative size in 1000 rows of torques of RMS 10."""
-    rows = np.full(joints, 1000)
-    zero = np.zeros(joints)
-    torque = np.full(joints, 1e5)
-    squared = torque * np.broadcast_to(relative, joints) ** 2
-    return PredictionError(rows, np.sqrt(squared), zero, squared, zero, torque)
-
-
-def an_estimate(**changes):
-    fields = {
-        "names": ("a", "b"), "units": ("kg", "kg"), "values": np.ones(2), "covariance": np.eye(2),
-        "noise_std": np.ones(2), "samples": np.full(2, 1000), "method": "", "condition": 10.0,
-    }  # fmt: skip
-    return Estimate(**(fields | changes))
-
-
-def judged(names=AXES, **changes):
-    """Return the verdict on good evidence with changes; those of the context by name."""
-    context_fields = CellContext.__dataclass_fields__.keys() & changes.keys()
-    around = {name: changes.pop(name) for name in context_fields}
-    asked = {name: changes.pop(name) for name in ("purposes", "asked") if name in changes}
-    evidence = Evidence(an_estimate(), held_out=an_error(0.05), training=an_error(0.04))
-    return judge(names, replace(evidence, context=CellContext(**around), **changes), **asked)
-
-
-def finding_of(check, names=AXES, **changes):
-    """Return the only finding of a check."""
-    (only_finding,) = (
-        finding for finding in judged(names, **changes).findings if finding.check == check
-    )
-    return only_finding
-
-
-RIGID = RigidTorque(1.0, 0.01, np.full(2, np.inf), 0.05)
 BEGUN = Part("A.mcap from 3 s on", (False, True))
-
-NOTHING = TorqueDiagnosis(None, RIGID, None, ())
-"""That of an arm as described, with nothing that explains an error."""
-
-
-def explained(change, ratio, size=0.01, std=0.001):
-    """The diagnosis of an arm as described, with one change that explains an error."""
-    return TorqueDiagnosis(None, RIGID, None, (Explanation(change, ratio, size, std),))
-
-
-def caused(meaning, *joints, ratio=0.4, part=None):
-    return explained(Change(meaning, joints, part=part), ratio)
-
-
-LATE = DelayEstimate(
-    delay=0.003, std=1e-4, assumed=0.0, cycle=0.001, interval_factor=2.0, reason=None,
-    significant=True,
-)  # fmt: skip
 # Torque 10 ± 0.3 (constant gravity), error 0.5: 5 % of the torque, no variance explained.
 HEAVY = replace(an_error(0.05), torque_sum=np.array([1000 * np.sqrt(100.0 - 0.09), 0.0]))
 MANY = tuple(f"p{k}" for k in range(12))
+
+
+def assert_figures(finding, figures):
+    """Compare figures of a finding, or of the joints that it names."""
+    known = {**finding.values, **finding.each}
+    assert {name: known[name] for name in figures} == {
+        name: pytest.approx(value) for name, value in figures.items()
+    }
 
 
 class TestJudgement:
@@ -304,36 +265,79 @@ class TestJudgement:
         )
 
     @pytest.mark.parametrize(
-        ("changes", "message"),
+        ("changes", "key", "joints", "figures"),
         [
-            ({"held_out": an_error(0.2)}, "over all axes, limit 10 %"),
-            ({"held_out": an_error(np.array([0.01, 0.4]))}, "exceeds 35 %: two 40 %"),
-            ({"training": an_error(0.05), "held_out": an_error(0.2)}, "one 4.0 times, 20.0 %"),
-            ({"moved": np.array([9.0, 0.4])}, "two moved for less than 0.5 s"),
-            ({"held_out": HEAVY}, "model of one predicts no better than the mean torque"),
-            ({"estimate": an_estimate(undetermined=MANY)}, ", ".join(MANY)),
-            ({"nominal": an_error(0.03)}, "nominal model predicts better"),
-            ({"diagnosis": caused("axis sign", 0)}, "one probably turns opposite to the URDF"),
-            ({"diagnosis": caused("torque sign", 1)}, "torque of two has probably the wrong sign"),
+            ({"held_out": an_error(0.2)}, "overall error", (), {"limit": 0.1}),
             (
-                {"diagnosis": caused("torque order", 0, 1)},
-                "torques of one and two are probably interchanged",
+                {"held_out": an_error(np.array([0.01, 0.4]))},
+                "axis error on unseen motion alone",
+                (1,),
+                {"relative": (0.4,), "limit": 0.35},
             ),
-            ({"diagnosis": caused("joint order", 0, 1)}, "positions and torques of one and two"),
-            ({"diagnosis": caused("delay")}, "of all axes lags the position by 10 ± 2 ms more"),
-            ({"diagnosis": caused("scale", 1)}, "the torque of two is 1.01 ± 0.002 times"),
-            ({"disagreement": np.array([0.2, 0.0])}, "single repetitions differ by more than 10 %"),
-            ({"implausible": Implausible(("m1 is negative",), ())}, "m1 is negative"),
+            (
+                {"training": an_error(0.05), "held_out": an_error(0.2)},
+                "generalisation",
+                (0, 1),
+                {"growth": (4.0, 4.0), "relative": (0.2, 0.2)},
+            ),
+            ({"moved": np.array([9.0, 0.4])}, "joints at rest", (1,), {"least": 0.5}),
+            ({"held_out": HEAVY}, "nothing explained", (0,), {}),
+            (
+                {"estimate": an_estimate(undetermined=MANY)},
+                "undetermined",
+                (),
+                {"parameters": MANY},
+            ),
+            (
+                {"nominal": an_error(0.03)},
+                "nominal model better",
+                (),
+                {"nominal": 0.03, "identified": 0.05},
+            ),
+            ({"diagnosis": caused("axis sign", 0)}, "axis sign", (0,), {"ratio": 0.4}),
+            ({"diagnosis": caused("torque sign", 1)}, "torque sign", (1,), {}),
+            ({"diagnosis": caused("torque order", 0, 1)}, "torque order", (0, 1), {}),
+            ({"diagnosis": caused("joint order", 0, 1)}, "joint order", (0, 1), {}),
+            (
+                {"diagnosis": caused("delay")},
+                "delay of the torque",
+                (),
+                {"size": 10.0, "half_interval": 2.0, "difference": 0.01},
+            ),
+            (
+                {"diagnosis": caused("scale", 1)},
+                "torque constant",
+                (1,),
+                {"size": 1.01, "half_interval": 0.002},
+            ),
+            (
+                {"disagreement": np.array([0.2, 0.0])},
+                "different repetitions",
+                (0,),
+                {"difference": (0.2,)},
+            ),
+            (
+                {"implausible": Implausible((negative("m1"),), ())},
+                "negative parameter",
+                (),
+                {"value": -1.0},
+            ),
             (
                 {"held_out": an_error(0.12), "noise_floor": np.full(2, 0.1), "diagnosis": NOTHING},
-                "is 12.0 %, 12.0 times the noise floor of 1.0 %; none",
+                "unexplained error",
+                (),
+                {"overall": 0.12, "floors": 12.0, "floor": 0.01},
             ),
         ],
     )
-    def test_wrong_findings_are_reasons(self, changes, message):
+    def test_wrong_findings_are_reasons(self, changes, key, joints, figures):
         verdict = judged(**changes)
         assert not verdict.good
-        assert any(message in reason for reason in verdict.reasons)
+        finding = found(**changes)[key]
+        assert (finding.level, finding.joints) == ("wrong", joints)
+        assert_figures(finding, figures)
+        (named,) = (each for each in verdict.findings if each.key == key)
+        assert named.words in verdict.reasons
         assert verdict.reasons[0] in verdict.line
 
     @pytest.mark.parametrize(("floor", "good"), [(0.1, False), (0.8, True)])
@@ -378,22 +382,46 @@ class TestJudgement:
         assert "feed-forward" not in verdict.line
 
     @pytest.mark.parametrize(
-        ("changes", "message"),
+        ("changes", "key", "joints", "figures"),
         [
-            ({"diagnosis": caused("scale", 1, ratio=0.85)}, "torque of two is 1.01"),
-            ({"controller": an_error(0.02)}, "controller's own dynamic model predicts better"),
-            ({"saturated": np.array([0.0, 0.04])}, "two in 4.0 % of its samples"),
-            ({"estimate": an_estimate(condition=450.0)}, "excites the parameters poorly"),
-            ({"implausible": Implausible((), ("I2m is negative",))}, "I2m is negative"),
-            ({"training": an_error(0.01)}, "one 5.0 times"),
-            ({"friction_change": np.array([0.0, -0.05])}, "two -5 %"),
-            ({"systematic": np.array([0.025, 0.0])}, "exceeds 2.0 %: one 2.5 %"),
-            ({}, "cannot be distinguished from noise"),
+            (
+                {"diagnosis": caused("scale", 1, ratio=0.85)},
+                "torque constant",
+                (1,),
+                {"size": 1.01},
+            ),
+            ({"controller": an_error(0.02)}, "controller's model better", (), {}),
+            ({"saturated": np.array([0.0, 0.04])}, "saturation", (1,), {"saturated": (0.04,)}),
+            ({"estimate": an_estimate(condition=450.0)}, "poor excitation", (), {}),
+            (
+                {"implausible": Implausible((), (negative("I2m"),))},
+                "negative parameter",
+                (),
+                {"name": "I2m"},
+            ),
+            ({"training": an_error(0.01)}, "generalisation", (0, 1), {"growth": (5.0, 5.0)}),
+            (
+                {"friction_change": np.array([0.0, -0.05])},
+                "slightly changed friction",
+                (1,),
+                {"change": (-0.05,)},
+            ),
+            (
+                {"systematic": np.array([0.025, 0.0])},
+                "systematic error",
+                (0,),
+                {"slow": (0.025,), "limit": 0.02},
+            ),
+            ({}, "no repetitions", (), {}),
         ],
     )
-    def test_doubtful_findings_are_warnings(self, changes, message):
+    def test_doubtful_findings_are_warnings(self, changes, key, joints, figures):
         verdict = judged(**changes)
-        assert verdict.good and any(message in warning for warning in verdict.warnings)
+        finding = found(**changes)[key]
+        assert (finding.level, finding.joints) == ("doubtful", joints)
+        assert_figures(finding, figures)
+        (named,) = (each for each in verdict.findings if each.key == key)
+        assert verdict.good and named.words in verdict.warnings
 
     @pytest.mark.parametrize(
         ("meaning", "part"),
@@ -403,11 +431,8 @@ class TestJudgement:
         ],
     )
     def test_each_explanation_has_a_message_and_a_step(self, meaning, part):
-        (cause,) = (
-            finding
-            for finding in judged(diagnosis=caused(meaning, 0, 1, part=part)).findings
-            if finding.role == "cause"
-        )
+        verdict = judged(diagnosis=caused(meaning, 0, 1, part=part))
+        (cause,) = (finding for finding in verdict.findings if finding.role == "cause")
         assert not {"{", "}"} & {*cause.words, *cause.next_step} and cause.next_step
 
     @pytest.mark.parametrize("error", [0.05, 0.5])
@@ -427,13 +452,15 @@ class TestJudgement:
             error = replace(
                 error, squared=error.squared * power, torque_squared=error.torque_squared * power
             )
-            return judged(held_out=error, training=error, **context)
+            return {"held_out": error, "training": error, **context}
 
-        assert not axes(0.03).good
-        assert axes(0.01).good
-        assert any("two 60 % of 0.1 N·m" in warning for warning in axes(0.01).warnings)
-        assert axes(0.03, noise_floor=np.array([0.1, 0.2])).good
-        assert axes(0.03, torque_limit=np.array([30.0, 100.0])).good
+        assert not judged(**axes(0.03)).good
+        assert judged(**axes(0.01)).good
+        warning = found(**axes(0.01))["axis error of little torque"]
+        assert (warning.level, warning.joints, warning.remedy) == ("doubtful", (1,), "move faster")
+        assert_figures(warning, {"relative": (0.6,), "torque": (0.1,), "unit": ("N·m",)})
+        assert judged(**axes(0.03, noise_floor=np.array([0.1, 0.2]))).good
+        assert judged(**axes(0.03, torque_limit=np.array([30.0, 100.0]))).good
 
     @pytest.mark.parametrize("power", [1.0, 1e-8])
     def test_an_error_beyond_all_torque_is_no_noise(self, power):
@@ -443,21 +470,26 @@ class TestJudgement:
         error = replace(
             error, squared=error.squared * size, torque_squared=error.torque_squared * size
         )
-        verdict = judged(held_out=error, training=error)
-        assert any("56738 %" in words for words in (*verdict.reasons, *verdict.warnings))
-        steps = " ".join(finding.next_step for finding in verdict.findings)
-        assert "check sign, gear ratio and torque constant of two" in steps
-        assert "faster" not in steps
+        findings = found(held_out=error, training=error)
+        of_axis = [finding for finding in findings.values() if "relative" in finding.each]
+        assert {finding.joints for finding in of_axis} == {(1,)}
+        assert_figures(of_axis[0], {"relative": (567.38,)})
+        assert {finding.remedy for finding in of_axis} <= {
+            "check the drives",
+            "check the drives and the unit",
+        }
+        assert "move faster" not in {finding.remedy for finding in findings.values()}
 
     def test_an_error_of_rounding_does_not_grow(self):
-        tiny = {"training": an_error(1e-7), "held_out": an_error(1e-6)}
-        assert not {"generalisation", "outliers"} & {
-            finding.check for finding in judged(**tiny).findings if finding.level != "good"
-        }
+        findings = found(training=an_error(1e-7), held_out=an_error(1e-6))
+        assert not {"generalisation", "outliers"} & findings.keys()
 
     def test_a_joint_several_times_worse_than_its_fit_is_not_good(self):
         changes = {"training": an_error(np.array([0.05, 0.015])), "held_out": an_error(0.1)}
-        assert any("two 6.7 times, 10.0 %" in reason for reason in judged(**changes).reasons)
+        assert not judged(**changes).good
+        finding = found(**changes)["generalisation"]
+        assert finding.joints == (1,)
+        assert_figures(finding, {"growth": (0.1 / 0.015,), "relative": (0.1,)})
 
     def test_nor_is_one_whose_share_grew_more_than_its_error(self):
         """Twice the error, of less torque."""
@@ -467,8 +499,10 @@ class TestJudgement:
         unseen = replace(
             unseen, squared=unseen.squared * less, torque_squared=unseen.torque_squared * less
         )
-        (reason,) = judged(training=fitted, held_out=unseen).reasons
-        assert "two 3.0 times, 9.0 %" in reason
+        assert len(judged(training=fitted, held_out=unseen).reasons) == 1
+        finding = found(training=fitted, held_out=unseen)["generalisation"]
+        assert (finding.level, finding.joints) == ("wrong", (1,))
+        assert_figures(finding, {"growth": (3.0,), "relative": (0.09,)})
         still = replace(
             unseen, squared=unseen.squared / 4, torque_squared=unseen.torque_squared / 4
         )
@@ -485,46 +519,54 @@ class TestJudgement:
             )
 
         changes = {"training": small([0.01, 0.013]), "held_out": small([0.01, 0.1])}
-        assert any("two 7.7 times, 10.0 %" in reason for reason in judged(**changes).reasons)
+        assert not judged(**changes).good
+        assert_figures(found(**changes)["generalisation"], {"growth": (0.1 / 0.013,)})
         assert judged(**changes, noise_floor=np.array([0.1, 0.1])).good
 
     @pytest.mark.parametrize(
-        ("change", "error", "level", "message"),
+        ("change", "error", "level"),
         [
-            (UnseenChange("gain", 1, 0.91, 0.001, 0.01), 0.1, "wrong", "two 0.91 ± 0.002"),
-            (UnseenChange("gain", 1, 0.95, 0.001, 0.01), 0.05, "doubtful", "two 0.95 ± 0.002"),
-            (UnseenChange("friction", 0, 1.3, 0.01, 0.01), 0.1, "wrong", "one +30 %"),
-            (UnseenChange("friction", 0, 1.3, 0.01, 0.01), 0.03, "wrong", "one +30 %"),
-            (UnseenChange("friction", 0, 1.3, 0.01, 0.01), 0.01, "wrong", "one +30 %"),
-            (UnseenChange("friction", 0, 1.3, 0.01, 0.01), 0.004, "doubtful", "one +30 %"),
-            (UnseenChange("friction", 0, 0.92, 0.01, 0.01), 0.1, "doubtful", "one -8 %"),
+            (UnseenChange("gain", 1, 0.91, 0.001, 0.01), 0.1, "wrong"),
+            (UnseenChange("gain", 1, 0.95, 0.001, 0.01), 0.05, "doubtful"),
+            (UnseenChange("friction", 0, 1.3, 0.01, 0.01), 0.1, "wrong"),
+            (UnseenChange("friction", 0, 1.3, 0.01, 0.01), 0.03, "wrong"),
+            (UnseenChange("friction", 0, 1.3, 0.01, 0.01), 0.01, "wrong"),
+            (UnseenChange("friction", 0, 1.3, 0.01, 0.01), 0.004, "doubtful"),
+            (UnseenChange("friction", 0, 0.92, 0.01, 0.01), 0.1, "doubtful"),
         ],
     )
-    def test_what_changed_is_named(self, change, error, level, message):
-        changes = {"changes": (change,), "held_out": an_error(error), "training": an_error(error)}
-        (cause,) = (finding for finding in judged(**changes).findings if finding.role == "cause")
-        assert cause.level == level and message in cause.words
+    def test_what_changed_is_named(self, change, error, level):
+        findings = found(changes=(change,), held_out=an_error(error), training=an_error(error))
+        (cause,) = (finding for finding in findings.values() if finding.role == "cause")
+        assert (cause.level, cause.joints) == (level, (change.joint,))
+        if change.kind == "gain":
+            assert cause.key == "changed torque"
+            assert_figures(cause, {"factor": (change.ratio,), "half_interval": (0.002,)})
+        else:
+            wrong, slight = "changed friction", "slightly changed friction"
+            assert cause.key == (wrong if level == "wrong" else slight)
+            assert_figures(cause, {"change": (change.ratio - 1.0,)})
 
     def test_torque_and_friction_that_are_alike_are_both_named(self):
         changes = (UnseenChange("friction", 1, 1.1001, 0.001, 0.01, alike=True),)
-        (cause,) = (each for each in judged(changes=changes).findings if each.role == "cause")
-        assert "another torque constant of two explains it as well" in cause.words
+        (cause,) = (each for each in found(changes=changes).values() if each.role == "cause")
+        assert cause.values["alike_joints"] == (1,)
 
     def test_a_gain_of_the_fitted_motion_alone_has_changed(self):
         """The fit shows it against the other axes, unseen motion shows that it is gone."""
         changes = (UnseenChange("gain", 1, 0.91, 0.001, 0.01),)
-        found = explained(Change("scale", (1,)), 0.4, 0.1)
+        diagnosis = explained(Change("scale", (1,)), 0.4, 0.1)
         assumed = {"scale_std": np.full(2, 0.03), "held_out": an_error(0.1)}
-        verdict = judged(diagnosis=found, changes=changes, **assumed)
-        assert any("differs from that of the fitted motion" in each for each in verdict.reasons)
+        findings = found(diagnosis=diagnosis, changes=changes, **assumed)
+        assert findings["changed torque"].level == "wrong"
 
     @pytest.mark.parametrize(("changed", "named"), [(0, False), (1, True), (None, True)])
     def test_a_torque_that_changed_is_no_reference_of_constants(self, changed, named):
         """The constant of axis 1 is relative to axis 0."""
         changes = () if changed is None else (UnseenChange("gain", changed, 0.91, 0.001, 0.01),)
-        found = caused("scale", 1, ratio=0.86)
-        findings = judged(diagnosis=found, changes=changes, held_out=an_error(0.1)).findings
-        assert named == any(finding.check == "torque constant" for finding in findings)
+        diagnosis = caused("scale", 1, ratio=0.86)
+        findings = found(diagnosis=diagnosis, changes=changes, held_out=an_error(0.1))
+        assert named == ("torque constant" in findings)
 
     @pytest.mark.parametrize(
         ("size", "ratio", "error", "level"),
@@ -541,80 +583,72 @@ class TestJudgement:
         The scale of the other torque is in the deviation of the factor. The ratio is that of both
         axes: the error of the second is multiplied by its square.
         """
-        found = explained(Change("scale", (1,)), ratio, size, 0.03)
+        diagnosis = explained(Change("scale", (1,)), ratio, size, 0.03)
         errors = {"held_out": an_error(error), "training": an_error(error)}
-        verdict = judged(diagnosis=found, scale_std=np.full(2, 0.03), **errors)
-        (finding,) = (each for each in verdict.findings if each.check == "torque constant")
-        assert finding.level == level
-        assert ("assumed uncertainty" in finding.words) == (level == "information")
+        findings = found(diagnosis=diagnosis, scale_std=np.full(2, 0.03), **errors)
+        is_assumed = level == "information"
+        key = "torque constant, as assumed" if is_assumed else "torque constant"
+        assert findings[key].level == level
+        assert ("torque constant" in findings) == (not is_assumed)
 
     def test_a_body_that_explains_the_error_is_not_unexplained(self):
         changes = {"held_out": an_error(0.1), "noise_floor": np.full(2, 0.1), "diagnosis": NOTHING}
         load = CarriedLoad(mass=2.0, explained=0.98, axes=2, half_interval=0.1)
-        reasons = " ".join(judged(**changes, load=load).reasons)
-        assert "explains 98 %" in reasons and "none of the tested faults" not in reasons
+        findings = found(**changes, load=load)
+        assert findings["load"].level == "wrong" and "unexplained error" not in findings
+        assert_figures(findings["load"], {"mass": 2.0, "explained": 0.98, "half_interval": 0.1})
 
-    def test_a_motion_in_one_direction_is_said(self):
-        verdict = judged(one_way=np.array([False, True]))
-        (direction_finding,) = (
-            finding for finding in verdict.findings if "one direction" in finding.words
-        )
-        assert direction_finding.level == "doubtful" and direction_finding.words.startswith(
-            "two moved in one direction"
-        )
-        assert (
-            direction_finding.next_step == "record a motion in which two moves in both directions"
-        )
+    def test_a_motion_in_one_direction_is_doubtful(self):
+        finding = found(one_way=np.array([False, True]))["one direction"]
+        assert (finding.level, finding.joints) == ("doubtful", (1,))
+        assert finding.remedy == "move in both directions"
 
     def test_springs_and_balancers_are_named_before_faults(self):
-        verdict = judged(held_out=an_error(0.2), training=an_error(0.2))
-        (step,) = (
-            next_step for next_step in verdict.next_steps if "[[robot.elements]]" in next_step
-        )
-        assert step.startswith("describe a spring, a balancer or a hydraulic counterweight")
-        assert "signs" in step
+        findings = found(held_out=an_error(0.2), training=an_error(0.2))
+        assert findings["overall error"].remedy == "describe elements, or check the drives"
 
     def test_it_explains_what_is_not_determined(self):
         estimate = an_estimate(undetermined=("f0_2", "fo_2", "m1"))
-        verdict = judged(estimate=estimate, one_way=np.array([False, True]))
-        direction, others = (
-            finding for finding in verdict.findings if finding.check == "excitation"
-        )
-        if "m1" in direction.words:
-            direction, others = others, direction
+        findings = found(estimate=estimate, one_way=np.array([False, True]))
+        direction, others = findings["undetermined in one direction"], findings["undetermined"]
         assert direction.level == others.level == "wrong"
-        assert "two, which moved in one direction only: two f0_2 and fo_2" in direction.words
-        assert direction.next_step == "record a motion in which two moves in both directions"
-        assert others.words == "the motion does not determine m1"
+        assert direction.joints == (1,)
+        assert_figures(direction, {"coulomb": ("f0_2",), "offset": ("fo_2",)})
+        assert direction.remedy == "move in both directions"
+        assert_figures(others, {"parameters": ("m1",)})
+        assert "one direction" not in findings
 
     def test_all_negated_torques_are_one_cause(self):
         """By the nominal model, or by friction that would drive every axis."""
-        signs = Implausible(("m1 is negative", "I2m is negative"), ())
+        signs = Implausible((negative("m1"), negative("I2m")), ())
         nominal = NominalScale(np.full(2, -1.0), np.full(2, 0.1))
         driving = TopSpeedFriction(np.full(2, -3.0), np.full(2, 0.1))
-        for symptom in ({"nominal_scale": nominal}, {"dissipation": driving}):
-            verdict = judged(implausible=signs, diagnosis=caused("axis sign", 0), **symptom)
-            (reason,) = verdict.reasons
-            assert "all torques have the opposite sign" in reason
-            assert verdict.next_steps[0].startswith("set scale = -1")
+        for symptom, key in (
+            ({"nominal_scale": nominal}, "all torques opposite"),
+            ({"dissipation": driving}, "all axes driven by friction"),
+        ):
+            findings = found(implausible=signs, diagnosis=caused("axis sign", 0), **symptom)
+            (wrong,) = (each for each in findings.values() if each.level == "wrong")
+            assert (wrong.key, wrong.remedy) == (key, "negate all torques")
 
     def test_one_negated_torque_is_named_by_the_nominal_model(self):
         scale = NominalScale(np.array([1.0, -1.0]), np.full(2, 0.1))
-        (reason,) = judged(nominal_scale=scale).reasons
-        assert "opposite sign" in reason and "two -1" in reason and "one" not in reason
+        findings = found(nominal_scale=scale)
+        (wrong,) = (each for each in findings.values() if each.level == "wrong")
+        assert (wrong.key, wrong.joints) == ("torque opposite", (1,))
+        assert_figures(wrong, {"scale": (-1.0,)})
 
     def test_friction_that_drives_one_axis_is_not_all_torques(self):
         dissipation = TopSpeedFriction(np.array([3.0, -3.0]), np.full(2, 0.1))
         assert judged(dissipation=dissipation).good
 
-    def test_good_findings(self):
-        comparison = finding_of("against the controller's model", controller=an_error(0.09))
-        assert (
-            comparison.level == "good"
-            and "is 9.0 %, of the identified model 5.0 %" in comparison.words
-        )
-        verdict = judged(systematic=np.array([0.019, 0.0]))
-        assert not any("beyond noise" in warning for warning in verdict.warnings)
+    def test_a_worse_model_of_the_controller_is_good(self):
+        comparison = found(controller=an_error(0.09))["controller's model worse"]
+        assert comparison.level == "good"
+        assert_figures(comparison, {"controller": 0.09, "identified": 0.05})
+
+    def test_a_small_slow_error_is_no_finding(self):
+        assert "systematic error" not in found(systematic=np.array([0.019, 0.0]))
 
     def test_a_delay_comes_before_torque_constants(self):
         verdict = judged(systematic=np.array([0.1, 0.1]), delays=LATE)
@@ -625,50 +659,38 @@ class TestJudgement:
     def test_a_delay_of_a_wide_interval_is_suspected(self):
         """It differs significantly, and was not applied."""
         wide = replace(LATE, delay=0.009, std=1e-3, reason="95 % interval of ± 2 ms")
-        suspected = finding_of("delay", delays=wide)
+        suspected = found(delays=wide)["suspected delay"]
         assert suspected.level == "doubtful"
-        assert "probably lags the position by 9 ± 2 ms (0 ms assumed)" in suspected.words
+        assert_figures(suspected, {"delay": 9.0, "half_interval": 2.0, "assumed": 0.0})
         for unsure in (replace(wide, significant=False), replace(wide, std=4e-3)):
-            assert not any(finding.check == "delay" for finding in judged(delays=unsure).findings)
+            assert not any("delay" in key for key in found(delays=unsure))
 
-    @pytest.mark.parametrize(
-        ("used", "level", "words"),
-        [
-            (0.0026, "doubtful", "by 3 ± 0.2 ms (0 ms stated); 2.6 ms was compensated"),
-            (0.003, "doubtful", "by 3 ± 0.2 ms (0 ms stated); this was compensated"),
-        ],
-    )
-    def test_a_delay_far_from_the_stated_one_is_doubtful(self, used, level, words):
+    @pytest.mark.parametrize(("used", "figures"), [(0.0026, {"used": 2.6}), (0.003, {})])
+    def test_a_delay_far_from_the_stated_one_is_doubtful(self, used, figures):
         """Also where the fit has one between the two."""
-        around = {"delays": LATE, "assumed_delay": used}
-        finding = finding_of("delay", **around)
-        assert (finding.level, words in finding.words) == (level, True), finding.words
+        finding = found(delays=LATE, assumed_delay=used)["compensated delay"]
+        assert finding.level == "doubtful"
+        assert_figures(finding, {"delay": 3.0, "half_interval": 0.2, "stated": 0.0} | figures)
+        assert ("used" in finding.values) == bool(figures)
 
     def test_a_delay_near_the_stated_one_is_as_assumed(self):
-        near = replace(LATE, delay=0.0005)
-        finding = finding_of("delay", delays=near, assumed_delay=0.0004)
-        assert finding.level == "good"
-        assert finding.words == (
-            "the torque lags the position by 0.5 ± 0.2 ms (0 ms stated, 0.4 ms in the fit), which "
-            "agrees with what the fit assumed"
-        )
+        finding = found(delays=replace(LATE, delay=0.0005), assumed_delay=0.0004)["assumed delay"]
+        assert finding.level == "good" and "tolerance" not in finding.values
+        assert_figures(finding, {"delay": 0.5, "half_interval": 0.2, "stated": 0.0, "used": 0.4})
 
     def test_a_delay_outside_its_interval_is_not_as_assumed(self):
         """A difference of less than 60 % of a cycle does not matter, but it is one."""
-        near = replace(LATE, delay=0.0004)
-        finding = finding_of("delay", delays=near, assumed_delay=0.0)
+        finding = found(delays=replace(LATE, delay=0.0004), assumed_delay=0.0)["assumed delay"]
         assert finding.level == "good"
-        assert "as assumed" not in finding.words
-        assert "by 0.4 ± 0.2 ms (0 ms stated), within 0.6 ms of what the fit" in finding.words
+        assert_figures(finding, {"delay": 0.4, "half_interval": 0.2, "tolerance": 0.6})
 
     def test_models_of_the_same_fit_that_predict_apart_are_named(self):
         large = an_error(0.2)
-        left_open = finding_of(LEFT_OPEN, held_out=large, open_share=0.25)
+        left_open = found(held_out=large, open_share=0.25)[LEFT_OPEN]
         assert left_open.level == "doubtful"
-        assert "(to 4.0 %) deviate by 25.0 % of the torque" in left_open.words
+        assert_figures(left_open, {"fitted": 0.04, "open": 0.25})
         for error, share in ((large, 0.15), (large, None), (an_error(0.05), 0.25)):
-            findings = judged(held_out=error, open_share=share).findings
-            assert not any(finding.check == LEFT_OPEN for finding in findings)
+            assert LEFT_OPEN not in found(held_out=error, open_share=share)
 
     def test_undetermined_repetitions_are_not_compared(self):
         changes = {"estimate": an_estimate(undetermined=MANY), "disagreement": np.array([0.8, 0.1])}
@@ -714,43 +736,49 @@ class TestPatternsOfTheResidual:
     """Those that were found by chance alone are no finding, small ones no doubt."""
 
     def test_untested_ones_have_no_finding(self, clean):
-        checks = {finding.check for finding in judged(residuals=clean).findings}
-        assert "whiteness" in checks
-        assert not {"torque ripple", "friction over time"} & checks
+        findings = found(residuals=clean)
+        assert "correlated residual" in findings
+        assert not [key for key in findings if "ripple" in key or "drift" in key]
 
     @pytest.mark.parametrize(("error", "named"), [(0.0004, False), (0.05, True)])
     def test_an_error_of_zero_has_no_outliers(self, clean, error, named):
         few = Outliers(np.full(2, 0.001), np.full(2, 0.95), an_error(0.2 * error))
-        verdict = judged(held_out=an_error(error), residuals=replace(clean, outliers=few))
-        assert ("outliers" in {finding.check for finding in verdict.findings}) == named
+        findings = found(held_out=an_error(error), residuals=replace(clean, outliers=few))
+        assert ("outliers" in findings) == named
 
     @pytest.mark.parametrize(
-        ("share", "level"), [(0.0, "good"), (0.9, "information"), (1.1, "doubtful")]
-    )
-    def test_large_ripple_is_doubtful(self, clean, share, level):
-        size = share * Thresholds().ripple
-        changed = replace(clean, ripple=ripple(size * clean.torque_rms[1]))
-        finding = finding_of("torque ripple", residuals=changed)
-        assert finding.level == level
-        assert "one" not in finding.words
-        expected = f"two (4 per motor turn, {percentage(size, 1)} of its torque)"
-        assert (expected in finding.words) == (level != "good")
-
-    @pytest.mark.parametrize(
-        ("change", "share", "level", "message"),
+        ("share", "key", "level"),
         [
-            ((1e-5, -1e-5), 1.0, "good", "did not change"),
-            ((0.02, 0.0), 1.0, "information", "one by +2.0 %, at most 2.0 % of an axis"),
-            ((0.1, 0.0), 0.2, "information", "at most 2.0 %"),
-            ((0.02, -0.2), 1.0, "doubtful", "during the recordings: two by -20.0 %"),
+            (0.0, "no ripple", "good"),
+            (0.9, "usual ripple", "information"),
+            (1.1, "large ripple", "doubtful"),
         ],
     )
-    def test_drift_is_judged_by_its_torque(self, clean, change, share, level, message):
-        changed = replace(clean, drift=drift(*change), friction_share=np.array([share, 1.0]))
-        finding = finding_of("friction over time", residuals=changed)
+    def test_large_ripple_is_doubtful(self, clean, share, key, level):
+        size = share * Thresholds().ripple
+        finding = found(residuals=replace(clean, ripple=ripple(size * clean.torque_rms[1])))[key]
         assert finding.level == level
-        assert message in finding.words
-        assert (finding.role == "cause") == (level == "doubtful")
+        if share:
+            assert finding.joints == (1,)
+            assert_figures(finding, {"harmonic": (4,), "relative": (size,)})
+
+    @pytest.mark.parametrize(
+        ("change", "share", "key", "joints"),
+        [
+            ((1e-5, -1e-5), 1.0, "no friction drift", ()),
+            ((0.02, 0.0), 1.0, "small friction drift", (0,)),
+            ((0.1, 0.0), 0.2, "small friction drift", (0,)),
+            ((0.02, -0.2), 1.0, "large friction drift", (1,)),
+        ],
+    )
+    def test_drift_is_judged_by_its_torque(self, clean, change, share, key, joints):
+        changed = replace(clean, drift=drift(*change), friction_share=np.array([share, 1.0]))
+        finding = found(residuals=changed)[key]
+        assert finding.joints == joints
+        assert finding.each.get("change", ()) == tuple(change[joint] for joint in joints)
+        assert (finding.role == "cause") == (finding.level == "doubtful")
+        if key.startswith("small"):
+            assert_figures(finding, {"most": 0.02})
 
 
 # Causes

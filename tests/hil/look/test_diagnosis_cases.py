@@ -16,7 +16,7 @@ from hil.look import look_at
 from hil.look.readings import Changes, Fact
 from hil.payload.payload_run import find_payload
 from hil.pipeline.identification import identify_archives
-from identification.validation.facts.diagnosis import NO_BODIES
+from identification.validation.finding_messages import NO_BODIES
 from tests.hil.diagnosis_cases import CASES, URDF, identified, needs_the_cases, rigid_error
 
 pytestmark = [pytest.mark.slow, needs_the_cases]

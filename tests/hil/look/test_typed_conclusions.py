@@ -24,7 +24,7 @@ from hil.look import messages as look_messages
 from hil.look.readings import Channels, Decider, Evidence, NextBest, Reading, Setting
 from hil.look.result import Aspect
 from identification.validation import verdict
-from identification.validation.finding import Facts, Finding, Naming
+from identification.validation.finding_messages import WordedFinding, worded
 from tests.hil.importers.test_log_kinds import URDF
 from tests.hil.importers.test_several_arms import robot_of_arms
 from tests.hil.simulated_logs import write_log, write_moving_log
@@ -131,21 +131,10 @@ LOGS: Mapping[str, Callable[[tuple[Floats, ...]], tuple[Floats, ...]]] = {
 }
 
 
-class _OfKeys:
-    """Facts whose findings say the name of their check and no more."""
-
-    def __init__(self, facts: Facts) -> None:
-        self._facts = facts
-
-    def findings(self, naming: Naming) -> Any:
-        for finding in self._facts.findings(naming):
-            yield _by_key(finding)
-
-
-def _by_key(finding: Finding) -> Finding:
-    step = f"{finding.check}, step" if finding.next_step else ""
-    reservation = finding.check if finding.reservation else ""
-    return replace(finding, words=finding.check, next_step=step, reservation=reservation)
+def _by_key(finding: WordedFinding) -> WordedFinding:
+    step = f"{finding.key}, step" if finding.next_step else ""
+    reservation = finding.key if finding.reservation else ""
+    return replace(finding, words=finding.key, next_step=step, reservation=reservation)
 
 
 def say_keys(patch: pytest.MonkeyPatch) -> None:
@@ -154,17 +143,13 @@ def say_keys(patch: pytest.MonkeyPatch) -> None:
     def key(value: object) -> str:
         return type(value).__name__
 
-    def of_facts(*arguments: Any) -> tuple[Any, ...]:
-        return tuple(_OfKeys(facts) for facts in facts_in_order(*arguments))
-
-    facts_in_order = verdict.facts_in_order
     patch.setattr(import_messages, "worded", key)
     patch.setattr(look_messages, "_worded", key)
     for name in ("described", "sentences", "fit_alike", "problem_of", "remedy_of"):
         for module in (import_messages, look_messages):
             if hasattr(module, name):
                 patch.setattr(module, name, key)
-    patch.setattr(verdict, "facts_in_order", of_facts)
+    patch.setattr(verdict, "worded", lambda *arguments: _by_key(worded(*arguments)))
 
 
 MESSAGES = frozenset(
@@ -178,14 +163,14 @@ MESSAGES = frozenset(
 
 
 def without_messages(value: Any) -> Any:
-    """Return JSON without messages; findings by check, level and role."""
+    """Return JSON without messages; findings by key, level and role."""
     if isinstance(value, list):
         return [without_messages(item) for item in value]
     if not isinstance(value, dict):
         return value
     kept = {k: without_messages(v) for k, v in value.items() if k not in MESSAGES}
     if isinstance(findings := value.get("findings"), list):
-        kept["findings"] = [(each["check"], each["level"], each["role"]) for each in findings]
+        kept["findings"] = [(each["key"], each["level"], each["role"]) for each in findings]
     return kept
 
 

@@ -71,8 +71,8 @@ class TestFrictionLaw:
 
     def test_a_term_that_nobody_stated_is_said(self):
         (finding,) = friction_findings(self.BASIC, self.BASIC.changed({"load": True}))
-        assert finding.level == "information"
-        assert "Coulomb, viscous, load, offset" in finding.words
+        assert (finding.key, finding.level) == ("chosen friction law", "information")
+        assert finding.values["law"] == "Coulomb, viscous, load, offset"
 
     @pytest.mark.parametrize("stated", [{"third": "quadratic"}, {"stribeck": 0.1}, {"load": True}])
     def test_a_stated_term_that_goes_is_a_warning(self, stated):
@@ -80,7 +80,7 @@ class TestFrictionLaw:
         assert finding.level == "doubtful"
         terms = {"quadratic": "quadratic", 0.1: "stribeck=0.1", True: "load"}
         (term,) = stated.values()
-        assert f"{terms[term]},offset`" in finding.next_step
+        assert finding.values["option"].endswith(f"{terms[term]},offset")
 
     def test_the_stated_law_is_not_mentioned(self):
         assert friction_findings(self.BASIC, self.BASIC, chosen=0) == []
@@ -111,11 +111,11 @@ class TestResolution:
         cell = SimpleNamespace(joint_names=("shoulder", "elbow"), model=model)
         sources = SimpleNamespace(cell=cell, training=[SimpleNamespace(recording=recording)])
         findings = [*_resolution(SimpleNamespace(sources=sources, fitted=[samples]))]
-        assert [finding.check for finding in findings] == ["resolution"] * named
+        assert [finding.key for finding in findings] == ["coarse positions at rest"] * named
         if named:
-            assert "shoulder 0.0002, elbow 0.0002; friction reverses over 0.0001" in (
-                findings[0].words
-            )
+            assert findings[0].joints == (0, 1)
+            assert findings[0].each["step"] == pytest.approx((2e-4, 2e-4))
+            assert findings[0].values["presliding"] == 1e-4
 
 
 @pytest.mark.parametrize(
@@ -139,6 +139,6 @@ def test_a_sampling_rate_that_folds_noise_is_named(every, bandwidth, named):
     )
     estimate = SimpleNamespace(values=np.ones(MODEL.n_parameters))
     findings = [*_sampling_rate(prepared, estimate)]
-    assert [finding.check for finding in findings] == ["sampling rate"] * named
+    assert [finding.key for finding in findings] == ["folded noise"] * named
     if named:
-        assert "at 50 Hz the torque has noise up to half this rate" in findings[0].words
+        assert findings[0].values["rate"] == pytest.approx(50.0)

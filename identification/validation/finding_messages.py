@@ -1,0 +1,851 @@
+"""Findings in words: a sentence for each key, a next step for each remedy.
+
+Sentences are format strings of what a finding has: its `values`, `{motion}` (the motion that was
+predicted), `{joints}` (names of its joints), `{axes}` (the same with "and", or all of them),
+`{joint}` and `{other}` of a pair, `{numbers}` (from 1), and `{each}`: its joints, each with an
+entry of its own figures. `{x:pc1}` is a percentage of one decimal as on pages, `{x:more}` "more" or
+"less" by its sign.
+"""
+
+from __future__ import annotations
+
+import string
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any, Final, NamedTuple
+
+from identification.hypotheses.changes import COUPLED, IN_ORDER, SIGNS, Change, Meaning
+from identification.hypotheses.column_search import UNSEEN
+from identification.text import joined, percentage
+from identification.validation.consistency import ELEMENTS
+from identification.validation.finding import (
+    Finding,
+    FindingKey,
+    Level,
+    RemedyKey,
+    RepeatedSamples,
+    Role,
+)
+from identification.validation.position_jumps import PositionJump
+
+UNTESTED: Final = "tested"
+"""Name of the check whether every joint was tested on held-out motion."""
+IMPOSSIBLE: Final = "physical signs"
+"""Name of the check whether bodies with these parameters can exist."""
+NO_BODIES: Final = "bodies in the torque"
+"""Name of the check whether the torque is that of an arm."""
+ARM: Final = "arm of the URDF"
+"""Name of the check whether the model is that of the described arm."""
+FORM: Final = "form of friction"
+"""Name of the check whether a friction law lacks a term."""
+LEFT_OPEN: Final = "left open by the motion"
+"""Name of the check whether models of the same fit predict alike."""
+
+
+@dataclass(frozen=True)
+class WordedFinding:
+    """A finding in words."""
+
+    check: str  # name of the check
+    # "wrong": the model must not be used; "doubtful": a warning; "information": neutral
+    level: Level
+    words: str  # message without full stop
+    next_step: str = ""  # remedy; empty if none is needed
+    # a "cause" explains errors; the step of a "symptom" is given only if no cause was found
+    role: Role = "condition"
+    # what a model that predicts well must not be used for without care, for the verdict's sentence
+    reservation: str = ""
+    # share of the squared error that is gone with this corrected, 0 to 1; None: not measured
+    explains: float | None = None
+    # indices of the joints that it names; empty if it names none
+    joints: tuple[int, ...] = ()
+    key: str = ""  # what was found; stays when the words change; empty in earlier files
+
+
+@dataclass(frozen=True)
+class Naming:
+    """Names in messages: those of the joints, and of the motion that was predicted."""
+
+    joints: tuple[str, ...] = ()
+    motion: str = UNSEEN
+
+    def all_of(self, joints: Sequence[int]) -> str:
+        """Return joints by their indices."""
+        return joined([self.joints[joint] for joint in joints])
+
+
+class Optional(NamedTuple):
+    """Words for which a finding may lack the figures."""
+
+    words: str
+    otherwise: str = ""  # words in that case
+
+
+class Sentence(NamedTuple):
+    """How a finding is worded."""
+
+    check: str
+    words: str
+    each: str = ""  # entry of a joint
+    reservation: str = ""
+    optional: Mapping[str, Optional] = {}  # by their names in the words
+
+
+def worded(finding: Finding, naming: Naming) -> WordedFinding:
+    """Return a finding in words."""
+    sentence = SENTENCES[finding.key]
+    text = _Text(finding, naming, sentence)
+    return WordedFinding(
+        check=text.of(sentence.check),
+        level=finding.level,
+        words=text.of(sentence.words),
+        next_step="" if finding.remedy is None else text.of(REMEDIES[finding.remedy]),
+        role=finding.role,
+        reservation=text.of(sentence.reservation),
+        explains=finding.explains,
+        joints=finding.joints,
+        key=finding.key,
+    )
+
+
+class _Text(string.Formatter):
+    """Format strings filled with what a finding has."""
+
+    def __init__(self, finding: Finding, naming: Naming, sentence: Sentence) -> None:
+        names = [naming.joints[joint] for joint in finding.joints]
+        self._naming = naming
+        self._fields: dict[str, Any] = {
+            "motion": naming.motion,
+            "joints": joined(names),
+            "axes": " and ".join(names) or "all axes",
+            "joint": names[0] if names else "",
+            "other": names[-1] if names else "",
+            "numbers": ", ".join(str(joint + 1) for joint in finding.joints),
+            **finding.values,
+        }
+        entries = []
+        for row, name in enumerate(names):
+            figures = {key: figures[row] for key, figures in finding.each.items()}
+            entries.append(f"{name} {self.vformat(sentence.each, (), figures)}")
+        self._fields["each"] = joined(entries)
+        for name, (words, otherwise) in sentence.optional.items():
+            needed = {field for _, field, _, _ in self.parse(words) if field}
+            is_known = needed <= self._fields.keys()
+            self._fields[name] = self.of(words) if is_known else otherwise
+
+    def of(self, text: str) -> str:
+        return self.vformat(text, (), self._fields)
+
+    def format_field(self, value: Any, format_spec: str) -> str:
+        match value:
+            case Change() if format_spec == "check":
+                return _CHECKS[value.meaning]
+            case Change():
+                return _change(value, self._naming)
+            case PositionJump():
+                after = f"after {value.time:.3f} s of {value.recording}"
+                size = "" if format_spec == "time" else f"by {value.size:+.3g} "
+                return f"{value.joint} {size}{after}"
+            case RepeatedSamples():
+                return f"{value.joint} {value.count} in {value.recording}"
+            case tuple() if format_spec == "names":
+                return self._naming.all_of(value)
+            case tuple():
+                most = int(format_spec) if format_spec.isdecimal() else len(value)
+                entry_spec = format_spec if format_spec.endswith("f") else ""
+                entries = [self.format_field(entry, entry_spec) for entry in value]
+                return " or ".join(entries) if format_spec == "or" else joined(entries, most)
+            case float() if format_spec == "more":
+                return "more" if value > 0.0 else "less"
+            case float() if "pc" in format_spec:
+                decimals = int(format_spec[-1])
+                return percentage(value, decimals, signed=format_spec.startswith("+"))
+        return format(value, format_spec)
+
+
+_SIGN: Final = "direction of axes"
+_ORDER: Final = "order of joints"
+_COUPLED_ANGLES: Final = "coupled angles"
+_CHECKS: Final[Mapping[Meaning, str]] = {
+    **dict.fromkeys(SIGNS, _SIGN),
+    **dict.fromkeys(IN_ORDER, _ORDER),
+    **dict.fromkeys(COUPLED, _COUPLED_ANGLES),
+}
+_QUANTITIES: Final[Mapping[Meaning, str]] = {
+    "torque sign": "torque",
+    "position sign": "position",
+    "axis sign": "position and torque",
+    "torque order": "torques",
+    "position order": "positions",
+    "joint order": "positions and torques",
+}
+
+
+def _change(change: Change, naming: Naming) -> str:
+    """Return a sign, an order or a coupled angle in words."""
+    joints = naming.all_of(change.joints)
+    if change.meaning in _QUANTITIES:
+        done = "negated" if change.meaning in SIGNS else "interchanged"
+        return f"{_QUANTITIES[change.meaning]} of {joints} {done}"
+    joint, other = (naming.joints[index] for index in change.joints)
+    sign = "plus" if change.meaning == "angle sum" else "less"
+    return f"an angle of {joint} {sign} that of {other}"
+
+
+_CORRECTED: Final = Optional(
+    "; correcting this multiplies the error of predicted parts of {whole} by {ratio:.2f}"
+)
+
+
+def _fault(check: str, words: str) -> Sentence:
+    """Return the sentence of a change, with the error that is left with it corrected if known."""
+    return Sentence(check, f"{words}{{corrected}}", optional={"corrected": _CORRECTED})
+
+
+_CONSTANT: Final = (
+    "the torque of {axes} is {size:.3g} ± {half_interval:.2g} times the value consistent with the"
+    " other axes"
+)
+_EXCEEDS: Final = "the torque error on {motion} exceeds {limit:pc0}"
+_SLOW: Final = "the torque error on {motion} beyond noise exceeds {limit:pc1}: {each}"
+_ROWS_EQUAL: Final = (
+    "the residual is correlated over {memory:.3g} ms (median axis), {rows} rows equal {worth:.0f}"
+    " independent ones, for {parameters} parameters"
+)
+_OF_RESIDUAL: Final = (
+    "({error:+.3g} {torque_unit} about {at:.2g} {unit}, {relative:pc1} of its torque)"
+)
+_RIPPLE: Final = "({harmonic} per motor turn, {relative:pc1} of its torque)"
+_COARSE: Final = "the positions have a coarse resolution [rad or m]: {each}"
+_LAW: Final = "the friction law is {law}, chosen by inner prediction; the recordings state {stated}"
+_NEAREST: Final = "none of the tested explanations fits the recording; the nearest is"
+_TORQUE_LAGS: Final = "the torque lags the position by {delay:.3g} ± {half_interval:.2g} ms"
+_ALIKE: Final = Optional("; another torque constant of {alike_joints:names} explains it as well")
+_WITH_FRICTION: Final = Optional(" ({fitted_friction:pc1} with fitted friction)")
+_AT_SPEED: Final = (
+    "friction of {name} is {value:.3g} at its top speed of {speed:.3g}, less than half of its"
+    " Coulomb friction {coulomb:.3g}"
+)
+
+SENTENCES: Final[Mapping[FindingKey, Sentence]] = {
+    "nothing held out": Sentence(UNTESTED, "no motion was held out: all errors are in-sample"),
+    "joints at rest": Sentence(UNTESTED, "{joints} moved for less than {least:g} s of {motion}"),
+    "no torque": Sentence(UNTESTED, "the measured torque of {joints} is zero throughout {motion}"),
+    "position jumps": Sentence(
+        "position jumps",
+        "the measured position jumped faster than an arm can move (rad or m): {jumps:3}",
+    ),
+    "faulty rows": Sentence("rows", "{recording}: {fault}"),
+    "spikes": Sentence(
+        "rows",
+        "samples of the torque stand out alone and are left out of fit and error: {each} of {rows}"
+        " of the fitted motion",
+        "{count:g}",
+    ),
+    "commanded positions": Sentence(
+        "positions",
+        "the positions of {recordings:6} are the commands, bit for bit: the arm follows them late"
+        "{lag}, and every speed and acceleration is that of the plan, not of the arm",
+        optional={"lag": Optional(", here by about {delay:.0f} ms")},
+    ),
+    "counted rows": Sentence(
+        "time",
+        "the times of {recording} count its rows, and the map reads them in {unit}: with another"
+        " cycle of the controller, speeds and accelerations are wrong by the same factor in all"
+        " joints",
+    ),
+    "retimed": Sentence("clock", "{recordings:6}: {times}"),
+    "repeated samples": Sentence(
+        "clock",
+        "the log repeats position samples, has them late or lacks rows: {samples:6} (first:"
+        " {first:time}); the arm moved on",
+    ),
+    "unwrapped angles": Sentence(
+        "wrapped angles", "angles that wrap at a whole turn were unwrapped: {angles:6}"
+    ),
+    "coarse positions": Sentence(
+        "resolution",
+        f"{_COARSE}; more than {{limit:pc0}} of the accelerations is rounding error",
+        "{step:.2g}",
+    ),
+    "coarse positions at rest": Sentence(
+        "resolution",
+        f"{_COARSE}; friction reverses over {{presliding:.2g}}, so that its direction at rest is"
+        " that of rounding",
+        "{step:.2g}",
+    ),
+    "folded noise": Sentence(
+        "sampling rate",
+        "at {rate:.3g} Hz the torque has noise up to half this rate; sampling folds it to below"
+        " {bandwidth:g} Hz, where it is {noise:pc0} of the squared residual",
+    ),
+    "saturation": Sentence(
+        "saturation",
+        "torque or current was at its limit: {each}; the true value may be larger",
+        "in {saturated:pc1} of its samples",
+    ),
+    "no saturation": Sentence("saturation", "no torque or current was at its limit"),
+    "undetermined": Sentence("excitation", "the motion does not determine {parameters}"),
+    "undetermined in one direction": Sentence(
+        "excitation",
+        "the motion determines only the sum of Coulomb friction and offset of the torque of"
+        " {joints}, which moved in one direction only: {each}",
+        "{coulomb} and {offset}",
+    ),
+    "poor excitation": Sentence(
+        "excitation",
+        "the motion excites the parameters poorly: condition number {condition:.0f} of the"
+        " regressor with unit columns, limit {limit:.0f}; predictions are reliable for similar"
+        " motions only, single parameters are not",
+    ),
+    "one direction": Sentence(
+        "excitation",
+        "{joints} moved in one direction only on the fitted motion: Coulomb friction and offset of"
+        " the torque are one column of the regressor there, and only their sum is determined",
+    ),
+    "good excitation": Sentence(
+        "excitation",
+        "the motion determines every parameter: condition number {condition:.0f} of the regressor"
+        " with unit columns",
+    ),
+    "no bodies": Sentence(
+        NO_BODIES,
+        "there is next to nothing of bodies in the torque, at most {over_friction:pc0} of its"
+        " friction on any axis, and {scale:.2g} times what the masses of the URDF need: a model of"
+        " the arm was subtracted from it, as by a controller that reports external torque",
+    ),
+    "no gravity": Sentence(
+        "gravity",
+        "gravity was removed from the torque: without it, the fitted motion is predicted with"
+        " {ratio:.2f} times the error",
+    ),
+    "zeros": Sentence(
+        "zeros",
+        "the zeros of joints are other than those of the URDF: {each} to be added; with that, rows"
+        " that did not choose it are predicted with {error:pc0} of the error",
+        "{degrees:+.1f}°",
+    ),
+    "zeros, nearest": Sentence(
+        "zeros",
+        f"{_NEAREST} zeros of joints other than those of the URDF ({{each}})",
+        "{degrees:+.1f}°",
+    ),
+    "alike": Sentence(
+        "{change:check}",
+        "several explanations fit alike: {alike:or}; with each of them, rows that did not choose"
+        " it are predicted with {error:pc0} of the error",
+    ),
+    "nearest": Sentence("{change:check}", f"{_NEAREST} {{change}}"),
+    "another arm": Sentence(ARM, "its masses would be {scale:.2g} times those described"),
+    "gravity": Sentence(
+        "gravity",
+        "with gravity ({best}) m/s² in base axes, {angle:.0f}° from the declared ({declared})"
+        " m/s², {motion} is predicted with {error:.2f} times the error",
+    ),
+    "scale of the torque": Sentence(
+        "scale of the torque",
+        "ratio of measured torque to the torque of the nominal inertias: {each}",
+        "{scale:.3g} ± {tolerance:.2g}",
+    ),
+    "all torques opposite": Sentence(
+        _SIGN,
+        "all torques have the opposite sign of the nominal inertial torques: ratio {each}",
+        "{scale:.2g}",
+    ),
+    "all axes driven by friction": Sentence(
+        _SIGN,
+        "all torques have the opposite sign: friction would drive every axis, {each} at top speed",
+        "{friction:.3g} ± {half_interval:.2g}",
+    ),
+    "torque opposite": Sentence(
+        _SIGN,
+        "the torque has the opposite sign of the nominal inertial torque: ratio {each}",
+        "{scale:.2g}",
+    ),
+    "outliers": Sentence(
+        "outliers",
+        "isolated outliers cause most of the error on {motion} ({each} of the samples); without"
+        " them it is {without:pc1} over all axes",
+        "{outlying:pc2}",
+    ),
+    "delay of the torque": _fault(
+        "delay",
+        "the torque of {axes} lags the position by {size:.3g} ± {half_interval:.2g} ms"
+        " {difference:more} than assumed",
+    ),
+    "torque constant": _fault("torque constant", _CONSTANT),
+    "torque constant, as assumed": Sentence(
+        "torque constant",
+        f"{_CONSTANT}, which the assumed uncertainty of the torques includes (standard deviation of"
+        " the ratio {scale_std:pc1})",
+    ),
+    "load friction": _fault(
+        "friction over load",
+        "friction grows with the load, by {size:.3g} ± {half_interval:.2g} of the transmitted"
+        " torque (median axis)",
+    ),
+    "torque sign": _fault(_SIGN, "the torque of {axes} has probably the wrong sign"),
+    "position sign": _fault(_SIGN, "the position of {axes} has probably the wrong sign"),
+    "axis sign": _fault(
+        _SIGN, "{axes} probably turns opposite to the URDF: wrong sign of gear ratio or direction"
+    ),
+    "torque order": _fault(_ORDER, "the torques of {axes} are probably interchanged"),
+    "position order": _fault(_ORDER, "the positions of {axes} are probably interchanged"),
+    "joint order": _fault(_ORDER, "the positions and torques of {axes} are probably interchanged"),
+    "angle sum": _fault(
+        _COUPLED_ANGLES, "the recorded angle of {joint} is probably its own plus that of {other}"
+    ),
+    "angle difference": _fault(
+        _COUPLED_ANGLES, "the recorded angle of {joint} is probably its own less that of {other}"
+    ),
+    "payload of a part": _fault(
+        "sameness",
+        "in {part} the arm carried {size:.3g} ± {half_interval:.2g} kg {difference:more} than in"
+        " the other data",
+    ),
+    "torque of a part": _fault(
+        "sameness",
+        "in {part} the torque of {axes} is {size:.3g} ± {half_interval:.2g} times that of the other"
+        " data",
+    ),
+    "friction of a part": _fault(
+        "sameness",
+        "in {part} the friction of {axes} is {size:.3g} ± {half_interval:.2g} times that of the"
+        " other data",
+    ),
+    "arm of a part": _fault(
+        "sameness", "{part} is probably of another arm, tool or setting than the other data"
+    ),
+    "load": Sentence(
+        "load",
+        "on {motion} the arm carried {mass:.3g}{interval} kg {difference:more} than on the fitted"
+        " motion: a body on the last link explains {explained:pc0} of the additional error",
+        optional={"interval": Optional(" ± {half_interval:.2g}")},
+    ),
+    "changed torque": Sentence(
+        "sameness",
+        "the torque on {motion} differs from that of the fitted motion by a factor: {each}",
+        "{factor:.3g} ± {half_interval:.2g}",
+    ),
+    "changed friction": Sentence(
+        "friction",
+        "friction on {motion} differs from the estimate: {each}, beyond the {limit:pc0} that gear"
+        " temperature causes; this explains the error of {explained:names}{alike}",
+        "{change:+pc0}",
+        optional={"alike": _ALIKE},
+    ),
+    "slightly changed friction": Sentence(
+        "friction",
+        "friction on {motion} differs by more than {limit:pc0}: {each}; gear temperature may have"
+        " changed{alike}",
+        "{change:+pc0}",
+        "friction of {joints} changed",
+        {"alike": _ALIKE},
+    ),
+    "negative Coulomb friction": Sentence(
+        IMPOSSIBLE,
+        "Coulomb friction of {name} is negative ({value:.3g}): a torque or a direction has the"
+        " wrong sign",
+    ),
+    "little friction at speed": Sentence(IMPOSSIBLE, _AT_SPEED),
+    "little friction at speed by a chosen term": Sentence(
+        "friction law", f"{_AT_SPEED}, by a friction term that was chosen by inner prediction"
+    ),
+    "negative parameter": Sentence(
+        IMPOSSIBLE, "{name} is negative: {value:.3g} ± {std:.2g} {unit}"
+    ),
+    "no consistent parameters": Sentence(IMPOSSIBLE, "{violations}: {remedy}"),
+    "friction law lacks a term": Sentence(
+        FORM,
+        "the friction law of {joints} lacks a term, such as {each}; the intervals of its"
+        " coefficients allow for that",
+        "{term}, {friction:pc0} of its friction",
+        "the friction law of {joints} is uncertain",
+    ),
+    "complete friction law": Sentence(FORM, "no joint's friction law lacks a term that matters"),
+    "chosen friction law": Sentence("friction law", _LAW),
+    "chosen friction law in place of the stated": Sentence(
+        "friction law", f"{_LAW}, which predicts parts of the fitted motion worse"
+    ),
+    "overall error": Sentence(
+        "error on unseen motion",
+        "the torque error on {motion} is {overall:pc1} over all axes, limit {limit:pc0}",
+    ),
+    "axis error": Sentence("error on unseen motion", f"{_EXCEEDS}: {{each}}", "{relative:pc0}"),
+    "axis error of little torque": Sentence(
+        "error on unseen motion",
+        f"{_EXCEEDS} for axes of little torque: {{each}}",
+        "{relative:pc0} of {torque:.2g} {unit}",
+    ),
+    "axis error on unseen motion alone": Sentence(
+        "error on unseen motion", f"{_EXCEEDS}: {{each}}", "{relative:pc0}"
+    ),
+    "unexplained error": Sentence(
+        "unexplained error",
+        "the torque error on {motion} is {overall:pc1}, {floors:.1f} times the noise floor of"
+        " {floor:pc1}; none of the tested faults explains it (delay, torque constants, signs and"
+        " order of joints, payload, changes between recordings)",
+    ),
+    "left open by the motion": Sentence(
+        LEFT_OPEN,
+        "parameters that fit the recording equally well (to {fitted:pc1}) deviate by {open:pc1} of"
+        " the torque on {motion}, since the fitted motion leaves them open; the error of"
+        " {overall:pc1} there does not tell a fault of such an effect (low sampling rate, coarse"
+        " resolution, small payload) from chance",
+    ),
+    "nothing explained": Sentence(
+        "variance explained (R²)",
+        "the model of {joints} predicts no better than the mean torque (R² at most {limit:g})",
+    ),
+    "little explained": Sentence(
+        "variance explained (R²)",
+        "the model explains less than {limit:pc0} of the torque variance: {each}",
+        "{explained:pc0}",
+    ),
+    "explained": Sentence(
+        "variance explained (R²)",
+        "the model explains at least {least:pc1} of the torque variance of each axis (lowest:"
+        " {joints})",
+    ),
+    "generalisation": Sentence(
+        "generalisation",
+        "the torque error on {motion} is more than {limit:g} times that of the fitted motion:"
+        " {each}",
+        "{growth:.1f} times, {relative:pc1}",
+    ),
+    "no repetitions": Sentence(
+        "systematic error",
+        "without repetitions of one motion, errors of the drive train (coupling, torque constant)"
+        " cannot be distinguished from noise and were not tested",
+    ),
+    "systematic error": Sentence("systematic error", _SLOW, "{slow:pc1}"),
+    "different repetitions": Sentence(
+        "repetitions",
+        "the estimates of single repetitions differ by more than {limit:pc0} of the torque: {each}",
+        "{difference:pc0}",
+    ),
+    "nominal model better": Sentence(
+        "against the nominal model",
+        "the nominal model predicts better: error {nominal:pc1}{with_friction}, identified model"
+        " {identified:pc1}",
+        optional={"with_friction": _WITH_FRICTION},
+    ),
+    "nominal model worse": Sentence(
+        "against the nominal model",
+        "the error of the nominal model is {nominal:pc1}{with_friction}, of the identified model"
+        " {identified:pc1}",
+        optional={"with_friction": _WITH_FRICTION},
+    ),
+    "controller's model better": Sentence(
+        "against the controller's model",
+        "the controller's own dynamic model predicts better: error {controller:pc1}, identified"
+        " model {identified:pc1}",
+    ),
+    "controller's model worse": Sentence(
+        "against the controller's model",
+        "the error of the controller's own dynamic model is {controller:pc1}, of the identified"
+        " model {identified:pc1}",
+    ),
+    "controller's inertia differs": Sentence(
+        "against the controller's inertia",
+        "ratio of the controller's inertia (joint side, with rotors) to the identified one: {each}",
+        "{ratio:.2f}",
+    ),
+    "controller's inertia agrees": Sentence(
+        "against the controller's inertia",
+        "the controller's inertia agrees with the identified one: ratio {each}",
+        "{ratio:.2f}",
+    ),
+    "compensated delay": Sentence(
+        "delay",
+        f"{_TORQUE_LAGS} ({{stated:.3g}} ms stated); {{what}} was compensated",
+        optional={"what": Optional("{used:.3g} ms", "this")},
+    ),
+    "delay chosen by prediction": Sentence(
+        "delay",
+        "the torque lags the position by {delay:.3g} ms (chosen by inner prediction); this was"
+        " compensated",
+    ),
+    "suspected delay": Sentence(
+        "delay",
+        "the torque probably lags the position by {delay:.3g} ± {half_interval:.2g} ms"
+        " ({assumed:.3g} ms assumed); this was not compensated, as the interval is wide and parts"
+        " of the fitted motion are not predicted clearly better",
+    ),
+    "other delay": Sentence(
+        "delay",
+        "the delay of the torque differs from the assumed one: {delay:.3g} ± {half_interval:.2g} ms"
+        " ({assumed:.3g} ms assumed)",
+    ),
+    "assumed delay": Sentence(
+        "delay",
+        f"{_TORQUE_LAGS} ({{stated:.3g}} ms stated{{in_fit}}), {{agreement}}",
+        optional={
+            "in_fit": Optional(", {used:.3g} ms in the fit"),
+            "agreement": Optional(
+                "within {tolerance:.2g} ms of what the fit assumed",
+                "which agrees with what the fit assumed",
+            ),
+        },
+    ),
+    "filtered torque": Sentence(
+        "torque bandwidth",
+        "the recorded torque is probably filtered by a low-pass of {bandwidth:.3g} Hz ({shape});"
+        " the model is filtered in the same way",
+    ),
+    "filtered or computed torque": Sentence(
+        "torque bandwidth",
+        "the recorded torque has no noise above {bandwidth:.2g} Hz: it was filtered by a low-pass"
+        " or computed",
+    ),
+    "short recordings": Sentence("whiteness", f"the recordings are short: {_ROWS_EQUAL}"),
+    "correlated residual": Sentence(
+        "whiteness", f"{_ROWS_EQUAL}; the standard deviations include this"
+    ),
+    "residual over speed": Sentence(
+        "residual over speed",
+        "the residual depends on speed: {each}; the friction law may have another form",
+        _OF_RESIDUAL,
+    ),
+    "no residual over speed": Sentence(
+        "residual over speed", "the residual does not depend noticeably on speed"
+    ),
+    "residual over position": Sentence(
+        "residual over position", "the residual depends on position: {each}", _OF_RESIDUAL
+    ),
+    "no residual over position": Sentence(
+        "residual over position", "the residual does not depend noticeably on position"
+    ),
+    "large ripple": Sentence(
+        "torque ripple",
+        "torque ripple with the motor angle exceeds {limit:pc0} of the torque: {each}",
+        _RIPPLE,
+    ),
+    "usual ripple": Sentence(
+        "torque ripple", "torque ripple with the motor angle, of usual size: {each}", _RIPPLE
+    ),
+    "no ripple": Sentence("torque ripple", "no torque ripple is significant"),
+    "large friction drift": Sentence(
+        "friction over time",
+        "friction changed during the recordings: {each}, more than {limit:pc0} of the torque",
+        "by {change:+pc1}",
+        "friction of {joints} changed during the recordings",
+    ),
+    "small friction drift": Sentence(
+        "friction over time",
+        "friction changed during the recordings: {each}, at most {most:pc1} of an axis's torque",
+        "by {change:+pc1}",
+    ),
+    "no friction drift": Sentence(
+        "friction over time", "friction did not change significantly during the recordings"
+    ),
+}
+"""The sentence of each finding."""
+
+_DRIVES: Final = "check sign, gear ratio and torque constant of {joints}"
+_SAMENESS: Final = (
+    "check what changed between the recordings: temperature, brakes, drive settings of {axes}"
+)
+_COVER: Final = (
+    "fit a longer or more varied motion: the fitted motion does not cover the predicted one"
+)
+_WARM_UP: Final = "warm the arm up by moving it before recording"
+_ALL_SIGNS: Final = "check the sign of the torque and the direction of each axis"
+_COUPLED: Final = (
+    "turn one joint alone and see which angles change; if so, state it in the column map of the"
+    " log: coupled = [[{numbers}, FACTOR]] in [position] and [velocity] (joints by their columns,"
+    " from 1)"
+)
+
+MOUNTING_STEP: Final = (
+    "state how the arm is mounted: `--gravity X Y Z` where a log is read with its URDF, or gravity"
+    " of [robot] in the cell file"
+)
+"""What to do about a wrong direction of gravity."""
+
+REMEDIES: Final[Mapping[RemedyKey, str]] = {
+    "hold out a motion": (
+        "predict a recording that is not fitted (`hil identify --predict ARCHIVE`)"
+    ),
+    "move the joints": (
+        "record a validation motion that moves {joints}; a joint that must not move is locked"
+        " (`locked` under [robot] in the cell file, or `hil import log --held JOINT`)"
+    ),
+    "resolve the torque": "record the torque of {joints} with sufficient resolution",
+    "check the encoder": (
+        "check encoder, coupling and cable of {jumping:6} and record again, or cut the recording"
+        " before the jump"
+    ),
+    "find why the logger stopped": (
+        "find out why the logger stopped; the rest of the recording is used"
+    ),
+    "check what wrote rows twice": "check what wrote rows twice; they were used once",
+    "separate the motions": (
+        "give the motions as files of their own if they are of different days"
+    ),
+    "check for damaged packets": "check for damaged packets; all other samples are used",
+    "record the positions": (
+        "give the column of the measured positions (--columns 'position=NAME{{}}'), or record it"
+    ),
+    "state the sampling rate": ("state the rate of the controller: sample_rate = HZ and no [time]"),
+    "log the time": "log the controller's time with each sample",
+    "log each sample once": ("log every sample of the controller once, with the controller's time"),
+    "record more digits": (
+        "record positions with more digits, or identify with a lower --bandwidth"
+    ),
+    "record more digits, or leave slow rows out": (
+        "record positions with more digits, or leave slow rows out (`hil identify --exclude-rows"
+        " slow`)"
+    ),
+    "log at a higher rate": (
+        "log at a higher rate, or filter the torque below half the rate before it is sampled"
+    ),
+    "slow the motion down": "slow the motion down where {joints} is at its limit",
+    "design a motion": "design a motion for this arm (`hil design`) and record it",
+    "move in both directions": "record a motion in which {joints} moves in both directions",
+    "record all torque": (
+        "record the torque of the motors or of joint sensors, before the controller's model is"
+        " subtracted"
+    ),
+    "state that gravity was removed": (
+        "state it: `--gravity 0 0 0` where a log is read with its URDF, or gravity of [robot] in"
+        " the cell file"
+    ),
+    "correct the zeros": (
+        "correct them: [position] offset = [{offsets:.4f}] (rad) in the column map; compare with a"
+        " posture of the arm"
+    ),
+    "compare a posture": "compare a posture of the arm with that of the URDF at the same angles",
+    "jog and compare": ("jog {joints} and compare direction, order and torque with the column map"),
+    "compare with the map": "compare direction and order of {joints} with the column map",
+    "check masses and units": (
+        "check unit and side (motor or joint) of the torque, gear ratios and torque constants, and"
+        " the units of the masses of the URDF"
+    ),
+    "state the mounting": (
+        f"{MOUNTING_STEP}; if it is right, check the zero positions of the joints"
+    ),
+    "check the scale": (
+        "check unit, side (motor or joint), torque constant and gear ratio of the torque of"
+        " {joints}, the payload, and the masses of the URDF"
+    ),
+    "negate all torques": (
+        "set scale = -1 for the torques in the column map, or negate all torque constants"
+    ),
+    "check the sign of the torque": (
+        "check the sign of the torque of {joints} in the column map, or of its torque constant"
+    ),
+    "check the torque for spikes": (
+        "check the recorded torques for spikes, damaged packets and collisions; remove them, or use"
+        " a robust estimator (`hil identify --estimator tukey` or huber)"
+    ),
+    "use the delay found": ("run `hil identify --delay auto`, or correct the delay at its source"),
+    "check the constant": (
+        "check torque constant and gear ratio of {axes}; recordings with and without a known"
+        " payload determine the constant (`hil torque-constants --loaded`)"
+    ),
+    "fit load friction": (
+        "fit it: add `load` to the terms of `--friction`, as in `--friction"
+        " coulomb,viscous,load,offset`"
+    ),
+    "check the sign in the map": (
+        "check the sign of the torque of {axes} in the column map, or of its torque constant"
+    ),
+    "check the sign of the position": "check the sign of the position of {axes} in the column map",
+    "jog the axes": "jog {axes} by hand and compare its direction of rotation with the URDF's",
+    "check the order": (
+        "check the order of the columns in the column map against the joints of the URDF"
+    ),
+    "state the coupled angle": _COUPLED.replace("FACTOR", "1"),
+    "state the coupled difference": _COUPLED.replace("FACTOR", "-1"),
+    "separate the payloads": (
+        "identify the recordings of each payload separately, or state a known payload in their cell"
+        " file ([robot.payload])"
+    ),
+    "check what changed in between": _SAMENESS,
+    "separate the arms": "identify from recordings of one arm in one condition",
+    "record with one payload": (
+        "record both with the same tool and payload, or state the payload of each in its cell file"
+    ),
+    "check what changed": (
+        "check what changed for {joints} between the recordings: torque constant, unit or scale of"
+        " the torque, drive settings; identify the recordings of each state separately"
+    ),
+    "warm the arm up": _WARM_UP,
+    "warm the arm up, and check what else changed": (
+        f"{_WARM_UP}, and check what else changed for {{alike_joints:names}}"
+    ),
+    "check all signs": f"{_ALL_SIGNS} in the column map or cell",
+    "describe a balancer": (
+        f"describe {ELEMENTS} that carries part of the weight in [[robot.elements]] of the cell"
+        f" file; else {_ALL_SIGNS}"
+    ),
+    "use the consistent estimate": (
+        "use the consistent estimate where the model must be physical (simulation, URDF)"
+    ),
+    "compare with basic friction": (
+        "compare with `hil identify --friction coulomb,viscous,offset`"
+    ),
+    "describe the friction": (
+        "describe the friction of {joints} by further terms (`--friction` or [robot.friction]), or"
+        " use its curve in the report"
+    ),
+    "keep the stated friction": ("keep it with `hil identify --friction {option}` if it is known"),
+    "describe elements, or check the drives": (
+        f"describe {ELEMENTS}, if the arm has one, in [[robot.elements]] of the cell file; else"
+        " check gear ratios, signs, torque constants and the delay between torque and position"
+    ),
+    "cover the motion": _COVER,
+    "cover the motion in both directions": (
+        f"{_COVER}, in which every joint moves in both directions"
+    ),
+    "cover the motion, or check what changed": (
+        f"{_COVER}; if it does, check what changed for {{joints}} between the recordings"
+    ),
+    "check the drives": f"{_DRIVES}, and whether the torque exceeds its noise",
+    "check the drives and the unit": f"{_DRIVES}, and the unit of the torque",
+    "move faster": "move {joints} faster and further, so that the torque exceeds the noise",
+    "check for missing effects": (
+        "check for effects that the model lacks: friction curves of the report, elasticity, springs"
+        " or balancers ([[robot.elements]] of the cell file), temperature"
+    ),
+    "repeat the motion": "record the same motion several times",
+    "check the coupling": "check sign, gear ratio, coupling and torque constant of {joints}",
+    "check the constant with a payload": (
+        "check the torque constant of {joints} with a known payload (`hil torque-constants`), or"
+        " without gravity load against the drive's data sheet"
+    ),
+    "compare the repetitions": "compare the repetitions: conditions changed between them",
+    "use the nominal model": "use the nominal model, or fit a longer and more varied motion",
+    "fit more before replacing the controller's": (
+        "fit a longer and more varied motion before replacing the controller's model"
+    ),
+    "check the constant and the payload": (
+        "check torque constant and gear ratio of {joints}, and the payload"
+    ),
+    "state the delay": ("state it (`hil identify --delay SECONDS`), or correct it at its source"),
+    "state the delay, or correct the program": (
+        "state it (`hil identify --delay SECONDS`), or correct it in the recording program"
+    ),
+    "compare with the delay found": (
+        "compare with `hil identify --delay auto`, or state the delay if it is known (`--delay"
+        " SECONDS`)"
+    ),
+    "compare with the delay found, or correct the cell": (
+        "compare with `hil identify --delay auto`, or correct the delay in the cell"
+    ),
+    "record the torque unfiltered": (
+        "record the torque unfiltered, or state its low-pass with --torque-bandwidth"
+    ),
+    "record a longer motion": "record a longer motion, or the same one several times",
+    "try friction terms": ("try further friction terms for {joints} (Stribeck, asymmetric, third)"),
+    "check the geometry": (
+        "check the URDF's geometry and gravity direction, and for a hose, spring or payload that"
+        " the model lacks"
+    ),
+    "average the ripple": (
+        "record a long motion, which averages it, or compensate it separately: the model does not"
+        " include it"
+    ),
+}
+"""What to do, for each remedy."""

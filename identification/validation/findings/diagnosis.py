@@ -1,0 +1,106 @@
+"""Findings about what recordings are: torque without bodies or gravity, zeros, another arm."""
+
+from __future__ import annotations
+
+from typing import Final
+
+import numpy as np
+
+from identification.hypotheses.diagnosis import RigidTorque, TorqueDiagnosis
+from identification.hypotheses.search import Step
+from identification.validation.evidence import Evidence
+from identification.validation.finding import Finding, Thresholds, Value
+
+_OTHER_SCALE: Final = 3.0  # of the torque to that of the masses; descriptions in use are closer
+_SIGMAS: Final = 3.0
+
+
+def is_other(evidence: Evidence) -> bool:
+    """Whether the torque is other than stated: without bodies or gravity, or of other zeros."""
+    found = evidence.diagnosis
+    if found is None:
+        return False
+    zeros = any(step.sure for step in found.zeros)
+    return found.rigid.is_nothing or found.is_weightless or zeros
+
+
+def other_meanings(evidence: Evidence, _: Thresholds) -> tuple[Finding, ...]:
+    """Return what the torque is other than stated."""
+    return () if evidence.diagnosis is None else of_diagnosis(evidence.diagnosis)
+
+
+def of_diagnosis(found: TorqueDiagnosis) -> tuple[Finding, ...]:
+    """Return what a torque is other than stated: without bodies, gravity, zeros, open signs."""
+    findings = [_zeros(found), *(_open(step) for step in found.discrete if not step.sure)]
+    if found.rigid.is_nothing:
+        findings.insert(0, without_bodies(found.rigid))
+    elif found.is_weightless:
+        findings.insert(0, _without_gravity(found))
+    return tuple(finding for finding in findings if finding is not None)
+
+
+def without_bodies(rigid: RigidTorque) -> Finding:
+    """Return that there is next to nothing of bodies in a torque."""
+    values = {"over_friction": float(rigid.over_friction.max()), "scale": rigid.scale}
+    return Finding("no bodies", "wrong", "record all torque", "cause", values)
+
+
+def _without_gravity(found: TorqueDiagnosis) -> Finding:
+    assert found.weightless is not None
+    ratio = {"ratio": found.weightless.ratio}
+    return Finding("no gravity", "wrong", "state that gravity was removed", "cause", ratio)
+
+
+def _zeros(found: TorqueDiagnosis) -> Finding | None:
+    """Return zeros of joints that are other than those of the URDF, or nearest to the data."""
+    steps = found.zeros
+    if not steps:
+        return None
+    offsets = np.zeros(len(found.rigid.over_friction))
+    for step in steps:
+        offsets[list(step.change.joints)] += step.change.size
+    certain = all(step.sure for step in steps)
+    values: dict[str, Value] = {
+        "error": _ratio(steps[0]),
+        "offsets": tuple((offsets + 0.0).tolist()),
+    }
+    if certain:
+        finding = Finding("zeros", "wrong", "correct the zeros", "cause", values)
+    else:
+        finding = Finding("zeros, nearest", "doubtful", "compare a posture")
+    return finding.about(offsets != 0.0, degrees=np.degrees(offsets))
+
+
+def _ratio(step: Step) -> float:
+    """Return the error with a change over that without."""
+    return step.error / max(step.before, 1e-300)
+
+
+def _open(step: Step) -> Finding:
+    """Return a sign or an order that is other than stated, or the nearest to an explanation."""
+    change = step.change
+    if not (step.is_explained and step.alike):
+        values: dict[str, Value] = {"change": change}
+        return Finding(
+            "nearest", "doubtful", "compare with the map", values=values, joints=change.joints
+        )
+    alike = (change, *(other for other, _ in step.alike if other.is_discrete))
+    values = {"change": change, "alike": alike, "error": _ratio(step)}
+    return Finding("alike", "wrong", "jog and compare", "cause", values, joints=change.joints)
+
+
+def another_arm(evidence: Evidence, _: Thresholds) -> Finding | None:
+    """Return that the masses are not those described, however well the model predicts.
+
+    None where another finding says more.
+    """
+    if evidence.diagnosis is None or is_other(evidence):
+        return None
+    rigid = evidence.diagnosis.rigid
+    if not np.isfinite(rigid.scale) or evidence.context.nominal_scale is None:
+        return None
+    far = _SIGMAS * rigid.std
+    if rigid.scale - far < _OTHER_SCALE and rigid.scale + far > 1.0 / _OTHER_SCALE:
+        return None
+    scale = {"scale": rigid.scale}
+    return Finding("another arm", "wrong", "check masses and units", "cause", scale)

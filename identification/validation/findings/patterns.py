@@ -1,0 +1,121 @@
+"""Findings about patterns of the torque residual."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from identification.arrays import Array
+from identification.validation.evidence import Evidence
+from identification.validation.finding import Finding, Mask, Thresholds, Value
+from identification.validation.residuals import Profile, ResidualChecks, Ripple
+
+
+def _notable(checks: ResidualChecks, pattern: Profile | Ripple, limits: Thresholds) -> Mask:
+    """Return the joints whose pattern is significant and large enough (n,)."""
+    large = checks.share(pattern.rms) > limits.pattern
+    return pattern.significant & large & (pattern.rms > limits.pattern_of_residual * checks.rms)
+
+
+def correlation(evidence: Evidence, limits: Thresholds) -> Finding | None:
+    """Compare the independent rows of the fitted recordings with the number of parameters."""
+    if evidence.residuals is None:
+        return None
+    autocorrelation = evidence.residuals.autocorrelation
+    parameters = len(evidence.estimate.names)
+    worth = float(np.nansum(autocorrelation.effective_rows))
+    values: dict[str, Value] = {
+        "memory": 1e3 * float(np.nanmedian(autocorrelation.time)),
+        "rows": int(autocorrelation.rows.sum()),
+        "worth": worth,
+        "parameters": parameters,
+    }
+    if worth < limits.rows_per_parameter * parameters:
+        return Finding("short recordings", "doubtful", "record a longer motion", values=values)
+    return Finding("correlated residual", "good", values=values)
+
+
+def over_speed(evidence: Evidence, limits: Thresholds) -> Finding | None:
+    """Return the joints whose residual depends on their speed, or that there are none."""
+    checks = evidence.residuals
+    if checks is None:
+        return None
+    joints = _notable(checks, checks.speed, limits)
+    if not joints.any():
+        return Finding("no residual over speed", "good")
+    found = Finding("residual over speed", "doubtful", "try friction terms", "symptom")
+    return _with_worst(found, evidence, joints, checks.speed, "/s")
+
+
+def over_position(evidence: Evidence, limits: Thresholds) -> Finding | None:
+    """Return the joints whose residual depends on their position, or that there are none."""
+    checks = evidence.residuals
+    if checks is None:
+        return None
+    joints = _notable(checks, checks.position, limits)
+    if not joints.any():
+        return Finding("no residual over position", "good")
+    found = Finding("residual over position", "doubtful", "check the geometry", "symptom")
+    return _with_worst(found, evidence, joints, checks.position)
+
+
+def _with_worst(
+    found: Finding, evidence: Evidence, joints: Mask, profile: Profile, per_second: str = ""
+) -> Finding:
+    """Add the mean residual of each joint where it is most significant."""
+    checks = evidence.residuals
+    assert checks is not None
+    n = len(joints)
+    at, error = zip(*(profile.worst(joint) for joint in range(n)), strict=True)
+    turns = [evidence.revolute(joint) for joint in range(n)]
+    return found.about(
+        joints,
+        at=at,
+        error=error,
+        torque_unit=["N·m" if turn else "N" for turn in turns],
+        unit=[f"{'rad' if turn else 'm'}{per_second}" for turn in turns],
+        relative=checks.share(profile.rms),
+    )
+
+
+def ripple(evidence: Evidence, limits: Thresholds) -> Finding | None:
+    """Return the joints whose residual follows the motor angle, or that there are none."""
+    checks = evidence.residuals
+    if checks is None or checks.ripple is None:
+        return None
+    share = checks.share(checks.ripple.rms)
+    joints = _notable(checks, checks.ripple, limits)
+    large = joints & (share > limits.ripple)
+    harmonic = [checks.ripple.strongest(joint) for joint in range(len(share))]
+    if not joints.any():
+        return Finding("no ripple", "good")
+    if not large.any():
+        return Finding("usual ripple", "information").about(
+            joints, relative=share, harmonic=harmonic
+        )
+    limit = {"limit": limits.ripple}
+    return Finding("large ripple", "doubtful", "average the ripple", values=limit).about(
+        large, relative=share, harmonic=harmonic
+    )
+
+
+def friction_drift(evidence: Evidence, limits: Thresholds) -> Finding | None:
+    """Return the joints whose friction changed during the recordings, or that there are none."""
+    checks = evidence.residuals
+    if checks is None or checks.drift is None:
+        return None
+    change: Array = checks.drift.change
+    # A change counts by its share of the torque.
+    torque = np.abs(change) * checks.friction_share
+    joints = checks.drift.significant
+    large = joints & (torque > limits.drift)
+    if not joints.any():
+        return Finding("no friction drift", "good")
+    if not large.any():
+        most = {"most": float(torque[joints].max())}
+        return Finding("small friction drift", "information", values=most).about(
+            joints, change=change
+        )
+    limit = {"limit": limits.drift}
+    return Finding("large friction drift", "doubtful", "warm the arm up", "cause", limit).about(
+        large, change=change
+    )

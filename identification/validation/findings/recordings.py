@@ -1,0 +1,105 @@
+"""Findings about the recordings: joints that were tested, position jumps, delay, limits."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from identification.validation.evidence import SIGMAS, Evidence
+from identification.validation.finding import Finding, Thresholds, Value
+
+
+def nothing_held_out(evidence: Evidence, _: Thresholds) -> Finding | None:
+    """Return that all errors are those of the fit."""
+    if not evidence.in_sample:
+        return None
+    return Finding("nothing held out", "wrong", "hold out a motion")
+
+
+def joints_at_rest(evidence: Evidence, limits: Thresholds) -> Finding | None:
+    """Return the joints that hardly moved on held-out motion."""
+    moved = evidence.moved
+    still = evidence.held_out.rows == 0 if moved is None else moved < limits.moved
+    if not still.any():
+        return None
+    least = {"least": limits.moved}
+    return Finding("joints at rest", "wrong", "move the joints", values=least).about(still)
+
+
+def no_torque(evidence: Evidence, _: Thresholds) -> Finding | None:
+    """Return the joints whose measured torque is zero throughout held-out motion."""
+    error = evidence.held_out
+    silent = (error.rows > 0) & (error.torque_squared == 0.0)
+    if not silent.any():
+        return None
+    return Finding("no torque", "wrong", "resolve the torque").about(silent)
+
+
+def position_jumps(evidence: Evidence, _: Thresholds) -> Finding | None:
+    """Return steps of measured positions that an arm cannot make, the largest first."""
+    jumps = tuple(sorted(evidence.context.jumps, key=lambda jump: -abs(jump.size)))
+    if not jumps:
+        return None
+    jumping = tuple(dict.fromkeys(jump.joint for jump in jumps))
+    values: dict[str, Value] = {"jumps": jumps, "jumping": jumping}
+    return Finding("position jumps", "wrong", "check the encoder", "cause", values)
+
+
+def corrections(evidence: Evidence, _: Thresholds) -> tuple[Finding, ...]:
+    """Return the faults of the recordings that were corrected before the fit."""
+    return evidence.context.corrections
+
+
+def delay(evidence: Evidence, limits: Thresholds) -> Finding | None:
+    """Compare the estimated delay of the torque behind the position with the assumed one.
+
+    None where it was not determined; behind commanded positions it is the lag of the servo.
+    """
+    delays = evidence.context.delays
+    assumed = evidence.context.assumed_delay
+    if delays is None or evidence.context.commanded_positions:
+        return None
+    beyond = max(limits.delay * delays.cycle, SIGMAS * delays.std)
+    differs = abs(delays.delay - assumed) > beyond
+    far = abs(delays.delay - delays.assumed) > beyond  # and yet combined with what is stated
+    values: dict[str, Value] = {
+        "delay": 1e3 * delays.delay,
+        "half_interval": 1e3 * delays.half_interval,
+        "stated": 1e3 * delays.assumed,
+        "assumed": 1e3 * assumed,
+    }
+    if delays.significant and (assumed == delays.applied or (far and assumed != delays.assumed)):
+        if assumed != delays.delay:
+            values["used"] = 1e3 * assumed
+        return Finding("compensated delay", "doubtful", "state the delay", values=values)
+    # With a poor motion a delay cannot be separated from the parameters.
+    estimate = evidence.estimate
+    poor = bool(estimate.undetermined) or estimate.condition > limits.condition
+    if delays.determined and not poor:
+        if differs:
+            return Finding(
+                "other delay",
+                "doubtful",
+                "compare with the delay found, or correct the cell",
+                "cause",
+                values,
+            )
+        if assumed != delays.assumed:
+            values["used"] = 1e3 * assumed
+        if abs(delays.delay - assumed) > delays.half_interval:
+            values["tolerance"] = 1e3 * beyond
+        return Finding("assumed delay", "good", values=values)
+    if delays.significant and differs:
+        return Finding("suspected delay", "doubtful", "compare with the delay found", values=values)
+    return None
+
+
+def saturation(evidence: Evidence, limits: Thresholds) -> Finding | None:
+    """Return the joints whose torque or current was at its limit, or that there are none."""
+    share = evidence.context.saturated
+    if share is None:
+        return None
+    full = np.asarray(share > limits.saturated)
+    if not full.any():
+        return Finding("no saturation", "good")
+    found = Finding("saturation", "doubtful", "slow the motion down", "cause")
+    return found.about(full, saturated=share)

@@ -1,0 +1,193 @@
+"""Findings in words."""
+
+from __future__ import annotations
+
+import ast
+import inspect
+import string
+from collections.abc import Iterator
+from typing import get_args
+
+import numpy as np
+import pytest
+
+from hil.pipeline import cell_context
+from identification.hypotheses.changes import Change
+from identification.validation.finding import Finding, FindingKey, RemedyKey, RepeatedSamples
+from identification.validation.finding_messages import (
+    REMEDIES,
+    SENTENCES,
+    Naming,
+    worded,
+)
+from identification.validation.findings import (
+    diagnosis,
+    errors,
+    excitation,
+    faults,
+    form,
+    patterns,
+    recordings,
+    references,
+    sameness,
+    scale,
+)
+from identification.validation.physical_signs import SignKind
+from identification.validation.position_jumps import PositionJump
+
+NAMING = Naming(("one", "two", "three"))
+FIRST = PositionJump("a.mcap", "one", 1.5, 0.25)
+MODULES = (
+    cell_context, diagnosis, errors, excitation, faults, form, patterns, recordings, references,
+    sameness, scale,
+)  # fmt: skip
+
+
+def test_every_finding_and_every_remedy_has_words() -> None:
+    assert SENTENCES.keys() == {*get_args(FindingKey)}
+    assert REMEDIES.keys() == {*get_args(RemedyKey)}
+    assert {*get_args(SignKind)} <= SENTENCES.keys()
+
+
+def literals() -> Iterator[str]:
+    for module in MODULES:
+        for node in ast.walk(ast.parse(inspect.getsource(module))):
+            if isinstance(node, ast.Constant) and isinstance(node.value, str):
+                yield node.value
+
+
+def test_no_sentence_and_no_remedy_is_without_a_finding() -> None:
+    used = {*literals(), *get_args(SignKind)}
+    assert not SENTENCES.keys() - used
+    assert not REMEDIES.keys() - used
+
+
+@pytest.mark.parametrize("text", [*REMEDIES.values(), *(each.words for each in SENTENCES.values())])
+def test_words_have_no_full_stop_and_no_capital(text: str) -> None:
+    """They are put together to sentences: only names and symbols begin with a capital."""
+    assert not text.endswith(".")
+    words = "".join(part for part, *_ in string.Formatter().parse(text))
+    assert words[0].islower() or text.startswith(("{", "Coulomb"))
+
+
+@pytest.mark.parametrize(
+    ("finding", "words", "step"),
+    [
+        (
+            Finding("no torque", "wrong", "resolve the torque", joints=(0, 2)),
+            "the measured torque of one, three is zero throughout unseen motion",
+            "record the torque of one, three with sufficient resolution",
+        ),
+        (
+            Finding(
+                "axis error of little torque",
+                "doubtful",
+                "move faster",
+                values={"limit": 0.35},
+                joints=(1,),
+                each={"relative": (0.6,), "torque": (0.1,), "unit": ("N·m",)},
+            ),
+            "the torque error on unseen motion exceeds 35 % for axes of little torque: two 60 % of"
+            " 0.1 N·m",
+            "move two faster and further, so that the torque exceeds the noise",
+        ),
+        (
+            Finding("position jumps", "wrong", values={"jumps": (FIRST,) * 5}),
+            "the measured position jumped faster than an arm can move (rad or m): "
+            + ", ".join(["one by +0.25 after 1.500 s of a.mcap"] * 3)
+            + " and 2 more",
+            "",
+        ),
+        (
+            Finding(
+                "repeated samples",
+                "doubtful",
+                values={"samples": (RepeatedSamples("one", 3, "a.mcap"),), "first": FIRST},
+            ),
+            "the log repeats position samples, has them late or lacks rows: one 3 in a.mcap (first:"
+            " one after 1.500 s of a.mcap); the arm moved on",
+            "",
+        ),
+        (
+            Finding(
+                "delay of the torque",
+                "wrong",
+                values={"size": 10.0, "half_interval": 2.0, "difference": -0.01},
+            ),
+            "the torque of all axes lags the position by 10 ± 2 ms less than assumed",
+            "",
+        ),
+        (
+            Finding(
+                "angle difference", "wrong", "state the coupled difference", joints=(2, 1)
+            ),
+            "the recorded angle of three is probably its own less that of two",
+            "turn one joint alone and see which angles change; if so, state it in the column map of"
+            " the log: coupled = [[3, 2, -1]] in [position] and [velocity] (joints by their"
+            " columns, from 1)",
+        ),
+        (
+            Finding(
+                "alike",
+                "wrong",
+                "jog and compare",
+                values={
+                    "change": Change("axis sign", (0,)),
+                    "alike": (Change("axis sign", (0,)), Change("angle sum", (1, 0))),
+                    "error": 0.5,
+                },
+                joints=(0,),
+            ),
+            "several explanations fit alike: position and torque of one negated or an angle of two"
+            " plus that of one; with each of them, rows that did not choose it are predicted with"
+            " 50 % of the error",
+            "jog one and compare direction, order and torque with the column map",
+        ),
+        (
+            Finding(
+                "zeros",
+                "wrong",
+                "correct the zeros",
+                values={"error": 0.25, "offsets": (0.0, 0.1)},
+                joints=(1,),
+                each={"degrees": (5.73,)},
+            ),
+            "the zeros of joints are other than those of the URDF: two +5.7° to be added; with"
+            " that, rows that did not choose it are predicted with 25 % of the error",
+            "correct them: [position] offset = [0.0000, 0.1000] (rad) in the column map; compare"
+            " with a posture of the arm",
+        ),
+        (
+            Finding("commanded positions", "wrong", values={"recordings": ("a", "b")}),
+            "the positions of a, b are the commands, bit for bit: the arm follows them late, and"
+            " every speed and acceleration is that of the plan, not of the arm",
+            "",
+        ),
+        (
+            Finding(
+                "commanded positions", "wrong", values={"recordings": ("a",), "delay": 80.0}
+            ),
+            "the positions of a are the commands, bit for bit: the arm follows them late, here by"
+            " about 80 ms, and every speed and acceleration is that of the plan, not of the arm",
+            "",
+        ),
+    ],
+)  # fmt: skip
+def test_sentences(finding: Finding, words: str, step: str) -> None:
+    found = worded(finding, NAMING)
+    assert (found.words, found.next_step) == (words, step)
+
+
+def test_a_finding_about_joints_has_the_figures_of_these() -> None:
+    finding = Finding("no torque", "wrong").about(
+        np.array([False, True, True]), size=np.array([1.0, 2.0, 3.0]), unit=["a", "b", "c"]
+    )
+    assert finding.joints == (1, 2)
+    assert finding.each == {"size": (2.0, 3.0), "unit": ("b", "c")}
+
+
+def test_joint_names_may_contain_braces() -> None:
+    found = worded(
+        Finding("no torque", "wrong", "resolve the torque", joints=(0,)), Naming(("{one}",))
+    )
+    assert "of {one} is zero" in found.words and "of {one} with" in found.next_step
