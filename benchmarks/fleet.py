@@ -16,7 +16,7 @@ from dataclasses import dataclass, field
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
 from time import process_time
-from typing import Final, Literal, NamedTuple
+from typing import Final, Literal, NamedTuple, get_args
 
 import numpy as np
 import pinocchio as pin
@@ -24,11 +24,13 @@ from numpy.typing import NDArray
 from scipy.signal import lfilter
 
 from hil.compare.comparison import LEAST, holm
+from hil.fleet.covariates import warmed
 from hil.fleet.series_changes import Course, Series, common_course, courses
 from hil.fleet.trend import FALSE_ALARMS
 
 Array = NDArray[np.float64]
 FaultKind = Literal["wear", "lubricant", "replacement", "tool"]
+Known = Literal["temperature", "minutes since start", "nothing"]
 
 EVERY: Final = -1
 """Number in place of that of a robot: what happens to all of them."""
@@ -40,6 +42,7 @@ _VISCOUS: Final = np.array([16.0, 18.0, 10.0, 2.0, 2.0, 1.5])  # N·m·s/rad
 _MIDDLE: Final = np.array([0.0, -1.2, 0.8, 0.0, 0.5, 0.0])  # rad
 _ROTORS: Final = np.array([1.2, 1.2, 0.6, 0.2, 0.2, 0.2])  # kg·m²
 _NOISE: Final = 0.02  # of the torque of a joint
+_WARM_UP: Final = 45.0  # minutes, its time constant
 
 
 @dataclass(frozen=True)
@@ -107,6 +110,7 @@ class Condition(NamedTuple):
 
     when: datetime
     temperature: float  #: of the joints [°C], as a controller measures it
+    minutes: float  #: since the robot was started
     friction: Array  #: share of the nominal friction of each joint (6,)
 
 
@@ -164,6 +168,7 @@ class Fleet:
                 share[fault.joint] *= 1.0 + fault.share(month)
         return Condition(
             when=FIRST + month * MONTH + timedelta(hours=float(random.uniform(0.0, 8.0))),
+            minutes=-_WARM_UP * float(np.log(cold)),
             temperature=35.0 - 8.0 * season - 12.0 * cold + 0.3 * float(random.standard_normal()),
             friction=share,
         )
@@ -269,15 +274,20 @@ def planned(seed: int, *, faulty: bool) -> FleetPlan:
     return FleetPlan(faults=tuple(faults), seed=seed)
 
 
-def watched(plan: FleetPlan, *, heat: bool = True) -> Outcome:
-    """Ask about a fleet every month, with the temperatures of its logs or without them."""
+def watched(plan: FleetPlan, known: Known = "temperature") -> Outcome:
+    """Ask about a fleet every month, with what its logs say of their warm-up."""
     fleet = Fleet(plan)
     random = np.random.default_rng(plan.seed)
     conditions = [[fleet.condition(r, m) for m in range(plan.months)] for r in range(plan.robots)]
     friction = np.array([[each.friction for each in robot] for robot in conditions])
     friction *= 1.0 + _MEASURED * random.standard_normal(friction.shape)
     months = np.array([[(e.when - FIRST) / MONTH for e in robot] for robot in conditions])
-    temperature = np.array([[e.temperature for e in robot] for robot in conditions])
+    told = {
+        "temperature": [[[each.temperature] for each in robot] for robot in conditions],
+        "minutes since start": [[[each.minutes] for each in robot] for robot in conditions],
+        "nothing": [[[] for _ in robot] for robot in conditions],
+    }
+    columns = np.array(told[known])
     places = {(fault.robot, fault.joint): fault for fault in plan.faults}
     first: dict[tuple[int, int], int] = {}
     last: dict[tuple[int, int], Course] = {}
@@ -288,9 +298,11 @@ def watched(plan: FleetPlan, *, heat: bool = True) -> Outcome:
             for robot in range(plan.robots):
                 value = friction[robot, :month, joint]
                 relative = value / value[:3].mean() - 1.0
-                columns = temperature[robot, :month, None][:, : int(heat)]
                 variance = np.full(month, _MEASURED**2)
-                family.append(Series(months[robot, :month], relative, variance, columns))
+                family.append(
+                    Series(months[robot, :month], relative, variance, columns[robot, :month])
+                )
+            family = warmed(family, [known][: columns.shape[2]])
             for robot, course in enumerate(courses(family)):
                 if course is not None:
                     found[robot, joint] = course
@@ -315,9 +327,9 @@ def main() -> None:
     parser.add_argument("--fleets", type=int, default=4, help="with faults, and without, each")
     fleets = parser.parse_args().fleets
     begun = process_time()
-    for heat in (True, False):
-        faulty = [watched(planned(seed, faulty=True), heat=heat) for seed in range(fleets)]
-        others = [watched(planned(100 + k, faulty=False), heat=heat) for k in range(fleets)]
+    for known in get_args(Known):
+        faulty = [watched(planned(seed, faulty=True), known) for seed in range(fleets)]
+        others = [watched(planned(100 + k, faulty=False), known) for k in range(fleets)]
         every = [result for outcome in faulty for result in outcome.found]
         # Wear that has not passed 10 % two months before the end need not be found.
         due = [(f, m, e) for f, m, e in every if f.passes_tenth + _IN_TIME < 23.0]
@@ -329,7 +341,7 @@ def main() -> None:
         years = sum(outcome.years for outcome in (*faulty, *others))
         alarms = sum(outcome.alarms for outcome in (*faulty, *others))
         print(
-            f"{'with' if heat else 'without'} temperature: {sum(soon)} of {len(due)} faults found"
+            f"{known} logged: {sum(soon)} of {len(due)} faults found"
             f" within two months of 10 %, {sum(dated)} dated within a month;"
             f" {alarms} false alarms in {years:.0f} fleet-years"
         )

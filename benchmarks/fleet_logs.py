@@ -1,6 +1,6 @@
 """What it costs to watch a fleet: processor time, memory, a new month, and a Dask scheduler.
 
-Run with ``python -m benchmarks.fleet_logs [--robots N] [--months N]``: a log of 30 s at 100 Hz of
+Run with ``python -m benchmarks.fleet_logs [--robots N] [--months N] [--rate HZ]``: a log of 30 s of
 each robot in every month, read by `hil trend` for the first time, again, and with one month more;
 then the same logs by the workers of a scheduler, with a cache of their own.
 """
@@ -25,9 +25,21 @@ from benchmarks.fleet import Fleet, FleetPlan, urdf, write_fleet
 _PORT: Final = 18786
 
 
+_MAIN_PROCESS: Final = """
+import sys
+from pathlib import Path
+from hil.__main__ import main
+try:
+    main()
+finally:
+    lines = Path("/proc/self/status").read_text().splitlines()
+    sys.stderr.write(next(line for line in lines if line.startswith("VmHWM")).split()[1])
+"""
+
+
 @dataclass(frozen=True)
 class Cost:
-    """Of one command: seconds, and megabytes of its largest process."""
+    """Of one command: seconds, of all its processes, and megabytes of the main process."""
 
     wall: float
     processor: float
@@ -37,7 +49,7 @@ class Cost:
 
 def asked(logs: Path, *options: str) -> Cost:
     """Run `hil trend` on logs in a process of its own, with the processes that it starts."""
-    command = [sys.executable, "-m", "hil", "trend", str(logs), "--urdf", str(urdf())]
+    command = [sys.executable, "-c", _MAIN_PROCESS, "trend", str(logs), "--urdf", str(urdf())]
     command += ["--robot", "{robot}/{date}.csv", "--json", *options]
     before = resource.getrusage(resource.RUSAGE_CHILDREN)
     started = time.perf_counter()
@@ -45,7 +57,8 @@ def asked(logs: Path, *options: str) -> Cost:
     wall = time.perf_counter() - started
     after = resource.getrusage(resource.RUSAGE_CHILDREN)
     processor = after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime
-    return Cost(wall, processor, after.ru_maxrss / 1024.0, json.loads(ran.stdout))
+    peak = float(ran.stderr.split()[-1]) / 1024.0
+    return Cost(wall, processor, peak, json.loads(ran.stdout))
 
 
 @contextmanager
@@ -73,7 +86,7 @@ def scheduler() -> Iterator[str]:
 def _shown(title: str, cost: Cost, logs: int) -> None:
     print(
         f"{title}: {cost.processor:.0f} s of processor time, {cost.processor / logs:.2f} s a log;"
-        f" {cost.wall:.0f} s wall; largest process so far {cost.memory:.0f} MB",
+        f" {cost.wall:.0f} s wall; main process {cost.memory:.0f} MB",
         flush=True,
     )
 
@@ -83,9 +96,10 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--months", type=int, default=5)
     parser.add_argument("--robots", type=int, default=20)
+    parser.add_argument("--rate", type=float, default=100.0, help="of the logs [Hz]")
     options = parser.parse_args()
     months, robots = options.months, options.robots
-    fleet = Fleet(FleetPlan(robots=robots, months=months + 1))
+    fleet = Fleet(FleetPlan(robots=robots, months=months + 1, rate=options.rate))
     with TemporaryDirectory() as folder:
         logs = Path(folder) / "logs"
         write_fleet(logs, fleet, months=range(months))

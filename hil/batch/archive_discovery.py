@@ -102,6 +102,7 @@ class ArchiveRef:
     robot: str = ""  #: name or serial number; "" if all with one `arm` are one robot
     arm_type: str = ""  #: digest that robots of one type share; "" without a robot
     dated_by: DatedBy = ""
+    content: str = ""  #: digest of the bytes of the log; "" of an archive
     #: what a log has beside its motion: means of columns, and texts, by name
     facts: Mapping[str, float | str] = field(default_factory=dict, hash=False)
 
@@ -198,7 +199,12 @@ def discover(
             f"there is no archive (*{SUFFIX}){'' if importing is None else ', log or bag'} in it",
             *(f"{unused.path} {unused.message}" for unused in found.refused[:1]),
         ]
-        raise InputError(", ".join(roots), "; ".join(reasons), remedy="name others")
+        remedy = "name others" + (
+            ""
+            if importing is not None
+            else ", or describe the arm of logs and bags: --urdf ARM.urdf"
+        )
+        raise InputError(", ".join(roots), "; ".join(reasons), remedy=remedy)
     imported = {} if importing is None else importing.imported(found.logs)
     refs: dict[str, ArchiveRef | SkippedArchive] = {}
     with reporter.task("reading the metadata of archives", len(places)) as task:
@@ -595,11 +601,12 @@ def _exclusion(ref: ArchiveRef, latest: _Attempts) -> str:
 
 def _copy(ref: ArchiveRef, seen: dict[str, str]) -> SkippedArchive | None:
     """Return an archive that is a copy of one `seen`; else None, and add it to those."""
-    if ref.sha256 in seen and ref.use != "standstill":
-        return SkippedArchive(ref.origin, "is a copy", seen[ref.sha256])
+    content = ref.content or ref.sha256
+    if content in seen and ref.use != "standstill":
+        return SkippedArchive(ref.origin, "is a copy", seen[content])
     if ref.attempt:
         first = seen.setdefault(f"{ref.folder} {ref.record}", ref.name)
         if first != ref.name:
             return SkippedArchive(ref.origin, "is a copy or a repaired version", first)
-    seen[ref.sha256] = ref.origin
+    seen[content] = ref.origin
     return None

@@ -22,6 +22,9 @@ class KindsOfLogs(Protocol):
     def is_log(self, file: Path, siblings: Collection[str]) -> bool:
         """Return whether a file, found in a folder with these names, may be a log or a bag."""
 
+    def is_other(self, file: Path) -> bool:
+        """Return whether a file is known to be no recording, such as a table of results."""
+
     def is_folder_of_one(self, folder: Path) -> bool:
         """Return whether a folder is one recording: a bag, or a file for each quantity."""
 
@@ -118,7 +121,7 @@ class _Search:
             self.archives.add(path.as_posix())
         elif path.suffix.lower() == SUFFIX and self._kinds.is_archive(path):
             self.archives.add(path.as_posix())
-        else:
+        elif not self._kinds.is_other(path):
             self.logs.add(path.as_posix())
 
     def _refuse(self, error: OSError) -> None:

@@ -20,7 +20,7 @@ from hil.batch.estimates import BatchEstimate, BatchEstimator, relative_error
 from hil.batch.graph import BatchResult
 from hil.batch.table import write_tables
 from hil.cli.arguments import JsonOption, QuietOption, VerboseOption, print_json, with_options
-from hil.cli.fleet_options import Fleet, RecordingsArgument, last, map_lines
+from hil.cli.fleet_options import Fleet, RecordingsArgument, last, map_lines, skipped_line
 from hil.cli.identify_options import Identifying
 from hil.cli.imports import Described, Reading
 from hil.fleet.logs import LogMap, write_maps
@@ -160,16 +160,6 @@ def _line(campaign: BatchEstimate) -> str:
 
 def _broken_lines(broken: Sequence[SkippedArchive]) -> list[str]:
     return [f"{unused.path} could not be used: {unused.message}" for unused in broken]
-
-
-def skipped_line(skipped: Sequence[SkippedArchive]) -> str:
-    """Count the skipped archives by reason, without the name of another archive in it."""
-    others = [
-        unused._replace(copy_of="another") if unused.copy_of else unused for unused in skipped
-    ]
-    counts = Counter(unused.message for unused in others)
-    reasons = "; ".join(f"{count} {reason}" for reason, count in counts.most_common())
-    return f"skipped, not for fitting: {reasons}"
 
 
 def as_dict(result: BatchResult, written: Sequence[Path]) -> dict[str, Any]:

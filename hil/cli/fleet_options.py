@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections import Counter
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -14,7 +15,7 @@ import typer
 from hil.base.progress import Reporter
 from hil.base.terminal_text import plural
 from hil.batch.cache import CacheLocation
-from hil.batch.cluster import Cluster
+from hil.batch.cluster import Cluster, SkippedArchive
 from hil.cli.imports import Described, Reading
 from hil.fleet.logs import LogMap, LogReading, LogsOfBatch
 from hil.fleet.naming import RobotNaming
@@ -79,12 +80,12 @@ class Fleet:
         arm: Described,
         reading: Reading,
         reporter: Reporter,
-        *,
-        columns: tuple[str, ...] = (),
+        columns: Sequence[str] = (),
+        others: Iterable[Path | None] = (),
     ) -> Iterator[FleetWork]:
         """Provide workers and cache; logs are read if their robot is described.
 
-        Of logs these `columns` are read beside the motion.
+        Of logs these `columns` are read in addition to the motion; `others` are no logs.
 
         Raises:
             InputError: an option is invalid, or one of logs is given without their robot.
@@ -100,7 +101,8 @@ class Fleet:
             if arm.is_given:
                 facts = naming.facts._replace(columns=(*naming.facts.columns, *columns))
                 how = LogReading.of(arm.robot, reading.options, repr(arm), facts)
-                logs = LogsOfBatch(how, cache, cluster, reporter)
+                besides = frozenset(path.resolve() for path in others if path is not None)
+                logs = LogsOfBatch(how, cache, cluster, reporter, besides)
             yield FleetWork(cluster, cache, naming, logs)
 
     @contextmanager
@@ -122,6 +124,16 @@ def map_lines(maps: Mapping[LogMap, int], *, verbose: bool) -> Iterator[str]:
         yield f"{plural(count, 'log')} read by the column map {source}"
         if verbose:
             yield from (f"  {meaning}" for meaning in log_map.meanings)
+
+
+def skipped_line(skipped: Sequence[SkippedArchive]) -> str:
+    """Count the skipped archives by reason, without the name of another archive in it."""
+    others = [
+        unused._replace(copy_of="another") if unused.copy_of else unused for unused in skipped
+    ]
+    counts = Counter(unused.message for unused in others)
+    reasons = "; ".join(f"{count} {reason}" for reason, count in counts.most_common())
+    return f"skipped, not for fitting: {reasons}"
 
 
 def last(lines: Sequence[str], most: int, where: str) -> Iterator[str]:

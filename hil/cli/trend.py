@@ -14,7 +14,7 @@ from hil.base.one_screen import brief
 from hil.base.progress import reporter as make_reporter
 from hil.base.terminal_text import plural, printable
 from hil.cli.arguments import JsonOption, QuietOption, VerboseOption, print_json, with_options
-from hil.cli.fleet_options import Fleet, RecordingsArgument, last, map_lines
+from hil.cli.fleet_options import Fleet, RecordingsArgument, last, map_lines, skipped_line
 from hil.cli.identify_options import Identifying
 from hil.cli.imports import Described, Reading
 from hil.fleet.conditions import Conditions
@@ -30,7 +30,7 @@ from hil.fleet.trend_page import trend_page
 CHANGED: Final = 5
 """Exit status with --fail-on-change: something has changed."""
 _MOST_BROKEN: Final = 8
-_TAIL: Final = 2  # lines at the end: counts and files
+_TAIL: Final = 3  # lines at the end: files, what was skipped, counts
 
 
 @with_options(Identifying, "how")
@@ -69,8 +69,8 @@ def trend(
         output: HTML file for the report. Default: no report.
         table: CSV file with every value of every series. Default: none.
         limit: Change whose date is foreseen, such as 'friction +50 %' (repeatable).
-        covariate: Column that may explain a change, such as minutes since the start (repeatable).
-            Temperatures are found by their names.
+        covariate: Column that may explain a change, such as a payload (repeatable). Temperatures
+            and the time since the start are found by their names.
         conditions: CSV file of what the logs lack, by date (column when) and,
             unless it is the same for all, robot: columns of numbers such as ambient temperature.
         fail_on_change: Return exit status 5 if something has changed.
@@ -83,7 +83,7 @@ def trend(
         result = judge(read_table(Path(places[0]), stated))
     else:
         reporter = make_reporter(quiet=quiet or json, messages=verbose)
-        with fleet.opened(arm, reading, reporter, columns=tuple(covariate or [])) as work:
+        with fleet.opened(arm, reading, reporter, covariate or (), (conditions, table)) as work:
             estimated = estimated_fleet(
                 places, how.options(estimator="wls"), work.cluster, reporter,
                 cache=work.cache, naming=work.naming, importing=work.logs, conditions=stated,
@@ -114,6 +114,8 @@ def _print(
         typer.echo(printable(line), err=True)
     if written and not quiet:
         lines.append(f"written: {', '.join(map(str, written))}")
+    if result.skipped and not quiet:
+        lines.append(skipped_line(result.skipped))
     lines = [f"{verdict(result)}.", *lines, _counts(result)]
     for line in lines if verbose else brief(lines, last=_TAIL):
         typer.echo(printable(line))

@@ -14,8 +14,10 @@ def as_dict(fleet: FleetTrend) -> dict[str, Any]:
         "changed": bool(fleet.changed),
         "simulated": fleet.simulated,
         "covariates": list(fleet.covariates),
+        "unknown": list(fleet.unknown),
         "seasonal": fleet.seasonal,
         "dated_by_file": fleet.dated_by_file,
+        "in_several_places": {name: list(places) for name, places in fleet.twice.items()},
         "recordings": fleet.recordings,
         "robots": [
             {

@@ -39,6 +39,7 @@ class EstimatedFleet:
 
     types: tuple[TypeSeries, ...]
     dated_by_file: int  #: recordings that have only the date of their file
+    twice: Mapping[str, Sequence[str]]  #: places of robots that are in several at the same time
     simulated: bool
     broken: tuple[SkippedArchive, ...]
     skipped: tuple[SkippedArchive, ...]
@@ -48,6 +49,7 @@ class EstimatedFleet:
         return replace(
             trend,
             dated_by_file=self.dated_by_file,
+            twice=self.twice,
             simulated=self.simulated,
             broken=self.broken,
             skipped=self.skipped,
@@ -92,13 +94,14 @@ def estimated_fleet(
     ]
     broken = [*found.broken, *undated]
     if not refs:
-        first = [f"{each.path} could not be used: {each.message}" for each in broken[:1]]
-        raise InputError(None, "; ".join(["there is no recording with a date", *first]))
+        first = [f"{each.path}: {each.message}" for each in (*broken, *found.skipped)[:1]]
+        raise InputError(None, "; ".join(["no recording can be used", *first]))
     types = _types(refs, options, cluster, reporter, cache, broken)
     used = [ref for each in types for ref in each.refs]
     return EstimatedFleet(
         types=tuple(each.series(conditions) for each in types),
         dated_by_file=sum(ref.dated_by == "file" for ref in used),
+        twice=naming.in_several_places(used),
         simulated=all(ref.simulated for ref in used),
         broken=tuple(broken),
         skipped=found.skipped,

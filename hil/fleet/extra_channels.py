@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 from collections.abc import Collection, Iterable, Iterator
 from pathlib import Path
 from typing import Final, NamedTuple
@@ -13,6 +12,7 @@ from mcap.reader import make_reader
 from hil.base.arrays import Array
 from hil.base.errors import SourceError
 from hil.base.safe_input import open_file
+from hil.fleet.covariates import may_explain
 from hil.importers.array_files import ArrayFile
 from hil.importers.bags import SUFFIXES as BAGS
 from hil.importers.bags import BagMessage, open_bag
@@ -22,14 +22,15 @@ from hil.importers.log_files import LogFiles
 from hil.importers.mcap_messages import Topic
 from hil.importers.text_table import TextTable
 
-_TEMPERATURE: Final = re.compile(r"temp(?!late|orary|lat|t)|celsius|°c", re.IGNORECASE)
 _MOST_COLUMNS: Final = 64
 _JOINTS: Final = ("name", "joint_names")  # fields of a message that name joints
 _NO_FACTS: Final = (*_JOINTS, "header", "layout", "variance")
 
 
 class ExtraChannels(NamedTuple):
-    """What is read of each log beside its motion; temperatures are found by their names.
+    """What is read of each log beside its motion; some columns are found by their names.
+
+    These are temperatures and the time since the start.
 
     Attributes:
         columns: their names.
@@ -60,13 +61,13 @@ def facts_of(source: Path, extra: ExtraChannels, files: LogFiles) -> dict[str, f
         is_named = channel.name in extra.columns
         if is_named and channel.text:
             facts[channel.name] = channel.text
-        elif is_named or _TEMPERATURE.search(f"{channel.name} {channel.unit or ''}"):
+        elif is_named or may_explain(f"{channel.name} {channel.unit or ''}"):
             facts.update(_means(table, channel.name))
     return facts
 
 
 def _of_topics(source: Path, columns: Collection[str]) -> Iterator[tuple[str, float]]:
-    """Yield the means of temperatures in the topics of a bag, and of what `columns` name.
+    """Yield the means of what may explain a change in a bag, and of what `columns` name.
 
     A name joins topic and field, such as ``/motor/temperature``. Fields of several values end with
     the joint where the message names joints, else with a number from 1.
@@ -74,15 +75,15 @@ def _of_topics(source: Path, columns: Collection[str]) -> Iterator[tuple[str, fl
     try:
         with open_bag(source) as bag:
             for topic, kind in bag.topics.items():
-                if kind.is_ros and (_is_of_heat(topic, kind) or _is_named(topic, columns)):
+                if kind.is_ros and (_may_explain(topic, kind) or _is_named(topic, columns)):
                     yield from _of_messages(topic, bag.messages(topic), columns)
     except SourceError:
         return
 
 
-def _is_of_heat(topic: str, kind: Topic) -> bool:
+def _may_explain(topic: str, kind: Topic) -> bool:
     definition = kind.definition.decode(errors="replace")
-    return _TEMPERATURE.search(f"{topic} {kind.kind} {definition}") is not None
+    return may_explain(f"{topic} {kind.kind} {definition}")
 
 
 def _is_named(topic: str, columns: Collection[str]) -> bool:
@@ -99,7 +100,7 @@ def _of_messages(
         for field, value in content.items():
             alone = field == "data" or topic.endswith(f"/{field}")
             name = topic if alone else f"{topic}/{field}"
-            if field in _NO_FACTS or not (name in columns or _TEMPERATURE.search(name)):
+            if field in _NO_FACTS or not (name in columns or may_explain(name)):
                 continue
             values = _numbers(value)
             ends = [str(k) for k in range(1, len(values) + 1)] if len(values) > 1 else [""]

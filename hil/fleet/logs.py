@@ -25,6 +25,7 @@ from hil.batch.cluster import Cluster, ClusterTask, SkippedArchive, reason_of
 from hil.batch.places import SUFFIX, Stamp, name_of, stamp_of
 from hil.cell import Cell
 from hil.fleet.extra_channels import ExtraChannels, facts_of
+from hil.fleet.table import is_table
 from hil.importers.array_files import READERS
 from hil.importers.bag_map import BagMap
 from hil.importers.bags import SUFFIXES as BAGS
@@ -239,7 +240,8 @@ def _read(
     """Return a log that was read, with its archive and the facts that are wanted of it."""
     ref = described_archive(place.as_posix(), cache, log)
     facts = facts_of(Path(log), reading.facts, files)
-    return ReadLog(replace(ref, facts=facts), log_map)
+    content = json_digest([digest for _, digest in _digests(Path(log))])
+    return ReadLog(replace(ref, facts=facts, content=content), log_map)
 
 
 def _by_map(
@@ -283,12 +285,20 @@ def _place_of(source: Path, reading: LogReading, log_map: LogMap, cache: CacheLo
     Raises:
         SourceError: the log cannot be read.
     """
+    how = [reading.key, log_map.text, log_map.gravity, code_digest()]
+    return cache.path(source.as_posix(), json_digest(["log", _digests(source), how]), _ARCHIVE)
+
+
+def _digests(source: Path) -> list[tuple[str, str]]:
+    """Return name and digest of each file of a log.
+
+    Raises:
+        SourceError: one cannot be read.
+    """
     try:
-        digests = [(path.name, file_digest(path)) for path in _files_of(source)]
+        return [(path.name, file_digest(path)) for path in _files_of(source)]
     except OSError as error:
         raise SourceError(source, f"cannot be read: {error.strerror}") from error
-    how = [reading.key, log_map.text, log_map.gravity, code_digest()]
-    return cache.path(source.as_posix(), json_digest(["log", digests, how]), _ARCHIVE)
 
 
 def _write(recording: ImportedRecording, place: Path) -> None:
@@ -321,6 +331,7 @@ class LogsOfBatch:
     Attributes:
         reading: how they are read.
         cache: for archives; one that keeps nothing cannot be used.
+        others: files beside logs that are none, such as one of conditions.
         maps: by which logs were read, with their number, after the import.
     """
 
@@ -328,6 +339,7 @@ class LogsOfBatch:
     cache: CacheLocation
     cluster: Cluster
     reporter: Reporter
+    others: frozenset[Path] = frozenset()
     maps: dict[LogMap, int] = field(default_factory=dict)
 
     def is_log(self, file: Path, siblings: Collection[str]) -> bool:
@@ -337,6 +349,10 @@ class LogsOfBatch:
             suffix = Path(file.stem).suffix.lower()
         is_table = file.stem in _TABLES and f"{_TABLES[0]}.parquet" in siblings
         return suffix in _LOG_SUFFIXES and not is_table and {*MARKS}.isdisjoint(siblings)
+
+    def is_other(self, file: Path) -> bool:
+        """Return whether a file is stated to be no log, or is a table of quantities over time."""
+        return file in self.others or is_table(file)
 
     def is_folder_of_one(self, folder: Path) -> bool:
         """Return whether a folder is one recording: a bag, or a file for each quantity."""

@@ -7,6 +7,7 @@ from datetime import datetime
 from typing import Final
 
 from hil.base.terminal_text import plural
+from hil.fleet.covariates import is_heat, is_since_start
 from hil.fleet.trend import FleetTrend, LimitReached, QuantityTrend, RobotTrend
 from identification.text import percentage
 
@@ -73,8 +74,7 @@ def robot_sentence(robot: RobotTrend, fleet: FleetTrend) -> str:
     if trend.changed:
         return f"{name}, {trend_sentence(trend, fleet)}"
     if trend.explained:
-        explanation = "a season" if not robot.robot else _explanation(fleet)
-        return f"{name}, {trend.joint}: {name_of(trend)} varies; {explanation} explains it"
+        return f"{name}, {trend.joint}: {name_of(trend)} varies; {_explanation(trend)} explains it"
     return f"{name}: no significant change"
 
 
@@ -87,8 +87,8 @@ def trend_sentence(trend: QuantityTrend, fleet: FleetTrend) -> str:
         parts.append(f"{signed(trend.rate)} a month")
     elif last.kind == "step":
         parts.append(f"in one step about {last.begin[:10]}")
-    if fleet.covariates:
-        parts.append("not explained by temperature")
+    if trend.robot and trend.effects:
+        parts.append(f"not explained by {' or '.join(_explaining(trend))}")
     elif fleet.seasonal:
         parts.append("not explained by a season" + (" of all robots" if trend.robot else ""))
     parts += [limit_text(limit) for limit in trend.limits if limit.date is not None]
@@ -104,10 +104,21 @@ def limit_text(limit: LimitReached) -> str:
     return f"reaches {reached} in {month(limit.date)} ({since} to {until})"
 
 
-def _explanation(fleet: FleetTrend) -> str:
-    if fleet.covariates:
-        return f"{' and '.join(fleet.covariates[:2])}, or a season of all robots,"
-    return "a season of all robots"
+def _explanation(trend: QuantityTrend) -> str:
+    if not trend.robot:
+        return "a season"
+    season = "a season of all robots"
+    names = " and ".join(_explaining(trend))
+    return f"{names}, or {season}," if names else season
+
+
+def _explaining(trend: QuantityTrend) -> list[str]:
+    """Return in words what was taken into account for a robot, in addition to a season."""
+    words = {
+        "temperature" if is_heat(name) else "time since the start" if is_since_start(name) else name
+        for name in trend.effects
+    }
+    return sorted(words)
 
 
 def notes(fleet: FleetTrend) -> Iterator[str]:
@@ -117,6 +128,13 @@ def notes(fleet: FleetTrend) -> Iterator[str]:
             "no recording has a temperature: warm-up and season count as noise from day to day"
             + (", except for what all robots have in common" if fleet.seasonal else "")
         )
+    for robot, places in fleet.twice.items():
+        yield (
+            f"{robot} is recorded in {' and '.join(places)} at the same time; if these are several"
+            " robots, name them by several parts of the path: --robot '{robot}/{robot}/...'"
+        )
+    for name in fleet.unknown:
+        yield f"no recording has a column {name!r} of numbers"
     if fleet.dated_by_file:
         recordings = plural(fleet.dated_by_file, "recording")
         yield f"{recordings} dated by the file alone, which a copy changes; see --robot"

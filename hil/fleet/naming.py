@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from datetime import UTC, datetime
 from functools import cached_property
+from itertools import count, pairwise
 from pathlib import Path
 from typing import Final, Literal
 
@@ -66,8 +67,8 @@ class RobotNaming:
             problem = f"{text!r} does not say where the robot is named"
             raise InputError(None, problem, field=_FIELD, remedy=_REMEDY)
         unknown = {*re.findall(r"\{[^}]*\}", text)} - {ROBOT, DATE}
-        if unknown or text.count(ROBOT) > 1 or text.count(DATE) > 1:
-            problem = f"{text!r} has other placeholders than one {ROBOT} and one {DATE}"
+        if unknown or text.count(DATE) > 1:
+            problem = f"{text!r} has other placeholders than {ROBOT} and one {DATE}"
             raise InputError(
                 None, problem, field=_FIELD, remedy=f"write * for other parts; {_REMEDY}"
             )
@@ -84,11 +85,13 @@ class RobotNaming:
         """The pattern of paths as a regular expression, which ends where they do."""
         parts = []
         end = 0
+        robots = count(1)
         for match in _PLACEHOLDER.finditer(self.name):
             parts.append(re.escape(self.name[end : match.start()]))
             end = match.end()
             others = {"**/": "(?:[^/]+/)*", "*": "[^/]*", "?": "[^/]"}
-            parts.append(others.get(match[0]) or f"(?P<{match[0][1:-1]}>[^/]+?)")
+            name = f"robot{next(robots)}" if match[0] == ROBOT else match[0][1:-1]
+            parts.append(others.get(match[0]) or f"(?P<{name}>[^/]+?)")
         parts.append(re.escape(self.name[end:]))
         return re.compile(f"(?:^|.*/){''.join(parts)}$")
 
@@ -119,11 +122,41 @@ class RobotNaming:
             return ref
         return replace(ref, robot=robot, arm_type=ref.arm, arm=digest(f"{ref.arm} {robot}"))
 
+    def in_several_places(self, refs: Sequence[ArchiveRef]) -> dict[str, list[str]]:
+        """Return the places of names that are in several whose recordings alternate in time.
+
+        A folder for each month has the same names, too, one after the other.
+        """
+        if self.by not in ("path", "folder"):
+            return {}
+        dates: dict[str, dict[str, list[str]]] = {}
+        for ref in refs:
+            dates.setdefault(ref.robot, {}).setdefault(self._place_of_name(ref), []).append(
+                ref.when
+            )
+        found = {}
+        for robot, places in dates.items():
+            spans = sorted((min(of_one), max(of_one), name) for name, of_one in places.items())
+            names = {
+                name
+                for (_, end, first), (begin, _, second) in pairwise(spans)
+                if begin < end
+                for name in (first, second)
+            }
+            if names:
+                found[robot] = sorted(names)
+        return found
+
+    def _place_of_name(self, ref: ArchiveRef) -> str:
+        """Return the path of a recording up to the name of its robot."""
+        match = self._pattern.match(ref.origin) if self.by == "path" else None
+        return ref.campaign if match is None else ref.origin[: match.end("robot1")]
+
     def _robot(self, ref: ArchiveRef, named: dict[str, str]) -> str:
         if self.by == "folder":
             return ref.campaign.rsplit("/", 1)[-1]
         if self.by == "path":
-            return named.get("robot", "")
+            return "/".join(part for key, part in named.items() if key != "date")
         if self.by == "metadata" and not ref.source:
             with as_file(ref.location) as path:
                 return open_archive(path, fields=(), stop=-1.0).header.entries.get(self.name, "")

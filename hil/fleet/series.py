@@ -2,24 +2,23 @@
 
 from __future__ import annotations
 
-import re
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from datetime import UTC, datetime, timedelta
 from typing import Final, NamedTuple
 
 import numpy as np
 
 from hil.base.arrays import Array
+from hil.fleet import covariates
 from hil.fleet.quantities import FollowedQuantity
-from hil.fleet.series_changes import FEWEST, Series
+from hil.fleet.series_changes import FEWEST, Series, mean_of_known
 
 REFERENCE: Final = 3.0
 """First months of a robot, against which it has changed."""
 MONTH: Final = timedelta(days=365.25 / 12.0)
 _FIRST: Final = 3  # recordings that these have at least
 _DETERMINED: Final = 4.0  # standard deviations that a value exceeds
-_MOST_COMMON: Final = 2  # covariates that concern all joints
 
 
 @dataclass(frozen=True, eq=False)
@@ -65,21 +64,19 @@ class TypeSeries:
     recordings: Mapping[str, Sequence[DatedRecording]]
     families: Sequence[QuantityFamily]
 
-    def covariates(self, more: Sequence[str]) -> list[str]:
-        """Return the names of numbers that every recording has, and of those that were asked for.
-
-        Of `more` only those that any has.
-        """
-        counts: dict[str, int] = {}
+    @property
+    def known(self) -> set[str]:
+        """Names of the numbers that any recording has."""
         every = [each for recordings in self.recordings.values() for each in recordings]
-        for recording in every:
-            for name in recording.facts:
-                counts[name] = counts.get(name, 0) + 1
-        return [name for name, count in counts.items() if count == len(every) or name in more]
+        return {name for recording in every for name in recording.facts}
 
-    def covariates_of(self, joint: str, more: Sequence[str]) -> list[str]:
-        """Return the covariates that concern a joint."""
-        return names_of_joint(self.covariates(more), joint, self.joints)
+    def covariates_of(self, joint: str, stated: Sequence[str]) -> list[str]:
+        """Return the covariates that concern a joint, with those that were asked for."""
+        numbers = {
+            robot: [each.facts for each in recordings]
+            for robot, recordings in self.recordings.items()
+        }
+        return covariates.chosen(numbers, stated, joint, self.joints)
 
 
 def first_of(recordings: Sequence[DatedRecording]) -> int:
@@ -90,13 +87,14 @@ def first_of(recordings: Sequence[DatedRecording]) -> int:
 
 
 class RelativeSeries(NamedTuple):
-    """A series as shares of its first months."""
+    """A series as shares of its first months, which have the `first` recordings."""
 
     series: Series
     dates: tuple[str, ...]
     values: Array
     stds: Array
     reference: float
+    first: int
 
     @classmethod
     def of(
@@ -131,39 +129,15 @@ class RelativeSeries(NamedTuple):
         columns = np.array(
             [[each.facts.get(name, np.nan) for name in names] for each in recordings]
         ).reshape(len(recordings), len(names))
-        series = Series(times, values / reference - 1.0, variances / reference**2, _filled(columns))
+        series = Series(times, values / reference - 1.0, variances / reference**2, columns)
         dates = tuple(each.when for each in recordings)
-        return cls(series, dates, values, np.sqrt(variances), reference)
+        return cls(series, dates, values, np.sqrt(variances), reference, first)
 
+    def of_an_error(self, series: Series) -> Series:
+        """Return a series of an error of the first months' model.
 
-def _filled(columns: Array) -> Array:
-    """Return covariates with the mean of the others where one is missing, 0 where all are."""
-    counts = np.isfinite(columns).sum(axis=0)
-    means = np.nansum(columns, axis=0) / np.maximum(counts, 1)
-    return np.where(np.isfinite(columns), columns, means)
-
-
-def names_of_joint(names: Sequence[str], joint: str, joints: Sequence[str]) -> list[str]:
-    """Return the covariates that concern a joint: its own, and two at most of no joint.
-
-    Covariates of joints end with the names of all of these, or with their numbers from 0 or 1.
-    """
-    by_stem: dict[str, dict[str, str]] = {}
-    for name in names:
-        if (match := re.fullmatch(r"(.*?)_?(\d+)", name)) is not None:
-            by_stem.setdefault(match[1], {})[match[2]] = name
-        stem, _, end = name.rpartition("/")
-        if end in joints:
-            by_stem.setdefault(stem, {})[end] = name
-    count = len(joints)
-    ends = ([*map(str, range(count))], [*map(str, range(1, count + 1))], [*joints])
-    place = joints.index(joint)
-    own = []
-    of_joints: set[str] = set()
-    for found in by_stem.values():
-        for each in ends:
-            if {*found} == {*each}:
-                own.append(found[each[place]])
-                of_joints.update(found.values())
-                break
-    return [*own[:1], *[name for name in names if name not in of_joints][:_MOST_COMMON]]
+        Its covariates are distances from those months: it grows whether a day is warmer or colder.
+        """
+        columns = series.covariates
+        first = mean_of_known(columns[: self.first])
+        return replace(series, covariates=np.abs(columns - first))

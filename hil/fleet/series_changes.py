@@ -28,7 +28,7 @@ Kind = Literal["step", "slope"]
 FEWEST: Final = 4
 """Recordings below which a series has no model."""
 AFTER: Final = 2
-"""Recordings on either side of a change: one alone may be an outlier."""
+"""Recordings on either side of a change, and between two: one alone may be an outlier."""
 SIBLINGS: Final = 4
 """Other robots from which on their common course is subtracted."""
 _MOST_CHANGES: Final = 3
@@ -43,6 +43,7 @@ _LEAST_EFFECT: Final = 0.1  # of all friction, that heat and season leave
 _YEAR: Final = 12.0  # months
 _LASTING: Final = 0.8  # of the whole time, that a robot was there for what all have in common
 _ENTRY: Final = 1e-3  # p value of one series from which on a change enters its model
+_ENTRY_WITHOUT_ONE: Final = 0.01  # likewise without any one recording, which may be an outlier
 
 
 @dataclass(frozen=True, eq=False)
@@ -53,7 +54,7 @@ class Series:
         time: of each recording (m,) [months].
         value: relative to the first months (m,).
         variance: of the values, by the recordings alone (m,).
-        covariates: such as temperatures (m, c), finite.
+        covariates: such as temperatures (m, c), NaN where unknown.
     """
 
     time: Array
@@ -213,17 +214,31 @@ def common_course(family: Sequence[Series]) -> CommonCourse | None:
 
 
 def _without_effects(family: Sequence[Series]) -> tuple[list[Series], list[_Prior]]:
-    """Return series without what siblings say of the effects of covariates, and these effects."""
-    centred = [
-        replace(each, covariates=each.covariates - each.covariates.mean(axis=0)) for each in family
-    ]
-    priors = _effects(centred)
-    # Heat and season act on the friction that there is, which may have doubled.
-    without = [
-        replace(each, value=_divided(each.value, each.covariates @ prior.mean))
-        for each, prior in zip(centred, priors, strict=True)
-    ]
+    """Return series without what siblings say of the effects of covariates, and these effects.
+
+    The covariates of these series are deviations from the mean of the robot. Where one is unknown
+    it is 0, and what it might explain counts as variance.
+    """
+    priors = _effects(family)
+    centred = [each.covariates - mean_of_known(each.covariates) for each in family]
+    squares = sum(np.nansum(each**2, axis=0) for each in centred)
+    counts = sum(np.isfinite(each).sum(axis=0) for each in centred)
+    scatter = squares / np.maximum(counts, 1)
+    without = []
+    for each, prior, columns in zip(family, priors, centred, strict=True):
+        known = np.nan_to_num(columns)
+        unknown = np.isnan(columns) @ (prior.mean**2 * scatter)
+        # Heat and season act on the friction that there is, which may have doubled.
+        value = (1.0 + each.value) * np.exp(-known @ prior.mean) - 1.0
+        variance = each.variance + unknown
+        without.append(Series(each.time, value, variance, known))
     return without, priors
+
+
+def mean_of_known(columns: Array) -> Array:
+    """Return the means of columns (m, c) over what is known of them (c,), 0 where nothing is."""
+    counts = np.isfinite(columns).sum(axis=0)
+    return np.asarray(np.nansum(columns, axis=0) / np.maximum(counts, 1))
 
 
 def _divided(value: Array, effect: Array) -> Array:
@@ -262,19 +277,10 @@ def _effects(family: Sequence[Series]) -> list[_Prior]:
     count = family[0].covariates.shape[1] if family else 0
     if not count:
         return [_flat(0) for _ in family]
-    steps = [
-        (np.diff(np.log(np.maximum(1.0 + each.value, _LEAST_EFFECT))),
-         np.diff(each.covariates, axis=0))
-        for each in family
-    ]  # fmt: skip
+    steps = [_steps(each) for each in family]
     value = np.concatenate([y for y, _ in steps])
     columns = np.concatenate([x for _, x in steps])
-    within = np.ones(len(value), dtype=bool)
-    effect = np.zeros(count)
-    for _ in range(5):
-        effect = np.linalg.lstsq(columns[within], value[within], rcond=None)[0]
-        residual = np.abs(value - columns @ effect)
-        within = residual <= _OUTLIER * np.median(residual) / _NORMAL_MAD
+    effect, within = _common_effect(value, columns)
     variance = (
         float(np.mean((value[within] - columns[within] @ effect) ** 2)) if within.any() else 0.0
     )
@@ -295,6 +301,33 @@ def _effects(family: Sequence[Series]) -> list[_Prior]:
         information_of_siblings = np.asarray(np.linalg.inv(covariance), dtype=np.float64)
         priors.append(_Prior(mean, information_of_siblings))
     return priors
+
+
+def unexplained(family: Sequence[Series]) -> float:
+    """Return the mean of the steps of values that an effect of the covariates leaves."""
+    steps = [_steps(each) for each in family]
+    value = np.concatenate([y for y, _ in steps])
+    columns = np.concatenate([x for _, x in steps])
+    effect, _ = _common_effect(value, columns)
+    return float(np.mean(np.abs(value - columns @ effect))) if len(value) else 0.0
+
+
+def _common_effect(value: Array, columns: Array) -> tuple[Array, NDArray[np.bool_]]:
+    """Return the effect of columns (m, c) on steps (m,), and which of these are no outliers."""
+    within = np.ones(len(value), dtype=bool)
+    effect: Array = np.zeros(columns.shape[1])
+    for _ in range(5 if len(value) else 0):
+        effect = np.asarray(np.linalg.lstsq(columns[within], value[within], rcond=None)[0])
+        residual = np.abs(value - columns @ effect)
+        within = residual <= _OUTLIER * np.median(residual) / _NORMAL_MAD
+    return effect, within
+
+
+def _steps(series: Series) -> tuple[Array, Array]:
+    """Return steps of the logarithm of values (m - 1,) and of covariates, where all are known."""
+    known = np.isfinite(series.covariates).all(axis=1)
+    value = np.log(np.maximum(1.0 + series.value[known], _LEAST_EFFECT))
+    return np.diff(value), np.diff(series.covariates[known], axis=0)
 
 
 def _spread(information: Array, products: Array, effect: Array, variance: float) -> Array:
@@ -426,7 +459,8 @@ def _course(series: Series, prior: _Prior, noise: _Noise) -> Course:
     chosen: list[ShapeOfChange] = []
     p_value = 1.0
     while len(chosen) < _MOST_CHANGES:
-        best, statistic = _likeliest(series, prior, weights, chosen, candidates)
+        apart = _apart(series.time, candidates, chosen)
+        best, statistic = _likeliest(series, prior, weights, chosen, apart)
         if best is None:
             break
         single = 2.0 * float(student.sf(abs(statistic), noise.freedom))
@@ -439,6 +473,10 @@ def _course(series: Series, prior: _Prior, noise: _Noise) -> Course:
                 added = pair
             p_value = p = min(1.0, 2.0 * min(p, p_of_pair))
         if p > _ENTRY:
+            break
+        without = _p_without_one(series, prior, weights, chosen, added, noise.freedom)
+        if without > _ENTRY_WITHOUT_ONE:
+            p_value = p_value if chosen else max(p_value, without)
             break
         chosen = _refined(series, prior, weights, [*chosen, *added], candidates)
     return _described(series, prior, weights, tuple(chosen), candidates, p_value, noise)
@@ -455,6 +493,47 @@ def _candidates(time: Array) -> list[ShapeOfChange]:
     begins = np.arange(distinct[0], last + 1e-9, max(_FINE, (last - distinct[0]) / 200.0))
     slopes = [ShapeOfChange("slope", float(begin)) for begin in begins]
     return [*(ShapeOfChange("step", float(begin)) for begin in steps), *slopes]
+
+
+def _p_without_one(
+    series: Series,
+    prior: _Prior,
+    weights: Array,
+    chosen: Sequence[ShapeOfChange],
+    added: Sequence[ShapeOfChange],
+    freedom: float,
+) -> float:
+    """Return the p value of changes without the recording that they most depend on."""
+    gains = []
+    for number in range(len(weights)):
+        others = weights.copy()
+        others[number] = 0.0
+        before = _misfit(series, prior, others, chosen)
+        gains.append(before - _misfit(series, prior, others, [*chosen, *added]))
+    return float(fisher.sf(max(0.0, min(gains)) / len(added), len(added), freedom))
+
+
+def _apart(
+    time: Array, candidates: Sequence[ShapeOfChange], chosen: Sequence[ShapeOfChange]
+) -> list[ShapeOfChange]:
+    """Return the changes that have `AFTER` recordings between them and those chosen."""
+    if not chosen:
+        return list(candidates)
+    near = np.any(_near(time, candidates, chosen), axis=1)
+    return [candidates[k] for k in np.flatnonzero(~near).tolist()]
+
+
+def _near(
+    time: Array, shapes: Sequence[ShapeOfChange], others: Sequence[ShapeOfChange]
+) -> NDArray[np.bool_]:
+    """Return whether there are fewer than `AFTER` recordings between changes and others (s, o).
+
+    Two so near together can be as large as one outlier asks for.
+    """
+    distinct = np.unique(time)
+    first = np.searchsorted(distinct, [shape.begin for shape in shapes], side="right")
+    second = np.searchsorted(distinct, [shape.begin for shape in others], side="right")
+    return np.asarray(np.abs(first[:, None] - second[None, :]) < AFTER)
 
 
 def _design(series: Series, chosen: Sequence[ShapeOfChange]) -> Array:
@@ -529,6 +608,7 @@ def _likeliest_pair(
         - 2.0 * sides[steps, None] * sides * products[steps]
         + sides**2 * first
     ) / np.where(determinant > 1e-6 * first * own, determinant, np.inf)
+    gain[_near(series.time, [candidates[k] for k in steps], candidates)] = 0.0
     step, other = np.unravel_index(int(np.argmax(gain)), gain.shape)
     if not gain[step, other] > 0.0:
         return [], 1.0
@@ -558,8 +638,9 @@ def _refined(
     for _ in range(2 if len(chosen) > 1 else 1):
         for number in range(len(refined)):
             others = [*refined[:number], *refined[number + 1 :]]
-            best, _ = _likeliest(series, prior, weights, others, candidates)
-            if best is not None and best not in others:
+            apart = _apart(series.time, candidates, others)
+            best, _ = _likeliest(series, prior, weights, others, apart)
+            if best is not None:
                 refined[number] = best
     return refined
 

@@ -7,7 +7,7 @@ are adjusted for all robots, joints and quantities (Holm 1979).
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from datetime import datetime
 from typing import Final, Literal, NamedTuple
 
@@ -16,6 +16,7 @@ import numpy as np
 from hil.base.arrays import Array
 from hil.batch.cluster import SkippedArchive
 from hil.compare.comparison import LEAST, holm
+from hil.fleet.covariates import warmed
 from hil.fleet.quantities import CAUSES, FollowedQuantity, QuantityName
 from hil.fleet.series import (
     MONTH,
@@ -82,7 +83,8 @@ class QuantityTrend:
         p_value: of no change, adjusted for all robots, joints and quantities.
         changed: whether the change is significant and at least 5 %.
         explained: whether it would be without temperature and season, and is not with them.
-        effects: share of change by one unit of each covariate, by name.
+        effects: share of change by one unit of each covariate, by name; of a time since the start
+            by the whole warm-up, of the reference error by a unit away from the first months.
         limits: when those that were stated are reached.
     """
 
@@ -160,7 +162,9 @@ class FleetTrend:
         together: all robots of a type, of each type that has enough of them for a year.
         covariates: names of temperatures and other columns that were used.
         seasonal: whether the robots are enough to show what moves all of them at once.
+        unknown: covariates that were asked for, and that no recording has.
         dated_by_file: recordings that have only the date of their file.
+        twice: places of names that are in several at the same time, maybe of several robots.
         simulated: whether no robot moved.
         broken, skipped: what could not be used, and what is not for it.
     """
@@ -169,7 +173,9 @@ class FleetTrend:
     together: tuple[RobotTrend, ...]
     covariates: tuple[str, ...]
     seasonal: bool
+    unknown: tuple[str, ...] = ()
     dated_by_file: int = 0
+    twice: Mapping[str, Sequence[str]] = field(default_factory=dict)
     simulated: bool = False
     broken: tuple[SkippedArchive, ...] = ()
     skipped: tuple[SkippedArchive, ...] = ()
@@ -196,8 +202,8 @@ def fleet_trend(
     Args:
         types: their series.
         limits: of which the dates are foreseen.
-        covariates: numbers that may explain a change, in addition to those that all recordings
-            have.
+        covariates: names of numbers that may explain a change, in addition to those that most
+            recordings have.
     """
     found = [
         (number, each)
@@ -218,12 +224,14 @@ def fleet_trend(
         _robot_trend("", series.digest, (), trends)
         for series, trends in zip(types, by_type, strict=True)
     ]
-    names = {name for series in types for name in series.covariates(covariates)}
+    names = {name for trend in judged if trend.robot for name in trend.effects}
+    known = {name for series in types for name in series.known}
     return FleetTrend(
         robots=_ranked(robots),
         together=_ranked([each for each in together if each.trends]),
         covariates=tuple(sorted(names)),
         seasonal=any(len(series.recordings) > SIBLINGS for series in types),
+        unknown=tuple(name for name in covariates if name not in known),
     )
 
 
@@ -285,7 +293,10 @@ def _family_trends(
         relative = RelativeSeries.of(recordings, values, variances, names, origin)
         if relative is not None:
             series[robot] = relative
-    members = [each.series for each in series.values()]
+    members = warmed([each.series for each in series.values()], names)
+    if followed.quantity == "reference error":
+        pairs = zip(series.values(), members, strict=True)
+        members = [each.of_an_error(member) for each, member in pairs]
     for (robot, each), course in zip(series.items(), courses(members), strict=True):
         if course is not None:
             trend = _trend(robot, followed, each, course, origin, names, limits)
@@ -298,6 +309,7 @@ def _family_trends(
             (1.0 + common.series.value) * reference,
             np.sqrt(common.series.variance) * abs(reference),
             reference,
+            len(common.series.time),
         )
         course = common.course
         trend = _trend("", followed, whole, course, origin, _SEASON, limits)
@@ -359,7 +371,13 @@ def _trend(
         p_value=course.p_value,
         changed=False,
         explained=False,
-        effects=dict(zip(names, (course.effects * scale).tolist(), strict=True)),
+        effects={
+            name: effect * scale
+            for name, effect, column in zip(
+                names, course.effects.tolist(), each.series.covariates.T, strict=True
+            )
+            if np.isfinite(column).any()
+        },
         limits=tuple(reached),
     )
 

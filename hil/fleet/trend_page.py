@@ -27,8 +27,8 @@ from identification.text import percentage
 
 _MONTH: Final = 365.25 / 12.0 * 86400.0  # s
 _HEIGHT: Final = 96.0  # px of a chart
-_VALUE: Final = Legend("value", "value without temperature and season", "--wide", 4.0)
-_RAW: Final = Legend("raw", "value as estimated", "--muted", 2.5)
+_VALUE: Final = Legend("value", "value without temperature and season", "--wide", 6.0)
+_RAW: Final = Legend("raw", "value as estimated", "--muted", 4.0)
 _MODEL: Final = Legend("model", "model", "--second", 1.8)
 
 

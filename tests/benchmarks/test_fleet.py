@@ -2,18 +2,20 @@
 
 from __future__ import annotations
 
+from typing import get_args
+
 import numpy as np
 import pytest
 
-from benchmarks.fleet import EVERY, Fault, Fleet, FleetPlan, planned, watched
+from benchmarks.fleet import EVERY, Fault, Fleet, FleetPlan, Known, planned, watched
 
 LOST = Fault(1, "lubricant", 2, 6.5, 0.25)
 
 
 @pytest.mark.long
-@pytest.mark.parametrize("heat", [True, False])
-def test_a_lost_lubricant_is_found_and_dated(heat: bool) -> None:
-    outcome = watched(FleetPlan(robots=6, months=10, faults=(LOST,)), heat=heat)
+@pytest.mark.parametrize("known", get_args(Known))
+def test_a_lost_lubricant_is_found_and_dated(known: Known) -> None:
+    outcome = watched(FleetPlan(robots=6, months=10, faults=(LOST,)), known)
     ((fault, month, error),) = outcome.found
     assert fault is LOST
     assert month is not None

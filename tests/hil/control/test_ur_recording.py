@@ -25,6 +25,8 @@ from hil.archive.check import check_archive
 from hil.archive.recorder import Recorded
 from hil.base.errors import ArchiveWriteError, ControllerError, InputError, OperatorStopError
 from hil.base.progress import Silent
+from hil.batch.cache import CacheLocation
+from hil.batch.graph import reidentify
 from hil.cell import Cell, CellError
 from hil.cli.record import with_rtde
 from hil.control.link import Progress
@@ -36,6 +38,7 @@ from hil.importers.recording_import import ImportOptions
 from hil.look.look import look_at
 from hil.look.readings import Fact
 from hil.pipeline.identification import identify_archives
+from hil.pipeline.options import FIXED
 from hil.pipeline.torque_constants import find_gains
 from identification.model.known_payload import Payload
 from sim_fixtures.plant import Carried
@@ -50,6 +53,7 @@ from sim_fixtures.ur import (
     UrSettings,
 )
 from sim_fixtures.ur.controller import UrPayload
+from tests.hil.batch_work import Here
 
 HOST = "127.0.0.1"
 NAME = "excitation_000_a1.mcap"
@@ -148,6 +152,17 @@ def test_it_identifies_the_arm_in_units_of_the_stated_constants(
     units = truth.stated_constant / truth.torque_constant
     coulomb = [p.estimate for p in found.results.parameters if p.name.startswith("f0_")]
     np.testing.assert_allclose(coulomb, truth.plant.coulomb * units, rtol=0.1)
+
+
+def test_a_batch_has_the_mean_temperature_of_each_joint(recorded: Path, tmp_path: Path) -> None:
+    """Which may explain a change of its friction."""
+    cache = CacheLocation(str(tmp_path))
+    result = reidentify([str(recorded)], FIXED, Here(), Silent(), cache=cache)
+    (repetition,) = result.repetitions
+    means = open_archive(recorded).columns["joint_temperature"].mean(axis=0)
+    assert repetition.facts == pytest.approx(
+        {f"joint_temperature{number}": mean for number, mean in enumerate(means, 1)}
+    )
 
 
 def test_a_known_load_decides_the_torque_constants(recorded: Path, tmp_path: Path) -> None:

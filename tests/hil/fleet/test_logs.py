@@ -76,8 +76,8 @@ def broken(result):
 class TestFound:
     """Which files are logs."""
 
-    def found(self, *places):
-        importing = LogsOfBatch(None, CacheLocation(), None, Silent())
+    def found(self, *places, others=()):
+        importing = LogsOfBatch(None, CacheLocation(), None, Silent(), frozenset(others))
         return [
             str(Path(each).relative_to(self.root))
             for each in find_recordings([str(place) for place in places], importing).logs
@@ -119,6 +119,14 @@ class TestFound:
     )  # fmt: skip
     def test_by_a_pattern(self, pattern, names):
         assert self.found(pattern) == names
+
+    def test_conditions_and_tables_of_quantities_are_none(self):
+        """Also of a pattern that matches them."""
+        (self.root / "a" / "hall.csv").write_text("when,ambient\n2026-03-15,21.5\n")
+        (self.root / "a" / "trend.csv").write_text("robot,joint,quantity,when,value\n")
+        for places in (["a"], ["a/*.csv", "a/*.npz"]):
+            found = self.found(*places, others=[self.root / "a" / "hall.csv"])
+            assert found == ["a/one.csv", "a/two.npz"]
 
     def test_a_pattern_that_matches_nothing_is_refused(self):
         with pytest.raises(InputError, match=r"c\*\.csv: matches no file"):
@@ -178,6 +186,17 @@ class TestRead:
         assert (len(result.repetitions), [*broken(result)]) == (4, ["a.csv"])
         (log_map,) = importing.maps
         assert Path(log_map.first).name == FIRST
+
+    def test_a_copy_counts_once(self, folder):
+        """Under another name, and of another robot."""
+        first = folder / "robot00" / FIRST
+        shutil.copy(first, folder / "robot00" / "latest.csv")
+        shutil.copy(first, folder / "robot01" / "2024-07-01.csv")
+        result, _ = batch(folder)
+        assert len(result.repetitions) == 4
+        names = ("latest.csv", "2024-07-01.csv")
+        reasons = {Path(each.path).name: each.message for each in result.skipped}
+        assert reasons == dict.fromkeys(names, f"is a copy of {first}")
 
     def test_logs_with_other_channels_have_a_map_of_their_own(self, folder):
         for path in (folder / "robot01").glob("*.csv"):

@@ -44,6 +44,7 @@ class TestRobot:
             ("data/{robot}/**/*.csv", "/data/r04/a/b/log.csv", "r04"),
             ("data/{robot}/**/*.csv", "/data/r04/log.csv", "r04"),
             ("log_{robot}_*.csv", "/data/2026-01-01/log_SN-12_x.csv", "SN-12"),
+            ("{robot}/{robot}/{date}.csv", "/data/line1/r04/2026-03-15.csv", "line1/r04"),
             ("{robot}_{date}.csv", "/2026-01-01/cell.7_2026-02-01.csv", "cell.7"),
             ("folder", "/data/r04/2026-03-15.csv", "r04"),
         ],
@@ -67,10 +68,37 @@ class TestRobot:
         with pytest.raises(InputError, match="--robot"):
             placed(spec, "/data/y.csv", when="x")
 
-    @pytest.mark.parametrize("spec", ["robot", "column=", "{robot}{serial}", "{robot}/{robot}"])
+    @pytest.mark.parametrize(
+        "spec", ["robot", "column=", "{robot}{serial}", "{robot}/{date}/{date}"]
+    )
     def test_that_nothing_names_is_refused(self, spec):
         with pytest.raises(InputError, match="--robot"):
             RobotNaming.parse(spec)
+
+
+class TestSeveralPlaces:
+    """One name in several folders: of several robots, or of one with a folder for each month."""
+
+    @staticmethod
+    def of(spec, *recordings):
+        naming = RobotNaming.parse(spec)
+        return naming.in_several_places(
+            [naming.place(ref(origin, when=when)) for origin, when in recordings]
+        )
+
+    def test_at_the_same_time_are_shown(self):
+        recordings = [
+            (f"/{line}/r04/{month}.csv", month)
+            for line in ("line1", "line2")
+            for month in ("2026-01-15", "2026-02-15")
+        ]
+        assert self.of("{robot}/*.csv", *recordings) == {"r04": ["/line1/r04", "/line2/r04"]}
+        assert self.of("folder", *recordings) == {"r04": ["/line1/r04", "/line2/r04"]}
+        assert self.of("{robot}/{robot}/*.csv", *recordings) == {}
+
+    def test_one_after_the_other_are_one_robot(self):
+        recordings = [(f"/{month}/r04/log.csv", month) for month in ("2026-01-15", "2026-02-15")]
+        assert self.of("{robot}/*.csv", *recordings) == {}
 
 
 class TestDate:

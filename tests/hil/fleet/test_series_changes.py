@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -127,6 +129,18 @@ class TestNotInvented:
             noisy = fleet(seed + 100, robots=1, day=0.04)[0]
             alarms += courses([noisy, *family[1:]])[0].p_value < 0.01
         assert alarms <= 2
+
+    @pytest.mark.parametrize("place", [0, 3, -2, -1])
+    def test_one_outlier_is_none(self, place):
+        """Neither by a slope to the last recording, nor by two changes between three of them."""
+        alarms = 0
+        for seed in range(20):
+            family = fleet(seed, months=9, heat=False)
+            value = family[0].value.copy()
+            value[place] -= 0.18
+            found = courses([replace(family[0], value=value), *family[1:]])
+            alarms += holm(np.array([each.p_value for each in found]))[0] < 0.01
+        assert alarms <= 1
 
     def test_a_short_series_has_no_model(self):
         family = fleet(0, months=FEWEST - 1)

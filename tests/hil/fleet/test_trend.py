@@ -13,7 +13,6 @@ from benchmarks.fleet import Fault, Fleet, FleetPlan, urdf, write_fleet
 from hil.base.errors import InputError
 from hil.batch.cluster import Cluster
 from hil.cli import app
-from hil.fleet.series import names_of_joint
 from hil.fleet.trend_limits import TrendLimit
 from tests.hil.batch_work import NOTHING_OPEN
 from tests.hil.report.test_report import Page, assert_inert, assert_stands_alone
@@ -133,6 +132,18 @@ def test_a_table_of_a_batch_gives_the_same_robots(done, logs, tmp_path):
     assert printed["covariates"] == ["temperature"]
 
 
+def test_a_covariate_that_no_recording_has_is_named(done, logs):
+    ran = run(logs, "--covariate", "payload")
+    assert ran.exit_code == 0, ran.output
+    assert "no recording has a column 'payload'" in ran.stdout
+
+
+def test_logs_without_their_arm_are_refused_with_the_option(logs):
+    ran = CliRunner().invoke(app, ["trend", str(logs)])
+    assert isinstance(ran.exception, InputError)
+    assert "--urdf" in str(ran.exception)
+
+
 class TestLimit:
     def test_is_a_quantity_and_a_change(self):
         assert TrendLimit.parse("friction+50%") == ("friction", 0.5)
@@ -142,20 +153,3 @@ class TestLimit:
     def test_is_refused_otherwise(self, text):
         with pytest.raises(InputError, match="--limit"):
             TrendLimit.parse(text)
-
-
-class TestCovariates:
-    JOINTS = ("shoulder", "elbow", "wrist")
-
-    @pytest.mark.parametrize(
-        ("names", "joint", "expected"),
-        [
-            (["temp1", "temp2", "temp3", "ambient"], "elbow", ["temp2", "ambient"]),
-            (["T_0", "T_1", "T_2"], "wrist", ["T_2"]),
-            (["m/wrist", "m/elbow", "m/shoulder", "ambient"], "elbow", ["m/elbow", "ambient"]),
-            (["temp1", "temp2"], "shoulder", ["temp1", "temp2"]),
-            ([], "shoulder", []),
-        ],
-    )
-    def test_of_a_joint_are_its_own_and_those_of_none(self, names, joint, expected):
-        assert names_of_joint(names, joint, self.JOINTS) == expected
