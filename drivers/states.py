@@ -264,7 +264,7 @@ class RequestedMotion(Protocol):
         """Reason of that outcome."""
 
 
-class Axes(Protocol):
+class AxisModes(Protocol):
     """What a decision reads of the modes of the axes, an `AxesReport`."""
 
     def misplaced(self, in_motion: bool) -> int | None:
@@ -296,7 +296,7 @@ def decide(
     cause: Input,
     losses: LossTracker,
     motion: RequestedMotion | None,
-    axes: Axes | None = None,
+    axes: AxisModes | None = None,
 ) -> Decision:
     """Return what an input does in this state; changes nothing.
 

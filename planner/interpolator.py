@@ -20,12 +20,12 @@ from planner.interpolator_codes import (
     Event,
     EventKind,
     FlybyCriterion,
+    InterpolationStep,
     MotionType,
     OutputFormat,
     PointAccuracy,
     SpeedCorrection,
     Status,
-    Step,
 )
 from planner.interpolator_settings import MoveSettings, require, service
 from planner.limits import JointLimits
@@ -45,16 +45,17 @@ __all__ = [
     "PointAccuracy",
     "SpeedCorrection",
     "Status",
-    "Step",
+    "InterpolationStep",
 ]
 
 
 class Interpolator(MoveSettings):
     """Plans joint moves while they run, and plays them, with the services of RRS-1.
 
-    Services return a `Status` (`get_next_step` a `Step`); a refused service changed nothing, and
-    `refusal` is the reason of the last one. Settings apply to later targets, except GEN_OVR
-    (`set_override_speed`), which acts at once. The same calls return the same steps bit by bit.
+    Services return a `Status` (`get_next_step` an `InterpolationStep`); a refused service changed
+    nothing, and `refusal` is the reason of the last one. Settings apply to later targets, except
+    GEN_OVR (`set_override_speed`), which acts at once. The same calls return the same steps bit by
+    bit.
 
     Args:
         limits: Limits of the arm.
@@ -161,7 +162,7 @@ class Interpolator(MoveSettings):
         """Return the identifier of the next target, or None."""
         return self._queue.ahead[0].target_id if self._queue and self._queue.ahead else None
 
-    def get_next_step(self, output_format: int = OutputFormat.JOINT) -> Step:
+    def get_next_step(self, output_format: int = OutputFormat.JOINT) -> InterpolationStep:
         """Return the next step of the motion.
 
         OK; NEED_MORE_DATA while fewer targets are known than requested; FINAL_STEP at the end of
@@ -267,14 +268,16 @@ class Interpolator(MoveSettings):
     def _wanted(self, queue: MotionQueue) -> Status:
         return Status.NEED_MORE_DATA if len(queue.ahead) <= self._advance else Status.OK
 
-    def _step(self, status: Status, events: tuple[Event, ...]) -> Step:
-        return Step(status, self._position, self._elapsed, self._at_ends(self._position), events)
+    def _step(self, status: Status, events: tuple[Event, ...]) -> InterpolationStep:
+        return InterpolationStep(
+            status, self._position, self._elapsed, self._at_ends(self._position), events
+        )
 
-    def _no_step(self, status: Status, reason: str) -> Step:
+    def _no_step(self, status: Status, reason: str) -> InterpolationStep:
         self.refusal = reason
         return self._step(status, ())
 
-    def _stand(self, events: tuple[Event, ...]) -> Step:
+    def _stand(self, events: tuple[Event, ...]) -> InterpolationStep:
         """Return the step of a stopped arm at rest."""
         target = self.get_current_target_id()
         if not self._stop_reported and target is not None:
@@ -286,7 +289,7 @@ class Interpolator(MoveSettings):
             self._rest_at(self._position)
         return step
 
-    def _finish(self, queue: MotionQueue, before: float, now: float) -> Step:
+    def _finish(self, queue: MotionQueue, before: float, now: float) -> InterpolationStep:
         """Return the step in which the motion ends, between two motion times [s]."""
         share = (queue.duration - before) / (now - before) if now > before else 0.0
         self._elapsed += self._period * min(share, 1.0)

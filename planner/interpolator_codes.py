@@ -97,7 +97,7 @@ class Event(NamedTuple):
     target_id: int
 
 
-class Step(NamedTuple):
+class InterpolationStep(NamedTuple):
     """One interpolation step.
 
     `position` is the set-point (n,) [rad], read-only, the last one after an error and NaN before

@@ -27,7 +27,7 @@ CEILINGS: Final[Mapping[str, int]] = {
     "array types defined twice": 0,
     "long names of tests": 0,
     "tests of hil outside a room": 0,
-    "class names defined twice": 2,
+    "class names defined twice": 0,
 }
 """Figures that no change may exceed. Size has none: features are not traded for lines."""
 BANNED: Final = {
