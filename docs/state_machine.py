@@ -1,4 +1,4 @@
-"""Writes `state-machine.md` and its picture, `state-machine.svg`, from the session's state table.
+"""Writes the last section of `wire.md` and its picture, `state-machine.svg`, from the session's states.
 
 Positions of states are defined here; arrows and their labels come from `drivers.states`. The
 picture has its own background, so that it is readable on light and dark pages.
@@ -15,13 +15,13 @@ from typing import Final
 
 from drivers.states import TRANSITIONS, Input, State
 
-PAGE: Final = Path(__file__).with_name("state-machine.md")
+PAGE: Final = Path(__file__).with_name("wire.md")
 TARGET: Final = Path(__file__).with_name("state-machine.svg")
 Table = Mapping[State, Mapping[Input, State]]
 
-_TITLE: Final = """# The session's state machine
-
-This page and its picture are generated from the table `drivers.states.TRANSITIONS` by
+_TITLE: Final = "## The session's state machine"
+_SOURCE: Final = """
+This section and its picture are generated from the table `drivers.states.TRANSITIONS` by
 `python docs/state_machine.py`; a test fails if they differ. The replies of each state are in the
 docstring of `drivers/session.py`.
 """
@@ -96,11 +96,12 @@ def input_table(table: Table = TRANSITIONS) -> str:
 
 
 def page() -> str:
-    """Return the text of ``docs/state-machine.md``."""
+    """Return the text of ``docs/wire.md`` with its last section as the table has it."""
     started = ", ".join(label(state) for state, row in TRANSITIONS.items() if Input.OFF in row)
+    before, _, _ = PAGE.read_text("utf-8").partition(_TITLE)
     return (
-        f"{_TITLE}\n![States of the session, and the inputs between them]({_PICTURE})\n\n"
-        f'"{_ANY[0].upper() + _ANY[1:]}" means: {started}.\n\n## Inputs\n\n'
+        f"{before}{_TITLE}\n{_SOURCE}\n![States of the session, and the inputs between them]({_PICTURE})\n\n"
+        f'"{_ANY[0].upper() + _ANY[1:]}" means: {started}.\n\n### Inputs\n\n'
         "A cyclic packet is one input, which depends on the axes to be moved; the session adds "
         "further inputs. An input without a target in a state cannot occur in it.\n\n"
         f"{input_table()}"

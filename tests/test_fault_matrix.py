@@ -1,4 +1,4 @@
-"""Every fault in every situation has the outcome of docs/fault-matrix.md, and breaks no law.
+"""Every fault in every situation has the outcome of docs/limits.md#fault-matrix, and breaks no law.
 
 The laws are those of `tests.drivers.judge`; also, the arm comes to rest, and a new motion completes
 after the drive was switched on again.

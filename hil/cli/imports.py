@@ -391,7 +391,7 @@ def log(
 ) -> None:
     """Import a numeric log: CSV, text matrices, .npz, .npy, .mat, MATLAB text or .mcap.
 
-    A column map names columns or arrays, their units and sides: `docs/archive-format.md`. It can
+    A column map names columns or arrays, their units and sides: `docs/logs.md`. It can
     also name a separate file per quantity or per joint; the source is then a folder. Without --map
     it is inferred from the names and units of the channels, printed, and written next to the
     archive. Warnings report probable errors of the map, with the errors of both interpretations.

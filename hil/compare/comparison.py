@@ -1,4 +1,4 @@
-"""Parameters that differ significantly between campaigns of one arm; see `docs/compare.md`.
+"""Parameters that differ significantly between campaigns of one arm; see `docs/batch.md#comparing-campaigns`.
 
 The variance of a value is the larger of that of the estimate and that of the repetitions, whose
 effective number is n (1 - ρ) / (1 + ρ) (Bayley and Hammersley 1946) with ρ corrected for bias

@@ -17,7 +17,7 @@ from hil.importers.column_map import map_text
 from hil.importers.rosbag2 import CommandStamps, Effort
 
 _COMMENT: Final = "How hil read the joint states of the bag; joints by their names"
-_DOCUMENTATION: Final = "docs/bring-your-own-robot.md"
+_DOCUMENTATION: Final = "docs/logs.md"
 
 
 class BagMap(BaseModel):

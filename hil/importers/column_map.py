@@ -1,6 +1,6 @@
 """The column map of a log, a TOML file: which columns or arrays hold which quantity.
 
-`docs/archive-format.md` describes its entries.
+`docs/logs.md` describes its entries.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ KINEMATIC: Final = ("position", "velocity", "commanded_position")
 Vector = tuple[FiniteFloat, ...]
 Column = Annotated[int, Field(ge=0)] | str
 _Number = Annotated[int, Field(ge=1)]
-DOCUMENTATION: Final = "the column map in docs/archive-format.md"
+DOCUMENTATION: Final = "the column map in docs/logs.md"
 _ONE_OR_EACH = "a number, or a list of one per joint"
 _Share = Annotated[FiniteFloat, Field(ge=0.0, lt=1.0)]
 _PerJoint = Annotated[Vector | None, Field(description="a list of numbers, one per joint")]

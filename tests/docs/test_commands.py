@@ -30,7 +30,7 @@ TYPED_ELSEWHERE = {
     "payload.md": "tests/hil/payload/test_payload_command.py",
     **dict.fromkeys(
         (
-            "bring-your-own-robot.md",
+            "logs.md",
             "i-have-a-comau.md",
             "simulators.md",
         ),
@@ -74,16 +74,16 @@ NOT_TYPED = {
     "hil torque-constants archives": "needs recordings with a load",
     "hil run campaigns/october --live": "needs a campaign on a real link",
     "hil import rosbag2": "needs a recording; tests/hil/importers/test_rosbag2.py",
-    "hil import log log.csv --map columns.toml": "typed in bring-your-own-robot.md",
-    "hil torque-constants empty.mcap": "typed in bring-your-own-robot.md",
+    "hil import log log.csv --map columns.toml": "typed in logs.md",
+    "hil torque-constants empty.mcap": "typed in logs.md",
     "hil payload bare --loaded gripper": "typed in payload.md",
     "hil payload --model": "typed in payload.md",
-    "hil design cell.toml -o runs/precise": "typed in precision.md",
-    "hil design cell.toml -o runs/next": "typed in precision.md",
-    "hil rehearse runs/precise": "typed in precision.md",
-    "hil run runs/precise": "typed in precision.md",
-    "hil rehearse runs/next": "typed in precision.md",
-    "hil run runs/next": "typed in precision.md",
+    "hil design cell.toml -o runs/precise": "typed in design.md",
+    "hil design cell.toml -o runs/next": "typed in design.md",
+    "hil rehearse runs/precise": "typed in design.md",
+    "hil run runs/precise": "typed in design.md",
+    "hil rehearse runs/next": "typed in design.md",
+    "hil run runs/next": "typed in design.md",
     "hil identify ur10": "needs a recording; tests/hil/identified/test_one_command.py reads it",
     "hil identify chirp_sweep": "needs recordings; tests/hil/servo/test_servo_command.py",
     "hil identify '~/.cache": "needs a data set; tests/hil/importers/test_lerobot.py writes some",
@@ -222,10 +222,10 @@ FAST = ("connect.md", "i-have-a-log.md", "motion.md", "README.md")
 AFTER_A_DEMO = ("commands.md", "controller.md", "tutorial.md")
 AFTER_TWO = {
     "commands.md": ("march", "june"),
-    "compare.md": ("march", "june"),
+    "batch.md": ("march", "june"),
     "design.md": ("demo",),
 }  # Pages that name campaigns of one arm, and how
-SLOW = ("commands.md", "compare.md", "controller.md", "design.md", "tutorial.md")
+SLOW = ("batch.md", "commands.md", "controller.md", "design.md", "tutorial.md")
 
 
 @pytest.mark.parametrize(

@@ -81,7 +81,7 @@ class TestPrecision:
         """In the order in which a user has what a block needs: the campaign before `--given`."""
         for name in ("cell.toml", "robot.urdf"):
             shutil.copy(ROOT / "examples" / "two_joints" / name, workplace)
-        text = page("precision.md")
+        text = section(DESIGN, "Precision to order")
         first, given, campaign, following = (block for _, block in blocks(text))
         assert typed(first) == ["design"]
         assert typed(campaign, (0, 5)) == ["rehearse", "run"]
@@ -93,8 +93,8 @@ class TestPrecision:
         assert record["outcome"] in ("met", "out of reach")
 
 
-class TestBringYourOwnRobot:
-    TEXT = page("bring-your-own-robot.md")
+class TestLogs:
+    TEXT = page("logs.md")
     BALANCER = TEXT.split("## An arm with a balancer")[1].split("\n## ")[0]
 
     def test_every_block_runs(self, workplace: Path, identified_campaign: Campaign) -> None:
@@ -107,7 +107,7 @@ class TestBringYourOwnRobot:
         ran = []
         for language, block in blocks(self.TEXT.replace(self.BALANCER, "")):
             if language == "python":
-                exec(compile(block, "docs/bring-your-own-robot.md", "exec"), {})
+                exec(compile(block, "docs/logs.md", "exec"), {})
             elif language == "toml":
                 saved(block)
             else:

@@ -1,6 +1,6 @@
 """Run every fault in every situation and print the outcomes: `python -m tests.fault_matrix`.
 
-The table is that of docs/fault-matrix.md, which the tests read; exit status 1 if a law was broken.
+The table is that of docs/limits.md#fault-matrix, which the tests read; exit status 1 if a law was broken.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ from typing import Final
 from tests.fault_matrix import faulty_runs, ur_runs
 from tests.fault_matrix.faulty_runs import Run
 
-DOCUMENT: Final = Path(__file__).parents[2] / "docs" / "fault-matrix.md"
+DOCUMENT: Final = Path(__file__).parents[2] / "docs" / "limits.md"
 Outcomes = Mapping[str, tuple[str, ...]]
 """By situation or speed: one, or one for each behaviour of the controller."""
 

@@ -183,7 +183,7 @@ def test_a_standstill_gives_the_noise(tmp_path: Path) -> None:
 
 ROOT = Path(__file__).resolve().parents[3]
 DATA = ROOT.parent / "shared" / "data"
-TEXT = (ROOT / "docs" / "bring-your-own-robot.md").read_text(encoding="utf-8")
+TEXT = (ROOT / "docs" / "logs.md").read_text(encoding="utf-8")
 SECTION = TEXT.split("## Two published recordings")[1].split("\n## ")[0]
 COMMANDS = re.findall(r"^\$ hil (.*)$", SECTION, re.MULTILINE)
 

@@ -1,4 +1,4 @@
-"""Answers to all packets are those of the protocol and of `docs/safety-rules.md`.
+"""Answers to all packets are those of the protocol and of `docs/safety.md#safety-rules`.
 
 One answer to each new well-formed packet, with the next number; the same bytes to a duplicate; none
 to stale, foreign or malformed packets. The contents of answers are the law `guard`.

@@ -20,7 +20,7 @@ _NUMBERS: Final = 0x7FFF  # largest packet number
 def gaps(seen: Observed) -> Iterator[str]:
     """A motion with more consecutive missed packets than allowed does not complete.
 
-    `docs/safety-rules.md`: it is stopped on its path, refused or lost.
+    `docs/safety.md#safety-rules`: it is stopped on its path, refused or lost.
     """
     most = seen.cell.controller.max_gap
     for number, life in enumerate(seen.runs, start=1):
