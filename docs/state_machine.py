@@ -1,4 +1,4 @@
-"""Writes the last section of `wire.md` and its picture, `state-machine.svg`, from the session's states.
+"""Writes the last section of `wire.md` and its picture from the session's state table.
 
 Positions of states are defined here; arrows and their labels come from `drivers.states`. The
 picture has its own background, so that it is readable on light and dark pages.
@@ -100,7 +100,8 @@ def page() -> str:
     started = ", ".join(label(state) for state, row in TRANSITIONS.items() if Input.OFF in row)
     before, _, _ = PAGE.read_text("utf-8").partition(_TITLE)
     return (
-        f"{before}{_TITLE}\n{_SOURCE}\n![States of the session, and the inputs between them]({_PICTURE})\n\n"
+        f"{before}{_TITLE}\n{_SOURCE}\n"
+        f"![States of the session, and the inputs between them]({_PICTURE})\n\n"
         f'"{_ANY[0].upper() + _ANY[1:]}" means: {started}.\n\n### Inputs\n\n'
         "A cyclic packet is one input, which depends on the axes to be moved; the session adds "
         "further inputs. An input without a target in a state cannot occur in it.\n\n"

@@ -119,7 +119,7 @@ class Archive:
                 self.path,
                 "is not a JSON object",
                 field=name,
-                remedy="leave the archive out, or attach that of another one of its campaign",
+                remedy="leave the archive out, or attach the file of another archive of its run",
             )
         return content
 

@@ -224,7 +224,7 @@ class Scan:
             outcome = ArchiveOutcome.of(entries)
             self.mixed = not outcome.belongs_to(self.header)
             if self.mixed:
-                raise Damage(offset, "(metadata 'hil.outcome') is that of another recording")
+                raise Damage(offset, "(metadata 'hil.outcome') belongs to another recording")
             self.outcome = outcome
         elif name in (METADATA, OUTCOME):
             raise Damage(offset, f"(metadata {name!r}) is there a second time")

@@ -327,7 +327,7 @@ def message_layout(
         if name not in types:
             raise LayoutError(f"they have no {name}")
         if types[name][0] != kind:
-            raise LayoutError(f"their {name} is not that of {n} joints")
+            raise LayoutError(f"their {name} does not fit {n} joints")
     return layout
 
 

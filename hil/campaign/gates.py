@@ -162,8 +162,8 @@ def require_as_rehearsed(campaign: CampaignState, connection: Connection) -> Non
         return
     raise NotRehearsedError(
         campaign.folder.root,
-        "was planned and rehearsed with wider following-error thresholds than those of the "
-        f"controller ({'; '.join(below)})",
+        "was planned and rehearsed with wider following-error thresholds than the "
+        f"controller announces ({'; '.join(below)})",
         "write the controller's into [drive_train] following_error of the cell file and rehearse, "
         "or widen them in the controller",
     )

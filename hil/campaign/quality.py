@@ -219,7 +219,7 @@ class RepetitionCheck:
             joint = int(np.argmax(new[row] / bound))
             if new[row, joint] > bound[joint]:
                 return QualityProblem(
-                    f"the {what} of {self._cell.joint_names[joint]} differs from that of the "
+                    f"the {what} of {self._cell.joint_names[joint]} differs from the "
                     f"{len(self._earlier)} repetitions before by {percentage(new[row, joint], 2)} "
                     f"of {scale} (rms); {percentage(bound[joint], 2)} are allowed",
                     differs=True,

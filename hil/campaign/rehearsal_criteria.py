@@ -214,7 +214,7 @@ def of_estimate(twin: Twin, folder: CampaignFolder, reporter: Reporter) -> list[
             MOST_SIGMA,
             f"the errors of {finite.sum()} parameters are at most {apart[farthest]:.3g} standard "
             f"deviations ({estimate.names[farthest]}), {MOST_SIGMA:g} are allowed",
-            "the drive train or the model of the cell file is not that of the arm",
+            "drive train or model of the cell file do not match the arm",
         ),
         criterion(
             "unseen motion",

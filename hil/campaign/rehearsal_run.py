@@ -164,7 +164,7 @@ def _not_seen(cell: Cell) -> list[str]:
         name for name in ("gear_ratio", "joint_sign", "joint_offset_deg") if name not in given
     ]
     sentences = [
-        "torque constants and current limits: the simulated motors have those of the cell file",
+        "torque constants and current limits: the simulated motors take them from the cell file",
         "floor, walls and shapes: they are checked, but as the cell file and the URDF have them",
     ]
     if (unchecked := collision_checker(cell).exceptions) is not None:

@@ -146,7 +146,7 @@ class Cell:
         }
         changed = self._with_robot(friction=common.model_copy(update={"joints": joints}))
         if [law.table() for law in changed.model.friction.laws] != [dict(law) for law in laws]:
-            raise ValueError("the friction laws are not those of this arm's joints")
+            raise ValueError("the friction laws do not belong to this arm's joints")
         return changed
 
     def without_payload(self) -> Cell:

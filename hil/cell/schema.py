@@ -92,7 +92,7 @@ class PayloadTable(Table):
         [0.0, 0.0, 0.0, 0.0, 0.0, 0.0],
     )
     frame: str = field(
-        "link of the URDF that defines the frame; nothing for that of the last joint", ""
+        "link of the URDF that defines the frame; nothing for the frame of the last joint", ""
     )
     name: str = field("its name, which the header of each archive has", "")
 
@@ -206,7 +206,7 @@ class CouplingTable(Table):
 
     motor_from_joint: list[Vector] | Literal["drive_train"] = field(
         "motor angle per joint angle, one row per motor, each with one value per "
-        'joint; or "drive_train" for that of [drive_train]'
+        'joint; or "drive_train" as stated in [drive_train]'
     )
     inertia: Choice = field("true or false: an inertia for each pair of coupled joints", True)
     friction: Choice = field("true or false: friction of each coupled motor", True)

@@ -134,7 +134,7 @@ def design(
             limits, too. Default: 5 kg.
         payload_centre: Its centre of mass as it is expected, m in the frame of the flange. Default:
             0,0,0.1.
-        repetitions: Number of repetitions of the motion. Default: that of [campaign].
+        repetitions: Number of repetitions of the motion. Default: as in [campaign].
         seed: Seed of the search; the result depends on nothing else. Default: that of the settings.
         workers: Number of processes; the result does not depend on it. Default: one per processor.
         limits_only: Check joint limits only and do not return to the home posture; for comparison

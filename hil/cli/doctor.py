@@ -31,7 +31,7 @@ def doctor(
     Checks permissions, processor, load, route, port or CAN bus, and disk; then measures wake-up and
     turnaround latency in processes with the real-time settings of an exchange. Sends nothing to the
     controller, changes nothing and needs no root; run it as the user who will run hil. Each remedy
-    is a command. Cycles of 1 and 2 ms are judged, and that of CELL; without CELL it is 1 ms.
+    is a command. Judges cycles of 1 and 2 ms, and the cycle of CELL; without CELL, 1 ms.
 
     Exit status: 0 fit for the cycle; 5 not fit, or the link cannot work, or measured for less than
     60 s (provisional); 2 bad input.

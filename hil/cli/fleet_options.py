@@ -120,7 +120,7 @@ class Fleet:
 def map_lines(maps: Mapping[LogMap, int], *, verbose: bool) -> Iterator[str]:
     """Name the map of each kind of logs; with `verbose` also what it says of the channels."""
     for log_map, count in maps.items():
-        source = f"concluded from {log_map.first}" if log_map.first else "given by --map"
+        source = f"inferred from {log_map.first}" if log_map.first else "given by --map"
         yield f"{plural(count, 'log')} read by the column map {source}"
         if verbose:
             yield from (f"  {meaning}" for meaning in log_map.meanings)

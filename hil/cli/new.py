@@ -88,7 +88,7 @@ def new(
             at HOST; this PC listens on PORT (1000).
         from_archive_file: Read the cell and the init packet of an archive of this arm.
         controller: Ask an arm for its values: ur (Universal Robots, over RTDE).
-        host: Address of that arm; the port is that of RTDE (30004).
+        host: Address of that arm; its RTDE port is 30004.
         bind: Local address to listen on; 0.0.0.0 for all.
         arm: Arm number of the controller.
         wait: Time to wait for the controller, s.

@@ -33,7 +33,7 @@ def plot(
     **Example:** `hil plot runs/demo/archives/excitation_000_a1.mcap --joint 2 -o joint_2.svg`
 
     Options:
-        archive: The archive (*.mcap), or a folder, of which the first archive is plotted.
+        archive: The archive (*.mcap), or a folder, whose first archive is plotted.
         output: The picture (*.png, *.svg, *.pdf). Default: the name of the archive with .png, in
             the working directory.
         start: Start of the plotted part, s.

@@ -172,7 +172,7 @@ def constants_lines(found: ConstantsFound) -> Iterator[str]:
     if np.isfinite(found.stated).any():
         yield f"torque constants by the arm's own model: {_constants(found.stated)}"
     if found.differ:
-        yield f"those of the cell differ: {_constants(found.in_cell)}; correct torque_constant"
+        yield f"the cell has others: {_constants(found.in_cell)}; correct torque_constant"
     share = percentage(found.uncertainty)
     yield (
         f"next  the constants are uncertain by {share}: record the motion with a known load, then\n"

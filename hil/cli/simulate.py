@@ -165,7 +165,7 @@ def simulate(
     the emergency stop. See `docs/simulate.md`, also for the faults.
 
     With --link rtde:HOST[:PORT] it is a Universal Robots controller that listens at that address
-    (RTDE, primary interface and dashboard) until Ctrl-C: outputs only, for programs that read them.
+    (RTDE, primary interface and dashboard) until Ctrl-C, and runs the program of `hil move`.
 
     Options:
         cell: Cell file; without a [simulation] table the arm has the values of [nominal].

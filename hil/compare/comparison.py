@@ -1,4 +1,4 @@
-"""Parameters that differ significantly between campaigns of one arm; see `docs/batch.md#comparing-campaigns`.
+"""Parameters that differ significantly between campaigns of one arm; see `docs/batch.md`.
 
 The variance of a value is the larger of that of the estimate and that of the repetitions, whose
 effective number is n (1 - ρ) / (1 + ρ) (Bayley and Hammersley 1946) with ρ corrected for bias

@@ -355,7 +355,7 @@ def _require_same_arm(cell: Cell, reader: RtdeReader, identity: ArmIdentity) -> 
     """Raise ControllerError if the arm is not that of the cell."""
     cycle_ms = round(1000.0 / reader.frequency)
     if cycle_ms != cell.controller.cycle_ms:
-        problem = f"the controller's cycle is {cycle_ms} ms, that of the cell"
+        problem = f"the controller's cycle is {cycle_ms} ms, the cell states"
         remedy = f"write cycle_ms = {cycle_ms} in [controller]"
         raise ControllerError(f"{problem} {cell.controller.cycle_ms} ms; {remedy}")
     if different := cell.expected_arm.differences(identity, reader.version.major):

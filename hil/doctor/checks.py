@@ -385,7 +385,7 @@ def rtde_check(server: RtdeServer) -> DoctorCheck:
             "RTDE", CheckStatus.BAD, f"{where}: {error.reason}", (f"# {error.remedy}",)
         )
     except (DriverError, OSError) as error:
-        remedy = "# make sure that the port is that of RTDE (30004)"
+        remedy = "# make sure that this is the RTDE port (30004)"
         return DoctorCheck("RTDE", CheckStatus.BAD, f"{where}: {error}", (remedy,))
     facts = f"{where} replies: software {version}"
     if (version.major, version.minor) < OLDEST or version.major > NEWEST_MAJOR:

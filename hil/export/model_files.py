@@ -126,12 +126,12 @@ class ExportedEnsemble:
         lines = [
             f"written: {len(arms)} arms drawn with seed {self.seed} in {self.path}",
             f"moved to the nearest physically consistent arm: {np.count_nonzero(arms.moved)}",
-            "spread of their torque on the fitted motion over that of the stated intervals:"
+            "spread of their torque on the fitted motion over the spread by the stated intervals:"
             f" {pooled:.2f} over all joints ({spread})",
         ]
         if abs(pooled - 1.0) > _SPREAD_TOLERANCE:
             lines.append(
-                f"the spread of fewer than {FEWEST} arms is that of chance: draw more, such as"
+                f"the spread of fewer than {FEWEST} arms is mostly chance: draw more, such as"
                 " --ensemble 20"
                 if len(arms) < FEWEST
                 else "warning: the nearest arms that can be built do not vary as the intervals say:"

@@ -356,7 +356,7 @@ def _remarks(results: ServoResults) -> tuple[str, ...]:
     )
     return (
         "Servo and friction identified by hil from commanded and measured positions; bodies are"
-        " those of the URDF.",
+        " as in the URDF.",
         f"Verdict: {results.verdict.line}",
         *(
             [f"The torque scale of {unknown} is not determined: gains and friction hold together."]

@@ -246,7 +246,7 @@ class IdentifiedArm:
             index=False, border=0, float_format=partial(percentage, decimals=1), na_rep="-"
         )
         source = base64.b64encode(self.plot().png()).decode("ascii")
-        alternative = "Measured torque, and that of the identified and the nominal model"
+        alternative = "Measured torque, and the torques of the identified and the nominal model"
         lines = (*self.verdict.warnings, *(f"next: {step}" for step in self.verdict.next_steps))
         remarks = "".join(f"<li>{escape(line)}</li>" for line in lines)
         channels = "".join(f"<li>{escape(line)}</li>" for line in self.channels)

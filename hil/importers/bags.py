@@ -261,7 +261,7 @@ def _not_a_bag(file: Path, error: Exception) -> SourceError:
     problem = f"is not {kind}, or damaged ({reason})"
     remedy = "name the .db3, .mcap or .bag file, or the bag's folder"
     if _is_database(file):
-        remedy = "copy it again, with the file that ends in -wal beside it, if there is one"
+        remedy = "copy it again, together with the file that ends in -wal, if there is one"
     elif _starts_with(file, _ROS_1):
         remedy = f"copy it again; or, if its recorder was killed: rosbag reindex {typed(file.name)}"
     return SourceError(file, problem, remedy=remedy)

@@ -257,7 +257,7 @@ def _of_arrays(messages: Iterable[BagMessage], measured: Measured) -> tuple[Arra
     apart = values[known][:, :, None] - measured.position[known][:, None, :]
     nearest = np.argmin(np.mean(apart**2, axis=0), axis=1)
     if len(set(nearest.tolist())) < count:
-        raise _NotCommandsError("it is not clear which of its numbers is of which joint")
+        raise _NotCommandsError("it is not clear which number belongs to which joint")
     return values[:, np.argsort(nearest)], "an array, each number of the joint that follows it"
 
 

@@ -229,7 +229,7 @@ class _Log:
         bit = sign_bit_of(values)
         if bit is None and not are_per_mille(names, values):
             return
-        problem = "is in whole numbers named as those of the object 6077h: per mille of a rated one"
+        problem = "has whole numbers and the name of the object 6077h: per mille of a rated one"
         if bit is not None:
             problem = f"is a magnitude with the sign in bit {bit}, as servos write their load"
         entries = [] if columns is None else [f"columns = {json.dumps(columns)}"]

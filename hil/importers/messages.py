@@ -131,7 +131,7 @@ def _unit_of(meaning: ChannelMeaning) -> str:
         return f"{meaning.unit} as the log states"
     if meaning.unit_basis is UnitBasis.CUSTOM:
         return f"no unit stated, read as {next(iter(UNITS[meaning.kind]))}"
-    return "no unit stated, concluded from the numbers"
+    return "no unit stated, inferred from the numbers"
 
 
 @worded.register
@@ -281,7 +281,7 @@ def _(copied: CopiedCommands) -> str:
         options = " or ".join(f"--columns 'position={name}'" for name in copied.measured)
         remedy = f"if they are measured, choose {options}"
     return (
-        f"the positions are those of {copied.commands} bit for bit: commands, which the arm "
+        f"the positions equal {copied.commands} bit for bit: they are commands, which the arm "
         f"follows late and never exactly; {remedy}"
     )
 
@@ -307,8 +307,8 @@ def _(base: OneTimeBase) -> str:
 @worded.register
 def _(clock: OtherClock) -> str:
     return (
-        f"commands are on another clock: moved by {clock.offset:.3f} s, at which their speeds agree"
-        " best with those of the positions; their delay is then not known"
+        f"commands are on another clock: moved by {clock.offset:.3f} s, where their speeds best"
+        " match the speeds of the positions; their delay is then not known"
     )
 
 
@@ -409,7 +409,7 @@ def remedy_of(outside: OutsideLimits) -> str:
     if outside.within is Within.ORDER:
         order = ", ".join(outside.order)
         return (
-            f"with the columns those of {order}, none would: check the order of the joints, or "
+            f"with the columns in the order {order}, none would: check the order of the joints, or "
             f"{_MAP_CHECK}"
         )
     return _MAP_CHECK
@@ -441,7 +441,7 @@ def _(fast: FastJoint) -> str:
 def _(other: VelocityOrder) -> str:
     return (
         "the velocities are in another order than the positions: as mapped they deviate "
-        f"from the slopes by {other.deviation:.0f} %, as those of {', '.join(other.order)} by "
+        f"from the slopes by {other.deviation:.0f} %, in the order {', '.join(other.order)} by "
         f"{other.least:.0f} %: name the columns of both in the same order"
     )
 
@@ -486,7 +486,9 @@ def _(large: LargeTorque) -> str:
 
 @worded.register
 def _(size: TorqueSize) -> str:
-    reference = "those of the URDF's masses" if size.by_masses else "the effort limits of the URDF"
+    reference = (
+        "the torques of the URDF's masses" if size.by_masses else "the effort limits of the URDF"
+    )
     listing = ", ".join(f"{name}: {ratio:.2g}" for name, ratio in size.ratios.items())
     which = "large" if size.too_large else "small"
     start = f"the torques are too {which} for this arm: measured over {reference} {listing}; check "

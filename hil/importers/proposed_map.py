@@ -336,9 +336,7 @@ class _Search:
             best = self._smoothest([name for name in patterns if "{}" not in name])
             if best is not None:
                 patterns = [best, *(name for name in patterns if name != best)]
-                problem += (
-                    f", of which {best} fits the motion: at its times the positions are smooth"
-                )
+                problem += f"; {best} fits the motion: at its times the positions are smooth"
         options = " or ".join(f"--columns '{kind}={pattern}'" for pattern in patterns[:_MOST_NAMED])
         raise SourceError(self._log, problem, field=kind, remedy=f"choose one: {options}")
 

@@ -431,7 +431,7 @@ class _States:
         if missing:
             name, without = missing[0]
             listing = ", ".join(without)
-            problem = f"{name} of {listing} was not recorded, that of the other joints was"
+            problem = f"{name} was recorded for the other joints, but not for {listing}"
             remedy = f"record it; {_AT_REST}; --effort ignore imports the motion alone"
             raise SourceError(self._source, problem, field=name, remedy=remedy)
         stamp = first.stamp
@@ -477,7 +477,7 @@ class _States:
             gap = samples.stamp[after] - samples.stamp[after - 1]
             if (gap > _MOST_APART * period).any():
                 return (
-                    f"those of ({', '.join(part.joints)}) up to {1e-6 * gap.max():.3g} ms apart, "
+                    f"for ({', '.join(part.joints)}) up to {1e-6 * gap.max():.3g} ms apart, "
                     f"where {parts[0].joints[0]} comes every {1e-6 * period:.3g} ms"
                 )
         return ""

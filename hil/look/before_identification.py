@@ -61,7 +61,7 @@ def concluded(
     """Return a log imported again with what its motion and torque say, if that is sure.
 
     A log that a map describes, or whose torque follows its arm, is returned as it is, and so is a
-    bag. A warning is among its lines if the URDF may be that of another arm.
+    bag. A warning is among its lines if the URDF may describe another arm.
 
     Raises:
         SourceError: two readings fit alike, or the URDF is that of another arm.
@@ -249,7 +249,7 @@ def _hangs_otherwise(cell: Cell, samples: Samples, score: Score) -> bool:
 def _of_this_arm(
     imported: ImportedRecording, source: Path, contradictions: Contradictions
 ) -> ImportedRecording:
-    """Return a recording, with a warning if the URDF may be that of another arm.
+    """Return a recording, with a warning if the URDF may describe another arm.
 
     Raises:
         SourceError: more than two independent findings contradict it.

@@ -92,10 +92,10 @@ _FACTS: Final[Mapping[Fact, str]] = {
     Fact.MEASURED: "measured",
     Fact.SLOPE: "slope of the position, same unit, sign and order",
     Fact.SCALED_SLOPE: "times the slope of the position",
-    Fact.SLOPE_IN_DEGREES: "deg/s beside rad",
-    Fact.SLOPE_OF_DEGREES: "rad/s beside deg",
+    Fact.SLOPE_IN_DEGREES: "deg/s, positions in rad",
+    Fact.SLOPE_OF_DEGREES: "rad/s, positions in deg",
     Fact.NEGATED_SLOPE: "negated",
-    Fact.SLOPE_IN_REVOLUTIONS: "rev/min beside rad/s",
+    Fact.SLOPE_IN_REVOLUTIONS: "rev/min, positions in rad",
     Fact.NOT_EXAMINED: "not examined",
     Fact.ORDER_OF_URDF: "joints in the order of the URDF",
     Fact.SIGNS_OF_URDF: "as the URDF's axes",
@@ -120,8 +120,8 @@ _FACTS: Final[Mapping[Fact, str]] = {
     Fact.NO_DELAY_SEEN: "none seen",
     Fact.NO_LOW_PASS: "none in the torque",
     Fact.NO_BODIES: "next to nothing of bodies: a model was subtracted from the torque",
-    Fact.NONE_FITS: "none of those that were tested fits; the nearest are above",
-    Fact.OTHER_ARM: "may be another than that of the URDF",
+    Fact.NONE_FITS: "no tested explanation fits; the nearest are above",
+    Fact.OTHER_ARM: "may not be the arm of the URDF",
 }
 _BASES: Final[Mapping[Basis, str]] = {
     Basis.GIVEN_RATE: "at the rate that was given",
@@ -141,17 +141,17 @@ _BASES: Final[Mapping[Basis, str]] = {
     Basis.ENCODER_NOISE: "noise of an encoder at all frequencies",
     Basis.NO_NOISE: "no noise above that frequency",
     Basis.NO_MOTION: "no joint moves",
-    Basis.DRIVING_FRICTION: "friction would drive the joint otherwise",
+    Basis.DRIVING_FRICTION: "otherwise friction would add energy to the joint",
     Basis.DISSIPATION: "friction takes energy in every joint",
     Basis.NOT_EXAMINED: "not examined",
     Basis.SIZE_UNTESTED: "no masses in the URDF and little weight: size not tested",
     Basis.CELL: "by the cell",
     Basis.LAST_BODY_UNDETERMINED: "the motion determines no parameter of the last body",
-    Basis.NO_GEOMETRY: "a torque says them only together with the arm's geometry",
+    Basis.NO_GEOMETRY: "the torque shows them only together with the arm's geometry",
     Basis.NO_ROW: "no usable row",
     Basis.NO_FILTER_BETTER: "none predicts it better",
     Basis.FREE_PARAMETERS: "with free parameters, before a fit of the friction law",
-    Basis.NO_BODIES: "torque of friction says nothing of it",
+    Basis.NO_BODIES: "friction torque does not show it",
 }
 _STEPS: Final[Mapping[NextStep, str]] = {
     NextStep.STATE_UNIT_OR_GEARS: "state unit, sign or gears of both",
@@ -170,7 +170,7 @@ _STEPS: Final[Mapping[NextStep, str]] = {
     NextStep.MOVE_EACH_JOINT: "move the joints one by one",
     NextStep.PUSH_A_JOINT: "push one joint by hand and see its torque",
     NextStep.COMPARE_A_POSTURE: "compare a posture with the URDF's (viewer)",
-    NextStep.RECORD_ALL_TORQUE: "record the torque of motors or sensors, before that",
+    NextStep.RECORD_ALL_TORQUE: "record the torque before a model is subtracted from it",
     NextStep.WEIGH_A_LOAD: "hold a known load with and without it (`hil torque-constants`)",
     NextStep.TURN_ONE_JOINT: "turn one joint alone and see which angles change",
     NextStep.HOLD_STILL: "hold the arm still, stretched out, and see the torque",
@@ -234,7 +234,7 @@ def gravity_option(gravity: Vector) -> str:
 
 def fit_alike(choices: Sequence[TiedReading]) -> str:
     """Return how many readings fit alike, in words."""
-    return f"{'two' if len(choices) == 2 else 'three'} readings fit alike"
+    return f"{'two' if len(choices) == 2 else 'three'} explanations fit equally well"
 
 
 def as_json(look: Look) -> dict[str, Any]:
@@ -285,7 +285,7 @@ def described(change: ArmChange) -> str:
         text = _CHANGES[meaning]
     if meaning in COUPLED:
         joint, other = _names(change)
-        return f"the angle of {joint} is recorded {text} that of {other}"
+        return f"the angle of {joint} is recorded {text} the angle of {other}"
     if meaning in IN_ORDER:
         return f"{text} {_exchanged(change)}"
     if not change.change.joints:
@@ -517,17 +517,17 @@ def _(velocity: LateVelocity) -> str:
 
 @_worded.register
 def _(error: ErrorRatio) -> str:
-    return f"error {error.ratio:.2f} times that as recorded ({-error.sigmas:.0f} standard errors)"
+    return f"{error.ratio:.2f} times the error as recorded ({-error.sigmas:.0f} standard errors)"
 
 
 @_worded.register
 def _(nearest: NextBest) -> str:
-    return f"next best: {described(nearest.change)}, error {nearest.ratio:.2f} times"
+    return f"next best: {described(nearest.change)} (error {nearest.ratio:.2f} times as large)"
 
 
 @_worded.register
 def _(nearest: NearestZero) -> str:
-    return f"{described(nearest.change)}: error {nearest.ratio:.2f} times"
+    return f"{described(nearest.change)}: error {nearest.ratio:.2f} times as large"
 
 
 @_worded.register
@@ -602,14 +602,14 @@ def _(found: BeyondEffort) -> str:
 
 @_worded.register
 def _(found: BeyondMasses) -> str:
-    return f"the torque is {found.ratio:.2g} times that of {_expected(found)}"
+    return f"the torque is {found.ratio:.2g} times the torque of {_expected(found)}"
 
 
 @_worded.register
 def _(lengths: OtherLengths) -> str:
     return (
         f"the torque fits links {lengths.factor:.2g} times as long (error "
-        f"{percentage(lengths.error)}, with those of the URDF {percentage(lengths.stated)})"
+        f"{percentage(lengths.error)}, with the URDF's {percentage(lengths.stated)})"
     )
 
 
@@ -672,7 +672,7 @@ def _about(motors: MotorTorque | MotorCurrents) -> str:
     each = ", ".join(f"{ratio:.3g}" for ratio in motors.ratios)
     if not motors.unseen or len(motors.unseen) == len(motors.ratios):
         return f"[{each}] (about"
-    return f"[{each}] (about; of {', '.join(motors.unseen)} that of the others"
+    return f"[{each}] (about; {', '.join(motors.unseen)} as the others"
 
 
 # --- what an identification says of a log that it has looked at
@@ -702,10 +702,10 @@ def _(none: NoJointTorque) -> str:
 
 @import_messages.worded.register
 def _(arm: DoubtfulArm) -> str:
-    return f"warning: the URDF may be that of another arm: {sentences(arm.found)}"
+    return f"warning: the URDF may describe another arm: {sentences(arm.found)}"
 
 
 @import_messages.worded.register
 def _(changed: ChangedReading) -> str:
     text = row_text(changed.row)
-    return f"{changed.row.aspect}: {text.reading}, concluded; {text.reason}"
+    return f"{changed.row.aspect}: {text.reading}, inferred; {text.reason}"

@@ -240,7 +240,7 @@ def _notes(arm: UrArmStatements, urdf: str) -> Iterator[str]:
         )
     else:
         yield (
-            "the torque constants are those of the arm's own model, uncertain by 10 %: weigh a "
+            "the torque constants come from the arm's own model, uncertain by 10 %: weigh a "
             "known payload (`hil torque-constants`), then correct torque_uncertainty"
         )
     if _payload_mass(arm) and _flange(urdf) is None:

@@ -348,7 +348,7 @@ class _DelayChoice:
         ):
             # It was estimated without the low-pass, and may be the lag of that.
             unchanged = f"no other delay than the assumed {self.assumed * 1e3:.3g} ms was applied"
-            return None, (f"{unchanged} beside the low-pass of the torque",)
+            return None, (f"{unchanged} in addition to the low-pass of the torque",)
         if how.torque_delay in [delay.value for delay in self.suggested]:
             return self.estimate, (*self.notes, _compensated(how.torque_delay))
         if how.torque_delay != self.assumed:

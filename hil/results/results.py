@@ -217,7 +217,7 @@ class LinkResult(Frozen):
     rotor_inertia: float | None
     rotor_at_bound: bool = False  #: Whether that is zero because no torque shows a rotor
     room: float
-    """Smallest second moment over that of the nominal body; 0 at the limit of consistency."""
+    """Smallest second moment over the nominal body's; 0 at the limit of consistency."""
     reference: str  #: Origin of its nominal body
 
 

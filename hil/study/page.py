@@ -117,7 +117,7 @@ def _ratios(results: StudyResults, motions: str) -> Panel:
     chart = Chart(
         Caption(f"r{motions}", motions, "", what), np.empty(0),
         [Plot(22.0 * len(rows), "", traces, limits=y_limits, names=rows)],
-        f"error over that of A, {motions}", x_range=(low, high),
+        f"error over A's, {motions}", x_range=(low, high),
         ticks=[math.log10(tick) for tick in ticks], tick_names=[f"{tick:g}" for tick in ticks],
     )  # fmt: skip
     return chart_panel(chart, width=560.0, left=_NAMES)

@@ -1,6 +1,6 @@
 """Run every fault in every situation and print the outcomes: `python -m tests.fault_matrix`.
 
-The table is that of docs/limits.md#fault-matrix, which the tests read; exit status 1 if a law was broken.
+The tests read the same table in docs/limits.md; exit status 1 if a law was broken.
 """
 
 from __future__ import annotations

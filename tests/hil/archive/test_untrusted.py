@@ -300,7 +300,7 @@ class TestContents:
 
     def test_other_number_of_joints(self, written, path):
         forged(written.data, path, metadata={"joint_names": '["a", "b", "c"]'})
-        assert "not that of 3 joints" in str(open_archive(path).damage)
+        assert "does not fit 3 joints" in str(open_archive(path).damage)
         assert "has no sample" in outcomes(path)["open_recording"]
         assert not check_archive(path).conforms
 

@@ -267,7 +267,7 @@ def test_a_full_disk_leaves_what_was_written(
         ({"cell.serial_number": "2"}, "its serial number is 20235500123, but the cell states 2;"),
         ({"controller.rtde.model": "UR10e"}, "its type is UR5e, but the cell states UR10e;"),
         ({"controller.rtde.calibration": "00"}, "its calibration is 1f2e"),
-        ({"controller.cycle_ms": 8}, "cycle is 2 ms, that of the cell 8 ms; write cycle_ms = 2"),
+        ({"controller.cycle_ms": 8}, "cycle is 2 ms, the cell states 8 ms; write cycle_ms = 2"),
     ],
 )
 def test_another_arm_is_not_recorded(tmp_path: Path, values: dict[str, Any], problem: str) -> None:

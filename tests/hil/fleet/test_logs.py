@@ -275,7 +275,7 @@ class TestCommand:
         pattern = str(folder / "**" / "*.csv")
         done = CliRunner().invoke(app, ["batch", pattern, *arguments, *NOTHING_OPEN])
         assert done.exit_code == 5, done.output
-        assert "4 logs read by the column map concluded from" in done.stdout
+        assert "4 logs read by the column map inferred from" in done.stdout
         assert "notes.csv could not be used: " in done.stderr
         assert "1 failed" in done.stdout
         assert 'columns = "tau{}"' in (out / "map.toml").read_text()

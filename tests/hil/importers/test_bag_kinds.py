@@ -200,7 +200,7 @@ class TestPublishers:
         rare += [message(k, joints=(2,)) for k in range(0, COUNT, 20)]
         typed = Typed(urdf, rare, "--lock-others")
         assert typed.refused
-        assert "come in messages of their own, those of (ankle) up to 80 ms apart, where hip " in (
+        assert "come in messages of their own, for (ankle) up to 80 ms apart, where hip " in (
             typed.message
         )
         assert "(hip, knee) and (ankle)" in typed.message

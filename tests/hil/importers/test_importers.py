@@ -930,7 +930,7 @@ ERRORS = {
     "fast clock": ({"clock": 1e-3}, "1e+05 samples per second are unusual"),
     "order": (
         {"order": (1, 2, 0, 3, 4, 5)},
-        "as those of shoulder_lift_joint, elbow_joint, shoulder_pan_joint, wrist_1_joint, "
+        "in the order shoulder_lift_joint, elbow_joint, shoulder_pan_joint, wrist_1_joint, "
         "wrist_2_joint, wrist_3_joint by 0 %",
     ),
 }
@@ -997,7 +997,7 @@ class TestWarnings:
         assert all("degrees" in other for other in others)
         sentences = warnings(replace(panda, position=panda.position[:, ORDER]))
         names = ", ".join(panda.joint_names[j] for j in ORDER)
-        assert f"those of {names}, none would" in sentences[0]
+        assert f"in the order {names}, none would" in sentences[0]
         sentences = warnings(replace(panda, position=panda.position + 20.0 * (np.arange(7) == 3)))
         assert messages.CHECK_UNIT_SIGN_ZERO in sentences[0]
         assert "order" not in sentences[0]
@@ -1012,10 +1012,10 @@ class TestSizeOfTorques:
         """Against the masses of the URDF, whatever its effort limits are."""
         for robot in (arm, panda):
             (sentence,) = warnings(robot, torque=1e-3)
-            assert sentence.startswith(f"{TOO_SMALL}those of the URDF's masses")
+            assert sentence.startswith(f"{TOO_SMALL}the torques of the URDF's masses")
             assert "N·m read as mN·m would be 1000 times too small" in sentence
             *limits, sentence = warnings(robot, torque=1e3)
-            assert sentence.startswith(f"{TOO_LARGE}those of the URDF's masses")
+            assert sentence.startswith(f"{TOO_LARGE}the torques of the URDF's masses")
             assert all("its limit in the URDF" in limit for limit in limits)
 
     def test_without_masses_the_effort_limits_are_the_measure(self, arm: Simulated) -> None:

@@ -119,7 +119,7 @@ class TestSeveralTimes:
     def test_the_one_that_fits_the_motion_comes_first(self, tmp_path: Path, arm: Path) -> None:
         source = write(tmp_path / "log.csv", arrival(), TIME, POSITION, TORQUE, names=self.NAMES)
         refused = refusal(source, arm)
-        assert "of which robot_time fits the motion" in refused
+        assert "; robot_time fits the motion" in refused
         first, other = OPTION.findall(refused)
         assert (first, other) == ("--columns 'time=robot_time'", "--columns 'time=host_stamp'")
         assert refusal(source, arm, *shlex.split(first)) == ""

@@ -129,7 +129,7 @@ def late(table: Mapping[str, Floats]) -> dict[str, Floats]:
         (exchanged, "order", f"torque columns are of {JOINTS[1]}, {JOINTS[0]}, {JOINTS[2]}"),
         (of_motors, "side", "motor side (before the gears), or a current"),
         (late, "delay", "torque 4"),
-        (to_the_ground, "coupling", f"angle of {JOINTS[1]} is recorded plus that of {JOINTS[0]}"),
+        (to_the_ground, "coupling", f"{JOINTS[1]} is recorded plus the angle of {JOINTS[0]}"),
     ],
 )
 def test_a_planted_meaning_is_named(
@@ -209,7 +209,7 @@ class TestCommand:
         write_log(path, ["t", "q{}", "v{}", "tau{}"], *columns.values())
         result = hil("look", path, "--urdf", urdf)
         assert result.exit_code == 2
-        assert "two readings fit alike" in result.output
+        assert "two explanations fit equally well" in result.output
         assert "gear_ratio" in result.output
         assert "torque_constant" in result.output
         assert [*tmp_path.iterdir()] == [path]
@@ -244,7 +244,7 @@ class TestConclusions:
         path = tmp_path / "a.csv"
         write_log(path, ["t", "q{}", "v{}", "tau{}"], *{**table, **negated(table)}.values())
         result = hil("identify", path, "--urdf", urdf)
-        assert "signs: torque negated: all joints, concluded" in result.output
+        assert "signs: torque negated: all joints, inferred" in result.output
         text = (tmp_path / "a" / "map.toml").read_text()
         assert "scale = [-1.0, -1.0, -1.0]" in text
 
@@ -257,7 +257,8 @@ class TestConclusions:
         planted = {**table, **to_the_ground(table)}
         write_log(path, ["t", "q{}", "v{}", "tau{}"], *planted.values())
         result = hil("identify", path, "--urdf", urdf, "--output", tmp_path / "o")
-        sentence = f"coupling: the angle of {JOINTS[1]} is recorded plus that of {JOINTS[0]}, conc"
+        first, second = JOINTS[:2]
+        sentence = f"the angle of {second} is recorded plus the angle of {first}, inferred"
         assert sentence in " ".join(result.output.split())
         assert hil("look", path, "--urdf", urdf, "-o", target).exit_code == 0
         archive = tmp_path / "a.mcap"
@@ -311,7 +312,7 @@ class TestConclusions:
         path = write_log(tmp_path / "a.csv", ["t", "q{}", "v{}", "tau{}"], *table.values())
         gravity = ("--gravity", *map(str, mounted))
         result = hil("identify", path, "--urdf", urdf, *gravity, "--output", tmp_path / "o")
-        assert "mounting: upright, concluded" in result.output
+        assert "mounting: upright, inferred" in result.output
         columns = open_archive(tmp_path / "o" / "a.mcap").columns
         assert columns["torque"] == pytest.approx(table["tau"], abs=1e-6)
 
@@ -350,7 +351,7 @@ class TestOtherArm:
         other = self.described(tmp_path / "other.urdf", self.weak(self.narrow(URDF)))
         result = hil("identify", path, "--urdf", other)
         assert result.exit_code in (0, 5)
-        pattern = r"may be that of another arm: \w+ moves \d+° beyond its range; the torque of"
+        pattern = r"may describe another arm: \w+ moves \d+° beyond its range; the torque of"
         assert re.search(pattern, " ".join(result.output.split()))
 
     def test_a_torque_that_no_masses_explain_refuses_it_besides(
@@ -401,7 +402,7 @@ class TestOtherArm:
     def test_a_look_says_it(self, tmp_path: Path, table: Mapping[str, Floats]) -> None:
         text = URDF.replace("<origin xyz='0 0 0.4'/>", "<origin xyz='0 0 0.25'/>")
         looked = look(self.described(tmp_path / "x.urdf", text), tmp_path / "a.csv", table)
-        assert reading(looked, "arm") == ("may be another than that of the URDF", "undetermined")
+        assert reading(looked, "arm") == ("may not be the arm of the URDF", "undetermined")
 
     def test_an_identification_of_a_bag_says_it(
         self, tmp_path: Path, table: Mapping[str, Floats]
@@ -428,7 +429,7 @@ class TestOtherArm:
         refusal = undecided(tmp_path / "a.csv", choices, size)
         assert refusal.field == "--urdf"
         assert "may not be of the arm of the URDF: a moves 75°" in refusal.problem
-        assert "two readings fit alike" in refusal.problem
+        assert "two explanations fit equally well" in refusal.problem
 
     def test_readings_of_an_axis_that_are_not_so_are_another_arm(self, tmp_path: Path) -> None:
         aspects: tuple[tuple[Aspect, bool], ...] = (("zero", True), ("side", False))
@@ -530,6 +531,6 @@ class TestTerminal:
         columns = {**table, **of_motors(table)}
         write_log(path, ["t", "q{}", "v{}", "tau{}"], *columns.values())
         code, screen = self.asked(answer, "look", path, "--urdf", urdf)
-        assert "two readings fit alike" in screen
+        assert "two explanations fit equally well" in screen
         assert "side: 1 or 2, or 0 if unknown" in screen
         assert code == status

@@ -128,7 +128,7 @@ def test_a_description_times_its_factors_is_that_of_the_arm(
         assert found[key] == pytest.approx(expected, rel=1e-9, abs=1e-12), key
     code, shown = typed("look", folder / "log.csv", "--urdf", urdf)
     assert code == 0
-    assert "two readings fit alike" not in shown
+    assert "two explanations fit equally well" not in shown
 
 
 def scale(element: ElementTree.Element | None, factor: float) -> None:

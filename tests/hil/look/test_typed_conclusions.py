@@ -77,7 +77,7 @@ class TestNamesOfChannels:
         assert isinstance(nearest, NextBest)
         assert nearest.ratio > 3.0
         result = hil("look", path, "--urdf", urdf, "-v")
-        assert re.search(r"next best: \w+, error \d+\.\d+ times", result.output)
+        assert re.search(r"next best: \w+ \(error \d+\.\d+ times", result.output)
 
     def test_the_recorded_arm_has_a_row_of_its_own(self, tmp_path: Path) -> None:
         urdf = robot_of_arms(tmp_path, ("left", 3), ("head", 1))

@@ -57,7 +57,7 @@ class TestPolishAdvice:
     [
         (20, 1.01, ""),
         (20, 0.4, "warning: the nearest arms that can be built do not vary as the intervals say"),
-        (3, 0.6, "the spread of fewer than 10 arms is that of chance"),
+        (3, 0.6, "the spread of fewer than 10 arms is mostly chance"),
     ],
 )
 def test_drawn_arms_that_vary_otherwise_are_named(count: int, spread: float, said: str) -> None:
