@@ -295,12 +295,13 @@ class _DelayChoice:
             return unused._beside_stated(
                 estimate, described, filtered=filtered or _asks_low_pass(sources, options)
             )
-        delay = SuggestedDelay(estimate.delay, estimate.determined)
+        delay = SuggestedDelay(estimate.delay, estimate.determined and estimate.significant)
+        doubtful = estimate.determined and estimate.unconfirmed
         return replace(
             unused,
-            suggested=(delay,) if estimate.significant else (),
-            notes=described,
-            errors={estimate.applied: estimate.variance},
+            suggested=(delay,) if estimate.significant or doubtful else (),
+            notes=described[:1] if doubtful else described,
+            errors=dict.fromkeys((estimate.applied, estimate.delay), estimate.variance),
         )
 
     def _beside_stated(
@@ -350,12 +351,16 @@ class _DelayChoice:
             unchanged = f"no other delay than the assumed {self.assumed * 1e3:.3g} ms was applied"
             return None, (f"{unchanged} in addition to the low-pass of the torque",)
         if how.torque_delay in [delay.value for delay in self.suggested]:
-            return self.estimate, (*self.notes, _compensated(how.torque_delay))
+            assert self.estimate is not None
+            confirmed = replace(self.estimate, significant=True)
+            return confirmed, (*self.notes, _compensated(how.torque_delay))
         if how.torque_delay != self.assumed:
             return None, (_compensated(how.torque_delay),)
         if self.suggested:
             determined = all(delay.determined for delay in self.suggested)
             reason = "it predicts worse" if determined else "it is not determined"
+            if self.estimate is not None and self.estimate.unconfirmed:
+                reason = "it predicts no better"
             # It was estimated without a low-pass of the torque.
             suspected = not determined and how.torque_bandwidth is None
             estimate = self.estimate if suspected else None

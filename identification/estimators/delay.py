@@ -179,6 +179,9 @@ class DelayEstimate:
     reason: str | None  # why the delay is undetermined, or None
     # whether the delay differs from `assumed` at 99 % and predicts left-out blocks better
     significant: bool
+    # whether it differs at 99 % and does not predict left-out blocks better; without a prior, parts
+    # that determine little are predicted badly with any delay
+    unconfirmed: bool = False
 
     @property
     def determined(self) -> bool:
@@ -236,11 +239,11 @@ class DelayEstimate:
         if not self.determined and not self.significant:
             return f"all axes: not determined; {self.reason}"
         half = self.half_interval
+        differs = "" if self.significant or self.unconfirmed else "not "
         return (
             f"all axes: {self.delay * 1e3:.3f} ms ± {half * 1e3:.3f} ms"
             f" ({self.delay / self.cycle:.2f} ± {half / self.cycle:.2f} cycles),"
-            f" {'' if self.significant else 'not '}significantly different from the"
-            f" {self.assumed * 1e3:.3g} ms assumed"
+            f" {differs}significantly different from the {self.assumed * 1e3:.3g} ms assumed"
         )
 
 
@@ -301,11 +304,11 @@ def _estimated(
     factor, by_chance = (float(student_limit(share, count - 1)) for share in (0.025, _CHANCE))
     at_limit = shift <= ends[0] or shift >= ends[1]
 
-    def predicts_better() -> bool:
-        """Return whether left-out blocks are predicted better than without the delay."""
+    differs = not at_limit and bool(np.isnan(other)) and abs(shift) > by_chance * std
+    confirmed = False
+    if differs:
         unshifted = reader.linearised(0.0, values, blocks.weights)
-        return blocks.predicted() < unshifted.predicted(with_delay=False)
-
+        confirmed = blocks.predicted() < unshifted.predicted(with_delay=False)
     return DelayEstimate(
         delay=shift + assumed,
         std=std,
@@ -313,9 +316,8 @@ def _estimated(
         cycle=reader.cycle,
         interval_factor=factor,
         reason=_undetermined_reason(factor * std, at_limit, other + assumed),
-        significant=bool(
-            not at_limit and np.isnan(other) and abs(shift) > by_chance * std and predicts_better()
-        ),
+        significant=differs and confirmed,
+        unconfirmed=differs and not confirmed,
     )
 
 

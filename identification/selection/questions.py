@@ -110,7 +110,7 @@ class SuggestedDelay(NamedTuple):
     """A delay of the torque that differs significantly from that of the settings."""
 
     value: float  # s
-    determined: bool  # whether to a millisecond
+    determined: bool  # whether to a millisecond, and its estimate predicts better with it
 
 
 def choose_settings(
@@ -475,6 +475,7 @@ _SETTINGS_SEARCHED: Final = (
         "velocity",
         VELOCITY,
         lambda now: [now.preprocessed(velocity=source) for source in VELOCITIES],
+        transfer=TRANSFER,
     ),
     _SearchedSetting(
         "bandwidth",

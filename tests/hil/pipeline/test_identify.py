@@ -604,6 +604,20 @@ def test_a_delay_that_predicts_no_better_is_not_applied(reason):
     assert note.startswith("4 ms ± 2 ms; not applied, as it")
 
 
+def test_inner_prediction_decides_on_an_unconfirmed_delay(log):
+    """They are predicted without a prior, badly with any delay where the motion is poor."""
+    sources = gather_sources([log], 0.7)
+    estimate = replace(estimated(2e-3), unconfirmed=True)
+    choice = _DelayChoice.of(estimate, sources, Settings(Preprocessing()), Options())
+    assert choice.suggested == (SuggestedDelay(2e-3, determined=False),)
+    applied, notes = choice.confirmed_by(Preprocessing(torque_delay=2e-3))
+    assert applied.significant and "compensated" in notes[-1]
+    refused, (note,) = choice.confirmed_by(Preprocessing())
+    assert not refused.significant and note.endswith("predicts no better")
+    wide = replace(estimate, reason="95 % interval of ± 2 ms")
+    assert not _DelayChoice.of(wide, sources, Settings(Preprocessing()), Options()).suggested
+
+
 def test_delays_of_the_torque_are_compensated(log, split):
     """A stated one is applied, and another reported."""
     np.testing.assert_allclose(split.results.delays.applied, LATE, atol=1e-3)
