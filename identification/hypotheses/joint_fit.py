@@ -108,9 +108,13 @@ class JointFit:
 
     def ratio_to(self, other: JointFit) -> float:
         """Return the error over that of another fit of the same torques: mean over the joints."""
-        both = (self.error > 0.0) & (other.error > 0.0)
-        ratios = np.log(self.error[both] / other.error[both])
+        ratios = np.log(self.ratios_to(other))
         return float(np.exp(ratios.mean())) if len(ratios) else 1.0
+
+    def ratios_to(self, other: JointFit) -> Array:
+        """Return the error over that of another fit, of each joint with a torque."""
+        both = (self.error > 0.0) & (other.error > 0.0)
+        return np.asarray(self.error[both] / other.error[both])
 
 
 def candidates(model: RobotModel, samples: Samples, *, gains: bool = True) -> Mask:
@@ -157,8 +161,8 @@ def find_joints(
     point = problem.start(start)
     fit = _fitted(problem, free, point)
     # The scale that all torques have in common is that of the masses.
-    fit = replace(fit, gain=(1.0 + fit.gain) / np.median(1.0 + fit.gain) - 1.0)
     tied = _tied(problem, fit)
+    fit = replace(fit, gain=(1.0 + fit.gain) / _common_scale(1.0 + fit.gain, tied) - 1.0)
     while fit.free.any():
         needed = _significant(problem, fit)
         if np.array_equal(needed, fit.free):
@@ -371,6 +375,18 @@ def _tied(problem: _Problem, fit: JointFit) -> tuple[int, ...]:
         tied = tuple(k for k in free.tolist() if known[k] or k == joint)
         best = max(best, tied, key=len)
     return best
+
+
+def _common_scale(scales: Array, tied: Sequence[int]) -> float:
+    """Return the scale (n,) that most of the joints have which the motion compares.
+
+    Of several that as many have, the one nearest to the masses of the description.
+    """
+    if len(tied) < 2:
+        return float(np.median(scales))
+    compared = scales[list(tied)]
+    others = (np.abs(compared / compared[:, None] - 1.0) > LEAST_GAIN).sum(axis=1)
+    return float(compared[np.lexsort((np.abs(np.log(compared)), others))[0]])
 
 
 def _significant(problem: _Problem, fit: JointFit) -> Mask:

@@ -10,7 +10,7 @@ it.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import combinations
 from typing import Final
@@ -90,6 +90,9 @@ _OTHER_SIDE: Final = 60.0 * DEGREE  # between two zeros that are not one
 _FAR_STARTS: Final = 2  # zeros far from what is stated at which a fit starts
 _NEEDED: Final = 2.0  # standard errors of one of several zeros and scales that its fit needs
 _ADEQUATE: Final = 1.2  # error ratio to a free fit, of a reading that explains the rows
+_ADEQUATE_JOINT: Final = 2.0  # the same of each joint: a mean hides one that is not explained
+_FAR: Final = 90.0 * DEGREE  # zeros beyond it are of no assembly: a sign and a near one look alike
+_SIGNED: Final = 3  # signs of least error with zeros and scales beside them, which are compared
 _AT_ONCE: Final = 24  # fits, so that their sums stay in the processor's cache
 _ZEROS: Final = (-135.0, -90.0, -45.0, 45.0, 90.0, 135.0, 180.0)  # deg, near which a fit starts
 
@@ -128,6 +131,11 @@ class Step:
         return self.error < EXPLAINED and self.is_adequate and is_certain
 
     @property
+    def is_far(self) -> bool:
+        """Whether it is a zero that no assembly has."""
+        return self.change.meaning == "zero" and abs(self.change.size) > _FAR
+
+    @property
     def by_friction(self) -> bool:
         """Whether the error speaks for it little or not at all, but friction does."""
         return self.ratio > 1.0 - _ALIKE
@@ -153,16 +161,18 @@ class Adequacy:
 
     Attributes:
         ratio: error with the reading over that of the free fit, mean over the joints.
+        largest: of the joints.
         agrees: whether the free fit has the same zeros and scales.
     """
 
     ratio: float
+    largest: float
     agrees: bool
 
     @property
     def is_enough(self) -> bool:
         """Whether the reading explains the rows about as well."""
-        return self.agrees and self.ratio < _ADEQUATE
+        return self.agrees and self.ratio < _ADEQUATE and self.largest < _ADEQUATE_JOINT
 
 
 @dataclass(frozen=True, eq=False)
@@ -185,7 +195,7 @@ class Readings:
     score: Score
     nearest: Mapping[Meaning, tuple[Change, Comparison]]
     unseen_zeros: tuple[int, ...] = ()
-    adequacy: Adequacy = Adequacy(1.0, agrees=True)
+    adequacy: Adequacy = Adequacy(1.0, 1.0, agrees=True)
 
 
 def find_readings(
@@ -207,32 +217,15 @@ def find_readings(
         search.change(changes)
         return search
 
-    search = started()
-    as_recorded = search.tried()
-    steps: list[Step] = []
-    while len(steps) < _MOST_STEPS:
-        found = search.by_prediction() or search.by_friction()
-        if not found:
-            break
-        steps += found
-    if len(steps) > 1:
-        again = started()
-        single = again.single_as_good_as(search.score, as_recorded)
-        if single is not None:
-            search = again
-            steps = [single]
-    if sized := [step for step in steps if step.change.meaning in SIZED]:
-        # Found one after the other: now all at once, on the others.
-        others = [step for step in steps if step not in sized]
-        again = started([step.change for step in others])
-        if joint_steps := again.by_joint_fit(sized):
-            search = again
-            steps = [*others, *joint_steps]
+    search, steps = _one_by_one(started)
+    adequacy = search.adequacy()
+    if not adequacy.is_enough or any(not step.sure or step.is_far for step in steps):
+        search, steps = _with_a_sign(started, search, steps)
+        adequacy = search.adequacy()
     nearest = search.nearest()
     score = score_of(search.model, search.samples, search.score.columns)
     # What a change explains shows beside the others.
     steps = [step if step.alike else replace(step, error=search.score.overall) for step in steps]
-    adequacy = search.adequacy()
     if not adequacy.is_enough:
         steps = _doubted(steps, search, started())
     doubted = [step for step in steps if not step.sure]
@@ -248,6 +241,74 @@ def find_readings(
         search.unseen_zeros(),
         adequacy,
     )
+
+
+def _one_by_one(started: Callable[..., _Search]) -> tuple[_Search, list[Step]]:
+    """Adopt changes one after the other, then zeros and scales of all joints at once."""
+    search = started()
+    as_recorded = search.tried()
+    steps = search.more_steps()
+    if len(steps) > 1:
+        again = started()
+        single = again.single_as_good_as(search.score, as_recorded)
+        if single is not None:
+            search = again
+            steps = [single]
+    if sized := [step for step in steps if step.change.meaning in SIZED]:
+        # Found one after the other: now all at once, on the others.
+        others = [step for step in steps if step not in sized]
+        again = started([step.change for step in others])
+        if joint_steps := again.by_joint_fit(sized):
+            search = again
+            steps = [*others, *joint_steps]
+    return search, steps
+
+
+def _with_a_sign(
+    started: Callable[..., _Search], found: _Search, steps: list[Step]
+) -> tuple[_Search, list[Step]]:
+    """Return a reading with a sign, and zeros and scales fitted beside it; the one found if better.
+
+    One after the other, neither need lessen the error: a joint whose sign is wrong has no zero that
+    fits, and one whose zero is wrong no sign. Where both fit alike, the steps say so.
+    """
+    tried = list(_signed(started))
+    if not tried:
+        return found, steps
+    change, best, more = min(tried, key=lambda each: each[1].score.overall)
+    against = compare(best.score, found.score, found.model)
+    is_alike = (
+        against.sigmas < SEPARATE and best.score.overall < (1.0 + _ALIKE) * found.score.overall
+    )
+    is_better = against.ratio < 1.0 - _LARGE and against.sigmas < -SEPARATE
+    if not is_better and not (is_alike and len(more) + 1 < len(steps)):
+        other = [(change, best.score.overall)]
+        if not is_alike or any(step.change == change for step in steps):
+            return found, steps
+        return found, [replace(step, alike=(*step.alike, *other)) for step in steps]
+    before = started()
+    without = started([step.change for step in more])
+    alone = compare(best.score, without.score, found.model)
+    alike = [
+        (other, again.score.overall)
+        for other, again, _ in tried
+        if other != change
+        and compare(again.score, best.score, found.model).sigmas < SEPARATE
+        and again.score.overall < (1.0 + _ALIKE) * best.score.overall
+    ]
+    sign = Step(
+        change, best.score.overall, before.score.overall, alone.ratio, alone.sigmas, tuple(alike)
+    )
+    return best, [sign, *more, *best.more_steps()]
+
+
+def _signed(started: Callable[..., _Search]) -> Iterator[tuple[Change, _Search, list[Step]]]:
+    """Yield the signs that fit best with zeros and scales of all joints, and these steps."""
+    fewer = started()
+    fewer.samples = _thinned(fewer.samples, _FEWER_ROWS)
+    for change in fewer.signs_by_joint_fit()[:_SIGNED]:
+        again = started([change])
+        yield change, again, again.by_joint_fit(())
 
 
 def _doubted(steps: Sequence[Step], found: _Search, as_recorded: _Search) -> list[Step]:
@@ -275,7 +336,7 @@ def find_zeros_and_scales(model: RobotModel, samples: Samples) -> Readings:
     few = _thinned(samples, _ROWS)
     search = _Search(model, few, {}, unit_is_open=False)
     steps = search.by_joint_fit(())
-    adequacy = search.adequacy() if steps else Adequacy(1.0, agrees=True)
+    adequacy = search.adequacy() if steps else Adequacy(1.0, 1.0, agrees=True)
     steps = [replace(step, is_adequate=step.is_adequate and adequacy.is_enough) for step in steps]
     return Readings(tuple(steps), model, search.samples, search.score, {}, (), adequacy)
 
@@ -380,6 +441,26 @@ class _Search:
         others = [trial for trial in better if trial.change.meaning != "zero"]
         return [self._adopt(best, [*others, *self._singles()])]
 
+    def more_steps(self) -> list[Step]:
+        """Adopt changes one after the other, as long as they are significant."""
+        steps: list[Step] = []
+        while len(steps) < _MOST_STEPS:
+            found = self.by_prediction() or self.by_friction()
+            if not found:
+                break
+            steps += found
+        return steps
+
+    def signs_by_joint_fit(self) -> list[Change]:
+        """Return the signs of single joints, those that fit best with zeros and scales first."""
+        free = candidates(self.model, self.samples)
+        moved = np.flatnonzero(np.ptp(self.samples.motion.position, axis=0) > 0.0).tolist()
+        costs = {}
+        for change in (Change(kind, (joint,)) for joint in moved for kind in SIGNS):
+            samples = changed_samples(self.model, self.samples, change)
+            costs[change] = fit_joints(self.model, samples, free).cost
+        return sorted(costs, key=lambda change: costs[change])
+
     def _singles(self, but: _Joints | None = None) -> list[Trial]:
         """Return single zeros and scales that were fitted, other than those of the best."""
         known = [] if but is None else list(but.changes)
@@ -451,7 +532,9 @@ class _Search:
         """Compare the reading found with a free fit."""
         free = self.free_fit()
         moved = [joint for each in self._changes if each.meaning == "zero" for joint in each.joints]
-        return Adequacy(self.stated_fit().ratio_to(free), free.is_zero_at(moved))
+        stated = self.stated_fit()
+        largest = float(stated.ratios_to(free).max(initial=1.0))
+        return Adequacy(stated.ratio_to(free), largest, free.is_zero_at(moved))
 
     def _best_joints(self, trials: Sequence[Trial]) -> _Joints | None:
         """Return zeros and scales that predict better; None if none do."""
