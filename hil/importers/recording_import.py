@@ -88,7 +88,7 @@ class ImportedRecording:
         map_text: the column map, TOML; None for joint states of a bag, which need none.
         bag: how those were read; None for a log.
         is_stated: whether a whole column map was given.
-        held_joints, coupled: as of :func:`hil.import_log`.
+        held_joints, coupled, outside_limits: as of :func:`hil.import_log`.
         concluded: the meaning of each group of channels, what was fixed for it, and what the motion
             and the torque say, in this order.
         examined: what was found in its samples, and warnings.
@@ -105,6 +105,7 @@ class ImportedRecording:
     files: LogFiles = field(default_factory=LogFiles, compare=False, repr=False)
     held_joints: tuple[str, ...] = ()
     coupled: bool = True
+    outside_limits: bool = False
 
     @property
     def text(self) -> str | None:
@@ -199,6 +200,7 @@ class _Request:
             files=self.files,
             held_joints=self.held_joints,
             coupled=self.coupled,
+            outside_limits=self.outside_limits,
         )
 
 
@@ -302,6 +304,7 @@ def read_again(
         files=imported.files,
         held_joints=imported.held_joints,
         coupled=imported.coupled,
+        outside_limits=imported.outside_limits,
     )
 
 

@@ -13,7 +13,14 @@ from hil.archive import open_archive
 from hil.archive.schema import CYCLE
 from hil.base.errors import ArchiveError, SourceError
 from hil.cell import Cell
-from hil.importers.conclusions import Certainty, ChannelMeaning, Examined, NameBasis, UnitBasis
+from hil.importers.conclusions import (
+    Certainty,
+    ChannelMeaning,
+    ConcludedUnit,
+    Examined,
+    NameBasis,
+    UnitBasis,
+)
 from hil.importers.excerpt import LONGEST
 from hil.importers.log_files import LogFiles
 from hil.importers.recording_import import ImportedRecording, ImportOptions, RobotOf, read_recording
@@ -30,7 +37,7 @@ from identification.errors import IdentificationError
 from identification.estimators.delay import DelayEstimate, estimate_delay
 from identification.estimators.torque_channel import possible_low_passes
 from identification.hypotheses.changes import Axes
-from identification.hypotheses.search import Readings, find_readings
+from identification.hypotheses.search import EXPLAINED, Readings, find_readings
 from identification.model.robot import RobotModel
 from identification.signals.recording import Recording, RecordingError
 from identification.signals.samples import Preprocessing, prepare
@@ -49,8 +56,7 @@ _COLUMNS: Final[tuple[tuple[str, Kind, str], ...]] = (
 def look_at(source: Path, robot_of: RobotOf | None, options: ImportOptions) -> Look:
     """Return what a recording contains and, with its robot, what its torque can determine.
 
-    An archive of `hil` has its robot in it, unless another is given, and states what its channels
-    are.
+    An archive has its robot in it, unless another is given, and states what its channels are.
 
     Raises:
         SourceError: it cannot be read, or its names leave a quantity open.
@@ -76,17 +82,29 @@ def look_at(source: Path, robot_of: RobotOf | None, options: ImportOptions) -> L
     return _with_torque(source, recorded, imported, cell, rows)
 
 
+def _no_longer_certain_unit(row: Row, error: float) -> Row:
+    """Return a row whose unit the numbers alone say, of a torque that the arm does not explain.
+
+    One joint in another unit than the others leaves the limits of the URDF as all of them do.
+    """
+    by_numbers = any(isinstance(each, ConcludedUnit) for each in row.evidence)
+    if row.aspect not in ("position", "velocity") or not by_numbers:
+        return row
+    return physics.no_longer_certain(row, error)
+
+
 def _archived(source: Path) -> ImportedRecording | None:
     """Return an archive of `hil` as what an import would give; None of any other file."""
     try:
         archive = open_archive(source)
     except ArchiveError:
         return None  # the import says what it is, and whether it can be read
-    if archive.kind == "imported" or not {"cell.toml", "robot.urdf"} <= archive.attachments.keys():
+    if not {"cell.toml", "robot.urdf"} <= archive.attachments.keys():
         return None
     concluded = tuple(
         ChannelMeaning(f"{CYCLE}/{column}", kind, NameBasis.MESSAGE, unit, UnitBasis.MESSAGE)
         for column, kind, unit in _COLUMNS
+        if np.isfinite(archive.columns.get(column, np.nan)).any()
     )
     return ImportedRecording(archive, (source,), None, concluded, Examined((), ()))
 
@@ -111,8 +129,10 @@ def _with_torque(
     delay, low_pass = _channel(finding.axes.read(recording), finding.readings.model)
     channel = physics.channel_rows(delay, low_pass)
     groups = physics.determined(finding.readings)
-    rows = [*rows, *finding.rows(groups), *channel]
     score = finding.readings.score
+    if score.overall > EXPLAINED:
+        rows = [_no_longer_certain_unit(row, score.overall) for row in rows]
+    rows = [*rows, *finding.rows(groups), *channel]
     contradictions = Contradictions.of(
         cell, finding.readings.model, finding.readings.samples, score, score.overall
     )

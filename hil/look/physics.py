@@ -239,7 +239,7 @@ class TorqueFindings:
             beside = FreeFit(adequacy.ratio)
             rows.append(Row("explanation", Fact.NONE_FITS, Certainty.UNDETERMINED, (beside,)))
         if error > EXPLAINED:
-            rows = [_no_longer_certain(row, error) for row in rows]
+            rows = [no_longer_certain(row, error) for row in rows]
         as_read = ErrorAsRead(error)
         rows.append(Row("as read", as_read, Certainty.CERTAIN, (Basis.FREE_PARAMETERS,)))
         return rows
@@ -484,7 +484,7 @@ def _says_nothing(row: Row) -> Row:
     return replace(row, certainty=Certainty.UNDETERMINED, evidence=(Basis.NO_BODIES,), decider=None)
 
 
-def _no_longer_certain(row: Row, error: float) -> Row:
+def no_longer_certain(row: Row, error: float) -> Row:
     """Return a row that rests on a torque which the arm does not explain."""
     if row.certainty is not Certainty.CERTAIN or row.aspect == "payload":
         return row

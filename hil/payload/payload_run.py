@@ -185,6 +185,14 @@ class PayloadFound:
                 " the inertia is not determined. Friction or delay of the torques may differ"
                 " between the recordings; record the same motion bare and loaded, on a warm arm."
             )
+        if estimate.is_beyond_reach:
+            distance = float(np.linalg.norm(body.centre))
+            lines.append(
+                f"A load of {body.mass:.3g} kg whose centre of mass is {distance:.2g} m from the"
+                " frame is larger than any of foam: the difference may be of the arm itself, not of"
+                " a load. Record both on a warm arm, one after the other, and check with a load of"
+                " known mass."
+            )
         if self.mounting is not None:
             lines.append(f"The mounting is doubtful: {self.mounting}. No controller settings.")
         return lines

@@ -47,6 +47,7 @@ _INERTIA: Final = np.arange(6)
 _DIAGONAL: Final = [4, 7, 9]  # of a tensor, among `NAMES`
 _STATED: Final = 1.959963984540054  # standard deviations in half a 95 % interval
 _DENSITY: Final = 1000.0  # kg/m³; a ball of it is the least inertia worth determining
+_LIGHTEST: Final = 10.0  # kg/m³, of foam: a ball of it contains the centre of what is carried
 
 CONTRADICTION_SIGMAS: Final = 5.0
 SAME_MASS: Final = 0.1
@@ -87,6 +88,12 @@ class PayloadEstimate:
     method: str  # description of the covariance
     # share of the squared interval of the mass that the torque scale makes; no recording reduces it
     scale_share: float = 0.0
+
+    @property
+    def is_beyond_reach(self) -> bool:
+        """Whether its centre is farther from the frame than any load of this mass is large."""
+        _, high = self.intervals[0]
+        return self.body is not None and self.moment[1] > high * ball_radius(high, _LIGHTEST)
 
 
 def identify_payload(
@@ -154,6 +161,13 @@ def _determined_mass(estimate: _BodyEstimate) -> tuple[float, float, float]:
             " more axes, with the wrist in many poses"
         )
     if high < 0.0:
+        if estimate.moment[1] > -low * ball_radius(-low, _LIGHTEST):
+            distance = estimate.moment[0] / -mass
+            raise PayloadError(
+                f"the loaded recordings are {-mass:.3g} kg lighter than the bare ones, with a"
+                f" centre of mass {distance:.2g} m from the frame: that is no load of either, but"
+                " a change of the arm itself; record both on a warm arm, one after the other"
+            )
         raise PayloadError(
             f"the bare recordings carry {-mass:.3g} kg more than the loaded ones; check whether"
             " they are interchanged, and the sign of the torques"
@@ -247,9 +261,9 @@ def reach(model: RobotModel, frame: str | None, travel: Array) -> float:
     return float(lengths.sum() + slides.sum() + np.linalg.norm(translation))
 
 
-def ball_radius(mass: float) -> float:
-    """Return the radius of a ball with the density of water [m]."""
-    return float((3.0 * mass / (4.0 * np.pi * _DENSITY)) ** (1.0 / 3.0))
+def ball_radius(mass: float, density: float = _DENSITY) -> float:
+    """Return the radius of a ball [m], by default with the density of water [kg/m³]."""
+    return float((3.0 * mass / (4.0 * np.pi * density)) ** (1.0 / 3.0))
 
 
 def mass_difference(model: RobotModel, runs: Sequence[Run]) -> tuple[float, float, float]:

@@ -108,6 +108,7 @@ class TestPayload:
 
 TIME = np.arange(2000) * 5e-3
 LOAD = Payload(4.0, (0.2, 0.0, 0.1), (0.02, 0.0, 0.0, 0.03, 0.0, 0.04))
+BEYOND = Payload(0.3, (3.0, 0.0, 0.5), (0.02, 0.0, 0.0, 0.03, 0.0, 0.04))
 NOISE = np.array([3.0, 1.0])  # N·m
 SEEDS = 24
 
@@ -152,6 +153,18 @@ class TestMass:
         exchanged = [replace(run, loaded=not run.loaded) for run in runs]
         with pytest.raises(PayloadError, match=r"carry 4\.\d* kg more .* interchanged"):
             identify_payload(model, exchanged)
+
+    @pytest.mark.parametrize("is_exchanged", [False, True])
+    def test_a_load_larger_than_its_mass_can_be_is_doubted(self, is_exchanged):
+        """0.3 kg at 3 m is no load, and exchanged recordings of one are none either."""
+        model, runs = recordings([None, BEYOND])
+        if is_exchanged:
+            exchanged = [replace(run, loaded=not run.loaded) for run in runs]
+            with pytest.raises(PayloadError, match="no load of either"):
+                identify_payload(model, exchanged)
+            return
+        assert identify_payload(model, runs).is_beyond_reach
+        assert not identified([None, LOAD], noise=np.zeros(2)).is_beyond_reach
 
 
 @pytest.fixture(scope="module")

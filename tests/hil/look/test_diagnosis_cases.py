@@ -14,6 +14,7 @@ from hil.importers.imported_robot import Robot
 from hil.importers.recording_import import ImportOptions, RobotOf, import_recording
 from hil.look import look_at
 from hil.look.readings import Changes, Fact
+from hil.look.result import Row
 from hil.payload.payload_run import find_payload
 from hil.pipeline.identification import identify_archives
 from identification.validation.finding_messages import NO_BODIES
@@ -81,3 +82,30 @@ def test_no_load_is_weighed_without_gravity(tmp_path: Path) -> None:
     bare, loaded = (archived(folder / f"{name}.csv", tmp_path) for name in ("bare_g", "full_g"))
     with pytest.raises(InputError, match="gravity was removed from the torque"):
         find_payload([bare], [loaded], Silent())
+
+
+@pytest.mark.parametrize(
+    ("log", "aspect"),
+    [
+        (THREE, "zero"),
+        (SUBTRACTED, "bodies"),
+        (CASES / "06-torque-already-compensated" / "bare_g.csv", "gravity"),
+    ],
+    ids=["zeros", "no bodies", "no gravity"],
+)
+def test_a_look_at_an_archive_is_that_of_its_log(log: Path, aspect: str, tmp_path: Path) -> None:
+    """An archive has its robot in it: none need be given."""
+    readings = [
+        [row.reading for row in look.rows if row.aspect == aspect and is_certain(row)]
+        for look in (
+            look_at(log, robot_of, ImportOptions()),
+            look_at(archived(log, tmp_path), None, ImportOptions()),
+        )
+    ]
+    of_log, of_archive = readings
+    assert len(of_log) == 1
+    assert str(of_archive) == str(of_log)
+
+
+def is_certain(row: Row) -> bool:
+    return row.certainty is Certainty.CERTAIN

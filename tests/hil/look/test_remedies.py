@@ -262,3 +262,91 @@ def test_damaged_samples_of_torque_are_left_out_and_counted(cases: Path, tmp_pat
     (count,) = re.findall(r"left out of fit and error: j2 (\d) of \d+ of the fitted motion", shown)
     assert count == "4"
     assert "isolated outliers" not in shown
+
+
+def rows_of_bursts(cases: Path) -> Any:
+    """Positions, then torques, at 250 Hz: rows of the log whose stamps alone are wrong."""
+    return np.loadtxt(cases / "10-rows" / "bursts.csv", delimiter=",", skiprows=1)[:, 1:]
+
+
+def written(path: Path, **columns: Any) -> Path:
+    """Write a log with a column for each quantity, or one for each joint of it."""
+    names = [
+        name.format(joint)
+        for name, values in columns.items()
+        for joint in range(1 if values.ndim == 1 else values.shape[1])
+    ]
+    table = np.column_stack(list(columns.values()))
+    np.savetxt(path, table, delimiter=",", header=",".join(names), comments="", fmt="%.10g")
+    return path
+
+
+def test_the_measured_positions_in_place_of_the_commands(cases: Path, tmp_path: Path) -> None:
+    """Commands 40 ms ahead of the arm, written as its measured positions as well."""
+    rows = rows_of_bursts(cases)
+    lead = 10
+    quantities = {
+        "t": np.arange(len(rows) - lead) / RATE,
+        "measured_joint_position_{}": rows[lead:, :6],
+        "commanded_joint_position_{}": rows[lead:, :6],
+        "encoder_{}": rows[:-lead, :6],
+        "measured_torque_{}": rows[:-lead, 6:],
+    }
+    log = written(tmp_path / "log.csv", **quantities)
+    line = ("identify", log, "--urdf", cases / "arm.urdf")
+    code, shown = typed(*line, "-o", tmp_path / "wrong")
+    assert code == 5
+    (option,) = set(re.findall(r"\((--columns 'position=NAME\{\}')\)", shown))
+    option = option.replace("NAME{}", "encoder_{}")
+    code, shown = typed(*line, *shlex.split(option), "-o", tmp_path / "right")
+    assert code == 0
+    assert "Good for feed-forward" in shown
+
+
+@pytest.mark.parametrize("name", ["bursts", "frozen"])
+def test_rows_that_are_as_a_verdict_wants_them_have_no_finding(
+    cases: Path, tmp_path: Path, name: str
+) -> None:
+    """The controller's time with each sample; a log without the second in which nothing moves."""
+    line = ("--urdf", cases / "arm.urdf", "-v")
+    steps = {
+        "bursts": "log the controller's time with each sample",
+        "frozen": "find out why the logger stopped",
+    }
+    code, shown = typed("identify", cases / "10-rows" / f"{name}.csv", *line, "-o", tmp_path / "a")
+    assert code == 0
+    assert steps[name] in shown
+    rows = rows_of_bursts(cases)
+    time = np.arange(len(rows)) / RATE
+    log = written(tmp_path / "log.csv", **{"t": time, "q{}": rows[:, :6], "tau{}": rows[:, 6:]})
+    code, shown = typed("identify", log, *line, "-o", tmp_path / "b")
+    assert code == 0
+    assert steps[name] not in shown
+    assert "scatter by" not in shown and "the log repeats one row" not in shown
+
+
+def test_bodies_without_inertias_are_no_obstacle(cases: Path, tmp_path: Path) -> None:
+    """What a description lacks comes from the motion: nothing is to be mended."""
+    tree = ElementTree.parse(cases / "arm.urdf")
+    for inertia in tree.iter("inertia"):
+        scale(inertia, 0.0)
+    urdf = tmp_path / "zero.urdf"
+    tree.write(urdf)
+    log = cases / "11-urdf-units" / "log.csv"
+    code, shown = typed("identify", log, "--urdf", urdf, "-o", tmp_path / "found")
+    assert code == 0
+    assert "Good for feed-forward" in shown
+
+
+def test_an_import_keeps_its_options_when_it_reads_a_log_again(cases: Path, tmp_path: Path) -> None:
+    """Zeros are found, and the log is read with them: joints held, and not coupled, as stated."""
+    log = cases / "09-several-zeros" / "three.csv"
+    archive = tmp_path / "out.mcap"
+    line = ("import", "log", log, "--urdf", cases / "arm.urdf", "-o", archive)
+    code, shown = typed(*line, "--held", "j6", "--uncoupled")
+    assert code == 0
+    assert "zero" in shown
+    table = np.loadtxt(log, delimiter=",", skiprows=1)
+    moved = columns(archive)["position"][0] - table[0, 1:7]
+    assert np.degrees(moved) == pytest.approx([0.0, 20.1, -11.5, 0.0, 8.6, 0.0], abs=1.0)
+    assert open_archive(archive).header.held_joints == ("j6",)
