@@ -172,6 +172,6 @@ def test_several_faults_of_an_arm_are_named_at_once(seed: int, tmp_path: Path) -
     assert not outcome["wrong"]
 
 
-def test_a_turned_joint_is_not_certain_where_a_sign_looks_the_same(tmp_path: Path) -> None:
+def test_a_turned_joint_that_a_sign_imitates_is_not_certain(tmp_path: Path) -> None:
     """Joint 2 the other way round, and 3 from another zero: 3 turned by 156 degrees fits alike."""
     assert not judged(52, tmp_path)["wrong"]

@@ -304,7 +304,7 @@ def test_the_measured_positions_in_place_of_the_commands(cases: Path, tmp_path: 
 
 
 @pytest.mark.parametrize("name", ["bursts", "frozen"])
-def test_rows_that_are_as_a_verdict_wants_them_have_no_finding(
+def test_rows_as_a_verdict_wants_them_have_no_finding(
     cases: Path, tmp_path: Path, name: str
 ) -> None:
     """The controller's time with each sample; a log without the second in which nothing moves."""
@@ -338,7 +338,7 @@ def test_bodies_without_inertias_are_no_obstacle(cases: Path, tmp_path: Path) ->
     assert "Good for feed-forward" in shown
 
 
-def test_an_import_keeps_its_options_when_it_reads_a_log_again(cases: Path, tmp_path: Path) -> None:
+def test_an_import_that_reads_again_keeps_its_options(cases: Path, tmp_path: Path) -> None:
     """Zeros are found, and the log is read with them: joints held, and not coupled, as stated."""
     log = cases / "09-several-zeros" / "three.csv"
     archive = tmp_path / "out.mcap"
