@@ -182,7 +182,17 @@ class Execution:
         return self.position, second, bounds
 
     def resume_from(self, position: Array, velocity: Array, cycles: int, cycle: int) -> None:
-        """Continue from the controller's target, see `MotionSource`; raises SourceFailed."""
+        """Continue from the controller's target, see `MotionSource`.
+
+        Args:
+            position: of the target (n,) [rad].
+            velocity: of the target (n,) [rad/s].
+            cycles: since the source gave its last set-point.
+            cycle: number of the cycle.
+
+        Raises:
+            SourceFailed: the source cannot continue.
+        """
         with _failing("cannot continue", cycle):
             # Copies, because the guard compares with these arrays.
             self._source.resume_from(position.copy(), velocity.copy(), cycles)
@@ -239,7 +249,14 @@ def _failed(what: str, error: BaseException, cycle: int) -> SourceFailed:
 def execution_of(
     source: MotionSource, n_joints: int, settle_cycles: int, stop_cycles: int
 ) -> Execution | str:
-    """Return the execution of a source, or why it cannot run."""
+    """Return the execution of a source, or why it cannot run.
+
+    Args:
+        source: of the set-points.
+        n_joints: of the cell.
+        settle_cycles: that the end is held.
+        stop_cycles: that a stop or a hold may take.
+    """
     try:
         if has_members(source, _MEMBERS):
             return Execution(source, n_joints, settle_cycles, stop_cycles)

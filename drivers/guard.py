@@ -28,7 +28,18 @@ Joints = NDArray[np.bool_]
 
 
 def require(where: Joints, values: Array, bounds: Array, check: Check, cycle: int) -> None:
-    """Raise for the first joint of `where` (n,) whose value (n,) is above its bound (n,)."""
+    """Raise for the first joint whose value is above its bound.
+
+    Args:
+        where: joints that are checked (n,).
+        values: magnitudes (n,).
+        bounds: of the values (n,).
+        check: that they belong to.
+        cycle: number of the cycle.
+
+    Raises:
+        GuardError: a value is above its bound.
+    """
     bad = where & ~(values <= bounds)
     if bad.any():
         joint = int(np.argmax(bad))
@@ -55,8 +66,15 @@ def raise_first(
 ) -> NoReturn:
     """Raise for the first row and joint outside its bound; not finite values come first.
 
-    `values` (k, n) has a row for each of `checks`, with a magnitude of at most `allowed` (k, n).
-    A position is measured from the `middle` (n,) of its range.
+    Args:
+        values: one row for each check (k, n).
+        allowed: largest magnitude of each (k, n).
+        checks: that the rows belong to (k).
+        cycle: number of the cycle.
+        middle: of the range (n,), from which a position is measured.
+
+    Raises:
+        GuardError: always.
     """
     not_finite = ~np.isfinite(values)
     bad = not_finite if not_finite.any() else ~(np.abs(values) <= allowed)
@@ -277,7 +295,17 @@ class Guard:
         self._feedback_bounds *= 1.0 + RELATIVE_TOLERANCE
 
     def check_hold(self, target: Array, actual: Array, opened: Joints, cycle: int) -> None:
-        """Check that axes `opened` (n,) can hold their target (n,) D1 while others are closed."""
+        """Check that open axes can hold their target while others are closed.
+
+        Args:
+            target: D1 of the packet (n,), motor revolutions.
+            actual: D3 of the packet (n,), motor revolutions.
+            opened: axes that are open (n,).
+            cycle: number of the cycle.
+
+        Raises:
+            GuardError: a target is too far from its axis.
+        """
         require_finite(target, opened, cycle)
         bound = self.following_error * (1.0 + RELATIVE_TOLERANCE)
         require(opened, np.abs(actual - target), bound, Check.FOLLOWING_ERROR, cycle)
@@ -299,8 +327,14 @@ class Guard:
     def check_start(self, target: Array, actual: Array, step: Array, cycle: int) -> None:
         """Check that the arm may begin to move in this cycle.
 
-        Of the packet: `target` D1 and `actual` D3, (n,), and `step` D2 and D4, (2, n), motor
-        revolutions and per cycle.
+        Args:
+            target: D1 of the packet (n,), motor revolutions.
+            actual: D3 of the packet (n,), motor revolutions.
+            step: D2 and D4 of the packet (2, n), motor revolutions per cycle.
+            cycle: number of the cycle.
+
+        Raises:
+            GuardError: the arm moves, or is not at its target.
         """
         every = self._every
         require_finite(target, every, cycle)
@@ -383,10 +417,17 @@ class Guard:
         require(where, np.abs(velocity - sent), bound, Check.PAUSE_VELOCITY, cycle)
 
     def check_set_point(self, q: Array, qd: Array, bounds: BoundsName, cycle: int) -> None:
-        """Check the next set-point q (n,) rad, qd (n,) rad/s, which then counts as sent.
+        """Check the next set-point, which then counts as sent.
 
-        `bounds` apply from this set-point on; wider ones stay active until no difference reaches
-        back to them.
+        Args:
+            q: positions (n,) [rad].
+            qd: velocities (n,) [rad/s].
+            bounds: that apply from this set-point on; wider ones stay active until no difference
+                reaches back to them.
+            cycle: number of the cycle.
+
+        Raises:
+            GuardError: the set-point breaks a bound.
         """
         history = self._history
         history[:3] = history[1:4]

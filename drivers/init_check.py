@@ -39,12 +39,18 @@ def verify_controller(
     arm: int,
     other_axes: frozenset[tuple[int, int]] = frozenset(),
 ) -> InitReceived:
-    """Compare an init packet with the cell, for an arm from 1.
+    """Compare an init packet with the cell.
 
     Any difference makes the session unusable: with a wrong gear ratio, calibration or coupling the
-    arm moves elsewhere. So does another cycle than `period` (s), a joint that is not open, and an
-    open axis of any arm that is neither a joint of the cell nor one of `other_axes` (arm, axis,
-    from 1), because its targets are not checked.
+    arm moves elsewhere.
+
+    Args:
+        drive_train: of the cell.
+        period: of a cycle of the cell [s].
+        init: packet of the controller, in which every joint must be open.
+        arm: of the cell, from 1.
+        other_axes: (arm, axis), from 1, that may be open besides; no other may, because its targets
+            are not checked.
     """
     differences = _axes(drive_train.n_joints, init, arm, other_axes)
     if not math.isclose(init.period, period, rel_tol=1e-9):

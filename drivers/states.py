@@ -86,9 +86,13 @@ KNOWN_MODES: Final = OPEN_MODES | CLOSED_MODES | PAUSE_MODES | {Mode.DRIVING_ON}
 def read_input(
     drive_on: bool, all_modes: Sequence[int], wanted_modes: Sequence[int], mode: int
 ) -> Input:
-    """Classify a cyclic packet by the arm's drive, the mode of every slot and of wanted axes.
+    """Classify a cyclic packet.
 
-    `mode` is the open mode in which the wanted axes are to be moved.
+    Args:
+        drive_on: whether the arm's drive is on.
+        all_modes: mode of every slot.
+        wanted_modes: modes of the wanted axes.
+        mode: open mode in which these are to be moved.
     """
     if all(m == Mode.END_OF_SESSION for m in all_modes):
         return Input.END

@@ -203,7 +203,11 @@ class ControllerProtocol(Protocol):
     def own_packets(
         self, drive_train: DriveTrain, position: Array, period: float, limits: tuple[Array, Array]
     ) -> OwnPackets:
-        """Return packets of an arm at rest at a position (n,) [rad].
+        """Return packets of an arm at rest.
 
-        `limits`: largest following error and current of each joint (n,).
+        Args:
+            drive_train: of the cell.
+            position: of the arm (n,) [rad].
+            period: of a cycle [s].
+            limits: largest following error and current of each joint (n,).
         """

@@ -54,9 +54,13 @@ class StraightMoves(NamedTuple):
     def between(
         cls, starts: Array, ends: Array, bounds: Allowance, deceleration: Array
     ) -> StraightMoves:
-        """Plan the fastest straight moves (s, n) under velocity, acceleration, jerk limits (s, n).
+        """Plan the fastest straight moves between positions.
 
-        `deceleration` (s, n) [rad/s²] bounds the slowing down.
+        Args:
+            starts: positions (s, n) [rad].
+            ends: positions (s, n) [rad].
+            bounds: of velocity, acceleration and jerk (s, n).
+            deceleration: bound of the slowing down (s, n) [rad/s²].
         """
         change = ends - starts
         length = np.max(np.abs(change), axis=1)
@@ -126,7 +130,14 @@ class StraightMoves(NamedTuple):
 def rest_to_rest(
     distance: Array, velocity: Array, acceleration: Array, deceleration: Array, jerk: Array
 ) -> tuple[Array, Array, Array, Array]:
-    """Plan the fastest scalar moves over distances > 0 (s,) that start and end at rest.
+    """Plan the fastest scalar moves that start and end at rest.
+
+    Args:
+        distance: of each move, > 0 (s,).
+        velocity: largest (s,).
+        acceleration: largest while speeding up (s,).
+        deceleration: largest while slowing down (s,).
+        jerk: largest (s,).
 
     Returns:
         Knots (s, 8) [s], pieces (s, 7, 4), and the times of speeding up and slowing down (s,) [s].
@@ -320,10 +331,17 @@ STOP: Final = Corner(0.0, 0.0, None)
 def round_corners(
     moves: StraightMoves, before: Rows, after: Rows, bounds: Allowance, fly: Array
 ) -> list[Corner]:
-    """Round corners between moves `before` and `after` each, (c,), as far as `fly` (c,) requests.
+    """Round corners between moves as far as requested.
 
-    A corner takes the same share of the ramps before and after it, within `bounds` (c, n), so that
-    no part of a move belongs to two corners. It never takes longer than a stop.
+    A corner takes the same share of the ramps before and after it, so that no part of a move
+    belongs to two corners. It never takes longer than a stop.
+
+    Args:
+        moves: straight ones.
+        before: row of the move before each corner (c,).
+        after: row of the move after each corner (c,).
+        bounds: of the corners (c, n).
+        fly: share of the ramps that is requested (c,).
 
     Raises:
         UnsupportedSolver: a corner is to be rounded with an untested version of ruckig.
@@ -413,9 +431,13 @@ class Solutions(NamedTuple):
 
 
 def solve_many(starts: Array, ends: Array, times: Array, bounds: Allowance) -> Solutions:
-    """Find the fastest motions between states (c, n, 3) under limits (c, n).
+    """Find the fastest motions between states, in which all joints arrive together.
 
-    All joints arrive together. `times` are the expected durations (c,) [s].
+    Args:
+        starts: position, velocity and acceleration of each joint (c, n, 3).
+        ends: likewise (c, n, 3).
+        times: expected durations (c,) [s].
+        bounds: limits (c, n).
 
     Raises:
         UnsupportedSolver: ruckig is of another series than `SERIES`.

@@ -57,7 +57,13 @@ class MotionQueue:
     def append(
         self, target_id: int, move: Move, overrides: Overrides, now: float
     ) -> PiecewiseCubic:
-        """Add a target at the present motion time `now` [s]; return the whole motion.
+        """Add a target; return the whole motion.
+
+        Args:
+            target_id: by which events name the target.
+            move: to the target.
+            overrides: of speed and acceleration.
+            now: present motion time [s].
 
         Raises:
             PlannerError: no motion to it was found; the queue is unchanged.

@@ -121,7 +121,14 @@ class Legs(NamedTuple):
 
     @classmethod
     def between(cls, starts: Array, ends: Array, bounds: Allowance, deceleration: Array) -> Legs:
-        """Plan moves between positions (s, n) [rad]."""
+        """Plan moves between positions.
+
+        Args:
+            starts: positions (s, n) [rad].
+            ends: positions (s, n) [rad].
+            bounds: of velocity, acceleration and jerk (s, n).
+            deceleration: bound of the slowing down (s, n) [rad/s²].
+        """
         cautious = bounds._replace(
             velocity=SEGMENT_VELOCITY * bounds.velocity,
             acceleration=SEGMENT_ACCELERATION * bounds.acceleration,
@@ -243,7 +250,13 @@ def _assembled(moves: StraightMoves, corners: Sequence[Corner], count: int) -> B
 def legs_through(
     points: Array, moves: Sequence[Move], limits: JointLimits, overrides: Overrides
 ) -> Legs:
-    """Plan the moves from each of the points (s + 1, n) [rad] to the next, from rest to rest.
+    """Plan the moves from each point to the next, from rest to rest.
+
+    Args:
+        points: positions (s + 1, n) [rad].
+        moves: to all of them but the first (s).
+        limits: of the joints.
+        overrides: of speed and acceleration.
 
     Raises:
         InvalidSetting: the overrides have another number of joints.
@@ -347,7 +360,14 @@ class MotionPlan:
 
 
 def passage(index: int, target: Array, corner: Corner, time: float) -> TargetPassage:
-    """Return the passage of a target (n,) [rad] by a corner that begins at `time` [s]."""
+    """Return how a target is passed by a corner.
+
+    Args:
+        index: of the target.
+        target: position (n,) [rad].
+        corner: that rounds it.
+        time: at which the corner begins [s].
+    """
     if corner.join is None:
         return TargetPassage(index, time, 0.0, "stopped", 0.0)
     passed = passing(corner.join, target)
@@ -399,6 +419,12 @@ def plan_moves(
     faster if rounded less, is rounded less or becomes a stop; see `MotionPlan.targets`. The motion
     never takes longer than one with a stop at every target.
 
+    Args:
+        start: position (n,) [rad].
+        moves: to the targets, in order.
+        limits: of the joints.
+        overrides: of speed and acceleration.
+
     Raises:
         InvalidViaPoints: start (via point 0) or a target (via point i of the i-th move) is of the
             wrong shape, not finite, or out of limits.
@@ -427,11 +453,14 @@ def plan_moves(
 def plan(
     via_points: ArrayLike, limits: JointLimits, *, speed: ArrayLike = 1.0, fly: float = 0.5
 ) -> PiecewiseCubic:
-    """Plan a motion through via points (n_points, n_joints) [rad], from rest to rest.
+    """Plan a motion through via points, from rest to rest.
 
-    `speed` is a share of each joint's velocity limit, in (0, 1], a number or (n,); `fly` the share
-    of each deceleration that the next acceleration overlaps, from 0 (stop at every via point) to 1
-    (the corner begins with the deceleration).
+    Args:
+        via_points: positions (n_points, n_joints) [rad].
+        limits: of the joints.
+        speed: share of each joint's velocity limit, in (0, 1], a number or (n,).
+        fly: share of each deceleration that the next acceleration overlaps, from 0 (stop at every
+            via point) to 1 (the corner begins with the deceleration).
 
     Raises:
         InvalidSetting: speed or fly outside its range.
@@ -452,9 +481,16 @@ def plan_chunk(
 ) -> list[PiecewiseCubic | PlannerError]:
     """Plan the motions of many individuals of a search together.
 
-    ruckig can crash the process, so searches call this in `planner.worker` processes. Via points of
-    individuals may differ in number; `speed` has one row (n,) for each; `fly` as of `plan`. Returns
-    for each individual its motion, or the error that `plan` would raise.
+    ruckig can crash the process, so searches call this in `planner.worker` processes.
+
+    Args:
+        individuals: via points of each, which may differ in number.
+        speed: one row (n,) for each.
+        limits: of the joints.
+        fly: as of `plan`.
+
+    Returns:
+        The motion of each individual, or the error that `plan` would raise.
     """
     planned: dict[int, PiecewiseCubic | PlannerError] = {}
     alike: dict[int, list[tuple[int, Array]]] = {}

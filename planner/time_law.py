@@ -80,7 +80,12 @@ def admits(bounds: RateBounds, rate: float, slope: float) -> bool:
 def ramp(rate: float, slope: float, target: float, bounds: RateBounds) -> Ramp:
     """Return the fastest change from a state to a target rate, reached with zero slope.
 
-    A slope beyond its bound, which came from wider bounds, does not grow further.
+    Args:
+        rate: of the state.
+        slope: of the rate; one beyond its bound, which came from wider bounds, does not grow
+            further.
+        target: rate at the end.
+        bounds: of slope and its change.
     """
     way = target - rate
     change = bounds.change
@@ -153,7 +158,7 @@ _SHARES = np.linspace(0.02, 1.0, 99)
 def slowing_bounds(
     limits: JointLimits, acceleration: float, jerk: float, extrema: Extrema | None = None
 ) -> RateBounds:
-    """Return bounds that keep acceleration and jerk below these multiples (> 1) of the limits.
+    """Return bounds that keep acceleration and jerk below multiples of the limits.
 
     With r = ds/dt in [0, 1],
 
@@ -162,8 +167,13 @@ def slowing_bounds(
         jerk = q''' r³ + 3 q'' r r' + q' r''
 
     are worst at r = 1 with all terms of one sign. The jerk left over is divided between the terms
-    in r' and r'' such that a change from full rate to rest takes the least time. Without `extrema`
-    of the path the limits are assumed.
+    in r' and r'' such that a change from full rate to rest takes the least time.
+
+    Args:
+        limits: of the joints.
+        acceleration: largest multiple of its limit (> 1).
+        jerk: likewise (> 1).
+        extrema: of the path; by default the limits.
     """
     v = limits.velocity
     a = limits.acceleration

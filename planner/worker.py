@@ -278,7 +278,17 @@ def in_child(function: Callable[P, T], /, *args: P.args, **kwargs: P.kwargs) -> 
 def plan_in_child(
     via_points: ArrayLike, limits: JointLimits, *, speed: ArrayLike = 1.0, fly: float = 0.5
 ) -> PiecewiseCubic:
-    """Plan as `planner.plan` does, in a child process; raises as `in_child` does."""
+    """Plan as `planner.plan` does, in a child process.
+
+    Args:
+        via_points: positions (n_points, n_joints) [rad].
+        limits: of the joints.
+        speed: share of each joint's velocity limit.
+        fly: how far corners are rounded, from 0 to 1.
+
+    Raises:
+        PlannerError: see `in_child`.
+    """
     return in_child(plan, via_points, limits, speed=speed, fly=fly)
 
 
@@ -307,7 +317,15 @@ def map_in_children(
     *,
     done: Callable[[int], None] | None = None,
 ) -> list[Outcome[T]]:
-    """Return the results of `stream_in_children` by index."""
+    """Return the results of `stream_in_children` by index.
+
+    Args:
+        children: processes that work.
+        function: called with the arguments of a chunk.
+        chunks: of the work.
+        arguments: of the function for a chunk.
+        done: called with the number of results that have just come.
+    """
     outcomes = dict(stream_in_children(children, function, chunks, arguments, done=done))
     return [outcomes[index] for index in range(len(outcomes))]
 

@@ -37,10 +37,14 @@ class Disturbances:
         self._any = False
 
     def begin(self, kind: DisturbanceKind, axis: int, size: float, cycles: int) -> None:
-        """Disturb one axis (0-based) for some cycles.
+        """Disturb one axis for some cycles.
 
-        "jam": the axis is stuck; "load": an external torque, `size` as a share of the motor's
-        largest torque; "slip": an encoder error, `size` in motor revolutions.
+        Args:
+            kind: "jam": the axis is stuck; "load": an external torque; "slip": an encoder error.
+            axis: from 0.
+            size: of a load, as a share of the motor's largest torque; of a slip, in motor
+                revolutions.
+            cycles: that it lasts.
         """
         row = _ROWS[kind]
         self._size[row, axis] = size

@@ -819,7 +819,14 @@ class SimulatedController:
         self._silent = 0 if warm else round(self.settings.boot_time / self.period)
 
     def disturb(self, kind: DisturbanceKind, axis: int, size: float, cycles: int) -> None:
-        """Disturb one axis (from 1), slip relative to its threshold; see `Disturbances.begin`."""
+        """Disturb one axis; see `Disturbances.begin`.
+
+        Args:
+            kind: of the disturbance.
+            axis: from 1.
+            size: of a slip relative to its threshold, else as there.
+            cycles: that it lasts.
+        """
         if kind == "slip":
             size *= self._drive.following_error[axis - 1]
         self._arm.disturbances.begin(kind, axis - 1, size, cycles)

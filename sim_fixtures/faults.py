@@ -62,7 +62,14 @@ class FaultyController(Protocol):
         """Switch the drive off for a reason."""
 
     def disturb(self, kind: DisturbanceKind, axis: int, size: float, cycles: int) -> None:
-        """Disturb one axis, from 1."""
+        """Disturb one axis; see `SimulatedController.disturb`.
+
+        Args:
+            kind: of the disturbance.
+            axis: from 1.
+            size: as there.
+            cycles: that it lasts.
+        """
 
 
 @dataclass(frozen=True)

@@ -107,8 +107,12 @@ def resolve_dry_friction(
 ) -> DryFriction:
     """Return the friction torques of one step and the velocities they leave.
 
-    `free_velocity` are the velocities without dry friction (n,) [rad/s], `coulomb` the Coulomb
-    torques and `guess` the initial torques of the iteration (n,) [N m], `step` in s.
+    Args:
+        free_velocity: velocities without dry friction (n,) [rad/s].
+        inverse_inertia: of the arm (n, n).
+        coulomb: Coulomb torques (n,) [N·m].
+        step: duration [s].
+        guess: torques from which the iteration starts (n,) [N·m].
     """
     coupling = inverse_inertia * step
     rows: list[list[float]] = coupling.tolist()
@@ -136,7 +140,13 @@ def resolve_dry_friction(
 def build_model(
     urdf: str, gravity: ArrayLike, armature: ArrayLike, inertia_scale: ArrayLike = 1.0
 ) -> pin.Model:
-    """Return pinocchio's model of a URDF text with gravity [m/s2], armature [kg m2], scaled links.
+    """Return pinocchio's model of a URDF text.
+
+    Args:
+        urdf: text.
+        gravity: (3,) [m/s²].
+        armature: of each joint (n,) [kg·m²].
+        inertia_scale: by which inertias of the links are multiplied.
 
     Raises:
         SettingError: the number of armatures is not that of the joints, or a joint is not revolute.

@@ -235,14 +235,19 @@ def serve(
     The first packet is repeated once a second until a PC replies, so that either program may be
     started first.
 
-    `request` is called every cycle. At `END` the controller ends its session; if the arm does not
-    stop within `patience` s, its drive is switched off. At `ABORT` it stops at once. `watch` is
-    called once per cycle with the counts so far.
-
-    A cycle without a reply is extended by up to `cycle_extension` s. Real controllers do not extend
-    cycles; this is for PCs with occasional delays. A PC from which nothing came within an extension
-    is gone: it is not waited for again before something comes from it, so that a program that has
-    ended costs one extension. After `END`, only a valid reply counts.
+    Args:
+        peer: the controller.
+        link: to the PC.
+        request: called every cycle. At `END` the controller ends its session, at `ABORT` it stops
+            at once.
+        watch: called once per cycle with the counts so far.
+        clock: of the cycles.
+        patience: in which the arm must have stopped after `END`, else its drive is switched off
+            [s].
+        cycle_extension: by which a cycle without a reply is extended at most [s]; for PCs with
+            occasional delays, as real controllers do not extend cycles. A PC from which nothing
+            came within an extension is not waited for again before something comes from it. After
+            `END`, only a valid reply counts.
     """
     server = _Server(peer, link, request, watch, clock, patience, cycle_extension)
     if server.await_pc():

@@ -28,6 +28,7 @@ CEILINGS: Final[Mapping[str, int]] = {
     "long names of tests": 0,
     "tests of hil outside a room": 0,
     "class names defined twice": 0,
+    "long signatures without Args": 110,
 }
 """Figures that no change may exceed. Size has none: features are not traded for lines."""
 BANNED: Final = {
@@ -39,6 +40,7 @@ _STATES: Final = {"q", "qd", "qdd"}
 _WITHOUT_MOTION: Final = ("planner", "drivers", "sim_fixtures")  # they may not import it
 _ALIASES: Final = {f"{package}.arrays" for package in PACKAGES} | {"hil.base.arrays"}
 _LONG: Final = 60  # Lines of a function, characters of a test's name
+_MANY: Final = 4  # Parameters of a signature that needs a word on each
 
 
 @cache
@@ -207,6 +209,22 @@ class Sources:
             if len(modules) > 1
         ]
 
+    def undescribed_parameters(self) -> list[str]:
+        """Public functions and methods of `_MANY` parameters or more without a block `Args:`.
+
+        One that says "See `...`" has the parameters of what it names; the options of a command
+        have their help.
+        """
+        return [
+            f"{name}:{node.lineno} {node.name}, {count} parameters"
+            for name, tree in self.trees.items()
+            if not name.startswith("hil.cli.")
+            for node in _public_functions(tree)
+            if (count := _parameters(node)) >= _MANY
+            and "Args:" not in (text := ast.get_docstring(node) or "")
+            and not text.startswith("See ")
+        ]
+
     def long_functions(self) -> list[str]:
         """Functions of more lines than `_LONG`, docstring included."""
         return [
@@ -265,6 +283,24 @@ def _imports(nodes: Iterable[ast.AST]) -> set[ast.Import | ast.ImportFrom]:
     return {node for node in nodes if isinstance(node, ast.Import | ast.ImportFrom)}
 
 
+def _public_functions(tree: ast.AST) -> Iterator[ast.FunctionDef | ast.AsyncFunctionDef]:
+    """Public functions of a module, and public methods of its public classes."""
+    for node in ast.iter_child_nodes(tree):
+        name = getattr(node, "name", "")
+        if name.startswith("_"):
+            continue
+        if isinstance(node, ast.ClassDef):
+            yield from _public_functions(node)
+        elif isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef):
+            yield node
+
+
+def _parameters(node: ast.FunctionDef | ast.AsyncFunctionDef) -> int:
+    """Number of parameters, `self` and `cls` left out."""
+    given = (*node.args.posonlyargs, *node.args.args, *node.args.kwonlyargs)
+    return sum(argument.arg not in ("self", "cls") for argument in given)
+
+
 def _loaded(tree: ast.AST) -> Iterator[ast.AST]:
     """Nodes outside functions; imports for types alone, which do not run, are among them."""
     for node in ast.iter_child_nodes(tree):
@@ -286,6 +322,7 @@ def lists(sources: Sources) -> dict[str, list[str]]:
         "long names of tests": long_test_names(),
         "tests of hil outside a room": tests_outside_a_room(),
         "class names defined twice": sources.second_classes(),
+        "long signatures without Args": sources.undescribed_parameters(),
     }
 
 

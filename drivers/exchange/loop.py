@@ -266,12 +266,18 @@ def exchange(
 ) -> None:
     """Reply to packets until the session ends, the link closes, or `ends_when()` is true.
 
-    `ends_when` is called after the replies to what was received at once, and at least every 0.1 s
-    and a cycle; it is the place for work that can wait. Of a backlog only the newest packets get a
-    reply (`ReceiveQueue`). A closed link counts as permanent silence, which ends a motion. More
-    than `max_late` consecutive late replies, each overtaken by the next packet, stop a motion.
-    `before_packet` is called with the time at which the last packet arrived, before the next one
-    is received.
+    Of a backlog only the newest packets get a reply (`ReceiveQueue`). A closed link counts as
+    permanent silence, which ends a motion.
+
+    Args:
+        transport: that packets come from.
+        session: that answers them.
+        ends_when: called after the replies to what was received at once, and at least every 0.1 s
+            and a cycle; the place for work that can wait.
+        max_late: consecutive late replies, each overtaken by the next packet, that a motion
+            survives.
+        before_packet: called with the time at which the last packet arrived, before the next one is
+            received.
     """
     queue = ReceiveQueue(transport, session)
     peers = _PeerSelection(transport, session)

@@ -182,10 +182,16 @@ def discover(
 ) -> Discovery:
     """Find every archive at or below some places, and import logs and bags if that is stated.
 
-    `place` adds what is known of the robot and the date of each.
-
     Workers hash each archive and read its metadata. One whose file has not changed since the last
     search is not opened.
+
+    Args:
+        roots: folders, files, patterns or URLs.
+        cache: of what was read.
+        cluster: of workers.
+        reporter: of progress.
+        importing: of logs and bags, which count only with it.
+        place: adds what is known of the robot and the date of each archive.
 
     Raises:
         InputError: a place does not exist, or there is no archive.

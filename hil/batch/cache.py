@@ -107,9 +107,15 @@ class CacheLocation:
             return None
 
     def write(self, location: str, key: str, content: Any, arrays: Arrays) -> None:
-        """Write an entry: JSON data and arrays by name.
+        """Write an entry.
 
         The arrays are one in the file: `numpy` takes a tenth of a millisecond for each.
+
+        Args:
+            location: of the entry.
+            key: that it must have when it is read.
+            content: JSON data.
+            arrays: by name.
 
         Raises:
             CacheError: the file cannot be written.

@@ -164,7 +164,11 @@ def estimate_campaign(
 ) -> tuple[CampaignResult, EstimateGroup]:
     """Estimate one campaign from its reduced archives; return also what a pooled estimate needs.
 
-    `settings` are those of the campaign, with its own noise.
+    Args:
+        parts: archives, reduced or skipped.
+        arm: model of the arm.
+        settings: of the campaign, with its own noise.
+        campaign: its name.
     """
     reduced = added(part for part in parts if isinstance(part, ReducedArchives))
     estimator = Estimator(arm)
@@ -200,6 +204,13 @@ def estimate_cached(
     """Estimate one campaign from its archives, of which each partition has a cached sum.
 
     Reading a sum takes less time than a task of its own.
+
+    Args:
+        partitions: archives whose sums are cached together.
+        cache: of the sums.
+        arm: model of the arm.
+        settings: of the campaign, with its own noise.
+        campaign: its name.
 
     Raises:
         CacheError: a damaged sum is computed again, and the cache cannot be written.
@@ -335,7 +346,14 @@ class Estimator:
     def repetition(
         self, summary: Summary, settings: str, posterior: Posterior, share: float
     ) -> BatchEstimate:
-        """Return the estimate of one archive, this share of its campaign."""
+        """Return the estimate of one archive.
+
+        Args:
+            summary: of the archive.
+            settings: digest of them.
+            posterior: of the campaign.
+            share: of the archive in its campaign.
+        """
         ref = summary.ref
         nothing = np.full(self.model.n_joints, np.nan)
         estimate = self.of_archive(summary, posterior, share)
@@ -367,7 +385,12 @@ class Estimator:
     ) -> BatchEstimate:
         """Return the estimate of a campaign, or of all campaigns of the arm.
 
-        Friction may drift over the `recordings` of a campaign.
+        Args:
+            level: of the estimate.
+            group: what is summed.
+            posterior: of the estimator.
+            warnings: on the recordings.
+            recordings: factors of a campaign, over which friction may drift.
 
         Raises:
             IdentificationError: there is no estimate.

@@ -98,7 +98,14 @@ def archives_for_settings(
 def cached_settings(
     refs: Sequence[ArchiveRef], options: Options, arms: Settings | None, cache: CacheLocation
 ) -> Settings | None:
-    """Return the settings that were decided from these archives before."""
+    """Return the settings that were decided from these archives before.
+
+    Args:
+        refs: the archives.
+        options: of the identification.
+        arms: settings of the arm, if it has any.
+        cache: that they are in.
+    """
     if not refs:
         return None
     return cache.get(refs[0].origin, decision_digest(options, arms, refs), Settings)
@@ -109,8 +116,14 @@ def decide_settings(
 ) -> tuple[Settings | None, list[SkippedArchive]]:
     """Decide a campaign's settings from `archives_for_settings` and cache them.
 
-    They are those of the arm, if it has any, with the campaign's own noise. Returned with the
-    archives that could not be read; None if no excitation is left.
+    Args:
+        refs: archives of the campaign.
+        options: of the identification.
+        arms: settings of the arm; if it has any, the campaign has these, with its own noise.
+        cache: of the settings.
+
+    Returns:
+        The settings, None if no excitation is left; archives that could not be read.
 
     Raises:
         RecordingError: a recording cannot be prepared.
@@ -176,12 +189,18 @@ def reidentify(
     """Identify every arm from all its archives: by repetition, by campaign, and pooled.
 
     The numbers are those of `hil identify` on the archives of a campaign with the same held out.
-    They depend neither on the order in which archives are found nor on the workers.
+    They depend neither on the order in which archives are found nor on the workers. A single
+    recording is never split.
 
-    The roots are folders, files, patterns or URLs. A single recording is never split. `importing`
-    imports logs and bags, which count only with it; `place` adds what is known of the robot and the
-    date of a recording. `check` receives the archives found, before
-    samples are read, and may raise.
+    Args:
+        roots: folders, files, patterns or URLs.
+        options: of the identification.
+        cluster: of workers.
+        reporter: of progress.
+        cache: of reduced archives.
+        importing: of logs and bags, which count only with it.
+        place: adds what is known of the robot and the date of a recording.
+        check: receives the archives found, before samples are read, and may raise.
 
     Raises:
         InputError: a place does not exist, no archive can be fitted, or the estimator is not one of

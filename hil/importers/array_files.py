@@ -112,8 +112,11 @@ class ArrayFile:
     ) -> Array:
         """Return columns side by side, shape (m, columns).
 
-        They are arrays by name, or columns (`rows`: rows) by index of the matrix `array`. `field`
-        is that of the map, for errors.
+        Args:
+            columns: arrays by name, or columns of a matrix by index.
+            field: of the map, for errors.
+            array: the matrix.
+            rows: whether the indices are of its rows.
 
         Raises:
             SourceError: no such array or column, or arrays of different lengths.

@@ -115,9 +115,13 @@ def as_joint_state(message: BagMessage) -> BagMessage:
 def commanded_positions(
     bag: Bag, states: str, measured: Measured, chosen: str | None = None
 ) -> Commands:
-    """Return the commanded positions of the joints; `states` is the topic of the measured ones.
+    """Return the commanded positions of the joints.
 
-    `chosen` is the topic of the commands, `NO_COMMAND` for none; None to find it.
+    Args:
+        bag: that they are read from.
+        states: topic of the measured positions.
+        measured: positions, with which commands are compared.
+        chosen: topic of the commands, `NO_COMMAND` for none; None to find it.
 
     Raises:
         SourceError: there is no such topic, or it has no commanded positions.

@@ -28,6 +28,12 @@ def trees(
 ) -> list[Mapping[str, Any]]:
     """Return messages as dictionaries.
 
+    Args:
+        kind: name of the schema.
+        encoding: of the messages.
+        definition: of the schema.
+        messages: as recorded.
+
     Raises:
         MessageError: one cannot be decoded.
     """

@@ -98,9 +98,15 @@ class Robot:
         recorded: Collection[str] | None = None,
         links: Links = Links(),  # noqa: B008 - frozen
     ) -> Robot:
-        """Return a robot by a cell file; see `from_urdf` for the arguments.
+        """Return a robot by a cell file.
 
-        `locked` joints are added to those of the cell; no `gravity` is that of the cell.
+        Args:
+            path: of the file.
+            gravity: (3,) [m/s²] in base axes; by default that of the cell.
+            locked: positions by name [rad or m] of joints to be fixed in addition to those of the
+                cell.
+            recorded: names of the joints that were recorded; see `from_urdf`.
+            links: of a robot with several arms; likewise.
 
         Raises:
             InputError: the cell file or its URDF is invalid, or has no such joint.

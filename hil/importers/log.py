@@ -81,12 +81,19 @@ def import_log(
 ) -> Path:
     """Convert a log to an archive of kind ``imported``, and return its path.
 
-    The source is the log; with quantities in several files, one of them or their folder. Where the
-    map couples joints, the model gets the inertias and the friction of the coupled motors, unless
-    its cell states otherwise or `coupled` is false. Angles and torques always use the coupling.
+    Angles and torques always use the coupling of joints.
 
-    With `force` an existing archive is replaced; `outside_limits` accepts positions of which no row
-    is within the limits of the URDF.
+    Args:
+        source: the log; with quantities in several files, one of them or their folder.
+        output: path of the archive.
+        robot: that was recorded.
+        columns: map of the log.
+        held_joints: joints that were clamped.
+        use: of the recording: fitted, or held out.
+        coupled: whether the model gets the inertias and the friction of the motors that the map
+            couples, unless its cell states otherwise.
+        force: replace an existing archive.
+        outside_limits: accept positions of which no row is within the limits of the URDF.
 
     Raises:
         SourceError: a file cannot be read, a column is missing, a cell is not a number, or the map
@@ -108,7 +115,14 @@ def read_log(
     coupled: bool = True,
     files: LogFiles | None = None,
 ) -> RecordingContent:
-    """Read a log; see :func:`import_log`. `files` are those that were parsed before.
+    """Read a log; see :func:`import_log`.
+
+    Args:
+        source: the log; with quantities in several files, one of them or their folder.
+        robot: that was recorded.
+        columns: map of the log.
+        coupled: whether the model gets coupled motors.
+        files: that were parsed before.
 
     Raises:
         SourceError: a file cannot be read, a column is missing, a cell is not a number, or the map
@@ -157,7 +171,11 @@ def are_in_rows_of_their_own(
 ) -> bool:
     """Return whether a table has its quantities in different rows, as of two topics.
 
-    The map is one that interpolates.
+    Args:
+        source: the table.
+        robot: that was recorded.
+        columns: a map that interpolates.
+        files: that were parsed before.
 
     Raises:
         SourceError: the map does not fit the log.

@@ -84,10 +84,17 @@ def proposed_map(
     """Return the column map that the channels of a log suggest for a robot.
 
     A ready map whose columns the log has comes first, then the names of
-    :data:`hil.importers.channels.CHANNEL_NAMES`. `chosen` are channels by quantity that are given:
-    a name with ``{}`` for the joint, or names separated by commas. `sample_rate` [Hz] replaces the
-    time; `form` is how texts are written, where that is stated; of the quantities `with_unit` a map
-    states the unit; `files` are those that were parsed before.
+    :data:`hil.importers.channels.CHANNEL_NAMES`.
+
+    Args:
+        log: its path.
+        robot: that was recorded.
+        chosen: channels by quantity that are given: a name with ``{}`` for the joint, or names
+            separated by commas.
+        sample_rate: replaces the time [Hz].
+        form: how texts are written, where that is stated.
+        with_unit: quantities of which a map states the unit.
+        files: that were parsed before.
 
     Raises:
         SourceError: the log cannot be read, or its channels leave a quantity open.

@@ -86,8 +86,12 @@ class RecordingContent:
     ) -> Examined:
         """Write the recording as an archive, and return what was found in it.
 
-        With `force` an existing archive is replaced once the new one is complete; the others as of
-        :meth:`archive`.
+        Args:
+            output: path of the archive.
+            held_joints: joints that were clamped.
+            use: of the recording.
+            force: replace an existing archive once the new one is complete.
+            outside_limits: as of :meth:`archive`.
 
         Raises:
             SourceError: as of :meth:`archive`.
@@ -110,8 +114,13 @@ class RecordingContent:
     ) -> tuple[Archive, Examined]:
         """Return the recording as an archive in memory, and what was found in it.
 
-        The archive has the same in words. `path` is that of the file that may be written;
-        `outside_limits` accepts positions of which no row is within the limits of the URDF.
+        The archive has the same in words.
+
+        Args:
+            path: of the file that may be written.
+            held_joints: joints that were clamped.
+            use: of the recording.
+            outside_limits: accept positions of which no row is within the limits of the URDF.
 
         Raises:
             SourceError: no sample, a value that is not finite or above 1e12, an invalid clock, or

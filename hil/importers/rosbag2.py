@@ -65,17 +65,25 @@ def import_rosbag2(
 ) -> Path:
     """Convert the joint states of a bag to an archive of kind ``imported``, and return its path.
 
-    The source is a ``.db3``, ``.mcap`` or (ROS 1) ``.bag`` file, or the folder of a bag; compressed
-    ones as well. Joints are found by name in all messages of the topic; `joint_names` are names in
-    the URDF by name in the bag, where they differ. Where joints come in messages of their own,
-    those are merged by stamp. Messages with none of them (a gripper on the same topic) are ignored.
-    Stamps are those in the messages' headers; where all are empty, or `clock` is ``bag``, the
-    bag's. The effort is a joint torque [N·m] or a motor current [A]. Commanded positions are those
-    of `command_topic` (``none`` for none), by default of the topic that says most
-    (:mod:`hil.importers.commands`).
+    Joints are found by name in all messages of the topic. Where joints come in messages of their
+    own, those are merged by stamp. Messages with none of them (a gripper on the same topic) are
+    ignored. Stamps are those in the messages' headers; where all are empty, the bag's.
 
-    With `force` an existing archive is replaced; `outside_limits` accepts positions of which no row
-    is within the limits of the URDF.
+    Args:
+        source: a ``.db3``, ``.mcap`` or (ROS 1) ``.bag`` file, or the folder of a bag; compressed
+            ones as well.
+        output: path of the archive.
+        robot: that was recorded.
+        topic: of the joint states.
+        effort: whether it is a joint torque [N·m] or a motor current [A].
+        clock: ``bag`` for the stamps of the bag.
+        joint_names: names in the URDF by name in the bag, where they differ.
+        command_topic: of the commanded positions (``none`` for none), by default the topic that
+            says most (:mod:`hil.importers.commands`).
+        held_joints: joints that were clamped.
+        use: of the recording.
+        force: replace an existing archive.
+        outside_limits: accept positions of which no row is within the limits of the URDF.
 
     Raises:
         SourceError: no bag, no such topic, a joint that was not recorded, a value not finite.
@@ -107,6 +115,15 @@ def read_rosbag2(
     command_topic: str | None = None,
 ) -> RecordingContent:
     """Read the joint states of a bag; see :func:`import_rosbag2`.
+
+    Args:
+        source: a file or the folder of a bag.
+        robot: that was recorded.
+        topic: of the joint states.
+        effort: whether it is a torque or a current.
+        clock: ``bag`` for the stamps of the bag.
+        joint_names: names in the URDF by name in the bag, where they differ.
+        command_topic: of the commanded positions.
 
     Raises:
         SourceError: no bag, no such topic, a joint that was not recorded, a value not finite.

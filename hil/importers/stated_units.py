@@ -46,7 +46,14 @@ def without_unit(name: str) -> tuple[str, str | None]:
 
 
 def other_unit(path: Path, kind: Kind, channels: str, unit: str) -> SourceError:
-    """Return the refusal of channels of a quantity in a unit of another one, or of none."""
+    """Return the refusal of channels of a quantity in a unit of another one, or of none.
+
+    Args:
+        path: of the log.
+        kind: quantity.
+        channels: its names.
+        unit: that is stated.
+    """
     is_known = unit_of(unit) is not None
     which = f"which is not a unit of {kind}" if is_known else "a unit that is not known"
     si = names_of_units(kind).partition(",")[0]

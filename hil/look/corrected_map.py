@@ -32,9 +32,13 @@ def entries_of(
 ) -> dict[str, Any]:
     """Return the entries of a map that make an import read what `axes` say.
 
-    `channels` are the names of the channels of the log.
-
     Angles of `zero` are in the unit of the map, before its scale and coupling.
+
+    Args:
+        axes: where the joints are in what was recorded.
+        text: of the map as it is.
+        channels: of the log.
+        joints: names in the order of the URDF.
     """
     table = parse_toml(text)
     same = bool(np.array_equal(axes.position_order, axes.torque_order))

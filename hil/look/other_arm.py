@@ -79,8 +79,13 @@ class Contradictions:
     ) -> Contradictions:
         """Compare samples of a recording, as read, with the URDF.
 
-        `score` is that of the samples, `error` is the share of the torque that stays unexplained,
-        `changed` names what of the axes (order, signs, zero) had to be changed for that.
+        Args:
+            cell: of the arm.
+            model: of it.
+            samples: of the recording.
+            score: of the samples.
+            error: share of the torque that stays unexplained.
+            changed: what of the axes (order, signs, zero) had to be changed for that.
         """
         limits = urdf_limits(cell.urdf, cell.joint_names)
         names = cell.joint_names

@@ -130,7 +130,11 @@ def estimate_with(
 ) -> Estimation:
     """Estimate the parameters by `options.estimator`, with all applicable tests.
 
-    `reductions` are those of the fitted recordings; they are computed unless known.
+    Args:
+        prepared: recordings and settings.
+        options: of the identification.
+        reporter: of progress.
+        reductions: of the fitted recordings; computed unless known.
 
     Raises:
         InputError: the archives lack data that the estimator needs.
@@ -193,10 +197,16 @@ def _interval_notes(cell: Cell, scale: TorqueScale) -> tuple[str, ...]:
 
 
 def posterior_of(cell: Cell, factor: Factor, name: str, strength: Strength) -> Posterior:
-    """Return the posterior of an estimator; all but "auto" have the strength of the residuals.
+    """Return the posterior of an estimator.
 
     The bodies are as uncertain as `[nominal]` states; the estimator "prior" trusts them to
     `NOMINAL_SHARE` if it states nothing.
+
+    Args:
+        cell: of the arm.
+        factor: of the data.
+        name: of the estimator.
+        strength: of the prior for "auto"; all others have that of the residuals.
     """
     table = cell.file.nominal
     share = NOMINAL_SHARE if name == "prior" else BODY_SHARE

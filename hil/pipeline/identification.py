@@ -98,12 +98,19 @@ def identify_archives(
     name: str = "",
     warnings: Sequence[str] = (),
 ) -> Identification:
-    """Identify from archives, files or in memory; `predict` is held out.
+    """Identify from archives, files or in memory.
 
-    The kind of the others decides which are fitted.
+    The kind of the archives decides which are fitted. They are read as recordings
+    (`gather_sources`), which become samples (`prepare_sources`), factors and an estimate
+    (`estimate_with`), evidence and a verdict (`validate`), and results.
 
-    Archives are read as recordings (`gather_sources`), which become samples (`prepare_sources`),
-    factors and an estimate (`estimate_with`), evidence and a verdict (`validate`), and results.
+    Args:
+        archives: of one arm.
+        reporter: of progress.
+        options: of the identification.
+        predict: archives that are held out.
+        name: of the results.
+        warnings: that they begin with.
 
     Raises:
         InputError: the archives cannot be used, not together, or not by the chosen estimator.

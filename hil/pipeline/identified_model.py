@@ -157,9 +157,13 @@ def model_of(identification: Identification) -> IdentifiedModel:
 
 
 def arm_with(cell: Cell, standard: Array, values: Array, fitted: Sequence[Samples]) -> ExportedArm:
-    """Return an arm of parameters, standard (s,) and all (p,), with the limits of its cell or URDF.
+    """Return an arm with the limits of its cell or URDF.
 
-    Friction that grows with the load is that of the fitted motion.
+    Args:
+        cell: of the arm.
+        standard: standard parameters (s,).
+        values: all parameters (p,).
+        fitted: motion whose load friction has that grows with the load.
     """
     described = urdf_limits(cell.urdf, cell.joint_names)
     efforts = cell.torque_limit

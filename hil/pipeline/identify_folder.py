@@ -24,6 +24,12 @@ def identify_paths(
 ) -> Identification:
     """Identify from a campaign folder, a folder of archives, or archives.
 
+    Args:
+        archives: the folder alone, or archives.
+        reporter: of progress.
+        options: of the identification.
+        predict: archives that are held out.
+
     Raises:
         InputError: the folder contains neither, or is not the only path.
     """
@@ -51,9 +57,15 @@ def identify_recorded(
     *,
     predict: Sequence[Path | Archive] = (),
 ) -> Identification:
-    """Identify from the complete archives of a campaign folder; `predict` adds held-out archives.
+    """Identify from the complete archives of a campaign folder.
 
-    How it was conducted is added by :func:`hil.campaign.identified_campaign.with_execution_log`.
+    How it was executed is added by :func:`hil.campaign.identified_campaign.with_execution_log`.
+
+    Args:
+        root: of the campaign.
+        reporter: of progress.
+        options: of the identification.
+        predict: archives that are held out in addition.
 
     Raises:
         InputError: the folder has no complete excitation.

@@ -124,10 +124,15 @@ def gather_sources(
 ) -> Sources:
     """Open archives that are not in memory, and sort all into fitted and held-out recordings.
 
-    Excitations are fitted, validation runs and `predict` are held out; imported recordings state
-    their use. Without held-out archives, the last part of a single recording (see `Options.split`)
-    or the last of several is held out, unless `in_sample`. Without `with_torque` recordings may
-    lack it.
+    Excitations are fitted, validation runs are held out; imported recordings state their use.
+
+    Args:
+        given: archives.
+        split: part of a single recording that is held out where nothing else is (`Options.split`);
+            of several recordings it is the last.
+        predict: archives that are held out.
+        in_sample: hold nothing out.
+        with_torque: whether recordings must have it.
 
     Raises:
         InputError: there is nothing to fit, an archive is given twice, or `predict` is given with

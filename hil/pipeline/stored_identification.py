@@ -50,9 +50,14 @@ def read_or_identify(
     reuse: bool,
     predict: Sequence[Path] = (),
 ) -> IdentifiedModel:
-    """Return the arm in the files of a folder if `reuse`, else identify it from the archives.
+    """Return the arm in the files of a folder, or identify it from the archives.
 
-    `predict` are archives that are held out.
+    Args:
+        paths: a folder, or archives.
+        options: of the identification.
+        reporter: of progress.
+        reuse: whether to read the files of an earlier identification.
+        predict: archives that are held out.
 
     Raises:
         InputError: the archives cannot be used, or give no physically consistent parameters.

@@ -47,7 +47,13 @@ from .validation import Validation
 def summary(
     name: str, prepared: Prepared, estimation: Estimation, validation: Validation
 ) -> results.Results:
-    """Return the results of an identification of this name.
+    """Return the results of an identification.
+
+    Args:
+        name: of the results.
+        prepared: recordings and settings.
+        estimation: of the parameters.
+        validation: of the estimate.
 
     Raises:
         InputError: the plan in the archives cannot be read.

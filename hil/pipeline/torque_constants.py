@@ -50,8 +50,11 @@ def find_gains(
 ) -> GainsFound:
     """Identify the torque constant of every motor.
 
-    Archives are `loaded` if they have another payload than that of their cell. Currents lag
-    positions by `delay` [s]; "stated" uses the cell's.
+    Args:
+        archives: with and without a known payload.
+        loaded: archives with another payload than that of their cell.
+        reporter: of progress.
+        delay: of currents behind positions [s]; "stated" uses the cell's.
 
     Raises:
         InputError: an archive cannot be used, or not with the others; no archive has a payload.

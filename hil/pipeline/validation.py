@@ -46,7 +46,14 @@ class Validation:
 def validate(
     prepared: Prepared, estimation: Estimation, options: Options, reporter: Reporter
 ) -> Validation:
-    """Gather the evidence on an estimate, and judge it by the purposes of the options."""
+    """Gather the evidence on an estimate, and judge it.
+
+    Args:
+        prepared: recordings and settings.
+        estimation: of the parameters.
+        options: of the identification, with the purposes that decide.
+        reporter: of progress.
+    """
     sources = prepared.sources
     result = estimation.result
     model = sources.cell.model

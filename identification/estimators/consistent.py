@@ -178,6 +178,12 @@ def consistent_parameters(
 ) -> tuple[Array, Array]:
     """Return the most probable consistent standard parameters (s,) and others (k,).
 
+    Args:
+        model: of the arm.
+        equations: normal equations of the data.
+        prior: of the bodies.
+        design_effect: rows of data that count as one.
+
     Raises:
         SolverError: the conic solver found none.
     """
@@ -235,7 +241,13 @@ def consistent_values(
 ) -> Array:
     """Return a posterior's parameters (p,), or the most probable possible ones instead of them.
 
-    `values` (p,) are the free posterior's, with weights (n,) of the joints.
+    Args:
+        model: of the arm.
+        factor: of the data.
+        weights: of the joints (n,).
+        values: parameters of the free posterior (p,).
+        prior: of the bodies.
+        design_effect: rows of data that count as one.
 
     Raises:
         SolverError: the conic solver found none.
@@ -334,10 +346,13 @@ def consistent_estimate(
 ) -> ConsistentEstimate:
     """Fit physically consistent standard parameters and friction to the samples.
 
-    An `unconstrained` estimate of the same samples is for comparison; weights (n,) are by default
-    the inverse residual variances of an ordinary fit; the prior is by default
-    :func:`identification.estimators.prior.body_prior`, against which `design_effect` rows count as
-    one.
+    Args:
+        model: of the arm.
+        factor: of the samples.
+        unconstrained: estimate from the same samples, for comparison.
+        weights: of the joints (n,); by default the inverse residual variances of an ordinary fit.
+        prior: by default :func:`identification.estimators.prior.body_prior`.
+        design_effect: rows of data that count as one against the prior.
 
     Raises:
         IdentificationError: no rows.

@@ -96,9 +96,15 @@ def block_covariance(
 ) -> Clustered:
     """Return the cluster-robust covariance of a weighted least-squares estimate by its factor.
 
-    `values` (p,) solve the factor with weights (n,). With the information P (p, p) of a Gaussian
-    prior, of which `design_effect` times d counts, H = A + d P replaces A, and the prior's scatter
-    ``d² H^-1 P H^-1`` is added to that of the data.
+    With a prior, H = A + d P replaces A, and the prior's scatter ``d² H^-1 P H^-1`` is added to
+    that of the data.
+
+    Args:
+        factor: of the data, by blocks of time.
+        weights: of the joints (n,).
+        values: parameters (p,) that solve the factor with these weights.
+        prior: information P of a Gaussian prior (p, p).
+        design_effect: d, by which it is multiplied.
     """
     used = factor.occupied()
     scores = used.scores(weights, values)
@@ -132,10 +138,15 @@ def cluster_covariance(
     block: float = FINE_BLOCK,
     stretch: int = 1,
 ) -> Clustered:
-    """Return the cluster-robust covariance by information (B, p, p) and scores (B, p) of blocks.
+    """Return the cluster-robust covariance of blocks.
 
-    The solution is that of the summed information, with the prior's (p, p). Blocks of `block`
-    seconds are merged, by a further factor `stretch` if enough remain.
+    Args:
+        information: of each block (B, p, p).
+        scores: of each block (B, p).
+        solution: of the summed information, with the prior's.
+        prior: its information (p, p).
+        block: duration of the blocks, which are merged to it [s].
+        stretch: further factor by which blocks are merged if enough remain.
     """
     used = scores.any(axis=1)
     information = information[used]
@@ -186,7 +197,14 @@ def _sandwich(
 def with_block_covariance(
     estimate: Estimate, factor: Factor, weights: Array, name: str = "weighted least squares"
 ) -> Estimate:
-    """Return the estimate from a factor and weights (n,) with cluster-robust covariance."""
+    """Return an estimate with cluster-robust covariance.
+
+    Args:
+        estimate: from the factor.
+        factor: of the data, by blocks of time.
+        weights: of the joints (n,).
+        name: of the method.
+    """
     clustered = block_covariance(factor, weights, estimate.values)
     return replace(
         estimate,
@@ -242,10 +260,16 @@ def leverage_corrected(
 ) -> Array:
     """Return rows (R, k), R >= B, whose outer products sum to the covariance for unit information.
 
-    Scores (B, k) times (1 - H_b)^-1/2, with H = `shares` (B, k, k). From `_LOW_LEVERAGE` to
-    `_HIGH_LEVERAGE` the residual of the block, which vanishes, is replaced by the variance of white
-    residuals, ``h``, times the design effect of the rest, at least one. With `left_out` (1 -
-    H_b)^-1, by leaving out one block at a time, for decisions that a narrow interval would spoil.
+    The rows are scores times (1 - H_b)^-1/2. From `_LOW_LEVERAGE` to `_HIGH_LEVERAGE` the residual
+    of the block, which vanishes, is replaced by the variance of white residuals, ``h``, times the
+    design effect of the rest, at least one.
+
+    Args:
+        shares: H_b, information of each block as a share of all (B, k, k).
+        scores: of each block (B, k).
+        symmetric: whether the shares are.
+        left_out: multiply by (1 - H_b)^-1, as by leaving out one block at a time, for decisions
+            that a narrow interval would spoil.
     """
     corrected, dependent = _regular(shares, scores, symmetric, (1.0,) if left_out else _NODES)
     power = 1.0 if left_out else 0.5
@@ -337,7 +361,15 @@ def clustered_covariance(
     weights: Array,
     loss: Loss = Loss(),  # noqa: B008 - frozen
 ) -> Clustered:
-    """Return the covariance of a solution with weights (n,) and any loss."""
+    """Return the cluster-robust covariance of a solution with any loss.
+
+    Args:
+        model: of the arm.
+        recordings: that were fitted.
+        solution: of the fit.
+        weights: of the joints (n,).
+        loss: of the residuals.
+    """
     count = max(int(fine_blocks(samples)[-1]) + 1 for samples in recordings)
     k = solution.root.shape[1]
     information = np.zeros((count, k, k))  # information in coordinates with unit sum of squares

@@ -126,8 +126,13 @@ def delay_sensitivity(
 ) -> Array:
     """Return the change of the parameters (p,) with the given delay, per second.
 
-    They change by the fit of the torque's rate; `products` are the `rate_products` of the factor's
-    samples (n, p, p + 1), `precision` (p, p) is that of a prior beside them.
+    They change by the fit of the torque's rate.
+
+    Args:
+        estimate: with the given delay.
+        factor: of the samples.
+        products: `rate_products` of these samples (n, p, p + 1).
+        precision: information of a prior (p, p).
     """
     weights = inverse_variance(estimate.noise_std**2)
     rate = np.tensordot(weights, products, axes=1) @ np.append(estimate.values, 1.0)
@@ -145,9 +150,14 @@ def with_uncertain_delay(
     variance: float,
     precision: Array | None = None,
 ) -> Estimate:
-    """Return the estimate with the variance [s²] of its given delay in the covariance.
+    """Return an estimate whose covariance includes the variance of the given delay.
 
-    The other arguments are those of :func:`delay_sensitivity`.
+    Args:
+        estimate: with the given delay.
+        factor: of the samples.
+        products: `rate_products` of these samples (n, p, p + 1).
+        variance: of the delay [s²].
+        precision: information of a prior (p, p).
     """
     sensitivity = delay_sensitivity(estimate, factor, products, precision)
     return replace(
@@ -256,8 +266,11 @@ def estimate_delay(
 ) -> DelayEstimate:
     """Estimate the delay of a recording's torque relative to its position.
 
-    `noise_variance` (n,) as for :func:`identification.signals.samples.smooth`; the options are of
-    the smoothing and the torque's low-pass, with the assumed delay.
+    Args:
+        recording: with torque.
+        model: of the arm.
+        noise_variance: of the positions (n,), as for :func:`identification.signals.samples.smooth`.
+        options: of the smoothing and the torque's low-pass, with the assumed delay.
 
     Raises:
         RecordingError: see :func:`identification.signals.samples.prepare`.

@@ -118,7 +118,14 @@ def expected_compliance(model: RobotModel, samples: Samples, values: Array) -> A
 
 
 def elastic_torque(model: RobotModel, samples: Samples, values: Array, compliance: Array) -> Array:
-    """Return what compliances (n,), one by one, add to the torques: (m, n, n), the last theirs."""
+    """Return what compliances, one by one, add to the torques: (m, n, n), the last index theirs.
+
+    Args:
+        model: of the arm.
+        samples: of the motion.
+        values: parameters (p,).
+        compliance: of each joint (n,).
+    """
     time = samples.motion.time
     torque = np.zeros((*samples.torque.shape, model.n_joints))
     for segment in samples.segments:
@@ -154,10 +161,15 @@ def elastic_torque(model: RobotModel, samples: Samples, values: Array, complianc
 def open_compliance(
     inverse: Array, products: Array, squares: Array, design_effect: float = 1.0
 ) -> tuple[Array, Array]:
-    """Return how compliances move the parameters (p, n), and their covariance beside them (n, n).
+    """Return how compliances move the parameters (p, n), and their own covariance (n, n).
 
-    In units of the expected ones. `inverse` is that of the information (p, p) of `products` (p, n)
-    and `squares` (n, n), of whose rows `design_effect` count as one.
+    In units of the expected compliances.
+
+    Args:
+        inverse: of the information (p, p).
+        products: of the parameters' columns with those of the compliances (p, n).
+        squares: of the compliances' columns (n, n).
+        design_effect: rows that count as one.
     """
     moved = inverse @ products
     beside = (squares - products.T @ moved) / design_effect + np.eye(len(squares))

@@ -69,6 +69,14 @@ def draw_ensemble(
     The nearest consistent arms of draws vary less than the draws. So these are widened until the
     torque of the arms, on the motion of the factor, varies as the covariance says.
 
+    Args:
+        model: of the arm.
+        prior: of the bodies.
+        estimate: mean and covariance.
+        factor: of the data.
+        count: of the arms.
+        seed: of the random numbers.
+
     Raises:
         UndeterminedError: the covariance is not finite.
         SolverError: no consistent arm was found for a draw.

@@ -29,8 +29,11 @@ def fit_least_squares(
 ) -> Estimate:
     """Fit recordings with cluster-robust covariance, by QR if the condition requires it.
 
-    "weighted" weights joints by their noise (eq. 4). With a known factor, recordings are read for
-    QR only.
+    Args:
+        model: of the arm.
+        recordings: prepared.
+        weighting: "weighted" weights joints by their noise (eq. 4).
+        factor: of the recordings, if known: they are then read for QR only.
 
     Raises:
         IdentificationError: no recordings, or no usable row.
@@ -58,7 +61,15 @@ def clustered_fit(
     by_time: Factor,
     weights: Array,
 ) -> tuple[Solution, Clustered]:
-    """Solve with weights (n,) and return the cluster-robust covariance; QR reads the samples."""
+    """Solve with weights and return the cluster-robust covariance; QR reads the samples.
+
+    Args:
+        model: of the arm.
+        precise: factor that is solved.
+        recordings: prepared.
+        by_time: their factor by blocks of time.
+        weights: of the joints (n,).
+    """
     solution = precise.solve(weights)
     if precise.storage == "qr":
         return solution, clustered_covariance(model, recordings, solution, weights)
@@ -85,7 +96,14 @@ class RepeatedEstimate:
     def of(
         cls, model: RobotModel, pooled: Estimate, values: Sequence[Array], factor: Factor
     ) -> RepeatedEstimate:
-        """Combine an estimate from all repetitions with the parameters (p,) from each."""
+        """Combine an estimate from all repetitions with those from each.
+
+        Args:
+            model: of the arm.
+            pooled: estimate from all.
+            values: parameters (p,) from each.
+            factor: of all.
+        """
         return cls(pooled, np.array(values), factor, estimate(model, factor).std)
 
     def with_scatter(self) -> RepeatedEstimate:
@@ -133,9 +151,12 @@ def estimate_repetitions(
 ) -> RepeatedEstimate:
     """Estimate from each repetition and from all, by default by weighted least squares (eq. 4).
 
-    `each` gives the parameters (p,) from a single repetition, by default the same estimator does; a
-    single recording has the estimate from all. `factors` are those of the recordings by time, if
-    they are known.
+    Args:
+        model: of the arm.
+        recordings: of the repetitions; a single one has the estimate from all.
+        fit: estimator.
+        each: gives the parameters (p,) from a single repetition; by default the same estimator.
+        factors: of the recordings by time, if known.
 
     Raises:
         IdentificationError: a repetition without a usable row.

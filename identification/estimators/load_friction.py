@@ -64,8 +64,13 @@ def fit_with_load(
 
     The first fit has the load that the samples carry (:meth:`Samples.with_load` of an estimate
     without such friction saves a pass). Where they carry none, it is zero: the columns of the
-    shares are zero in the first pass, and the fit has to leave these undetermined. A model without
-    such friction is fitted once, to the samples as they are.
+    shares are zero in the first pass, and the fit has to leave these undetermined.
+
+    Args:
+        model: of the arm; one without such friction is fitted once, to the samples as they are.
+        recordings: prepared.
+        fit: estimator.
+        most: number of passes.
     """
     samples = tuple(recordings)
     if not model.friction.has_load:

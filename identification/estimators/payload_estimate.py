@@ -104,8 +104,12 @@ def identify_payload(
 ) -> PayloadEstimate:
     """Estimate the body that the loaded recordings carry and the bare ones do not.
 
-    `scale_std` is the relative standard deviation of each joint's torque scale (n,), by default
-    zero: it is common to all recordings. A known `arm` replaces or adds to bare recordings.
+    Args:
+        model: of the arm.
+        runs: the recordings.
+        scale_std: relative standard deviation of each joint's torque scale (n,), common to all
+            recordings; by default zero.
+        arm: what is known of it, in place of bare recordings or in addition.
 
     Raises:
         PayloadError: undetermined mass, or negative mass.
@@ -204,6 +208,12 @@ def contradiction(
     `CONTRADICTION_SIGMAS` standard deviations and above the shares of what was weighed that
     friction and model errors explain (`SAME_MASS`, `SAME_CENTRE`). The torque scale is the same in
     all recordings.
+
+    Args:
+        model: of the arm.
+        runs: the recordings.
+        estimate: of the payload from all of them.
+        arm: what is known of it.
     """
     bare, loaded = ([run for run in runs if run.loaded == kind] for kind in (False, True))
     mass = float(estimate.parameters[9])

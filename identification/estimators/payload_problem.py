@@ -53,7 +53,14 @@ class Run:
     def of(
         cls, name: str, model: RobotModel, samples: Samples, frame: str | None, *, loaded: bool
     ) -> Run:
-        """Reduce a recording of an arm without payload; the body is at a frame or the last joint.
+        """Reduce a recording of an arm without payload.
+
+        Args:
+            name: of the recording.
+            model: of the arm.
+            samples: of the recording.
+            frame: of the body; by default the last joint.
+            loaded: whether the arm carried it.
 
         Raises:
             ModelError: the description has no such frame, or it is fixed to the base.
@@ -98,10 +105,16 @@ class KnownArm:
 
     @classmethod
     def of(cls, factor: Factor, estimate: Estimate, prior: Array, design_effect: float) -> KnownArm:
-        """Return the posterior of a factor and the information of a prior (p, p).
+        """Return the posterior of a factor and a prior.
 
-        Its information is that of the rows that count, one of `design_effect`, and of the prior:
-        the covariance from few blocks cannot be inverted.
+        The covariance from few blocks cannot be inverted, so its information is that of the rows
+        that count, and of the prior.
+
+        Args:
+            factor: of the recordings of the arm.
+            estimate: from it.
+            prior: its information (p, p).
+            design_effect: rows that count as one.
         """
         weights = inverse_variance(estimate.noise_std**2) / design_effect
         information = factor.weighted(weights).A + prior
@@ -235,7 +248,13 @@ class _Problem:
 def fit_body(
     model: RobotModel, runs: Sequence[Run], shape: Array, arm: KnownArm | None = None
 ) -> BodyFit:
-    """Solve the joint problem for the r unknowns of the body, ten parameters by shape (10, r).
+    """Solve the joint problem for the r unknowns of the body.
+
+    Args:
+        model: of the arm.
+        runs: the recordings.
+        shape: ten parameters of the body by its unknowns (10, r).
+        arm: what is known of it.
 
     Raises:
         IdentificationError: no usable row.

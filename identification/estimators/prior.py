@@ -113,8 +113,13 @@ class TorqueSums(NamedTuple):
     ) -> tuple[Array, Array]:
         """Return parameters (p,) of one torque and the weights of the joints (n,).
 
-        As :func:`posterior_values`, with the mean (p,) of a prior and its information (p, p) times
-        the rows that count as one. `smallest_noise` is that of the factor.
+        As :func:`posterior_values`.
+
+        Args:
+            mean: of the prior (p,).
+            precision: its information times the rows that count as one (p, p).
+            smallest_noise: of the factor.
+            start: weights from which the iteration starts (n,).
         """
         gram, samples = self
         flat = gram.reshape(len(gram), -1)
@@ -163,10 +168,15 @@ class GaussianPrior:
     def of_combinations(
         cls, combinations: Array, mean: Array, std: Array, origin: str = "given"
     ) -> GaussianPrior:
-        """Return the prior on ``combinations @ s`` of independent s with mean and std (s,).
+        """Return the prior on ``combinations @ s`` of independent s.
 
-        An infinite standard deviation makes the direction on which its quantity acts flat. With the
-        identity (p, s) and mean zero this is ridge regression in units of `std`.
+        With the identity and mean zero this is ridge regression in units of `std`.
+
+        Args:
+            combinations: (p, s).
+            mean: of s (s,).
+            std: of s (s,); an infinite one makes the direction on which its quantity acts flat.
+            origin: what the prior is from.
         """
         flat = np.isinf(std)
         spread = combinations[:, ~flat] * std[~flat]
@@ -283,8 +293,13 @@ def posterior_values(
 ) -> tuple[Array, Array]:
     """Return the posterior's parameters (p,) and the weights of the joints (n,).
 
-    The weights are the inverse variances of the joints' own residuals, iterated from `start` (n,)
-    if given.
+    The weights are the inverse variances of the joints' own residuals, by iteration.
+
+    Args:
+        factor: of the data.
+        prior: of the parameters.
+        design_effect: rows of data that count as one.
+        start: weights from which the iteration starts (n,).
     """
     sums = TorqueSums.of(factor)
     precision = design_effect * prior.information
@@ -301,8 +316,12 @@ def with_prior(
 ) -> PosteriorEstimate:
     """Estimate from data and prior with white residuals; a flat prior gives least squares.
 
-    Weights (n,) are by default those of an ordinary fit without prior. The information of the data
-    is divided by `design_effect`.
+    Args:
+        model: of the arm.
+        factor: of the data.
+        prior: of the parameters.
+        weights: of the joints (n,), by default those of an ordinary fit without prior.
+        design_effect: by which the information of the data is divided.
 
     Raises:
         IdentificationError: too few rows to estimate the noise, and no weights.
@@ -335,10 +354,16 @@ def fit_posterior(
 ) -> PosteriorEstimate:
     """Estimate from a factor by time and a prior, with coloured residuals.
 
-    `design_effect` rows count as one, by default as many as :func:`design_effect_of` says. The
-    covariance has the scatter of the data, cluster-robust, and the prior's of what they leave open.
-    That of a stronger prior is the mean square error by what is believed: the covariance of the
-    believed posterior, and the square of the way from its mean as far as its errors do not make it.
+    The covariance has the scatter of the data, cluster-robust, and the prior's of what they leave
+    open. That of a stronger prior is the mean square error by what is believed: the covariance of
+    the believed posterior, and the square of the way from its mean as far as its errors do not make
+    it.
+
+    Args:
+        model: of the arm.
+        factor: of the data, by blocks of time.
+        prior: of the parameters.
+        design_effect: rows that count as one, by default as :func:`design_effect_of` says.
 
     Raises:
         IdentificationError: the factor has no rows.
@@ -496,13 +521,21 @@ def body_prior(
 ) -> BodyPrior:
     """Return the prior of an arm; its scale without masses, and of friction, is the torque's.
 
-    Bodies: the nominal ones with a deviation of `share` of the mass, times the body's length, times
-    its square. Without masses in the description, or with masses that have no relation to the
-    torque of the factor: zero with bodies that could make all of the torque. Rotors: zero, with the
-    inertia of the links outboard or, if larger, what makes half of the torque's scatter. Friction
-    and elements: zero, with a coefficient that makes half of it; offsets less of a joint that moves
-    one way (`OFFSET_SHARE`). `stated` replaces mean and standard deviation by name:
-    ``{"I3m": (1.2, 0.2), "f0_1": (40.0, 40.0)}``.
+    Bodies: the nominal ones. Without masses in the description, or with masses that have no
+    relation to the torque of the factor: zero with bodies that could make all of the torque.
+    Rotors: zero, with the inertia of the links outboard or, if larger, what makes half of the
+    torque's scatter. Friction and elements: zero, with a coefficient that makes half of it; offsets
+    less of a joint that moves one way (`OFFSET_SHARE`).
+
+    Args:
+        model: of the arm.
+        factor: of the data.
+        share: standard deviation of the nominal bodies: of the mass, times the body's length, times
+            its square.
+        stated: mean and standard deviation by name, in place of these:
+            ``{"I3m": (1.2, 0.2), "f0_1": (40.0, 40.0)}``.
+        wide_rotors: whether all rotors may be heavier, seen through their gears, than what they
+            move.
     """
     layout = model.layout
     names = layout.names + model.parameter_names[model.base.rank :]

@@ -69,8 +69,14 @@ def robust_estimate(
     """Fit recordings with a robust loss; every iteration reads the samples once.
 
     The noise scale of each joint is estimated from the median absolute residual; Tukey's loss
-    starts from the solution and scales of Huber's (Yohai 1987). `total`, the recordings' factor,
-    saves a pass.
+    starts from the solution and scales of Huber's (Yohai 1987).
+
+    Args:
+        model: of the arm.
+        recordings: prepared.
+        loss: of the residuals.
+        total: factor of the recordings, which saves a pass.
+        most_iterations: of the fit.
 
     Raises:
         IdentificationError: no recordings, or no usable row.

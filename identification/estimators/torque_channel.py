@@ -90,12 +90,18 @@ def possible_low_passes(
 
     Many controllers log a filtered torque, in which Coulomb friction is a slope instead of a step.
     Causal filters are compared without a delay; a kind whose residuals are not clearly smaller than
-    with a delay alone is left out. `undelayed` is the delay [s] without a low-pass, by default that
-    of the options; `noise_variance` (n,) as for :func:`identification.signals.samples.smooth`.
+    with a delay alone is left out.
 
     Rows count in stretches of motion of the whole arm of a second or more, whatever rows the
     options leave out: reversals and slow motion of a joint show a filter best, and a filter does
     not end at them.
+
+    Args:
+        recording: with torque.
+        model: of the arm.
+        noise_variance: of the positions (n,), as for :func:`identification.signals.samples.smooth`.
+        options: of the preparation.
+        undelayed: delay without a low-pass [s], by default that of the options.
     """
     still = options.torque_delay if undelayed is None else undelayed
     mean = recording.averaged(_RATE)

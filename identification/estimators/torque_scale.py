@@ -65,9 +65,14 @@ def scale_covariance(sensitivity: Array, std: Array, interval_factor: float = _N
 def with_torque_scale(
     estimate: Estimate, factor: Factor, weights: Array, inverse: Array, std: Array
 ) -> Estimate:
-    """Return the estimate with its change by the scale of torques; the covariance stays.
+    """Return an estimate with its change by the scale of torques; the covariance stays.
 
-    `factor`, `weights` and `inverse` as for :func:`scale_sensitivity`, `std` relative (n,).
+    Args:
+        estimate: from the factor.
+        factor: of the data.
+        weights: of the joints (n,).
+        inverse: of the information (p, p), as for :func:`scale_sensitivity`.
+        std: relative standard deviation of each joint's torque (n,).
     """
     change = scale_sensitivity(factor, weights, inverse) * std
     return replace(estimate, scale_change=change if std.any() else None)

@@ -237,8 +237,14 @@ def check_motion(
 ) -> tuple[Violation, ...]:
     """Return the violations of a motion of any duration, none if it may be sent.
 
-    Limits, rest at both ends and contacts are checked over all time, torques and currents every
-    `period` [s].
+    Limits, rest at both ends and contacts are checked over all time.
+
+    Args:
+        trajectory: the motion.
+        limits: of the joints.
+        checker: of collisions; none are checked without it.
+        currents: of the motors; likewise.
+        period: at which torques and currents are checked [s].
     """
     constraints = Constraints(limits, max_duration=np.inf, checker=checker, currents=currents)
     return constraints.violations(trajectory, sampled(trajectory, period))

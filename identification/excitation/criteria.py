@@ -203,7 +203,13 @@ def fitness_eq7(
 ) -> float:
     r"""Return :math:`\lambda_1 \log_{10}|\det/N^{N_\pi}| + \lambda_2 I_{c,max}/I_c`, as printed.
 
-    The first term is larger by an order of magnitude. -inf for a singular matrix.
+    The first term is larger by an order of magnitude.
+
+    Args:
+        log10_det: of the information; -inf for a singular matrix, as is the result.
+        coupling_index: I_c.
+        p: number of parameters.
+        weights: of the two terms.
     """
     if not np.isfinite(log10_det) or not np.isfinite(coupling_index):
         return -np.inf
@@ -426,10 +432,13 @@ class Objective:
         weights: Array | None = None,
         means: Sequence[Array] | None = None,
     ) -> Array:
-        r"""Return :math:`\mathrm{tr}(\Phi_t M \Phi_t^T)` of each sample (m,), M (e, e).
+        r"""Return :math:`\mathrm{tr}(\Phi_t M \Phi_t^T)` of each sample (m,).
 
-        With `weights` (n,) of the rows of the joints it is that of all parameters, M (p, p).
-        `means` are subtracted from each joint's columns.
+        Args:
+            motion: of m samples.
+            matrix: M (e, e); with weights that of all parameters (p, p).
+            weights: of the rows of the joints (n,).
+            means: subtracted from each joint's columns.
         """
         model = self.model
         if self.parameters is not None and weights is None:

@@ -222,7 +222,13 @@ def reaches(
 
     No distance changes by more than ``reaches @ |steps|`` [m]: a point's derivative by a revolute
     joint is no longer than its distance from the joint, by a prismatic one it is 1. Joints that
-    move both bodies do not count. `slides` (n,) is the largest |q| of prismatic joints [m].
+    move both bodies do not count.
+
+    Args:
+        chain: of the arm.
+        bodies: hulls.
+        pairs: p pairs of them.
+        slides: largest |q| of prismatic joints (n,) [m].
     """
     hulls = [body.hull for body in bodies]
     radius = [

@@ -44,9 +44,19 @@ def random_validation_motions(
 ) -> tuple[ViaPointMotion, ...]:
     """Return random motions across the joint ranges to validate predictions on.
 
-    They begin and end in `home` (n,) [rad], with `n_via` points between and corner rounding `fly`,
-    and satisfy the same constraints as an excitation. Their random numbers are independent of those
-    of any search. The same seed gives the same motions bit for bit, the first ones for any `count`.
+    They satisfy the same constraints as an excitation. Their random numbers are independent of
+    those of any search. The same seed gives the same motions bit for bit, the first ones for any
+    `count`.
+
+    Args:
+        limits: of the joints.
+        home: position at both ends (n,) [rad].
+        seed: of the random numbers.
+        count: of the motions.
+        n_via: points between the ends.
+        fly: how far corners are rounded, from 0 to 1.
+        checker: of collisions.
+        currents: of the motors.
 
     Raises:
         NoFeasibleMotionError: 100 attempts in a row without a feasible motion.

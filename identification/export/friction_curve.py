@@ -26,10 +26,15 @@ class FrictionCurve(NamedTuple):
 def friction_curve(
     model: RobotModel, values: Array, joint: int, low: float, high: float, load: float = 0.0
 ) -> FrictionCurve:
-    """Return the curve of a joint, from 0, for parameters (p,).
+    """Return the friction of a joint over its speed.
 
-    Speeds reach from `low`, at most zero, to `high`, at least zero [rad/s or m/s]; `load` is the
-    torque that the gear transmits [N·m or N], see :func:`median_load`.
+    Args:
+        model: of the arm.
+        values: parameters (p,).
+        joint: from 0.
+        low: lowest speed, at most zero [rad/s or m/s].
+        high: highest speed, at least zero [rad/s or m/s].
+        load: torque that the gear transmits [N·m or N], see :func:`median_load`.
     """
     law = model.friction.laws[joint]
     table = model.friction.table(values[model.friction_part])

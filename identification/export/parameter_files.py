@@ -38,7 +38,14 @@ def parameters_json(
     essential: Collection[str] | None = None,
     provenance: Mapping[str, str] | None = None,
 ) -> str:
-    """Return an estimate as JSON text, with what else is given.
+    """Return an estimate as JSON text.
+
+    Args:
+        model: of the arm.
+        estimate: of its parameters.
+        consistent: physically consistent estimate, if any.
+        essential: names of the essential parameters, if known.
+        provenance: what the estimate is from.
 
     Raises:
         IdentificationError: the estimate is of other parameters.

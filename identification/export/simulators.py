@@ -243,6 +243,12 @@ class SimulatorComparison(NamedTuple):
 def compare(text: str, form: ModelFormat, arm: ExportedArm, motion: Motion) -> SimulatorComparison:
     """Read a text back, compare it with the arm, and compute the torque of parts left out.
 
+    Args:
+        text: of the model file.
+        form: its format.
+        arm: that was written.
+        motion: on which torques are computed.
+
     Raises:
         WriteBackError: the torque differs at some random state.
         MissingMujocoError: the format needs MuJoCo, which is not installed.
@@ -260,6 +266,12 @@ def compare(text: str, form: ModelFormat, arm: ExportedArm, motion: Motion) -> S
 
 def read_back(text: str, form: ModelFormat, arm: ExportedArm, count: int = STATES) -> float:
     """Return the largest difference of a text's torque from the arm's, see :class:`Comparison`.
+
+    Args:
+        text: of the model file.
+        form: its format.
+        arm: that was written.
+        count: of random states.
 
     Raises:
         WriteBackError: the torque differs at some random state.

@@ -68,13 +68,18 @@ def write_urdf(
     remarks: Sequence[str] = (),
     load: Array | None = None,
 ) -> str:
-    """Return the URDF text of a model with standard parameters (s,), and friction (k,) if given.
+    """Return the URDF text of a model with identified parameters.
 
-    Friction that grows with the load is written as Coulomb friction at a `load` (n,) of the gears
-    [N·m or N], such as :func:`median_load`, by default zero; a remark says so.
-    A coefficient of NaN leaves its attribute unchanged, None all of ``<dynamics>``; `remarks` are
-    lines of a comment before the robot. The inverse dynamics of the text are compared with the
-    regressor before it is returned.
+    Friction that grows with the load is written as Coulomb friction at one load; a remark says so.
+    The inverse dynamics of the text are compared with the regressor before it is returned.
+
+    Args:
+        urdf: text that is changed.
+        model: of it.
+        standard: parameters (s,).
+        friction: parameters (k,); NaN leaves its attribute unchanged, None all of ``<dynamics>``.
+        remarks: lines of a comment before the robot.
+        load: of the gears (n,) [N·m or N], such as :func:`median_load`; by default zero.
 
     Raises:
         NotConsistentError: a link, a rotor or friction is not physically consistent.

@@ -33,8 +33,11 @@ def instrument_factor(
 ) -> Factor:
     """Reduce a recording to blocks of [Z | W | y].
 
-    Rows count if the noise-free instrument, known where `usable` (m, n), moves as well. Its load of
-    the gears is that of the samples.
+    Args:
+        model: of the arm.
+        samples: of the recording, whose load of the gears the instrument has too.
+        instrument: noise-free motion; rows count if it moves as well.
+        usable: rows in which it is known (m, n), by default all.
     """
     rows = samples.usable & model.moving(instrument.velocity)
     if usable is not None:
@@ -73,9 +76,15 @@ def gain_factor(
 ) -> Factor:
     """Reduce a recording to blocks of [W | t | 1 | i], one Gram matrix for each motor.
 
-    A motor's current (m, n) [A] counts if the rows of all its joints do; t is the payload torque.
-    `transmission`: motor angles per joint angle (n, n); identity: gains include gear ratios. Blocks
-    of `block` seconds count from the origin of the motion.
+    A motor's current counts if the rows of all its joints do; t is the payload torque.
+
+    Args:
+        model: of the arm.
+        samples: of the recording.
+        motor_current: (m, n) [A].
+        payload: that the arm carries.
+        transmission: motor angles per joint angle (n, n); identity: gains include gear ratios.
+        block: duration of blocks, which count from the origin of the motion [s].
     """
     n = model.n_joints
     p = model.n_parameters

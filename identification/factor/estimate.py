@@ -22,7 +22,13 @@ KNOWN: Final = (0.1, 0.5)
 def residual_variance(factor: Factor, values: Array, root: Array, weights: Array) -> Array:
     """Return the variance of the torque residual per joint (n,), NaN without rows.
 
-    Degrees of freedom are shared by the information trace(w_j S' G_j S) of joints, S = root (p, k).
+    Degrees of freedom are shared by the information trace(w_j S' G_j S) of joints.
+
+    Args:
+        factor: of the data.
+        values: parameters (p,).
+        root: S, a root of the inverse information (p, k).
+        weights: of the joints (n,).
     """
     squares = factor.products(np.append(-values, 1.0)[:, None])[:, 0, 0]
     spent = weights * np.trace(factor.products(root), axis1=1, axis2=2)
@@ -111,7 +117,17 @@ def estimate_of(
     covariance: Array | None = None,
     interval_factor: float = 1.96,
 ) -> Estimate:
-    """Return the estimate of a solution with weights (n,); covariance by default A^-1."""
+    """Return the estimate of a solution.
+
+    Args:
+        units: of the parameters.
+        factor: that was solved.
+        solution: of it.
+        weights: of the joints (n,).
+        method: name of the estimator.
+        covariance: of the parameters (p, p); by default A^-1.
+        interval_factor: standard deviations in half a 95 % interval.
+    """
     covariance = solution.inverse if covariance is None else covariance.copy()
     mark_undetermined(covariance, solution.determined)
     variance = residual_variance(factor, solution.values, solution.root, weights)

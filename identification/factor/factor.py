@@ -82,7 +82,13 @@ class Factor:
         storage: Storage = "gram",
         index: Indices | None = None,
     ) -> Self:
-        """Reduce the usable rows of a recording, by their rising blocks (m,) or to one block.
+        """Reduce the usable rows of a recording.
+
+        Args:
+            model: of the arm.
+            samples: of the recording.
+            storage: Gram matrices, or QR.
+            index: rising block of each row (m,); by default one block.
 
         Raises:
             ShapeError: wrong shape of an array.
@@ -102,9 +108,13 @@ class Factor:
     def from_samples(
         cls, model: RobotModel, motion: Motion, torque: Array, mask: NDArray[np.bool_] | None = None
     ) -> Self:
-        """Reduce m samples of a motion and the torque of W pi [N·m, N] (m, n).
+        """Reduce m samples of a motion and its torque.
 
-        `mask` (m, n): usable rows, by default all; see :meth:`RobotModel.moving`.
+        Args:
+            model: of the arm.
+            motion: of the samples.
+            torque: W pi (m, n) [N·m or N].
+            mask: usable rows (m, n), by default all; see :meth:`RobotModel.moving`.
 
         Raises:
             ShapeError: wrong shape of an array.
@@ -122,10 +132,15 @@ class Factor:
         names: tuple[str, ...],
         storage: Storage = "gram",
     ) -> Self:
-        """Reduce chunks of k rows: their rising block indices (k,), and a table for each joint.
+        """Reduce chunks of k rows.
 
-        A table (c_j + 1, k) has the columns and, last, the torque, zero for unusable rows; `counts`
-        (B, n) are the usable ones.
+        Args:
+            chunks: rising block indices (k,), and a table (c_j + 1, k) for each joint: its columns
+                and, last, the torque, zero for unusable rows.
+            counts: usable rows (B, n).
+            columns: parameters of each joint's table (c_j,).
+            names: of the parameters.
+            storage: Gram matrices, or QR.
         """
         widths = [len(joint_columns) + 1 for joint_columns in columns]
         matrices = tuple(np.zeros((len(counts), width, width)) for width in widths)

@@ -40,7 +40,15 @@ def find_load(
     fitted: Factor,
     predicted: Factor,
 ) -> CarriedLoad:
-    """Fit the training motion, then ten parameters of the last link to the unseen motion."""
+    """Fit the training motion, then ten parameters of the last link to the unseen motion.
+
+    Args:
+        model: of the arm.
+        training: recordings that are fitted.
+        held_out: recordings of unseen motion.
+        fitted: factor of the training in standard parameters.
+        predicted: likewise of the unseen motion.
+    """
     seen, unseen = (under_gravity(factor, model.gravity) for factor in (fitted, predicted))
     values = standard_parameters(seen, fitted.samples / np.maximum(seen.gram[:, -1, -1], 1e-300))
     # Squared error of the fit, scaled to as many rows.

@@ -67,10 +67,13 @@ class ColumnScore(NamedTuple):
     def explains(
         self, joints: Sequence[int], usual: ColumnScore, noise: Array, separate: ColumnScore | None
     ) -> bool:
-        """Return whether the error of the fit on some joints, all if none, is explained.
+        """Return whether the error of the fit on some joints is explained.
 
-        It is compared with the fit `usual` without this correction, sums of squared noise (n,),
-        and the fit with separate parameters for the part, if any.
+        Args:
+            joints: that count; all if none.
+            usual: fit without this correction.
+            noise: sums of squared noise (n,).
+            separate: fit with separate parameters for the part, if any.
         """
         before = usual.shares(usual.fitted)
         after = self.shares(self.fitted)
@@ -133,8 +136,13 @@ def column_score(
 ) -> ColumnScore:
     """Predict every fifth block from the others.
 
-    Of the parameters with `added` columns (B, n, q, r), to the `target` of each joint (n, q), both
-    as combinations of the columns. Without a prior, bodies that no arm has are allowed.
+    Columns and target are combinations of the columns of the tables.
+
+    Args:
+        tables: of the blocks.
+        added: columns of further parameters (B, n, q, r).
+        target: of each joint (n, q).
+        prior: of the parameters; without one, bodies that no arm has are allowed.
     """
 
     def solved(gram: Array) -> Array:

@@ -101,9 +101,13 @@ def find_columns(
 def find_columns_of_unseen(
     model: RobotModel, seen: Sequence[Samples], unseen: Sequence[Samples], fitted: ExplainedFit
 ) -> tuple[Explanation, ...]:
-    """Find changes that begin within unseen recordings, from `seen` ones that have none.
+    """Find changes that begin within unseen recordings.
 
-    `fitted` names the seen ones.
+    Args:
+        model: of the arm.
+        seen: recordings that have none.
+        unseen: recordings in which one may begin.
+        fitted: fit of the seen ones, with their names.
     """
     names = [fitted.name_of(recording) for recording in range(len(seen))]
     several = len(unseen) > 1

@@ -184,7 +184,14 @@ def folded(blocks: Array) -> Array:
 
 
 def columns_of(tables: ColumnSums, model: RobotModel, values: Array, change: Change) -> Array:
-    """Return the columns of a change as combinations of those of a table (B, n, q, r)."""
+    """Return the columns of a change as combinations of those of a table (B, n, q, r).
+
+    Args:
+        tables: of the blocks.
+        model: of the arm.
+        values: parameters (p,).
+        change: of what was recorded.
+    """
     _, n, width, _ = tables.gram.shape
     p = model.n_parameters
     joints = list(change.joints or range(model.n_joints))

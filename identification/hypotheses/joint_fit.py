@@ -126,7 +126,14 @@ def candidates(model: RobotModel, samples: Samples, *, gains: bool = True) -> Ma
 
 
 def starting_at(model: RobotModel, samples: Samples, zero: Array, gain: Array) -> JointFit:
-    """Return zeros and scales (n,) with the parameters that fit best with them."""
+    """Return zeros and scales with the parameters that fit best with them.
+
+    Args:
+        model: of the arm.
+        samples: of the recording.
+        zero: of the joints (n,) [rad].
+        gain: of the torques (n,).
+    """
     problem = _Problem.of(model, samples, 1.0)
     none = np.zeros(2 * problem.n, dtype=np.bool_)
     return _fitted(problem, none, problem.settled(zero, gain, problem.of_torque()))
@@ -156,7 +163,14 @@ def fit_joints(
 def find_joints(
     model: RobotModel, samples: Samples, free: Mask, start: JointFit | None = None
 ) -> JointFit:
-    """Find the few zeros and scales of `free` (2 n,) that are other than stated."""
+    """Find the few zeros and scales that are other than stated.
+
+    Args:
+        model: of the arm.
+        samples: of the recording.
+        free: zeros and scales that may be (2 n,).
+        start: of the search.
+    """
     problem = _Problem.of(model, samples, 1.0)
     point = problem.start(start)
     fit = _fitted(problem, free, point)

@@ -95,8 +95,11 @@ def score_of(
 ) -> Score:
     """Predict every fifth of `_BLOCKS` blocks of samples from the others.
 
-    `columns` are those of the recorded torque that the joints are read from, by default in order;
-    `wide_rotors` as for :func:`~identification.estimators.prior.body_prior`.
+    Args:
+        model: of the arm.
+        samples: of the recording.
+        columns: of the recorded torque that the joints are read from, by default in order.
+        wide_rotors: as for :func:`~identification.estimators.prior.body_prior`.
     """
     columns = np.arange(model.n_joints) if columns is None else columns
     factor = _factor(model, samples)

@@ -207,8 +207,11 @@ def find_readings(
 ) -> Readings:
     """Find how samples of one recording are to be read.
 
-    `mountings` are models with another gravity, by name ("" without gravity); `unit_is_open`
-    whether nothing states the unit of the positions.
+    Args:
+        model: of the arm.
+        samples: of the recording.
+        mountings: models with another gravity, by name ("" without gravity).
+        unit_is_open: whether nothing states the unit of the positions.
     """
     few = _thinned(samples, _ROWS)
 

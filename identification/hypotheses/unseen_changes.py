@@ -130,8 +130,14 @@ def find_changes(
 ) -> tuple[UnseenChange, ...]:
     """Compare unseen with fitted motion under an estimate; return the joints that changed.
 
-    The factor is that of the usable held-out rows. A joint that the fitted motion has not `moved`
-    (n,) has no torque or friction that could have changed.
+    Args:
+        model: of the arm.
+        estimate: from the training.
+        training: recordings that were fitted.
+        held_out: recordings of unseen motion.
+        held_out_factor: of their usable rows.
+        moved: joints that the fitted motion has moved (n,); others have no torque or friction that
+            could have changed.
     """
     values = estimate.values
     fitted, unseen = (_Part.of(model, values, runs) for runs in (training, held_out))

@@ -192,8 +192,16 @@ class RobotModel:
     ) -> RobotModel:
         """Create the model from URDF text.
 
-        Gravity (3,) [m/s²] is in base axes; `joint_friction` has the laws of joints that differ,
-        `locked` the positions [rad or m] of joints to be fixed, both by name.
+        Args:
+            urdf: text.
+            gravity: (3,) [m/s²] in base axes.
+            rotor_inertia: whether rotors have parameters.
+            friction: law of the joints.
+            joint_friction: laws of joints that differ, by name.
+            locked: positions of joints to be fixed, by name [rad or m].
+            coupling: of motors and joints.
+            payload: known, at the flange.
+            elements: springs, balancers and counterweights.
 
         Raises:
             ModelError: the text is not an open chain of revolute and prismatic joints, there is no

@@ -118,7 +118,14 @@ def contact_detection(
     postures: Array,
     limits: PurposeLimits,
 ) -> Purpose:
-    """Return the force at the flange that a threshold sees which holds without contact."""
+    """Return the force at the flange that a threshold detects which holds without contact.
+
+    Args:
+        model: of the arm.
+        residuals: slow part of the residual on unseen motion.
+        postures: in which forces act (k, n) [rad or m].
+        limits: of the purposes.
+    """
     if not residuals:
         return Purpose.unknown("contact", "nothing held out", "N")
     found = contact(model, residuals, postures)

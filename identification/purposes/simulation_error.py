@@ -62,7 +62,13 @@ def flange_error(model: RobotModel, values: Array, recordings: Sequence[Samples]
 
 
 def departures(model: RobotModel, values: Array, windows: Windows, error: Array) -> Array:
-    """Return how far joints depart from their motion (w, n) [rad or m] by torque errors (w, K, n).
+    """Return how far joints depart from their motion (w, n) [rad or m] by torque errors.
+
+    Args:
+        model: of the arm.
+        values: parameters (p,).
+        windows: of the motion.
+        error: of the torque (w, K, n) [N·m or N].
 
     Raises:
         IdentificationError: the inertia of the arm is not that of bodies.

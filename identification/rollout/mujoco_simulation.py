@@ -90,10 +90,13 @@ class RolloutArm:
         return cls(model, places, model.qpos_spring[places].copy(), viscous, step, feedback)
 
     def force(self, torque: Array, position: Array, velocity: Array, change: Array) -> Array:
-        """Return what acts on the joints beside friction and springs of the state (m, n).
+        """Return what acts on the joints in addition to friction and springs of the state (m, n).
 
-        Of a torque, and of the reference of the feedback: position before each step, velocity half
-        a step later; `change` is that of the measured velocity in half a step.
+        Args:
+            torque: measured (m, n).
+            position: reference of the feedback before each step (m, n).
+            velocity: half a step later (m, n).
+            change: of the measured velocity in half a step (m, n).
         """
         # The viscous friction of a step is that of the velocity after it, half a step late.
         force = torque + self.feedback.damping * velocity + self.viscous * change
@@ -104,8 +107,11 @@ class RolloutArm:
     def simulate(self, start: Array, velocity: Array, force: Array, reference: Array) -> Array:
         """Return the positions after each step (w, K, n), not finite where they are unstable.
 
-        From positions and, half a step before, velocities (w, n), under a force (w, K, n). They
-        are unstable where they are far from a reference (w, K, n).
+        Args:
+            start: positions (w, n).
+            velocity: half a step before (w, n).
+            force: on the joints (w, K, n).
+            reference: positions (w, K, n) from which unstable ones are far.
         """
         mujoco = load_mujoco()
         from mujoco import rollout  # optional dependency

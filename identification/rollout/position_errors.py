@@ -102,6 +102,12 @@ def simulate(
 ) -> Array:
     """Return the positions of an arm at the horizons (w, h, n), not finite where it is unstable.
 
+    Args:
+        arm: that is simulated.
+        motion: that was recorded.
+        feedback: to the measured positions.
+        extra: torque in addition (w, K, n).
+
     Raises:
         NotSimulatedError: MuJoCo does not accept the arm.
     """

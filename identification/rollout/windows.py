@@ -109,9 +109,13 @@ def stretches_of(
 ) -> list[Stretch]:
     """Return the stretches of a recording without gap.
 
-    `load` torque (m, n), which was subtracted from that of the samples, is added. The positions
-    are interpolated by a cubic spline, of which the velocity is the derivative. Where some samples
-    have a commanded position (m, n), those without (NaN) are gaps.
+    The positions are interpolated by a cubic spline, of which the velocity is the derivative.
+
+    Args:
+        samples: of the recording.
+        load: torque that was subtracted from that of the samples (m, n), and is added.
+        step: of the simulation [s].
+        commanded: positions (m, n); samples without (NaN) are gaps if others have one.
     """
     stretches = []
     parts: Sequence[slice] = samples.segments
@@ -167,10 +171,15 @@ def mean_about(time: Array, values: Array, grid: Array) -> Array:
 def windows_of(
     stretches: Sequence[Stretch], step: float, horizon: float, stride: float, lead: float = 0.0
 ) -> Windows:
-    """Return windows of a horizon [s] that start every `stride` seconds.
+    """Return windows of equal duration.
 
-    The first starts `lead` seconds after the start of its stretch: what acts on an arm so much
-    later, such as a delayed command, is not known before.
+    Args:
+        stretches: of the recordings.
+        step: of the simulation [s].
+        horizon: duration of a window [s].
+        stride: between the starts of windows [s].
+        lead: of the first window after the start of its stretch [s]: what acts on an arm so much
+            later, such as a delayed command, is not known before.
 
     Raises:
         NoWindowError: no stretch is as long.

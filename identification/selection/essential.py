@@ -104,7 +104,12 @@ def eliminate(
 ) -> Elimination:
     """Remove parameters one by one and choose the cut by the error on held-out samples.
 
-    Weights (n,) are by default the inverse residual variances of an ordinary fit.
+    Args:
+        model: of the arm.
+        training: factor of the fitted samples.
+        held_out: factor of the others.
+        weights: of the joints (n,); by default the inverse residual variances of an ordinary fit.
+        rule: of the cut.
 
     Raises:
         IdentificationError: one of the factors has no rows.

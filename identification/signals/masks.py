@@ -108,16 +108,25 @@ def mask_rows(
 ) -> RowMask:
     """Return reasons against rows of a checked recording, with its smoothed motion.
 
-    `bandwidth` (n,) [Hz] and `delay` [s] are of the smoothing; `torque_bandwidth` (n,) [Hz] of a
-    low-pass of torque and regressor; `current_limit` (n,) [A] of motors. `left_out` excludes
+    Args:
+        recording: that was checked.
+        model: of the arm.
+        motion: of the recording, smoothed.
+        bandwidth: of the smoothing (n,) [Hz].
+        current_limit: of the motors (n,) [A].
+        torque_bandwidth: of a low-pass of torque and regressor (n,) [Hz].
+        delay: of the torque [s].
+        left_out: slow rows that are excluded:
 
-    - "rests": rows in which no joint moves for more than `LONGEST_HALT`: a joint that stands while
-        another moves holds its load; and the two rows at each reversal of a joint, or more in
-        `TURN`;
-    - "halts": rows of a joint slower than standstill for more than `LONGEST_HALT`, and those at a
-        change of its velocity's sign, likewise;
-    - "slow": all rows slower than standstill, or near a velocity reversal;
-    - "none": no slow rows.
+            - "rests": rows in which no joint moves for more than `LONGEST_HALT`: a joint that
+            stands
+                while another moves holds its load; and the two rows at each reversal of a joint, or
+                more in `TURN`;
+            - "halts": rows of a joint slower than standstill for more than `LONGEST_HALT`, and
+            those
+                at a change of its velocity's sign, likewise;
+            - "slow": all rows slower than standstill, or near a velocity reversal;
+            - "none": no slow rows.
     """
     shape = recording.position.shape
     still = ~model.moving(motion.velocity)

@@ -284,10 +284,15 @@ def prepare(
 ) -> Samples:
     """Prepare a recording for a model; the torque of a known payload is subtracted.
 
-    Variances of the positions and, for `options.smooth_torque`, of the torques (n,) are estimated
-    if None, see :func:`smooth`. `origin` is the start of the planned motion [s], by default of the
-    command; rows at the `current_limit` of the motors (n,) [A] are excluded. `motions` keeps the
-    motions of one recording by their settings, for several preparations.
+    Args:
+        recording: with torque.
+        model: of the arm.
+        noise_variance: of the positions (n,); estimated if None, see :func:`smooth`.
+        torque_variance: of the torques (n,), for `options.smooth_torque`; likewise.
+        options: of the preparation.
+        origin: start of the planned motion [s], by default of the command.
+        current_limit: of the motors (n,) [A]; rows at it are excluded.
+        motions: of the recording by their settings, kept for several preparations.
 
     Raises:
         RecordingError: the recording is invalid or has no torque.

@@ -65,10 +65,16 @@ class SmoothingSpline:
 def fit_smoothing_spline(
     time: Array, values: Array, tolerance: Array, *, widest: float = np.inf
 ) -> SmoothingSpline:
-    """Smooth channels (m, c) to mean squared residuals equal to their tolerances (c,).
+    """Smooth channels to mean squared residuals equal to their tolerances.
 
-    Limited by the largest bandwidth `widest` [Hz], by the closest spline with one knot per sample
-    and by the smoothest one, nearly a parabola.
+    Limited by the closest spline with one knot per sample and by the smoothest one, nearly a
+    parabola.
+
+    Args:
+        time: of the samples (m,) [s].
+        values: channels (m, c).
+        tolerance: of each channel (c,).
+        widest: largest bandwidth [Hz].
     """
     for samples_per_knot in (4, 2, 1):
         problem = _Problem.of(time, values, samples_per_knot * float(np.median(np.diff(time))))
@@ -379,7 +385,14 @@ FORWARDS: Final = tuple(LowPassShape(order, causal=True) for order in (1, 2, 4))
 def low_passed(
     time: Array, columns: Array, bandwidth: float, shape: LowPassShape = SMOOTHER
 ) -> Array:
-    """Filter columns (m, c) of a segment by a low-pass [Hz]; Butterworth: at even times."""
+    """Filter columns of a segment by a low-pass; Butterworth: at even times.
+
+    Args:
+        time: of the samples (m,) [s].
+        columns: (m, c).
+        bandwidth: of the low-pass [Hz].
+        shape: its order and direction.
+    """
     if shape == SMOOTHER:
         return low_pass(time, columns, bandwidth)
     step = float(np.median(np.diff(time)))

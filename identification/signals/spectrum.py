@@ -16,10 +16,16 @@ HARRIS: Final = (0.35875, -0.48829, 0.14128, -0.01168)
 def power_density(
     signals: Array, rate: float, length: int, window: tuple[float, ...] = HANN
 ) -> tuple[Array, Array]:
-    """Return frequencies (f,) [Hz] and one-sided power densities (f, c) of signals (m, c) [1/Hz].
+    """Return frequencies (f,) [Hz] and one-sided power densities (f, c) of signals [1/Hz].
 
-    Welch (1967): mean over parts of `length` rows that overlap by half, without their mean, which
-    has no frequency here.
+    Welch (1967): mean over parts that overlap by half, without their mean, which has no frequency
+    here.
+
+    Args:
+        signals: (m, c).
+        rate: of the samples [Hz].
+        length: of a part, in rows.
+        window: that parts are multiplied by.
     """
     phase = 2.0 * np.pi * np.arange(length) / length
     weights = sum(share * np.cos(k * phase) for k, share in enumerate(window))

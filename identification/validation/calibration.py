@@ -96,9 +96,16 @@ class Calibration:
 def calibrate(
     estimate: Estimate, factor: Factor, fitted: TorqueMeans, held_out: TorqueMeans, refit: Refit
 ) -> Calibration:
-    """Compare held-out mean torques with 95 % intervals from `factor` and `fitted` means.
+    """Compare held-out mean torques with their 95 % intervals.
 
     Undetermined parameters are ignored.
+
+    Args:
+        estimate: whose intervals are tested.
+        factor: that it is from.
+        fitted: mean torques of the fitted motion.
+        held_out: mean torques of unseen motion.
+        refit: of a part of the factor.
 
     Raises:
         IdentificationError: fewer than `FEWEST_BLOCKS` blocks, or a fold cannot be fitted.

@@ -128,9 +128,15 @@ def check_consistency(
 ) -> ConsistencyCheck:
     """Compare the physically consistent estimate with an unconstrained one.
 
-    Weights (n,) are by default the inverse residual variances of an ordinary fit; with `in_sample`
-    the held-out motion is the training. Prior and `design_effect` as for
-    :func:`identification.estimators.consistent.consistent_estimate`.
+    Args:
+        model: of the arm.
+        training: factor of the fitted motion.
+        held_out: factor of unseen motion.
+        unconstrained: estimate from the training.
+        weights: of the joints (n,); by default the inverse residual variances of an ordinary fit.
+        prior: as for :func:`identification.estimators.consistent.consistent_estimate`.
+        design_effect: likewise.
+        in_sample: whether the held-out motion is the training.
 
     Raises:
         IdentificationError: see :func:`identification.estimators.consistent.consistent_estimate`.

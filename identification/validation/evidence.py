@@ -60,8 +60,14 @@ def repetition_noise(
 ) -> Array:
     """Return the standard deviation of the residual between repetitions (n,) [N·m or N].
 
-    The residual of parameters (p,), through a low-pass [Hz] if given, is compared at equal times,
-    rounded to the sampling interval; NaN for a joint that never moves at the same time twice.
+    It is compared at equal times, rounded to the sampling interval; NaN for a joint that never
+    moves at the same time twice.
+
+    Args:
+        model: of the arm.
+        values: parameters (p,).
+        recordings: repetitions of one motion.
+        bandwidth: of a low-pass of the residual [Hz].
     """
     step = 0.0
     parts = []
@@ -219,9 +225,18 @@ def gather(
 ) -> Evidence:
     """Collect the evidence for a verdict; every recording is read a few times.
 
-    With `same_motion` the training recordings, in the order of the result, repeat one motion, and
-    noise is measured. `nominal` are parameters (p,). With `in_sample` the held-out motions are the
-    training; `unseen` is the sum of their factors, if known, and `prior` that of the arm.
+    Args:
+        model: of the arm.
+        result: estimates from all recordings and from each.
+        training: recordings that were fitted, in the order of the result.
+        held_out: recordings of unseen motion.
+        same_motion: whether the training repeats one motion; noise is measured then.
+        nominal: parameters (p,).
+        context: data on the cell.
+        in_sample: whether the held-out motions are the training.
+        names: of the training.
+        unseen: sum of the factors of the held-out motions, if known.
+        prior: of the arm.
     """
     pooled, values = result.pooled, result.pooled.values
     unseen = total_factor(model, held_out) if unseen is None else unseen

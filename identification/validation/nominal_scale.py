@@ -92,11 +92,15 @@ def nominal_scale(
     rotors_known: bool = False,
     share: float | None = None,
 ) -> NominalScale:
-    """Compare measured torque with that of nominal parameters (p,) per axis, without friction.
+    """Compare measured torque with that of nominal parameters per axis, without friction.
 
-    `rotors_known`: the nominal parameters include rotor inertias; `share`: relative standard
-    deviation of the nominal torque, by default that of bodies as uncertain as in
-    :func:`identification.estimators.prior.body_prior`.
+    Args:
+        model: of the arm.
+        nominal: parameters (p,).
+        runs: prepared recordings.
+        rotors_known: whether the nominal parameters include rotor inertias.
+        share: relative standard deviation of the nominal torque, by default that of bodies as
+            uncertain as in :func:`identification.estimators.prior.body_prior`.
     """
     bodies = nominal_deviations(model) if share is None else np.zeros((model.base.rank, 0))
     if all(run.torque_bandwidth is None for run in runs):
@@ -173,9 +177,15 @@ class InertiaRatio(NamedTuple):
 def inertia_ratio(
     model: RobotModel, values: Array, position: Array, theirs: Array
 ) -> InertiaRatio | None:
-    """Compare a controller's diagonal inertia (m, n), joint side, with that of values (p,).
+    """Compare a controller's diagonal inertia with that of an estimate.
 
-    At positions (m, n) [rad or m]; zero where not sent. None if there is nothing to compare.
+    None if there is nothing to compare.
+
+    Args:
+        model: of the arm.
+        values: parameters (p,).
+        position: of the joints (m, n) [rad or m].
+        theirs: the controller's inertia, joint side (m, n); zero where not sent.
     """
     if not np.any(theirs):
         return None

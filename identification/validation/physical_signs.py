@@ -66,11 +66,15 @@ def implausibilities(
 ) -> Implausible:
     """Return what is physically impossible in an estimate.
 
-    The torque of wrong signs on a `motion` is compared with the error of its prediction (n,), of
-    which it must be a multiple on axes of little torque; friction is evaluated up to the highest
-    speeds (n,). Terms of friction of `added` symbols were
-    chosen, not stated: they follow the friction within the fitted speeds and are no reason against
-    a model.
+    Args:
+        model: of the arm.
+        estimate: of its parameters.
+        motion: factor of a motion, on which the torque of wrong signs is compared with an error.
+        error_rms: of the prediction of that motion (n,), of which the torque must be a multiple on
+            axes of little torque.
+        speed: highest of each joint (n,), up to which friction is evaluated.
+        added: symbols of friction terms that were chosen, not stated: they follow the friction
+            within the fitted speeds and are no reason against a model.
     """
     impossible: list[WrongSign] = []
     doubtful: list[WrongSign] = []

@@ -112,7 +112,14 @@ class PredictionError:
 def residual(
     model: RobotModel, values: Array, samples: Samples, bandwidth: float | None = None
 ) -> Array:
-    """Return measured minus predicted torque (m, n), low-passed [Hz] if given; 0 if unusable."""
+    """Return measured minus predicted torque (m, n); 0 in unusable rows.
+
+    Args:
+        model: of the arm.
+        values: parameters (p,).
+        samples: of the recording.
+        bandwidth: of a low-pass of the residual [Hz].
+    """
     return _usable_part(
         samples, samples.torque - samples.predicted_torque(model, values), bandwidth
     )
@@ -156,9 +163,15 @@ def noise_floor(
 ) -> Array | None:
     """Return the standard deviation of torque noise per joint (n,) [N·m or N], NaN without rows.
 
-    It is that of the residual of parameters (p,) above `SLOW`, as of white noise, and that between
-    repetitions (n,) below, if given; None if the torque has no noise because it was filtered. The
-    median over short blocks: play, spikes and jumps of some blocks are faults, no noise.
+    It is that of the residual above `SLOW`, as of white noise, and that between repetitions below,
+    if given; None if the torque has no noise because it was filtered. The median over short blocks:
+    play, spikes and jumps of some blocks are faults, no noise.
+
+    Args:
+        model: of the arm.
+        values: parameters (p,).
+        recordings: prepared.
+        repeated: noise between repetitions (n,).
     """
     first = recordings[0]
     if repeated is None and noiseless_above(first.motion.time, first.torque, first.segments):
@@ -202,10 +215,16 @@ class SlowError(NamedTuple):
 
 
 def slow_error(model: RobotModel, values: Array, samples: Samples, bandwidth: float) -> SlowError:
-    """Return the error of parameters (p,) below a bandwidth [Hz], apart from changed friction.
+    """Return the error of parameters below a bandwidth, apart from changed friction.
 
     Friction varies with gear temperature, so the friction torque of each joint may be scaled by one
     factor within `FRICTION_CHANGE`.
+
+    Args:
+        model: of the arm.
+        values: parameters (p,).
+        samples: of the recording.
+        bandwidth: [Hz].
     """
     error = residual(model, values, samples, bandwidth)
     friction = samples.predicted_torque(model, values, model.friction_columns)
@@ -225,7 +244,14 @@ def slow_error(model: RobotModel, values: Array, samples: Samples, bandwidth: fl
 def prediction_error(
     model: RobotModel, values: Array, runs: Iterable[Samples], *, all_rows: bool = False
 ) -> tuple[PredictionError, ...]:
-    """Return the error of parameters (p,) on each recording, with `all_rows` also at standstill."""
+    """Return the error of parameters on each recording.
+
+    Args:
+        model: of the arm.
+        values: parameters (p,).
+        runs: prepared recordings.
+        all_rows: also at standstill.
+    """
     return tuple(
         PredictionError.between(
             run.torque, run.predicted_torque(model, values), None if all_rows else run.usable

@@ -271,9 +271,15 @@ def check_residuals(
     same_motion: bool = False,
     motor_from_joint: Array | None = None,
 ) -> ResidualChecks:
-    """Check the residuals of parameters (p,) on all recordings.
+    """Check the residuals of parameters on all recordings.
 
-    Drift is tested on the training recordings in order; ripple needs motor angles per joint (n, n).
+    Args:
+        model: of the arm.
+        values: parameters (p,).
+        training: recordings that were fitted, in the order in which drift is tested.
+        held_out: recordings of unseen motion.
+        same_motion: whether the training repeats one motion.
+        motor_from_joint: motor angles per joint angle (n, n), which ripple needs.
     """
     runs = [*training, *held_out]
     fitted = len(training)
@@ -335,11 +341,17 @@ class FoldedNoise(NamedTuple):
 def folded_noise(
     model: RobotModel, values: Array, recordings: Sequence[Samples], bandwidth: float
 ) -> FoldedNoise:
-    """Return what noise without a filter adds to the residual below a bandwidth [Hz].
+    """Return what noise without a filter adds to the residual below a bandwidth.
 
     Sampling folds the noise above half the rate below it (Shannon 1949), where it is white: below
     the bandwidth it has at least the smallest density of all octaves above. No share where half
     the rate is within the first of these.
+
+    Args:
+        model: of the arm.
+        values: parameters (p,).
+        recordings: prepared.
+        bandwidth: [Hz].
     """
     squares, power, noise, low = np.zeros(4)
     for run in recordings:

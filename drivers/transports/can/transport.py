@@ -41,10 +41,13 @@ _SAMPLE_POINT: Final = 80.0  # %
 def open_bus(
     interface: str, channel: str, rates: BusRates, options: Mapping[str, Any]
 ) -> can.BusABC:
-    """Open a bus of python-can, with further arguments `options`.
+    """Open a bus of python-can.
 
-    `channel` is can0, /dev/ttyACM0, ...; a multicast group may have its port behind a slash. On
-    SocketCAN the bit rates are set by `ip link`, not here.
+    Args:
+        interface: of python-can.
+        channel: can0, /dev/ttyACM0, ...; a multicast group may have its port behind a slash.
+        rates: of the bits; on SocketCAN these are set by `ip link`, not here.
+        options: further arguments of the interface.
 
     Raises:
         TransportError: it cannot be opened.

@@ -75,6 +75,12 @@ def improve(ascent: Ascent, genes: Array, scores: Scores, steps: int) -> tuple[A
     """Return genes (n_genes,) and scores (m = 1) of a motion that is not worse than a feasible one.
 
     Every motion that replaces another satisfies all constraints and has a larger fitness.
+
+    Args:
+        ascent: of the problem.
+        genes: of the feasible motion (n_genes,).
+        scores: of it (m = 1).
+        steps: most of them.
     """
     best = (genes.copy(), scores)
     value = float(ascent.fitness(scores)[0])

@@ -188,10 +188,15 @@ def search(
     scored: Callable[[int], None] | None = None,
     stop: Callable[[], bool] = lambda: False,
 ) -> Design:
-    """Search for the best motion of a population's problem; new scores are appended to `journal`.
+    """Search for the best motion of a population's problem.
 
-    `progress` is called after each generation, `scored` with each number of newly scored motions,
-    `stop` before each generation; true ends the search with the best motion so far.
+    Args:
+        population: of the first generation.
+        settings: of the search.
+        journal: new scores are appended to it.
+        progress: called after each generation.
+        scored: called with each number of newly scored motions.
+        stop: called before each generation; true ends the search with the best motion so far.
 
     Raises:
         NoFeasibleMotionError: no motion satisfies all constraints and excites every parameter.

@@ -178,9 +178,15 @@ def gene_steps(genes: Array) -> Array:
 def gene_slopes(
     problem: SensitivityProblem, sensitivity: Sensitivity, genes: Array, which: NDArray[np.intp]
 ) -> Array:
-    """Return the slopes (k, 2 + c) for some genes (k,), in ascending order.
+    """Return the slopes of fitness, error and constraints (k, 2 + c) for some genes.
 
     They are 0 for a gene whose step cannot be planned.
+
+    Args:
+        problem: of the search.
+        sensitivity: at the genes.
+        genes: of the motion (n_genes,).
+        which: genes whose slopes are returned (k,), in ascending order.
     """
     steps = gene_steps(genes)[which]
     rows = np.repeat(genes[None], len(which), axis=0)
