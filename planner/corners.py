@@ -382,11 +382,11 @@ def round_corners(
     candidates = solved(rows, shares)
     saving = sum(cuts(rows, shares)) - candidates.durations
     saving = saving.reshape(len(FIRST_SHARES), -1)
-    for place in ranked(saving):
-        picked = np.flatnonzero(np.take_along_axis(saving, place[None], axis=0)[0] >= 0.0)
+    for index in ranked(saving):
+        picked = np.flatnonzero(np.take_along_axis(saving, index[None], axis=0)[0] >= 0.0)
         picked = picked[stopped(asked[picked])]
         if len(picked) > 0:
-            chosen = place[picked] * len(asked) + picked
+            chosen = index[picked] * len(asked) + picked
             finish(rows[chosen], shares[chosen], candidates.take(chosen))
     for part in LAST_SHARES:
         rows = asked[stopped(asked)]
@@ -550,8 +550,10 @@ def _closed(block: Block, start: Array, end: Array) -> Block:
     piece = np.sum(finer[..., :-1, None] >= block.knots[..., None, 1:-1], axis=-1)
     jerks = np.take_along_axis(block.coefficients[..., 3], piece, axis=-1)
     # Effect of each jerk on the end state, from the time left at its two knots.
-    left = duration - finer
-    effect = -np.diff(np.stack((left**3 / 6.0, left**2 / 2.0, left), axis=-2), axis=-1)
+    remaining = duration - finer
+    effect = -np.diff(
+        np.stack((remaining**3 / 6.0, remaining**2 / 2.0, remaining), axis=-2), axis=-1
+    )
     # Makes the three rows comparable.
     scale = np.concatenate((np.ones_like(duration), duration, duration**2), axis=-1)
     closing = np.linalg.pinv(effect * scale[..., None])

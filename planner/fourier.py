@@ -220,14 +220,15 @@ class FourierSeries:
 
     def _bounds(self, order: int, ramped: bool) -> Array:
         """Return a bound of a derivative's magnitude, less offset, from the amplitudes, (n,)."""
-        size = np.abs(self.amplitude)
+        amplitude = np.abs(self.amplitude)
         rate = np.abs(self.frequency)
         with np.errstate(all="ignore"):  # an overflow is inf, which exceeds every limit
             sums = [
-                np.sum(np.where(size > 0.0, size * rate**k, 0.0), axis=1) for k in range(order + 1)
+                np.sum(np.where(amplitude > 0.0, amplitude * rate**k, 0.0), axis=1)
+                for k in range(order + 1)
             ]
             # |sin x| <= |x|
-            sums[0] = np.sum(size * np.minimum(rate * self.length, 1.0), axis=1)
+            sums[0] = np.sum(amplitude * np.minimum(rate * self.length, 1.0), axis=1)
             bound = sums[order]
             if ramped:
                 ramp = np.float64(self.ramp)

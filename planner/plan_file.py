@@ -172,8 +172,8 @@ class PlanFile:
             raise
         except ValidationError as error:
             first = error.errors(include_url=False, include_input=False)[0]
-            place = ".".join(map(str, first["loc"])) or "top level"
-            raise InvalidPlanFile(f"not a plan: {place}: {first['msg']}") from error
+            field = ".".join(map(str, first["loc"])) or "top level"
+            raise InvalidPlanFile(f"not a plan: {field}: {first['msg']}") from error
         except (PlannerError, *DAMAGED) as error:
             raise InvalidPlanFile(f"not a plan: {error}") from error
 

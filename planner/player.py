@@ -72,10 +72,10 @@ class _Sines:
         phase = s * self._frequency
         position = (self._amplitude * np.sin(phase)) @ self._sum
         velocity = (self._rate * np.cos(phase)) @ self._sum
-        left = self._length - s
-        if min(s, left) < self._ramp:
-            share, grown = self._window(min(s, left) / self._ramp)
-            slope = grown / self._ramp if s < left else -grown / self._ramp
+        remaining = self._length - s
+        if min(s, remaining) < self._ramp:
+            share, grown = self._window(min(s, remaining) / self._ramp)
+            slope = grown / self._ramp if s < remaining else -grown / self._ramp
             position, velocity = share * position, share * velocity + slope * position
         return self._offset + position, velocity
 

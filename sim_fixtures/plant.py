@@ -121,9 +121,9 @@ def resolve_dry_friction(
     for _ in range(MAX_SWEEPS):
         converged = True
         for i, limit in enumerate(coulomb):
-            before = torque[i]
-            wanted = max(-limit, min(limit, before + velocity[i] / rows[i][i]))
-            change = wanted - before
+            previous = torque[i]
+            wanted = max(-limit, min(limit, previous + velocity[i] / rows[i][i]))
+            change = wanted - previous
             if abs(change) > TOLERANCE * limit:
                 torque[i] = wanted
                 velocity = [v - a * change for v, a in zip(velocity, rows[i], strict=True)]

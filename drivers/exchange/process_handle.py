@@ -232,9 +232,9 @@ class ExchangeProcess:
         end = time.monotonic() + timeout
         while True:
             self.send_heartbeat()
-            left = end - time.monotonic()
-            status = self._process.wait(max(0.0, min(left, _POLL)))
-            if status is not None or left <= _POLL:
+            remaining = end - time.monotonic()
+            status = self._process.wait(max(0.0, min(remaining, _POLL)))
+            if status is not None or remaining <= _POLL:
                 return status
 
     def terminate(self) -> None:

@@ -127,8 +127,8 @@ class WarmUp:
         if not isinstance(transport, PollingTransport):
             return
         due = arrived + self._period
-        left = due - LEAD - transport.now
-        if left <= 0.0 or transport.wait(left):
+        remaining = due - LEAD - transport.now
+        if remaining <= 0.0 or transport.wait(remaining):
             return
         begun = transport.now
         with suppress(Exception):  # whatever it may be, the real session goes on

@@ -178,12 +178,12 @@ class SimulatedTransport:
     def receive(self, timeout: float) -> bytes | None:
         """Return the next packet; None after `timeout` s without one. Raises TransportClosed."""
         self._require_open()
-        left = timeout
+        remaining = timeout
         while True:
             if self._arrived:
                 return self._arrived.popleft()
-            left = self._advance(left)
-            if left < 0.0:
+            remaining = self._advance(remaining)
+            if remaining < 0.0:
                 return None
 
     def _advance(self, timeout: float) -> float:

@@ -180,13 +180,13 @@ class _Layout:
         self.length = _HEADER + _RECIPE + self.struct.size
         at: dict[str, slice] = {}
         offsets: dict[str, int] = {}
-        place = 0
+        index = 0
         begin = _HEADER + _RECIPE
         for name, kind in zip(recipe.names, recipe.types, strict=True):
             count = _COUNTS.get(kind, 1)
-            at[name] = slice(place, place + count)
+            at[name] = slice(index, index + count)
             offsets[name] = begin
-            place += count
+            index += count
             begin += struct.calcsize(">" + _FORMATS[kind])
         self.at = at
         names = ("robot_mode", "safety_mode", "runtime_state", f"output_int_register_{STAGE}")

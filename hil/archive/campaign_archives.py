@@ -35,8 +35,8 @@ def read_back(kind: type[T], text: str, *, strict: bool = True) -> T:
         return value
     except ValidationError as error:
         first = error.errors()[0]
-        place = ".".join(map(str, first["loc"]))
-        raise ValueError(f"{place}: {first['msg']}" if place else str(first["msg"])) from error
+        field = ".".join(map(str, first["loc"]))
+        raise ValueError(f"{field}: {first['msg']}" if field else str(first["msg"])) from error
 
 
 def load_record(

@@ -86,8 +86,8 @@ class LayoutBuilder:
         """Add a number, or an array of `count` numbers, that changes with each message."""
         item = _PRIMITIVES[primitive]
         size = item.itemsize * (1 if count is None else count)
-        place = self._extend(item.itemsize, size)
-        self._fields.append((name, item if count is None else (item, (count,)), place))
+        offset = self._extend(item.itemsize, size)
+        self._fields.append((name, item if count is None else (item, (count,)), offset))
 
     def count(self, value: int) -> None:
         """Add the constant length of a sequence."""
@@ -115,11 +115,11 @@ class LayoutBuilder:
         return MessageLayout(np.dtype(fields), bytes(self._template), tuple(self._constant))
 
     def _extend(self, alignment: int, size: int) -> int:
-        place = self.next_place(alignment)
-        if place + size > LARGEST_MESSAGE:
+        offset = self.next_place(alignment)
+        if offset + size > LARGEST_MESSAGE:
             raise LayoutError(f"its messages are longer than {LARGEST_MESSAGE} bytes")
-        self._template += bytes(place + size - len(self._template))
-        return place
+        self._template += bytes(offset + size - len(self._template))
+        return offset
 
     def _fix(self, alignment: int, data: bytes) -> None:
         part = slice(self._extend(alignment, len(data)), len(self._template))

@@ -222,8 +222,8 @@ class ArchiveProcessHandle:
         """
         deadline = time.monotonic() + timeout
         while self.alive or not self._gone:
-            left = max(0.0, deadline - time.monotonic())
-            if not select.select([self.channel], [], [], left)[0]:
+            remaining = max(0.0, deadline - time.monotonic())
+            if not select.select([self.channel], [], [], remaining)[0]:
                 return None
             try:
                 answer: Answer = self.channel.receive()

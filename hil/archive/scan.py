@@ -234,7 +234,7 @@ class Scan:
         outside, inside = _chunks_by_time(self._stream, self.size, self._times)
         if inside - {head.offset for head in self.heads}:
             self.shortfalls = ["a chunk is missing"]
-        for place, head in enumerate(self.heads):
+        for index, head in enumerate(self.heads):
             if head.opcode == container.CHUNK and head.offset in outside:
                 self._flush()
                 self._skipped = True
@@ -242,7 +242,7 @@ class Scan:
                 continue
             self._try(self._add, head)
             if len(self.damages) >= _MOST_DAMAGES:
-                del self.heads[place + 1 :]
+                del self.heads[index + 1 :]
                 break
         self._flush()
         self.heads = [head for head in self.heads if head.offset not in self._left_out]
@@ -432,10 +432,10 @@ class Scan:
                 part = slice(first, first + len(data))
                 first = part.stop
                 rows = data if chosen is None else data[chosen[part]]
-                now = slice(at, at + len(rows))
-                at = now.stop
+                added = slice(at, at + len(rows))
+                at = added.stop
                 for raw, start in columns:
-                    raw[now] = rows[:, start : start + raw.itemsize].view(raw.dtype)[:, 0]
+                    raw[added] = rows[:, start : start + raw.itemsize].view(raw.dtype)[:, 0]
 
     def _missing_messages(
         self, by_topic: Mapping[str, ChunkMessages], offset: int

@@ -298,9 +298,9 @@ class Cluster:
             raise
 
     def _without_scheduler(self) -> ClusterError:
-        place = self._scheduler or "of this PC"
+        address = self._scheduler or "of this PC"
         return ClusterError(
-            f"the Dask scheduler {place} does not answer any more; start it and run the command"
+            f"the Dask scheduler {address} does not answer any more; start it and run the command"
             " again: what was computed is in the cache"
         )
 

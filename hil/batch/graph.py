@@ -437,9 +437,9 @@ class _Batch:
             else:
                 parts = []
                 for wanted in partitions:
-                    part = submit(place, reduce_archives, wanted, campaign.ready, self.cache)
-                    receivers[id(part)] = _advance(advance, len(wanted), place)
-                    parts.append(part)
+                    reduced = submit(place, reduce_archives, wanted, campaign.ready, self.cache)
+                    receivers[id(reduced)] = _advance(advance, len(wanted), place)
+                    parts.append(reduced)
                 pair = submit(place, estimate_campaign, parts, *estimated)
                 yield from parts
             result = submit(place, result_of, pair)

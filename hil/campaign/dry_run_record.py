@@ -79,11 +79,11 @@ def agreement(gravity: Array, torque: Array, velocity: Array, moving: NDArray[np
             continue
         speed = velocity[rows, joint]
         both = np.column_stack([gravity[rows, joint], torque[rows, joint]])
-        size = np.sqrt(np.mean(both[:, 1] ** 2))
+        rms = np.sqrt(np.mean(both[:, 1] ** 2))
         friction = np.column_stack([np.sign(speed), speed])
         residual = both - friction @ np.linalg.lstsq(friction, both, rcond=None)[0]
         weight, measured = np.linalg.norm(residual, axis=0)
-        if weight > _LEAST_SHARE * size * np.sqrt(rows.sum()) and measured > 0.0:
+        if weight > _LEAST_SHARE * rms * np.sqrt(rows.sum()) and measured > 0.0:
             correlation[joint] = residual[:, 0] @ residual[:, 1] / (weight * measured)
     return correlation
 
@@ -142,8 +142,8 @@ class DryRunRecord:
         """
         remedy = "remove it; its archives are evaluated again, or the dry run is repeated"
         record = load_record(cls, folder.dry_run, remedy, version=FORMAT_VERSION)
-        now = folder.plan_hash if plan_hash is None and record is not None else plan_hash
-        return record if record is not None and record.plan_hash == now else None
+        present = folder.plan_hash if plan_hash is None and record is not None else plan_hash
+        return record if record is not None and record.plan_hash == present else None
 
     @classmethod
     def load_valid(

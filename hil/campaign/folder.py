@@ -220,9 +220,9 @@ class CampaignFolder(RecordedCampaign):
     def _changed(self) -> str | None:
         """Return the first file that differs from the manifest."""
         sealed = self._manifest().inputs
-        now = self._inputs()
-        for name in sorted(sealed.keys() | now.keys()):
-            if sealed.get(name) != now.get(name):
+        present = self._inputs()
+        for name in sorted(sealed.keys() | present.keys()):
+            if sealed.get(name) != present.get(name):
                 return name
         return None
 

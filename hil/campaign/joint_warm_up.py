@@ -184,6 +184,6 @@ class FrictionMeter:
         work = (torque * np.gradient(columns["position"][rows], axis=0)).sum(axis=0)
         with np.errstate(divide="ignore", invalid="ignore"):
             friction = (work - self._rigid_work) / self._way
-        size = np.sqrt(np.mean(torque**2, axis=0))
-        measurable = (self._way > _LEAST_WAY) & (np.abs(friction) > _LEAST_SHARE * size)
+        rms = np.sqrt(np.mean(torque**2, axis=0))
+        measurable = (self._way > _LEAST_WAY) & (np.abs(friction) > _LEAST_SHARE * rms)
         return np.where(measurable, friction, np.nan)

@@ -170,10 +170,10 @@ class RunWatch:
         done = 0.0 if progress is None or progress.motion_time is None else progress.motion_time
         override = max(self._request.override, _SLOWEST)
         after = max(self._override_after, _SLOWEST) if self._in_dry_run else override
-        left = self._present.time(override) - done / min(self._present.most, override)
-        left = max(left, 0.0) + BETWEEN * len(self._expected)
-        left += sum(one.time(override if one.dry_run else after) for one in self._expected)
-        self.status = replace(self.status, motion=progress, time_left=left, **changes)
+        remaining = self._present.time(override) - done / min(self._present.most, override)
+        remaining = max(remaining, 0.0) + BETWEEN * len(self._expected)
+        remaining += sum(one.time(override if one.dry_run else after) for one in self._expected)
+        self.status = replace(self.status, motion=progress, time_left=remaining, **changes)
         if "show" in self._problems:
             return
         try:

@@ -112,13 +112,13 @@ class PrecisionRecord:
 
     def with_look(self, look: PrecisionLook, limit: int) -> PrecisionRecord:
         """Return the record after another repetition, of at most `limit`."""
-        before = tuple(each for each in self.looks if each.repetitions < look.repetitions)
+        earlier = tuple(each for each in self.looks if each.repetitions < look.repetitions)
         reached = tuple(
-            replace(each, more=None) if _is_overdue(before, look, k) else each
+            replace(each, more=None) if _is_overdue(earlier, look, k) else each
             for k, each in enumerate(look.reached)
         )
         look = replace(look, reached=reached)
-        looks = (*before, look)
+        looks = (*earlier, look)
         longer = replace(self, looks=looks)
         last = looks[-IN_A_ROW:]
         if len(last) == IN_A_ROW and all(recent.met for recent in last):

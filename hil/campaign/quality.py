@@ -236,9 +236,9 @@ class RepetitionCheck:
         )
         usual = np.median([repetition.position[:rows] for repetition in self._earlier], axis=0)
         currents = np.median([repetition.current[:rows] for repetition in self._earlier], axis=0)
-        size = np.maximum(_rms(currents), 1e-3 * self._cell.drive_train.current_limit)
+        scale = np.maximum(_rms(currents), 1e-3 * self._cell.drive_train.current_limit)
         apart = _rms(executed.position[:rows] - usual) / following_threshold(self._cell)
-        return np.array([apart, _rms(executed.current[:rows] - currents) / size])
+        return np.array([apart, _rms(executed.current[:rows] - currents) / scale])
 
 
 def _rms(values: Array) -> Array:

@@ -261,10 +261,10 @@ def further_repetitions(repetitions: int, ratio: float, share: float) -> int | N
     """
     if ratio <= 1.0:
         return 0
-    left = 1.0 / ratio**2 - (1.0 - share)
-    if not left > 0.0:  # NaN as well
+    variance = 1.0 / ratio**2 - (1.0 - share)
+    if not variance > 0.0:  # NaN as well
         return None
-    return max(1, math.ceil(repetitions * share / left) - repetitions)
+    return max(1, math.ceil(repetitions * share / variance) - repetitions)
 
 
 class PrecisionStage:

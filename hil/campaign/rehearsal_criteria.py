@@ -96,8 +96,8 @@ def of_motions(cell: Cell, folder: CampaignFolder, name: str, failure: str) -> R
     """Judge whether all motions were completed (`failure` is ""), within the speed limits."""
     entries = folder.manifest()
     if failure:
-        place = folder.archives / entries[-1].name if entries else None
-        remedy = "" if place is None else _motion_remedy(cell, name, place, None, _CORRECT)
+        path = folder.archives / entries[-1].name if entries else None
+        remedy = "" if path is None else _motion_remedy(cell, name, path, None, _CORRECT)
         text = f"{name}: {failure}"
         return criterion(f"motions ({name})", 1.0, 0.0, text, remedy)
     shares = [_speed_shares(cell, folder.archives / entry.name) for entry in entries]

@@ -61,7 +61,7 @@ def robot_model(
     _require(path, "robot.friction.joints", friction.joints, chain.joint_names)
     coupling = _coupling(path, robot.coupling, chain, drive_train)
     payload = _payload(path, robot.payload, chain)
-    elements = [_element(path, place, table, chain) for place, table in enumerate(robot.elements)]
+    elements = [_element(path, index, table, chain) for index, table in enumerate(robot.elements)]
     if friction.ripple:
         elements += ripples(chain.joint_names, drive_train(), friction.ripple)
     _require(path, "robot.friction.springs", friction.springs, chain.joint_names)
@@ -141,8 +141,8 @@ def _payload(path: Path, table: PayloadTable | None, chain: Chain) -> Payload | 
         return payload
 
 
-def _element(path: Path, place: int, table: ElementTable, chain: Chain) -> Element:
-    field = f"robot.elements[{place}]"
+def _element(path: Path, index: int, table: ElementTable, chain: Chain) -> Element:
+    field = f"robot.elements[{index}]"
     _require(path, f"{field}.joint", [table.joint], chain.joint_names)
     with _cell_errors(path, field, table.kind, "correct that table"):
         element = _built(table)

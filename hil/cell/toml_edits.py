@@ -64,8 +64,8 @@ def _set(table: Any, key: str, value: Item) -> None:
         return
     present = table[key]
     if isinstance(present, List) and isinstance(value, List) and len(present) == len(value):
-        for place, entry in enumerate(value):
-            present[place] = inline(entry)
+        for index, entry in enumerate(value):
+            present[index] = inline(entry)
     else:
         table[key] = value
 

@@ -109,6 +109,6 @@ def _finish_servo(
     servo: IdentifiedServo, output: Path | None, reporter: Reporter, **show: bool
 ) -> None:
     """Write the files of an arm without torque, and print its verdict."""
-    place = write_servo(servo, output, reporter)
+    folder = write_servo(servo, output, reporter)
     read = [Paragraph(text, use.ljust(LABEL), 2) for use, text in servo_read_lines(servo)]
-    finish_servo(servo.results, **show, written=(place, place / REPORT), read=read)
+    finish_servo(servo.results, **show, written=(folder, folder / REPORT), read=read)

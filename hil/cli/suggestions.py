@@ -77,20 +77,20 @@ def with_present_names(arguments: Sequence[str]) -> tuple[list[str], list[str]]:
     """Return arguments of the command line with present names, and a note for each former one."""
     present = list(arguments)
     notes = list[str]()
-    place = next((k for k, word in enumerate(present) if not word.startswith("-")), None)
-    if place is None:
+    index = next((k for k, word in enumerate(present) if not word.startswith("-")), None)
+    if index is None:
         return present, notes
-    if new := FORMER_COMMANDS.get(present[place]):
-        notes.append(f"hil {present[place]} is now called hil {new}")
-        present[place] = new
+    if new := FORMER_COMMANDS.get(present[index]):
+        notes.append(f"hil {present[index]} is now called hil {new}")
+        present[index] = new
     end = present.index("--") if "--" in present else len(present)
-    for k in range(place + 1, end):
+    for k in range(index + 1, end):
         name, equals, value = present[k].partition("=")
         option, commands = FORMER_OPTIONS.get(name, ("", ()))
-        if present[place] in commands:
+        if present[index] in commands:
             notes.append(f"{name} is now called {option}")
             present[k] = option + equals + value
-        if present[place] == "design" and name in _METHOD_OPTIONS:
+        if present[index] == "design" and name in _METHOD_OPTIONS:
             at = k if equals else k + 1
             method = value if equals else "".join(present[at : min(at + 1, end)])
             if new := FORMER_METHODS.get(method):

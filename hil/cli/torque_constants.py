@@ -93,9 +93,9 @@ def _payload(mass: float | None, centre: str, inertia: str, frame: str | None) -
 
 def assumption(frame: str | None) -> str:
     """Return what is assumed of a load whose centre of mass was not given."""
-    place = f"the frame {frame}" if frame else "the frame of the last joint's link"
+    origin = f"the frame {frame}" if frame else "the frame of the last joint's link"
     return (
-        f"the load's centre of mass is assumed at the origin of {place}; if it is elsewhere, give"
+        f"the load's centre of mass is assumed at the origin of {origin}; if it is elsewhere, give"
         " --centre x,y,z"
     )
 

@@ -406,10 +406,10 @@ def effective_count(repetitions: Array) -> float:
     if m < MIN_REPETITIONS:
         return 1.0
     centred = repetitions - repetitions.mean()
-    size = float(centred @ centred)
-    if size == 0.0:
+    power = float(centred @ centred)
+    if power == 0.0:
         return float(m)
-    raw = float(centred[:-1] @ centred[1:]) / size
+    raw = float(centred[:-1] @ centred[1:]) / power
     rho = min(max(raw + (1.0 + 4.0 * raw) / (m - 1), 0.0), _MAX_CORRELATION)
     return max(1.0, m * (1.0 - rho) / (1.0 + rho))
 

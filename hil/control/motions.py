@@ -141,8 +141,8 @@ class CheckedMoves:
             at = end
         go(home)
         go(where)
-        for before, after in pairwise(joined):
-            _require(after, _jump(before, after))
+        for previous, after in pairwise(joined):
+            _require(after, _jump(previous, after))
         return joined
 
 
@@ -212,16 +212,16 @@ def _require(motion: CampaignMotion, problem: str | None) -> None:
     raise MotionRefusedError(str(motion), problem, remedy)
 
 
-def _jump(before: CampaignMotion, after: CampaignMotion) -> str | None:
-    """Return why `after` cannot follow `before`, None if it begins where that ends."""
-    end = before.ends[1]
+def _jump(previous: CampaignMotion, after: CampaignMotion) -> str | None:
+    """Return why `after` cannot follow `previous`, None if it begins where that ends."""
+    end = previous.ends[1]
     start = after.ends[0]
     distance = np.abs(start - end)
     if np.max(distance) <= START_TOLERANCE:
         return None
     joint = int(np.argmax(distance))
     return (
-        f"it begins with joint {joint + 1} at {start[joint]:.6g} rad, but {before} ends at "
+        f"it begins with joint {joint + 1} at {start[joint]:.6g} rad, but {previous} ends at "
         f"{end[joint]:.6g} rad"
     )
 

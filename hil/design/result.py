@@ -207,9 +207,9 @@ class DesignResult:
         Raises:
             InputError: names the cells and the parts that differ.
         """
-        now = fingerprint(cell)
+        present = fingerprint(cell)
         then = self.data["cell"]
-        different = [part for part in DECISIVE if now[part] != then.get(part)]
+        different = [part for part in DECISIVE if present[part] != then.get(part)]
         if different:
             raise InputError(
                 path,

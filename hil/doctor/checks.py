@@ -207,11 +207,11 @@ class DiskTrial:
     error: str = ""
 
 
-def disk_checks(place: Path, trial: DiskTrial | None) -> list[DoctorCheck]:
+def disk_checks(folder: Path, trial: DiskTrial | None) -> list[DoctorCheck]:
     """Check free space and write time; `trial` is None if the disk did not respond."""
     if trial is None:
-        message = f"the disk of {place} does not respond"
-        return [DoctorCheck("disk write", CheckStatus.BAD, message, (f"df -h {place}", _MOVE))]
+        message = f"the disk of {folder} does not respond"
+        return [DoctorCheck("disk write", CheckStatus.BAD, message, (f"df -h {folder}", _MOVE))]
     hours = trial.free / (BYTES_PER_CYCLE * 3_600_000)
     status = CheckStatus.OK if hours >= 2 else CheckStatus.WARN if hours >= 0.5 else CheckStatus.BAD
     message = (

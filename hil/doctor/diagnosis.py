@@ -132,9 +132,9 @@ def realtime_permissions() -> RealTimeReport | None:
     return None if answer is None else RealTimeReport(**answer)
 
 
-def disk_trial(place: Path) -> DiskTrial | None:
-    """Measure free space and write times at `place`; None if the disk did not respond."""
-    answer = run_probe(["disk", str(place)], 0.0)
+def disk_trial(folder: Path) -> DiskTrial | None:
+    """Measure free space and write times at `folder`; None if the disk did not respond."""
+    answer = run_probe(["disk", str(folder)], 0.0)
     return None if answer is None else DiskTrial(**answer)
 
 

@@ -128,12 +128,12 @@ def disk(place: Path) -> dict[str, object]:
     return answer | {"seconds": took}
 
 
-def nearest_folder(place: Path) -> Path:
-    """Return `place` or its nearest existing parent."""
-    place = place.absolute()
-    while not place.is_dir() and place != place.parent:
-        place = place.parent
-    return place
+def nearest_folder(path: Path) -> Path:
+    """Return `path` or its nearest existing parent."""
+    path = path.absolute()
+    while not path.is_dir() and path != path.parent:
+        path = path.parent
+    return path
 
 
 def _print_json(answer: object) -> None:

@@ -107,13 +107,13 @@ def names_of_joint(
             by_stem.setdefault(stem, {})[end] = name
     count = len(joints)
     ends = ([*map(str, range(count))], [*map(str, range(1, count + 1))], [*joints])
-    place = joints.index(joint)
+    index = joints.index(joint)
     own = []
     of_joints: set[str] = set()
     for found in by_stem.values():
         for each in ends:
             if {*found} == {*each}:
-                own.append(found[each[place]])
+                own.append(found[each[index]])
                 of_joints.update(found.values())
                 break
     return own[:1], [name for name in names if name not in of_joints]

@@ -573,9 +573,9 @@ def _likeliest(
     columns = np.column_stack([shape.column(series.time) for shape in candidates])
     weighted = weights[:, None] * columns
     crossed = design.T @ weighted
-    size = np.einsum("mk,mk->k", columns, weighted)
-    free = size - np.einsum("pk,pq,qk->k", crossed, covariance, crossed)
-    usable = free > 1e-9 * size
+    norm = np.einsum("mk,mk->k", columns, weighted)
+    free = norm - np.einsum("pk,pq,qk->k", crossed, covariance, crossed)
+    usable = free > 1e-9 * norm
     statistic = np.zeros(len(candidates))
     statistic[usable] = (weighted.T @ rest)[usable] / np.sqrt(free[usable])
     best = int(np.argmax(np.abs(statistic)))

@@ -76,12 +76,12 @@ def grouped(channels: Iterable[Channel], joints: Sequence[str]) -> list[ChannelG
         end = channel.name.strip()[len(bare) :] if bare in repeated else ""
         kind = channel.kind
         pattern = bare
-        place = 0
+        index = 0
         by_joint = False
         match = NUMBER.search(bare)
         if match is not None:
             pattern = f"{bare[: match.start()]}{{}}{bare[match.end() :]}"
-            place = int(match[0])
+            index = int(match[0])
         joint = _joint_in(bare, joints)
         if joint is not None:
             quantity = _REPEATED_MARK.sub(r"\1", bare.replace(joint, "")).strip(" _.-/")
@@ -90,8 +90,8 @@ def grouped(channels: Iterable[Channel], joints: Sequence[str]) -> list[ChannelG
                 kind = of_joint
                 by_joint = True
                 pattern = bare.replace(joint, "{}")
-                place = list(joints).index(joint)
-        entry = (place, bare + end, channel)
+                index = list(joints).index(joint)
+        entry = (index, bare + end, channel)
         members.setdefault((pattern + end, kind, by_joint), []).append(entry)
     groups = []
     for (pattern, kind, by_joint), entries in members.items():

@@ -40,5 +40,5 @@ def _speeds(part: Timed) -> Array:
     grid: Stamps = np.arange(part.stamp[0], part.stamp[-1], _STEP)
     speeds = np.diff(at_stamps(grid, part.stamp, part.values, across_gaps=True), axis=0)
     speeds = np.nan_to_num(speeds)
-    size = np.sqrt((speeds**2).mean(axis=0))
-    return np.asarray(speeds / np.where(size > 0.0, size, 1.0))
+    rms = np.sqrt((speeds**2).mean(axis=0))
+    return np.asarray(speeds / np.where(rms > 0.0, rms, 1.0))

@@ -203,12 +203,12 @@ def _commands_of(bag: Bag, topic: str, measured: Measured) -> Commands:
     values = np.where(known[:, None], values, np.nan)
     position = measured.position[known]
     wrong = np.sqrt(np.mean((values[known] - position) ** 2, axis=0))
-    size = position.std(axis=0)
-    if (wrong > np.maximum(size, _ALIKE)).any():
-        joint = int(np.argmax(wrong / np.maximum(size, _ALIKE)))
+    deviation = position.std(axis=0)
+    if (wrong > np.maximum(deviation, _ALIKE)).any():
+        joint = int(np.argmax(wrong / np.maximum(deviation, _ALIKE)))
         raise _NotCommandsError(
             f"it does not follow the positions of {measured.joints[joint]} ({wrong[joint]:.3g} rad"
-            f" or m apart, which move by {size[joint]:.3g})"
+            f" or m apart, which move by {deviation[joint]:.3g})"
         )
     if known.all():
         return Commands(values, topic, reading)

@@ -120,10 +120,10 @@ def _link(name: str) -> str:
 
 
 def _fixed(
-    parent: str, child: str, place: tuple[float, float, float], roll: float
+    parent: str, child: str, position: tuple[float, float, float], roll: float
 ) -> tuple[str, str]:
     """Return a link fixed to another one, translated and then rotated about x."""
-    xyz = " ".join(map(repr, place))
+    xyz = " ".join(map(repr, position))
     joint = (
         f'<joint name="fixed_{child}" type="fixed"><parent link="{parent}"/>'
         f'<child link="{child}"/><origin xyz="{xyz}" rpy="{roll!r} 0 0"/></joint>'

@@ -54,13 +54,15 @@ def _of_protobuf(kind: str, definition: bytes, messages: Sequence[bytes]) -> lis
 
     files = descriptor_pb2.FileDescriptorSet.FromString(definition)
     pool = descriptor_pool.DescriptorPool()
-    left = {file.name: file for file in files.file}
-    while left:  # a file is added after those that it imports
-        ready = [file for file in left.values() if not left.keys() & set(file.dependency)]
+    unresolved = {file.name: file for file in files.file}
+    while unresolved:  # a file is added after those that it imports
+        ready = [
+            file for file in unresolved.values() if not unresolved.keys() & set(file.dependency)
+        ]
         if not ready:
             raise MessageError("have a definition that imports itself")
         for file in ready:
-            pool.Add(left.pop(file.name))
+            pool.Add(unresolved.pop(file.name))
     message_class = message_factory.GetMessageClass(pool.FindMessageTypeByName(kind))
     return [
         json_format.MessageToDict(

@@ -118,7 +118,7 @@ def _of_rows(rows: Sequence[Any], names: Sequence[str]) -> dict[str, NDArray[Any
     if array is None:
         return {}
     if array.ndim == 2 and len(names) == array.shape[1]:
-        return {name: array[:, place] for place, name in enumerate(names)}
+        return {name: array[:, column] for column, name in enumerate(names)}
     return {_NAMELESS: array}
 
 

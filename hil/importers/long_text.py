@@ -68,9 +68,9 @@ def _excerpt(path: Path, form: Format, longest: int) -> LongText | None:
     chosen = {0, *chosen_stretches(moved[1:], max(1, most - 1)) + 1}
     numbers: list[int] = []
     read: list[str] = []
-    for place, lines in enumerate(_stretches(path, form)):
-        if place in chosen:
-            numbers += range(place * STRETCH + 1, place * STRETCH + 1 + len(lines))
+    for index, lines in enumerate(_stretches(path, form)):
+        if index in chosen:
+            numbers += range(index * STRETCH + 1, index * STRETCH + 1 + len(lines))
             read += lines
     follow = next(k for k in range(len(chosen) + 1) if k not in chosen)
     excerpt = Excerpt(len(read), total, len(chosen))

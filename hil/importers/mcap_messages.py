@@ -118,7 +118,7 @@ def _opened(path: Path) -> Iterator[BinaryIO]:
     except OSError as error:
         raise SourceError(path, f"cannot be read: {error.strerror or error}") from error
     except (Damage, McapError, KeyError, ValueError, struct.error, MemoryError) as error:
-        place = f"at byte {error.offset}: " if isinstance(error, Damage) else ""
-        problem = f"is not an MCAP file, or truncated ({place}{type(error).__name__}: {error})"
+        where = f"at byte {error.offset}: " if isinstance(error, Damage) else ""
+        problem = f"is not an MCAP file, or truncated ({where}{type(error).__name__}: {error})"
         remedy = "recover it (`hil archive repair` for archives of hil, `mcap recover` for others)"
         raise SourceError(path, problem, remedy=remedy) from error

@@ -34,7 +34,7 @@ def row_names(texts: Sequence[str | None], joints: Sequence[str]) -> RowNames:
 
     `texts` are the text of each column that is the same in all rows, None of the others.
     """
-    places = [place for place, text in enumerate(texts) if text in joints]
+    places = [index for index, text in enumerate(texts) if text in joints]
     if len(places) < 2:
         return RowNames(0, ())
     first = places[0]

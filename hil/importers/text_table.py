@@ -169,8 +169,8 @@ class TextTable:
         """The text of each column, None if it is a number or not the same in first and last row."""
         first, last = (self.dialect.cells(self.lines[row]) for row in (0, -1))
         texts: list[str | None] = []
-        for place in range(self.width):
-            ends = {row[place] if place < len(row) else "" for row in (first, last)}
+        for column in range(self.width):
+            ends = {row[column] if column < len(row) else "" for row in (first, last)}
             text = ends.pop() if len(ends) == 1 else ""
             texts.append(None if not text or self.is_number(text) else text)
         return texts
@@ -276,10 +276,10 @@ class TextTable:
             numbers = list(self.numbered)
         numerals = with_points(texts, self.dialect)
         times: list[int | None] = [_nanoseconds(text, decimals) for text in numerals]
-        unread = [place for place, time in enumerate(times) if time is None]
+        unread = [row for row, time in enumerate(times) if time is None]
         if len(unread) > len(times) / 2:
             times = nanoseconds_of_dates(texts)
-            unread = [place for place, time in enumerate(times) if time is None]
+            unread = [row for row, time in enumerate(times) if time is None]
         if unread and not self.gaps:
             text = texts[unread[0]]
             shown = repr(text) if text else "nothing"

@@ -80,12 +80,12 @@ def product_of(text: str) -> UnitProduct | None:
     powers: Counter[str] = Counter()
     names = []
     factor = 1.0
-    for place, part in enumerate(_SLASH.split(text)):
+    for index, part in enumerate(_SLASH.split(text)):
         for name, power in _powers(part):
             if name not in _ATOMS:
                 return None
             dimension, size = _ATOMS[name]
-            signed = -power if place else power
+            signed = -power if index else power
             names.append(name)
             powers[dimension] += signed
             factor *= size**signed

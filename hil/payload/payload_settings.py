@@ -103,9 +103,9 @@ def _kuka(load: ControllerLoad) -> str:
     """Return an entry of `$config.dat`: principal moments, axes by Rz(A) Ry(B) Rx(C)."""
     if not load.with_centre:
         return f"; centre of mass {NOT_DETERMINED}"
-    place = ",".join(f"{name} {part}" for name, part in _named(load.centre(1e-3, 2)))
+    centre = ",".join(f"{name} {part}" for name, part in _named(load.centre(1e-3, 2)))
     if not load.with_inertia:
-        entry = f"{{M {load.mass},CM {{{place},A a,B b,C c}},J {{X jx,Y jy,Z jz}}}}"
+        entry = f"{{M {load.mass},CM {{{centre},A a,B b,C c}},J {{X jx,Y jy,Z jz}}}}"
         return f"; inertia {NOT_DETERMINED}:\n; LOAD_DATA[1]={entry}"
     moments, rotation = principal_axes(load.body.inertia)
     angles = rotation.as_euler("ZYX", degrees=True)
@@ -113,7 +113,7 @@ def _kuka(load: ControllerLoad) -> str:
         f"{name} {angle:.3f}" for name, angle in zip("ABC", angles.tolist(), strict=True)
     )
     three = ",".join(f"{name} {part}" for name, part in _named(_figures(moments)))
-    return f"LOAD_DATA[1]={{M {load.mass},CM {{{place},{turned}}},J {{{three}}}}}"
+    return f"LOAD_DATA[1]={{M {load.mass},CM {{{centre},{turned}}},J {{{three}}}}}"
 
 
 def _abb(load: ControllerLoad) -> str:

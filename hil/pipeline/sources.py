@@ -405,8 +405,8 @@ def stamps_of(source: Source, cell: Cell) -> NDArray[np.int64]:
     whole = _usable(archive, cell, numbered).recording.motor_current
     assert whole is not None
     first = 0 if source.context is None else source.context[1]
-    part = whole[first : first + source.recording.n_samples, 0]
-    stamps: NDArray[np.int64] = archive.columns["stamp"][np.rint(part).astype(np.intp)]
+    own = whole[first : first + source.recording.n_samples, 0]
+    stamps: NDArray[np.int64] = archive.columns["stamp"][np.rint(own).astype(np.intp)]
     return stamps
 
 

@@ -340,8 +340,8 @@ def _load(
     scale = 1.0 / np.sqrt(np.diag(arm_information))
     unit = np.linalg.inv(arm_information * scale[:, None] * scale)
     covariance = unit * scale[:, None] * scale + np.diag(drift**2)
-    size = np.sqrt(np.diag(covariance))
-    root = size[:, None] * np.linalg.cholesky(covariance / size[:, None] / size)
+    deviation = np.sqrt(np.diag(covariance))
+    root = deviation[:, None] * np.linalg.cholesky(covariance / deviation[:, None] / deviation)
     direction = np.zeros((1, change.shape[1]))
     direction[0, -1] = 1.0
     allowed = np.array([requirement.value * (payload.mass if requirement.relative else 1.0)])

@@ -99,12 +99,12 @@ class PredictedRows:
         p = directions.shape[1]
         total = motions * np.tensordot(1.0 / density, self.grams, axes=1)
         information = prior + total[:p, :p]
-        size = 1.0 / np.sqrt(np.diag(information))
-        inverse = np.linalg.inv(information * size[:, None] * size) * size[:, None] * size
+        scale = 1.0 / np.sqrt(np.diag(information))
+        inverse = np.linalg.inv(information * scale[:, None] * scale) * scale[:, None] * scale
         rows = np.einsum("kp,pq,kq->k", directions, inverse, directions)
         moved = inverse @ total[:p, p]
-        left = float(total[p, p] - total[:p, p] @ moved)
-        delay = self._delay_variance(1.0 / np.sqrt(left) if left > 0.0 else np.inf)
+        variance = float(total[p, p] - total[:p, p] @ moved)
+        delay = self._delay_variance(1.0 / np.sqrt(variance) if variance > 0.0 else np.inf)
         moved_by_gears, covariance = open_compliance(
             inverse, total[:p, p + 1 :], total[p + 1 :, p + 1 :]
         )

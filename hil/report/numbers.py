@@ -42,12 +42,12 @@ def beside(value: float | None, std: float) -> str:
         return significant(value)
     if not (math.isfinite(value) and math.isfinite(std) and std > 0.0):
         return significant(value, 4)
-    place = int(f"{std:.1e}".split("e")[1]) - 1
-    if place > 0:
+    exponent = int(f"{std:.1e}".split("e")[1]) - 1
+    if exponent > 0:
         return fixed(value, 0)
-    if -place <= _MOST_DECIMALS:
-        return fixed(value, -place)
-    digits = max(1, math.floor(math.log10(abs(value))) - place)
+    if -exponent <= _MOST_DECIMALS:
+        return fixed(value, -exponent)
+    digits = max(1, math.floor(math.log10(abs(value))) - exponent)
     return _short_exponent(f"{value:.{digits}e}")
 
 
@@ -55,10 +55,10 @@ def percent(fraction: float | None, decimals: int | None = None) -> str:
     """Format a fraction in per cent, without the % sign."""
     if fraction is None or math.isnan(fraction) or decimals is not None:
         return fixed(None if fraction is None else 100.0 * fraction, decimals or 0)
-    size = abs(100.0 * fraction)
-    if size >= 1000.0:
+    magnitude = abs(100.0 * fraction)
+    if magnitude >= 1000.0:
         return ">999"
-    return fixed(100.0 * fraction, 0 if size >= 99.5 else 1 if size >= 9.95 else 2)
+    return fixed(100.0 * fraction, 0 if magnitude >= 99.5 else 1 if magnitude >= 9.95 else 2)
 
 
 def with_std(value: float | None, std: float | None) -> str:

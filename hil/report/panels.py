@@ -146,12 +146,12 @@ def box_panel(boxes: Boxes) -> Panel:
         return _panel(figure, boxes.caption, width, _BOX_HEIGHT + bottom)
 
 
-def _box(axes: Axes, place: int, values: Array) -> None:
+def _box(axes: Axes, row: int, values: Array) -> None:
     """Draw quartiles and median, and whiskers to the last values within 1.5 box heights."""
     muted = style.colour(MUTED)
     line = {"color": muted, "linewidth": 1.0}
     parts = axes.boxplot(
-        [values], positions=[place], widths=0.6, patch_artist=True, showfliers=False,
+        [values], positions=[row], widths=0.6, patch_artist=True, showfliers=False,
         manage_ticks=False, capprops=line, whiskerprops=line,
         boxprops={"facecolor": style.colour(BAND), "edgecolor": muted, "linewidth": 1.0},
         medianprops={"color": style.colour(INK), "linewidth": 2.2},
@@ -206,8 +206,8 @@ def _axes(figure: Figure, left: float, top: float, width: float, height: float) 
     """Return axes with distances in px from the upper left corner."""
     whole = figure.get_size_inches() * _POINTS_PER_INCH
     bottom = whole[1] - top - height
-    place = (left / whole[0], bottom / whole[1], width / whole[0], height / whole[1])
-    axes = figure.add_axes(place)
+    rectangle = (left / whole[0], bottom / whole[1], width / whole[0], height / whole[1])
+    axes = figure.add_axes(rectangle)
     axes.patch.set_visible(False)
     return axes
 

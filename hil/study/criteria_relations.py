@@ -139,5 +139,5 @@ def _spearman(x: Array, y: Array) -> Array:
     a, b = (rankdata(values, axis=1) for values in (x, y))
     a = a - a.mean(axis=1, keepdims=True)
     b = b - b.mean(axis=1, keepdims=True)
-    size = np.sqrt((a**2).sum(axis=1) * (b**2).sum(axis=1))
-    return np.asarray((a * b).sum(axis=1) / np.where(size > 0.0, size, 1.0))
+    norm = np.sqrt((a**2).sum(axis=1) * (b**2).sum(axis=1))
+    return np.asarray((a * b).sum(axis=1) / np.where(norm > 0.0, norm, 1.0))

@@ -240,17 +240,17 @@ class _MotionErrors(NamedTuple):
 
 def _errors(model: RobotModel, table: Array, run: Samples) -> _MotionErrors:
     """Return low-passed errors of estimates (k, p) on one motion."""
-    left = np.zeros((*run.torque.shape, len(table)))
+    residual = np.zeros((*run.torque.shape, len(table)))
     for j, (block, used) in enumerate(zip(*run.regressor(model), strict=True)):
-        left[:, j] = run.torque[:, j, None] - block @ table[:, used].T
+        residual[:, j] = run.torque[:, j, None] - block @ table[:, used].T
 
     def filtered(error: Array) -> Array:
         return low_passed(run, error.reshape(len(error), -1)).reshape(error.shape)
 
     whole = _motion_rows(run)
-    squared = (filtered(left)[whole] ** 2).sum(axis=(0, 1)) / (run.torque[whole] ** 2).sum()
-    left[~run.usable] = 0.0
-    slow = np.where(run.usable[..., None], filtered(left), 0.0)
+    squared = (filtered(residual)[whole] ** 2).sum(axis=(0, 1)) / (run.torque[whole] ** 2).sum()
+    residual[~run.usable] = 0.0
+    slow = np.where(run.usable[..., None], filtered(residual), 0.0)
     rows = np.maximum(np.count_nonzero(run.usable, axis=0), 1)
     torque = np.where(run.usable, run.torque, 0.0)
     relative = np.sqrt((slow**2).sum(axis=(0, 1)) / (torque**2).sum())

@@ -86,8 +86,8 @@ class Program:
         s = layout.size
         k = model.n_parameters - b
         bodies = reference_bodies(model.nominal[links], model.chain.translation)
-        size = np.where(np.isfinite(prior.std) & (prior.std > 0.0), prior.std, 1.0)
-        transform = np.diag(size)
+        scale = np.where(np.isfinite(prior.std) & (prior.std > 0.0), prior.std, 1.0)
+        transform = np.diag(scale)
         cones = []
         for places, frame in zip(links, bodies.frames, strict=True):
             entries = np.einsum("ab,kbc,dc->kad", frame, _SYMMETRIC, frame)
@@ -95,14 +95,14 @@ class Program:
             cones.append(Cone(places, _SYMMETRIC, _INSIDE * np.eye(4)))
         alone = layout.rotors
         if layout.pairs:
-            coupled = _coupled_rotors(model, size)
+            coupled = _coupled_rotors(model, scale)
             cones.append(coupled)
             alone = np.setdiff1d(alone, coupled.places)
         # The layout of u is that of the parameters: a link's ten places hold its entries.
         losses = dissipation(model.friction)
         count = len(losses.combine)
         friction = np.zeros((count, s + k))
-        friction[:, s : s + count] = np.linalg.inv(losses.combine) * size[s : s + count]
+        friction[:, s : s + count] = np.linalg.inv(losses.combine) * scale[s : s + count]
         rows = np.concatenate([np.eye(s + k)[alone], friction[losses.not_negative]])
         return cls(bodies, transform, tuple(cones), rows)
 

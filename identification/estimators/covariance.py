@@ -118,9 +118,9 @@ def block_covariance(
     scores = merged(scores, length)
     shares = np.empty((len(scores), root.shape[1], root.shape[1]))
     for start in range(0, len(scores), _AT_ONCE):
-        part = slice(start, start + _AT_ONCE)
-        information = longer.blocks(part).by_block(weights)[:, :-1, :-1]
-        shares[part] = _shares(information, root, root)
+        chunk = slice(start, start + _AT_ONCE)
+        information = longer.blocks(chunk).by_block(weights)[:, :-1, :-1]
+        shares[chunk] = _shares(information, root, root)
     spread = None if prior is None else design_effect**2 * prior
     return _sandwich(shares, scores, solution, longer.block, spread)
 
@@ -395,11 +395,11 @@ def clustered_covariance(
     steep = curvature > _FLAT
     # Coordinates in which all blocks together have unit information.
     to_unit = vectors[:, steep] / np.sqrt(curvature[steep])
-    size = np.maximum(np.linalg.norm(solution.root, axis=1), np.finfo(np.float64).tiny)
+    scale = np.maximum(np.linalg.norm(solution.root, axis=1), np.finfo(np.float64).tiny)
     flat = np.abs(solution.root @ vectors[:, ~steep]).max(axis=1, initial=0.0)
     steep_solution = solution._replace(
         root=solution.root @ to_unit,
-        determined=solution.determined & (flat < _PARTICIPATION * size),
+        determined=solution.determined & (flat < _PARTICIPATION * scale),
     )
     shares = to_unit.T @ information @ to_unit
     return _sandwich(shares, merged(scores[rows > 0], length), steep_solution, length * FINE_BLOCK)

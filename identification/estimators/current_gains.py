@@ -142,8 +142,10 @@ def _reasons(
 ) -> tuple[str | None, ...]:
     """Return why each motor's gain is undetermined or None, from inverse and std (n,)."""
     p = total.shape[1] - 3
-    size = np.abs(inverse)
-    relative = np.divide(std, size, out=np.full_like(size, np.inf), where=size > _VANISHING)
+    magnitude = np.abs(inverse)
+    relative = np.divide(
+        std, magnitude, out=np.full_like(magnitude, np.inf), where=magnitude > _VANISHING
+    )
     # Whether the payload's torque on a motor exceeds rounding.
     powers = np.diagonal(total, axis1=1, axis2=2)
     loaded = powers[:, p] > _NO_LOAD**2 * powers[:, :p].max(axis=1, initial=0.0)

@@ -304,9 +304,11 @@ def _estimated(
         solution = blocks.solution()
         values = np.delete(solution.values, p)
         step = np.clip(solution.values[p], -_PROFILE_STEP, _PROFILE_STEP)
-        before = shift
+        previous = shift
         shift = float(np.clip(shift + step, *ends))
-        if abs(shift - before) <= max(_CONVERGED, _OF_STD * float(np.sqrt(solution.inverse[p, p]))):
+        if abs(shift - previous) <= max(
+            _CONVERGED, _OF_STD * float(np.sqrt(solution.inverse[p, p]))
+        ):
             break
         # What is far from determined need not settle, and often does not.
         if iteration >= _FIRST_ITERATIONS and blocks.delay_std(solution)[0] > WIDEST_INTERVAL:
@@ -561,9 +563,9 @@ class _Reader:
             at = time[b] - shift
             for name, field in fields.items():
                 moved[name][b] = read_at(inside, field[raw], at)
-            place = np.interp(at, time[b], np.arange(len(at)))
+            index = np.interp(at, time[b], np.arange(len(at)))
             clear = self.clear[b]
-            near = clear[np.floor(place).astype(int)] & clear[np.ceil(place).astype(int)]
+            near = clear[np.floor(index).astype(int)] & clear[np.ceil(index).astype(int)]
             usable[b] &= near & ((at >= inside[0]) & (at <= inside[-1]))[:, None]
         result = replace(self.binned, motion=Motion(time, **moved), usable=usable)
         return replace(result, torque=result.torque - result.known_torque(self.model))

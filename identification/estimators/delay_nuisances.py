@@ -95,13 +95,13 @@ def _of_friction(
     """
     speed = np.abs(motion.velocity[:, joint])
     sign = np.sign(motion.velocity[:, joint])
-    size = float(np.sqrt(np.mean(friction**2)))
+    rms = float(np.sqrt(np.mean(friction**2)))
     phase = np.pi * (motion.time - motion.time[0]) / max(np.ptp(motion.time), _TINY)
     for k in range(1, _CHANGES + 1):
         yield f"change {k} of friction", DRIFT / k * np.cos(k * phase) * friction
     for slow in _STATIC_SPEEDS:
-        yield f"friction below {slow:g}", STATIC * size * sign * np.exp(-((speed / slow) ** 2))
+        yield f"friction below {slow:g}", STATIC * rms * sign * np.exp(-((speed / slow) ** 2))
     relative = speed / max(float(speed.max(initial=0.0)), _TINY)
-    yield "quadratic friction", CURVATURE * size * sign * relative**2
+    yield "quadratic friction", CURVATURE * rms * sign * relative**2
     if load is not None:
         yield "friction over load", LOAD_SHARE * np.abs(load) * sign

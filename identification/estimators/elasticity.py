@@ -60,10 +60,10 @@ class ElasticTorque:
         measured = np.zeros((n, n))
         torque = elastic_torque(model, samples, values, compliance)
         torque /= np.where(compliance > 0.0, compliance, 1.0)
-        for part, tables in augmented_rows(model, samples):
+        for rows, tables in augmented_rows(model, samples):
             for joint, (table, used) in enumerate(zip(tables, model.plan.columns, strict=True)):
-                usable = samples.usable[part, joint]
-                effect = torque[part][usable, joint]
+                usable = samples.usable[rows, joint]
+                effect = torque[rows][usable, joint]
                 products[joint][used] += table[:-1, usable] @ effect
                 squares[joint] += effect.T @ effect
                 measured[joint] += effect.T @ table[-1, usable]
@@ -185,9 +185,9 @@ def expected_square(covariance: Array, *, rigid: bool) -> Array:
     """
     shown = np.eye(len(covariance)) - covariance
     variance = np.diag(covariance @ shown if rigid else shown)
-    size = np.sqrt(np.maximum(variance, 0.0))
-    squares = np.outer(size, size) / (2.0 * np.pi)
-    np.fill_diagonal(squares, 0.5 * size**2)
+    deviation = np.sqrt(np.maximum(variance, 0.0))
+    squares = np.outer(deviation, deviation) / (2.0 * np.pi)
+    np.fill_diagonal(squares, 0.5 * deviation**2)
     return np.asarray(covariance + squares)
 
 

@@ -120,12 +120,12 @@ class _Draws:
         model = self.model
         combinations = self.prior.combinations
         combined = combinations * self._deviations
-        size = np.linalg.norm(combined, axis=1)
-        pull = np.linalg.pinv(combined / size[:, None], rcond=_RANK)
+        length = np.linalg.norm(combined, axis=1)
+        pull = np.linalg.pinv(combined / length[:, None], rcond=_RANK)
         start = self.prior.mean + self._start
         change = self.estimate.values + scale * self._change - start @ combinations.T
-        arms = start + (change / size @ pull.T) * self._deviations
-        unseen = _not_combined(combined / size[:, None]) / _or_one(self._deviations)
+        arms = start + (change / length @ pull.T) * self._deviations
+        unseen = _not_combined(combined / length[:, None]) / _or_one(self._deviations)
         rows = np.concatenate([self._inverse_root @ combinations, unseen])
         program = Program.of(model, self.prior)
         moved = np.zeros(len(arms), dtype=np.bool_)

@@ -86,7 +86,7 @@ def friction_trend(sums: Sequence[Array]) -> FrictionDrift | None:
         count < _FEWEST_PIECES + parts - 1, np.nan, np.einsum("pn,pn->n", weight, at**2)
     )
     change = np.einsum("pn,pn,pn->n", weight, at, y) / spread
-    left = np.where(moving, y - change * at, 0.0)
+    residual = np.where(moving, y - change * at, 0.0)
     scale = count / np.maximum(freedom - (pieces - count), 1)
-    std = np.sqrt(((weight * at * left) ** 2).sum(axis=0) / spread**2 * scale)
+    std = np.sqrt(((weight * at * residual) ** 2).sum(axis=0) / spread**2 * scale)
     return FrictionDrift(share, change, std, freedom)

@@ -196,14 +196,14 @@ def _trials(
         / np.repeat(np.maximum(forms.samples, 1), q)
     ).reshape(n, q)
     slow = np.array([term.symbol == STRIBECK.symbol for term in FORMS])
-    size = np.where(slow, 1.0, np.where(rms > 0.0, rms, np.inf))
+    scale = np.where(slow, 1.0, np.where(rms > 0.0, rms, np.inf))
     return _Trials(
         value=value.reshape(n, q),
         std=std.reshape(n, q),
         freedom=freedom.reshape(n, q),
         possible=possible.reshape(n, q) & ~(slow & (rms**2 > _MOSTLY_SLOW)),
         moved=moved.reshape(p, n, q),
-        expected=_SHARE * _friction_rms(model, estimate, forms)[:, None] / size,
+        expected=_SHARE * _friction_rms(model, estimate, forms)[:, None] / scale,
     )
 
 

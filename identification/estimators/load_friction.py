@@ -88,10 +88,10 @@ def fit_with_load(
         result = fit(samples)
         passes += 1
         samples = tuple(recording.with_load(model, result.values) for recording in samples)
-        before = predicted
+        previous = predicted
         predicted = [_predicted(model, result.values, recording) for recording in samples]
-        if before is not None:
-            change = _change(before, predicted)
+        if previous is not None:
+            change = _change(previous, predicted)
         if passes >= most or change < CONVERGED:
             return LoadFit(result, samples, passes, change)
 

@@ -288,8 +288,8 @@ def mass_difference(model: RobotModel, runs: Sequence[Run]) -> tuple[float, floa
 def _consistent(mass: float, centre: Array, six: Array) -> Body:
     """Return the body whose second moments about its centre are those of a tensor (6,), or zero."""
     about = body(np.concatenate([six, np.zeros(3), [mass]]))
-    size, axes = np.linalg.eigh(pseudo_inertia(inertial_parameters(about)))
-    inside = inertial_from_pseudo((axes * np.maximum(size, 0.0)) @ axes.T)
+    moments, axes = np.linalg.eigh(pseudo_inertia(inertial_parameters(about)))
+    inside = inertial_from_pseudo((axes * np.maximum(moments, 0.0)) @ axes.T)
     return Body(mass, centre, body(inside).inertia)
 
 
@@ -348,8 +348,8 @@ class _BodyEstimate(NamedTuple):
         scale = np.linalg.norm(self.determined, axis=0)  # for equal units
         scale = np.where(scale > ROUNDING * scale.max(initial=0.0), scale, 1.0)
         lost = (rows - rows @ np.linalg.pinv(self.determined) @ self.determined) / scale
-        size = np.linalg.norm(rows / scale, axis=1)
-        return np.asarray(np.linalg.norm(lost, axis=1) < PARTICIPATION * size)
+        length = np.linalg.norm(rows / scale, axis=1)
+        return np.asarray(np.linalg.norm(lost, axis=1) < PARTICIPATION * length)
 
     @property
     def mass(self) -> tuple[float, float, float]:

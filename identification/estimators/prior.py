@@ -147,9 +147,9 @@ class TorqueSums(NamedTuple):
                 )
                 / scale
             )
-            before = variance
+            previous = variance
             variance = self.squared_errors(values) / rows
-            if (np.abs(variance - before) <= _SETTLED * before).all():
+            if (np.abs(variance - previous) <= _SETTLED * previous).all():
                 break
         return values, weights
 
@@ -180,13 +180,13 @@ class GaussianPrior:
         """
         flat = np.isinf(std)
         spread = combinations[:, ~flat] * std[~flat]
-        size = _length(spread, axis=1)
-        seen = _null_space(combinations[:, flat] / size[:, None])
-        seen_spread = seen.T @ (spread / size[:, None])
+        length = _length(spread, axis=1)
+        seen = _null_space(combinations[:, flat] / length[:, None])
+        seen_spread = seen.T @ (spread / length[:, None])
         covariance = seen_spread @ seen_spread.T
         scale = np.sqrt(np.diag(covariance))
         lower = np.linalg.cholesky(covariance / np.outer(scale, scale))
-        root = scipy.linalg.solve_triangular(lower, seen.T / scale[:, None], lower=True) / size
+        root = scipy.linalg.solve_triangular(lower, seen.T / scale[:, None], lower=True) / length
         return cls(combinations @ mean, np.asarray(root), origin)
 
     @cached_property
@@ -745,11 +745,11 @@ def _torque_over_columns(model: RobotModel, sums: TorqueSums) -> Array:
     whole = np.where(acting, power[..., None], 0.0).sum(axis=-2)
     rows = np.where(acting, samples[..., None], 0).sum(axis=-2)
     squares = np.maximum(columns.sum(axis=-2), rows * _of_model(model).usual ** 2)
-    size = np.sqrt(whole / np.where(squares > 0.0, squares, 1.0))
+    ratio = np.sqrt(whole / np.where(squares > 0.0, squares, 1.0))
     # Without a row that shows it, a coefficient of the size of the torque.
     rms = np.sqrt(power.sum(axis=-1) / np.maximum(1, samples.sum(axis=-1)))
     rms = np.where(rms > 0.0, rms, 1.0)
-    return np.asarray(np.where(size > 0.0, size, rms[..., None]))
+    return np.asarray(np.where(ratio > 0.0, ratio, rms[..., None]))
 
 
 def _rotor_torque(model: RobotModel, sums: TorqueSums, rotors: NDArray[np.intp]) -> Array:
@@ -855,10 +855,10 @@ def _nominal_ratio(model: RobotModel, sums: TorqueSums) -> tuple[Array, Array]:
     inverse = np.where(significant, 1.0 / np.where(significant, eigenvalues, 1.0), 0.0)
     first = vectors[..., 0, :]
     right = (vectors * (total[..., :-1, -1] / scale)[..., None]).sum(axis=-2)
-    left = total[..., -1, -1] - (inverse * right**2).sum(axis=-1)
+    residual = total[..., -1, -1] - (inverse * right**2).sum(axis=-1)
     rows = _INDEPENDENT * np.maximum(1.0, samples.sum(axis=-1))
     ratio = (first * inverse * right).sum(axis=-1) / scale[..., 0]
-    variance = np.maximum(left, 0.0) / rows * (first**2 * inverse).sum(axis=-1)
+    variance = np.maximum(residual, 0.0) / rows * (first**2 * inverse).sum(axis=-1)
     std = np.sqrt(np.maximum(variance, 0.0)) / scale[..., 0]
     determined = moving[..., 0]
     return np.where(determined, ratio, np.nan), np.where(determined, std, np.inf)

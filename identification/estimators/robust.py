@@ -121,9 +121,9 @@ def _iterate(
     """Weight all rows by their residuals, solve, and update the scale unless fixed."""
     residuals = tuple(np.full(samples.torque.shape, np.nan) for samples in recordings)
     rows = _weighted_rows(model, recordings, state.solution.values, state.scale, loss, residuals)
-    before = state.factor
+    previous = state.factor
     factor = Factor.of_rows(
-        rows, before.samples[None], model.plan.columns, before.parameter_names, before.storage
+        rows, previous.samples[None], model.plan.columns, previous.parameter_names, previous.storage
     )
     weights = inverse_variance(state.scale**2)
     solution = factor.solve(weights if weights.any() else np.ones(len(weights)))
@@ -156,27 +156,27 @@ def _weighted_rows(
     residuals: Sequence[Array],
 ) -> Iterator[tuple[NDArray[np.intp], list[Array]]]:
     """Yield rows of one block times the roots of their weights; writes to `residuals`."""
-    for samples, left in zip(recordings, residuals, strict=True):
-        for part, blocks in augmented_rows(model, samples):
+    for samples, residual in zip(recordings, residuals, strict=True):
+        for rows, blocks in augmented_rows(model, samples):
             for joint, (block, used) in enumerate(zip(blocks, model.plan.columns, strict=True)):
                 error = block[-1] - values[used] @ block[:-1]
-                left[part, joint] = np.where(samples.usable[part, joint], error, np.nan)
+                residual[rows, joint] = np.where(samples.usable[rows, joint], error, np.nan)
                 if np.isfinite(scale[joint]):
                     block *= np.sqrt(loss.weight(error / scale[joint]))
-            yield np.zeros(part.stop - part.start, dtype=np.intp), blocks
+            yield np.zeros(rows.stop - rows.start, dtype=np.intp), blocks
 
 
 def _scales(recordings: Sequence[Samples], residuals: Sequence[Array], solution: Solution) -> Array:
     """Return the standard deviation per joint (n,) from the median of |residual|."""
     usable = np.concatenate([samples.usable for samples in recordings])
     torque = np.concatenate([samples.torque for samples in recordings])
-    left = np.concatenate(residuals)
+    residual = np.concatenate(residuals)
     rows = np.count_nonzero(usable)
     wider = np.sqrt(rows / max(rows - solution.root.shape[1], 1))
-    scale = np.full(left.shape[1], np.nan)
+    scale = np.full(residual.shape[1], np.nan)
     for joint, joint_rows in enumerate(usable.T):
         if joint_rows.any():
             floor = _SMALLEST_SCALE * np.sqrt(np.mean(torque[joint_rows, joint] ** 2))
-            spread = np.median(np.abs(left[joint_rows, joint])) / _MAD * wider
+            spread = np.median(np.abs(residual[joint_rows, joint])) / _MAD * wider
             scale[joint] = max(spread, floor, np.finfo(np.float64).tiny ** 0.5)
     return scale

@@ -50,19 +50,19 @@ def with_siblings(estimates: Sequence[Estimate]) -> Siblings | None:
         return None
     shown = np.where(determined, values, 0.0)[:, used]
     counts = determined[:, used].sum(axis=0)
-    size = np.sqrt((shown**2).sum(axis=0) / counts)
-    size = np.maximum(size, np.nanmedian(np.where(determined, stds, np.nan)[:, used], axis=0))
-    information = np.array([_information(each, used, size) for each in estimates])
-    scaled = shown / size
+    rms = np.sqrt((shown**2).sum(axis=0) / counts)
+    rms = np.maximum(rms, np.nanmedian(np.where(determined, stds, np.nan)[:, used], axis=0))
+    information = np.array([_information(each, used, rms) for each in estimates])
+    scaled = shown / rms
     centre = scaled.sum(axis=0) / counts
     spread = (np.where(determined[:, used], scaled - centre, 0.0) ** 2).sum(axis=0) / counts
     spread = np.maximum(spread, _LEAST_SPREAD**2)
     for _ in range(_MOST_ROUNDS):
-        before = spread
+        previous = spread
         mean, of_mean, centred, covariances = _expected(information, scaled, spread)
         squares = (centred - mean) ** 2 + np.diagonal(covariances, axis1=1, axis2=2)
         spread = np.maximum(squares.mean(axis=0), _LEAST_SPREAD**2)
-        if np.all(np.abs(spread - before) <= _CONVERGED * before):
+        if np.all(np.abs(spread - previous) <= _CONVERGED * previous):
             break
     # The spread of few arms is known poorly, and may have come out too small (Morris 1983).
     doubt = 2.0 / max(1.0, len(estimates) - 3.0)
@@ -74,12 +74,12 @@ def with_siblings(estimates: Sequence[Estimate]) -> Siblings | None:
         pulled = own / wide
         shift = np.where(determined[number, used], scaled[number] - centred[number], 0.0)
         covariance = own + pulled @ of_mean @ pulled.T
-        alone = np.where(determined[number, used], stds[number, used] / size, 0.0) ** 2
+        alone = np.where(determined[number, used], stds[number, used] / rms, 0.0) ** 2
         room = np.maximum(alone - np.diag(covariance), 0.0)  # no wider than without siblings
         covariance = covariance + np.diag(np.minimum(doubt * shift**2, room))
-        found.append(_replaced(each, used, centred[number] * size, covariance, size))
+        found.append(_replaced(each, used, centred[number] * rms, covariance, rms))
     every = np.full((2, len(stds[0])), np.nan)
-    every[:, used] = mean * size, np.sqrt(spread) * size
+    every[:, used] = mean * rms, np.sqrt(spread) * rms
     return Siblings(every[0], every[1], tuple(found))
 
 
@@ -91,13 +91,13 @@ def _marginal_variance(information: Array, spread: Array) -> Array:
     return np.asarray(len(information) / np.maximum(precision.sum(axis=0), 1e-12))
 
 
-def _information(estimate: Estimate, used: Indices, size: Array) -> Array:
+def _information(estimate: Estimate, used: Indices, rms: Array) -> Array:
     """Return the information on some parameters in units of their size; none of undetermined."""
     covariance = estimate.covariance[np.ix_(used, used)]
     known = np.flatnonzero(np.isfinite(np.diag(covariance)) & (np.diag(covariance) > 0.0))
     information = np.zeros_like(covariance)
     if len(known):
-        scale = size[known]
+        scale = rms[known]
         part = covariance[np.ix_(known, known)] / np.outer(scale, scale)
         information[np.ix_(known, known)] = np.linalg.pinv(part, hermitian=True)
     return np.asarray(information, dtype=np.float64)
@@ -122,7 +122,7 @@ def _expected(
 
 
 def _replaced(
-    estimate: Estimate, used: Indices, values: Array, covariance: Array, size: Array
+    estimate: Estimate, used: Indices, values: Array, covariance: Array, rms: Array
 ) -> Estimate:
     """Return an estimate with other values and covariance of some parameters."""
     every = estimate.values.copy()
@@ -130,7 +130,7 @@ def _replaced(
     whole = estimate.covariance.copy()
     whole[used, :] = 0.0
     whole[:, used] = 0.0
-    whole[np.ix_(used, used)] = covariance * np.outer(size, size)
+    whole[np.ix_(used, used)] = covariance * np.outer(rms, rms)
     names = {estimate.names[k] for k in used}
     return replace(
         estimate,

@@ -490,8 +490,8 @@ def _parts(time: Array, segments: Iterable[slice]) -> Iterator[slice]:
 
 def _window(length: int) -> Array:
     """Return a window (length,) from zero to zero, level but for `_TAPERED` of it (Tukey 1967)."""
-    place = np.linspace(0.0, 1.0, length)
-    from_end = np.minimum(place, 1.0 - place) / (0.5 * _TAPERED)
+    phase = np.linspace(0.0, 1.0, length)
+    from_end = np.minimum(phase, 1.0 - phase) / (0.5 * _TAPERED)
     return np.asarray(0.5 - 0.5 * np.cos(np.pi * np.minimum(from_end, 1.0)))
 
 

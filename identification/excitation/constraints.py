@@ -176,12 +176,12 @@ def _beyond(
     kind: Kind, subjects: tuple[str, ...], values: Array, bounds: Array, motion: Motion
 ) -> list[Violation]:
     violations = []
-    size = np.abs(values)
-    for j, k in enumerate(np.argmax(size, axis=0)):
-        if not size[k, j] <= bounds[j]:  # NaN as well
+    magnitude = np.abs(values)
+    for j, k in enumerate(np.argmax(magnitude, axis=0)):
+        if not magnitude[k, j] <= bounds[j]:  # NaN as well
             posture = tuple(motion.position[k].tolist())
             time = float(motion.time[k])
-            most = float(size[k, j]), float(bounds[j])
+            most = float(magnitude[k, j]), float(bounds[j])
             violations.append(Violation(kind, subjects[j], *most, time, posture))
     return violations
 

@@ -52,11 +52,11 @@ def _are_clear(checker: CollisionChecker, paths: Sequence[Array]) -> NDArray[np.
     """Return which paths (m, n) are clear; most contacts show in a few of their postures."""
     clear = np.ones(len(paths), dtype=np.bool_)
     for stride in _STRIDES:
-        left = np.flatnonzero(clear)
-        some = [paths[k][::stride] for k in left.tolist()]
+        unchecked = np.flatnonzero(clear)
+        some = [paths[k][::stride] for k in unchecked.tolist()]
         if some:
             numbers = np.repeat(np.arange(len(some)), [len(path) for path in some])
-            clear[left] = checker.clear(np.concatenate(some), numbers)
+            clear[unchecked] = checker.clear(np.concatenate(some), numbers)
     return clear
 
 
@@ -114,8 +114,8 @@ class ViaPointGenome:
         """Plan motions through points (m_k, n) [rad] at speeds (k, n); see :meth:`motions`."""
         motions = list[PiecewiseCubic | PlannerError]()
         for first in range(0, len(points), _TOGETHER):
-            part = slice(first, first + _TOGETHER)
-            motions += plan_chunk(points[part], speed[part], self.limits, self.fly)
+            chunk = slice(first, first + _TOGETHER)
+            motions += plan_chunk(points[chunk], speed[chunk], self.limits, self.fly)
         return motions
 
     def sample(self, random: np.random.Generator, count: int) -> Array:

@@ -108,10 +108,10 @@ class LoadQuantities:
         loads = self.change.shape[1]
         about = change.T @ left[:, loads:]
         # What the arm's motion does not show has a variance without bound, not zero.
-        size = 1.0 / np.sqrt(np.where(np.diag(about) > 0.0, np.diag(about), 1.0))
-        unit = about * size[:, None] * size + _UNDETERMINED * np.eye(loads)
+        scale = 1.0 / np.sqrt(np.where(np.diag(about) > 0.0, np.diag(about), 1.0))
+        unit = about * scale[:, None] * scale + _UNDETERMINED * np.eye(loads)
         covariance = np.linalg.inv(unit)
-        moved = (self.directions * size) @ covariance * size
+        moved = (self.directions * scale) @ covariance * scale
         slope = moved @ left[:, :loads].T @ self.root.T
         return Spread(np.einsum("kb,kb->k", self.directions, moved), slope)
 

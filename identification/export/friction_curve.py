@@ -62,12 +62,12 @@ def median_load(model: RobotModel, values: Array, recordings: Sequence[Samples])
     if not model.friction.has_load:
         return np.zeros(model.n_joints)
     sizes = [np.abs(model.gear_torque(values, recording.motion)) for recording in recordings]
-    size = np.concatenate(sizes)
+    magnitude = np.concatenate(sizes)
     usable = np.concatenate([recording.usable for recording in recordings])
     return np.array(
         [
             np.median(column[rows] if rows.any() else column)
-            for column, rows in zip(size.T, usable.T, strict=True)
+            for column, rows in zip(magnitude.T, usable.T, strict=True)
         ]
     )
 

@@ -159,12 +159,12 @@ class SteppedFriction:
 
     def _torque(self, v: Array, direction: Array, load: Array) -> Array:
         c = self._column
-        size = np.abs(v)
+        speed = np.abs(v)
         low = np.exp(-((v / c["STRIBECK_SPEED"]) ** 2))
         dry = c["FRICTION_COULOMB"] + c["FRICTION_LOAD"] * load + c["FRICTION_STRIBECK"] * low
-        fluid = c["FRICTION_VISCOUS"] + c["FRICTION_QUADRATIC"] * size + c["FRICTION_CUBIC"] * v**2
+        fluid = c["FRICTION_VISCOUS"] + c["FRICTION_QUADRATIC"] * speed + c["FRICTION_CUBIC"] * v**2
         smooth = c["FRICTION_TANH"] * np.tanh(v / c["TANH_SPEED"])
         return np.asarray(
-            dry * direction + smooth + fluid * v + c["FRICTION_ASYMMETRIC"] * size
+            dry * direction + smooth + fluid * v + c["FRICTION_ASYMMETRIC"] * speed
             + c["FRICTION_OFFSET"]
         )  # fmt: skip

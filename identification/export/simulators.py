@@ -100,8 +100,8 @@ def mjcf(
         _add(link, "inertial", pos=as_text(mass.centre), mass=as_text(mass.mass),
              fullinertia=as_text(six))  # fmt: skip
         _joint(link, motors, arm, j, coupled=bool(coupled[j]), step=step, servos=servos)
-        for frame, place in arm.fixed(j).items():
-            _add(link, "site", name=frame, **_pose(*place))
+        for frame, pose in arm.fixed(j).items():
+            _add(link, "site", name=frame, **_pose(*pose))
     _tendons(root, arm, coupled, step)
     root.append(motors)
     return _text(root)
@@ -255,13 +255,15 @@ def compare(text: str, form: ModelFormat, arm: ExportedArm, motion: Motion) -> S
         MissingDrakeError: likewise Drake.
     """
     difference = read_back(text, form, arm)
-    left = {name: _rms(torque) for name, torque in _left_out(form, arm, motion).items()}
-    left[_REVERSALS] = _rms(_dry(arm, motion) - _dry(arm, motion, jumps=True))
+    omitted = {name: _rms(torque) for name, torque in _left_out(form, arm, motion).items()}
+    omitted[_REVERSALS] = _rms(_dry(arm, motion) - _dry(arm, motion, jumps=True))
     if form.read is _mujoco_torque:
         dry = _mujoco_torque(text, arm, motion, friction=True) - _supported(form, arm, motion)
-        left[_REVERSALS] = _rms(dry - _dry(arm, motion))
+        omitted[_REVERSALS] = _rms(dry - _dry(arm, motion))
     whole = arm.model.torque(arm.values, motion.without_load()) + arm.model.load_torque(motion)
-    return SimulatorComparison(difference, _rms(whole), {k: v for k, v in left.items() if v.any()})
+    return SimulatorComparison(
+        difference, _rms(whole), {k: v for k, v in omitted.items() if v.any()}
+    )
 
 
 def read_back(text: str, form: ModelFormat, arm: ExportedArm, count: int = STATES) -> float:
@@ -394,15 +396,15 @@ def _left_out(form: ModelFormat, arm: ExportedArm, motion: Motion) -> dict[str, 
 
     Without dry friction at reversals, which every simulator has in its own way.
     """
-    left = dict[str, Array]()
+    omitted = dict[str, Array]()
     for name, torque, supported in _parts(form, arm, motion):
         if not supported:
-            left[name] = left.get(name, 0.0) + torque()
+            omitted[name] = omitted.get(name, 0.0) + torque()
     some = motion.rows(slice(None, None, -(-motion.n_samples // _MOST_ROUNDED)))
     rounded, whole = _rounding(arm, some)
     if np.abs(rounded).max() > AGREES * np.abs(whole).max():
-        left[_ROUNDED] = _rounding(arm, motion)[0]
-    return left
+        omitted[_ROUNDED] = _rounding(arm, motion)[0]
+    return omitted
 
 
 def _rounding(arm: ExportedArm, motion: Motion) -> tuple[Array, Array]:

@@ -128,19 +128,19 @@ def friction_factor(model: RobotModel, samples: Samples, terms: Sequence[Frictio
     )
     chunks = (
         (
-            index[part],
+            index[rows],
             [
                 np.concatenate(
                     [
                         table[:-1],
-                        np.where(samples.usable[part, joint], added[joint][:, part], 0.0),
+                        np.where(samples.usable[rows, joint], added[joint][:, rows], 0.0),
                         table[-1:],
                     ]
                 )
                 for joint, table in enumerate(tables)
             ],
         )
-        for part, tables in augmented_rows(model, samples)
+        for rows, tables in augmented_rows(model, samples)
     )
     names = (
         *model.parameter_names,
@@ -187,15 +187,15 @@ def every_torque_factor(model: RobotModel, motions: Sequence[Samples]) -> Factor
     every = samples.torque.T
     chunks = (
         (
-            index[part],
+            index[rows],
             [
                 np.concatenate(
-                    [block[:-1], np.where(samples.usable[part, joint], every[:, part], 0.0)]
+                    [block[:-1], np.where(samples.usable[rows, joint], every[:, rows], 0.0)]
                 )
                 for joint, block in enumerate(tables)
             ],
         )
-        for part, tables in augmented_rows(model, samples)
+        for rows, tables in augmented_rows(model, samples)
     )
     columns = tuple(
         np.append(joint_columns, np.arange(p, p + n - 1)) for joint_columns in model.plan.columns

@@ -94,7 +94,7 @@ class Factor:
             ShapeError: wrong shape of an array.
         """
         index = np.zeros(len(samples.torque), dtype=np.intp) if index is None else index
-        chunks = ((index[part], tables) for part, tables in augmented_rows(model, samples))
+        chunks = ((index[rows], tables) for rows, tables in augmented_rows(model, samples))
         counts = count_by_block(index, samples.usable)
         return cls.of_rows(chunks, counts, model.plan.columns, model.parameter_names, storage)
 
@@ -394,15 +394,15 @@ class Factor:
 
     def restricted(self, chosen: Indices) -> Self:
         """Return the factor of the parameters `chosen` (k,), in that order."""
-        place = np.full(self.n_parameters, -1, dtype=np.intp)
-        place[chosen] = np.arange(len(chosen))
+        index = np.full(self.n_parameters, -1, dtype=np.intp)
+        index[chosen] = np.arange(len(chosen))
         matrices = []
         columns = []
         for matrix, used in zip(self.matrices, self.columns, strict=True):
-            stays = np.flatnonzero(place[used] >= 0)
+            stays = np.flatnonzero(index[used] >= 0)
             both = np.append(stays, len(used))
             matrices.append(matrix[:, both[:, None], both])
-            columns.append(place[used[stays]])
+            columns.append(index[used[stays]])
         names = tuple(self.parameter_names[k] for k in chosen)
         return replace(
             self, matrices=tuple(matrices), columns=tuple(columns), parameter_names=names

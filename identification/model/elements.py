@@ -180,10 +180,10 @@ class GasCylinder(Element):
         base = self.anchors.base
         link = self.anchors.link
         end = base + link if self.pulls else abs(base - link)
-        left = float(self._volume_left(np.array(end)))
-        if not left > 0.0:
+        volume = float(self._volume_left(np.array(end)))
+        if not volume > 0.0:
             raise ModelError(
-                f"the gas has {left:.3g} m³ left where the anchors are {end:.3g} m apart; correct"
+                f"the gas has {volume:.3g} m³ left where the anchors are {end:.3g} m apart; correct"
                 " volume, area, length or the distances of the anchors"
             )
 
@@ -194,8 +194,8 @@ class GasCylinder(Element):
 
     def shapes(self, q: Array) -> Array:
         """Return the computed torque (m, 1) [N·m]."""
-        left = self._volume_left(self.anchors.length(q))
-        force = self.area * self.pressure * self.volume / left
+        volume = self._volume_left(self.anchors.length(q))
+        force = self.area * self.pressure * self.volume / volume
         torque = (1.0 if self.pulls else -1.0) * self.anchors.lever(q) * force
         return np.asarray(torque)[:, None]
 

@@ -501,13 +501,13 @@ def dissipation(friction: JointFriction) -> Dissipation:
     f0, f0 + fs (value at rest of a Stribeck term), f1, or f1 + fd and f1 - fd, and fl are not
     negative. The third term and the offset, which may be a sensor's, can have any sign.
     """
-    place = {(t.motor, t.owner, t.symbol): k for k, t in enumerate(friction.terms)}
-    combine = np.eye(len(place))
+    column = {(t.motor, t.owner, t.symbol): k for k, t in enumerate(friction.terms)}
+    combine = np.eye(len(column))
     for k, (_, term, owner, motor, _) in enumerate(friction.terms):
         if term.pair is None:
             continue
         symbol, matrix = term.pair
-        if (other := place.get((motor, owner, symbol))) is not None:
+        if (other := column.get((motor, owner, symbol))) is not None:
             combine[np.ix_([other, k], [other, k])] = matrix
     kinds = [joint_term.term.not_negative for joint_term in friction.terms]
     return Dissipation(combine, np.array(kinds, dtype=np.bool_))

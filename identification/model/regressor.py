@@ -431,15 +431,15 @@ def _lay_out(plan: RegressorPlan) -> tuple[tuple[Rows, ...], tuple[NDArray[np.in
     offsets = np.concatenate([[0], np.cumsum(sizes)]).tolist()
     rows: list[list[int]] = [[] for _ in range(n)]
     columns: list[list[int]] = [[] for _ in range(n)]
-    place = 0
+    column = 0
     for link, symbols in enumerate(plan.links):
         for position, symbol in enumerate(symbols):
             for joint in chain.ancestors(link):
                 # moments do not act on a prismatic joint
                 if chain.revolute[joint] or symbol >= N_INERTIA:
-                    rows[joint].append(place)
+                    rows[joint].append(column)
                     columns[joint].append(offsets[link] + position)
-            place += 1
+            column += 1
     first_friction = offsets[-1] + len(plan.couplings)
     terms = plan.friction.terms if plan.friction is not None else ()
     places = {term: first_friction + k for k, term in enumerate(terms)}

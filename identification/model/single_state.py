@@ -148,8 +148,8 @@ def _pinocchio_model(model: RobotModel, bodies: Array) -> pin.Model:
             if chain.revolute[j]
             else pin.JointModelPrismaticUnaligned
         )
-        place = pin.SE3(chain.rotation[j], chain.translation[j])
-        index = made.addJoint(int(chain.parents[j]) + 1, kind(chain.axis[j]), place, name)
+        pose = pin.SE3(chain.rotation[j], chain.translation[j])
+        index = made.addJoint(int(chain.parents[j]) + 1, kind(chain.axis[j]), pose, name)
         parameters = bodies[j]
         if payload is not None and payload[0] == j:
             parameters = parameters + payload[1]

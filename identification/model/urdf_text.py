@@ -178,16 +178,16 @@ class _Reading:
                 raise _RefusedError(f"it has more than {MOST_LINKS} links")
 
     def _of_inertia(self, tag: str, attributes: Mapping[str, str]) -> str:
-        place = f"in the <{tag}> of its <inertial>"
+        where = f"in the <{tag}> of its <inertial>"
         needed = [] if tag == "origin" else [key for key in _NUMBERS[tag] if key not in attributes]
         if needed:
             written = " ".join(f'{key}="{_USUAL.get(key, "...")}"' for key in needed)
-            return f"link {self._link!r} has no {', '.join(needed)} {place}; write {written}"
+            return f"link {self._link!r} has no {', '.join(needed)} {where}; write {written}"
         for key, count in _NUMBERS[tag].items():
             text = attributes.get(key)
             if text is not None and not (_FORMS[count].fullmatch(text) and _finite(text)):
                 wanted = "one number" if count == 1 else f"{count} numbers"
-                return f"link {self._link!r} has {key}={text[:40]!r} {place}; write only {wanted}"
+                return f"link {self._link!r} has {key}={text[:40]!r} {where}; write only {wanted}"
         if tag == "mass" and (mass := float(attributes["value"])) < 0.0:
             return f"link {self._link!r} has a mass of {mass:g} kg; write 0 or more"
         if self._has_blanks():

@@ -127,14 +127,14 @@ class _Joint:
     def at(self, delay: float) -> _Fit:
         """Fit the parameters at a delay."""
         columns, error = self._equations(delay)
-        size = _sizes(columns)
-        projected = self.instruments.T @ (columns / size)
+        length = _lengths(columns)
+        projected = self.instruments.T @ (columns / length)
         scaled = scipy.optimize.lsq_linear(
             projected, self.instruments.T @ error, bounds=(0.0, np.inf)
         ).x
         shown = self.instruments.T @ error - projected @ scaled
-        scatter = float(np.mean((error - columns @ (scaled / size)) ** 2))
-        coefficients = scaled / size
+        scatter = float(np.mean((error - columns @ (scaled / length)) ** 2))
+        coefficients = scaled / length
         compliance = coefficients[0]
         values = np.zeros(len(NAMES))
         if compliance > 0.0:
@@ -169,24 +169,24 @@ class _Joint:
     def _covariance(self, delay: float, fit: _Fit) -> Array:
         """Return the covariance of coefficients and delay (6, 6), by sums over the blocks."""
         every, error = self._with_delay(delay, fit)
-        size = _sizes(every)
-        shown = self.instruments @ (self.instruments.T @ (every / size))
+        length = _lengths(every)
+        shown = self.instruments @ (self.instruments.T @ (every / length))
         residual = (error - every[:, :-1] @ fit.coefficients).reshape(self.blocks, -1)
-        parts = shown.reshape(self.blocks, -1, len(size))
+        parts = shown.reshape(self.blocks, -1, len(length))
         sums = np.einsum("brc,br->bc", parts, residual)
         inverse = np.linalg.pinv(shown.T @ shown, hermitian=True, rcond=1e-12)
-        freedom = self.blocks / max(self.blocks - len(size), 1)
-        return np.asarray(freedom * inverse @ (sums.T @ sums) @ inverse / np.outer(size, size))
+        freedom = self.blocks / max(self.blocks - len(length), 1)
+        return np.asarray(freedom * inverse @ (sums.T @ sums) @ inverse / np.outer(length, length))
 
 
 def _column(of_all: Callable[[float], Array], joint: int, delay: float) -> Array:
     return of_all(delay)[:, :, joint]
 
 
-def _sizes(columns: Array) -> Array:
-    size = np.linalg.norm(columns, axis=0)
-    size[size == 0.0] = 1.0
-    return np.asarray(size)
+def _lengths(columns: Array) -> Array:
+    length = np.linalg.norm(columns, axis=0)
+    length[length == 0.0] = 1.0
+    return np.asarray(length)
 
 
 def _joints_of(arm: ExportedArm, stretches: Sequence[Stretch], step: float) -> list[_Joint]:
@@ -237,7 +237,7 @@ def _joints_of(arm: ExportedArm, stretches: Sequence[Stretch], step: float) -> l
     return [
         _Joint(
             len(fixed) // rows,
-            scipy.linalg.orth(instruments[:, :, j] / _sizes(instruments[:, :, j])),
+            scipy.linalg.orth(instruments[:, :, j] / _lengths(instruments[:, :, j])),
             fixed[:, :, j],
             partial(_column, at, j),
         )

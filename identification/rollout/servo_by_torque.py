@@ -110,9 +110,9 @@ def _gains_at(
     kd = np.zeros(n)
     for joint in range(n):
         columns = np.column_stack([error[:, joint], rate[:, joint]])
-        size = np.linalg.norm(columns, axis=0)
-        size[size == 0.0] = 1.0
-        gains = np.linalg.lstsq(columns / size, torque[:, joint], rcond=None)[0] / size
+        length = np.linalg.norm(columns, axis=0)
+        length[length == 0.0] = 1.0
+        gains = np.linalg.lstsq(columns / length, torque[:, joint], rcond=None)[0] / length
         kp[joint] = gains[0]
         kd[joint] = max(0.0, float(gains[1]))
         residual = torque[:, joint] - columns @ gains

@@ -161,10 +161,10 @@ def mean_about(time: Array, values: Array, grid: Array) -> Array:
     widths = np.diff(time)[:, None]
     areas = np.cumsum(0.5 * widths * (values[1:] + values[:-1]), axis=0)
     integral = np.concatenate([np.zeros((1, values.shape[1])), areas])
-    place = np.clip(np.searchsorted(time, edges, side="right") - 1, 0, len(time) - 2)
-    share = ((edges - time[place]) / widths[place, 0])[:, None]
-    slope = values[place + 1] - values[place]
-    at = integral[place] + widths[place] * (share * values[place] + 0.5 * share**2 * slope)
+    index = np.clip(np.searchsorted(time, edges, side="right") - 1, 0, len(time) - 2)
+    share = ((edges - time[index]) / widths[index, 0])[:, None]
+    slope = values[index + 1] - values[index]
+    at = integral[index] + widths[index] * (share * values[index] + 0.5 * share**2 * slope)
     return np.asarray(np.diff(at, axis=0) / step)
 
 

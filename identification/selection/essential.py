@@ -174,10 +174,10 @@ class _Path:
 
     def remove_guarded(self) -> None:
         """Remove until the spread is below the rule, or no removal is allowed."""
-        before: list[int] | None = None
+        previous: list[int] | None = None
         # Refused removals may be possible after others.
-        while before != self.refused:
-            before = self.refused
+        while previous != self.refused:
+            previous = self.refused
             self.refused = []
             while self.current.spread(self._free) >= self._rule.spread:
                 if len(self.current.left) == 1:
@@ -204,27 +204,27 @@ class _Path:
     def _worst(self) -> tuple[int, float]:
         """Return index and relative standard deviation of the next parameter to remove."""
         solution = self.current.solution
-        left = self.current.left
+        remaining = self.current.left
         if not solution.determined.all():
-            information = self._equations.part(left).A
+            information = self._equations.part(remaining).A
             lost = 1.0 - np.einsum("ij,ji->i", solution.inverse, information)
-            return int(left[np.flatnonzero(lost > 0.99 * lost.max())[-1]]), np.inf
+            return int(remaining[np.flatnonzero(lost > 0.99 * lost.max())[-1]]), np.inf
         worst = int(np.argmax(np.where(self._free, self.current.relative, -1.0)))
-        return int(left[worst]), float(self.current.relative[worst])
+        return int(remaining[worst]), float(self.current.relative[worst])
 
     def _without(self, index: int) -> _Subset:
         return self._subset(self.current.left[self.current.left != index])
 
-    def _subset(self, left: Indices) -> _Subset:
-        solution = solve(self._equations.part(left))
+    def _subset(self, remaining: Indices) -> _Subset:
+        solution = solve(self._equations.part(remaining))
         values = np.zeros(len(self._equations.b))
-        values[left] = solution.values
+        values[remaining] = solution.values
         variance = np.maximum(np.diag(solution.inverse), 0.0)
         relative = np.sqrt(variance) / np.maximum(np.abs(solution.values), _TINY)
         relative[~solution.determined] = np.inf
         augmented = np.append(-values, 1.0)
         return _Subset(
-            left,
+            remaining,
             solution,
             relative,
             values,

@@ -457,14 +457,14 @@ def _fitted_lines(values: Array, width: int) -> Array:
     """
     half = width // 2
     fitted = scipy.ndimage.convolve1d(values, np.full(width, 1.0 / width))
-    place = np.arange(-half, half + 1)
+    offset = np.arange(-half, half + 1)
     for window, beside in (
         (slice(0, width), slice(0, half)),
         (slice(len(values) - width, len(values)), slice(half + 1, width)),
     ):
         section = values[window]
-        slope = float(place @ section) / max(1.0, float(place @ place))
-        fitted[window][beside] = section.mean() + slope * place[beside]
+        slope = float(offset @ section) / max(1.0, float(offset @ offset))
+        fitted[window][beside] = section.mean() + slope * offset[beside]
     return np.asarray(fitted)
 
 

@@ -87,11 +87,11 @@ class RowMask:
     @property
     def counts(self) -> dict[str, NDArray[np.intp]]:
         """Excluded rows per joint (n,), by the first matching reason."""
-        left = np.ones(self.shape, dtype=np.bool_)
+        usable = np.ones(self.shape, dtype=np.bool_)
         counts = {}
         for reason, rows in self.reasons.items():
-            counts[reason] = np.count_nonzero(rows & left, axis=0)
-            left &= ~rows
+            counts[reason] = np.count_nonzero(rows & usable, axis=0)
+            usable &= ~rows
         return counts
 
 

@@ -292,10 +292,10 @@ def unwrap(position: Array, gap_before: NDArray[np.bool_] | None = None) -> Arra
     turns = np.rint(np.nan_to_num(steps) / _TURN)
     if not turns.any():
         return position
-    left = np.nan_to_num(steps) - _TURN * turns
-    padded = np.pad(left, ((1, 1), (0, 0)), mode="edge")
+    remainder = np.nan_to_num(steps) - _TURN * turns
+    padded = np.pad(remainder, ((1, 1), (0, 0)), mode="edge")
     usual = 0.5 * (padded[:-2] + padded[2:])
-    turns[np.abs(left - usual) > _SMOOTH + np.abs(usual)] = 0.0
+    turns[np.abs(remainder - usual) > _SMOOTH + np.abs(usual)] = 0.0
     if gap_before is not None:
         at_gap = turns * gap_before[1:, None]
         wraps = (turns - at_gap).any(axis=0)

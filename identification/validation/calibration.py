@@ -175,8 +175,8 @@ def _means(model: RobotModel, samples: Samples) -> tuple[Array, NDArray[np.intp]
     count = count_by_block(index, usable)[present]
     places = [np.append(joint_columns, p) for joint_columns in model.plan.columns]
     sums = np.zeros((int(index[-1]) + 1, model.n_joints, p + 1))
-    for part, chunk in augmented_rows(model, replace(samples, usable=usable)):
-        for block, at in block_slices(index[part]):
+    for rows, chunk in augmented_rows(model, replace(samples, usable=usable)):
+        for block, at in block_slices(index[rows]):
             for joint, joint_rows in enumerate(chunk):
                 sums[block, joint, places[joint]] += joint_rows[:, at].sum(axis=1)
     divisor = np.where(count > 0.5 * np.bincount(index).max(), count, np.nan)

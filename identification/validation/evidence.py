@@ -75,12 +75,12 @@ def repetition_noise(
         step = step or float(np.median(np.diff(samples.motion.time)))
         index = np.rint((samples.motion.time - samples.origin) / step).astype(np.int64)
         rows, joints = np.nonzero(samples.usable & (index >= 0)[:, None])
-        left = residual(model, values, samples, bandwidth)
-        parts.append((index[rows], joints, left[rows, joints]))
+        error = residual(model, values, samples, bandwidth)
+        parts.append((index[rows], joints, error[rows, joints]))
     length = max((int(index.max(initial=-1)) for index, _, _ in parts), default=-1) + 1
     table = np.full((len(parts), length, model.n_joints), np.nan)
-    for repetition_row, (index, joints, left) in zip(table, parts, strict=True):
-        repetition_row[index, joints] = left
+    for repetition_row, (index, joints, error) in zip(table, parts, strict=True):
+        repetition_row[index, joints] = error
     count = np.count_nonzero(~np.isnan(table), axis=0)
     shared = count >= 2
     mean = np.nansum(table, axis=0) / np.maximum(count, 1)

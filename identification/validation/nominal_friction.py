@@ -26,8 +26,8 @@ def with_fitted_friction(model: RobotModel, nominal: Array, factor: Factor) -> A
     fitted[model.friction_part] = True
     given = np.where(fitted, 0.0, nominal)
     gram = np.tensordot(joint_weights(factor), factor.gram, axes=1)
-    left = gram[:-1, -1] - gram[:-1, :-1] @ given
+    residual = gram[:-1, -1] - gram[:-1, :-1] @ given
     square = gram[:-1, :-1][np.ix_(fitted, fitted)]
     values = given.copy()
-    values[fitted] = solve_with_ridge(square, left[fitted], _RIDGE)
+    values[fitted] = solve_with_ridge(square, residual[fitted], _RIDGE)
     return values

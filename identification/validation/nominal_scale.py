@@ -141,8 +141,8 @@ def _scale(table: Array, torque: Array, deviations: Array, *, share: float) -> t
     others = table[:, 1:]
     if len(torque) < 10 * _BLOCKS or not rigid.any():
         return np.nan, np.inf
-    size = np.linalg.norm(others, axis=0)
-    basis, _ = np.linalg.qr(others[:, size > 0.0] / size[size > 0.0])
+    length = np.linalg.norm(others, axis=0)
+    basis, _ = np.linalg.qr(others[:, length > 0.0] / length[length > 0.0])
     # Part of the nominal torque that friction does not explain.
     alone = rigid - basis @ (basis.T @ rigid)
     power = float(alone @ alone)
@@ -150,8 +150,8 @@ def _scale(table: Array, torque: Array, deviations: Array, *, share: float) -> t
         return np.nan, np.inf
     scale = float(alone @ torque) / power
     friction = basis @ (basis.T @ (torque - scale * rigid))
-    left = np.array_split(alone * (torque - scale * rigid - friction), _BLOCKS)
-    scatter = np.square([part.sum() for part in left]).sum()
+    residuals = np.array_split(alone * (torque - scale * rigid - friction), _BLOCKS)
+    scatter = np.square([part.sum() for part in residuals]).sum()
     std = np.sqrt(scatter * _BLOCKS / (_BLOCKS - 1)) / power
     lost = float(rigid @ rigid) / power - 1.0
     misfit = _FRICTION_SHARE * np.linalg.norm(friction) / np.sqrt(power)

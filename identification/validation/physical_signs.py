@@ -82,11 +82,11 @@ def implausibilities(
     torque_rms = np.sqrt(motion.gram[:, -1, -1] / np.maximum(motion.samples, 1))
     little = little_torque(torque_rms, ~model.chain.revolute)
     limit = np.where(little, _FAR_ABOVE, 1.0) * error_rms
-    for sign, part in _wrong_signs(model, estimate, speed, added):
+    for sign, causing in _wrong_signs(model, estimate, speed, added):
         if sign.kind == "little friction at speed by a chosen term":
             chosen.append(sign)
             continue
-        part_values = np.where(part, estimate.values, 0.0)
+        part_values = np.where(causing, estimate.values, 0.0)
         squares = np.einsum("i,jik,k->j", part_values, motion.gram[:, :-1, :-1], part_values)
         torque = np.sqrt(np.maximum(squares, 0.0) / np.maximum(motion.samples, 1))
         (impossible if np.any(torque > limit) else doubtful).append(sign)

@@ -98,9 +98,9 @@ def _steps_of(
     steps = np.concatenate([np.diff(time[part]) for part in parts])[:, None]
     after = np.concatenate([np.arange(part.start + 1, part.stop) for part in parts])
     departure, shown = _without_clock(departure, speed, steps)
-    size = np.abs(departure)
-    spread = _NORMAL * np.median(size, axis=0)
-    usual = np.partition(size, -_USUAL, axis=0)[-_USUAL] if len(size) > 10 * _USUAL else 0.0
+    distance = np.abs(departure)
+    spread = _NORMAL * np.median(distance, axis=0)
+    usual = np.partition(distance, -_USUAL, axis=0)[-_USUAL] if len(distance) > 10 * _USUAL else 0.0
     least = np.maximum(np.maximum(_STANDS_OUT * spread, _BEYOND_USUAL * usual), _FASTEST * steps**2)
     least = np.maximum(least, rounded)
     # Missing or repeated rows cause departures by whole steps of the motion, also beside a gap.
@@ -110,12 +110,12 @@ def _steps_of(
     )
     apart = np.abs(departure - count * motion_step)
     whole = apart < np.maximum(least, _WHOLE * np.abs(motion_step))
-    suspect = (size - 0.5 * change > least) & (shown | ~whole)
+    suspect = (distance - 0.5 * change > least) & (shown | ~whole)
     lasting = np.zeros_like(suspect)
     for joint, k in np.argwhere(suspect.T):
         around = departure[max(0, k - _BESIDE) : k + _BESIDE + 1, joint]
         # Otherwise the steps beside it reverse it.
-        lasting[k, joint] = np.abs(around.sum()) > 0.5 * size[k, joint]
+        lasting[k, joint] = np.abs(around.sum()) > 0.5 * distance[k, joint]
     by_whole_steps = (count != 0.0) & (apart < _WHOLE * np.abs(motion_step))
     often = np.count_nonzero(lasting & by_whole_steps) >= _OFTEN
     moving = np.abs(motion_step) > _MOVES * spread
@@ -186,11 +186,11 @@ def _departures(time: Array, position: Array) -> tuple[Array, Array, Array]:
 def _without_clock(departure: Array, speed: Array, steps: Array) -> tuple[Array, NDArray[np.bool_]]:
     """Subtract the time error shown by the other joints from departures (m, n)."""
     # Departures of zero, at rest, do not measure noise.
-    size = np.abs(departure)
+    distance = np.abs(departure)
     noise = np.array(
         [
             _NORMAL * np.median(some) if (some := column[column > 0.0]).size else np.inf
-            for column in size.T
+            for column in distance.T
         ]
     )
     off = departure / noise
@@ -199,5 +199,5 @@ def _without_clock(departure: Array, speed: Array, steps: Array) -> tuple[Array,
     # Time error of the other joints, regularised by one step.
     error = ((rate * off).sum(axis=1, keepdims=True) - rate * off) / (weight + steps**-2)
     without = departure - speed * error
-    less = np.where(np.abs(without) < size, without, departure)
+    less = np.where(np.abs(without) < distance, without, departure)
     return less, weight * steps**2 > _SHOWS**2

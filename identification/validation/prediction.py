@@ -234,8 +234,8 @@ def slow_error(model: RobotModel, values: Array, samples: Samples, bandwidth: fl
     change = (friction * error * usable).sum(axis=0) / np.where(power > 0.0, power, 1.0)
 
     def less(share: Array) -> PredictionError:
-        left = error - share * friction
-        return PredictionError.between(samples.torque, samples.torque - left, usable)
+        remainder = error - share * friction
+        return PredictionError.between(samples.torque, samples.torque - remainder, usable)
 
     forgiven = np.clip(change, -FRICTION_CHANGE, FRICTION_CHANGE)
     return SlowError(less(forgiven), change, less(change))

@@ -78,7 +78,7 @@ class Profile(NamedTuple):
 
 
 def _profile(
-    runs: Sequence[Samples], left: Sequence[Array], over: Sequence[Array], repeated: int
+    runs: Sequence[Samples], residuals: Sequence[Array], over: Sequence[Array], repeated: int
 ) -> Profile:
     """Average residuals (m, n) of usable rows in equal bins of each joint's own quantity."""
     lowest = np.full(over[0].shape[1], np.inf)
@@ -93,14 +93,14 @@ def _profile(
     highest = np.where(moved, highest, 1.0)
     edges = np.linspace(lowest, highest, BINS + 1, axis=1)
     sums = []
-    for run, residual, quantity in zip(runs, left, over, strict=True):
+    for run, residual, quantity in zip(runs, residuals, over, strict=True):
         block = block_index(run)
         binned_sums = np.zeros((2, int(block[-1]) + 1, len(edges), BINS))
         for joint, usable in enumerate(run.usable.T):
             bins = np.searchsorted(edges[joint, 1:-1], quantity[:, joint], side="right")
-            place = block * BINS + bins
+            cell = block * BINS + bins
             for table, weights in zip(binned_sums, (residual[:, joint], usable), strict=True):
-                some = np.bincount(place, np.where(usable, weights, 0.0), len(table) * BINS)
+                some = np.bincount(cell, np.where(usable, weights, 0.0), len(table) * BINS)
                 table[:, joint] = some.reshape(-1, BINS)
         sums.append(binned_sums)
     return Profile(edges, block_mean(sums, repeated))
@@ -217,8 +217,8 @@ def autocorrelation(
     lags = max(2, min(_MOST_LAGS, round(longest / step)))
     shape = (lags + 1, residuals[0][0].shape[1])
     products, pairs = np.zeros((2, *shape))
-    for left, usable in residuals:
-        for joint, (column, rows) in enumerate(zip(left.T, usable.T, strict=True)):
+    for residual, usable in residuals:
+        for joint, (column, rows) in enumerate(zip(residual.T, usable.T, strict=True)):
             products[:, joint] += _products(np.where(rows, column, 0.0), lags)
             pairs[:, joint] += _products(rows.astype(np.float64), lags)
     pairs = np.rint(pairs)
@@ -283,7 +283,7 @@ def check_residuals(
     """
     runs = [*training, *held_out]
     fitted = len(training)
-    left = [
+    residuals = [
         np.where(run.usable, run.torque - run.predicted_torque(model, values), 0.0) for run in runs
     ]
     torque = np.array(
@@ -293,13 +293,13 @@ def check_residuals(
     repeated = fitted if same_motion else 1
     pieces = -(-PIECES // fitted)
     drift = [
-        _drift_sums(model, values, *pair, pieces) for pair in zip(training, left, strict=False)
+        _drift_sums(model, values, *pair, pieces) for pair in zip(training, residuals, strict=False)
     ]
     ripple = None
     if motor_from_joint is not None:
         waves = [
             _ripple_sums(*run_residual, motor_from_joint)
-            for run_residual in zip(runs, left, strict=True)
+            for run_residual in zip(runs, residuals, strict=True)
         ]
         ripple = Ripple(block_mean(waves, repeated))
     friction_power = sum(run_sums[1].sum(axis=0) for run_sums in drift)
@@ -308,18 +308,20 @@ def check_residuals(
     usable = [run.usable for run in runs]
     outliers = find_outliers(
         _joined([run.torque for run in runs[judged]]),
-        _joined(left[judged]),
+        _joined(residuals[judged]),
         _joined(usable[judged]),
     )
     steps = [np.median(np.diff(run.motion.time)) for run in training]
     return ResidualChecks(
         torque_rms=np.sqrt(torque.sum(axis=0) / rows),
-        rms=np.sqrt(sum(np.einsum("mj,mj->j", residual, residual) for residual in left) / rows),
-        autocorrelation=autocorrelation(
-            list(zip(left[:fitted], usable[:fitted], strict=True)), float(np.median(steps))
+        rms=np.sqrt(
+            sum(np.einsum("mj,mj->j", residual, residual) for residual in residuals) / rows
         ),
-        speed=_profile(runs, left, [run.motion.velocity for run in runs], repeated),
-        position=_profile(runs, left, [run.motion.position for run in runs], repeated),
+        autocorrelation=autocorrelation(
+            list(zip(residuals[:fitted], usable[:fitted], strict=True)), float(np.median(steps))
+        ),
+        speed=_profile(runs, residuals, [run.motion.velocity for run in runs], repeated),
+        position=_profile(runs, residuals, [run.motion.position for run in runs], repeated),
         ripple=ripple,
         drift=friction_trend(drift),
         friction_share=np.sqrt(friction_power / np.where(seen > 0.0, seen, 1.0)),
@@ -355,8 +357,8 @@ def folded_noise(
     """
     squares, power, noise, low = np.zeros(4)
     for run in recordings:
-        left = np.where(run.usable, run.torque - run.predicted_torque(model, values), 0.0)
-        squares += float((left**2).sum())
+        error = np.where(run.usable, run.torque - run.predicted_torque(model, values), 0.0)
+        squares += float((error**2).sum())
         power += float((run.torque[run.usable] ** 2).sum())
         part = max(run.segments, key=_length, default=slice(0, 0))
         if _length(part) < 2:
@@ -366,7 +368,7 @@ def folded_noise(
         length = min(_length(part), round(_RESOLVED / step))
         if highest < 2.0 * bandwidth or length * step * bandwidth < 1.0:
             continue
-        frequency, density = power_density(left[part], 1.0 / step, length)
+        frequency, density = power_density(error[part], 1.0 / step, length)
         octave = np.floor(np.log2(frequency / bandwidth)).astype(np.intp)
         complete = range(int(np.log2(highest / bandwidth)))
         within = frequency < bandwidth

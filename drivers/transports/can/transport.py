@@ -154,16 +154,16 @@ class CanLink:
         """
         self._require_open()
         end = time.monotonic() + timeout
-        left = timeout
+        remaining = timeout
         queued = MAX_QUEUED
         while True:
-            message = self._next(max(0.0, left))
+            message = self._next(max(0.0, remaining))
             if message is not None:
                 packet = self._decode(message)
                 if packet is not None:
                     return packet
-            left = end - time.monotonic()
-            if left <= 0.0:
+            remaining = end - time.monotonic()
+            if remaining <= 0.0:
                 queued -= 1
                 if message is None or queued == 0:
                     return None

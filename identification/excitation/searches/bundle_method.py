@@ -148,12 +148,12 @@ def _step(
     n = len(genes)
     offsets = [0.0] + [cut.offset(genes, fitness) for cut in bundle[1:]]
     rows = np.concatenate([-cut.slopes.rows for cut in bundle])
-    left = np.concatenate([np.maximum(cut.left(genes), 0.0) for cut in bundle])
+    margins = np.concatenate([np.maximum(cut.left(genes), 0.0) for cut in bundle])
     reach = box * np.abs(rows).sum(axis=1)
-    left -= backoff * reach
-    within = left < reach  # the others hold in all of the box
+    margins -= backoff * reach
+    within = margins < reach  # the others hold in all of the box
     rows = rows[within]
-    left = left[within]
+    margins = margins[within]
     gradients = np.array([-cut.slopes.gradient for cut in bundle])
     scale = np.abs(rows).max(axis=1, initial=0.0)
     unit = np.eye(n)
@@ -168,7 +168,7 @@ def _step(
     )
     upper = np.minimum(box, 1.0 - genes)
     lower = np.minimum(box, genes)
-    bound = np.concatenate((left / scale, upper, lower, offsets))
+    bound = np.concatenate((margins / scale, upper, lower, offsets))
     quadratic = scipy.sparse.diags_array(np.append(np.full(n, _CURVATURE), 0.0)).tocsc()
     settings: Any = clarabel.DefaultSettings()
     settings.verbose = False

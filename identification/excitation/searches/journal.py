@@ -106,9 +106,9 @@ class Journal:
         """Write content after the last valid record and truncate the file there."""
         self._file.seek(self._next)
         self._file.truncate()
-        left = memoryview(content)
-        while left:  # an unbuffered file may take a part
-            left = left[self._file.write(left) :]
+        unwritten = memoryview(content)
+        while unwritten:  # an unbuffered file may take a part
+            unwritten = unwritten[self._file.write(unwritten) :]
         self._file.flush()
         self._next += len(content)
 

@@ -155,11 +155,11 @@ class Front:
 
     def _nondominated(self) -> Self:
         cost = np.column_stack((columns(-SENSE * self.measures, self.criteria), self.precision))
-        left = np.lexsort((*self.genes.T[::-1], self.duration, *cost.T))
+        remaining = np.lexsort((*self.genes.T[::-1], self.duration, *cost.T))
         nondominated = []
-        while len(left):  # no other one dominates the first in this order
-            nondominated.append(left[0])
-            left = left[np.any(cost[left] < cost[left[0]], axis=1)]
+        while len(remaining):  # no other one dominates the first in this order
+            nondominated.append(remaining[0])
+            remaining = remaining[np.any(cost[remaining] < cost[remaining[0]], axis=1)]
         return self._part(np.array(nondominated, dtype=np.intp))
 
 

@@ -301,8 +301,8 @@ def _loads(currents: CurrentModel, motion: Motion) -> Iterator[Margin]:
             change[reversing[:, joint]] = 0.0
         slope[:, kind, joint] = -change[row, column]
     for peak, at, which, place in zip(slope, sample, column, row, strict=True):
-        left = float(1.0 - _RESERVE - loads[at, which])
-        yield Margin(float(motion.time[at]), chosen[:, place], peak, left)
+        margin = float(1.0 - _RESERVE - loads[at, which])
+        yield Margin(float(motion.time[at]), chosen[:, place], peak, margin)
 
 
 def _near_reversal(currents: CurrentModel, velocity: Array) -> NDArray[np.bool_]:
@@ -345,8 +345,8 @@ def _distances(checker: CollisionChecker, time: Array, states: Array) -> Iterato
                 continue
             slope = np.zeros((3, n))
             slope[0] = (distance[:n] - distance[n:]) / (2.0 * _POSITION_STEP)
-            left = here - checker.required[index] - _SPARE
-            yield Margin(float(time[nearest]), states[:, nearest], slope, left)
+            margin = here - checker.required[index] - _SPARE
+            yield Margin(float(time[nearest]), states[:, nearest], slope, margin)
 
 
 def _states(motion: Motion) -> Array:

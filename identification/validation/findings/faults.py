@@ -194,13 +194,13 @@ def fault_values(each: Explanation) -> dict[str, Value]:
 
     `difference` has the sign of the size, `whole` is what the ratio is of.
     """
-    size = each.size or 0.0
+    change_size = each.size or 0.0
     is_factor = each.change.meaning in ("scale", "friction")
     unit = 1e3 if each.change.meaning == "delay" else 1.0
     values: dict[str, Value] = {
-        "size": abs(unit * size + (1.0 if is_factor else 0.0)),
+        "size": abs(unit * change_size + (1.0 if is_factor else 0.0)),
         "half_interval": unit * each.half_interval,
-        "difference": size,
+        "difference": change_size,
         "ratio": each.ratio,
         "whole": "the fitted motion",
     }
