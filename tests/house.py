@@ -22,7 +22,7 @@ CEILINGS: Final[Mapping[str, int]] = {
     "folder circles": 0,
     "imports inside functions": 17,
     "banned names": 0,
-    "functions over 60 lines": 9,
+    "functions over 60 lines": 4,
     "motions taken apart": 0,
     "array types defined twice": 0,
     "long names of tests": 0,
@@ -226,14 +226,13 @@ class Sources:
         ]
 
     def long_functions(self) -> list[str]:
-        """Functions of more lines than `_LONG`, docstring included."""
+        """Functions of more lines than `_LONG`, docstring left out."""
         return [
-            f"{name}:{node.lineno} {node.name}, {node.end_lineno - node.lineno + 1} lines"
+            f"{name}:{node.lineno} {node.name}, {count} lines"
             for name, nodes in self.nodes.items()
             for node in nodes
             if isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef)
-            and node.end_lineno is not None
-            and node.end_lineno - node.lineno >= _LONG
+            and (count := _code_lines(node)) > _LONG
         ]
 
 
@@ -293,6 +292,15 @@ def _public_functions(tree: ast.AST) -> Iterator[ast.FunctionDef | ast.AsyncFunc
             yield from _public_functions(node)
         elif isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef):
             yield node
+
+
+def _code_lines(node: ast.FunctionDef | ast.AsyncFunctionDef) -> int:
+    """Lines of a function without its docstring."""
+    count = (node.end_lineno or node.lineno) - node.lineno + 1
+    text = node.body[0]
+    if ast.get_docstring(node) is None:
+        return count
+    return count - ((text.end_lineno or text.lineno) - text.lineno + 1)
 
 
 def _parameters(node: ast.FunctionDef | ast.AsyncFunctionDef) -> int:
