@@ -84,7 +84,7 @@ class Twin:
     def link(self, seconds: float, *, effects: bool) -> VirtualLink:
         """Return a link in virtual time to the arm, with random faults."""
         if self.cell.is_ur:
-            return self._ur_link(seconds)
+            return self._ur_link(seconds, effects=effects)
         table = self.cell.controller
         # The current loop has the delay of `[controller] current_delay_cycles`.
         lag = (LOOP_CYCLES - table.current_delay_cycles) * self.cell.period
@@ -103,12 +103,13 @@ class Twin:
             SimulatedTransport(controller, faults), self.cell, finish=controller.finish
         )
 
-    def _ur_link(self, seconds: float) -> VirtualLink:
+    def _ur_link(self, seconds: float, *, effects: bool) -> VirtualLink:
         """Return one to a controller of Universal Robots: its servoj lags by some 30 ms.
 
         It has the torque constants of the cell.
         """
-        robot = simulated_ur(self.cell, seed=self.seed, truth=arm_truth(self.cell, exact=True))
+        truth = arm_truth(self.cell, exact=True)
+        robot = simulated_ur(self.cell, seed=self.seed, truth=truth, effects=effects)
         peer = UrPeer(robot)
         faults = link_faults(self.cell, _HORIZON * seconds, self.seed)
         return VirtualLink.over(SimulatedTransport(peer, faults), self.cell, finish=peer.finish)

@@ -10,7 +10,7 @@ from hil.base.arrays import Array
 from hil.cell import Cell, CellError
 from identification.model.known_payload import Payload
 from identification.model.pseudo_inertia import body
-from sim_fixtures import PlantTruth
+from sim_fixtures import PlantTruth, UnmodelledEffects
 from sim_fixtures.plant import Carried
 
 
@@ -64,4 +64,15 @@ def planted_values(cell: Cell) -> Array:
         viscous=truth.viscous,
         third=truth.third,
         inertia_scale=truth.inertia_scale,
+    )
+
+
+def unmodelled_effects(cell: Cell) -> UnmodelledEffects:
+    """Return the unmodelled effects with the sizes of the cell."""
+    settings = cell.simulation
+    return UnmodelledEffects(
+        torque_ripple=settings.torque_ripple,
+        friction_drift=settings.friction_drift,
+        elasticity=tuple(settings.elasticity),
+        delay=settings.delay,
     )

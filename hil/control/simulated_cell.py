@@ -14,7 +14,7 @@ from hil.base.arrays import Array
 from hil.cell import AngleFrame, Cell, CellError
 from hil.control.motion_checks import collision_checker
 from hil.control.own_moves import InterpolatedMoves
-from hil.control.planted_arm import carried, planted_truth
+from hil.control.planted_arm import carried, planted_truth, unmodelled_effects
 from hil.control.ur_simulation import ur_link
 from hil.control.virtual_link import VirtualLink
 from identification.text import percentage
@@ -73,7 +73,7 @@ def simulated_link(
             'set it to "simulated" to run without hardware',
         )
     if cell.is_ur:
-        return ur_link(cell, session=session)
+        return ur_link(cell, session=session, effects=effects)
     settings = replace(controller_settings(cell, effects=effects), only_axis=only_axis)
     controller = simulated_controller(
         cell, effects=effects, drive=drive, truth=truth, settings=settings, session=session
@@ -210,17 +210,6 @@ def simulated_drive(cell: Cell) -> SimulatedDrive:
         k54=table.k54,
         k64=table.k64,
         k65=table.k65,
-    )
-
-
-def unmodelled_effects(cell: Cell) -> UnmodelledEffects:
-    """Return the unmodelled effects with the sizes of the cell."""
-    settings = cell.simulation
-    return UnmodelledEffects(
-        torque_ripple=settings.torque_ripple,
-        friction_drift=settings.friction_drift,
-        elasticity=tuple(settings.elasticity),
-        delay=settings.delay,
     )
 
 

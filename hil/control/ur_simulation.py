@@ -16,7 +16,7 @@ from drivers.ur.rtde import ControllerVersion, OutputRecipe
 from drivers.ur.wire import OPTIONAL, REQUIRED
 from hil.base.errors import InputError
 from hil.cell import Cell
-from hil.control.planted_arm import planted_truth
+from hil.control.planted_arm import planted_truth, unmodelled_effects
 from hil.control.virtual_link import VirtualLink
 from sim_fixtures.settings import SettingError, SimulationError
 from sim_fixtures.ur import (
@@ -98,9 +98,9 @@ class UrPeer:
         return UrDescription(identity, version, settings.frequency, recipe, 1).encode()
 
 
-def ur_link(cell: Cell, *, session: int = 0) -> VirtualLink:
+def ur_link(cell: Cell, *, session: int = 0, effects: bool = False) -> VirtualLink:
     """Return a link in virtual time to the simulated controller and arm of a cell."""
-    peer = UrPeer(simulated_ur(cell, session=session))
+    peer = UrPeer(simulated_ur(cell, session=session, effects=effects))
     return VirtualLink.over(SimulatedTransport(peer), cell, finish=peer.finish)
 
 
@@ -111,6 +111,7 @@ def simulated_ur(
     seed: int | None = None,
     session: int = 0,
     truth: UrArmTruth | None = None,
+    effects: bool = False,
 ) -> SimulatedUr:
     """Return controller and arm of a cell, at rest at its initial posture.
 
@@ -120,6 +121,7 @@ def simulated_ur(
         seed: of the noise, that of the cell by default.
         session: number of earlier sessions; each has noise of its own.
         truth: what the arm is; by default that of the cell.
+        effects: whether to simulate unmodelled effects, with the sizes of the cell.
     """
     return SimulatedUr(
         replace(_settings(cell), remote_control=True, payload=_payload(cell)),
@@ -128,6 +130,7 @@ def simulated_ur(
         faults=faults,
         seed=(cell.simulation.seed if seed is None else seed) + 1000 * session,
         urdf=cell.urdf,
+        effects=unmodelled_effects(cell) if effects else None,
     )
 
 

@@ -44,7 +44,12 @@ _COULOMB_SHARE: Final = 0.05
 """Assumed Coulomb friction, as a share of the largest torque."""
 _JERK_TIME: Final = 0.1
 """Assumed time of full acceleration, s."""
-_FOLLOWING_ERROR: Final = 2.0  # motor revolutions, an eighth of a radian
+_SERVO_LAG: Final = 0.035
+"""Time from a set-point to the arm that servoj takes at its shortest look-ahead [s]: measured by
+users of the maker's client library and ROS 2 driver (issues 86 and 1311), 34 and 35 ms."""
+_LAG_MARGIN: Final = 1.5
+"""Largest distance from the set-point, as a multiple of what that lag is at full speed."""
+_FULL_SPEED: Final = np.pi  # of a joint whose speed the arm does not state, rad/s
 _COUNTS: Final = 65536
 
 
@@ -215,11 +220,10 @@ def _flange(urdf: str) -> str | None:
 
 
 def _assumed(arm: UrArmStatements) -> Iterator[tuple[str, Any]]:
-    ones = np.ones(N_JOINTS)
     # They are the arm's own, and doubtful until a payload was weighed.
     yield "drive_train.torque_constant", _known(constants_of(arm) / GEAR_RATIO)
     yield "drive_train.torque_uncertainty", UNCERTAINTY
-    yield "drive_train.following_error", (_FOLLOWING_ERROR * ones).tolist()
+    yield "drive_train.following_error", _following_error(arm)
     yield "drive_train.encoder_counts_per_revolution", _COUNTS
     acceleration, velocity = arm.identity.acceleration, arm.identity.velocity
     if acceleration is not None:
@@ -229,6 +233,14 @@ def _assumed(arm: UrArmStatements) -> Iterator[tuple[str, Any]]:
         coulomb = _COULOMB_SHARE * np.array(torques)
         yield "nominal.coulomb", np.round(coulomb, 3).tolist()
         yield "nominal.viscous", np.round(coulomb / velocity, 3).tolist()
+
+
+def _following_error(arm: UrArmStatements) -> list[float]:
+    """Return the largest distance of arm and set-point (6,) [motor revolutions]."""
+    stated = arm.identity.velocity
+    velocity = np.full(N_JOINTS, _FULL_SPEED) if stated is None else stated
+    lag = _LAG_MARGIN * _SERVO_LAG * velocity * GEAR_RATIO / (2.0 * np.pi)
+    return [round(float(turns), 2) for turns in lag]
 
 
 def _notes(arm: UrArmStatements, urdf: str) -> Iterator[str]:

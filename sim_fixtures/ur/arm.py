@@ -13,8 +13,9 @@ from typing import Final
 import numpy as np
 import pinocchio as pin
 
+from sim_fixtures.arm import SimulatedDrift, SimulatedRipple, UnmodelledEffects
 from sim_fixtures.arrays import Array
-from sim_fixtures.plant import Carried, Plant, PlantTruth, build_model, carry
+from sim_fixtures.plant import Carried, ElasticPlant, Plant, PlantTruth, build_model, carry
 
 CELL_PATH: Final = Path(__file__).with_name("cell.toml")
 """A cell file of the simulated UR5e."""
@@ -24,6 +25,8 @@ _HEATING: Final = 0.25  # °C per W of friction in the long run
 _HEAT_TIME: Final = 900.0  # s
 _BANDWIDTH: Final = 60.0  # of the position loop, rad/s
 _FRICTION_SPEED: Final = 0.02  # of the controller's friction law at a reversal, rad/s
+_SUBSTEP: Final = 5e-4  # of an arm with effects that a model leaves out, s
+_MOTOR_PER_JOINT: Final = 101.0 / (2.0 * np.pi)  # revolutions per rad
 
 
 def _array(*values: float) -> Array:
@@ -79,6 +82,7 @@ class SimulatedUrArm:
         load: what its flange carries, and the controller does not know.
         entered: the payload that the controller knows; the flange carries it as well.
         urdf: of the arm, six joints.
+        effects: that a model of it leaves out.
     """
 
     def __init__(
@@ -91,16 +95,28 @@ class SimulatedUrArm:
         load: Carried | None = None,
         entered: Carried | None = None,
         urdf: str = UR5E_URDF,
+        effects: UnmodelledEffects | None = None,
     ) -> None:
         self.truth = truth
+        self._effects = effects or UnmodelledEffects()
         self.plant = Plant(urdf, truth.plant, position=position)
-        self._model = build_model(urdf, (0.0, 0.0, -9.81), truth.plant.rotor_inertia)
+        if any(self._effects.elasticity):
+            self.plant = ElasticPlant(
+                urdf, truth.plant, position=position, elasticity=self._effects.elasticity,
+                step=_SUBSTEP,
+            )  # fmt: skip
+        # Without rotors: what the arm reports as its moment is that of rigid bodies alone.
+        self._model = build_model(urdf, (0.0, 0.0, -9.81), np.zeros(6))
         carry(self.plant.model, load)
         carry(self.plant.model, entered)
         carry(self._model, entered)
         self._data = self._model.createData()
         self._period = period
         self._rng = np.random.default_rng(seed)
+        amplitude = self._effects.torque_ripple * truth.plant.coulomb
+        self._ripple = SimulatedRipple(amplitude, np.random.default_rng([seed, 1]))
+        self._drift = SimulatedDrift(self._effects.friction_drift, 6)
+        self._torque_before: Array = np.zeros(6)
         self.current: Array = np.zeros(6)
         self.target_moment: Array = np.zeros(6)
         self.target_current: Array = np.zeros(6)
@@ -110,21 +126,36 @@ class SimulatedUrArm:
         """Follow targets (6,) [rad, rad/s, rad/s²] for a cycle."""
         truth = self.truth
         rigid: Array = pin.rnea(self._model, self._data, q, qd, qdd)
-        # pinocchio's inverse dynamics leave armatures out; the arm reports rigid bodies alone.
         self.target_moment = rigid
         speed = np.abs(qd)
         friction = truth.coulomb * np.tanh(qd / _FRICTION_SPEED)
         friction = friction + (truth.viscous + truth.quadratic * speed) * qd
         self.target_current = (rigid + friction) / truth.stated_constant
-        inertia = np.diag(pin.crba(self._model, self._data, q)).copy()
-        drive = truth.plant.rotor_inertia * qdd
+        rotor = truth.plant.rotor_inertia
+        inertia = np.diag(pin.crba(self._model, self._data, q)) + rotor
+        drive = rotor * qdd
         error = q - self.plant.position
         rate = qd - self.plant.velocity
         correction = inertia * _BANDWIDTH * (_BANDWIDTH * error + 2.0 * rate)
         command = self.target_current + (drive + correction) / truth.stated_constant
         self.current = command
-        self.plant.step(truth.torque_constant * command, self._period)
+        torque = truth.torque_constant * command
+        if self._effects == UnmodelledEffects():
+            self.plant.step(torque, self._period)
+        else:
+            self._step_with_effects(torque)
         self._warm()
+
+    def _step_with_effects(self, torque: Array) -> None:
+        """Advance by a cycle under motor torques (6,) [N·m], in sub-steps."""
+        plant = self.plant
+        plant.scale_friction(self._drift.scale(plant.velocity, self._period))
+        delayed = round(self._effects.delay / _SUBSTEP)
+        for substep in range(round(self._period / _SUBSTEP)):
+            acting = self._torque_before if substep < delayed else torque
+            motors = (_MOTOR_PER_JOINT * plant.motor_position).tolist()
+            plant.step(acting + self._ripple.torque(motors), _SUBSTEP)
+        self._torque_before = torque
 
     def rest(self) -> None:
         """Stay for a cycle with brakes engaged and without current."""

@@ -10,6 +10,7 @@ from typing import Final, Literal, NamedTuple, cast, get_args
 
 import numpy as np
 
+from sim_fixtures.arm import UnmodelledEffects
 from sim_fixtures.arrays import Array
 from sim_fixtures.plant import Carried
 from sim_fixtures.settings import SettingError
@@ -227,6 +228,7 @@ class SimulatedUr:
         repeats: whether the program begins again at its end.
         at: where it rests without a program (6,) [rad].
         urdf: of the arm; its kinematics as the primary interface states them are those of a UR5e.
+        effects: that a model of the arm leaves out.
     """
 
     def __init__(
@@ -241,6 +243,7 @@ class SimulatedUr:
         repeats: bool = False,
         urdf: str = UR5E_URDF,
         at: Array | None = None,
+        effects: UnmodelledEffects | None = None,
     ) -> None:
         self.settings = settings or UrSettings()
         self.period = 1.0 / self.settings.frequency
@@ -257,6 +260,7 @@ class SimulatedUr:
             load=load,
             entered=_carried(self.settings.payload),
             urdf=urdf,
+            effects=effects,
         )
         self.cycle = -1
         self._program_time = 0.0
