@@ -38,6 +38,7 @@ class Line(BaseModel):
         plain: error of an ordinary fit.
         nominal: of the URDF's model as it is; None if it has no masses, or was not measured.
         nominal_friction: the same with rotor inertia, friction and offset fitted.
+        nominal_scale: the same with the scale of each joint's torque fitted as well.
         hil: by default settings.
         inside: share of held-out means inside their 95 % intervals, or words for it.
         seconds: of the processor, or words for it.
@@ -52,6 +53,7 @@ class Line(BaseModel):
     plain: float
     nominal: float | None = None
     nominal_friction: float | None = None
+    nominal_scale: float | None = None
     hil: float
     inside: float | str | None = None
     seconds: float | str | None = None
@@ -63,14 +65,19 @@ class Line(BaseModel):
         return self.hil / self.plain
 
     @property
+    def nominals(self) -> list[float]:
+        """Errors of the nominal model as it is, and with what was fitted, as far as measured."""
+        errors = self.nominal, self.nominal_friction, self.nominal_scale
+        return [error for error in errors if error is not None]
+
+    @property
     def is_loss(self) -> bool:
         """Whether an ordinary fit, or the nominal model with or without friction, was better."""
-        others = [error for error in (self.nominal, self.nominal_friction) if error is not None]
-        return self.ratio > BEHIND or any(self.hil > error for error in others)
+        return self.ratio > BEHIND or any(self.hil > error for error in self.nominals)
 
     def text(self) -> str:
         """The row in Markdown."""
-        nominal = [_percent(error) for error in (self.nominal, self.nominal_friction) if error]
+        nominal = [_percent(error) for error in self.nominals]
         mark = "" if self.commit is None else f" (measured elsewhere, {self.commit})"
         inside = _percent(self.inside) if isinstance(self.inside, float) else self.inside
         seconds = f"{self.seconds:.0f}" if isinstance(self.seconds, float) else self.seconds
@@ -97,6 +104,7 @@ def line_of(row: Mapping[str, Any]) -> Line:
         plain=row["plain"],
         nominal=row["nominal"],
         nominal_friction=row["nominal + friction"],
+        nominal_scale=row["nominal + scale"],
         hil=row["hil"],
         inside=row["inside"],
         seconds=row["seconds"]["hil"],
@@ -126,9 +134,10 @@ all joints and every row of what was predicted, of the torque as it was recorded
 
 *hil* has its default settings. *Ordinary* is an ordinary fit (`benchmarks/plain_fit.py`: base
 parameters, Coulomb and viscous friction, offset, rotor inertia; its cut-off chosen on the fitted
-part). *Nominal* is the URDF's model as it is, and behind the stroke with fitted rotor inertia and
-friction. *Ratio* is hil over ordinary: above 1 is a loss. *Inside* is the share of held-out means
-of torque in their 95 % intervals, *s* seconds of processor.
+part). *Nominal* is the URDF's model as it is, behind the first stroke with fitted rotor inertia and
+friction, behind the second with the scale of each joint's torque as well. *Ratio* is hil over
+ordinary: above 1 is a loss. *Inside* is the share of held-out means of torque in their 95 %
+intervals, *s* seconds of processor.
 
 Measured at {commit} on {splits} splits of real arms ({arms} arms): geometric mean of the ratios
 {mean:.2f}, {behind} of {splits} behind an ordinary fit or the nominal model. The page is renewed by

@@ -109,7 +109,8 @@ class TestFetch:
 
 
 def row(hil: float, **others: Any) -> dict[str, Any]:
-    measured = {"plain": 0.1, "nominal": None, "nominal + friction": None, "inside": 0.95}
+    nominal = dict.fromkeys(board.NEED_MASSES)
+    measured = {"plain": 0.1, **nominal, "inside": 0.95}
     seconds = {"seconds": {"hil": 4.2, "plain": 1.0}}
     return {"data": "gen3", "split": "a to b", "hil": hil, **measured, **seconds, **others}
 
@@ -147,15 +148,21 @@ class TestPage:
         assert "Without each choice" not in board_page.page_text([row(0.05)], "abc")
 
     @pytest.mark.parametrize(
-        ("hil", "nominal", "with_friction", "loss"),
-        [(0.1, None, None, False), (0.101, None, None, True), (0.05, 0.04, None, True),
-         (0.05, 0.2, 0.04, True), (0.05, 0.06, 0.06, False)],
+        ("hil", "nominal", "with_friction", "with_scale", "loss"),
+        [(0.1, None, None, None, False), (0.101, None, None, None, True),
+         (0.05, 0.04, None, None, True), (0.05, 0.2, 0.04, None, True),
+         (0.05, 0.2, 0.06, 0.04, True), (0.05, 0.06, 0.06, 0.06, False)],
     )  # fmt: skip
     def test_a_loss_is_against_any_of_them(
-        self, hil: float, nominal: float | None, with_friction: float | None, loss: bool
+        self,
+        hil: float,
+        nominal: float | None,
+        with_friction: float | None,
+        with_scale: float | None,
+        loss: bool,
     ) -> None:
         line = Line(arm="", source="", split="", plain=0.1, hil=hil, nominal=nominal,
-                    nominal_friction=with_friction)  # fmt: skip
+                    nominal_friction=with_friction, nominal_scale=with_scale)  # fmt: skip
         assert line.is_loss == loss
 
     def test_it_is_written_again_from_saved_rows(self, tmp_path: Path) -> None:
