@@ -33,9 +33,9 @@ UNTESTED: Final = "tested"
 IMPOSSIBLE: Final = "physical signs"
 """Name of the check whether bodies with these parameters can exist."""
 NO_BODIES: Final = "bodies in the torque"
-"""Name of the check whether the torque is that of an arm."""
+"""Name of the check whether the torque belongs to an arm."""
 ARM: Final = "arm of the URDF"
-"""Name of the check whether the model is that of the described arm."""
+"""Name of the check whether the model describes the arm of the URDF."""
 FORM: Final = "form of friction"
 """Name of the check whether a friction law lacks a term."""
 LEFT_OPEN: Final = "left open by the motion"
@@ -189,7 +189,7 @@ def _change(change: Change, naming: Naming) -> str:
         return f"{_QUANTITIES[change.meaning]} of {joints} {done}"
     joint, other = (naming.joints[index] for index in change.joints)
     sign = "plus" if change.meaning == "angle sum" else "less"
-    return f"an angle of {joint} {sign} that of {other}"
+    return f"the angle of {joint} {sign} the angle of {other}"
 
 
 _CORRECTED: Final = Optional(
@@ -245,7 +245,7 @@ SENTENCES: Final[Mapping[FindingKey, Sentence]] = {
     "commanded positions": Sentence(
         "positions",
         "the positions of {recordings:6} are the commands, bit for bit: the arm follows them late"
-        "{lag}, and every speed and acceleration is that of the plan, not of the arm",
+        "{lag}, and every speed and acceleration belongs to the plan, not to the arm",
         optional={"lag": Optional(", here by about {delay:.0f} ms")},
     ),
     "counted rows": Sentence(
@@ -270,8 +270,8 @@ SENTENCES: Final[Mapping[FindingKey, Sentence]] = {
     ),
     "coarse positions at rest": Sentence(
         "resolution",
-        f"{_COARSE}; friction reverses over {{presliding:.2g}}, so that its direction at rest is"
-        " that of rounding",
+        f"{_COARSE}; friction reverses over {{presliding:.2g}}, so that rounding decides its"
+        " direction at rest",
         "{step:.2g}",
     ),
     "folded noise": Sentence(
@@ -321,13 +321,13 @@ SENTENCES: Final[Mapping[FindingKey, Sentence]] = {
     ),
     "zeros": Sentence(
         "zeros",
-        "the zeros of joints are other than those of the URDF: {each} to be added; with that, rows"
+        "the zeros of joints differ from the URDF: {each} to be added; with that, rows"
         " that did not choose it are predicted with {error:pc0} of the error",
         "{degrees:+.1f}°",
     ),
     "zeros, nearest": Sentence(
         "zeros",
-        f"{_NEAREST} zeros of joints other than those of the URDF ({{each}})",
+        f"{_NEAREST} zeros of joints that differ from the URDF ({{each}})",
         "{degrees:+.1f}°",
     ),
     "alike": Sentence(
@@ -393,10 +393,12 @@ SENTENCES: Final[Mapping[FindingKey, Sentence]] = {
     "position order": _fault(_ORDER, "the positions of {axes} are probably interchanged"),
     "joint order": _fault(_ORDER, "the positions and torques of {axes} are probably interchanged"),
     "angle sum": _fault(
-        _COUPLED_ANGLES, "the recorded angle of {joint} is probably its own plus that of {other}"
+        _COUPLED_ANGLES,
+        "the recorded angle of {joint} is probably its own plus the angle of {other}",
     ),
     "angle difference": _fault(
-        _COUPLED_ANGLES, "the recorded angle of {joint} is probably its own less that of {other}"
+        _COUPLED_ANGLES,
+        "the recorded angle of {joint} is probably its own less the angle of {other}",
     ),
     "payload of a part": _fault(
         "sameness",
@@ -405,13 +407,13 @@ SENTENCES: Final[Mapping[FindingKey, Sentence]] = {
     ),
     "torque of a part": _fault(
         "sameness",
-        "in {part} the torque of {axes} is {size:.3g} ± {half_interval:.2g} times that of the other"
-        " data",
+        "in {part} the torque of {axes} is {size:.3g} ± {half_interval:.2g} times as large as"
+        " in the other data",
     ),
     "friction of a part": _fault(
         "sameness",
-        "in {part} the friction of {axes} is {size:.3g} ± {half_interval:.2g} times that of the"
-        " other data",
+        "in {part} the friction of {axes} is {size:.3g} ± {half_interval:.2g} times as large as"
+        " in the other data",
     ),
     "arm of a part": _fault(
         "sameness", "{part} is probably of another arm, tool or setting than the other data"
@@ -424,7 +426,7 @@ SENTENCES: Final[Mapping[FindingKey, Sentence]] = {
     ),
     "changed torque": Sentence(
         "sameness",
-        "the torque on {motion} differs from that of the fitted motion by a factor: {each}",
+        "the torque on {motion} differs from the torque on the fitted motion by a factor: {each}",
         "{factor:.3g} ± {half_interval:.2g}",
     ),
     "changed friction": Sentence(
@@ -509,8 +511,8 @@ SENTENCES: Final[Mapping[FindingKey, Sentence]] = {
     ),
     "generalisation": Sentence(
         "generalisation",
-        "the torque error on {motion} is more than {limit:g} times that of the fitted motion:"
-        " {each}",
+        "the torque error on {motion} is more than {limit:g} times as large as on the fitted"
+        " motion: {each}",
         "{growth:.1f} times, {relative:pc1}",
     ),
     "no repetitions": Sentence(
@@ -715,7 +717,7 @@ REMEDIES: Final[Mapping[RemedyKey, str]] = {
         "correct them: [position] offset = [{offsets:.4f}] (rad) in the column map; compare with a"
         " posture of the arm"
     ),
-    "compare a posture": "compare a posture of the arm with that of the URDF at the same angles",
+    "compare a posture": "compare a posture of the arm with the URDF at the same angles",
     "jog and compare": ("jog {joints} and compare direction, order and torque with the column map"),
     "compare with the map": "compare direction and order of {joints} with the column map",
     "check masses and units": (
@@ -838,7 +840,7 @@ REMEDIES: Final[Mapping[RemedyKey, str]] = {
         "record the torque unfiltered, or state its low-pass with --torque-bandwidth"
     ),
     "record a longer motion": "record a longer motion, or the same one several times",
-    "try friction terms": ("try further friction terms for {joints} (Stribeck, asymmetric, third)"),
+    "try friction terms": ("try further friction terms for {joints} (Stribeck, asymmetric, cubic)"),
     "check the geometry": (
         "check the URDF's geometry and gravity direction, and for a hose, spring or payload that"
         " the model lacks"

@@ -12,6 +12,7 @@ from pathlib import Path
 
 import pytest
 
+from identification.validation.finding_messages import SENTENCES
 from tests.docs.typed import PAGES, ROOT, command_of, options
 from tests.house import nodes_of
 
@@ -80,6 +81,18 @@ def test_the_reference_of_the_drivers_has_every_name() -> None:
         r"^\.\. auto(?:class|exception|function|data):: (?:[\w.]+\.)?(\w+)$", text, re.M
     )
     assert sorted(documented) == sorted(drivers.__all__)
+
+
+def test_the_page_on_verdicts_explains_every_finding_and_no_other() -> None:
+    """A row for each check, with what is seen, the cause and the remedy."""
+    page = (ROOT / "docs" / "read-a-report.md").read_text("utf-8")
+    explained = {
+        name
+        for row in re.findall(r"^\| (`.*?) \| .* \| .* \| .+ \|$", page, re.M)
+        for name in re.findall(r"`([^`]+)`", row)
+    }
+    checks = {sentence.check for sentence in SENTENCES.values()} - {"{change:check}"}
+    assert explained == checks
 
 
 FINDINGS = sorted((ROOT / "identification" / "validation").rglob("*.py"))

@@ -121,7 +121,7 @@ def test_words_have_no_full_stop_and_no_capital(text: str) -> None:
             Finding(
                 "angle difference", "wrong", "state the coupled difference", joints=(2, 1)
             ),
-            "the recorded angle of three is probably its own less that of two",
+            "the recorded angle of three is probably its own less the angle of two",
             "turn one joint alone and see which angles change; if so, state it in the column map of"
             " the log: coupled = [[3, 2, -1]] in [position] and [velocity] (joints by their"
             " columns, from 1)",
@@ -138,8 +138,8 @@ def test_words_have_no_full_stop_and_no_capital(text: str) -> None:
                 },
                 joints=(0,),
             ),
-            "several explanations fit alike: position and torque of one negated or an angle of two"
-            " plus that of one; with each of them, rows that did not choose it are predicted with"
+            "several explanations fit alike: position and torque of one negated or the angle of two"
+            " plus the angle of one; with each of them, rows that did not choose it are predicted with"
             " 50 % of the error",
             "jog one and compare direction, order and torque with the column map",
         ),
@@ -152,7 +152,7 @@ def test_words_have_no_full_stop_and_no_capital(text: str) -> None:
                 joints=(1,),
                 each={"degrees": (5.73,)},
             ),
-            "the zeros of joints are other than those of the URDF: two +5.7° to be added; with"
+            "the zeros of joints differ from the URDF: two +5.7° to be added; with"
             " that, rows that did not choose it are predicted with 25 % of the error",
             "correct them: [position] offset = [0.0000, 0.1000] (rad) in the column map; compare"
             " with a posture of the arm",
@@ -160,7 +160,7 @@ def test_words_have_no_full_stop_and_no_capital(text: str) -> None:
         (
             Finding("commanded positions", "wrong", values={"recordings": ("a", "b")}),
             "the positions of a, b are the commands, bit for bit: the arm follows them late, and"
-            " every speed and acceleration is that of the plan, not of the arm",
+            " every speed and acceleration belongs to the plan, not to the arm",
             "",
         ),
         (
@@ -168,7 +168,7 @@ def test_words_have_no_full_stop_and_no_capital(text: str) -> None:
                 "commanded positions", "wrong", values={"recordings": ("a",), "delay": 80.0}
             ),
             "the positions of a are the commands, bit for bit: the arm follows them late, here by"
-            " about 80 ms, and every speed and acceleration is that of the plan, not of the arm",
+            " about 80 ms, and every speed and acceleration belongs to the plan, not to the arm",
             "",
         ),
     ],
