@@ -111,7 +111,7 @@ def arms(data: Path, folder: Path, only: str | None = None) -> Iterator[Arm]:
 
 
 def _weight(recording: Recording, model: RobotModel) -> Array:
-    samples = prepare(recording, model, options=Preprocessing(14.0, left_out="rests"))
+    samples = prepare(recording, model, options=Preprocessing(14.0, exclude_rows="rests"))
     factor = Factor.by_time(model, samples)
     values = fit_posterior(model, factor, body_prior(model, factor).gaussian).estimate.values
     rigid = np.where(model.friction_columns, 0.0, values)

@@ -6,9 +6,10 @@ import inspect
 import json
 import math
 from collections.abc import Callable, Sequence
+from copy import copy
 from functools import wraps
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, get_args
 
 import typer
 
@@ -38,8 +39,7 @@ DhOption = Annotated[
     Path | None,
     typer.Option(
         metavar="TABLE",
-        help="CSV table of Denavit-Hartenberg parameters in place of --urdf, a row per joint. "
-        "Needs --convention.",
+        help="DH table (CSV) in place of --urdf, with --convention.",
         rich_help_panel=ARM,
     ),
 ]
@@ -57,12 +57,21 @@ Command = Callable[..., None]
 
 
 def with_options(
-    group: Callable[..., Any], to: str, *, but: Sequence[str] = ()
+    group: Callable[..., Any], to: str, *, but: Sequence[str] = (), rare: Sequence[str] = ()
 ) -> Callable[[Command], Command]:
-    """Add the fields of a dataclass, without `but`, as options; they are passed as `to`."""
+    """Add the fields of a dataclass as options; they are passed as `to`.
+
+    Args:
+        group: the dataclass.
+        to: parameter of the command that gets it.
+        but: fields that are no options.
+        rare: options that work and are not in the help, as the column map has entries for them.
+    """
     options = {**inspect.signature(group, eval_str=True).parameters}
     for name in but:
         del options[name]
+    for name in rare:
+        options[name] = _hidden(options[name])
 
     def decorate(command: Command) -> Command:
         parameters: dict[str, inspect.Parameter] = {}
@@ -82,6 +91,13 @@ def with_options(
         return run
 
     return decorate
+
+
+def _hidden(option: inspect.Parameter) -> inspect.Parameter:
+    kind, described = get_args(option.annotation)
+    described = copy(described)
+    described.hidden = True
+    return option.replace(annotation=Annotated[kind, described])
 
 
 def at_most_one(**given: object) -> None:

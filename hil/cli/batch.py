@@ -22,7 +22,7 @@ from hil.batch.table import write_tables
 from hil.cli.arguments import JsonOption, QuietOption, VerboseOption, print_json, with_options
 from hil.cli.fleet_options import Fleet, RecordingsArgument, last, map_lines, skipped_line
 from hil.cli.identify_options import Identifying
-from hil.cli.imports import Described, Reading
+from hil.cli.imports import RARE, Described, Reading
 from hil.fleet.logs import LogMap, write_maps
 from hil.fleet.table import write_batch
 from identification.text import percentage
@@ -34,8 +34,8 @@ _MOST_LINES: Final = 20
 
 
 @with_options(Identifying, "how")
-@with_options(Described, "arm", but=("friction", "standstill"))
-@with_options(Reading, "reading")
+@with_options(Described, "arm", but=("friction", "standstill_speed"))
+@with_options(Reading, "reading", rare=RARE)
 @with_options(Fleet, "fleet")
 def batch(
     places: RecordingsArgument,

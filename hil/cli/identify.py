@@ -14,7 +14,7 @@ from hil.base.progress import reporter as make_reporter
 from hil.base.safe_input import path_exists
 from hil.cli.arguments import JsonOption, QuietOption, VerboseOption, with_options
 from hil.cli.identify_options import EstimatorOption, Identifying
-from hil.cli.imports import Described, Reading
+from hil.cli.imports import RARE, Described, Reading
 from hil.cli.purpose_options import Required
 from hil.cli.servo_verdict import finish_servo
 from hil.cli.verdict import LABEL, finish
@@ -35,8 +35,8 @@ RecordingsArgument = Annotated[
 
 @with_options(Identifying, "how")
 @with_options(Required, "required")
-@with_options(Described, "arm", but=("friction", "standstill"))
-@with_options(Reading, "reading")
+@with_options(Described, "arm", but=("friction", "standstill_speed"))
+@with_options(Reading, "reading", rare=RARE)
 def identify(
     recordings: RecordingsArgument,
     output: Annotated[Path | None, typer.Option("--output", "-o")] = None,
@@ -67,12 +67,12 @@ def identify(
     **Examples:** `hil identify log.csv --urdf arm.urdf`, `hil identify runs/demo`
 
     Options:
-        output: Folder for all files. Default: the campaign folder (--paper: its subfolder), else
-            one named after the first recording, next to it.
-        predict: Recording to predict and not to fit, of any kind (repeatable).
+        output: Folder for all files. Default: the campaign folder (--paper: its subfolder), or one
+            next to the first recording, named after it.
+        predict: Recording to predict and not to fit (repeatable).
         paper: Filter torques and regressor alike, as in the paper.
-        split: Fraction that is fitted if there is no validation run; the rest is predicted.
-        fit_all: Fit everything and hold nothing out; no model is then judged good.
+        split: Fraction fitted without a validation run.
+        fit_all: Hold nothing out; no model is then judged good.
         annotate: Also write archives with predicted torque, for viewers.
         compare: MJCF to compare servo parameters with, without torque.
     """

@@ -46,7 +46,7 @@ class Identifying:
         str,
         typer.Option(
             metavar="TERMS",
-            help="Friction law, such as coulomb,viscous,offset; or auto.",
+            help="Friction law, such as coulomb,viscous,offset.",
             rich_help_panel=ESTIMATION,
         ),
     ] = "auto"
@@ -55,7 +55,7 @@ class Identifying:
         str,
         typer.Option(
             metavar="HZ",
-            help="Largest bandwidth of the smoothed positions; or auto.",
+            help="Largest bandwidth of the smoothed positions.",
             rich_help_panel=ESTIMATION,
         ),
     ] = "auto"
@@ -63,7 +63,7 @@ class Identifying:
         Literal["auto", "position", "measured"],
         typer.Option(
             metavar="SOURCE",
-            help="Source of the velocity: position (smoothed), measured or auto.",
+            help="From position (smoothed) or measured.",
             rich_help_panel=ESTIMATION,
         ),
     ] = "auto"
@@ -79,7 +79,7 @@ class Identifying:
         str,
         typer.Option(
             metavar="HZ",
-            help="Of a low-pass filter that the recorded torque has passed; or none, auto.",
+            help="Low-pass that the recorded torque went through; or none, auto.",
             rich_help_panel=ESTIMATION,
         ),
     ] = "auto"
@@ -93,7 +93,7 @@ class Identifying:
             delay=delay_from(self.delay),
             bandwidth=_bandwidth(self.bandwidth, "--bandwidth"),
             velocity=self.velocity,
-            standstill=self.exclude_rows,
+            exclude_rows=self.exclude_rows,
             torque_bandwidth=None
             if low_pass == "none"
             else _bandwidth(low_pass, "--torque-bandwidth"),

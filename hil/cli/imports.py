@@ -105,9 +105,10 @@ class Described:
             metavar="TERMS", help="Friction law, terms separated by commas.", rich_help_panel=ARM
         ),
     ] = "coulomb,viscous,offset"
-    standstill: Annotated[
+    standstill_speed: Annotated[
         float,
         typer.Option(
+            metavar="RAD/S",
             min=0.0,
             help="Joint speed below which rows are not fitted, rad/s.",
             rich_help_panel=ARM,
@@ -117,15 +118,14 @@ class Described:
         list[str] | None,
         typer.Option(
             metavar="NAME[=POSITION]",
-            help="Joint of the URDF that was not recorded, fixed at 0 or a position (repeatable).",
+            help="Joint that was not recorded, at 0 or a position (repeatable).",
             rich_help_panel=ARM,
         ),
     ] = None
     lock_others: Annotated[
         bool,
         typer.Option(
-            help="Fix all joints of the URDF that were not recorded and list them. For a log, "
-            "joints of the map names those that were.",
+            help="Fix and list all joints that were not recorded.",
             rich_help_panel=ARM,
         ),
     ] = False
@@ -134,8 +134,7 @@ class Described:
         str | None,
         typer.Option(
             metavar="LINK",
-            help="Link from which the recorded arm starts, of a robot with several arms; joints "
-            "outside it are fixed. Default: by names and number of those recorded.",
+            help="First link of the recorded arm, of a robot with several.",
             rich_help_panel=ARM,
         ),
     ] = None
@@ -158,7 +157,7 @@ class Described:
             dh=self.dh,
         )
         law = FrictionLaw.from_table(
-            {**friction_from(self.friction), "standstill": self.standstill}
+            {**friction_from(self.friction), "standstill": self.standstill_speed}
         )
         at = figures(self.locked or [], "--locked", "--locked joint_7=0.3 (rad or m)")
         joints = recorded() if self.lock_others else None
@@ -180,6 +179,17 @@ class Described:
         )
 
 
+RARE = (
+    "command_topic",
+    "commands",
+    "calibration",
+    "units",
+    "outside_limits",
+    "drop_missing",
+)
+"""Options of `Reading` that are entries of a map; `hil look` and `hil import` list them."""
+
+
 @dataclass(frozen=True)
 class Reading:
     """Options that state what the channels of a recording are, where that is not concluded."""
@@ -188,8 +198,8 @@ class Reading:
         Path | None,
         typer.Option(
             "--map",
-            help="Column map, a TOML file or a ready one by name (`hil import maps`). Default: "
-            "inferred from names and units, and printed.",
+            help="Column map: a TOML file (`hil look -o` writes one), or the name of a ready one "
+            "(`hil import maps`). Default: inferred.",
             rich_help_panel=CHANNELS,
         ),
     ] = None
@@ -198,8 +208,8 @@ class Reading:
         typer.Option(
             "--columns",
             metavar="QUANTITY=NAME",
-            help="Channels of a quantity, such as torque=tau{} with {} for the joint, or names "
-            "separated by commas (repeatable).",
+            help="Channels of a quantity, such as torque=tau{} with {} for the joint, or "
+            "torque=a,b (repeatable).",
             rich_help_panel=CHANNELS,
         ),
     ] = None
@@ -231,8 +241,7 @@ class Reading:
         list[str] | None,
         typer.Option(
             metavar="RECORDED=URDF",
-            help="Joint named differently in a bag (repeatable); {} is its number, as in "
-            "fer_joint{}=panda_joint{}.",
+            help="Other name of joints in a bag (repeatable), as in fer_joint{}=panda_joint{}.",
             rich_help_panel=CHANNELS,
         ),
     ] = None

@@ -34,7 +34,7 @@ IN_DOUBT = 2
 """Exit status of a recording with two readings that fit alike."""
 
 
-@with_options(Described, "arm", but=("friction", "standstill"))
+@with_options(Described, "arm", but=("friction", "standstill_speed"))
 @with_options(Reading, "reading", but=("outside_limits",))
 def look(
     recording: Annotated[Path, typer.Argument(help="Log or bag.")],

@@ -38,7 +38,7 @@ class Required:
         str | None,
         typer.Option(
             metavar="FORCE",
-            help="Contact force at the flange that has to be detected, such as 50N.",
+            help="Contact force at the flange to be detected, such as 50N.",
             rich_help_panel=PURPOSE,
         ),
     ] = None
@@ -54,7 +54,7 @@ class Required:
         str,
         typer.Option(
             metavar="LENGTH",
-            help="Flange error that a simulation may have after 0.2 s.",
+            help="Flange error of a simulation after 0.2 s.",
             rich_help_panel=PURPOSE,
         ),
     ] = "5mm"

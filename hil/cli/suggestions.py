@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import difflib
 import re
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any, Final
 
 SYNONYMS: Final[Mapping[str, tuple[str, ...]]] = {
@@ -56,12 +56,15 @@ OTHER_COMMANDS: Final[Mapping[str, str]] = {
 FORMER_COMMANDS: Final[Mapping[str, str]] = {"gains": "torque-constants", "reidentify": "batch"}
 """Commands by their names in version 0.1, which work in 0.2 as well."""
 
-FORMER_OPTIONS: Final[Mapping[str, tuple[str, Collection[str]]]] = {
-    "--standstill": ("--exclude-rows", ("identify", "rollout", "batch")),
-    "--in-sample": ("--fit-all", ("identify",)),
-    "--kinematic": ("--limits-only", ("design",)),
+FORMER_OPTIONS: Final[Mapping[str, Mapping[str, str]]] = {
+    "--standstill": {
+        **dict.fromkeys(("identify", "rollout", "batch"), "--exclude-rows"),
+        "import": "--standstill-speed",
+    },
+    "--in-sample": {"identify": "--fit-all"},
+    "--kinematic": {"design": "--limits-only"},
 }
-"""Options by their names in version 0.1: present name, and the commands that have it."""
+"""Options by their names in version 0.1: the present name in each command that has it."""
 
 FORMER_METHODS: Final[Mapping[str, str]] = {"balanced": "gradient", "front": "gradient"}
 """Methods of `hil design` in version 0.1, and those that replaced them. Settings files that name
@@ -86,8 +89,8 @@ def with_present_names(arguments: Sequence[str]) -> tuple[list[str], list[str]]:
     end = present.index("--") if "--" in present else len(present)
     for k in range(index + 1, end):
         name, equals, value = present[k].partition("=")
-        option, commands = FORMER_OPTIONS.get(name, ("", ()))
-        if present[index] in commands:
+        option = FORMER_OPTIONS.get(name, {}).get(present[index])
+        if option is not None:
             notes.append(f"{name} is now called {option}")
             present[k] = option + equals + value
         if present[index] == "design" and name in _METHOD_OPTIONS:

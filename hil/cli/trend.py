@@ -16,7 +16,7 @@ from hil.base.terminal_text import plural, printable
 from hil.cli.arguments import JsonOption, QuietOption, VerboseOption, print_json, with_options
 from hil.cli.fleet_options import Fleet, RecordingsArgument, last, map_lines, skipped_line
 from hil.cli.identify_options import Identifying
-from hil.cli.imports import Described, Reading
+from hil.cli.imports import RARE, Described, Reading
 from hil.fleet.conditions import Conditions
 from hil.fleet.documents import as_dict
 from hil.fleet.estimated import estimated_fleet
@@ -34,8 +34,8 @@ _TAIL: Final = 3  # lines at the end: files, what was skipped, counts
 
 
 @with_options(Identifying, "how")
-@with_options(Described, "arm", but=("friction", "standstill"))
-@with_options(Reading, "reading")
+@with_options(Described, "arm", but=("friction", "standstill_speed"))
+@with_options(Reading, "reading", rare=RARE)
 @with_options(Fleet, "fleet")
 def trend(
     places: RecordingsArgument,

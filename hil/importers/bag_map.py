@@ -29,6 +29,7 @@ class BagMap(BaseModel):
         effort: content of the effort field.
         command_topic: of the commanded positions, ``none`` for none; None to find it.
         rename: joint in the URDF by name in the bag, where they differ.
+        outside_limits: whether positions outside the limits of the URDF are accepted.
         arm: links between which the recorded arm lies; a table of its own, as of a column map.
     """
 
@@ -39,6 +40,7 @@ class BagMap(BaseModel):
     effort: Effort = "torque"
     command_topic: str | None = None
     rename: Mapping[str, str] = {}
+    outside_limits: bool = False
     arm: Links = Links()
 
     @property

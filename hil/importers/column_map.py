@@ -183,7 +183,8 @@ class ColumnMap(_Table):
 
     `joints` are the URDF's joint of each column, where the order differs from that of the URDF, or
     where the log has joints that the URDF does not have: their columns are not used. `arm` are the
-    links between which the recorded arm of a robot with several lies.
+    links between which the recorded arm of a robot with several lies. With `outside_limits`
+    positions outside the limits of the URDF are accepted.
     """
 
     position: Quantity
@@ -196,6 +197,7 @@ class ColumnMap(_Table):
         default=None, description="a number above 0, in Hz"
     )
     joints: tuple[str, ...] | None = Field(default=None, description="a list of names")
+    outside_limits: bool = False
     arm: Links = Links()
     drive: Drive = Drive()
     format: Format = Format()

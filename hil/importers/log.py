@@ -102,7 +102,11 @@ def import_log(
     """
     content = read_log(source, robot=robot, columns=columns, coupled=coupled)
     content.write(
-        output, held_joints=held_joints, use=use, force=force, outside_limits=outside_limits
+        output,
+        held_joints=held_joints,
+        use=use,
+        force=force,
+        outside_limits=outside_limits or columns.outside_limits,
     )
     return Path(output)
 

@@ -508,19 +508,17 @@ def _of_episode(
 ) -> ImportedRecording:
     """Read an episode of a data set."""
     robot = robot_of(lambda: data.joints)
-    text, units = data.map_for(robot, options.calibration, options.units)
-    columns = ColumnMap.model_validate(parse_toml(text))
-    content = read_log(
-        episode.path,
-        robot=robot,
-        columns=columns,
-        coupled=request.coupled,
-        files=episode.files,
-    )
-    request = replace(request, files=episode.files)
+    if options.columns is not None:
+        text, concluded = map_text(options.columns), tuple[Conclusion, ...]()
+        columns = ColumnMap.load(options.columns)
+    else:
+        text, units = data.map_for(robot, options.calibration, options.units)
+        columns, concluded = ColumnMap.model_validate(parse_toml(text)), (units,)
+    request = replace(request, source=episode.path, files=episode.files)
+    content = _read_log(request, robot, columns)
     number = {EPISODE: str(episode.number)}
     content = replace(content, source=(episode.source,), metadata={**content.metadata, **number})
-    return request.imported(content, with_arm(text, robot.links), (units,))
+    return _by_map(request, robot, columns, text, content, concluded)
 
 
 def _imported(request: _Request, robot_of: RobotOf, *, options: ImportOptions) -> ImportedRecording:
@@ -613,14 +611,34 @@ def _of_map(
     concluded: tuple[Conclusion, ...] = (),
 ) -> ImportedRecording:
     """Read a log by a column map and its text."""
-    content = read_log(
+    content = _read_log(request, robot, columns)
+    return _by_map(request, robot, columns, text, content, concluded)
+
+
+def _read_log(request: _Request, robot: Robot, columns: ColumnMap) -> RecordingContent:
+    return read_log(
         request.source,
         robot=robot,
         columns=columns,
         coupled=request.coupled,
         files=request.files,
     )
-    return request.imported(content, with_arm(text, robot.links), concluded)
+
+
+def _by_map(
+    request: _Request,
+    robot: Robot,
+    columns: ColumnMap,
+    text: str,
+    content: RecordingContent,
+    concluded: tuple[Conclusion, ...],
+) -> ImportedRecording:
+    """Return what a column map read, with the map as which it is read again."""
+    text = with_arm(text, robot.links)
+    if request.outside_limits and not columns.outside_limits:
+        text = with_values(text, {"outside_limits": True})
+    request = replace(request, outside_limits=request.outside_limits or columns.outside_limits)
+    return request.imported(content, text, concluded)
 
 
 def _bag_map(options: ImportOptions) -> BagMap:
@@ -661,7 +679,9 @@ def _read_bag(
     entries = content.metadata
     keys = ("topic", "clock", "effort", "command_topic")
     read = {key: entries[key] for key in keys if key in entries}
-    bag = BagMap.model_validate({**read, "rename": _used(names, robot), "arm": robot.links})
+    request = replace(request, outside_limits=request.outside_limits or stated.outside_limits)
+    others = {"arm": robot.links, "outside_limits": request.outside_limits}
+    bag = BagMap.model_validate({**read, "rename": _used(names, robot), **others})
     basis = NameBasis.MESSAGE, UnitBasis.MESSAGE
     concluded = tuple(
         ChannelMeaning(channel.name, kind, basis[0], next(iter(UNITS[kind])), basis[1])

@@ -42,7 +42,7 @@ from identification.model.robot import RobotModel
 from identification.signals.recording import Recording, RecordingError
 from identification.signals.samples import Preprocessing, prepare
 
-SETTINGS: Final = Preprocessing(14.0, left_out="rests")
+SETTINGS: Final = Preprocessing(14.0, exclude_rows="rests")
 """Preparation of a recording whose readings are compared."""
 _DELAY_SAMPLES: Final = 20_000
 _COLUMNS: Final[tuple[tuple[str, Kind, str], ...]] = (

@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import InitVar, dataclass
 from typing import Any, Final, Literal, get_args
+from warnings import warn
 
 from hil.base.errors import InputError
 from identification.model.friction import ABSENT, TERMS
-from identification.signals.masks import LeftOut
+from identification.signals.masks import ExcludedRows
 from identification.signals.samples import RIGID_BANDWIDTH, VelocitySource
 from identification.validation.purpose import NOTHING_REQUIRED, PurposeLimits, PurposeName
 
@@ -45,13 +46,17 @@ class Options:
     friction: Mapping[str, Any] | Literal["auto"] = "auto"
     #: rows excluded for low speed: long "rests" of the arm, long "halts" of each joint, all "slow"
     #: rows and those near a reversal, or "none"; None depends on the friction law
-    standstill: LeftOut | Literal["auto"] | None = "auto"
+    exclude_rows: ExcludedRows | Literal["auto"] | None = "auto"
     in_sample: bool = False  #: fit all recordings and hold out none
     #: what the model has to be good for; by default it is judged by its error on unseen motion
     purposes: tuple[PurposeName, ...] = ()
     required: PurposeLimits = NOTHING_REQUIRED  #: of these
+    standstill: InitVar[ExcludedRows | Literal["auto", ""]] = ""  #: `exclude_rows` before 0.2
 
-    def __post_init__(self) -> None:
+    def __post_init__(self, standstill: ExcludedRows | Literal["auto", ""]) -> None:
+        if standstill:
+            warn("standstill is now called exclude_rows", DeprecationWarning, stacklevel=3)
+            object.__setattr__(self, "exclude_rows", standstill)
         for name, choices in (("method", get_args(Method)), ("estimator", tuple(ESTIMATORS))):
             if (value := getattr(self, name)) not in choices:
                 remedy = f"use {', '.join(choices)}"
@@ -110,6 +115,6 @@ FIXED: Final = Options(
     bandwidth=RIGID_BANDWIDTH,
     velocity="position",
     friction={},
-    standstill=None,
+    exclude_rows=None,
 )
 """No automatic choice: delay and friction of the cell, no low-pass, weighted least squares."""

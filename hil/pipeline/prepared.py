@@ -72,7 +72,7 @@ def stated_settings(cell: Cell, options: Options) -> Settings:
         Preprocessing(
             rigid_bandwidth=RIGID_BANDWIDTH if options.bandwidth == "auto" else options.bandwidth,
             velocity="position" if options.velocity == "auto" else options.velocity,
-            left_out=None if options.standstill == "auto" else options.standstill,
+            exclude_rows=None if options.exclude_rows == "auto" else options.exclude_rows,
             smooth_torque=options.method == "paper",
             torque_delay=delay,
             torque_bandwidth=bandwidth if isinstance(bandwidth, float) else None,
@@ -411,7 +411,7 @@ def _questions(
         "velocity": options.velocity == "auto"
         and all(recording.velocity is not None for recording in recorded),
         "presliding": options.friction == "auto",
-        "rows": options.standstill == "auto",
+        "excluded rows": options.exclude_rows == "auto",
         # A cell file with a drive train states the friction terms.
         "friction": options.friction == "auto" and sources.cell.file.drive_train is None,
         "ripple": options.friction == "auto" and bool(_ripples(sources.cell)),

@@ -504,7 +504,12 @@ class SettingsResult(Frozen):
         Raises:
             ValueError: they are those of another version.
         """
-        settings: Settings = adapter_of(Settings).validate_python(self.settings)
+        entries = {**self.settings}
+        preprocessing = {**entries.get("preprocessing", {})}
+        if "left_out" in preprocessing:  # of earlier versions
+            preprocessing["exclude_rows"] = preprocessing.pop("left_out")
+            entries["preprocessing"] = preprocessing
+        settings: Settings = adapter_of(Settings).validate_python(entries)
         return settings
 
 

@@ -278,7 +278,7 @@ def estimate_delay(
         IdentificationError: no usable row.
     """
     # Reversals are left out below, less widely than beside a smoother of this bandwidth.
-    options = replace(_narrow(options), left_out="halts")
+    options = replace(_narrow(options), exclude_rows="halts")
     estimate = _estimated(recording, model, noise_variance, options)
     is_far = not estimate.half_interval < _WITHIN_REACH
     if estimate.determined or is_far or options.rigid_bandwidth <= _SMOOTH_MOTION:

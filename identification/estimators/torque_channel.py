@@ -113,7 +113,7 @@ def possible_low_passes(
         torque_bandwidth=None,
         torque_delay=still,
         smooth_torque=False,
-        left_out="rests",
+        exclude_rows="rests",
     )
     samples = prepare(mean, model, noise_variance=noise_variance, options=wide)
     # Without the ends, where the smoothed motion is inaccurate.

@@ -29,7 +29,7 @@ from identification.selection.scores import (
     SettingsTrial,
 )
 from identification.selection.settings import Choice, Settings
-from identification.signals.masks import LeftOut
+from identification.signals.masks import ExcludedRows
 from identification.signals.samples import Preprocessing, VelocitySource
 
 Rows = NDArray[np.bool_]
@@ -39,7 +39,7 @@ Question = Literal[
     "bandwidth",
     "velocity",
     "presliding",
-    "rows",
+    "excluded rows",
     "friction",
     "ripple",
     "springs",
@@ -74,7 +74,7 @@ BANDWIDTHS: Final = (14.0, 10.0, 20.0, 7.0, 40.0)  # Hz, by distance from the fi
 PRESLIDING: Final = (3e-5, 1e-5, 1e-4, 3e-4, 1e-6, 1e-3)  # rad or m
 # Rows of a joint that stands while another moves hold its load; but those near a reversal, or at
 # rest by brake or static friction, can mislead.
-LEFT_OUT: Final[tuple[LeftOut, ...]] = ("rests", "halts", "slow")
+EXCLUDED_ROWS: Final[tuple[ExcludedRows, ...]] = ("rests", "halts", "slow")
 # Speeds over which dry friction may reverse smoothly, and factors that refine the best of them.
 REVERSAL_SPEEDS: Final = (0.02, 0.08, 0.3)  # rad/s or m/s
 REVERSAL_STEPS: Final = (1.5, 1.25, 1.12, 1.06, 1.03, 1.015, 1.008)
@@ -184,8 +184,8 @@ def _first_candidates(start: Settings, questions: Collection[Question]) -> Setti
         settings = settings.preprocessed(rigid_bandwidth=BANDWIDTHS[0])
     if "velocity" in questions:
         settings = settings.preprocessed(velocity=VELOCITIES[0])
-    if "rows" in questions:
-        settings = settings.preprocessed(left_out=LEFT_OUT[0])
+    if "excluded rows" in questions:
+        settings = settings.preprocessed(exclude_rows=EXCLUDED_ROWS[0])
     if "presliding" in questions:
         settings = settings.with_friction(presliding=PRESLIDING[0])
     return settings
@@ -307,7 +307,7 @@ def _compare_delays(
     """
     compared: list[Choice] = []
     for delay in delays:
-        sliding = now.preprocessed(left_out="slow")
+        sliding = now.preprocessed(exclude_rows="slow")
         late = sliding.preprocessed(torque_delay=delay.value)
         # A delay with a wide interval has to show that it predicts better.
         pair = [late, sliding] if delay.determined else [sliding, late]
@@ -389,7 +389,7 @@ def _smooth_reversal(trial: SettingsTrial, now: Settings, filtered: Settings) ->
 
 
 def _with_tanh(now: Settings, speed: float) -> Settings:
-    return now.with_friction(tanh=speed).preprocessed(left_out="rests")
+    return now.with_friction(tanh=speed).preprocessed(exclude_rows="rests")
 
 
 def _sweep(
@@ -414,7 +414,7 @@ def _sweep(
             )
             now = decision.settings
             choices = [*choices, decision.choice]
-            if swept.question == "rows":
+            if swept.question == "excluded rows":
                 decision = _rows_for_motion(trial, now, candidates)
                 now = decision.settings
                 choices = [*choices, decision.choice]
@@ -467,9 +467,9 @@ _SETTINGS_SEARCHED: Final = (
         transfer=TRANSFER,
     ),
     _SearchedSetting(
-        "rows",
+        "excluded rows",
         ROWS,
-        lambda now: [now.preprocessed(left_out=rows) for rows in LEFT_OUT],
+        lambda now: [now.preprocessed(exclude_rows=rows) for rows in EXCLUDED_ROWS],
     ),
     _SearchedSetting(
         "velocity",

@@ -293,7 +293,7 @@ class SettingsTrial:
             return unknown
         targets = folds.predicted if rows == "all" else folds.fitted
         if rows == "moving":
-            targets = self._folds(settings.preprocessed(left_out="slow")).fitted
+            targets = self._folds(settings.preprocessed(exclude_rows="slow")).fitted
         try:
             return folds.errors(self._estimator(settings), targets)
         except (IdentificationError, np.linalg.LinAlgError):
@@ -525,7 +525,7 @@ def _description(model: RobotModel, settings: Settings) -> tuple[str, ...]:
     if orders:
         ripple = f"torque ripple, {' and '.join(map(str, orders))} per motor turn"
     springs = [part.joint for part in elements if isinstance(part, TorsionSpring)]
-    left_out = {
+    rows_of = {
         "slow": "slow rows and reversals",
         "halts": "long halts of each joint",
         "rests": "rests of the whole arm",
@@ -537,7 +537,7 @@ def _description(model: RobotModel, settings: Settings) -> tuple[str, ...]:
         *model.friction.laws[0].summary(),
         ripple,
         f"torsion springs of {', '.join(springs)}" if springs else "no torsion spring",
-        left_out.get(how.left_out or "", "by the friction law"),
+        rows_of.get(how.exclude_rows or "", "by the friction law"),
         f"delay of {1e3 * how.torque_delay:.3g} ms",
         "no low-pass" if width is None else f"low-pass of {width:.3g} Hz, {how.torque_shape}",
         *settings.strength.describe(),

@@ -52,7 +52,7 @@ _TAIL: Final = 0.01  # of the samples at either end, which are no range
 _LONGEST_SPIKE: Final = 2  # samples
 _NORMAL: Final = 1.4826  # standard deviation over median absolute value
 
-LeftOut = Literal["rests", "halts", "slow", "none"]
+ExcludedRows = Literal["rests", "halts", "slow", "none"]
 
 EDGE: Final = "beside a gap or an end of the recording"
 SATURATED: Final = "torque or current saturated"
@@ -104,7 +104,7 @@ def mask_rows(
     current_limit: Array | None = None,
     torque_bandwidth: Array | None = None,
     delay: float = 0.0,
-    left_out: LeftOut = "slow",
+    exclude_rows: ExcludedRows = "slow",
 ) -> RowMask:
     """Return reasons against rows of a checked recording, with its smoothed motion.
 
@@ -116,15 +116,13 @@ def mask_rows(
         current_limit: of the motors (n,) [A].
         torque_bandwidth: of a low-pass of torque and regressor (n,) [Hz].
         delay: of the torque [s].
-        left_out: slow rows that are excluded:
+        exclude_rows: slow rows that are excluded:
 
-            - "rests": rows in which no joint moves for more than `LONGEST_HALT`: a joint that
-            stands
-                while another moves holds its load; and the two rows at each reversal of a joint, or
-                more in `TURN`;
-            - "halts": rows of a joint slower than standstill for more than `LONGEST_HALT`, and
-            those
-                at a change of its velocity's sign, likewise;
+            - "rests": rows in which no joint moves for more than `LONGEST_HALT` (a joint that
+                stands while another moves holds its load), and the two rows at each reversal of a
+                joint, or more in `TURN`;
+            - "halts": rows of a joint slower than standstill for more than `LONGEST_HALT`, and the
+                same rows at each change of its velocity's sign;
             - "slow": all rows slower than standstill, or near a velocity reversal;
             - "none": no slow rows.
     """
@@ -148,12 +146,12 @@ def mask_rows(
     reach = max(0.0, 0.5 * (TURN - float(np.median(np.diff(recording.time)))))
     turning = near_any_reversal(model, motion, np.full(shape[1], reach))
     halts = long_rests(motion.time, still)
-    if left_out == "rests":
+    if exclude_rows == "rests":
         resting = long_rests(motion.time, np.all(still, axis=1)[:, None])
         reasons |= {REST: np.broadcast_to(resting, shape), REVERSAL: turning & ~halts}
-    elif left_out == "halts":
+    elif exclude_rows == "halts":
         reasons |= {REST: halts, REVERSAL: turning}
-    elif left_out == "slow":
+    elif exclude_rows == "slow":
         reasons |= {STANDSTILL: still, REVERSAL: reversal}
     reasons[SATURATED] = saturated
     reasons[SPIKE] = spikes

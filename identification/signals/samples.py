@@ -12,7 +12,7 @@ from identification.arrays import Array
 from identification.model.motion import Motion
 from identification.model.regressor import Regressor
 from identification.model.robot import RobotModel
-from identification.signals.masks import SHORTEST_STRETCH, LeftOut, RowMask, mask_rows
+from identification.signals.masks import SHORTEST_STRETCH, ExcludedRows, RowMask, mask_rows
 from identification.signals.noise import difference_variance
 from identification.signals.recording import Recording, RecordingError
 from identification.signals.smoothing import (
@@ -46,7 +46,7 @@ class Preprocessing:
     velocity: VelocitySource = "position"
     #: excluded slow rows, see :func:`identification.signals.masks.mask_rows`; by default "halts" if
     #: all joints have presliding friction, else "slow"
-    left_out: LeftOut | None = None
+    exclude_rows: ExcludedRows | None = None
     #: as in the paper: torque and regressor are smoothed alike. Without it least squares averages
     #: noise better
     smooth_torque: bool = False
@@ -319,7 +319,7 @@ def prepare(
         current_limit=current_limit,
         torque_bandwidth=torque_bandwidth,
         delay=options.torque_delay,
-        left_out=options.left_out or ("halts" if presliding else "slow"),
+        exclude_rows=options.exclude_rows or ("halts" if presliding else "slow"),
     )
     samples = Samples(
         motion=motion,

@@ -16,7 +16,7 @@ Floats = NDArray[np.float64]
 
 def diagnosed(position: Floats, torque: Floats) -> TorqueDiagnosis:
     recording = Recording(TIME, position, NAMES, torque)
-    options = Preprocessing(14.0, left_out="rests")
+    options = Preprocessing(14.0, exclude_rows="rests")
     return diagnose(model(), [prepare(recording, model(), options=options)])
 
 

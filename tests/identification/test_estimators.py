@@ -1570,7 +1570,7 @@ class TestDelayUncertainty:
         recording = delayed(0.004, torque_noise=0.0, position_noise=1e-8)
 
         def samples(delay):
-            options = Preprocessing(torque_delay=delay, left_out="slow", rigid_bandwidth=40.0)
+            options = Preprocessing(torque_delay=delay, exclude_rows="slow", rigid_bandwidth=40.0)
             return prepare(recording, MODEL, options=options)
 
         middle = samples(0.004)

@@ -139,8 +139,8 @@ def test_words_have_no_full_stop_and_no_capital(text: str) -> None:
                 joints=(0,),
             ),
             "several explanations fit alike: position and torque of one negated or the angle of two"
-            " plus the angle of one; with each of them, rows that did not choose it are predicted with"
-            " 50 % of the error",
+            " plus the angle of one; with each of them, rows that did not choose it are predicted"
+            " with 50 % of the error",
             "jog one and compare direction, order and torque with the column map",
         ),
         (

@@ -119,7 +119,7 @@ def planted(case: str) -> tuple[Floats, Floats]:
 def test_it_is_found_and_nothing_else(case: str) -> None:
     position, torque = planted(case)
     recording = Recording(TIME, position, NAMES, torque)
-    samples = prepare(recording, model(), options=Preprocessing(14.0, left_out="rests"))
+    samples = prepare(recording, model(), options=Preprocessing(14.0, exclude_rows="rests"))
     gravities = {"": (0.0, 0.0, 0.0), "upside down": (0.0, 0.0, 9.81)}
     mountings = {name: model(gravity) for name, gravity in gravities.items()}
     readings = find_readings(model(), samples, mountings=mountings)

@@ -451,7 +451,7 @@ class TestChosenSettings:
 
     def test_a_short_recording_is_asked_the_same_questions(self):
         """Evidence decides, not how long a recording is."""
-        asked = {"bandwidth", "presliding", "rows", "friction", "estimator"}
+        asked = {"bandwidth", "presliding", "excluded rows", "friction", "estimator"}
         short, long = (
             [choice.name for choice in chosen(a_recording(duration=duration), asked)[1]]
             for duration in (8.0, LONG)
@@ -478,10 +478,12 @@ class TestChosenSettings:
         recording = a_recording(motion=motion, noise=noise)
         held = np.zeros_like(recording.torque)
         held[standing, 1] = 5.0 * np.sign(np.sin(2.0 * motion.time[standing]))
-        settings, choices = chosen(replace(recording, torque=recording.torque + held), {"rows"})
+        settings, choices = chosen(
+            replace(recording, torque=recording.torque + held), {"excluded rows"}
+        )
         by_all_rows, in_motion = choices
         assert by_all_rows.chosen == 0
-        assert settings.preprocessing.left_out == "halts"
+        assert settings.preprocessing.exclude_rows == "halts"
         gain = 1.0 - in_motion.errors[1] / in_motion.errors[0]
         assert least < gain < most
 
@@ -491,7 +493,7 @@ class TestChosenSettings:
         position = recording.position.copy()
         position[:875, 0] = position[875, 0]
         rested = replace(recording, position=position)
-        _, choices = chosen(rested, {"presliding", "rows", "estimator"})
+        _, choices = chosen(rested, {"presliding", "excluded rows", "estimator"})
         assert [choice.name for choice in choices][-1] == STRENGTH
         assert all(np.isfinite(choice.errors).all() for choice in choices)
 
@@ -572,7 +574,7 @@ class TestLast:
 class TestFolds:
     def test_a_segment_is_predicted_from_all_others(self):
         recording = a_recording()
-        samples = prepare(recording, MODEL, options=Preprocessing(left_out="slow"))
+        samples = prepare(recording, MODEL, options=Preprocessing(exclude_rows="slow"))
         folds = Folds.of(MODEL, [samples])
         values = truth()
         errors = folds.errors(lambda _: values, folds.predicted)
@@ -589,7 +591,9 @@ class TestFolds:
 class TestHeldOutRows:
     """The torque of held-out rows has no effect on any choice."""
 
-    QUESTIONS = frozenset[Question]({"bandwidth", "presliding", "rows", "friction", "estimator"})
+    QUESTIONS = frozenset[Question](
+        {"bandwidth", "presliding", "excluded rows", "friction", "estimator"}
+    )
 
     @staticmethod
     def corrupted(recording):
@@ -626,7 +630,7 @@ def held_out_error(recording, settings):
 
 def low_pass_of(shape, seed=0):
     """Return a filtered recording and the chosen settings."""
-    questions = frozenset[Question]({"bandwidth", "presliding", "rows", "low-pass"})
+    questions = frozenset[Question]({"bandwidth", "presliding", "excluded rows", "low-pass"})
     recording = a_recording(noise=0.5 * NOISE, duration=LONG, shape=shape, seed=seed)
     return recording, chosen(recording, questions)[0]
 

@@ -689,8 +689,8 @@ class TestExcludedRows:
         for joint in joints:
             motion.velocity[halt, joint] = 0.0
         masks = {
-            left_out: mask_rows(recording, SLIDING, motion, np.full(2, 40.0), left_out=left_out)
-            for left_out in ("rests", "halts", "slow", "none")
+            rows: mask_rows(recording, SLIDING, motion, np.full(2, 40.0), exclude_rows=rows)
+            for rows in ("rests", "halts", "slow", "none")
         }
         return halt, masks
 
@@ -715,7 +715,7 @@ class TestExcludedRows:
         halt = np.zeros(len(TIME), dtype=np.bool_)
         halt[len(TIME) // 4 : 3 * len(TIME) // 4] = True
         motion.velocity[halt, 1] = 1e-6 * (-1.0) ** np.arange(np.count_nonzero(halt))
-        mask = mask_rows(recording, SLIDING, motion, np.full(2, 40.0), left_out="rests")
+        mask = mask_rows(recording, SLIDING, motion, np.full(2, 40.0), exclude_rows="rests")
         turning = rows_at_reversals(motion.velocity[:, 0])
         assert turning.any()
         np.testing.assert_array_equal(mask.reasons[REVERSAL][:, 0], turning)
@@ -723,7 +723,7 @@ class TestExcludedRows:
 
     def test_halts_exclude_two_rows_at_a_reversal(self):
         motion, recording = motion_and_recording()
-        mask = mask_rows(recording, SLIDING, motion, np.full(2, 40.0), left_out="halts")
+        mask = mask_rows(recording, SLIDING, motion, np.full(2, 40.0), exclude_rows="halts")
         for joint, speed in enumerate(motion.velocity.T):
             turning = rows_at_reversals(speed)
             assert turning.any()
@@ -740,7 +740,7 @@ class TestExcludedRows:
         recording = Recording(
             time=time, position=position, joint_names=SLIDING.joint_names, torque=position
         )
-        mask = mask_rows(recording, SLIDING, motion, np.full(2, 40.0), left_out="rests")
+        mask = mask_rows(recording, SLIDING, motion, np.full(2, 40.0), exclude_rows="rests")
         at = since[mask.reasons[REVERSAL][:, 0]]
         assert TURN == 2.0 / RATE
         for turn in (np.pi / 6.0, np.pi / 2.0):

@@ -197,7 +197,7 @@ def coverage(arm, model, recording, delay):
     standard[10::11] = arm.model.armature
     truth = np.concatenate([model.base.grouping @ standard, arm.coulomb, arm.viscous])
     # Rows at a reversal depend on presliding.
-    options = Preprocessing(torque_delay=delay.applied, left_out="slow")
+    options = Preprocessing(torque_delay=delay.applied, exclude_rows="slow")
     samples = prepare(recording, model, options=options)
     phase = Factor.by_time(model, samples)
     fitted = fit_least_squares(model, [samples], factor=phase)

@@ -21,11 +21,12 @@ from hil.cli.suggestions import (
 from hil.design import METHODS
 from hil.design.settings import FORMER_METHODS
 from hil.pipeline.estimators import ESTIMATORS
-from hil.pipeline.options import FRICTION_TERMS
+from hil.pipeline.options import FRICTION_TERMS, Options
+from hil.results.results import SettingsResult
 
 WIDTH = "100"
 MOST_LINES = 3
-TWO_SCREENS = 100  # lines
+TWO_SCREENS = 80  # lines
 
 
 def invoke(*arguments: str) -> Any:
@@ -177,6 +178,26 @@ class TestMisspelt:
         assert not OTHER_COMMANDS.keys() & COMMANDS.keys()
 
 
+class TestRareOptions:
+    """Entries of a map: they work, and only the commands that describe channels list them."""
+
+    NAMES = ("--command-topic", "--commands", "--calibration", "--units", "--outside-limits",
+             "--drop-missing")  # fmt: skip
+
+    @pytest.mark.parametrize("command", ["identify", "batch", "trend"])
+    def test_they_work_and_are_not_in_the_help(self, command: str) -> None:
+        shown = invoke(command, "--help").stdout
+        options = {name: option for option in COMMANDS[command].params for name in option.opts}
+        for name in self.NAMES:
+            assert name not in entries(shown)
+            assert options[name].hidden
+
+    @pytest.mark.parametrize("path", [("look",), ("import", "log")], ids=" ".join)
+    def test_commands_about_channels_list_them(self, path: tuple[str, ...]) -> None:
+        missing = {*self.NAMES} - {*entries(invoke(*path, "--help").stdout)}
+        assert missing <= ({"--outside-limits"} if path == ("look",) else set())
+
+
 class TestFormerNames:
     """Of version 0.1; they work in 0.2 and say so."""
 
@@ -222,9 +243,22 @@ class TestFormerNames:
         assert done.exit_code == expected.exit_code
         assert (str(done.exception), done.stdout) == (str(expected.exception), expected.stdout)
 
-    def test_an_import_has_a_standstill_speed(self) -> None:
-        arguments = ("import", "log", "a.csv", "--standstill", "0.02")
-        assert with_present_names(arguments) == (list(arguments), [])
+    def test_two_options_had_one_name(self) -> None:
+        present, notes = with_present_names(("import", "log", "a.csv", "--standstill", "0.02"))
+        assert present == ["import", "log", "a.csv", "--standstill-speed", "0.02"]
+        assert notes == ["--standstill is now called --standstill-speed"]
+
+    def test_options_in_python(self) -> None:
+        with pytest.warns(DeprecationWarning, match="standstill is now called exclude_rows"):
+            former = Options(standstill="slow")
+        assert former == Options(exclude_rows="slow")
+
+    def test_settings_of_earlier_results(self) -> None:
+        stored = SettingsResult(
+            archives=[], predicted=[], split=0.7, in_sample=False, estimator="wls",
+            settings={"preprocessing": {"left_out": "halts"}},
+        )  # fmt: skip
+        assert stored.decided().preprocessing.exclude_rows == "halts"
 
     def test_what_follows_two_dashes_is_no_option(self) -> None:
         arguments = ("identify", "--", "--in-sample")
@@ -233,6 +267,7 @@ class TestFormerNames:
     def test_they_are_not_in_the_help(self) -> None:
         assert "gains" not in invoke("--help").stdout
         assert "--standstill" not in invoke("identify", "--help").stdout
-        for name, commands in FORMER_OPTIONS.values():
-            for command in commands:
-                assert name in entries(invoke(command, "--help").stdout)
+        for names in FORMER_OPTIONS.values():
+            for command, name in names.items():
+                path = (command, "log") if command == "import" else (command,)
+                assert name in entries(invoke(*path, "--help").stdout)

@@ -1171,6 +1171,10 @@ class TestImportCommand:
         assert header.purpose == "validation"
         assert any("deg" in warning for warning in header.findings.warnings)
         assert json.loads(header.entries["source"]) == ["log.npz"]
+        text = (tmp_path / "map.toml").read_text()
+        (tmp_path / "map.toml").write_text(f"outside_limits = true\n{text}")
+        by_map = [each for each in arguments if each != "--outside-limits"]
+        assert CliRunner().invoke(app, [*by_map, "--force"]).exit_code == 0, "the map states it"
 
     def test_an_earlier_archive_gives_its_warnings_too(self) -> None:
         """Its metadata have another name for them."""

@@ -18,7 +18,7 @@ from hil.cli import app
 from hil.importers.conclusions import EpisodeUnits, UnitsFrom
 from hil.importers.imported_robot import Robot
 from hil.importers.lerobot import DataSet, is_data_set
-from hil.importers.recording_import import ImportOptions, read_episodes
+from hil.importers.recording_import import ImportOptions, read_episodes, read_recording
 from hil.pipeline.sources import refuse_duplicates
 
 Array = NDArray[np.float64]
@@ -174,6 +174,20 @@ def test_a_calibration_gives_the_range_of_each_joint(tmp_path: Path, urdf: Path)
     ((_, columns, concluded),) = recordings(folder, urdf, calibration=calibration)
     np.testing.assert_allclose(columns["position"], position, atol=1e-5)
     assert EpisodeUnits("range", UnitsFrom.CALIBRATION) in concluded
+
+
+def test_a_map_states_units_and_range_of_every_episode(tmp_path: Path, urdf: Path) -> None:
+    """The map of one episode, as `hil look -o` writes it, reads all of them without options."""
+    first, second = motion(4.0, 0.0), motion(3.0, 1.0)
+    folder = written(tmp_path / "pick", [(in_degrees(q), in_degrees(q)) for q in (first, second)])
+    robot = Robot.from_urdf(urdf)
+    stated = read_recording(folder, lambda _: robot, ImportOptions(units="deg"))
+    assert stated.text is not None
+    (tmp_path / "map.toml").write_text(stated.text)
+    found = recordings(folder, urdf, columns=tmp_path / "map.toml")
+    for (_, columns, concluded), position in zip(found, (first, second), strict=True):
+        np.testing.assert_allclose(columns["position"], position, atol=1e-5)
+        assert not concluded
 
 
 def test_the_range_may_be_that_of_the_urdf(tmp_path: Path, urdf: Path) -> None:

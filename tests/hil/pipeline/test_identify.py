@@ -439,7 +439,7 @@ class TestJudgement:
 def prepared(campaign):
     """Rows in sliding motion only, without velocity reversals."""
     sources = gather_sources(paths(campaign), 0.7)
-    return prepare_sources(sources, Options(standstill="slow"), Silent())
+    return prepare_sources(sources, Options(exclude_rows="slow"), Silent())
 
 
 def torque_share(difference, factor):
@@ -507,7 +507,7 @@ class TestEstimators:
 
 def test_a_stribeck_speed_below_the_recorded_ones_is_refused(campaign):
     """Its coefficient would be arbitrary: 58 % of error on held-out motion, or infinite torques."""
-    options = Options(friction={"stribeck": 1e-4}, estimator="wls", standstill="rests")
+    options = Options(friction={"stribeck": 1e-4}, estimator="wls", exclude_rows="rests")
     with pytest.raises(InputError, match=r"stribeck.*slower than twice .* larger speed"):
         prepare_sources(gather_sources(paths(campaign), 0.7), options, Silent())
 
@@ -649,7 +649,9 @@ def test_nothing_is_called_good_in_sample(log, split):
 
 
 # The arm of the log starts without acceleration, which no rigid body does: slow rows are left out.
-SLOW = replace(FIXED, friction={"presliding": 1e-4, "third": "none"}, delay=0.0, standstill="slow")
+SLOW = replace(
+    FIXED, friction={"presliding": 1e-4, "third": "none"}, delay=0.0, exclude_rows="slow"
+)
 
 
 def test_series_of_figures_have_fitted_rows_and_friction(tmp_path):
