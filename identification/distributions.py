@@ -30,3 +30,13 @@ def fisher_limit(share: ArrayLike, freedom: ArrayLike, of_variance: ArrayLike) -
     It is the mean of `freedom` squares over a variance of `of_variance` degrees of freedom.
     """
     return scipy.special.fdtri(freedom, of_variance, 1.0 - np.asarray(share))
+
+
+def student_tail(value: ArrayLike, freedom: ArrayLike) -> Any:
+    """Probability that Student's t of so many degrees of freedom exceeds a value."""
+    return scipy.special.stdtr(freedom, -np.asarray(value))
+
+
+def fisher_tail(value: ArrayLike, freedom: ArrayLike, of_variance: ArrayLike) -> Any:
+    """Probability that Fisher's F, see `fisher_limit`, exceeds a value."""
+    return scipy.special.fdtrc(freedom, of_variance, value)

@@ -15,8 +15,7 @@ from pathlib import Path
 from typing import Any, Final, NamedTuple
 
 import numpy as np
-from scipy.optimize import brentq
-from scipy.stats import t as student
+import scipy
 
 from hil.base.arrays import Array
 from hil.base.errors import InputError
@@ -28,6 +27,7 @@ from hil.batch.estimates import BatchArm, BatchEstimate
 from hil.pipeline.options import Options
 from hil.pipeline.sources import arm_differences
 from identification import RobotModel
+from identification.distributions import student_limit, student_tail
 from identification.factor.estimate import Estimate
 
 MIN_REPETITIONS: Final = 15
@@ -38,7 +38,7 @@ FALSE_ALARMS: Final = 0.01  #: Probability of any change of an arm that has none
 LEAST: Final = 0.05  #: Smallest relevant change, as a share of the first value
 SPEEDS: Final = np.geomspace(0.02, 5.0, 40)  # rad/s or m/s
 _MAX_CORRELATION: Final = 0.95
-_NORMAL: Final = float(student.ppf(0.975, 1e6))
+_NORMAL: Final = float(student_limit(0.025, 1e6))
 _TWO: Final = "give two or more campaigns of one arm"
 _CAVEAT: Final = (
     "the normal variation from day to day is not known from a few campaigns: friction of a cold arm"
@@ -366,7 +366,9 @@ def freedom_of(level: BatchEstimate) -> float:
     factor = level.estimate.interval_factor
     if factor <= _NORMAL:
         return 1e6
-    return float(brentq(lambda freedom: student.ppf(0.975, freedom) - factor, 0.5, 1.1e6))
+    return float(
+        scipy.optimize.brentq(lambda freedom: student_limit(0.025, freedom) - factor, 0.5, 1.1e6)
+    )
 
 
 def _figures(
@@ -429,8 +431,8 @@ def against_first(figures: Array) -> tuple[Array, Array, Array]:
     with np.errstate(divide="ignore", invalid="ignore"):
         both = np.where(np.isfinite(change), total**2 / (squares + squares[0]), np.nan)
         std = np.where(np.isfinite(change), np.sqrt(total), np.nan)
-        p_value = holm(2.0 * student.sf(np.abs(change) / std, both))
-    return change, student.isf(0.5 - 0.5 * CONFIDENCE, both) * std, p_value
+        p_value = holm(2.0 * student_tail(np.abs(change) / std, both))
+    return change, student_limit(0.5 - 0.5 * CONFIDENCE, both) * std, p_value
 
 
 def holm(p_values: Array) -> Array:

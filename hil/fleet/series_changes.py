@@ -18,10 +18,9 @@ from typing import Final, Literal, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.stats import f as fisher
-from scipy.stats import t as student
 
 from hil.base.arrays import Array
+from identification.distributions import fisher_tail, student_limit, student_tail
 
 Kind = Literal["step", "slope"]
 
@@ -68,12 +67,6 @@ class ShapeOfChange(NamedTuple):
 
     kind: Kind
     begin: float
-
-    def column(self, time: Array) -> Array:
-        """Return the effect of a unit of it (m,): 1, or 1 a month."""
-        if self.kind == "step":
-            return (time > self.begin).astype(np.float64)
-        return np.maximum(time - self.begin, 0.0)
 
 
 @dataclass(frozen=True, eq=False)
@@ -164,13 +157,13 @@ def courses(family: Sequence[Series]) -> list[Course | None]:
             continue
         # Without covariates, and without what all robots have in common.
         alone = replace(each, covariates=each.covariates[:, :0])
-        unadjusted = _course(alone, _flat(0), noise)
+        unadjusted = _model(alone, _flat(0), noise)
         adjusted.append(
             replace(
                 course,
                 effects=course.effects + mean,
                 unadjusted_p=unadjusted.p_value,
-                unadjusted_largest=unadjusted.largest,
+                unadjusted_largest=_largest(alone, unadjusted),
             )
         )
     return adjusted
@@ -251,15 +244,17 @@ def _fitted(
 ) -> tuple[list[Course | None], _Noise]:
     """Fit all series with one noise, which is estimated from what their models leave."""
     noise = _noise_of_steps(family)
-    found: list[Course | None] = []
+    long = [len(series.time) >= FEWEST for series in family]
+    pairs = [(s, prior) for s, prior, use in zip(family, priors, long, strict=True) if use]
+    models: list[_Model] = []
     for number in range(_ROUNDS):
-        found = [
-            _course(series, prior, noise) if len(series.time) >= FEWEST else None
-            for series, prior in zip(family, priors, strict=True)
-        ]
+        models = [_model(series, prior, noise) for series, prior in pairs]
         if number < _ROUNDS - 1:
-            noise = _noise_of_residuals(family, found, noise)
-    return found, noise
+            noise = _noise_of_residuals(pairs, models, noise)
+    found = iter(
+        [_described(*pair, model, noise) for pair, model in zip(pairs, models, strict=True)]
+    )
+    return [next(found) if use else None for use in long], noise
 
 
 # What robots have in common
@@ -405,7 +400,7 @@ def _noise_of_steps(family: Sequence[Series]) -> _Noise:
 
 
 def _noise_of_residuals(
-    family: Sequence[Series], found: Sequence[Course | None], before: _Noise
+    pairs: Sequence[tuple[Series, _Prior]], models: Sequence[_Model], before: _Noise
 ) -> _Noise:
     """Return the noise of what the models leave, and the correlation of successive residuals."""
     squares = 0.0
@@ -414,24 +409,23 @@ def _noise_of_residuals(
     freedom = 0.0
     count = 0
     pieces = 0
-    residuals = [
-        (series, course.adjusted - course.fitted, course)
-        for series, course in zip(family, found, strict=True)
-        if course is not None
-    ]
+    residuals = []
+    for (series, prior), model in zip(pairs, models, strict=True):
+        coefficients, _, design = _solved(series, prior, model.weights, model.changes)
+        residuals.append((series, series.value - design @ coefficients, len(model.changes)))
     if not residuals:
         return before
     every = np.concatenate([rest for _, rest, _ in residuals])
     limit = _OUTLIER * float(np.median(np.abs(every))) / _NORMAL_MAD
-    for series, rest, course in residuals:
+    for series, rest, changes in residuals:
         clipped = np.clip(rest, -limit, limit) if limit > 0.0 else rest
         squares += float(clipped @ clipped)
         products += float(clipped[:-1] @ clipped[1:])
-        used = 1 + 2 * len(course.changes) + (series.covariates.shape[1] if len(family) < 2 else 0)
+        used = 1 + 2 * changes + (series.covariates.shape[1] if len(pairs) < 2 else 0)
         freedom += max(0.0, len(rest) - used)
         measured += float(series.variance.sum())
         count += len(rest)
-        pieces += 1 + len(course.changes)
+        pieces += 1 + changes
     freedom = max(1.0, freedom)
     total = squares / freedom
     day = max(0.0, total - measured / count)
@@ -447,7 +441,16 @@ def _noise_of_residuals(
 # One series
 
 
-def _course(series: Series, prior: _Prior, noise: _Noise) -> Course:
+class _Model(NamedTuple):
+    """Changes of a series, of the `candidates`: weights of its values (m,), p value of none."""
+
+    weights: Array
+    changes: tuple[ShapeOfChange, ...]
+    candidates: Sequence[ShapeOfChange]
+    p_value: float
+
+
+def _model(series: Series, prior: _Prior, noise: _Noise) -> _Model:
     """Add the likeliest change, then the next, while they are significant."""
     time = series.time
     candidates = _candidates(time)
@@ -463,7 +466,7 @@ def _course(series: Series, prior: _Prior, noise: _Noise) -> Course:
         best, statistic = _likeliest(series, prior, weights, chosen, apart)
         if best is None:
             break
-        single = 2.0 * float(student.sf(abs(statistic), noise.freedom))
+        single = 2.0 * float(student_tail(abs(statistic), noise.freedom))
         p = min(1.0, len(candidates) * single)
         added = [best]
         if not chosen:
@@ -479,7 +482,14 @@ def _course(series: Series, prior: _Prior, noise: _Noise) -> Course:
             p_value = p_value if chosen else max(p_value, without)
             break
         chosen = _refined(series, prior, weights, [*chosen, *added], candidates)
-    return _described(series, prior, weights, tuple(chosen), candidates, p_value, noise)
+    return _Model(weights, tuple(chosen), candidates, p_value)
+
+
+def _largest(series: Series, model: _Model) -> float:
+    """Return the largest departure from the level before all changes, without covariates."""
+    coefficients, _, _ = _solved(series, _flat(0), model.weights, model.changes)
+    departures = _columns(model.changes, series.time) @ coefficients[1:]
+    return float(np.max(np.abs(departures), initial=0.0))
 
 
 def _candidates(time: Array) -> list[ShapeOfChange]:
@@ -504,13 +514,10 @@ def _p_without_one(
     freedom: float,
 ) -> float:
     """Return the p value of changes without the recording that they most depend on."""
-    gains = []
-    for number in range(len(weights)):
-        others = weights.copy()
-        others[number] = 0.0
-        before = _misfit(series, prior, others, chosen)
-        gains.append(before - _misfit(series, prior, others, [*chosen, *added]))
-    return float(fisher.sf(max(0.0, min(gains)) / len(added), len(added), freedom))
+    others = weights * (1.0 - np.eye(len(weights)))
+    before = _misfits(series, prior, others, _design(series, chosen))
+    gains = before - _misfits(series, prior, others, _design(series, [*chosen, *added]))
+    return float(fisher_tail(max(0.0, gains.min()) / len(added), len(added), freedom))
 
 
 def _apart(
@@ -539,9 +546,15 @@ def _near(
 def _design(series: Series, chosen: Sequence[ShapeOfChange]) -> Array:
     """Return the columns of the level, the covariates and the changes (m, 1 + c + k)."""
     level = np.ones((len(series.time), 1))
-    return np.column_stack(
-        [level, series.covariates, *(shape.column(series.time) for shape in chosen)]
-    )
+    return np.concatenate([level, series.covariates, _columns(chosen, series.time)], axis=1)
+
+
+def _columns(shapes: Sequence[ShapeOfChange], time: Array) -> Array:
+    """Return the effect of a unit of each change (m, k): 1, or 1 a month."""
+    begins = np.array([shape.begin for shape in shapes])
+    steps = np.array([shape.kind == "step" for shape in shapes], dtype=bool)
+    since = time[:, None] - begins
+    return np.asarray(np.where(steps, since > 0.0, np.maximum(since, 0.0)), dtype=np.float64)
 
 
 def _solved(
@@ -570,7 +583,7 @@ def _likeliest(
         return None, 0.0
     coefficients, covariance, design = _solved(series, prior, weights, chosen)
     rest = series.value - design @ coefficients
-    columns = np.column_stack([shape.column(series.time) for shape in candidates])
+    columns = _columns(candidates, series.time)
     weighted = weights[:, None] * columns
     crossed = design.T @ weighted
     norm = np.einsum("mk,mk->k", columns, weighted)
@@ -595,7 +608,7 @@ def _likeliest_pair(
         return [], 1.0
     coefficients, covariance, design = _solved(series, prior, weights, ())
     rest = series.value - design @ coefficients
-    columns = np.column_stack([shape.column(series.time) for shape in candidates])
+    columns = _columns(candidates, series.time)
     weighted = weights[:, None] * columns
     crossed = design.T @ weighted
     products = columns.T @ weighted - crossed.T @ covariance @ crossed
@@ -612,18 +625,31 @@ def _likeliest_pair(
     step, other = np.unravel_index(int(np.argmax(gain)), gain.shape)
     if not gain[step, other] > 0.0:
         return [], 1.0
-    p = float(fisher.sf(0.5 * float(gain[step, other]), 2.0, freedom))
+    p = float(fisher_tail(0.5 * float(gain[step, other]), 2.0, freedom))
     return [candidates[steps[int(step)]], candidates[int(other)]], min(1.0, gain.size * p)
 
 
-def _misfit(
-    series: Series, prior: _Prior, weights: Array, chosen: Sequence[ShapeOfChange]
-) -> float:
-    """Return twice the negative log-likelihood of a model, up to a constant."""
-    coefficients, _, design = _solved(series, prior, weights, chosen)
-    rest = series.value - design @ coefficients
-    off = coefficients[1 : 1 + len(prior.mean)] - prior.mean
-    return float(weights @ rest**2 + off @ prior.information @ off)
+def _misfits(series: Series, prior: _Prior, weights: Array, designs: Array) -> Array:
+    """Return twice the negative log-likelihoods of models (n,), up to a constant.
+
+    Args:
+        series: of all.
+        prior: of the effects of its covariates.
+        weights: of its values, of each model or of all (n, m) or (m,).
+        designs: columns of each or of all (n, m, p) or (m, p).
+    """
+    weighted = np.swapaxes(weights[..., None] * designs, -1, -2)
+    normal = weighted @ designs
+    right = weighted @ series.value
+    own = slice(1, 1 + len(prior.mean))
+    normal[..., own, own] += prior.information
+    right[..., own] += prior.information @ prior.mean
+    coefficients = (np.linalg.pinv(normal, hermitian=True) @ right[..., None])[..., 0]
+    rest = series.value - (designs @ coefficients[..., None])[..., 0]
+    off = coefficients[..., own] - prior.mean
+    return np.asarray(
+        (weights * rest**2).sum(axis=-1) + ((off @ prior.information) * off).sum(axis=-1)
+    )
 
 
 def _refined(
@@ -655,24 +681,17 @@ def _own_scale(
     weights = 1.0 / variance
     pair, _ = _likeliest_pair(series, prior, weights, candidates, 1.0)
     freedom = max(1.0, len(series.time) - 1.0 - 2.0 * len(pair))
-    ratio = _misfit(series, prior, weights, pair) / freedom
+    ratio = float(_misfits(series, prior, weights, _design(series, pair))) / freedom
     return max(1.0, (_OWN + freedom * ratio) / (_OWN + freedom))
 
 
-def _described(
-    series: Series,
-    prior: _Prior,
-    weights: Array,
-    chosen: tuple[ShapeOfChange, ...],
-    candidates: Sequence[ShapeOfChange],
-    p_value: float,
-    noise: _Noise,
-) -> Course:
+def _described(series: Series, prior: _Prior, model: _Model, noise: _Noise) -> Course:
     """Return a model with its changes, and the intervals of what it says of the end."""
+    weights, chosen, candidates, p_value = model
     coefficients, covariance, design = _solved(series, prior, weights, chosen)
     first = 1 + len(prior.mean)
-    factor = float(student.isf(0.025, noise.freedom))
-    end = np.array([shape.column(series.time[-1:])[0] for shape in chosen])
+    factor = float(student_limit(0.025, noise.freedom))
+    (end,) = _columns(chosen, series.time[-1:])
     slope = np.array([float(shape.kind == "slope") for shape in chosen])
     sizes = coefficients[first:]
     of_changes = covariance[first:, first:]
@@ -723,9 +742,11 @@ def _begin_interval(
 ) -> tuple[float, float]:
     """Return the begins of this kind of change within the 95 % interval by likelihood."""
     alike = [each for each in candidates if each.kind == shape.kind]
-    misfits = np.array([_misfit(series, prior, weights, [*others, each]) for each in alike])
-    best = _misfit(series, prior, weights, [*others, shape])
-    likely = np.array([each.begin for each in alike])[misfits <= best + _LIKELY]
+    begins = _columns([shape, *alike], series.time).T[..., None]
+    design = _design(series, others)
+    known = np.broadcast_to(design, (len(begins), *design.shape))
+    best, *misfits = _misfits(series, prior, weights, np.concatenate([known, begins], axis=2))
+    likely = np.array([each.begin for each in alike])[np.array(misfits) <= best + _LIKELY]
     earliest, latest = float(likely.min()), float(likely.max())
     if shape.kind == "step":  # anywhere between two recordings
         earliest = float(series.time[series.time < earliest].max())
