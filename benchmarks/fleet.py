@@ -1,6 +1,6 @@
 """A fleet of simulated arms with known faults, and how soon `hil trend` finds them.
 
-Run with ``python -m benchmarks.fleet [--fleets N]``: fleets of 20 robots over 24 months, which are
+Run with ``python -m benchmarks.fleet [--fleets N] [--logged WHAT]``: fleets of 20 robots over 24 months, which are
 asked about every month, as a nightly job does. The friction of each joint is known from each log
 to half a per cent, as from 30 s of motion; what follows is the trend. `write_fleet`
 simulates logs by pinocchio's recursive Newton-Euler with this module's friction, temperature and
@@ -325,9 +325,11 @@ def main() -> None:
     """Print how soon faults are found, how well they are dated, and how many alarms are false."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--fleets", type=int, default=4, help="with faults, and without, each")
-    fleets = parser.parse_args().fleets
+    parser.add_argument("--logged", choices=get_args(Known), nargs="*", default=get_args(Known))
+    options = parser.parse_args()
+    fleets = options.fleets
     begun = process_time()
-    for known in get_args(Known):
+    for known in options.logged:
         faulty = [watched(planned(seed, faulty=True), known) for seed in range(fleets)]
         others = [watched(planned(100 + k, faulty=False), known) for k in range(fleets)]
         every = [result for outcome in faulty for result in outcome.found]

@@ -611,14 +611,15 @@ def _likeliest_pair(
     columns = _columns(candidates, series.time)
     weighted = weights[:, None] * columns
     crossed = design.T @ weighted
-    products = columns.T @ weighted - crossed.T @ covariance @ crossed
+    known = covariance @ crossed
+    products = columns[:, steps].T @ weighted - crossed[:, steps].T @ known
     sides = weighted.T @ rest
-    own = np.diag(products)
+    own = (columns * weighted).sum(axis=0) - (crossed * known).sum(axis=0)
     first = own[steps, None]
-    determinant = first * own - products[steps] ** 2
+    determinant = first * own - products**2
     gain = (
         sides[steps, None] ** 2 * own
-        - 2.0 * sides[steps, None] * sides * products[steps]
+        - 2.0 * sides[steps, None] * sides * products
         + sides**2 * first
     ) / np.where(determinant > 1e-6 * first * own, determinant, np.inf)
     gain[_near(series.time, [candidates[k] for k in steps], candidates)] = 0.0
