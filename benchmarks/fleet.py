@@ -1,10 +1,10 @@
 """A fleet of simulated arms with known faults, and how soon `hil trend` finds them.
 
-Run with ``python -m benchmarks.fleet [--fleets N] [--logged WHAT]``: fleets of 20 robots over 24 months, which are
-asked about every month, as a nightly job does. The friction of each joint is known from each log
-to half a per cent, as from 30 s of motion; what follows is the trend. `write_fleet`
-simulates logs by pinocchio's recursive Newton-Euler with this module's friction, temperature and
-noise; it uses nothing of `hil` or `identification`.
+Run with ``python -m benchmarks.fleet [--fleets N] [--logged WHAT]``: fleets of 20 robots over 24
+months, which are asked about every month, as a nightly job does. The friction of each joint is
+known from each log to half a per cent, as from 30 s of motion; what follows is the trend.
+`write_fleet` simulates logs by pinocchio's recursive Newton-Euler with this module's friction,
+temperature and noise; it uses nothing of `hil` or `identification`.
 """
 
 from __future__ import annotations
