@@ -25,6 +25,7 @@ from identification.signals.masks import SATURATED, SPIKE
 from identification.signals.recording import UNWRAPPED, Recording
 from identification.signals.row_faults import RowFaultKind
 from identification.signals.samples import Samples
+from identification.validation.controller_inertia import InertiaRatio, inertia_ratio
 from identification.validation.evidence import CellContext
 from identification.validation.finding import (
     Finding,
@@ -34,7 +35,7 @@ from identification.validation.finding import (
     Thresholds,
     Value,
 )
-from identification.validation.nominal_scale import InertiaRatio, inertia_ratio, nominal_scale
+from identification.validation.nominal_scale import nominal_scale
 from identification.validation.position_jumps import PositionJump, position_steps
 from identification.validation.prediction import PredictionError, pooled_error
 from identification.validation.residuals import folded_noise

@@ -25,9 +25,10 @@ from identification.hypotheses.unseen_changes import UnseenChange, find_changes
 from identification.model.robot import RobotModel
 from identification.signals.samples import Samples
 from identification.validation.consistency import ConsistencyCheck
+from identification.validation.controller_inertia import InertiaRatio
 from identification.validation.finding import Finding, Thresholds
 from identification.validation.nominal_friction import with_fitted_friction
-from identification.validation.nominal_scale import InertiaRatio, NominalScale
+from identification.validation.nominal_scale import NominalScale
 from identification.validation.physical_signs import (
     Implausible,
     TopSpeedFriction,

@@ -1,4 +1,4 @@
-"""Measured torque over that of nominal inertias, and a controller's inertia over the identified.
+"""Measured torque over that of nominal inertias.
 
 A torque constant or gear ratio wrong by a factor fits equally well: only independent knowledge
 shows it.
@@ -7,7 +7,6 @@ shows it.
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
-from dataclasses import replace
 from typing import Final, NamedTuple
 
 import numpy as np
@@ -16,21 +15,8 @@ from numpy.typing import NDArray
 from identification.arrays import Array
 from identification.distributions import student_limit
 from identification.estimators.prior import nominal_deviations
-from identification.model.motion import Motion
 from identification.model.robot import RobotModel
 from identification.signals.samples import Samples
-
-
-def inertia_matrices(model: RobotModel, values: Array, position: Array) -> Array:
-    """Return inertia matrices (k, n, n) with rotors, of parameters (p,) at positions (k, n)."""
-    rest = Motion.at_rest(position)
-    static_torque = model.torque(values, rest)
-    columns = [
-        model.torque(values, replace(rest, acceleration=rest.acceleration + axis)) - static_torque
-        for axis in np.eye(model.n_joints)
-    ]
-    return np.stack(columns, axis=2)
-
 
 _MOST_ROWS: Final = 5_000  # that are compared with the nominal torque
 _BLOCKS: Final = 20  # parts of the recordings whose scatter gives the standard deviation
@@ -164,36 +150,3 @@ def _scale(table: Array, torque: Array, deviations: Array, *, share: float) -> t
     unit = max(1.0, abs(scale))
     is_certain = noise + _SURE * misfit < _WIDEST * unit and tolerance < unit
     return (scale, float(tolerance)) if is_certain else (np.nan, np.inf)
-
-
-class InertiaRatio(NamedTuple):
-    """Ratio of the controller's to the identified inertia per joint, with rotors, joint side."""
-
-    # median over postures (n,); NaN where the controller sends zero or the inertia is undetermined
-    ratio: Array
-    spread: Array  # standard deviation over postures (n,), NaN likewise
-
-
-def inertia_ratio(
-    model: RobotModel, values: Array, position: Array, theirs: Array
-) -> InertiaRatio | None:
-    """Compare a controller's diagonal inertia with that of an estimate.
-
-    None if there is nothing to compare.
-
-    Args:
-        model: of the arm.
-        values: parameters (p,).
-        position: of the joints (m, n) [rad or m].
-        theirs: the controller's inertia, joint side (m, n); zero where not sent.
-    """
-    if not np.any(theirs):
-        return None
-    ours = np.diagonal(inertia_matrices(model, values, position), axis1=1, axis2=2)
-    comparable = (ours > 0.0) & (theirs > 0.0)
-    ratio = np.where(comparable, theirs, np.nan) / np.where(comparable, ours, 1.0)
-    whole = comparable.mean(axis=0) > 0.9
-    median, spread = np.full((2, model.n_joints), np.nan)
-    median[whole] = np.nanmedian(ratio[:, whole], axis=0)
-    spread[whole] = np.nanstd(ratio[:, whole], axis=0)
-    return InertiaRatio(median, spread)

@@ -21,6 +21,7 @@ from identification.factor.normal_equations import solve
 from identification.hypotheses.unseen_changes import find_changes
 from identification.model.coupling import Coupling
 from identification.model.friction import FrictionLaw
+from identification.model.mass_matrix import mass_matrices
 from identification.model.robot import RobotModel
 from identification.selection.folds import FOLDS
 from identification.signals.masks import EDGE, SATURATED, STANDSTILL, RowMask
@@ -28,9 +29,10 @@ from identification.signals.recording import Recording
 from identification.signals.samples import Preprocessing, prepare
 from identification.validation.calibration import TorqueMeans, calibrate, inner_errors
 from identification.validation.consistency import check_consistency
+from identification.validation.controller_inertia import inertia_ratio
 from identification.validation.evidence import repetition_noise
 from identification.validation.nominal_friction import with_fitted_friction
-from identification.validation.nominal_scale import inertia_matrices, inertia_ratio, nominal_scale
+from identification.validation.nominal_scale import nominal_scale
 from identification.validation.physical_signs import Implausible, implausibilities
 from identification.validation.position_jumps import position_jumps, position_steps
 from identification.validation.prediction import (
@@ -954,9 +956,9 @@ def arm():
 
 
 class TestInertia:
-    def test_inertia_matrices_are_those_of_pinocchio(self):
+    def test_mass_matrices_are_those_of_pinocchio(self):
         model, values, position, diagonal = arm()
-        matrices = inertia_matrices(model, values, position)
+        matrices = mass_matrices(model, values, position)
         np.testing.assert_allclose(np.diagonal(matrices, axis1=1, axis2=2), diagonal, rtol=1e-9)
 
     def test_another_inertia_of_the_controller_is_a_finding(self):
