@@ -2,11 +2,16 @@
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, Final
 
 import numpy as np
 import scipy
 from numpy.typing import ArrayLike
+
+MAD_TO_STD: Final = 1.4826
+"""Standard deviation of a normal variable over its median absolute value."""
+NORMAL_95: Final = 1.96
+"""Standard deviations in half a 95 % interval of known variance."""
 
 
 def normal_limit(share: ArrayLike) -> Any:

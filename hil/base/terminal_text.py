@@ -26,6 +26,11 @@ def with_joint_names(text: str, joint_names: Sequence[str]) -> str:
     return _JOINT_NUMBER.sub(name, text)
 
 
+def one_line(text: str) -> str:
+    """Return a text as one printable line: names in archives may contain anything."""
+    return " ".join("".join(c if c.isprintable() else " " for c in text).split())
+
+
 def plural(number: int, noun: str) -> str:
     """Return number and noun: 1 packet, 2 packets, 2 replies."""
     several = f"{noun[:-1]}ies" if noun.endswith("y") else f"{noun}s"

@@ -16,7 +16,7 @@ from typing import Any, Final, Literal, NamedTuple, Protocol
 from hil.archive import Archive, ArchiveName, ArchiveOutcome, open_archive
 from hil.archive.campaign_archives import Entry, RecordedCampaign
 from hil.archive.check import recording_date
-from hil.archive.header import KINDS
+from hil.archive.header import KINDS, SUFFIX
 from hil.base.errors import ArchiveError, CampaignFolderError, InputError
 from hil.base.files import digest, file_digest, json_digest
 from hil.base.progress import Reporter
@@ -28,7 +28,6 @@ from identification.selection.settings import Settings
 from .cache import JSON, CacheError, CacheLocation, code_digest
 from .cluster import Cluster, ClusterTask, SkippedArchive, reason_of
 from .places import (
-    SUFFIX,
     Stamp,
     as_file,
     folder_of,

@@ -10,10 +10,9 @@ from tempfile import TemporaryDirectory
 from typing import Any, Final, NamedTuple
 from urllib.parse import urlsplit
 
+from hil.archive.header import SUFFIX
 from hil.base.errors import ArchiveError, InputError
 from hil.base.files import json_digest
-
-SUFFIX: Final = ".mcap"
 
 _VALIDATORS: Final = ("ETag", "Content-MD5", "Digest", "Last-Modified", "created", "mtime", "etag")
 """Entries of a file's description that change with its content."""

@@ -8,12 +8,13 @@ from glob import glob, has_magic
 from pathlib import Path
 from typing import NamedTuple, Protocol
 
+from hil.archive.header import SUFFIX
 from hil.base.errors import InputError
 from hil.base.safe_input import remedy_for_missing
 
 from .cache import BESIDE
 from .cluster import SkippedArchive
-from .places import SUFFIX, archives_at, is_url
+from .places import archives_at, is_url
 
 
 class KindsOfLogs(Protocol):

@@ -12,7 +12,7 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Final, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
@@ -35,6 +35,7 @@ from hil.pipeline.prepared import (
     versions_of,
 )
 from hil.pipeline.sources import Source, gather_sources
+from hil.precision.forecast import REFERENCE_PERIOD
 from hil.precision.given_recordings import given_sources
 from hil.precision.required_quantities import ReferenceMotions, RequiredQuantities
 from hil.precision.requirements import Requirement, require_known, requirements_from
@@ -48,8 +49,6 @@ from identification.signals.samples import Samples
 
 from .precision_record import IN_A_ROW, PrecisionLook, PrecisionRecord, Reached
 from .state import CampaignState
-
-_REFERENCE_PERIOD: Final = 0.04  # s
 
 
 @dataclass(frozen=True, eq=False)
@@ -207,7 +206,7 @@ class PrecisionMeter:
         self._sources = sources
         self._prepared = prepared_with(sources, settings, Silent())
         motions = [
-            midpoints(motion.trajectory, _REFERENCE_PERIOD) for motion in campaign.plan.validation
+            midpoints(motion.trajectory, REFERENCE_PERIOD) for motion in campaign.plan.validation
         ]
         model = self._prepared.sources.cell.model
         self._reference = ReferenceMotions(model, motions, campaign.cell.model.parameter_names)

@@ -11,6 +11,7 @@ import typer
 
 from hil.base.errors import InputError
 from hil.cli.arguments import ESTIMATION
+from hil.importers.dialect import number_of
 from hil.pipeline.estimators import ESTIMATORS, Estimator
 from hil.pipeline.options import Options, friction_from
 from identification.rollout.servo_by_torque import PositionServo
@@ -105,7 +106,7 @@ def delay_from(text: str | None) -> float | Literal["auto", "stated"] | None:
     """Parse the value of `--delay`, s; InputError if it is not one."""
     if text is None or text in ("auto", "stated"):
         return cast('Literal["auto", "stated"] | None', text)
-    value = _number(text)
+    value = number_of(text)
     if not abs(value) <= LONGEST_DELAY:
         remedy = f"give seconds between {-LONGEST_DELAY:g} and {LONGEST_DELAY:g}, stated or auto"
         raise InputError(None, f"{text!r} is not a delay", field="--delay", remedy=remedy)
@@ -116,7 +117,7 @@ def servo_from(text: str | None) -> PositionServo | str | None:
     """Parse the value of `--servo`; InputError if it is neither gains and delay nor a word."""
     if text is None or text == "identified":
         return text
-    figures = [_number(part) for part in text.split(",")]
+    figures = [number_of(part) for part in text.split(",")]
     if len(figures) != 3 or not (figures[0] > 0.0 and figures[1] >= 0.0):
         remedy = "give kp,kd,delay such as 2000,50,0.004, or the word identified"
         raise InputError(None, f"{text!r} is not a servo", field="--servo", remedy=remedy)
@@ -129,15 +130,8 @@ def servo_from(text: str | None) -> PositionServo | str | None:
 def _bandwidth(text: str, option: str) -> float | Literal["auto"]:
     if text == "auto":
         return "auto"
-    value = _number(text)
+    value = number_of(text)
     if not 0.0 < value < math.inf:
         remedy = 'give a frequency above 0 Hz, or "auto"'
         raise InputError(None, f"{text!r} is not a bandwidth", field=option, remedy=remedy)
     return value
-
-
-def _number(text: str) -> float:
-    try:
-        return float(text)
-    except ValueError:
-        return math.nan

@@ -31,7 +31,7 @@ from hil.importers.bag_map import BagMap
 from hil.importers.channels import CHANNEL_NAMES
 from hil.importers.column_map import ready_map, ready_maps
 from hil.importers.dh import convention_of
-from hil.importers.imported_robot import STANDARD_GRAVITY, Robot
+from hil.importers.imported_robot import Robot
 from hil.importers.lerobot import EpisodeUnit
 from hil.importers.messages import sentence
 from hil.importers.recording_content import Use
@@ -46,6 +46,7 @@ from hil.look.before_identification import Asking
 from hil.pipeline.options import friction_from
 from identification import FrictionLaw
 from identification.model.kinematics import MOST_JOINTS
+from identification.model.robot import STANDARD_GRAVITY
 
 app = typer.Typer(
     help="Convert recordings of other formats to archives that `hil identify` reads.",

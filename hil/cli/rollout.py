@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Annotated, Final
+from typing import Annotated
 
 import typer
 
@@ -22,7 +22,7 @@ from hil.cli.arguments import (
     with_options,
 )
 from hil.cli.identify_options import EstimatorOption, Identifying, servo_from
-from hil.cli.verdict import NOT_GOOD
+from hil.cli.verdict import MOST_JOINTS, NOT_GOOD
 from hil.pipeline.options import Options
 from hil.pipeline.stored_identification import read_or_identify
 from hil.plots.plan_picture import save
@@ -115,16 +115,13 @@ def rollout(
         raise typer.Exit(NOT_GOOD)
 
 
-_MOST_JOINTS: Final = 8
-
-
 def screen(result: RolloutResult) -> list[str]:
     """Return one screen: the result, the errors of identified and nominal arm side by side."""
     arms = [("identified", result.identified), ("nominal", result.nominal)]
     if result.polish is not None:
         arms[1:] = [("polished", result.polish.errors)]
     shown = [(name, arm) for name, arm in arms if arm is not None]
-    joints = range(min(_MOST_JOINTS, len(result.joint_names)))
+    joints = range(min(MOST_JOINTS, len(result.joint_names)))
     more = len(result.joint_names) - len(joints)
     lines = columns(
         [

@@ -23,7 +23,7 @@ NOT_GOOD = 5
 
 MOST: Final = 3
 """Findings, and next steps, on one screen."""
-_MOST_JOINTS: Final = 8  # rows on one screen
+MOST_JOINTS: Final = 8  # rows on one screen
 _MISSING: Final = "-"
 _LEVELS: Final = {"wrong": "wrong", "doubtful": "doubtful", "information": "info", "good": "ok"}
 LABEL: Final = 10
@@ -110,7 +110,7 @@ def screen(
     remarks += len(results.remarks) + len(judgement.next_steps) - len(steps)
     table_lines = table(results)
     parts: list[Part] = [Paragraph(results.verdict.line), *read, ""]
-    parts += table_lines if len(table_lines) <= _MOST_JOINTS + 2 else _some_joints(results)
+    parts += table_lines if len(table_lines) <= MOST_JOINTS + 2 else _some_joints(results)
     parts.append("")
     parts += [Paragraph(f.words, _LEVELS[f.level].ljust(LABEL), 3) for f in shown]
     parts += [Paragraph(step, "next".ljust(LABEL), 3) for step in steps]
@@ -183,7 +183,7 @@ _OF_ALL: Final = {"joint": "all", "RMS error": "", "of limit": ""}
 def _some_joints(results: Results) -> list[str]:
     """Return the table of the joints with the largest errors of an arm of many joints."""
     judgement = results.judgement
-    worst = sorted(judgement.joints, key=lambda joint: -(joint.relative or 0.0))[:_MOST_JOINTS]
+    worst = sorted(judgement.joints, key=lambda joint: -(joint.relative or 0.0))[:MOST_JOINTS]
     shown = [joint for joint in judgement.joints if joint in worst]
     rows: list[JointJudgement | OverallJudgement] = [*shown]
     if judgement.all_joints is not None:

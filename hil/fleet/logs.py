@@ -16,13 +16,14 @@ from pathlib import Path
 from typing import Final
 
 from hil.archive import write_archive
+from hil.archive.header import SUFFIX
 from hil.base.errors import ArchiveError, SourceError
 from hil.base.files import digest, file_digest, json_digest, replace_file, write_output
 from hil.base.progress import Reporter
 from hil.batch.archive_discovery import ArchiveRef, campaign_of, described_archive, is_untouched
 from hil.batch.cache import CacheError, CacheLocation, cache_errors, code_digest
 from hil.batch.cluster import Cluster, ClusterTask, SkippedArchive, reason_of
-from hil.batch.places import SUFFIX, Stamp, name_of, stamp_of
+from hil.batch.places import Stamp, name_of, stamp_of
 from hil.cell import Cell
 from hil.fleet.extra_channels import ExtraChannels, facts_of
 from hil.fleet.table import is_table

@@ -26,11 +26,8 @@ from hil.importers.name_words import kind_by_words
 from hil.importers.proposed_map import Proposal
 from hil.importers.stamps import is_clock
 from hil.importers.text_table import TextTable
-from hil.importers.units import Kind, kind_named
+from hil.importers.units import JOINT_KINDS, Kind, kind_named
 
-_JOINT_KINDS: Final[tuple[Kind, ...]] = (
-    "position", "velocity", "torque", "motor_current", "commanded_position",
-)  # fmt: skip
 _ARM: Final = ("torque", "motor_current", "commanded_position")
 
 
@@ -117,7 +114,7 @@ class _Search:
         entries: dict[str, Any] = {}
         times: dict[Kind, tuple[str, str | int]] = {}  # by quantity: file and column
         meanings: list[ChannelMeaning] = []
-        for kind in _JOINT_KINDS:
+        for kind in JOINT_KINDS:
             held = self._of(kind)
             if not held:
                 continue

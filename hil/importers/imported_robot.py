@@ -28,8 +28,8 @@ from hil.importers.plausibility import (
 from identification.errors import ModelError
 from identification.model.friction import FrictionLaw
 from identification.model.kinematics import pinocchio_model
+from identification.model.robot import STANDARD_GRAVITY
 
-STANDARD_GRAVITY: Final = (0.0, 0.0, -9.81)
 IMPORTED_LAW: Final = FrictionLaw(third=None, offset=True)
 """Default friction law of an imported robot. A term in v² or v³ that the motion does not need makes
 the prediction of a faster one worse."""

@@ -34,12 +34,9 @@ from hil.importers.name_words import is_measured, kind_by_words, kinds_said, wor
 from hil.importers.row_names import row_names
 from hil.importers.stated_units import other_unit
 from hil.importers.text_table import TextTable
-from hil.importers.units import Kind, kind_named, unit_of
+from hil.importers.units import JOINT_KINDS, Kind, kind_named, unit_of
 from hil.importers.unnamed_columns import ColumnBlocks, blocks_of, roughness
 
-_JOINT_KINDS: Final[tuple[Kind, ...]] = (
-    "position", "velocity", "torque", "motor_current", "commanded_position",
-)  # fmt: skip
 _MOST_NAMED: Final = 30
 _ERRORS: Final = frozenset({"error", "errors", "err"})
 """Words of the deviations of a controller, which are no quantity of a joint."""
@@ -203,7 +200,7 @@ class _Search:
     def proposal(self, form: Format | None) -> Proposal:
         """Return the map, or raise SourceError with what is missing; `form` is stated in it."""
         columns: dict[str, _Columns] = {}
-        kinds: list[Kind] = [*(("time",) if self._rate is None else ()), *_JOINT_KINDS]
+        kinds: list[Kind] = [*(("time",) if self._rate is None else ()), *JOINT_KINDS]
         for kind in kinds:
             names = self._channels(kind)
             if names is not None:
@@ -386,7 +383,7 @@ class _Search:
     def _refuse_unit(self, kind: Kind, group: ChannelGroup) -> NoReturn:
         assert group.unit is not None
         problem = f"{group.label} is named as {kind}, and {group.unit} is not a unit of it"
-        kinds = [other for other in _JOINT_KINDS[:4] if unit_of(group.unit, other)]
+        kinds = [other for other in JOINT_KINDS[:4] if unit_of(group.unit, other)]
         if not kinds or kind == "time":
             raise other_unit(self._log, kind, group.label, group.unit)
         options = " or ".join(f"--columns '{name}={group.pattern}'" for name in kinds)
@@ -480,7 +477,7 @@ class _Search:
     def _remedy_for_files(self, files: Mapping[Kind, str]) -> str:
         """Return the lines of a map for quantities in files of their own."""
         lines = ["sample_rate = HZ" if self._rate is None else f"sample_rate = {self._rate:g}"]
-        lines += [f'[{kind}] file = "{files[kind]}"' for kind in _JOINT_KINDS[:3] if kind in files]
+        lines += [f'[{kind}] file = "{files[kind]}"' for kind in JOINT_KINDS[:3] if kind in files]
         if "torque" not in files:
             current = files.get("motor_current")
             lines.append(

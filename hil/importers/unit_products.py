@@ -25,11 +25,11 @@ _WEIGHTS: Final = {
 _LENGTHS: Final = {
     "m": 1.0, "cm": 1e-2, "mm": 1e-3, "in": 0.0254, "inch": 0.0254, "ft": 0.3048, "foot": 0.3048,
 }  # fmt: skip
-_DEGREE: Final = math.pi / 180.0
+DEGREE: Final = math.pi / 180.0
 _ANGLES: Final = {
-    "rad": 1.0, "mrad": 1e-3, "deg": _DEGREE, "degree": _DEGREE, "degrees": _DEGREE, "°": _DEGREE,
-    "mdeg": 1e-3 * _DEGREE, "gon": math.pi / 200.0, "arcmin": _DEGREE / 60.0,
-    "arcsec": _DEGREE / 3600.0, "rev": 2.0 * math.pi, "turn": 2.0 * math.pi,
+    "rad": 1.0, "mrad": 1e-3, "deg": DEGREE, "degree": DEGREE, "degrees": DEGREE, "°": DEGREE,
+    "mdeg": 1e-3 * DEGREE, "gon": math.pi / 200.0, "arcmin": DEGREE / 60.0,
+    "arcsec": DEGREE / 3600.0, "rev": 2.0 * math.pi, "turn": 2.0 * math.pi,
     "turns": 2.0 * math.pi,
 }  # fmt: skip
 _TIMES: Final = {

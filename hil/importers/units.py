@@ -6,17 +6,20 @@ import math
 from collections.abc import Mapping
 from typing import Final, Literal, get_args
 
-from hil.importers.unit_products import product_of
+from hil.importers.unit_products import DEGREE, product_of
 
 Kind = Literal["time", "position", "velocity", "torque", "motor_current", "commanded_position"]
+JOINT_KINDS: Final[tuple[Kind, ...]] = (
+    "position", "velocity", "torque", "motor_current", "commanded_position",
+)  # fmt: skip
+"""Quantities of a joint."""
 
 _TURN: Final = 2.0 * math.pi
-_DEGREE: Final = math.pi / 180.0
-_ANGLES: Final = {"rad": 1.0, "mrad": 1e-3, "deg": _DEGREE, "rev": _TURN, "m": 1.0, "mm": 1e-3}
+_ANGLES: Final = {"rad": 1.0, "mrad": 1e-3, "deg": DEGREE, "rev": _TURN, "m": 1.0, "mm": 1e-3}
 UNITS: Final[Mapping[str, Mapping[str, float]]] = {
     "position": _ANGLES,
     "velocity": {
-        "rad/s": 1.0, "deg/s": _DEGREE, "rev/s": _TURN, "rpm": _TURN / 60.0, "m/s": 1.0,
+        "rad/s": 1.0, "deg/s": DEGREE, "rev/s": _TURN, "rpm": _TURN / 60.0, "m/s": 1.0,
         "mm/s": 1e-3,
     },
     "torque": {"N.m": 1.0, "mN.m": 1e-3, "kN.m": 1e3, "N": 1.0, "%": 0.01, "‰": 0.001},

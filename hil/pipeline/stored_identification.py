@@ -20,6 +20,7 @@ from hil.base.errors import HilError, InputError
 from hil.base.files import file_digest
 from hil.base.progress import Reporter
 from hil.base.safe_input import parse_json, path_exists, read_text
+from hil.base.terminal_text import one_line
 from hil.cell import Cell
 from hil.pipeline.identified_model import IdentifiedModel, arm_with, impossible_bodies, model_of
 from hil.pipeline.identify_folder import identify_paths
@@ -31,7 +32,6 @@ from hil.results.provenance import (
     RESULTS,
     archive_digests,
     provenance_of,
-    single_line,
 )
 from hil.results.results import Results, SettingsResult
 from hil.results.series import ReportSeries, load_series
@@ -184,7 +184,7 @@ def stored_identification(
     present = provenance_of(results, paths)
     if archive_digests(provenance) != archive_digests(present):
         raise NotReusableError("its archives are others than those that were identified")
-    if provenance.get("verdict") != single_line(present["verdict"]):
+    if provenance.get("verdict") != one_line(present["verdict"]):
         raise NotReusableError(f"{RESULTS} and {PARAMETERS_JSON} are not of one identification")
     try:
         used = settings.decided()

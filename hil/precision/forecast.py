@@ -26,6 +26,7 @@ from hil.pipeline.options import FIXED
 from hil.pipeline.prepared import reduction_of, stated_settings, versions_of
 from hil.precision.given_recordings import given_sources
 from hil.precision.required_quantities import ReferenceMotions, RequiredQuantities
+from identification.distributions import NORMAL_95
 from identification.estimators.payload_estimate import parameter_change
 from identification.estimators.payload_problem import DRIFT
 from identification.excitation import Excitation, LoadQuantities, Objective, midpoints
@@ -54,7 +55,8 @@ SIMULATED_SHARE: Final = 0.002
 currents: its servo, encoders and smoothing. Chosen by what a campaign of the simulated NS 16 left
 (0.3 % promised friction 1.3 times too wide)."""
 _CYCLE: Final = 0.001  # s, of a cell without controller
-_REFERENCE_PERIOD: Final = 0.04  # s
+REFERENCE_PERIOD: Final = 0.04
+"""Sampling of a motion on which precision is computed [s]."""
 _ARM_TIME: Final = 60.0  # s of motion, from which an arm is assumed to be known
 _RESERVE: Final = 0.85
 """Predicted over required interval for which a motion is made long enough. An interval is itself
@@ -68,7 +70,6 @@ _MOVE_SHARE: Final = 0.7
 """Time at speed of a move to the next via point of a search for a payload, as a share of that in
 which the slowest joint crosses its range."""
 _MOST: Final = 1000  # repetitions that are counted
-_NORMAL: Final = 1.96  # standard deviations in half a 95 % interval of a stated variance
 _ENDLESS: Final = 1e9  # factor of the information of motions without end
 
 
@@ -177,7 +178,7 @@ class PrecisionDesign:
                 remedy="for a payload add --for payload, with no other requirement than its mass; "
                 "for the arm omit --for payload, and its mass",
             )
-        sampled = [midpoints(motion, _REFERENCE_PERIOD) for motion in motions]
+        sampled = [midpoints(motion, REFERENCE_PERIOD) for motion in motions]
         reference = ReferenceMotions(cell.model, sampled)
         nominal = cell.nominal_values()
         scatter = reference.scatter(nominal)
@@ -297,7 +298,7 @@ class PrecisionDesign:
         pulls = (by_joint @ self.subject).T
         slope = precision.spread(by_joint.sum(axis=0)).slope
         moved = slope @ pulls * self.scale.std
-        by_scale = _NORMAL * np.linalg.norm(moved, axis=1) / self.required.quantities.allowed
+        by_scale = NORMAL_95 * np.linalg.norm(moved, axis=1) / self.required.quantities.allowed
         return np.where(is_absolute, by_scale, 0.0)
 
     def _require_possible(self) -> None:

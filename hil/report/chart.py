@@ -13,6 +13,7 @@ from typing import Final, NamedTuple
 import numpy as np
 
 from hil.base.arrays import Array
+from hil.base.terminal_text import one_line
 
 INK, MUTED, BAND, FIRST, SECOND, WIDE = (
     f"var(--{name})" for name in ("ink", "muted", "band", "first", "second", "wide")
@@ -30,11 +31,6 @@ class Caption(NamedTuple):
     title: str
     note: str
     what: str
-
-
-def one_line(text: str) -> str:
-    """Replace unprintable characters by blanks."""
-    return " ".join("".join(c if c.isprintable() else " " for c in text).split())
 
 
 def label(text: str) -> str:

@@ -19,7 +19,8 @@ from markupsafe import Markup
 from numpy.typing import NDArray
 
 from hil.base.arrays import Array
-from hil.report.chart import Chart, Trace, one_line
+from hil.base.terminal_text import one_line
+from hil.report.chart import Chart, Trace
 
 _LIBRARY: Final = ("bokeh.min.js", "bokeh-api.min.js")
 _VALUES: Final = 180_000

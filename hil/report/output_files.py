@@ -18,10 +18,11 @@ from hil.base.files import convert_write_errors, file_digest, write_files
 from hil.base.output_folder import SOURCES
 from hil.base.progress import Reporter
 from hil.base.safe_input import path_exists
+from hil.base.terminal_text import one_line
 from hil.cell import Cell
 from hil.pipeline.identification import Identification
 from hil.report.page import report_bytes
-from hil.results.provenance import PARAMETERS_JSON, RESULTS, provenance_of, single_line
+from hil.results.provenance import PARAMETERS_JSON, RESULTS, provenance_of
 from hil.results.results import ExportResult, OccasionResult, Results, SettingsResult
 from hil.results.rollout_result import ROLLOUT, RolloutResult
 from hil.results.series import SERIES, load_series
@@ -194,7 +195,7 @@ def exports_of(
     reason why there is none). IdentificationError: the estimate is of another model.
     """
     model = cell.model
-    origin = {key: single_line(value) for key, value in (provenance or {}).items()}
+    origin = {key: one_line(value) for key, value in (provenance or {}).items()}
     possible = None if isinstance(consistent, str) else consistent
     contents: dict[str, str | None] = {
         PARAMETERS_JSON: parameters_json(

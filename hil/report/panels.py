@@ -18,6 +18,7 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 
 from hil.base.arrays import Array
+from hil.base.terminal_text import one_line
 from hil.report import picture_style as style
 from hil.report.chart import (
     BAND,
@@ -28,7 +29,6 @@ from hil.report.chart import (
     Chart,
     Matrix,
     label,
-    one_line,
 )
 from hil.report.chart_picture import draw_plot
 

@@ -7,6 +7,7 @@ from pathlib import Path
 
 from hil.base.files import file_digest
 from hil.base.safe_input import path_exists
+from hil.base.terminal_text import one_line
 from hil.results.results import Results
 
 RESULTS = "results.json"
@@ -15,14 +16,9 @@ RESULTS = "results.json"
 PARAMETERS_JSON = "parameters.json"
 
 
-def single_line(text: str) -> str:
-    """Return a text as one printable line: names of archives may contain anything."""
-    return " ".join("".join(c if c.isprintable() else " " for c in text).split())
-
-
 def archive_digests(provenance: Mapping[str, str]) -> set[str]:
     """Return the archives of a provenance, each with its digest, in any order."""
-    return set(single_line(provenance.get("archives", "")).split(", "))
+    return set(one_line(provenance.get("archives", "")).split(", "))
 
 
 def provenance_of(results: Results, archives: Sequence[Path]) -> dict[str, str]:

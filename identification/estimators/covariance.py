@@ -32,7 +32,7 @@ from identification.estimators.loss_functions import Loss
 from identification.factor.blocks import FINE_BLOCK, block_slices, fine_blocks, merged
 from identification.factor.estimate import Estimate, mark_undetermined
 from identification.factor.factor import Factor
-from identification.factor.normal_equations import NormalEquations, Solution, solve
+from identification.factor.normal_equations import PARTICIPATION, NormalEquations, Solution, solve
 from identification.factor.rows import augmented_rows
 from identification.model.robot import RobotModel
 from identification.signals.samples import Samples
@@ -351,7 +351,6 @@ def _shares(information: Array, root: Array, left: Array) -> Array:
 
 # Curvature relative to the weighted squares below which a direction is undetermined.
 _FLAT: Final = 1e-3
-_PARTICIPATION: Final = 1e-3
 
 
 def clustered_covariance(
@@ -399,7 +398,7 @@ def clustered_covariance(
     flat = np.abs(solution.root @ vectors[:, ~steep]).max(axis=1, initial=0.0)
     steep_solution = solution._replace(
         root=solution.root @ to_unit,
-        determined=solution.determined & (flat < _PARTICIPATION * scale),
+        determined=solution.determined & (flat < PARTICIPATION * scale),
     )
     shares = to_unit.T @ information @ to_unit
     return _sandwich(shares, merged(scores[rows > 0], length), steep_solution, length * FINE_BLOCK)

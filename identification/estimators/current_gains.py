@@ -28,7 +28,7 @@ from identification.errors import IdentificationError
 from identification.estimators.covariance import Clustered, cluster_covariance
 from identification.estimators.payload_problem import DRIFT, OFFSET, STRETCH
 from identification.factor.blocks import FINE_BLOCK, merged
-from identification.factor.factor import Factor
+from identification.factor.factor import SMALLEST_NOISE, Factor
 from identification.factor.normal_equations import NormalEquations, Solution, solve
 from identification.model.robot import RobotModel
 from identification.text import percentage
@@ -39,7 +39,6 @@ MOST_BLOCKS: Final = 400
 _NO_LOAD: Final = 1e-9  # relative length of the payload's column that is rounding
 _ITERATIONS: Final = 50
 _VANISHING: Final = 1e-100
-_LEAST_NOISE: Final = 1e-6  # rounding of the Gram matrix, as a share of the current
 _CONVERGED: Final = 1e-9
 _MOST_VALUES: Final = 2e7  # of the information matrices of all blocks
 _FEWEST_BLOCKS: Final = 60
@@ -179,7 +178,7 @@ def _motor_by_motor(total: Array, rows: NDArray[np.intp]) -> tuple[Array, Array]
         solution = solve(NormalEquations(gram, current))
         squares = total[m][-1, -1] - solution.values @ current
         freedom = max(rows[m] - len(unknown), 1)
-        noise[m] = np.sqrt(max(squares, _LEAST_NOISE**2 * total[m][-1, -1]) / freedom)
+        noise[m] = np.sqrt(max(squares, SMALLEST_NOISE**2 * total[m][-1, -1]) / freedom)
         if solution.determined[p] and solution.values[p] > 0.0:
             inverses[m] = solution.values[p]
     estimated = np.isfinite(inverses)

@@ -24,6 +24,7 @@ from identification.estimators.consistent import Program, is_consistent, without
 from identification.estimators.prior import BodyPrior
 from identification.factor.estimate import Estimate
 from identification.factor.factor import Factor
+from identification.factor.normal_equations import or_one
 from identification.model.robot import RobotModel
 
 FEWEST = 10
@@ -125,7 +126,7 @@ class _Draws:
         start = self.prior.mean + self._start
         change = self.estimate.values + scale * self._change - start @ combinations.T
         arms = start + (change / length @ pull.T) * self._deviations
-        unseen = _not_combined(combined / length[:, None]) / _or_one(self._deviations)
+        unseen = _not_combined(combined / length[:, None]) / or_one(self._deviations)
         rows = np.concatenate([self._inverse_root @ combinations, unseen])
         program = Program.of(model, self.prior)
         moved = np.zeros(len(arms), dtype=np.bool_)
@@ -159,13 +160,9 @@ def _finite_deviations(std: Array) -> Array:
     return np.where(finite, std, _FLAT * np.max(std, initial=1.0, where=finite))
 
 
-def _or_one(deviations: Array) -> Array:
-    return np.where(deviations > 0.0, deviations, 1.0)
-
-
 def _roots(covariance: Array) -> tuple[Array, Array]:
     """Return R (p, p) with R R' the covariance, and its inverse."""
-    scale = _or_one(np.sqrt(np.diag(covariance)))
+    scale = or_one(np.sqrt(np.diag(covariance)))
     values, vectors = np.linalg.eigh(covariance / np.outer(scale, scale))
     size = np.sqrt(np.maximum(values, _SMALLEST))
     return scale[:, None] * vectors * size, (vectors / size).T / scale

@@ -34,7 +34,7 @@ from identification.factor.estimate import (
     residual_variance,
 )
 from identification.factor.factor import Factor
-from identification.factor.normal_equations import WORST_CONDITION
+from identification.factor.normal_equations import PARTICIPATION, WORST_CONDITION
 from identification.model.motion import Motion
 from identification.model.robot import RobotModel
 from identification.signals.samples import RIGID_BANDWIDTH, Samples
@@ -158,7 +158,6 @@ def tracking_lag(time: Array, measured: Array, command: SmoothingSpline) -> Arra
 # Below, instruments leave more than a tenth of the bias of least squares (Staiger and Stock 1997);
 # each block counts as one sample.
 WEAK: Final = 10.0
-_PARTICIPATION: Final = 1e-3
 
 
 @dataclass(frozen=True, eq=False)
@@ -197,7 +196,7 @@ def solve_cross(total: Array) -> CrossSolution:
         right=own_right,
         left=own_left,
         condition=float(np.sqrt(singular[0] / singular[-1])) if singular[-1] > 0.0 else np.inf,
-        determined=np.asarray(lost < _PARTICIPATION),
+        determined=np.asarray(lost < PARTICIPATION),
     )
 
 

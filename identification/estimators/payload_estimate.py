@@ -25,7 +25,6 @@ from identification.arrays import Array
 from identification.errors import IdentificationError
 from identification.estimators.payload_problem import (
     N_BODY,
-    PARTICIPATION,
     ROUNDING,
     BodyFit,
     KnownArm,
@@ -34,6 +33,7 @@ from identification.estimators.payload_problem import (
     fit_body,
 )
 from identification.estimators.torque_scale import scale_covariance
+from identification.factor.normal_equations import PARTICIPATION
 from identification.model.pseudo_inertia import (
     Body,
     body,

@@ -18,8 +18,8 @@ from identification.estimators.covariance import Clustered, cluster_covariance
 from identification.estimators.torque_scale import scale_sensitivity
 from identification.factor.blocks import FINE_BLOCK, count_by_block, fine_blocks
 from identification.factor.estimate import Estimate, inverse_variance
-from identification.factor.factor import Factor, no_rows_message
-from identification.factor.normal_equations import NormalEquations, solve
+from identification.factor.factor import SMALLEST_NOISE, Factor, no_rows_message
+from identification.factor.normal_equations import PARTICIPATION, NormalEquations, solve
 from identification.model.link_wrenches import LINK_SYMBOLS
 from identification.model.pseudo_inertia import inertial_from_pseudo, pseudo_inertia_map
 from identification.model.regressor import RegressorPlan
@@ -36,8 +36,6 @@ _MOST_BLOCKS: Final = 500
 # Longer blocks: with noise correlated over 50 ms nominal 95 % intervals cover 93 and 95 %,
 # otherwise 90 and 93 %.
 STRETCH: Final = 2
-_LEAST_NOISE: Final = 1e-6  # rounding of the Gram matrix, as a share of the torque
-PARTICIPATION: Final = 1e-3
 ROUNDING: Final = 1e-9
 
 
@@ -313,7 +311,7 @@ def _weights(grams: Sequence[_Rows], values: Array, rows: NDArray[np.intp]) -> A
         run_values = augmented[places]
         squares[joint] += run_values @ total @ run_values
         torque[joint] += total[-1, -1]
-    squares = np.maximum(squares, _LEAST_NOISE**2 * torque)
+    squares = np.maximum(squares, SMALLEST_NOISE**2 * torque)
     return np.divide(rows, squares, out=np.zeros(len(rows)), where=squares > 0.0)
 
 

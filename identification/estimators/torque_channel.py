@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 
 from identification.arrays import Array
 from identification.factor.blocks import EqualRuns, add_grams, equal_runs
+from identification.factor.factor import SMALLEST_NOISE
 from identification.model.robot import RobotModel
 from identification.signals.masks import LONGEST_END, edge_rows
 from identification.signals.noise import noiseless_above
@@ -59,7 +60,6 @@ _BESIDE: Final = 5  # signals beside the columns: load and torque, and three mad
 # bands and by 0.15 rad at 30 Hz from its centre, where arms have hardly any torque.
 _BAND: Final = 0.03  # width as a share of the frequency
 _NARROWEST: Final = 0.02  # Hz
-_SMALLEST_NOISE: Final = 1e-6  # share of the RMS torque, for joints that fit exactly
 _RIDGE: Final = 1e-11  # of columns of unit length, as the limit of condition of Gram matrices
 
 
@@ -261,7 +261,7 @@ class _Spectra:
         rows = np.array([joint.rows for joint in self.joints])
         power = np.array([joint.power for joint in self.joints])
         variance = np.broadcast_to(power / rows, (len(filters), len(rows)))
-        smallest = np.maximum(_SMALLEST_NOISE**2 * power / rows, np.finfo(np.float64).tiny)
+        smallest = np.maximum(SMALLEST_NOISE**2 * power / rows, np.finfo(np.float64).tiny)
         for _ in range(2):  # with weights of the torque, then of the residual
             # A torque that is zero throughout was not measured.
             weights = np.where(power > 0.0, 1.0 / np.maximum(variance, smallest), 0.0)
@@ -313,7 +313,7 @@ class _Spectra:
                 if not (product > 0.0 and power > 0.0):
                     continue
                 # At most one, up to the rounding of sums of squares.
-                coherence = min(product**2 / (power * torque), 1.0 - _SMALLEST_NOISE)
+                coherence = min(product**2 / (power * torque), 1.0 - SMALLEST_NOISE)
                 count = max(1.0, joint.duration * (high - low))
                 certain[k] = 2.0 * count * coherence / (1.0 - coherence)
                 gains[k] = math.log(product / power)

@@ -23,6 +23,7 @@ from typing import Final
 import numpy as np
 
 from identification.arrays import Array
+from identification.distributions import NORMAL_95
 from identification.factor.estimate import Estimate
 from identification.factor.factor import Factor
 
@@ -32,7 +33,6 @@ DATA_SHEET: Final = 0.03
 Makers of servo motors state tolerances of 5 to 10 % for the constant of one specimen, magnets lose
 some 4 % when they warm by 40 K (0.1 %/K, NdFeB); 3 % is half of a tolerance in between.
 """
-_NORMAL: Final = 1.96  # standard deviations in half a 95 % interval of known variance
 
 
 def scale_sensitivity(factor: Factor, weights: Array, inverse: Array) -> Array:
@@ -48,7 +48,7 @@ def scale_sensitivity(factor: Factor, weights: Array, inverse: Array) -> Array:
     return np.asarray(inverse @ (weights[:, None] * pulls).T)
 
 
-def scale_covariance(sensitivity: Array, std: Array, interval_factor: float = _NORMAL) -> Array:
+def scale_covariance(sensitivity: Array, std: Array, interval_factor: float = NORMAL_95) -> Array:
     """Return the covariance (p, p) by independent errors of the torque scale.
 
     Args:
@@ -58,7 +58,7 @@ def scale_covariance(sensitivity: Array, std: Array, interval_factor: float = _N
             with. Student's factor is for variances estimated from few blocks; that of the scale
             is stated, so that the normal 1.96 applies to it.
     """
-    moved = sensitivity * std * (_NORMAL / interval_factor)
+    moved = sensitivity * std * (NORMAL_95 / interval_factor)
     return np.asarray(moved @ moved.T)
 
 

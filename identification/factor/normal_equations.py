@@ -17,7 +17,8 @@ WORST_CONDITION: Final = 1e6
 # Condition 1e10 leaves six digits of rows; structural dependence shows as 1e14 and more.
 WORST_ROW_CONDITION: Final = 1e10
 
-_PARTICIPATION: Final = 1e-3
+PARTICIPATION: Final = 1e-3
+"""Share in undetermined directions up to which a parameter is determined."""
 
 _NO_COLUMN: Final = 1e-10  # length of a column that is rounding, over that of the longest
 
@@ -49,7 +50,7 @@ class Solution(NamedTuple):
         return np.asarray(self.root @ self.root.T)
 
 
-def _unit_columns(length: Array) -> Array:
+def or_one(length: Array) -> Array:
     """Return divisors for columns of a length (p,), one for zero."""
     return np.where(length > 0.0, length, 1.0)
 
@@ -61,16 +62,16 @@ def _determined_part(length: Array, size: Array, vectors: Array, worst: float) -
     smallest = size.min(initial=np.inf) if np.all(length > 0.0) else 0.0
     return Solution(
         values=np.zeros(len(length)),
-        root=vectors[:, significant] / size[significant] / _unit_columns(length)[:, None],
+        root=vectors[:, significant] / size[significant] / or_one(length)[:, None],
         condition=float(size.max() / smallest) if smallest > 0.0 else np.inf,
-        determined=np.asarray((length > 0.0) & (lost < _PARTICIPATION)),
+        determined=np.asarray((length > 0.0) & (lost < PARTICIPATION)),
     )
 
 
 def solve(equations: NormalEquations, worst: float = WORST_CONDITION) -> Solution:
     """Solve ``A x = b`` with unit columns; parameters of a condition above `worst` are open."""
     length = np.sqrt(np.diag(equations.A))
-    scale = _unit_columns(length)
+    scale = or_one(length)
     eigenvalues, vectors = np.linalg.eigh(equations.A / np.outer(scale, scale))
     part = _determined_part(length, np.sqrt(np.maximum(eigenvalues, 0.0)), vectors, worst)
     return part._replace(values=part.root @ (part.root.T @ equations.b))
@@ -108,7 +109,7 @@ def solve_rows(rows: Array, target: Array, worst: float = WORST_ROW_CONDITION) -
     :func:`solve`.
     """
     length = np.linalg.norm(rows, axis=0)
-    left, singular, right = np.linalg.svd(rows / _unit_columns(length), full_matrices=True)
+    left, singular, right = np.linalg.svd(rows / or_one(length), full_matrices=True)
     size = np.zeros(rows.shape[1])
     size[: len(singular)] = singular
     part = _determined_part(length, size, right.T, worst)
@@ -119,7 +120,7 @@ def solve_rows(rows: Array, target: Array, worst: float = WORST_ROW_CONDITION) -
 def rows_of(equations: NormalEquations) -> tuple[Array, Array]:
     """Return rows (k, p) and target (k,) with ``rows'rows = A`` and ``rows'target = b``."""
     length = np.sqrt(np.maximum(np.diag(equations.A), 0.0))
-    scale = _unit_columns(length)
+    scale = or_one(length)
     eigenvalues, vectors = np.linalg.eigh(equations.A / np.outer(scale, scale))
     significant = eigenvalues > max(eigenvalues[-1], 0.0) / WORST_CONDITION**2
     singular = np.sqrt(eigenvalues[significant])

@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from identification.arrays import Array
+from identification.distributions import MAD_TO_STD
 from identification.model.motion import Motion
 from identification.model.robot import RobotModel
 from identification.signals.recording import Recording
@@ -50,7 +51,6 @@ _OF_RANGE: Final = 0.5
 _UNDISTURBED: Final = 0.1  # of it, that the samples beside it differ
 _TAIL: Final = 0.01  # of the samples at either end, which are no range
 _LONGEST_SPIKE: Final = 2  # samples
-_NORMAL: Final = 1.4826  # standard deviation over median absolute value
 
 ExcludedRows = Literal["rests", "halts", "slow", "none"]
 
@@ -205,7 +205,7 @@ def spiking(values: Array, segments: Sequence[slice]) -> Rows:
         padded = np.pad(part, ((side, side), (0, 0)), mode="edge")
         windows = np.lib.stride_tricks.sliding_window_view(padded, 2 * side + 1, axis=0)
         apart = np.abs(part - np.median(windows, axis=-1))
-        spread = _NORMAL * np.median(apart, axis=0)
+        spread = MAD_TO_STD * np.median(apart, axis=0)
         low, high = np.quantile(part, [_TAIL, 1.0 - _TAIL], axis=0)
         least = np.maximum(_STANDS_OUT * spread, _OF_RANGE * (high - low))
         beyond = np.maximum(part - high, low - part) > 0.5 * _OF_RANGE * (high - low)

@@ -47,7 +47,6 @@ from identification.validation.prediction import (
 )
 from identification.validation.residuals import ResidualChecks, check_residuals
 
-SIGMAS: Final = 3.0
 _WORSE: Final = 1.25  # error of unseen over that of fitted motion from which something begins in it
 # Share of the rows in the rarer direction of motion below which friction and offset of a joint are
 # one column: with it their correlation is 0.98.

@@ -16,7 +16,8 @@ from identification.hypotheses.little_torque import little_torque
 from identification.model.friction import COULOMB
 from identification.model.robot import RobotModel
 
-SIGMAS: Final = 3.0  # standard deviations of a significant wrong sign or change
+SIGMAS: Final = 3.0
+"""Standard deviations of a significant sign, change, delay or scale."""
 # Masses, rotor inertias, moments of inertia about an axis.
 _NEVER_NEGATIVE: Final = re.compile(r"m\d+|I\d+(m|xx|yy|zz)")
 

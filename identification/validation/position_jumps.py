@@ -15,15 +15,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from identification.arrays import Array
+from identification.distributions import MAD_TO_STD
 from identification.signals.recording import GAP_STEPS, Recording
+from identification.signals.row_faults import FASTEST
 
 _ROWS_AT_ONCE: Final = 50_000  # that are searched for steps
 _STANDS_OUT: Final = 15.0  # robust standard deviations of a jump
 # The same relative to the frequent large departures (starts, stops, reversals).
 _USUAL: Final = 20  # departures
 _BEYOND_USUAL: Final = 3.0
-# Acceleration within one step of the clock; robots reach a fifth of it.
-_FASTEST: Final = 150.0  # rad/s² or m/s²
 _BESIDE: Final = 4  # steps to either side
 # Standard deviations by which other joints must move for a missing row to be visible.
 _SHOWS: Final = 5.0
@@ -33,7 +33,6 @@ _ON_PATH: Final = 0.25  # distance from the extrapolated path, as a share of the
 _WHOLE: Final = 0.15  # tolerance of departures by whole steps of the motion, as a share of a step
 # Resolutions by which rounding moves a step: one at its ends, half of one in the speed beside it.
 _ROUNDED: Final = 1.5
-_NORMAL: Final = 1.4826  # standard deviation over median absolute value
 
 
 @dataclass(frozen=True)
@@ -99,9 +98,9 @@ def _steps_of(
     after = np.concatenate([np.arange(part.start + 1, part.stop) for part in parts])
     departure, shown = _without_clock(departure, speed, steps)
     distance = np.abs(departure)
-    spread = _NORMAL * np.median(distance, axis=0)
+    spread = MAD_TO_STD * np.median(distance, axis=0)
     usual = np.partition(distance, -_USUAL, axis=0)[-_USUAL] if len(distance) > 10 * _USUAL else 0.0
-    least = np.maximum(np.maximum(_STANDS_OUT * spread, _BEYOND_USUAL * usual), _FASTEST * steps**2)
+    least = np.maximum(np.maximum(_STANDS_OUT * spread, _BEYOND_USUAL * usual), FASTEST * steps**2)
     least = np.maximum(least, rounded)
     # Missing or repeated rows cause departures by whole steps of the motion, also beside a gap.
     motion_step = speed * np.median(steps)
@@ -189,7 +188,7 @@ def _without_clock(departure: Array, speed: Array, steps: Array) -> tuple[Array,
     distance = np.abs(departure)
     noise = np.array(
         [
-            _NORMAL * np.median(some) if (some := column[column > 0.0]).size else np.inf
+            MAD_TO_STD * np.median(some) if (some := column[column > 0.0]).size else np.inf
             for column in distance.T
         ]
     )

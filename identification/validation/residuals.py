@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from identification.arrays import Array, Indices
-from identification.distributions import student_limit
+from identification.distributions import MAD_TO_STD, student_limit
 from identification.estimators.friction_drift import PIECES, FrictionDrift, friction_trend
 from identification.model.robot import RobotModel
 from identification.signals.block_mean import BlockMean, block_index, block_mean
@@ -30,7 +30,6 @@ CHANCE: Final = 0.001  # probability of a false finding per joint, over all its 
 HARMONICS: Final = (1, 2, 3, 4, 6)
 _SIGMAS: Final = 4.1  # largest of five harmonics: probability of about 0.001
 _BEYOND: Final = 6.0  # robust standard deviations; one normal sample in 500 million is beyond six
-_NORMAL: Final = 1.4826
 # Longer than the settling of a move.
 LONGEST_LAG: Final = 0.5  # s
 _MOST_LAGS: Final = 1000
@@ -179,7 +178,7 @@ def find_outliers(torque: Array, residual: Array, usable: Rows) -> Outliers:
         if rows.any():
             error = residual[:, joint]
             distance = np.abs(error - np.median(error[rows]))
-            limit = _BEYOND * _NORMAL * float(np.median(distance[rows]))
+            limit = _BEYOND * MAD_TO_STD * float(np.median(distance[rows]))
             far[:, joint] = rows & (distance > max(limit, np.finfo(np.float64).tiny))
             total[joint] = (error[rows] ** 2).sum()
             outlying[joint] = (error[far[:, joint]] ** 2).sum()

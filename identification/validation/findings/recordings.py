@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 
-from identification.validation.evidence import SIGMAS, Evidence
+from identification.validation.evidence import Evidence
 from identification.validation.finding import Finding, Thresholds, Value
+from identification.validation.physical_signs import SIGMAS
 
 
 def nothing_held_out(evidence: Evidence, _: Thresholds) -> Finding | None:
