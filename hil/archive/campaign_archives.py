@@ -44,8 +44,15 @@ def load_record(
 ) -> T | None:
     """Read the file of a campaign's step; return None where there is none.
 
-    CampaignFolderError, with this remedy: it cannot be read, or has another `format_version` than
-    `version` (0 for any); see `read_back` for `strict`.
+    Args:
+        kind: class of the record.
+        path: of the file.
+        remedy: of the error.
+        version: its `format_version`; 0 for any.
+        strict: see `read_back`.
+
+    Raises:
+        CampaignFolderError: it cannot be read, or has another version.
     """
     if not path_exists(path):
         return None

@@ -135,7 +135,14 @@ class LayoutBuilder:
 def joint_state_layout(
     names: tuple[str, ...], *, position: int, velocity: int, effort: int
 ) -> MessageLayout:
-    """Return the layout of sensor_msgs/JointState with these names and lengths of its arrays."""
+    """Return the layout of sensor_msgs/JointState.
+
+    Args:
+        names: of the joints.
+        position: length of its array.
+        velocity: likewise.
+        effort: likewise.
+    """
     builder = LayoutBuilder()
     builder.variable("sec", "int32")
     builder.variable("nanosec", "uint32")

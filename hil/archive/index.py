@@ -79,7 +79,14 @@ class FileIndex:
             self._channels.setdefault(item.id, item)
 
     def add_chunk(self, chunk: Chunk, messages: ByChannel, offset: int, length: int) -> bytes:
-        """Index a chunk; return the message indexes that follow it."""
+        """Index a chunk; return the message indexes that follow it.
+
+        Args:
+            chunk: as written.
+            messages: in it, by channel.
+            offset: of the chunk in the file.
+            length: of the chunk.
+        """
         end = offset + length
         offsets: dict[int, int] = {}
         data = b""

@@ -216,8 +216,12 @@ def cycle_messages(
 ) -> Batch:
     """Return the messages of k cycles: `/hil/cycle` and two JointState channels for viewers.
 
-    `period` [s] of the controller, joint `torque` (k, n) [N·m]; `states` (k,) by topic (`STATES`)
-    have the fields of its messages.
+    Args:
+        names: of the joints.
+        period: of the controller [s].
+        records: of the cycles (k,).
+        torque: of the joints (k, n) [N·m].
+        states: rows (k,) by topic (`STATES`), with the fields of its messages.
     """
     stamp = _stamp(records, period)
     columns = {name: records[name] for name in records.dtype.names or ()}
@@ -248,8 +252,11 @@ def sample_messages(
 ) -> Batch:
     """Return samples of an imported recording as messages.
 
-    `stamp` (k,) [ns]; `states` are ``position``, ``velocity`` and ``effort`` (k, n), where known;
-    `others` are what was recorded of ``motor_current`` [A] and ``commanded_position``.
+    Args:
+        names: of the joints.
+        stamp: of the samples (k,) [ns].
+        states: ``position``, ``velocity`` and ``effort`` (k, n), where known.
+        others: ``motor_current`` [A] and ``commanded_position`` (k, n), where recorded.
     """
     messages = {MEASURED: joint_states(names, stamp, states)}
     for name, values in others.items():
@@ -302,10 +309,16 @@ def _filled(
 def message_layout(
     topic: str, joints: Sequence[str], record: Schema | None, first: bytes
 ) -> MessageLayout:
-    """Return the layout of the messages of a topic of numbers, else `LayoutError`.
+    """Return the layout of the messages of a topic of numbers.
 
-    `record` is the schema in the file, None where it has none; `first` is one of the messages:
-    joint states may lack quantities.
+    Args:
+        topic: of the messages.
+        joints: their names.
+        record: schema in the file, None where it has none.
+        first: one of the messages: joint states may lack quantities.
+
+    Raises:
+        LayoutError: the messages are of another layout.
     """
     n = len(joints)
     if topic in (MEASURED, COMMANDED):

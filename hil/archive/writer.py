@@ -276,7 +276,14 @@ def described(
     period: float | None,
     attachments: Mapping[str, bytes],
 ) -> dict[str, str]:
-    """Return the entries of the ``hil`` record of an archive; arguments as of `ArchiveFile`.
+    """Return the entries of the ``hil`` record of an archive.
+
+    Args:
+        path: of the archive.
+        joint_names: as of `ArchiveFile`.
+        metadata: likewise.
+        period: likewise [s].
+        attachments: likewise.
 
     Raises:
         ArchiveWriteError: the metadata are invalid.
@@ -436,11 +443,14 @@ class ArchiveWriter:
         level: Level = Level.INFO,
         data: Mapping[str, Any] | None = None,
     ) -> None:
-        """Add an event of one line of text; it is flushed with the cycles that follow.
+        """Add an event; it is flushed with the cycles that follow.
 
-        Numbers of joints in the text become their names.
-        `cycle` is that of the controller in which it happened, None for the newest one written;
-        `data` are JSON values.
+        Args:
+            cycle: of the controller in which it happened, None for the newest one written.
+            name: of the event.
+            text: one line, in which numbers of joints become their names.
+            level: of the event.
+            data: JSON values.
         """
         text = with_joint_names(text, self._joint_names)
         time = (self.newest if cycle is None else cycle) * self.period
@@ -556,7 +566,14 @@ def write_samples(
 ) -> Path:
     """Write a recording as an archive of kind ``imported``; see `ArchiveWriter`.
 
-    `period` is the step [s] of a recording at a fixed rate.
+    Args:
+        path: of the archive.
+        samples: of the recording.
+        joint_names: in their order.
+        metadata: of the archive.
+        attachments: files in it, by name.
+        period: step of a recording at a fixed rate [s].
+        durable: wait for the disk.
 
     Raises:
         ArchiveWriteError: the file exists or cannot be written, or a stamp cannot be stored.

@@ -102,11 +102,17 @@ def read_text(
 ) -> str:
     """Return the text of a file, compressed by gzip or not, with line feeds as line ends.
 
-    It is in `encoding`, or in that of its byte-order mark, or in UTF-8; where it cannot be, in that
-    of its XML declaration or, with `or_latin`, in Windows-1252 or UTF-16.
+    Args:
+        path: of the file.
+        longest: bytes of the text.
+        encoding: by default that of its byte-order mark, or UTF-8; where it cannot be, that of its
+            XML declaration.
+        or_latin: or Windows-1252 or UTF-16 then.
 
-    OSError: as `open_file`, more bytes than `longest`, or damaged by compression.
-    UnicodeDecodeError: it is in none of these. LookupError: there is no such encoding.
+    Raises:
+        OSError: as `open_file`, more bytes than `longest`, or damaged by compression.
+        UnicodeDecodeError: it is in none of these encodings.
+        LookupError: there is no such encoding.
     """
     data = read_bytes(path, longest)
     return _decoded(data, encoding, or_latin=or_latin).replace("\r\n", "\n").replace("\r", "\n")

@@ -77,7 +77,15 @@ def run_motions(
     reporter: Reporter,
     options: RunOptions,
 ) -> RunResult:
-    """Run the missing motions of a campaign; see `Campaign.run`."""
+    """Run the missing motions of a campaign; see `Campaign.run`.
+
+    Args:
+        campaign: state of its folder.
+        link: to the controller; by default that of the cell.
+        watch: of the run.
+        reporter: of progress.
+        options: of the run.
+    """
     with campaign.folder.locked():
         campaign.folder.require_unchanged()
         return _CampaignRun(campaign, link, watch, reporter, options).execute()

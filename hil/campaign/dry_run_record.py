@@ -152,6 +152,12 @@ class DryRunRecord:
         """Return the dry run of a plan on this kind of arm whose archives are all there, or None.
 
         A dry run of a simulated arm does not cover the surroundings of a real one.
+
+        Args:
+            folder: of the campaign.
+            plan_hash: of the plan.
+            motions: their number.
+            simulated: whether the arm is.
         """
         record = cls.load(folder, plan_hash)
         if record is None or record.simulated is not simulated:
@@ -165,7 +171,14 @@ class DryRunRecord:
     def of(
         cls, campaign: CampaignState, names: Sequence[str], *, plan_hash: str, simulated: bool
     ) -> Self:
-        """Return the dry run from its archives."""
+        """Return the dry run from its archives.
+
+        Args:
+            campaign: state of its folder.
+            names: of the archives.
+            plan_hash: of the plan.
+            simulated: whether the arm is.
+        """
         folder = campaign.folder
         cell = campaign.cell
         limit = cell.drive_train.current_limit

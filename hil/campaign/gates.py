@@ -33,6 +33,13 @@ def require_gates(
 ) -> None:
     """Require the arm and the link of this campaign and a passed rehearsal, before anything moves.
 
+    Args:
+        campaign: state of its folder.
+        link: to the controller.
+        plan_hash: of the plan.
+        simulated: whether the arm is.
+        unrehearsed: whether a rehearsal is not asked for.
+
     Raises:
         NotRehearsedError: with the remedy.
         CampaignFolderError: folder, archives or link are not those of this campaign.
@@ -60,6 +67,13 @@ def require_dry_run(
     can_answer: bool,
 ) -> None:
     """Require a dry run that is accepted or can be, before anything moves.
+
+    Args:
+        folder: of the campaign.
+        dry_run: that was done, if any.
+        options: of the run.
+        simulated: whether the arm is.
+        can_answer: whether somebody can accept it.
 
     Raises:
         DryRunError: with the remedy.

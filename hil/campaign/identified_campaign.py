@@ -20,7 +20,13 @@ from .status import execution_log_of
 def identify_campaign(
     root: Path, reporter: Reporter, options: Options = Options(), *, predict: Sequence[Path] = ()
 ) -> Identification:
-    """Identify from the complete archives of a campaign folder; `predict` adds held-out archives.
+    """Identify from the complete archives of a campaign folder.
+
+    Args:
+        root: of the campaign.
+        reporter: of progress.
+        options: of the identification.
+        predict: archives that are held out in addition.
 
     Raises:
         InputError: the folder has no complete excitation.

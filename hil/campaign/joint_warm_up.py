@@ -110,7 +110,14 @@ class WarmUpRecord:
         return [change_per_motion(friction[: k + 1]) for k in range(len(friction))]
 
     def with_motion(self, archive: str, friction: Array, least: int, most: int) -> WarmUpRecord:
-        """Return this warm-up after another motion of friction (n,) [N·m], with its new outcome."""
+        """Return this warm-up after another motion, with its new outcome.
+
+        Args:
+            archive: of the motion.
+            friction: during it (n,) [N·m].
+            least: motions.
+            most: motions.
+        """
         joint_friction = tuple(float(f) if np.isfinite(f) else None for f in friction)
         longer = replace(self, motions=(*self.motions, WarmMotion(archive, joint_friction)))
         done = len(longer.motions)

@@ -214,6 +214,12 @@ class Runner:
     def run_motion(self, motion: CampaignMotion, number: int, total: int, most: float = 1.0) -> str:
         """Move to the start of a motion, run it, and return its archive, not yet in the manifest.
 
+        Args:
+            motion: of the campaign.
+            number: of the motion, from 1.
+            total: of the motions.
+            most: largest override.
+
         Raises:
             MotionFailedError: it ended otherwise than planned, or was not begun after a stop.
             SlippedError: a measured position slipped.

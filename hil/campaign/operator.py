@@ -109,7 +109,15 @@ class RunWatch:
         self._expected += motions
 
     def begin(self, kind: str, number: int, total: int, duration: float, most: float) -> None:
-        """Begin a motion of `duration` s at full speed, at an override of at most `most`."""
+        """Begin a motion.
+
+        Args:
+            kind: of the motion.
+            number: of the motion, from 1.
+            total: of the motions.
+            duration: at full speed [s].
+            most: largest override.
+        """
         if kind not in ("dryrun", "move"):
             self._expected = [one for one in self._expected if not one.dry_run]
         known = (one for one in self._expected if math.isclose(one.duration, duration))

@@ -238,8 +238,14 @@ def noise_shares(
     """Return the share of the variances (k,) that differs from one repetition to the next.
 
     The rest is the same in all of them, or changes slowly, as the friction of an arm that gets warm
-    (von Neumann 1941), or is of the `earlier` recordings. `moved` (p, k) are the inverse
-    information times the directions. NaN for one repetition.
+    (von Neumann 1941), or is of the earlier recordings. NaN for one repetition.
+
+    Args:
+        factors: of the repetitions.
+        weights: of the joints (n,).
+        values: parameters (p,).
+        moved: inverse information times the directions (p, k).
+        earlier: factor of earlier recordings, if any.
     """
     count = len(factors)
     if count < 2:

@@ -40,7 +40,15 @@ SATURATED: Final = 0.99  # Share of the current limit from which a motor is satu
 def criterion(
     name: str, value: float | None, bound: float, text: str, remedy: str = ""
 ) -> RehearsalCriterion:
-    """Return a criterion that is met by a finite value up to `bound`; else with a remedy."""
+    """Return a criterion that is met by a finite value up to a bound; else with a remedy.
+
+    Args:
+        name: of the criterion.
+        value: that is judged.
+        bound: largest value.
+        text: what the value is.
+        remedy: where it is not met.
+    """
     finite = None if value is None or not np.isfinite(value) else value
     passed = finite is not None and finite <= bound
     sentence = text if passed or not remedy else f"{text}: {remedy}"
@@ -53,7 +61,13 @@ def of_currents(cell: Cell, folder: CampaignFolder, name: str, bound: float) -> 
     """Judge the largest current of any motor, as a share of its limit.
 
     The two cycles after a lost packet, in which the controller comes back from its extrapolation to
-    the set-points, count only if a motor is saturated: `bound` is the margin of the motion.
+    the set-points, count only if a motor is saturated.
+
+    Args:
+        cell: of the campaign.
+        folder: of the rehearsal.
+        name: of the criterion.
+        bound: margin of the motion.
     """
     worst = 0.0
     motor = 0
@@ -93,7 +107,14 @@ _CORRECT = (
 
 
 def of_motions(cell: Cell, folder: CampaignFolder, name: str, failure: str) -> RehearsalCriterion:
-    """Judge whether all motions were completed (`failure` is ""), within the speed limits."""
+    """Judge whether all motions were completed, within the speed limits.
+
+    Args:
+        cell: of the campaign.
+        folder: of the rehearsal.
+        name: of the criterion.
+        failure: of a motion; "" if there was none.
+    """
     entries = folder.manifest()
     if failure:
         path = folder.archives / entries[-1].name if entries else None

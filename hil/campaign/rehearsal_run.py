@@ -42,7 +42,17 @@ def rehearse(
     """Run the plan twice on the simulated arm, and judge it; see `Campaign.rehearse`.
 
     Changes of the cell file are accepted until the campaign has recordings, but not during the
-    rehearsal (CampaignFolderError).
+    rehearsal.
+
+    Args:
+        campaign: state of its folder.
+        reporter: of progress.
+        seed: of the simulated arm.
+        stop: request of the operator.
+        again: also where a rehearsal has passed.
+
+    Raises:
+        CampaignFolderError: the cell file was changed during the rehearsal.
     """
     folder = campaign.folder
     with folder.locked():

@@ -125,7 +125,14 @@ def clock(seconds: float) -> str:
 
 
 def ask(console: Console, title: str, dry_run: DryRunRecord, stop: Stop) -> bool:
-    """Show a dry run and ask for its acceptance: "yes", or the joints that contradict the model."""
+    """Show a dry run and ask for its acceptance: "yes", or the joints that contradict the model.
+
+    Args:
+        console: of the terminal.
+        title: of the campaign.
+        dry_run: that was done.
+        stop: request of the operator.
+    """
     table = Table(title=Text(printable(f"Dry run of {title}, {clock(dry_run.duration)} long")))
     for column in ("joint", "largest following error", "largest current", "torque and gravity"):
         table.add_column(column, justify="right" if column.startswith("largest") else "left")
@@ -153,7 +160,14 @@ def ask(console: Console, title: str, dry_run: DryRunRecord, stop: Stop) -> bool
 
 
 def confirmed(console: Console, question: str, word: str, stop: Stop) -> bool:
-    """Ask for a word and return whether it was typed; False also after a stop request."""
+    """Ask for a word and return whether it was typed; False also after a stop request.
+
+    Args:
+        console: of the terminal.
+        question: that is shown.
+        word: to be typed.
+        stop: request of the operator.
+    """
     console.print(question, end="", markup=False, highlight=False)
     sys.stdout.flush()
     with contextlib.suppress(termios.error):  # discard what was typed before the question
@@ -228,7 +242,14 @@ class Screen:
 
     @classmethod
     def of(cls, cell: Cell, stop: Stop, *, title: str = "", quiet: bool = False) -> Screen:
-        """Return the screen of a run on a cell's own link; `title` is by default its name."""
+        """Return the screen of a run on a cell's own link.
+
+        Args:
+            cell: of the run.
+            stop: request of the operator.
+            title: by default the name of the cell.
+            quiet: show no picture.
+        """
         spec = cell.link_spec
         link = SIMULATED if spec is None or cell.only_simulated else spec.description
         name = title or cell.name

@@ -42,6 +42,12 @@ _POLL: Final = 0.2  # s between two looks whether the operator stopped it
 def run_simulated(campaign: CampaignState, stop: Stop, reporter: Reporter, *, effects: bool) -> int:
     """Run the missing motions on the simulated arm of the cell; return the cycles of the motions.
 
+    Args:
+        campaign: state of its folder.
+        stop: request of the operator.
+        reporter: of progress.
+        effects: whether the arm has effects that the model leaves out.
+
     Raises:
         ExecutionError: a motion failed, or it was stopped; what is complete is in the manifest.
     """
@@ -109,6 +115,12 @@ def adopt_second_session(campaign: CampaignState) -> None:
 
 def result_of(child: WorkerProcess, stop: Stop, what: str, remedy: str) -> Any:
     """Return what a run on a simulated arm in another process returned.
+
+    Args:
+        child: the process.
+        stop: request of the operator.
+        what: it runs, for errors.
+        remedy: of these.
 
     Raises:
         OperatorStopError: it was stopped.

@@ -135,6 +135,12 @@ def urscript(motion: Trajectory, name: str, repetitions: int, header: Sequence[s
 
     A slow motion has as many set-points per second as a fast one: each is `speed` of the way
     between two positions of the motion further than the one before.
+
+    Args:
+        motion: that is repeated.
+        name: of the program.
+        repetitions: of the motion.
+        header: lines of a comment.
     """
     cycle = 1.0 / SCRIPT_RATE
     positions = motion.sample(_times(motion, SCRIPT_RATE))[0]

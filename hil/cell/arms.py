@@ -97,6 +97,12 @@ def joints_outside(
 ) -> list[str]:
     """Return those of the moving joints that do not lie between the links.
 
+    Args:
+        path: of the file, for errors.
+        text: of the URDF.
+        links: between which an arm lies.
+        joint_names: moving joints.
+
     Raises:
         InputError: no other is left, or as of :func:`joints_between`.
     """

@@ -437,10 +437,17 @@ class Cell:
         third: Array,
         inertia_scale: Array | None = None,
     ) -> Array:
-        """Return the parameter vector (p,) of URDF inertias and these joint-side values (n,).
+        """Return the parameter vector (p,) of URDF inertias and joint-side values.
 
-        Inertias of links are multiplied by `inertia_scale` (n,); springs and balancers are those of
-        the file; other parameters (coupling inertia, offset, Stribeck) are zero.
+        Springs and balancers are those of the file; other parameters (coupling inertia, offset,
+        Stribeck) are zero.
+
+        Args:
+            rotor_inertia: of each joint (n,).
+            coulomb: friction (n,).
+            viscous: friction (n,).
+            third: friction (n,).
+            inertia_scale: by which the inertias of links are multiplied (n,).
         """
         model = self.model
         standard = model.nominal
@@ -461,7 +468,14 @@ class Cell:
         return np.asarray(urdf_angles * frame.sign + frame.offset, dtype=np.float64)
 
     def error(self, field: str, value: object, problem: str, remedy: str) -> CellError:
-        """Return an error of a field of this file."""
+        """Return an error of a field of this file.
+
+        Args:
+            field: its name.
+            value: that it has.
+            problem: what is wrong.
+            remedy: what to do.
+        """
         return CellError(self.path, field, value, problem, remedy)
 
 

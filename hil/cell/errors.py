@@ -29,7 +29,14 @@ def first_error(
     *,
     documentation: str = "docs/cell-file.md",
 ) -> CellError:
-    """Convert the first error of pydantic; `documentation` is named for undescribed fields."""
+    """Convert the first error of pydantic.
+
+    Args:
+        path: of the file.
+        error: of pydantic.
+        schema: of the file.
+        documentation: named for undescribed fields.
+    """
     detail = error.errors(include_url=False)[0]
     place = _place(schema, detail["loc"])
     value = detail["input"]

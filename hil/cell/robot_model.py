@@ -46,9 +46,17 @@ _GEARED: Final = 10.0  # turns of the motor per turn of the joint
 def robot_model(
     path: Path, urdf_name: str, urdf: str, robot: RobotTable, drive_train: Callable[[], Array]
 ) -> RobotModel:
-    """Build the model; `path` and `urdf_name` are for errors (CellError).
+    """Build the model of a cell.
 
-    `drive_train` returns the motor angles per joint angle (n, n) of `[drive_train]`.
+    Args:
+        path: of the cell file, for errors.
+        urdf_name: likewise.
+        urdf: text.
+        robot: table of the file.
+        drive_train: returns the motor angles per joint angle (n, n) of `[drive_train]`.
+
+    Raises:
+        CellError: cell or URDF are invalid.
     """
     friction = robot.friction
     with _cell_errors(path, "cell.urdf", urdf_name, "correct the URDF"):

@@ -324,6 +324,13 @@ class MotionLink:
     ) -> Recorded:
         """Reply without commanding anything, in real time until rest; archive every cycle.
 
+        Args:
+            spec: of the archive.
+            stop: request of the operator.
+            duration: of the controller's time [s]; without one until the session ends.
+            wait: longest time until the controller begins a session [s].
+            watch: of the recording.
+
         Raises:
             ControllerError: the controller cannot be read, or began no session within `wait` s.
             OperatorStopError: a stop was requested before it began one.
@@ -631,8 +638,14 @@ def recording_end(
 ) -> tuple[str, str] | None:
     """Return outcome and reason of a recording that is to end now, None while it continues.
 
-    `lost` is how the link was lost, or ""; `limited` whether a duration was requested; the last
-    refusal `refused` becomes the reason of any end.
+    Args:
+        restarted: whether the controller began another session.
+        complete: whether the duration is over.
+        ended: whether the session has ended.
+        lost: how the link was lost, or "".
+        stopped: whether a stop was requested.
+        limited: whether a duration was requested.
+        refused: last refusal, which becomes the reason of any end.
     """
     ends = (
         (restarted, "stopped", "the controller began a new session"),

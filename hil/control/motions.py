@@ -106,7 +106,14 @@ class CheckedMoves:
     def between(
         self, start: Array, end: Array, index: int, *, from_arm: bool = False
     ) -> CampaignMotion | None:
-        """Return the checked motion from `start` to `end` (n,) [rad]; None if they are the same."""
+        """Return the checked motion between two postures; None if they are the same.
+
+        Args:
+            start: posture (n,) [rad].
+            end: posture (n,) [rad].
+            index: of the move.
+            from_arm: whether it begins where the arm is.
+        """
         if np.max(np.abs(end - start)) <= AT_REST_TOLERANCE:
             return None
         motion = next((earlier for earlier in self._known if earlier.connects(start, end)), None)
@@ -181,9 +188,13 @@ def rest(position: Array, duration: float) -> PiecewiseCubic:
 def straight_move(
     cell: Cell, start: Array, end: Array, speed: float | None = None
 ) -> CampaignMotion:
-    """Return the straight motion between two postures (n,) [rad], planned in a child process.
+    """Return the straight motion between two postures, planned in a child process.
 
-    Its speed is a fraction of the joints' speeds, by default the cell's `approach_speed`.
+    Args:
+        cell: of the arm.
+        start: posture (n,) [rad].
+        end: posture (n,) [rad].
+        speed: fraction of the joints' speeds, by default the cell's `approach_speed`.
 
     Raises:
         MotionRefusedError: a posture is outside the limits.

@@ -45,7 +45,14 @@ class CheckedMove:
 
 
 def random_via_points(cell: Cell, frame: AngleFrame, count: int, seed: int) -> Array:
-    """Return home (or mid-range) and random points in the limits (1 + m, n) [rad]."""
+    """Return home (or mid-range) and random points in the limits (1 + m, n) [rad].
+
+    Args:
+        cell: of the arm.
+        frame: of the angles.
+        count: of the random points.
+        seed: of these.
+    """
     limits = cell.joint_limits
     ends = np.sort([frame.shown(limits.lower), frame.shown(limits.upper)], axis=0)
     shares = np.random.default_rng(seed).random((count, limits.n_joints))
@@ -82,7 +89,14 @@ def posture(cell: Cell, text: str, excitation_start: Array | None = None) -> Arr
 
 
 def turned(cell: Cell, start: Array, joint: str, degrees: float) -> Array:
-    """Return `start` (n,) [rad] with one joint turned by `degrees` in the frame of [limits]."""
+    """Return a posture (n,) [rad] with one joint turned.
+
+    Args:
+        cell: of the arm.
+        start: posture (n,) [rad].
+        joint: its name.
+        degrees: by which it turns, in the frame of [limits].
+    """
     target = start.copy()
     index = joint_index(cell, joint, "--joint")
     target[index] += np.radians(degrees) * AngleFrame.of(cell).sign[index]
@@ -129,11 +143,15 @@ def plan_move(
     speed: float | None = None,
     checks: MotionChecks | None = None,
 ) -> CheckedMove:
-    """Plan and check a straight motion in joint space between two postures (n,) [rad].
+    """Plan and check a straight motion in joint space between two postures.
 
-    `speed` is a fraction of the joints' speeds, by default the cell's `approach_speed`; `checks`
-    are by default the cell's; `send` applies those with the limits of the connected controller
-    again.
+    Args:
+        cell: of the arm.
+        start: posture (n,) [rad].
+        target: posture (n,) [rad].
+        speed: fraction of the joints' speeds, by default the cell's `approach_speed`.
+        checks: by default the cell's; `send` applies those with the limits of the connected
+            controller again.
 
     Raises:
         MotionRefusedError: it violates a limit, collides or needs too much current.
@@ -156,10 +174,16 @@ def send(
     watch: MotionWatch = unwatched_motion,
     durable: bool = True,
 ) -> MotionEnded:
-    """Execute a motion on a connected link and archive every cycle at the new file `path`.
+    """Execute a motion on a connected link and archive every cycle.
 
-    `stop` stops the arm on its path; `watch` shows the motion, and may slow and hold it; with
-    `durable` each flush waits for the disk.
+    Args:
+        planned: the motion.
+        cell: of the arm.
+        link: to the controller.
+        path: of the new archive.
+        stop: stops the arm on its path.
+        watch: shows the motion, and may slow and hold it.
+        durable: each flush waits for the disk.
 
     Raises:
         MotionRefusedError: the motion needs more current than the controller's limit.

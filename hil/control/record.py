@@ -36,9 +36,16 @@ def record(
 ) -> Recorded:
     """Record the session of the controller from its first cycle, without requesting any motion.
 
-    The kind is one of `KINDS`. `stop` ends the recording, as do the end of the session and the
-    `duration` [s] of the controller's time. `wait` limits the time for the controller to start [s].
-    With `durable` each flush waits for the disk.
+    Args:
+        link: to the controller.
+        cell: of the arm.
+        path: of the archive.
+        kind: one of `KINDS`.
+        stop: ends the recording, as does the end of the session.
+        duration: of the controller's time, after which it ends [s].
+        wait: longest time for the controller to start [s].
+        watch: of the recording.
+        durable: each flush waits for the disk.
 
     Raises:
         ControllerError: the controller did not start in time, or does not match the cell.
@@ -61,9 +68,13 @@ def archive_spec(
 ) -> ArchiveSpec:
     """Return the specification of an archive with cell, URDF, drive train and plan attached.
 
-    A motion of the controller's own program has no plan. The name of the cell is added to the
-    metadata. With `durable` each flush waits for the disk. `states` are topics of what the
-    controller sends beyond cycle records.
+    Args:
+        cell: of the arm, whose name is added to the metadata.
+        path: of the archive.
+        metadata: of the archive.
+        plan: of the motion; a motion of the controller's own program has none.
+        durable: each flush waits for the disk.
+        states: topics of what the controller sends beyond cycle records.
     """
     attachments = {
         "cell.toml": cell.text.encode(),

@@ -125,11 +125,20 @@ def simulated_controller(
     faults: Sequence[InjectedFault] = (),
     own_speed: float = OWN_SPEED,
 ) -> SimulatedController:
-    """Return controller and arm of a cell with any link; arguments as for `simulated_link`.
+    """Return controller and arm of a cell with any link.
 
-    `settings` are by default `controller_settings(cell)`, `seed` is that of the cell; the init
-    packet states the drive train of the cell, not `drive`. The moves of an own program run at the
-    share `own_speed` of the velocity limits.
+    The init packet states the drive train of the cell, not `drive`.
+
+    Args:
+        cell: that is simulated.
+        effects: as for `simulated_link`.
+        drive: likewise.
+        truth: likewise.
+        settings: by default `controller_settings(cell)`.
+        seed: by default that of the cell.
+        session: as for `simulated_link`.
+        faults: likewise.
+        own_speed: share of the velocity limits at which the moves of an own program run.
     """
     nominal_drive = simulated_drive(cell)
     settings = settings or controller_settings(cell, effects=effects)

@@ -159,9 +159,13 @@ def serve_session(
 ) -> Served:
     """Serve until a session has ended; a start aborted by the PC is repeated after a second.
 
-    `build` creates a controller that was just switched on; `patience` is the time for the arm to
-    come to rest at the end, s; `cycle_extension` the longest extension of a cycle to wait for its
-    reply, s; `watch` is called every cycle.
+    Args:
+        build: creates a controller that was just switched on.
+        link: to the PC.
+        pressed: buttons of the controller.
+        patience: for the arm to come to rest at the end [s].
+        cycle_extension: longest extension of a cycle to wait for its reply [s].
+        watch: called every cycle.
 
     Raises:
         InputError: the link cannot carry the session.

@@ -306,7 +306,17 @@ class VirtualLink(MotionLink):
         *,
         only_axis: int | None = None,
     ) -> VirtualLink:
-        """Return a link to the simulated controller of `cell` (TypeError for a real transport)."""
+        """Return a link to the simulated controller of a cell.
+
+        Args:
+            transport: of the simulated controller.
+            cell: that is simulated.
+            finish: called when the link is closed.
+            only_axis: the only axis, from 1, that is opened; None for all.
+
+        Raises:
+            TypeError: the transport is real.
+        """
         if not isinstance(transport, SimulatedTransport):
             raise TypeError(
                 f"{type(transport).__name__} is not virtual time: on a real link the exchange "

@@ -137,12 +137,22 @@ def run_design(
     """Search a motion for a cell as :func:`run_search` does, and write it into a folder.
 
     A stopped search writes its best motion, marked as incomplete, and a journal, with which
-    `resume` continues it; `force` replaces an existing design. The folder is locked until `then`,
-    called with the result, has returned.
+    `resume` continues it. The folder is locked until `then` has returned.
 
-    `given` is the information of the earlier recordings in the settings, `precision` what their
-    requirements stand for, and `promised` returns what a motion promises for each, for the file.
-    `carrying` is the cell with a payload that currents and torques must allow for.
+    Args:
+        folder: of the design.
+        cell: of the arm.
+        settings: of the search.
+        reporter: of progress.
+        workers: processes of the planner.
+        stop: request of the operator.
+        given: information of the earlier recordings in the settings.
+        precision: what their requirements stand for.
+        promised: returns what a motion promises for each of these, for the file.
+        carrying: cell with a payload that currents and torques must allow for.
+        resume: continue a stopped search.
+        force: replace an existing design.
+        then: called with the result.
 
     Raises:
         InputError: the folder has a design already, is locked, or cannot be written to.
@@ -235,7 +245,16 @@ def run_search(
     problem: excitation.Problem | None = None,
     journal: excitation.Journal | None = None,
 ) -> excitation.Design:
-    """Search a motion for a cell, or for a given problem of it; other arguments as in `search`.
+    """Search a motion for a cell, or for a given problem of it.
+
+    Args:
+        cell: of the arm.
+        requested: settings of the search.
+        reporter: of progress.
+        workers: processes of the planner.
+        stop: request of the operator.
+        problem: by default that of cell and settings.
+        journal: of the scores.
 
     Raises:
         NoExcitationError: no motion satisfies all constraints.

@@ -52,7 +52,12 @@ def no_excitation(
 ) -> NoExcitationError:
     """Return the error of a search without a result, with violations and remedies.
 
-    A `chain` of several arms is advised to be designed for one.
+    Args:
+        error: of the search.
+        frame: of the angles.
+        checker: of collisions.
+        settings: of the search.
+        chain: of the arm; one of several arms is advised to be designed for one.
     """
     contact = error.nearest.get("collision")
     always = None if contact is None or checker is None else always_so(contact, checker)

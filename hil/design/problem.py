@@ -43,8 +43,11 @@ def problem_of(
 ) -> Problem:
     """Return genome, objective and constraints of a search.
 
-    `given` is the information of earlier recordings, `precision` what the requirements of the
-    settings stand for.
+    Args:
+        cell: of the arm.
+        settings: of the search.
+        given: information of earlier recordings.
+        precision: what the requirements of the settings stand for.
 
     Raises:
         SettingsError: settings that do not fit the cell.

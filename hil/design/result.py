@@ -104,7 +104,14 @@ class DesignResult:
 
     @classmethod
     def of(cls, cell: Cell, settings: DesignSettings, design: Design, objective: Objective) -> Self:
-        """Return the result of a design."""
+        """Return the result of a design.
+
+        Args:
+            cell: of the arm.
+            settings: of the search.
+            design: that it found.
+            objective: of the search.
+        """
         names = objective.model.parameter_names
         chosen = objective.parameters
         front = design.front

@@ -271,7 +271,17 @@ def arm_from(
     options: Options | None,
     reporter: Reporter | None,
 ) -> IdentifiedArm:
-    """Identify an arm from recordings, see :func:`hil.identify`; None is the default of each."""
+    """Identify an arm from recordings, see :func:`hil.identify`; None is the default of each.
+
+    Args:
+        recordings: that are fitted.
+        urdf: of the arm.
+        robot: in place of it.
+        predict: recordings that are held out.
+        reading: how logs are read.
+        options: of the identification.
+        reporter: of progress.
+    """
     if urdf is not None:
         if robot is not None:
             problem = "exclude each other"
@@ -471,7 +481,14 @@ def write_arm(
     annotate: bool,
     reporter: Reporter,
 ) -> tuple[Path, Results]:
-    """Write an identified arm, see :meth:`IdentifiedArm.save`; return folder and `results.json`."""
+    """Write an identified arm, see :meth:`IdentifiedArm.save`; return folder and `results.json`.
+
+    Args:
+        arm: that is written.
+        folder: by default that of the identification.
+        annotate: write copies of the archives with the predicted torque.
+        reporter: of progress.
+    """
     first = arm.recordings[0]
     staging = arm.staging
     identification = arm.identification

@@ -103,6 +103,13 @@ def staged(
 
     Errors about an archive in memory name the recording it was read from.
 
+    Args:
+        fitted: recordings.
+        predicted: recordings that are held out.
+        robot_of: the arm of a recording.
+        options: of the import.
+        reporter: of progress.
+
     Raises:
         SourceError: one cannot be imported, or nothing can be identified from it.
     """

@@ -65,6 +65,13 @@ def torque_plot(
 ) -> TorquePlot:
     """Draw torque of joints, see :meth:`IdentifiedArm.plot`.
 
+    Args:
+        results: of the identification.
+        series: of the figures.
+        joints: by name or number, by default all.
+        size: of the figure [inch].
+        axes: to draw on.
+
     Raises:
         InputError: there is no such joint, or another number of axes than of joints.
     """

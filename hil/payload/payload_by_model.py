@@ -37,9 +37,16 @@ def weigh_by_model(
 ) -> PayloadFound:
     """Identify the payload of loaded recordings against the posterior of the arm.
 
-    `arm` are campaign folders or archives of the bare arm, of any motion: they are identified with
-    all automatic choices. Offsets and friction of the loaded recordings are free to scale, as
-    between bare and loaded ones.
+    Offsets and friction of the loaded recordings are free to scale, as between bare and loaded
+    ones.
+
+    Args:
+        arm: campaign folders or archives of the bare arm, of any motion: they are identified with
+            all automatic choices.
+        loaded: archives with the payload.
+        reporter: of progress.
+        frame: of the payload.
+        options: of the identification.
 
     Raises:
         InputError: archives cannot be used, are of two arms, or have no payload.

@@ -290,9 +290,14 @@ def find_payload(
 ) -> PayloadFound:
     """Identify the payload of the loaded recordings as their difference to the bare ones.
 
-    Both are archives, folders of them, or campaign folders. Settings are chosen on the bare
-    recordings; `[robot.payload]` of the cells is ignored. The payload is in the frame of a link, by
-    default that of `flange_of`.
+    Settings are chosen on the bare recordings; `[robot.payload]` of the cells is ignored.
+
+    Args:
+        bare: archives, folders of them, or campaign folders.
+        loaded: likewise.
+        reporter: of progress.
+        frame: link of the payload, by default that of `flange_of`.
+        options: of the identification.
 
     Raises:
         NoPayloadError: the loaded recordings show no payload.
@@ -412,9 +417,17 @@ def weighed(
     mounting: str | None,
     arm: KnownArm | None = None,
 ) -> tuple[PayloadEstimate, Body]:
-    """Return the payload of reduced recordings; `sides` are the bare and the loaded archives.
+    """Return the payload of reduced recordings.
 
-    `mounting` says why another mounting of the arm is likely.
+    Args:
+        model: of the arm.
+        runs: reduced recordings.
+        scale: of torques.
+        frame: of the payload.
+        sides: the bare and the loaded archives.
+        training: their recordings.
+        mounting: why another mounting of the arm is likely.
+        arm: what is known of it.
 
     Raises:
         InputError: there is no payload, the recordings contradict each other, or no arm can carry

@@ -159,11 +159,18 @@ class PrecisionDesign:
         *,
         effects: bool = False,
     ) -> PrecisionDesign:
-        """Return the requirements about a cell, on its validation motions; `given` are recordings.
+        """Return the requirements about a cell, on its validation motions.
 
-        With a `payload` they are about its mass, recorded on an arm that is known. Without
-        recordings the torque error of a real arm is assumed; that of a simulated one is the noise
-        of its currents, unless it has `effects` that the model leaves out.
+        Without recordings the torque error of a real arm is assumed; that of a simulated one is the
+        noise of its currents.
+
+        Args:
+            cell: of the arm.
+            requirements: of precision.
+            motions: validation motions.
+            given: recordings of the arm.
+            payload: that requirements are about, recorded on an arm that is known.
+            effects: whether a simulated arm has effects that the model leaves out.
 
         Raises:
             InputError: a requirement names no joint or parameter, or is beyond what can be had.

@@ -56,7 +56,14 @@ class PredictedRows:
 
     @classmethod
     def of(cls, cell: Cell, motion: Motion, values: Array, *, rigid: bool) -> Self:
-        """Return the sums over a sampled motion."""
+        """Return the sums over a sampled motion.
+
+        Args:
+            cell: of the arm.
+            motion: sampled.
+            values: parameters (p,).
+            rigid: whether the gears are known to be rigid.
+        """
         model = cell.model
         n = model.n_joints
         torque = model.torque(values, motion)

@@ -154,9 +154,14 @@ def example_series(
 ) -> dict[str, Array]:
     """Return the example's torque, as measured, predicted, nominal and by part, and its spectra.
 
-    By the names of :class:`ReportSeries`. `values` are the identified parameters (p,), `nominal`
-    those of the nominal model (p,), and `samples` a held-out recording, of which the rows `shown`
-    are in the figures.
+    By the names of :class:`ReportSeries`.
+
+    Args:
+        model: of the arm.
+        values: identified parameters (p,).
+        nominal: parameters of the nominal model (p,).
+        samples: of a held-out recording.
+        shown: rows of it that are in the figures.
     """
     step = _step(samples)
     few = samples if step == 1 else samples.thinned(step)

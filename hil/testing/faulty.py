@@ -117,10 +117,16 @@ class UdpController:
         faults: Sequence[str] = (),
         options: Sequence[str] = (),
     ) -> Iterator[UdpController]:
-        """Start a controller with faults and options of `hil simulate`; its cell is in `folder`.
+        """Start a controller with faults.
 
         Unless the options say otherwise, it ends its session (504) after `LONGEST`: a program that
         stays until then must not wait for ever.
+
+        Args:
+            cell: of the controller.
+            folder: of its cell file.
+            faults: as of `hil simulate`.
+            options: likewise.
         """
         port = free_port()
         path = folder / "udp_cell.toml"
