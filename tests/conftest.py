@@ -24,8 +24,12 @@ settings.register_profile(
 settings.load_profile("hil")
 
 # Tests of other folders import them, too, some before those of tests/drivers.
-_OF_DRIVERS = ("transport_contract", "can_bench", "rig", "judge", "oracle")
-pytest.register_assert_rewrite(*(f"tests.drivers.{name}" for name in _OF_DRIVERS))
+_OF_DRIVERS = ("transport_contract", "can_bench", "rig", "judge", "oracle", "losses")
+pytest.register_assert_rewrite(
+    *(f"tests.drivers.{name}" for name in _OF_DRIVERS),
+    "tests.hil.importers.moving_log",
+    "tests.hil.report.pages",
+)
 
 
 def pytest_ignore_collect(collection_path: Path, config: pytest.Config) -> bool | None:

@@ -19,7 +19,7 @@ from hil.importers.imported_robot import Robot
 from hil.importers.recording_import import ImportOptions
 from hil.pipeline.options import Options
 from identification.validation.verdict import Verdict
-from tests.hil.importers.test_log_kinds import URDF
+from tests.hil.importers.moving_log import URDF
 from tests.hil.simulated_logs import write_moving_log
 
 ROOT = Path(hil.__file__).parents[1]

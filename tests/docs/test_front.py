@@ -71,8 +71,8 @@ def test_ci_runs_the_script_on_every_supported_python() -> None:
     assert os.access(ROOT / ".ci" / "run", os.X_OK)
 
 
-def test_pre_commit_runs_the_pinned_tools() -> None:
+@pytest.mark.parametrize("tool", ["ruff check", "ruff format", "mypy", "lint-imports"])
+def test_pre_commit_runs_the_pinned_tools(tool: str) -> None:
     hooks = yaml.safe_load(text(".pre-commit-config.yaml"))["repos"][0]["hooks"]
     entries = " ".join(hook["entry"] for hook in hooks)
-    for tool in ("ruff check", "ruff format", "mypy", "lint-imports"):
-        assert f".venv/bin/{tool}" in entries
+    assert f".venv/bin/{tool}" in entries

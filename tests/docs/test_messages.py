@@ -6,57 +6,21 @@ import ast
 import re
 import shlex
 from collections.abc import Iterator
-from functools import cache
 
 from pydantic import BaseModel
 
 from hil.cell.schema import CellFile
 from hil.design.settings import DesignSettings
 from hil.importers.column_map import ColumnMap
-from tests.docs.test_words import MODULES, docstrings
-from tests.docs.typed import ROOT, command_of, options
+from tests.docs.sources import COMMAND, MODULES, OPTION, messages
+from tests.docs.typed import command_of, options
 from tests.house import nodes_of
 
-FIELD = "FIELD"
-OPTION = re.compile(r"(?<![\w-])--[a-z][a-z-]+")
-COMMAND = re.compile(r"(?:`|[Rr]un )(hil [a-z][^`;]*)")
 ENTRIES = (
     re.compile(r"\[(?P<table>[a-z_]+)\] (?P<key>[a-z_]{3,})\b(?= =|,|;|$|\)|:)"),
     re.compile(r"\b(?P<key>[a-z]+(?:_[a-z]+)*)`? (?:of|in|under) \[(?P<table>[a-z_]+)\]"),
 )
 OTHER_WORDS = {"and", "both", "factor", "listed", "parameters", "place", "stated", "that"}
-NOT_OF_HIL = (
-    "hil/report/",
-    "hil/study/page.py",
-    "hil/fleet/trend_page.py",
-    "hil/cli/suggestions.py",
-    "hil/doctor/checks.py",
-)
-"""Variables of a style sheet, misspelt options, commands of the system."""
-
-
-@cache
-def messages() -> tuple[tuple[str, str], ...]:
-    return tuple(_messages())
-
-
-def _messages() -> Iterator[tuple[str, str]]:
-    """Place and text of each string that is no docstring; each field of an f-string is FIELD."""
-    for module in MODULES:
-        name = str(module.relative_to(ROOT))
-        if name.startswith(NOT_OF_HIL):
-            continue
-        inner = docstrings(module)
-        for text in (node for node in nodes_of(module) if isinstance(node, ast.JoinedStr)):
-            inner |= {node for node in ast.walk(text) if node is not text}
-            parts = [
-                part.value if isinstance(part, ast.Constant) else FIELD for part in text.values
-            ]
-            yield f"{name}:{text.lineno}", "".join(map(str, parts))
-        for node in nodes_of(module):
-            is_text = isinstance(node, ast.Constant) and isinstance(node.value, str)
-            if is_text and node not in inner:
-                yield f"{name}:{node.lineno}", re.sub(r"{[^{}]*}", FIELD, node.value)
 
 
 PATH = re.compile(r"root|path|folder|campaign|output|location|source|file")

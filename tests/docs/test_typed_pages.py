@@ -31,7 +31,7 @@ from hil.results.results import Results
 from hil.results.rollout_result import RolloutResult
 from identification.model.motion import Motion
 from tests.docs.typed import ROOT, commands, section
-from tests.hil.payload.test_payload_command import CENTRE, MASS, archive_of_currents
+from tests.hil.payload.load_archives import CENTRE, MASS, archive_of_currents
 from tests.hil.simulated_logs import simulate
 from tests.motion_table import MotionTable
 

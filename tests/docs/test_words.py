@@ -10,10 +10,10 @@ from pathlib import Path
 
 import pytest
 
+from tests.docs.sources import MODULES, docstrings
 from tests.docs.typed import PAGES, ROOT
 from tests.house import PACKAGES, nodes_of
 
-MODULES = [path for name in PACKAGES for path in sorted((ROOT / name).rglob("*.py"))]
 TEMPLATES = sorted((ROOT / "hil" / "report" / "templates").glob("*.j2"))
 IDIOMS = re.compile(
     r"\b(kept|told|taken|announced|standing|wish|wish(es|ed)|doubts?|strangers?|sight|ways|plain"
@@ -30,11 +30,6 @@ LITERAL = {
 }
 INDEX = re.compile(r"\bpypi\b|\bconda\b|\bnpm\b|https?://\S*/simple\b", re.IGNORECASE)
 MOST_TERMS = 72
-
-
-def docstrings(module: Path) -> set[ast.AST]:
-    """Texts that are statements of their own."""
-    return {node.value for node in nodes_of(module) if isinstance(node, ast.Expr)}
 
 
 @cache

@@ -98,30 +98,36 @@ class TestLimits:
             Guard(limits(), period)
 
 
+STILL = np.zeros((2, N))
+CHECKS = {
+    "set-point": lambda guard, row: (guard.check_set_point, row, REST, "plan"),
+    "velocity": lambda guard, row: (guard.check_set_point, START, row, "plan"),
+    "current": lambda guard, row: (guard.check_feedback, REST, at(1, 100.0), row, REST),
+    "target held": lambda guard, row: (guard.check_hold, row, REST, EVERY),
+    "target and axes held": lambda guard, row: (guard.check_hold, row, row, EVERY),
+    "axes at the start": lambda guard, row: (guard.check_start, REST, row, STILL),
+    "target and axes at the start": lambda guard, row: (guard.check_start, row, row, STILL),
+    "first set-point": lambda guard, row: (guard.begin, row),
+}
+"""Each check of a guard with its arguments, of which one is a row (n,)."""
+
+
+@pytest.mark.parametrize("name", CHECKS)
 @given(st.integers(0, N - 1), NOT_FINITE)
-def test_values_that_are_not_finite_are_refused(joint, value):
+def test_values_that_are_not_finite_are_refused(name, joint, value):
     """Of any joint, before any other violation."""
     row = at(joint, 1.0)
-    far = at(1, 100.0)
     row[joint] = value
-    guard = Guard(limits(), PERIOD)
-    set_points = begun(limits())
-    for check, *arguments in (
-        (set_points.check_set_point, row, REST, "plan"),
-        (begun(limits()).check_set_point, START, row, "plan"),
-        (guard.check_feedback, REST, far, row, REST),
-        (guard.check_hold, row, REST, EVERY),
-        (guard.check_hold, row, row, EVERY),
-        (guard.check_start, REST, row, np.zeros((2, N))),
-        (guard.check_start, row, row, np.zeros((2, N))),
-        (guard.begin, row),
-    ):
-        with np.errstate(invalid="ignore"):
-            error = refused(Check.FINITE, check, *arguments, 5)
-        assert (error.joint, error.cycle, error.check) == (joint, 5, Check.FINITE)
-        assert NUMBER_NEEDED in str(error)
+    with np.errstate(invalid="ignore"):
+        error = refused(Check.FINITE, *CHECKS[name](begun(limits()), row), 5)
+    assert (error.joint, error.cycle, error.check) == (joint, 5, Check.FINITE)
+    assert NUMBER_NEEDED in str(error)
+
+
+@given(st.integers(0, N - 1), NOT_FINITE)
+def test_a_closed_axis_may_have_no_number(joint, value):
     others = np.arange(N) != joint
-    guard.check_hold(np.where(others, 0.0, value), REST, others, 5)
+    Guard(limits(), PERIOD).check_hold(np.where(others, 0.0, value), REST, others, 5)
 
 
 @given(st.lists(st.floats(-1.0, 1.0), min_size=1, max_size=60), st.sampled_from([1.0, 1.7, 3.0]))

@@ -11,7 +11,7 @@ from drivers.events import RepliesLost
 from drivers.guard import LAG
 from drivers.open_mode import REPETITIONS, SentSetPoints
 from drivers.packets import LAST_NUMBER, PacketSequence
-from planner import JointLimits, TrajectoryPlayer, plan
+from tests.drivers.losses import FAR, at_speed, lose, planned
 from tests.drivers.rig import (
     MOVE,
     PERIOD,
@@ -180,16 +180,6 @@ STEP = 1.9 * 0.002 * 120.0 / (2.0 * np.pi)
 """Motor revolutions per cycle of joint 1 at full speed."""
 PULL = 2.0 * 8.0 * 0.002**2 * 120.0 / (2.0 * np.pi) + 2e-5
 """Most that a step may change by from one cycle to the next in a stop, rounding included."""
-FAR = {"lower": np.full(N, -9.0), "upper": np.full(N, 9.0)}
-
-
-def at_speed(cycles: int = 600, speed: float = 1.9, **options) -> Rig:
-    """An arm whose first joint moves at this speed, rad/s."""
-    source = type("AtSpeed", (Cruise,), {"SPEED": speed, "RAMP": 1.0})()
-    rig = running(source, **{"guard_limits": limits(**FAR), **options})
-    rig.cycle(cycles)
-    assert rig.state is State.OPEN
-    return rig
 
 
 def report_late(rig: Rig) -> None:
@@ -203,15 +193,6 @@ def report_late(rig: Rig) -> None:
         rig.axes["d"][:] = late[-2]
 
     rig._follow = follow_late
-
-
-def lose(rig: Rig, count: int):
-    """Run cycles whose replies do not reach the controller, which holds its target."""
-    follow = rig._follow
-    rig._follow = lambda answer: rig.axes["d"].__setitem__((slice(None), [1, 3]), 0)
-    answer = rig.cycle(count)
-    rig._follow = follow
-    return answer
 
 
 class TestLostReplies:
@@ -312,13 +293,6 @@ class TestLostReplies:
             rig.cycle(49)
         assert rig.session.counters.rejected == 6
         assert (rig.session.stop_reason, rig.state) == (None, State.OPEN)
-
-
-def planned() -> TrajectoryPlayer:
-    """A motion of the planner, six times as far as `MOVE`."""
-    rates = ("lower", "upper", "velocity", "acceleration", "jerk")
-    bounds = JointLimits(**{name: getattr(limits(), name) for name in rates})
-    return TrajectoryPlayer(plan([START, START + MOVE * 6.0], bounds), PERIOD, bounds)
 
 
 class TestGaps:
@@ -542,14 +516,14 @@ class TestPauses:
         assert error.bound == pytest.approx(LAG * limits().acceleration[0])
 
     @pytest.mark.parametrize("missed", [0, 2])
-    def test_pause_is_longer_than_an_allowed_gap_by_two_cycles(self, missed):
-        for cycles, state in ((3.9, State.OPEN), (4.1, State.FAULTED)):
-            rig = at_speed(1200, speed=2.0)
-            rig.miss(missed)
-            rig.now = rig.session._arrived_at + (cycles - 1.0) * PERIOD
-            rig.axes["d"][:, 3] = 0.0
-            rig.cycle()
-            assert rig.state is state
+    @pytest.mark.parametrize(("cycles", "state"), [(3.9, State.OPEN), (4.1, State.FAULTED)])
+    def test_pause_is_longer_than_an_allowed_gap_by_two_cycles(self, missed, cycles, state):
+        rig = at_speed(1200, speed=2.0)
+        rig.miss(missed)
+        rig.now = rig.session._arrived_at + (cycles - 1.0) * PERIOD
+        rig.axes["d"][:, 3] = 0.0
+        rig.cycle()
+        assert rig.state is state
 
     def test_arm_that_lags_or_rests_without_a_motion_continues(self):
         """As on a busy computer, whose cycle was longer."""

@@ -176,19 +176,19 @@ class TestFeedback:
             *(([column], 0.0, np.nan, Check.FINITE) for column in (0, 2, 4)),
         ],
     )
-    def test_bounds_of_feedback(self, situation, columns, near, far, kind):
-        for sign in (-1.0, 1.0):
-            rig = FOLLOWING[situation]()
-            rig.axes["d"][3, columns] += sign * near
-            rig.cycle()
-            assert not rig.seen(Refused)
-            rig.axes["d"][3, 4] = 0.0
-            rig.axes["d"][3, columns] += sign * far
-            answer = rig.cycle()
-            assert (kind_of(rig.refusal), rig.refusal.joint) == (kind, 3)
-            modes = [4, 4, 4, 508, 4, 4] if kind is Check.FOLLOWING_ERROR else [505] * N
-            assert answer.axes["mode"].tolist() == modes
-            assert (rig.ended is None) == (situation == "held")
+    @pytest.mark.parametrize("sign", [-1.0, 1.0])
+    def test_bounds_of_feedback(self, situation, columns, near, far, kind, sign):
+        rig = FOLLOWING[situation]()
+        rig.axes["d"][3, columns] += sign * near
+        rig.cycle()
+        assert not rig.seen(Refused)
+        rig.axes["d"][3, 4] = 0.0
+        rig.axes["d"][3, columns] += sign * far
+        answer = rig.cycle()
+        assert (kind_of(rig.refusal), rig.refusal.joint) == (kind, 3)
+        modes = [4, 4, 4, 508, 4, 4] if kind is Check.FOLLOWING_ERROR else [505] * N
+        assert answer.axes["mode"].tolist() == modes
+        assert (rig.ended is None) == (situation == "held")
 
     @pytest.mark.parametrize(
         ("name", "column", "kind", "cell", "stated", "bound"),

@@ -14,8 +14,8 @@ from drivers.errors import Check
 from drivers.events import RepliesLost
 from planner import PiecewiseCubic, TrajectoryPlayer, plan
 from sim_fixtures.faults import parse_fault, split_faults
+from tests.drivers.losses import FAR, at_speed, lose, planned
 from tests.drivers.rig import PERIOD, N, at, limits, resumptions, running
-from tests.drivers.test_session_losses import FAR, at_speed, lose, planned
 from tests.fault_matrix import faulty_runs, small_cell
 from tests.laws.motions import Array, slows_down
 

@@ -172,11 +172,11 @@ class TestLoopback:
         with closing(UdpTransport.loopback()) as link:
             yield link
 
-    def test_it_receives_what_it_sends(self, loopback):
-        for length in (48, 1200):
-            loopback.send(bytes(length))
-            assert loopback.receive(PATIENCE) == bytes(length)
-            assert loopback.arrived <= loopback.now
+    @pytest.mark.parametrize("length", [48, 1200])
+    def test_it_receives_what_it_sends(self, loopback, length):
+        loopback.send(bytes(length))
+        assert loopback.receive(PATIENCE) == bytes(length)
+        assert loopback.arrived <= loopback.now
 
     def test_it_receives_nothing_else(self, loopback, controller):
         controller.socket.sendto(bytes(48), loopback.address)

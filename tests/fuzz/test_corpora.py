@@ -10,17 +10,13 @@ from pathlib import Path
 import pytest
 
 from tests.fuzz import targets
+from tests.fuzz.corpora import inputs
 from tests.fuzz.targets import CORPORA
 
 pytestmark = pytest.mark.safety
 
 MOST_FILES = 40
 MOST_BYTES = 200_000
-
-
-def inputs(name: str) -> list[bytes]:
-    """Return the corpus in the repository, sorted."""
-    return [path.read_bytes() for path in sorted((CORPORA / name).iterdir())]
 
 
 @pytest.mark.parametrize("name", targets.NAMES)

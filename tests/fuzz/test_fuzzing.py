@@ -19,7 +19,7 @@ from hil.archive import ArchiveHeader, open_archive
 from hil.base.errors import ArchiveError
 from tests.fuzz import __main__ as command
 from tests.fuzz import targets
-from tests.fuzz.test_corpora import inputs
+from tests.fuzz.corpora import inputs
 
 pytestmark = pytest.mark.long
 

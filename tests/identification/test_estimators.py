@@ -569,16 +569,16 @@ class TestPosterior:
             assert (fitted_posterior.ratio < 1.0).all()
 
     @pytest.mark.parametrize("storage", ["gram", "qr"])
-    def test_an_infinite_prior_is_weighted_least_squares(self, storage):
+    @pytest.mark.parametrize("std", [1e7, np.inf])
+    def test_an_infinite_prior_is_weighted_least_squares(self, storage, std):
         factor = Factor.of(MODEL, noisy(), storage)
         expected = estimate(MODEL, Factor.of(MODEL, noisy()))
-        for std in (1e7, np.inf):
-            prior = independent(np.full(P, 3.0), np.full(P, std))
-            posterior = with_prior(MODEL, factor, prior)
-            np.testing.assert_allclose(posterior.estimate.values, expected.values, rtol=1e-8)
-            np.testing.assert_allclose(posterior.estimate.std, expected.std, rtol=1e-8)
-            np.testing.assert_allclose(posterior.estimate.noise_std, expected.noise_std, rtol=1e-8)
-            assert posterior.learned.all()
+        prior = independent(np.full(P, 3.0), np.full(P, std))
+        posterior = with_prior(MODEL, factor, prior)
+        np.testing.assert_allclose(posterior.estimate.values, expected.values, rtol=1e-8)
+        np.testing.assert_allclose(posterior.estimate.std, expected.std, rtol=1e-8)
+        np.testing.assert_allclose(posterior.estimate.noise_std, expected.noise_std, rtol=1e-8)
+        assert posterior.learned.all()
 
     @pytest.mark.parametrize("storage", ["gram", "qr"])
     def test_without_data_it_is_the_prior(self, storage):
@@ -945,12 +945,12 @@ class TestPlaceholders:
         assert origin in prior.origin
         assert not prior.mean[: model.layout.size].any()
 
-    def test_masses_with_another_torque_are_some(self):
-        for size in (20.0, 0.05, -1.0):
-            prior, _ = self.prior(MODEL, size)
-            assert prior.placeholder
-            assert "times that of the bodies of the description" in prior.origin
-            assert not prior.mean[: MODEL.layout.size].any()
+    @pytest.mark.parametrize("size", [20.0, 0.05, -1.0])
+    def test_masses_with_another_torque_are_some(self, size):
+        prior, _ = self.prior(MODEL, size)
+        assert prior.placeholder
+        assert "times that of the bodies of the description" in prior.origin
+        assert not prior.mean[: MODEL.layout.size].any()
 
     @pytest.mark.parametrize("size", [0.7, 1.0, 1.5])
     def test_masses_of_about_the_torque_are_none(self, size):

@@ -18,7 +18,7 @@ from identification.errors import ModelError, ShapeError
 from identification.estimators.consistent import consistent_estimate
 from identification.excitation.collision import CollisionChecker
 from identification.excitation.errors import CollisionModelError
-from identification.export.exported_arm import ExportedArm, Ranges
+from identification.export.exported_arm import Ranges
 from identification.export.friction_curve import friction_curve, median_load
 from identification.export.parameter_files import covariance_csv, parameters_csv, parameters_json
 from identification.export.parameter_table import parameter_table
@@ -39,6 +39,7 @@ from identification.signals.noise import noiseless_above
 from identification.signals.smoothing import LowPassShape, low_passed
 from sim_fixtures.ns16 import urdf_text
 from tests import messages
+from tests.identification.exported_arm import WRIST, an_arm
 from tests.identification.robots import random_urdf, robot_text, some_bodies
 from tests.identification.two_link import URDF, as_samples, four_sines
 from tests.identification.two_link import URDF as TWO_LINK
@@ -586,26 +587,6 @@ class TestParameters:
 
 
 LAW = FrictionLaw(asymmetric=True, stribeck=0.1, presliding=1e-3)
-WRIST = np.eye(6)
-WRIST[5, 4] = 0.5
-
-
-def an_arm(urdf, **options):
-    """Random consistent bodies, and friction of all kinds."""
-    model = RobotModel.from_urdf(urdf, **options)
-    n = model.n_joints
-    standard = np.zeros(model.layout.size)
-    standard[: 11 * n] = some_bodies(n)
-    standard[model.layout.rotors] += 1.0
-    for k, (i, j) in enumerate(model.layout.pairs):
-        rotors = model.layout.rotors[[i, j]]
-        standard[model.layout.couplings[k]] = 0.3 * np.sqrt(np.prod(standard[rotors]))
-    others = np.random.default_rng(1).uniform(0.5, 2.5, model.n_parameters - model.base.rank)
-    values = np.concatenate([model.base.grouping @ standard, others])
-    infinite = np.full(n, np.inf)
-    return ExportedArm(
-        urdf, model, standard, values, Ranges(-infinite, infinite, infinite, infinite)
-    )
 
 
 def compared(form, arm, remarks=(), samples=20):

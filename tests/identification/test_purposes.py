@@ -24,14 +24,13 @@ from identification.purposes.gravity_error import (
 from identification.purposes.purposes import gravity_compensation, single_parameters
 from identification.purposes.quiet_torque import BLOCK, PERIOD, once_in, slow_residuals
 from identification.purposes.simulation_error import HORIZON, flange_error
+from tests.identification.quiet_motion import quiet
 from tests.identification.robots import random_urdf
 from tests.identification.two_link import (
     MODEL,
     NOISE,
     URDF,
     P,
-    as_samples,
-    coloured,
     four_sines,
     simulated,
     truth,
@@ -147,12 +146,6 @@ def test_what_the_motion_does_not_determine_is_an_infinite_error() -> None:
 
 
 # Contact and payload
-
-
-def quiet(duration: float, seed: int, error: Array | float = 0.0):
-    motion = four_sines(np.arange(0.0, duration, 0.005), 0.3)
-    noise = coloured(np.random.default_rng(seed), len(motion.time), 0.005, 0.1)
-    return as_samples(MODEL, motion, MODEL.torque(truth(), motion) + noise + error)
 
 
 def exceeded(peaks: Array, limit: Array) -> Array:

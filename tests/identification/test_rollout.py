@@ -38,7 +38,7 @@ from identification.rollout.windows import (
     windows_of,
 )
 from identification.validation.prediction import driving_residual
-from tests.identification.test_servo_by_positions import on_its_servo
+from tests.identification.servo_arm import on_its_servo
 from tests.identification.two_link import MODEL, URDF, as_samples, four_sines, simulated
 
 mujoco = pytest.importorskip("mujoco", reason="the extra mujoco is not installed")

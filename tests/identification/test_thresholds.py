@@ -13,7 +13,7 @@ from identification.purposes.quiet_torque import (
     slow_residuals,
 )
 from identification.purposes.thresholds import SHOWN, ContactThreshold, contact_thresholds
-from tests.identification.test_purposes import quiet
+from tests.identification.quiet_motion import quiet
 from tests.identification.two_link import MODEL, truth
 
 MIDDLE = np.array([0.3, -0.8])

@@ -53,7 +53,7 @@ from identification.validation.residuals import (
 from tests.hil.identified_arm import a_motion as sines
 from tests.hil.identified_arm import packaged_urdf
 from tests.identification.evidence import an_error, found, judged
-from tests.identification.test_selection import ARM_NOISE, three_sines
+from tests.identification.three_sines import ARM_NOISE, three_sines
 from tests.identification.two_link import (
     MODEL,
     NOISE,

@@ -13,8 +13,8 @@ from planner.errors import InvalidPlanFile
 from planner.moves import Move, Overrides, plan_moves
 from planner.plan_file import PlanFile
 from tests.motion_table import MotionTable
+from tests.planner.problems import problems
 from tests.planner.six_axes import SIX_AXES, random_points
-from tests.planner.test_moves import problems
 
 NAMES = tuple(f"joint_{i}" for i in range(1, 7))
 

@@ -306,16 +306,18 @@ class TestHalfASecond:
         assert seen.complete
         assert outcome_of(seen, "excitation_000_a1") == "rejected"
 
-    def test_missed_packets_excuse_no_end(self, stage: Stage) -> None:
+    @pytest.mark.parametrize(
+        "faults", [["delay@296x1:7ms"], ["delay@577x1:7ms", "delay@296x1:7ms"]]
+    )
+    def test_missed_packets_excuse_no_end(self, stage: Stage, faults: list[str]) -> None:
         """Only what moves the arm itself does, and only an error that asks for an inspection."""
-        for faults in (["delay@296x1:7ms"], ["delay@577x1:7ms", "delay@296x1:7ms"]):
-            seen = stage.observed(102383, faults)
-            rejected = RepetitionsRejectedError("repetition 3", ["it differs"])
-            assert len(list(completion(_ended_by(seen, rejected)))) == 1
-            pushed = replace(_ended_by(seen, rejected), struck=(*seen.struck, "push@300x9:1=0.1"))
-            assert list(completion(pushed)) == []
-            lost = MotionFailedError("repetition 3", "lost", "the drive went off")
-            assert len(list(completion(replace(_ended_by(seen, lost), struck=pushed.struck)))) == 1
+        seen = stage.observed(102383, faults)
+        rejected = RepetitionsRejectedError("repetition 3", ["it differs"])
+        assert len(list(completion(_ended_by(seen, rejected)))) == 1
+        pushed = replace(_ended_by(seen, rejected), struck=(*seen.struck, "push@300x9:1=0.1"))
+        assert list(completion(pushed)) == []
+        lost = MotionFailedError("repetition 3", "lost", "the drive went off")
+        assert len(list(completion(replace(_ended_by(seen, lost), struck=pushed.struck)))) == 1
 
 
 def outcome_of(seen: Observed, archive: str) -> str:

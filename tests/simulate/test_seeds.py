@@ -6,7 +6,7 @@ from typing import Final
 
 import pytest
 
-from tests.simulate.test_seeds_quick import failures
+from tests.simulate.seeds import failures
 
 pytestmark = pytest.mark.safety
 

@@ -4,22 +4,9 @@ from __future__ import annotations
 
 import pytest
 
-from tests.simulate.many import stage_folder
-from tests.simulate.scenes import NEIGHBOURS
-from tests.simulate.verdicts import Stage
+from tests.simulate.seeds import failures
 
 pytestmark = pytest.mark.safety
-
-
-def failures(group: int) -> list[str]:
-    """Play the seeds of a group; a sentence for each law that was broken, with what to type."""
-    with stage_folder() as root:
-        stage = Stage(root)
-        return [
-            f"python -m tests.simulate --seed {seed}: {law}: {text}"
-            for seed in range(group * NEIGHBOURS, (group + 1) * NEIGHBOURS)
-            for law, text in stage.verdict(seed, shrink=False).broken
-        ]
 
 
 def test_no_law_is_broken() -> None:

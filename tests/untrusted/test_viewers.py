@@ -13,7 +13,7 @@ pytest.importorskip("foxglove", reason="the extra 'live' is not installed")
 pytest.importorskip("websockets", reason="websockets is not installed")
 
 from hil.archive import live
-from tests.hil.archive.test_live import records, served
+from tests.hil.archive.live_archive import records, served
 from tests.hil.live_viewer import Viewer
 
 pytestmark = pytest.mark.safety

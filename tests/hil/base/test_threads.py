@@ -11,7 +11,7 @@ from threadpoolctl import threadpool_info, threadpool_limits
 import hil
 from hil.base.errors import InputError
 from hil.base.threads import VARIABLES
-from tests.hil.importers.test_log_kinds import URDF
+from tests.hil.importers.moving_log import URDF
 from tests.hil.simulated_logs import write_moving_log
 
 READ = InputError(None, "the log was read", remedy="none")

@@ -16,7 +16,7 @@ from hil.cell.toml_edits import urdf_limits
 from hil.cli import app
 from tests.hil.fast_cell import CELL
 from tests.hil.fast_cell import URDF as FAST
-from tests.hil.importers.test_log_kinds import JOINTS, POSITION, URDF, imported, rows, text
+from tests.hil.importers.moving_log import JOINTS, POSITION, URDF, imported, rows, text
 
 RANGE = re.compile("lower='[^']*' upper='[^']*'")
 NOT_STATED = {

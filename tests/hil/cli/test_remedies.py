@@ -16,11 +16,11 @@ import numpy as np
 import pinocchio as pin
 import pytest
 from numpy.typing import NDArray
-from typer.testing import CliRunner, Result
+from typer.testing import Result
 
 from hil.base.errors import InputError
-from hil.cli import app
-from tests.hil.importers.test_log_kinds import JOINTS, URDF
+from tests.hil.cli.remedies import message, typed
+from tests.hil.importers.moving_log import JOINTS, URDF
 from tests.hil.simulated_logs import write_log
 
 Array = NDArray[np.float64]
@@ -31,14 +31,6 @@ FOURTH = (
     "<parent link='lankle'/><child link='hand'/><origin xyz='0 0 0.4'/><axis xyz='0 1 0'/>"
     "<limit lower='-3' upper='3' effort='99' velocity='9'/></joint></robot>"
 )
-
-
-def typed(*arguments: object) -> Result:
-    return CliRunner().invoke(app, [str(word) for word in arguments], env={"COLUMNS": "200"})
-
-
-def message(result: Result) -> str:
-    return f"{result.output} {result.exception}"
 
 
 def motion(seed: int, duration: float = 16.0) -> tuple[Array, ...]:

@@ -36,7 +36,7 @@ from identification.model.motion import Motion
 from tests.hil import arm_histories
 from tests.hil.arm_histories import FRICTION, Condition
 from tests.hil.fast_cell import fast_cell
-from tests.hil.report.test_report import HOSTILE, Page, assert_inert, assert_stands_alone
+from tests.hil.report.pages import HOSTILE, Page, assert_inert, assert_stands_alone
 
 pytestmark = pytest.mark.long
 

@@ -41,7 +41,7 @@ from hil.control.motions import player_of
 from hil.control.simulator_process import free_port
 from planner import Move, plan_moves
 from sim_fixtures.ns16 import CELL_PATH
-from tests.hil.control.test_supervision import spec as spec_of
+from tests.hil.control.supervised import spec as spec_of
 from tests.hil.fast_cell import fast_cell, on_path, set_points
 from tests.hil.loopback import loopback_link, on_loopback
 from tests.messages import LEADS_OUT, NAME_LOCAL_ADDRESS

@@ -41,6 +41,7 @@ from hil.control.simulated_cell import simulated_link
 from hil.control.virtual_link import VirtualLink
 from hil.testing import faulty_link
 from planner import Move, PiecewiseCubic, TrajectoryPlayer, plan_moves
+from tests.hil.control.supervised import spec
 from tests.hil.fast_cell import fast_campaign, fast_cell, on_path
 from tests.laws.motions import as_planned
 from tests.laws.second_reader import read
@@ -97,13 +98,6 @@ class WatchedArm:
     def commanded(self) -> np.ndarray:
         """Set-points (k, n) [rad]; they are on the path, whatever the time law."""
         return on_path(self.archive, self.motion)
-
-
-def spec(cell: Cell, path: Path) -> ArchiveSpec:
-    return ArchiveSpec(
-        path, cell.joint_names, cell.period, {"kind": "move"},
-        {"drive_train.json": cell.drive_table.model_dump_json().encode()}, durable=False,
-    )  # fmt: skip
 
 
 @pytest.fixture

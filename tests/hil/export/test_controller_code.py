@@ -42,8 +42,8 @@ from identification.model.motion import Motion
 from identification.purposes.thresholds import ContactThreshold
 from sim_fixtures.ns16 import urdf_text
 from tests.hil.structured_text_reader import Block, blocks_of
+from tests.identification.exported_arm import WRIST, an_arm
 from tests.identification.robots import random_urdf
-from tests.identification.test_export import WRIST, an_arm
 from tests.identification.two_link import four_sines
 
 COMPILER = next(filter(shutil.which, ("cc", "gcc", "clang")), None)

@@ -120,13 +120,13 @@ class TestFound:
     def test_by_a_pattern(self, pattern, names):
         assert self.found(pattern) == names
 
-    def test_conditions_and_tables_of_quantities_are_none(self):
+    @pytest.mark.parametrize("places", [["a"], ["a/*.csv", "a/*.npz"]])
+    def test_conditions_and_tables_of_quantities_are_none(self, places):
         """Also of a pattern that matches them."""
         (self.root / "a" / "hall.csv").write_text("when,ambient\n2026-03-15,21.5\n")
         (self.root / "a" / "trend.csv").write_text("robot,joint,quantity,when,value\n")
-        for places in (["a"], ["a/*.csv", "a/*.npz"]):
-            found = self.found(*places, others=[self.root / "a" / "hall.csv"])
-            assert found == ["a/one.csv", "a/two.npz"]
+        found = self.found(*places, others=[self.root / "a" / "hall.csv"])
+        assert found == ["a/one.csv", "a/two.npz"]
 
     def test_a_pattern_that_matches_nothing_is_refused(self):
         with pytest.raises(InputError, match=r"c\*\.csv: matches no file"):

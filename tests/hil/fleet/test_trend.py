@@ -15,7 +15,7 @@ from hil.batch.cluster import Cluster
 from hil.cli import app
 from hil.fleet.trend_limits import TrendLimit
 from tests.hil.batch_work import NOTHING_OPEN
-from tests.hil.report.test_report import Page, assert_inert, assert_stands_alone
+from tests.hil.report.pages import Page, assert_inert, assert_stands_alone
 
 pytestmark = pytest.mark.long
 

@@ -15,7 +15,7 @@ from typer.testing import CliRunner
 import hil
 from hil.cli import app
 from hil.identified.identified_arm import IdentifiedArm
-from tests.hil.importers.test_log_kinds import URDF
+from tests.hil.importers.moving_log import URDF
 from tests.hil.simulated_logs import urdf_path
 
 COMPLAINTS = {"resolution", "outliers", "generalisation", "joint order"}

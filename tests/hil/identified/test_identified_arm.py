@@ -25,7 +25,7 @@ from hil.importers.text_table import TextTable
 from hil.report.figures import joints_of, torque_charts
 from hil.results.results import Results
 from tests.hil.browser import OpenedPage, chromium
-from tests.hil.importers.test_log_kinds import URDF
+from tests.hil.importers.moving_log import URDF
 from tests.hil.simulated_logs import write_moving_log
 
 

@@ -9,20 +9,17 @@ import json
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
 import scipy.io
 from numpy.typing import NDArray
-from typer.testing import CliRunner
 
 from hil.archive import open_archive
 from hil.archive.recording_of_archive import open_recording
 from hil.base import one_screen
 from hil.base.errors import InputError, SourceError
 from hil.base.output_folder import SOURCES, folder_beside, sources_text
-from hil.cli import app
 from hil.importers.column_map import ColumnMap
 from hil.importers.conclusions import ChannelMeaning, NameBasis, UnitBasis, UnusedChannels
 from hil.importers.imported_robot import Robot
@@ -33,9 +30,10 @@ from hil.importers.recording_import import ImportOptions, import_recording
 from hil.importers.rosbag2 import import_rosbag2
 from hil.pipeline.sources import cell_of
 from identification.validation.position_jumps import position_jumps
-from tests.hil.importers.test_bag_kinds import WHOLE, message
-from tests.hil.importers.test_log_kinds import JOINTS, POSITION, SLOPE, TIME, TORQUE, URDF
-from tests.hil.importers.test_rosbag2 import DEFINITION, STATE, bag, mcap, state
+from tests.hil.identified.command import hil
+from tests.hil.importers.bag_messages import WHOLE, message
+from tests.hil.importers.bags import DEFINITION, STATE, bag, mcap, state
+from tests.hil.importers.moving_log import JOINTS, POSITION, SLOPE, TIME, TORQUE, URDF
 from tests.hil.simulated_logs import urdf_path, write_moving_log
 from tests.hil.simulated_logs import write_log as log
 
@@ -52,10 +50,6 @@ def urdf(tmp_path: Path) -> Path:
 
 def moving(path: Path, *, seed: int = 0) -> Path:
     return write_moving_log(path, URDF, seed=seed)
-
-
-def hil(*arguments: object) -> Any:
-    return CliRunner().invoke(app, [str(argument) for argument in arguments])
 
 
 class TestProposedMap:

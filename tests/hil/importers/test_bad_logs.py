@@ -15,7 +15,7 @@ from typer.testing import CliRunner
 
 from hil.base.errors import HilError
 from hil.cli import app
-from tests.hil.importers.test_log_kinds import URDF
+from tests.hil.importers.moving_log import URDF
 from tests.hil.simulated_logs import write_log, write_moving_log
 
 Floats = NDArray[np.float64]

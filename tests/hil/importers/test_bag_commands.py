@@ -27,8 +27,8 @@ from hil.importers.ros_messages import CONTROLLER_STATE, definitions_of
 from hil.results.provenance import RESULTS
 from hil.results.rollout_result import ROLLOUT, RolloutResult
 from hil.results.servo_result import ServoResults
-from tests.hil.importers.test_rosbag2 import bag
-from tests.identification.test_servo_by_positions import DELAY, KD, KP, an_arm, on_its_servo
+from tests.hil.importers.bags import bag
+from tests.identification.servo_arm import DELAY, KD, KP, an_arm, on_its_servo
 from tests.identification.two_link import MODEL, URDF, four_sines
 
 STATE = "sensor_msgs/msg/JointState"

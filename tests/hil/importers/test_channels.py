@@ -10,18 +10,9 @@ import pytest
 from hil.importers.channels import channels_of, kind_of
 from hil.importers.column_map import ColumnMap, ready_maps
 from hil.importers.units import unit_of
-from tests.hil.importers.test_bag_kinds import WHOLE
-from tests.hil.importers.test_log_kinds import (
-    COUNT,
-    JOINTS,
-    NAMES,
-    POSITION,
-    RATE,
-    TIME,
-    rows,
-    text,
-)
-from tests.hil.importers.test_rosbag2 import DEFINITION, STATE, bag, drives, mcap
+from tests.hil.importers.bag_messages import WHOLE
+from tests.hil.importers.bags import DEFINITION, STATE, bag, drives, mcap
+from tests.hil.importers.moving_log import COUNT, JOINTS, NAMES, POSITION, RATE, TIME, rows, text
 
 NAMED = {
     "q1": ("position", 1), "q[0]": ("position", 0), "actual_q_5": ("position", 5),
@@ -40,9 +31,9 @@ def test_names_say_quantity_and_number(name: str) -> None:
     assert kind_of(name, units.get(name)) == NAMED[name]
 
 
-def test_units_of_torque_have_one_spelling_with_every_prefix() -> None:
-    for spelled in ("N.m", "Nm", "N·m", "N m"):
-        assert [unit_of(prefix + spelled) for prefix in ("", "m", "k")] == ["N.m", "mN.m", "kN.m"]
+@pytest.mark.parametrize("spelled", ["N.m", "Nm", "N·m", "N m"])
+def test_units_of_torque_have_one_spelling_with_every_prefix(spelled: str) -> None:
+    assert [unit_of(prefix + spelled) for prefix in ("", "m", "k")] == ["N.m", "mN.m", "kN.m"]
 
 
 def test_columns_of_the_ready_maps_are_known_by_name() -> None:

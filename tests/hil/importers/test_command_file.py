@@ -12,7 +12,8 @@ from hil.base.errors import SourceError
 from hil.importers.conclusions import ChannelMeaning, OtherClock
 from hil.importers.imported_robot import Robot
 from hil.importers.recording_import import ImportedRecording, ImportOptions, read_recording
-from tests.hil.importers.test_lerobot import JOINTS, motion, urdf
+from tests.hil.importers.lerobot_set import JOINTS, motion
+from tests.hil.importers.test_lerobot import urdf
 
 Array = NDArray[np.float64]
 __all__ = ["urdf"]  # a fixture

@@ -16,7 +16,7 @@ from pyarrow import parquet
 from hil.base.errors import SourceError
 from hil.importers.imported_robot import Robot
 from hil.importers.recording_import import import_recording
-from tests.hil.importers.test_log_kinds import JOINTS, POSITION, TIME, TORQUE, URDF
+from tests.hil.importers.moving_log import JOINTS, POSITION, TIME, TORQUE, URDF
 
 EPOCH = 10**18  # ns
 

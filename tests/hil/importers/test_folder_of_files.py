@@ -19,16 +19,7 @@ from hil.importers.recording_import import (
     is_archive,
     read_recording,
 )
-from tests.hil.importers.test_log_kinds import (
-    JOINTS,
-    POSITION,
-    RATE,
-    SLOPE,
-    TIME,
-    TORQUE,
-    URDF,
-    Floats,
-)
+from tests.hil.importers.moving_log import JOINTS, POSITION, RATE, SLOPE, TIME, TORQUE, URDF, Floats
 
 DEFAULT = ImportOptions()
 AT_RATE = ImportOptions(sample_rate=RATE)

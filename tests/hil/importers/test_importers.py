@@ -54,7 +54,7 @@ from hil.pipeline.sources import cell_of
 from identification import FrictionLaw
 from identification.model.kinematics import chain_from_urdf
 from tests import messages
-from tests.hil.importers.test_rosbag2 import STATE, bag, state
+from tests.hil.importers.bags import STATE, bag, state
 from tests.hil.simulated_logs import (
     JOINTS,
     Simulated,

@@ -9,7 +9,6 @@ from typing import Any
 import numpy as np
 import pyarrow as pa
 import pytest
-from numpy.typing import NDArray
 from pyarrow import parquet
 from typer.testing import CliRunner
 
@@ -20,10 +19,8 @@ from hil.importers.imported_robot import Robot
 from hil.importers.lerobot import DataSet, is_data_set
 from hil.importers.recording_import import ImportOptions, read_episodes, read_recording
 from hil.pipeline.sources import refuse_duplicates
+from tests.hil.importers.lerobot_set import FPS, JOINTS, Array, motion
 
-Array = NDArray[np.float64]
-
-JOINTS = ("pan", "lift", "gripper")
 LOWER, UPPER = -0.2, 1.8  # rad, of the gripper
 REACH = 1.9  # rad, of the other joints
 URDF = """<robot name="arm"><link name="base"/>
@@ -33,7 +30,6 @@ LINK = """<joint name="{name}" type="revolute"><parent link="{parent}"/><child l
 <limit lower="{lower}" upper="{upper}" effort="3" velocity="9"/></joint>
 <link name="{name}_link"><inertial><origin xyz="0 0 0.05"/><mass value="0.1"/>
 <inertia ixx="1e-4" iyy="1e-4" izz="1e-4" ixy="0" ixz="0" iyz="0"/></inertial></link>"""
-FPS = 50.0
 
 
 @pytest.fixture
@@ -50,13 +46,6 @@ def urdf(tmp_path: Path) -> Path:
         )
     )
     return path
-
-
-def motion(duration: float, phase: float) -> Array:
-    """Return positions (m, 3) [rad]."""
-    time = np.arange(0.0, duration, 1.0 / FPS)
-    turns = [1.5 * np.sin(time + phase), 0.8 * np.cos(0.7 * time), 0.8 + 0.5 * np.sin(1.3 * time)]
-    return np.column_stack(turns)
 
 
 def percent(gripper: Array) -> Array:

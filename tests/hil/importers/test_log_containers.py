@@ -16,7 +16,7 @@ from typer.testing import CliRunner
 from hil.archive import open_archive
 from hil.base.errors import HilError
 from hil.cli import app
-from tests.hil.importers.test_log_kinds import (
+from tests.hil.importers.moving_log import (
     COUNT,
     NAMES,
     POSITION,

@@ -3,41 +3,34 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 
-from hil.archive import Archive, open_archive
+from hil.archive import open_archive
 from hil.base.errors import SourceError
 from hil.cell.toml_edits import UrdfLimits
 from hil.importers.column_map import ColumnMap
 from hil.importers.imported_robot import Robot
 from hil.importers.log import import_log
 from hil.importers.plausibility import whole_turns
-
-Floats = NDArray[np.float64]
-RATE = 250
-COUNT = 400
-TIME = np.arange(COUNT) / RATE
-JOINTS = ("hip", "knee", "ankle")
-POSITION = np.column_stack([0.9 * np.sin(2.0 * TIME + k) for k in range(3)])
-SLOPE = np.column_stack([1.8 * np.cos(2.0 * TIME + k) for k in range(3)])
-TORQUE = np.column_stack([20.0 * np.cos(2.0 * TIME + k) for k in range(3)])
-URDF = (
-    "<robot name='three'><link name='base'/>"
-    + "".join(
-        f"<link name='l{name}'><inertial><mass value='{mass}'/><origin xyz='0 0 0.2'/>"
-        "<inertia ixx='0.1' iyy='0.1' izz='0.1' ixy='0' ixz='0' iyz='0'/></inertial></link>"
-        f"<joint name='{name}' type='revolute'><parent link='{parent}'/><child link='l{name}'/>"
-        "<origin xyz='0 0 0.4'/><axis xyz='0 1 0'/>"
-        "<limit lower='-3' upper='3' effort='99' velocity='9'/></joint>"
-        for name, parent, mass in zip(JOINTS, ("base", "lhip", "lknee"), (3, 2, 1), strict=True)
-    )
-    + "</robot>"
+from tests.hil.importers.moving_log import (
+    COUNT,
+    JOINTS,
+    NAMES,
+    POSITION,
+    RATE,
+    SLOPE,
+    TIME,
+    TORQUE,
+    URDF,
+    Floats,
+    assert_right,
+    imported,
+    rows,
+    text,
 )
 
 
@@ -46,56 +39,6 @@ def urdf(tmp_path: Path) -> Path:
     path = tmp_path / "three.urdf"
     path.write_text(URDF)
     return path
-
-
-def rows(
-    *,
-    time: Sequence[object] = tuple(f"{t:.6f}" for t in TIME),
-    position: Floats = POSITION,
-    torque: Floats = TORQUE,
-    cell: Callable[[float], str] = lambda value: f"{value:.6f}",
-) -> list[list[str]]:
-    numbers = np.column_stack([position, torque])
-    return [[str(t), *map(cell, row)] for t, row in zip(time, numbers.tolist(), strict=True)]
-
-
-NAMES = ["t", "q1", "q2", "q3", "tau1", "tau2", "tau3"]
-
-
-def text(
-    body: Sequence[Sequence[str]] | None = None,
-    *,
-    head: Sequence[Sequence[str]] = (NAMES,),
-    delimiter: str = ",",
-) -> str:
-    lines = [*head, *(rows() if body is None else body)]
-    return "\n".join(delimiter.join(line) for line in lines) + "\n"
-
-
-MAP: dict[str, Any] = {
-    "time": {"column": "t"},
-    "position": {"columns": "q{}"},
-    "torque": {"columns": "tau{}"},
-}
-
-
-def imported(path: Path, content: str | bytes, urdf: Path, **changes: Any) -> Archive:
-    path.write_bytes(content.encode() if isinstance(content, str) else content)
-    columns = ColumnMap.model_validate({**MAP, **changes})
-    output = path.with_suffix(".mcap")
-    return open_archive(
-        import_log(path, output, robot=Robot.from_urdf(urdf), columns=columns, force=True)
-    )
-
-
-def assert_right(archive: Archive, *, without: Sequence[int] = ()) -> None:
-    """The samples are those of the file, to its six digits."""
-    columns = archive.columns
-    elapsed = (columns["stamp"] - columns["stamp"][0]) * 1e-9
-    keep = np.delete(np.arange(COUNT), list(without))
-    assert elapsed == pytest.approx(TIME[keep] - TIME[keep[0]], abs=1e-6)
-    assert columns["position"] == pytest.approx(POSITION[keep], abs=1e-6)
-    assert columns["torque"] == pytest.approx(TORQUE[keep], abs=1e-6)
 
 
 def comma(value: float) -> str:
@@ -316,13 +259,13 @@ class TestRead:
             with pytest.raises(SourceError, match=sentence):
                 imported(tmp_path / "log.csv", content, urdf, position=position)
 
-    def test_a_urdf_in_another_encoding(self, tmp_path: Path, urdf: Path) -> None:
+    @pytest.mark.parametrize("encoding", ["ISO-8859-1", "UTF-16", "UTF-8"])
+    def test_a_urdf_in_another_encoding(self, tmp_path: Path, urdf: Path, encoding: str) -> None:
         content = '<?xml version="1.0" encoding="{}"?><!-- Größe -->' + URDF
-        for encoding in ("ISO-8859-1", "UTF-16", "UTF-8"):
-            urdf.write_bytes(content.format(encoding).encode(encoding))
-            archive = imported(tmp_path / "log.csv", text(), urdf)
-            assert "Größe" in archive.text("robot.urdf")
-            assert_right(archive)
+        urdf.write_bytes(content.format(encoding).encode(encoding))
+        archive = imported(tmp_path / "log.csv", text(), urdf)
+        assert "Größe" in archive.text("robot.urdf")
+        assert_right(archive)
 
 
 # What is refused, and the remedy that the message prints
@@ -420,11 +363,13 @@ class TestRemedies:
         (line,) = archive.header.findings.warnings
         assert "up to 1 rad or m apart (400 such stamps)" in line
 
-    def test_a_clock_that_was_set_back_is_refused(self, tmp_path: Path, urdf: Path) -> None:
-        for back in (0.5, 3600.0, 5.0):
-            time = np.where(np.arange(COUNT) < 200, TIME, TIME - back)
-            with pytest.raises(SourceError, match="older than the one before it"):
-                imported(tmp_path / "log.csv", text(rows(time=time.tolist())), urdf)
+    @pytest.mark.parametrize("back", [0.5, 3600.0, 5.0])
+    def test_a_clock_that_was_set_back_is_refused(
+        self, tmp_path: Path, urdf: Path, back: float
+    ) -> None:
+        time = np.where(np.arange(COUNT) < 200, TIME, TIME - back)
+        with pytest.raises(SourceError, match="older than the one before it"):
+            imported(tmp_path / "log.csv", text(rows(time=time.tolist())), urdf)
 
     def test_every_row_dropped_is_no_recording(self, tmp_path: Path, urdf: Path) -> None:
         odd = [

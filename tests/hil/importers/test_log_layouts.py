@@ -18,7 +18,7 @@ from hil.importers.name_words import kind_by_words
 from hil.importers.recording_import import ImportedRecording, ImportOptions, import_recording
 from hil.look import look_at
 from hil.look.messages import row_text
-from tests.hil.importers.test_log_kinds import JOINTS, POSITION, SLOPE, TIME, TORQUE, URDF, Floats
+from tests.hil.importers.moving_log import JOINTS, POSITION, SLOPE, TIME, TORQUE, URDF, Floats
 
 EPOCH = 1_700_000_000
 

@@ -21,7 +21,7 @@ from hil.importers.recording_import import ImportedRecording, ImportOptions, rea
 from hil.importers.text_table import TextTable
 from hil.pipeline.sources import cell_of, source_of
 from identification.signals.recording import PAUSE, Recording, cut_at_pauses
-from tests.hil.importers.test_log_kinds import JOINTS, URDF
+from tests.hil.importers.moving_log import JOINTS, URDF
 
 RATE = 250.0  # Hz
 ROWS = 8 * STRETCH

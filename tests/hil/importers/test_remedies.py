@@ -16,8 +16,9 @@ from typer.testing import CliRunner
 from hil.archive import Archive, open_archive
 from hil.base.errors import SourceError
 from hil.cli import app
-from tests.hil.importers.test_bag_kinds import WHOLE, message
-from tests.hil.importers.test_log_kinds import (
+from tests.hil.importers.bag_messages import WHOLE, message
+from tests.hil.importers.bags import DEFINITION, STATE, bag, mcap, state
+from tests.hil.importers.moving_log import (
     COUNT,
     JOINTS,
     NAMES,
@@ -29,7 +30,6 @@ from tests.hil.importers.test_log_kinds import (
     rows,
     text,
 )
-from tests.hil.importers.test_rosbag2 import DEFINITION, STATE, bag, mcap, state
 
 MAP = '[time]\ncolumn = "t"\n[position]\ncolumns = "q{}"\n[torque]\ncolumns = "tau{}"\n'
 OPTION = re.compile(r"--[a-z-]+(?: (?:[A-Z]+=[A-Z]+|/\w+|[A-Z]+|ignore))?")

@@ -14,7 +14,7 @@ from hil.archive import Archive, open_archive
 from hil.base.errors import HilError
 from hil.cli import app
 from hil.importers.servo_numbers import are_per_mille, encoder_of, sign_bit_of, signed
-from tests.hil.importers.test_log_kinds import POSITION, TIME, TORQUE, URDF
+from tests.hil.importers.moving_log import POSITION, TIME, TORQUE, URDF
 
 Floats = NDArray[np.float64]
 RATED = np.array([30.0, 25.0, 40.0])

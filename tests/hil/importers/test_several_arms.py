@@ -16,33 +16,11 @@ from hil.importers.messages import sentence
 from hil.importers.recording_import import ImportOptions, import_recording
 from hil.look import look_at
 from hil.pipeline.sources import cell_of
-from tests.hil.identified.test_one_command import hil
-from tests.hil.importers.test_log_kinds import POSITION, TIME, TORQUE
-from tests.hil.importers.test_rosbag2 import STATE, bag, state
+from tests.hil.identified.command import hil
+from tests.hil.importers.bags import STATE, bag, state
+from tests.hil.importers.moving_log import POSITION, TIME, TORQUE
+from tests.hil.importers.several_arms import chain, robot_of_arms
 from tests.hil.simulated_logs import write_log as log
-
-
-def chain(side: str, joints: int, parent: str) -> str:
-    parts = []
-    for number in range(1, joints + 1):
-        parts.append(
-            f"<link name='{side}_l{number}'><inertial><mass value='1'/><origin xyz='0 0 0.2'/>"
-            "<inertia ixx='1' iyy='1' izz='1' ixy='0' ixz='0' iyz='0'/></inertial></link>"
-            f"<joint name='{side}_j{number}' type='revolute'><parent link='{parent}'/>"
-            f"<child link='{side}_l{number}'/><axis xyz='0 1 0'/><origin xyz='0 0 0.4'/>"
-            "<limit lower='-3' upper='3' effort='90' velocity='9'/></joint>"
-        )
-        parent = f"{side}_l{number}"
-    return "".join(parts)
-
-
-def robot_of_arms(folder: Path, *arms: tuple[str, int]) -> Path:
-    """Its arms hang on a torso that turns, with their sides and numbers of joints."""
-    torso = chain("torso", 1, "base")
-    parts = "".join(chain(side, joints, "torso_l1") for side, joints in arms)
-    path = folder / "robot.urdf"
-    path.write_text(f"<robot name='two'><link name='base'/>{torso}{parts}</robot>")
-    return path
 
 
 @pytest.fixture

@@ -17,7 +17,7 @@ from hil.cli import app
 from hil.importers.stated_units import stated_unit, without_unit
 from hil.importers.unit_products import product_of
 from hil.importers.units import factor_of, unit_of
-from tests.hil.importers.test_log_kinds import POSITION, SLOPE, TIME, TORQUE, URDF
+from tests.hil.importers.moving_log import POSITION, SLOPE, TIME, TORQUE, URDF
 
 Floats = NDArray[np.float64]
 # By their definitions: 1 kgf = 9.80665 N, 1 lbf = 0.45359237 kgf, 1 ozf = 1/16 lbf, 1 in = 25.4 mm.

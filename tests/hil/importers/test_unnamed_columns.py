@@ -15,7 +15,7 @@ from hil.archive import Archive, open_archive
 from hil.base.errors import HilError
 from hil.cli import app
 from hil.importers.unnamed_columns import ColumnBlocks, blocks_of, roughness
-from tests.hil.importers.test_log_kinds import COUNT, POSITION, SLOPE, TIME, TORQUE, URDF
+from tests.hil.importers.moving_log import COUNT, POSITION, SLOPE, TIME, TORQUE, URDF
 
 Floats = NDArray[np.float64]
 FINGER = (

@@ -17,8 +17,8 @@ from hil.importers.imported_robot import Robot
 from hil.importers.ros_messages import typestore_of
 from hil.importers.rosbag2 import import_rosbag2
 from hil.importers.xcdr2 import in_version_1
-from tests.hil.importers.test_log_kinds import COUNT, JOINTS, POSITION, TIME, TORQUE, URDF
-from tests.hil.importers.test_rosbag2 import DEFINITION, STATE, mcap
+from tests.hil.importers.bags import DEFINITION, STATE, mcap
+from tests.hil.importers.moving_log import COUNT, JOINTS, POSITION, TIME, TORQUE, URDF
 
 START = 1_700_000_000 * 10**9
 

@@ -50,8 +50,8 @@ from identification.hypotheses.changes import Axes, Change
 from identification.hypotheses.scores import Score, compare, score_of
 from identification.model.robot import RobotModel
 from identification.signals.samples import prepare
-from tests.hil.importers.test_log_kinds import JOINTS, URDF
-from tests.hil.importers.test_rosbag2 import STATE, bag, state, states
+from tests.hil.importers.bags import STATE, bag, state, states
+from tests.hil.importers.moving_log import JOINTS, URDF
 from tests.hil.simulated_logs import write_log, write_moving_log
 
 Floats = NDArray[np.float64]

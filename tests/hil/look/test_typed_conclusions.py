@@ -25,8 +25,8 @@ from hil.look.readings import Channels, Decider, Evidence, NextBest, Reading, Se
 from hil.look.result import Aspect
 from identification.validation import verdict
 from identification.validation.finding_messages import WordedFinding, worded
-from tests.hil.importers.test_log_kinds import URDF
-from tests.hil.importers.test_several_arms import robot_of_arms
+from tests.hil.importers.moving_log import URDF
+from tests.hil.importers.several_arms import robot_of_arms
 from tests.hil.simulated_logs import write_log, write_moving_log
 
 Floats = NDArray[np.float64]

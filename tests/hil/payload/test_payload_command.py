@@ -21,18 +21,15 @@ from hil.base.progress import Silent
 from hil.cli import app
 from hil.importers.column_map import Drive
 from hil.payload.payload_run import find_payload
-from identification import FrictionLaw
 from tests import messages
 from tests.docs.test_commands import QUICK
 from tests.docs.typed import ROOT, commands
+from tests.hil.payload.load_archives import CENTRE, CONSTANTS, LAW, MASS, archive_of_currents
 from tests.hil.simulated_logs import Simulated, archive_of, simulate
 
 pytestmark = pytest.mark.long
 
-MASS = 4.0
-CENTRE = np.array([0.0, 0.09, 0.12])
 TENSOR = np.diag([0.01, 0.02, 0.015])
-LAW = FrictionLaw(third=None, offset=True)
 BOTH = ("--loaded", "full.mcap", "--mass", "4", "--centre", "0,0.09,0.12")
 
 
@@ -185,26 +182,8 @@ def test_the_same_recording_and_another_arm_are_named(folder: Path, tmp_path: Pa
         find_payload(empty, [other], Silent())
 
 
-CONSTANTS = np.array([0.12, 0.12, 0.1, 0.08, 0.05, 0.04])  # N·m/A, motor side
 TYPE = np.array([12.0, 12.0, 10.0, 5.0, 5.0, 5.0])  # N·m/A, joint side
 WALL = (0.0, -9.81, 0.0)
-RATIO = np.array([100.0, 100.0, -100.0, 60.0, 60.0, -60.0])
-
-
-def archive_of_currents(folder: Path, name: str, simulated: Simulated) -> Path:
-    """Positions in motor radians and currents in A, without torque constants."""
-    columns = {
-        "time": {"column": "t"},
-        "position": {"columns": "q", "side": "motor"},
-        "motor_current": {"columns": "i"},
-        "drive": {"gear_ratio": tuple(RATIO)},
-    }
-    arrays = {
-        "q": simulated.position * RATIO,
-        "i": simulated.torque / (RATIO * CONSTANTS),
-        "t": simulated.time,
-    }
-    return archive_of(folder / f"{name}.mcap", simulated.urdf, columns, LAW, **arrays)
 
 
 @pytest.fixture(scope="module")

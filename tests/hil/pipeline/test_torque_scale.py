@@ -53,11 +53,11 @@ class TestWhichCounts:
         assert scale.std.tolist() == [0.0, 0.0]
         assert scale.message.startswith("assuming exact torques")
 
-    def test_the_cell_comes_before_the_default(self) -> None:
+    @pytest.mark.parametrize("simulated", [False, True])
+    def test_the_cell_comes_before_the_default(self, simulated: bool) -> None:
         cell = example(drive_train="[0.01, 0.02]")
-        for simulated in (False, True):
-            scale = torque_scale(cell, [recording()], simulated=simulated)
-            assert scale.std.tolist() == [0.01, 0.02]
+        scale = torque_scale(cell, [recording()], simulated=simulated)
+        assert scale.std.tolist() == [0.01, 0.02]
 
     def test_the_column_map_comes_before_the_cell(self) -> None:
         mapped = [

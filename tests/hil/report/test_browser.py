@@ -6,7 +6,7 @@ import pytest
 
 from hil.report.page import report_bytes
 from tests.hil.browser import OpenedPage, chromium, page_count
-from tests.hil.report.test_report import JOINTS, make_results, make_series, with_joints
+from tests.hil.report.pages import JOINTS, make_results, make_series, with_joints
 
 # The process of the browser's driver warns at its end.
 pytestmark = [pytest.mark.long, pytest.mark.filterwarnings("ignore::ResourceWarning")]

@@ -14,7 +14,8 @@ from hil.results.provenance import RESULTS
 from hil.results.rollout_result import ROLLOUT, RolloutResult
 from hil.results.servo_result import ServoResults
 from tests import messages
-from tests.identification.test_servo_by_positions import DELAY, KP, TRUE, URDF, an_arm, on_its_servo
+from tests.identification.servo_arm import DELAY, KP, TRUE, an_arm, on_its_servo
+from tests.identification.test_servo_by_positions import URDF
 
 pytest.importorskip("mujoco", reason="the extra mujoco is not installed")
 

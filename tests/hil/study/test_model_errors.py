@@ -148,7 +148,9 @@ def small_motion(cell: Cell) -> Motion:
     return sampled(design(cell, Silent()).excitation.trajectory)
 
 
-def test_sizes_are_multiples(small: tuple[ModelErrors, PlannedTorque]) -> None:
-    for name in ("friction drift", "Stribeck friction", "friction with load", "torque constants"):
-        once, twice = (change(small, Condition(name, size)) for size in (1, 2))
-        np.testing.assert_allclose(twice, 2.0 * once, atol=1e-9)
+@pytest.mark.parametrize(
+    "name", ["friction drift", "Stribeck friction", "friction with load", "torque constants"]
+)
+def test_sizes_are_multiples(small: tuple[ModelErrors, PlannedTorque], name: str) -> None:
+    once, twice = (change(small, Condition(name, size)) for size in (1, 2))
+    np.testing.assert_allclose(twice, 2.0 * once, atol=1e-9)

@@ -36,7 +36,7 @@ from hil.study.searches import SINES, search_plans, take_best
 from hil.study.settings import Effort
 from sim_fixtures.ns16 import CELL_PATH
 from tests.hil.fast_cell import fast_cell
-from tests.hil.report.test_report import assert_stands_alone
+from tests.hil.report.pages import assert_stands_alone
 
 pytestmark = pytest.mark.long
 

@@ -53,12 +53,16 @@ def test_the_program_moves_every_joint_and_ends_at_rest(moving: dict[str, np.nda
     assert np.abs(moving["target_q"] - moving["actual_q"]).max() < 3e-3
 
 
-def test_targets_are_derivatives_of_one_another(moving: dict[str, np.ndarray]) -> None:
-    for lower, upper in (("target_q", "target_qd"), ("target_qd", "target_qdd")):
-        slope = np.gradient(moving[lower], 0.002, axis=0)[2:-2]
-        # Where the motion has faded in, its jerk jumps by that of the fade times the amplitude.
-        jump = 60.0 / (0.1 * UrProgram().period) ** 3
-        np.testing.assert_allclose(slope, moving[upper][2:-2], atol=0.25 * 0.002 * jump)
+@pytest.mark.parametrize(
+    ("lower", "upper"), [("target_q", "target_qd"), ("target_qd", "target_qdd")]
+)
+def test_targets_are_derivatives_of_one_another(
+    moving: dict[str, np.ndarray], lower: str, upper: str
+) -> None:
+    slope = np.gradient(moving[lower], 0.002, axis=0)[2:-2]
+    # Where the motion has faded in, its jerk jumps by that of the fade times the amplitude.
+    jump = 60.0 / (0.1 * UrProgram().period) ** 3
+    np.testing.assert_allclose(slope, moving[upper][2:-2], atol=0.25 * 0.002 * jump)
 
 
 def test_at_rest_the_arm_states_its_torque_constants(moving: dict[str, np.ndarray]) -> None:
