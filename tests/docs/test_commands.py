@@ -21,6 +21,7 @@ from hil.base.progress import Silent
 from hil.campaign import design
 from hil.cli import app
 from tests.docs.typed import PAGES, ROOT, commands, parse, section
+from tests.hil.fast_cell import QUICK
 from tests.hil.simulated_logs import write_moving_log
 
 pytestmark = pytest.mark.long
@@ -103,16 +104,6 @@ SHORTER = {
 
 NOT_GOOD_EITHER = ("doctor", "identify", "run")
 """May end with 5: this computer need not be fit, a campaign of seconds no good one."""
-
-QUICK = """method = "b"
-[search]
-population = 8
-generations = 4
-[via_points]
-n_via = 4
-fly = 0.5
-slowest = 0.8
-"""
 
 
 @pytest.fixture

@@ -17,6 +17,17 @@ from hil.cell import Cell
 from hil.cell.toml_edits import with_values
 from planner import PiecewiseCubic
 
+QUICK = """\
+method = "b"
+[search]
+population = 8
+generations = 3
+[via_points]
+n_via = 3
+fly = 0.5
+slowest = 0.8
+"""
+
 QUICK_GRADIENT = """\
 method = "gradient"
 [search]

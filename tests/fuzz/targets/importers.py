@@ -21,9 +21,8 @@ from hil.importers.rosbag2 import import_rosbag2
 from tests.fuzz.draw import mutate_bytes, mutate_text
 from tests.fuzz.mutate_mcap import mutate_mcap
 from tests.fuzz.targets import Target, place_of
-from tests.hil.importers.bags import STATE, STORE, bag, mcap, states
+from tests.hil.importers.bags import STATE, STORE, URDF, bag, mcap, states
 from tests.hil.importers.bags import many as messages
-from tests.hil.importers.test_rosbag2 import URDF
 
 TEXT, MAP, NPZ, NPY, MATLAB, SQLITE, BAG, MESSAGES, PACKED, FIELDS = range(10)
 """First byte of an input: what the others are a file of."""

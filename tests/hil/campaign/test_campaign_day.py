@@ -35,22 +35,12 @@ from hil.control.record import origin_of, with_present_date
 from hil.design import DesignResult
 from planner import TrajectoryPlayer
 from sim_fixtures.ns16 import CELL_PATH
-from tests.hil.fast_cell import fast_campaign, fast_cell, pass_rehearsal
+from tests.hil.fast_cell import QUICK, fast_campaign, fast_cell, pass_rehearsal
 from tests.messages import ANOTHER_CELL_OR_PLAN, HOLDS_RECORDINGS, LEFT_OUT_SIMULATED
 
 pytestmark = pytest.mark.long
 
 DOCUMENT = Path(__file__).parents[3] / "docs" / "campaign.md"
-QUICK = """\
-method = "b"
-[search]
-population = 8
-generations = 3
-[via_points]
-n_via = 3
-fly = 0.5
-slowest = 0.8
-"""
 
 
 def blocks(language: str) -> list[str]:

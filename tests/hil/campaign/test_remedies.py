@@ -24,9 +24,9 @@ from hil.campaign.folder import SIDES, CampaignFolder
 from hil.control.simulated_cell import simulated_link
 from hil.design import DesignResult
 from tests.docs.sources import COMMAND, FIELD, OPTION, messages
-from tests.hil.campaign.test_campaign_day import QUICK
 from tests.hil.cli.remedies import message, typed
 from tests.hil.fast_cell import (
+    QUICK,
     QUICK_GRADIENT,
     fast_campaign,
     fast_cell,

@@ -148,3 +148,14 @@ def drives(path: Path, *, firmware: str = "2.1", with_states: bool = False) -> P
         topics["/joint_states"] = (STATE, DEFINITION, "cdr", many())
         topics["/json"] = ("anything", "", "json", [(1, b"{}")])
     return mcap(path, topics, chunk_size=10_000)
+
+
+URDF = """<robot name="two"><link name="base"/>
+<link name="upper"><inertial><mass value="1"/><origin xyz="0 0 0.2"/>
+<inertia ixx="1" iyy="1" izz="1" ixy="0" ixz="0" iyz="0"/></inertial></link>
+<link name="lower"><inertial><mass value="1"/><origin xyz="0 0 0.2"/>
+<inertia ixx="1" iyy="1" izz="1" ixy="0" ixz="0" iyz="0"/></inertial></link>
+<joint name="hip" type="revolute"><parent link="base"/><child link="upper"/><axis xyz="0 1 0"/>
+<limit lower="-3" upper="3" effort="9" velocity="9"/></joint>
+<joint name="ankle" type="revolute"><parent link="upper"/><child link="lower"/><axis xyz="0 1 0"/>
+<origin xyz="0 0 0.4"/><limit lower="-3" upper="3" effort="9" velocity="9"/></joint></robot>"""

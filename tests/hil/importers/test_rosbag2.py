@@ -40,6 +40,7 @@ from tests.hil.importers.bags import (
     STAMPS,
     STATE,
     STORE,
+    URDF,
     VELOCITY,
     Messages,
     bag,
@@ -51,15 +52,6 @@ from tests.hil.importers.bags import (
 )
 
 TOPIC = "/joint_states"
-URDF = """<robot name="two"><link name="base"/>
-<link name="upper"><inertial><mass value="1"/><origin xyz="0 0 0.2"/>
-<inertia ixx="1" iyy="1" izz="1" ixy="0" ixz="0" iyz="0"/></inertial></link>
-<link name="lower"><inertial><mass value="1"/><origin xyz="0 0 0.2"/>
-<inertia ixx="1" iyy="1" izz="1" ixy="0" ixz="0" iyz="0"/></inertial></link>
-<joint name="hip" type="revolute"><parent link="base"/><child link="upper"/><axis xyz="0 1 0"/>
-<limit lower="-3" upper="3" effort="9" velocity="9"/></joint>
-<joint name="ankle" type="revolute"><parent link="upper"/><child link="lower"/><axis xyz="0 1 0"/>
-<origin xyz="0 0 0.4"/><limit lower="-3" upper="3" effort="9" velocity="9"/></joint></robot>"""
 
 
 @pytest.fixture

@@ -22,8 +22,8 @@ from hil.cli import app
 from hil.importers.column_map import Drive
 from hil.payload.payload_run import find_payload
 from tests import messages
-from tests.docs.test_commands import QUICK
 from tests.docs.typed import ROOT, commands
+from tests.hil.fast_cell import QUICK
 from tests.hil.payload.load_archives import CENTRE, CONSTANTS, LAW, MASS, archive_of_currents
 from tests.hil.simulated_logs import Simulated, archive_of, simulate
 

@@ -15,7 +15,7 @@ from hil.results.rollout_result import ROLLOUT, RolloutResult
 from hil.results.servo_result import ServoResults
 from tests import messages
 from tests.identification.servo_arm import DELAY, KP, TRUE, an_arm, on_its_servo
-from tests.identification.test_servo_by_positions import URDF
+from tests.identification.two_link import URDF
 
 pytest.importorskip("mujoco", reason="the extra mujoco is not installed")
 
