@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from itertools import pairwise
 
 import numpy as np
 import pinocchio as pin
@@ -41,7 +42,10 @@ def urdf() -> str:
 
 @dataclass(frozen=True)
 class Planted:
-    """True parameters of each joint (3,), in SI units; `delay` of the bus [s]."""
+    """True parameters of each joint (3,), in SI units; `delay` of the bus [s].
+
+    The `acceleration` of set-points is without limit unless it is given.
+    """
 
     kp: Array
     kd: Array
@@ -54,6 +58,7 @@ class Planted:
     limit: Array
     dead_band: Array
     delay: float
+    acceleration: float = np.inf
 
     @classmethod
     def drawn(cls, rng: np.random.Generator) -> Planted:
@@ -86,6 +91,24 @@ def commands(rng: np.random.Generator, duration: float) -> tuple[Array, Array]:
     return time, command[0] + (command - command[0]) * smooth
 
 
+def planned(command: Array, acceleration: float) -> Array:
+    """Return set-points (m, 3) that follow commands, and brake by an acceleration to meet them."""
+    fine = 20
+    step = STEP / fine
+    position = command[0].copy()
+    velocity = np.zeros(3)
+    rows = [position.copy()]
+    for before, after in pairwise(command):
+        for k in range(fine):
+            away = before + (after - before) * (k / fine) - position
+            wanted = np.sign(away) * np.sqrt(2.0 * acceleration * np.abs(away))
+            most = acceleration * step
+            velocity = velocity + np.clip(wanted - velocity, -most, most)
+            position = position + step * velocity
+        rows.append(position.copy())
+    return np.array(rows)
+
+
 def _stepped(
     whole: list[list[float]], push: list[float], bound: list[float], velocity: list[float]
 ) -> list[float]:
@@ -108,6 +131,8 @@ def simulated(planted: Planted, time: Array, command: Array) -> Array:
     data = model.createData()
     grid = np.arange(0.0, time[-1] + STEP, STEP)
     wanted = np.column_stack([np.interp(grid - planted.delay, time, each) for each in command.T])
+    if np.isfinite(planted.acceleration):
+        wanted = planned(wanted, planted.acceleration)
     rate = np.gradient(wanted, STEP, axis=0)
     q = command[0].copy()
     v = np.zeros(3)

@@ -78,22 +78,25 @@ def judged(seed: int, seconds: float) -> tuple[list[Judged], float]:
     rng = np.random.default_rng(seed)
     truth = planted.Planted.drawn(rng)
     model, bodies = _model()
-    motions = []
-    fine = []
+    recordings = []
     for duration in (seconds, 12.0):
         instants, command = planted.commands(rng, duration)
-        position = planted.simulated(truth, instants, command)
-        recording = Recording(
-            time=instants,
-            position=position,
-            joint_names=planted.NAMES,
-            commanded_position=command,
+        recordings.append(
+            Recording(
+                time=instants,
+                position=planted.simulated(truth, instants, command),
+                joint_names=planted.NAMES,
+                commanded_position=command,
+            )
         )
-        grid = Grid.of(recording)
-        motions += motions_of(recording, model, bodies, grid)
-        fine += motions_of(recording, model, bodies, grid.halved)
-    fitted, unseen = motions
-    found = fit_servos([fitted], fine[:1], np.full(3, planted.COUNT / np.sqrt(12.0)))
+    fitted, other = recordings
+    grid = Grid.of(fitted)
+    found = fit_servos(
+        lambda on: motions_of(fitted, model, bodies, on),
+        grid,
+        np.full(3, planted.COUNT / np.sqrt(12.0)),
+    )
+    (unseen,) = motions_of(other, model, bodies, grid)
     intervals = intervals_of(found)
     (simulated,) = predicted(model, bodies, unseen, [intervals.values])
     error = np.sqrt(np.mean((simulated - unseen.position) ** 2))

@@ -144,7 +144,7 @@ def scored(task: Task) -> Score:
     (unseen,) = motions([task.unseen], grid)
     resolution = np.full(len(task.joints), task.resolution / np.sqrt(12.0))
     begun = time.process_time()
-    found = fit_servos(fitted, motions(task.fitted, grid.halved), resolution)
+    found = fit_servos(lambda on: motions(task.fitted, on), grid, resolution)
     own = intervals_of(found).values
     between = time.process_time()
     start = in_units(natural(prior_of(fitted, resolution).mean))

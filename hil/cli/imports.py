@@ -210,7 +210,7 @@ class Reading:
             "--columns",
             metavar="QUANTITY=NAME",
             help="Channels of a quantity, such as torque=tau{} with {} for the joint, or "
-            "torque=a,b (repeatable).",
+            "torque=a,b, with *FACTOR after them (repeatable).",
             rich_help_panel=CHANNELS,
         ),
     ] = None

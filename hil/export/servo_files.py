@@ -354,6 +354,11 @@ def _remarks(results: ServoResults) -> tuple[str, ...]:
             value.joint for value in results.servo if value.name == "kp" and not value.determined
         )
     )
+    planned = ", ".join(
+        f"{value.joint} {value.value:.3g}"
+        for value in results.servo
+        if value.name == "acceleration" and value.determined
+    )
     return (
         "Servo and friction identified by hil from commanded and measured positions; bodies are"
         " as in the URDF.",
@@ -361,6 +366,14 @@ def _remarks(results: ServoResults) -> tuple[str, ...]:
         *(
             [f"The torque scale of {unknown} is not determined: gains and friction hold together."]
             if unknown
+            else []
+        ),
+        *(
+            [
+                "The servo accelerates its set-point by a limited rate [rad/s² or m/s²],"
+                f" which no simulator has: limit fast commands likewise. {planned}."
+            ]
+            if planned
             else []
         ),
         "Values are those with which the terms of this simulator come closest to the motion.",

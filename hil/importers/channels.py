@@ -54,7 +54,8 @@ CHANNEL_NAMES: Final[Mapping[Kind, tuple[str, ...]]] = {
         "state.tau_j", "qfrc_actuator", "appliedjointmotortorque", "motor_state.tau_est",
         "motorstate.tauest",
         "tau_meas", "tau_actual", "joint_torque", "joint_torques", "jointtorque", "geartorque.a",
-        "drehmoment", "field.effort", "observation.effort", "observation.torque",
+        "drehmoment", "field.effort", "observation.effort", "observation.torque", "load",
+        "present_load", "observation.load",
     ),
     "motor_current": (
         "i", "iq", "cur", "curr", "current", "currents", "actual_current", "actuali",

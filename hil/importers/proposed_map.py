@@ -216,6 +216,13 @@ class _Search:
         if others and not self._nameless:
             self._concluded.append(UnusedChannels(tuple(others[:_MOST_NAMED])))
         table: dict[str, object] = {kind: {"columns": names} for kind, names in columns.items()}
+        if (
+            "torque" in columns
+            and "torque" not in self._chosen
+            and self._is_load(columns["torque"])
+        ):
+            # Whether it is a torque is judged by its numbers, however a servo encodes them.
+            table["torque"] = {"columns": columns["torque"], "unit": "N.m"}
         if self._rate is not None:
             table = {"sample_rate": self._rate, **table}
         else:
@@ -245,9 +252,13 @@ class _Search:
         measured = [group for group in groups if is_measured(group.pattern)]
         if len(measured) == 1:
             groups = measured
+        if kind == "torque":
+            groups = [g for g in groups if not self._is_load(g.pattern)] or groups
         if len(groups) > 1:
             self._refuse_several(kind, groups)
         (group,) = groups
+        if kind == "torque" and self._is_load(group.pattern) and not self._has_commands:
+            return None
         if kind == "commanded_position" and group.size != len(self._columns_of):
             return None  # actions of something else
         is_open = group.unit is not None and kind not in self.with_unit
@@ -261,6 +272,17 @@ class _Search:
         self._used.update([group.pattern, *group.names])
         self._concluded.append(self._meaning(kind, group))
         return group.columns(self._columns_of)
+
+    @staticmethod
+    def _is_load(columns: _Columns) -> bool:
+        """Return whether channels are named as the load of a servo, which is a torque or none."""
+        names = [columns] if isinstance(columns, str) else map(str, columns)
+        return any("load" in words_of(name) for name in names)
+
+    @property
+    def _has_commands(self) -> bool:
+        kind: Kind = "commanded_position"
+        return kind in self._chosen or bool(self._groups_of(kind))
 
     def _groups_of(self, kind: Kind) -> list[ChannelGroup]:
         """Return the groups of a quantity: by whole names, else by words in them."""
@@ -460,7 +482,7 @@ class _Search:
             if missing == ["torque"]:
                 remedy += (
                     "; without torque, commanded positions (--columns"
-                    " 'commanded_position=NAME{}') are enough for `hil rollout --polish`"
+                    " 'commanded_position=NAME{}') are enough to identify the servos"
                 )
                 if pattern == "NAME{}":
                     remedy = f"record it, or {remedy}"
@@ -497,7 +519,7 @@ def _likely(kind: str, groups: Sequence[ChannelGroup]) -> str:
     said = {
         group.pattern: kinds_said(group.pattern)
         for group in groups
-        if group.kind is None and _ERRORS.isdisjoint(words_of(group.pattern))
+        if group.kind in (None, kind) and _ERRORS.isdisjoint(words_of(group.pattern))
     }
     patterns = [pattern for pattern, kinds in said.items() if kind in kinds]
     patterns += [pattern for pattern, kinds in said.items() if not kinds]

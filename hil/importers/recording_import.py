@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
@@ -42,6 +43,8 @@ from hil.importers.text_table import TextTable
 from hil.importers.units import UNITS, Kind
 
 _BAGS: Final = (".db3", ".bag", ".mcap", ".zstd", ".zst")
+_FACTOR: Final = re.compile(r"\*\s*([-+]?\d*\.?\d+(?:[eE][-+]?\d+)?)\s*\Z")
+"""Of the numbers of a channel, after its name."""
 RobotOf = Callable[[Callable[[], tuple[str, ...] | None]], Robot]
 """Returns the robot; its argument reads the names of the recorded joints."""
 
@@ -53,7 +56,8 @@ class ImportOptions:
     Attributes:
         columns: file of a column map, of some entries of one, or the name of a ready one; what it
             does not state is proposed.
-        chosen: channels by quantity, see :func:`hil.importers.proposed_map.proposed_map`.
+        chosen: channels by quantity, see :func:`hil.importers.proposed_map.proposed_map`, each
+            with a factor where it is ``NAME*FACTOR``.
         sample_rate: of a log without a time [Hz].
         topic: of the joint states of a bag.
         joint_names: in the URDF by name in the bag, where they differ.
@@ -552,7 +556,7 @@ def _proposed(
 ) -> Proposal:
     """Return the map that a log or a folder suggests, with the entries that some map states."""
     form = Format(missing="drop") if options.drop_missing else None
-    chosen = options.chosen
+    chosen, scales = _scaled(options.chosen)
     rate = options.sample_rate
     if some is not None:
         chosen = some.channels
@@ -582,7 +586,21 @@ def _proposed(
             columns = ColumnMap.model_validate(parse_toml(text))
             proposal = replace(proposal, text=text, columns=columns)
         proposal = _with_own_rows(request, robot, proposal)
+    if scales:
+        text = with_values(proposal.text, scales)
+        proposal = replace(proposal, text=text, columns=ColumnMap.model_validate(parse_toml(text)))
     return proposal if some is None else some.completed(proposal)
+
+
+def _scaled(chosen: Mapping[str, str]) -> tuple[dict[str, str], dict[str, float]]:
+    """Return the channels by quantity without factors, and these as entries of a column map."""
+    names = dict(chosen)
+    scales = {}
+    for kind, name in chosen.items():
+        if found := _FACTOR.search(name):
+            names[kind] = name[: found.start()]
+            scales[f"{kind}.scale"] = float(found.group(1))
+    return names, scales
 
 
 def _with_own_rows(request: _Request, robot: Robot, proposal: Proposal) -> Proposal:

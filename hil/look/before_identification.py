@@ -15,11 +15,13 @@ from hil.base.terminal_text import typed
 from hil.cell import Cell
 from hil.importers.conclusions import Certainty, ChannelMeaning
 from hil.importers.imported_robot import Robot
+from hil.importers.name_words import words_of
 from hil.importers.recording_content import Use
 from hil.importers.recording_import import ImportedRecording, ImportOptions, RobotOf, read_again
 from hil.look.look import SETTINGS, look_at_joints, mountings
 from hil.look.messages import choice_text, fit_alike, sentences, setting_text
 from hil.look.other_arm import Contradictions
+from hil.look.physics import Size
 from hil.look.readings import DoubtfulArm, ExplainedTorque, GravityOption, NoJointTorque
 from hil.look.result import ChangedReading, Look, Row, TiedReading
 from hil.pipeline.sources import cell_of, source_of
@@ -72,11 +74,17 @@ def concluded(
         "commanded_position" in imported.archive.columns and "torque" not in options.chosen
     )
     if may_be_load and _has_no_sign(imported.archive):
-        return _without_torque(imported, source, robot_of, use, NoJointTorque(None))
+        return _without_torque(imported, source, robot_of, use, NoJointTorque())
     few = _few_rows(imported.archive)
     if few is None:
         return imported
     cell, samples, score = few
+    if may_be_load and _is_named_load(imported):
+        size = Size.of(cell, cell.model, samples)
+        if size.is_off:
+            return _without_torque(
+                imported, source, robot_of, use, NoJointTorque(None, size.factor)
+            )
     is_bag = imported.map_text is None  # its joints have names: no other order is searched
     suspect = _is_suspect(cell, samples, score, source)
     if is_bag or not (suspect or _hangs_otherwise(cell, samples, score)):
@@ -162,6 +170,16 @@ def _has_no_sign(archive: Archive) -> bool:
     torque = np.asarray(archive.columns["torque"])
     moving = np.ptp(np.asarray(archive.columns["position"]), axis=0) > STUCK_MOVEMENT
     return bool(np.count_nonzero(moving) > 1 and (torque >= 0.0).all() and torque.any())
+
+
+def _is_named_load(imported: ImportedRecording) -> bool:
+    """Return whether the channels of the torque are named as the load of a servo."""
+    return any(
+        isinstance(each, ChannelMeaning)
+        and each.kind == "torque"
+        and "load" in words_of(each.channels)
+        for each in imported.concluded
+    )
 
 
 def _without_torque(

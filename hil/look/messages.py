@@ -72,6 +72,7 @@ from hil.look.readings import (
     StillJoints,
     StillUnexplained,
     TorqueDelay,
+    TorqueFactor,
     TorqueUnit,
     Travel,
     UnexplainedTorque,
@@ -165,7 +166,6 @@ _STEPS: Final[Mapping[NextStep, str]] = {
     NextStep.GIVE_URDF: "add --urdf ARM.urdf",
     NextStep.GIVE_URDF_OF_THIS_ARM: "give the URDF of this arm",
     NextStep.CHECK_COLUMNS: "check the order of the columns of both",
-    NextStep.CHECK_UNIT: "check the unit",
     NextStep.MOVE_ALL_OR_LOCK: "record a motion of all joints, or fix these (--locked NAME)",
     NextStep.MOVE_EACH_JOINT: "move the joints one by one",
     NextStep.PUSH_A_JOINT: "push one joint by hand and see its torque",
@@ -179,7 +179,7 @@ _STEPS: Final[Mapping[NextStep, str]] = {
     NextStep.RECORD_TORQUE: "record it",
     NextStep.RECORD_FASTER: "record faster motion",
     NextStep.RECORD_PAYLOAD: "record with and without it (`hil payload`)",
-    NextStep.IMPORT_COMMANDS: "import it: `hil rollout --polish` identifies servo and friction",
+    NextStep.IMPORT_COMMANDS: "`hil identify` finds servo and friction of them",
     NextStep.ASK_FOR_POSITIONS: "ask for the raw encoder positions",
     NextStep.ASK_FOR_UNIT: "ask for the unit of the channel",
     NextStep.ASK_FOR_FILTER: "ask for the filter of the channel",
@@ -639,6 +639,11 @@ def _(entries: MapEntries) -> str:
     )
 
 
+@_worded.register
+def _(scaled: TorqueFactor) -> str:
+    return f"check the unit; --columns 'torque=NAME*{scaled.factor:.2g}' applies the scale"
+
+
 def _toml(value: Any) -> str:
     if isinstance(value, str):
         return f'"{value}"'
@@ -689,14 +694,16 @@ def _(explained: ExplainedTorque) -> str:
 
 @import_messages.worded.register
 def _(none: NoJointTorque) -> str:
-    reason = (
-        "it is never negative, although the joints move in both directions"
-        if none.unexplained is None
-        else f"no masses explain {percentage(none.unexplained)} of it"
-    )
+    reason = "it is never negative, although the joints move in both directions"
+    name = "NAME"
+    if none.unexplained is not None:
+        reason = f"no masses explain {percentage(none.unexplained)} of it"
+    elif none.ratio is not None:
+        reason = f"it is {none.ratio:.2g} times the torque that the URDF's masses need"
+        name = f"NAME*{1.0 / none.ratio:.2g}"
     return (
         f"torque: left out, {reason}, as of the load or the duty of a servo; to use it in spite of"
-        " that, name it: --columns 'torque=NAME'"
+        f" that, name it: --columns 'torque={name}'"
     )
 
 

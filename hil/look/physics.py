@@ -48,6 +48,7 @@ from hil.look.readings import (
     StatedPayload,
     StillUnexplained,
     TorqueDelay,
+    TorqueFactor,
     TorqueUnit,
     UnseenFriction,
     UnseenZeros,
@@ -390,10 +391,12 @@ class TorqueFindings:
             return Row("side", TorqueUnit(unit), Certainty.LIKELY, evidence, entry)
         if factor > 1.0:
             reading = Fact.LARGE_TORQUE
-            return Row("side", reading, Certainty.UNDETERMINED, evidence, Decide.CHECK_UNIT)
+            scaled = TorqueFactor(1.0 / factor)
+            return Row("side", reading, Certainty.UNDETERMINED, evidence, scaled)
         if not self.size.may_be_geared:
             reading = Fact.SMALL_TORQUE
-            return Row("side", reading, Certainty.UNDETERMINED, evidence, Decide.CHECK_UNIT)
+            scaled = TorqueFactor(1.0 / factor)
+            return Row("side", reading, Certainty.UNDETERMINED, evidence, scaled)
         reading = Fact.MOTOR_SIDE
         return Row("side", reading, Certainty.UNDETERMINED, evidence, Decide.ASK_FOR_UNIT)
 

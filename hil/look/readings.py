@@ -509,7 +509,6 @@ class NextStep(Enum):
     GIVE_URDF = auto()
     GIVE_URDF_OF_THIS_ARM = auto()
     CHECK_COLUMNS = auto()
-    CHECK_UNIT = auto()
     MOVE_ALL_OR_LOCK = auto()
     MOVE_EACH_JOINT = auto()
     PUSH_A_JOINT = auto()
@@ -544,6 +543,13 @@ class MapEntries:
 
 
 @dataclass(frozen=True)
+class TorqueFactor:
+    """A factor that brings a torque to the size that the arm needs."""
+
+    factor: float
+
+
+@dataclass(frozen=True)
 class GravityOption:
     """``--gravity`` [m/s²]."""
 
@@ -572,7 +578,7 @@ class MotorCurrents:
     unseen: tuple[str, ...]
 
 
-Decider = NextStep | MapKey | MapEntries | GravityOption | OutsideLimits
+Decider = NextStep | MapKey | MapEntries | GravityOption | OutsideLimits | TorqueFactor
 """What decides a row; positions outside the limits say by what they would be within them."""
 
 Setting = MapEntries | GravityOption | MotorTorque | MotorCurrents
@@ -592,11 +598,14 @@ class NoJointTorque(Conclusion):
     """A channel named as a torque that is none, such as the load or the duty of a servo.
 
     Attributes:
-        unexplained: share of it that no masses of the arm explain; None where it has no sign,
-            although joints move in both directions.
+        unexplained: share of it that no masses of the arm explain; None where that is not why.
+        ratio: of it to the torque that the URDF's masses need, of a load in a unit of its own; None
+            where that is not why. Without both it has no sign, although joints move in both
+            directions.
     """
 
-    unexplained: float | None
+    unexplained: float | None = None
+    ratio: float | None = None
 
 
 @dataclass(frozen=True)

@@ -387,7 +387,7 @@ def source_of(archive: Archive, cell: Cell, *, to_fit: bool = True) -> Source:
         problem = "contains neither joint torques nor motor currents"
         remedy = "import torques, or motor currents with gear ratios and torque constants"
         if recording.commanded_position is not None:
-            remedy += "; `hil rollout --polish` identifies servo and friction from positions alone"
+            remedy += "; `hil identify` finds servo and friction from positions alone"
         raise ArchiveError(archive.path, problem, remedy=remedy)
     return _usable(archive, cell, recording)
 

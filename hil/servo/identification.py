@@ -33,7 +33,6 @@ from hil.results.servo_series import ServoSeries
 from hil.servo.maker_file import maker_parameters
 from hil.servo.messages import verdict_of
 from identification.servo.choice import ServoFit, fit_servos, steps_of_a_fit
-from identification.servo.fit import ServoEstimate
 from identification.servo.intervals import intervals_of, widened_covariance
 from identification.servo.parameters import TERMS, in_units
 from identification.servo.prediction import predicted
@@ -97,10 +96,11 @@ def identify_servos(
     if options.compare is not None:
         compared = maker_parameters(options.compare, cell.joint_names)
     grid = Grid.of(sources.training[0].recording)
-    fitted, fine = (
-        [each for source in sources.training for each in _motions(source, cell, bodies, on)]
-        for on in (grid, grid.halved)
-    )
+
+    def motions_on(on: Grid) -> list[ServoMotion]:
+        return [each for source in sources.training for each in _motions(source, cell, bodies, on)]
+
+    fitted = motions_on(grid)
     if not fitted:
         problem = "has no part in which the commanded positions are known"
         remedy = "record the commanded positions, or name them (--columns)"
@@ -108,7 +108,7 @@ def identify_servos(
     resolution = _resolution(sources)
     started = time.process_time()
     with reporter.task("servos", steps_of_a_fit() + len(ENGINES) * ITERATIONS) as task:
-        fit = fit_servos(fitted, fine, resolution, done=lambda: task.advance(1))
+        fit = fit_servos(motions_on, grid, resolution, done=lambda: task.advance(1))
         simulators = fits_in_simulators(fitted, fit, resolution, done=lambda: task.advance(1))
     found = _Found(fit, simulators, time.process_time() - started)
     with reporter.task("held-out motions", len(sources.held_out)) as task:
@@ -267,12 +267,12 @@ def _results(
             for choice in found.fit.choices
         ],
         verdict=placeholder,
-        posterior=_posterior(estimate),
+        posterior=_posterior(found.fit),
         simulators={
             engine: SimulatorServo(
                 servo=_values(fit, cell),
                 validation=[_prediction(each, engine) for each in series],
-                posterior=_posterior(fit.estimate),
+                posterior=_posterior(fit),
             )
             for engine, fit in found.simulators.items()
         },
@@ -301,9 +301,10 @@ def _values(fit: ServoFit, cell: Cell) -> list[ServoValue]:
     ]
 
 
-def _posterior(estimate: ServoEstimate) -> ServoPosterior:
+def _posterior(fit: ServoFit) -> ServoPosterior:
+    estimate = fit.estimate
     return ServoPosterior(
         coordinates=estimate.coordinates.tolist(),
         present=estimate.present.tolist(),
-        covariance=widened_covariance(estimate).tolist(),
+        covariance=widened_covariance(fit).tolist(),
     )

@@ -5,23 +5,27 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Final
 
-from hil.base.one_screen import Paragraph, Part, columns
+import numpy as np
+
+from hil.base.one_screen import COLUMNS, Paragraph, Part, columns
 from hil.results.servo_result import ServoPrediction, ServoResults, ServoValue, ServoVerdict
 
 _GOOD: Final = 0.5
 """Share of the command's own error, up to which a simulated motion is of use: a quarter of what the
 servo does otherwise than commanded is then left in the square."""
-_SHOWN: Final = (
-    "kp",
-    "kd",
-    "armature",
-    "viscous",
-    "coulomb",
-    "static",
-    "load",
-    "limit",
-    "dead_band",
-)
+_SHOWN: Final = {
+    "kp": "kp",
+    "kd": "kd",
+    "armature": "armat.",
+    "viscous": "viscous",
+    "coulomb": "coulomb",
+    "static": "static",
+    "load": "load",
+    "limit": "limit",
+    "acceleration": "accel.",
+    "dead_band": "dead band",
+}
+"""Parameters of the table of joints, as its heads call them; the last ones if there is room."""
 _MOST_ROWS: Final = 8  # of the table of joints
 _MOST: Final = 3  # recordings, warnings and next steps on a screen
 
@@ -100,6 +104,8 @@ def screen(results: ServoResults, read: Sequence[Part] = ()) -> list[Part]:
 def whole(results: ServoResults) -> list[str]:
     """Return everything: errors by joint, each parameter with its interval, choices and notes."""
     lines = [results.verdict.line, "", *columns(_errors(results, results.validation)), ""]
+    if by_joint := _errors_by_joint(results):
+        lines += [*columns(by_joint), ""]
     rows = [("joint", "parameter", "value", "95 % interval", "unit", "")]
     rows += [
         (
@@ -131,14 +137,31 @@ def _errors(results: ServoResults, shown: Sequence[ServoPrediction]) -> list[lis
         return [["no motion was held out"]]
     other = [] if results.compared is None else [results.compared]
     unit = f"rms [{unit_of(results)}]"
-    rows = [[unit, "all", "MuJoCo's terms", "command", *other, *results.joint_names]]
+    rows = [[unit, "all", "MuJoCo's terms", "command", *other]]
     for each, simple in zip(shown, results.simulators["mujoco"].validation, strict=False):
         overall = [each.position_error_mrad, simple.position_error_mrad, each.command_error_mrad]
         if other:
             overall.append(each.compared_error_mrad or 0.0)
-        numbers = [*overall, *each.joint_errors_mrad]
-        rows.append([each.archive, *(f"{number:.3g}" for number in numbers)])
+        rows.append([each.archive, *(f"{number:.3g}" for number in overall)])
     return rows
+
+
+def _errors_by_joint(results: ServoResults) -> list[list[str]]:
+    """Return the rows of the errors of each joint in predicted motions."""
+    rows = [
+        [each.archive, *(f"{number:.3g}" for number in each.joint_errors_mrad)]
+        for each in results.validation
+    ]
+    return [["by joint", *results.joint_names], *rows] if rows else []
+
+
+def _joint_errors(results: ServoResults) -> dict[str, str]:
+    """Return the error of each joint over all predicted motions, as text; empty without any."""
+    errors = np.array([each.joint_errors_mrad for each in results.validation])
+    if not len(errors):
+        return {}
+    overall = np.sqrt(np.mean(errors**2, axis=0))
+    return {name: f"{error:.2g}" for name, error in zip(results.joint_names, overall, strict=True)}
 
 
 def _parameters(results: ServoResults, joints: Sequence[str]) -> list[list[str]]:
@@ -148,13 +171,20 @@ def _parameters(results: ServoResults, joints: Sequence[str]) -> list[list[str]]
         for joint in joints
     }
     names = [name for name in _SHOWN if any(row[name].present for row in by_joint.values())]
-    return [
-        ["joint", *names],
-        *([joint, *(_cell(values[name]) for name in names)] for joint, values in by_joint.items()),
+    errors = _joint_errors(results)
+    rows = [
+        ["joint", *(["error"] if errors else []), *(_SHOWN[name] for name in names)],
+        *(
+            [joint, *([errors[joint]] if errors else []), *(_cell(values[name]) for name in names)]
+            for joint, values in by_joint.items()
+        ),
     ]
+    while max(map(len, columns(rows))) > COLUMNS:
+        rows = [row[:-1] for row in rows]
+    return rows
 
 
 def _cell(value: ServoValue) -> str:
     if not value.present:
         return "-"
-    return f"{value.value:.3g}{'' if value.determined else '?'}"
+    return f"{value.value:.2g}{'' if value.determined else '?'}"

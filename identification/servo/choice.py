@@ -1,6 +1,7 @@
 """Which terms a servo's model has: all but those without which other windows are predicted better.
 
 A term that neither helps nor harms stays, with the interval that its prior and the motion give it.
+It is shown where other windows are predicted worse without it.
 """
 
 from __future__ import annotations
@@ -13,18 +14,18 @@ import numpy as np
 from numpy.typing import NDArray
 
 from identification.arrays import Array
-from identification.servo.fit import ServoEstimate, ServoWindows, data_cost, fit
+from identification.servo.fit import ServoEstimate, ServoWindows, fit
 from identification.servo.parameters import OPTIONAL, PLACE, TERMS
-from identification.servo.recorded_motion import ServoMotion
+from identification.servo.recorded_motion import Grid, ServoMotion
 from identification.servo.start import STARTS, prior_of, start_of
 
 ITERATIONS: Final = 12
-_FINE: Final = 7  # iterations on the halved grid
+_FINE: Final = 5  # iterations on the halved grid
 _ROUGH: Final = 12  # iterations of each start
 _TRIAL: Final = 4  # of each fit of a fold
 _FOLDS: Final = 2
 _FEWEST_WINDOWS: Final = 4  # of which one half is predicted from the other
-_CHANCE: Final = 3.84  # of chi square with one degree of freedom, 95 %
+_CHANCE: Final = 1.92  # of a log-likelihood with one parameter more, 95 %
 _LARGEST: Final = 1.0  # rad or m of an error, as of a model that falls over
 
 
@@ -37,12 +38,15 @@ class TermChoice:
         joint: index.
         present: whether they are in the model.
         gain: by which they lower the root mean square of the prediction error, as a fraction.
+        shown: whether windows that were not fitted are predicted better with them by more than
+            chance, and not in one window alone.
     """
 
     terms: tuple[str, ...]
     joint: int
     present: bool
     gain: float
+    shown: bool
 
 
 @dataclass(frozen=True, eq=False)
@@ -53,7 +57,7 @@ class ServoFit:
         estimate: of all windows.
         choices: of terms.
         windows: number of windows.
-        shown: whether the fit is worse without a term, by more than chance (n, P).
+        shown: whether a term is shown by prediction; those of every model are (n, P).
     """
 
     estimate: ServoEstimate
@@ -68,8 +72,8 @@ def steps_of_a_fit() -> int:
 
 
 def fit_servos(
-    motions: Sequence[ServoMotion],
-    fine: Sequence[ServoMotion],
+    motions: Callable[[Grid], Sequence[ServoMotion]],
+    grid: Grid,
     resolution: Array,
     *,
     done: Callable[[], None] = lambda: None,
@@ -77,15 +81,17 @@ def fit_servos(
     """Fit the servos of an arm to motions, with the terms that predict best.
 
     Args:
-        motions: that are fitted.
-        fine: the same on the halved grid, for the last iterations.
+        motions: that are fitted, on a grid.
+        grid: of the simulation: starts and choices are on a coarser one, the end of the fit on the
+            halved one.
         resolution: standard deviation of the measured positions (n,).
         done: called after each iteration.
     """
-    windows = ServoWindows.of(motions)
-    prior = prior_of(motions, resolution)
+    rough = motions(grid.coarser)
+    windows = ServoWindows.of(rough)
+    prior = prior_of(rough, resolution)
     present = np.ones((windows.n_joints, len(TERMS)), np.bool_)
-    rough = [
+    starts = [
         fit(
             windows,
             prior,
@@ -98,35 +104,28 @@ def fit_servos(
         )
         for start in STARTS
     ]
-    best = min(rough, key=lambda each: float(_errors(windows, each, resolution).sum()))
+    best = min(starts, key=lambda each: float(_errors(windows, each, resolution).sum()))
     enough = windows.count >= _FEWEST_WINDOWS
     choices = _choices(windows, best, resolution, done) if enough else ()
     chosen = present.copy()
     for choice in choices:
         chosen[choice.joint, [PLACE[name] for name in choice.terms]] = choice.present
-    final = fit(
-        windows, prior, chosen, best.coordinates, resolution, iterations=ITERATIONS,
-        bus=best.bus_delay, done=done,
-    )  # fmt: skip
-    finely = ServoWindows.of(fine)
-    final = fit(
-        finely, prior, chosen, final.coordinates, resolution, iterations=_FINE,
-        bus=final.bus_delay, done=done,
-    )  # fmt: skip
-    return ServoFit(final, choices, windows.count, shown_terms(finely, final))
+    final = best
+    for on, iterations in ((grid, ITERATIONS), (grid.halved, _FINE)):
+        scales = (final.scatter, final.alike)
+        final = fit(
+            ServoWindows.of(motions(on)), prior, chosen, final.coordinates, resolution,
+            iterations=iterations, scales=scales, bus=final.bus_delay, rough=on == grid, done=done,
+        )  # fmt: skip
+    return ServoFit(final, choices, windows.count, _shown(choices, chosen))
 
 
-def shown_terms(windows: ServoWindows, estimate: ServoEstimate) -> NDArray[np.bool_]:
-    """Return whether the cost without a term is higher, by more than chance (n, P)."""
-    shown = np.ones_like(estimate.present)
-    before = data_cost(windows, estimate, estimate.present)
-    for terms in OPTIONAL:
-        places = [PLACE[name] for name in terms]
-        other = estimate.present.copy()
-        other[:, places] = False
-        change = data_cost(windows, estimate, other) - before
-        shown[:, places] = (change > _CHANCE)[:, None]
-    return shown
+def _shown(choices: Sequence[TermChoice], present: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    """Return whether terms are shown (n, P): where nothing was predicted, only what always is."""
+    shown = np.tile([term.always for term in TERMS], (len(present), 1))
+    for choice in choices:
+        shown[choice.joint, [PLACE[name] for name in choice.terms]] = choice.shown
+    return shown & present
 
 
 def _errors(windows: ServoWindows, estimate: ServoEstimate, resolution: Array) -> Array:
@@ -144,16 +143,25 @@ def _choices(
 ) -> tuple[TermChoice, ...]:
     """Choose by the errors of windows that were not fitted, for each joint by itself."""
     with_all = _predicted(windows, full, full.present, resolution, done)
+    independent = len(windows.measured) / full.alike  # residuals of a window
     choices = []
     for terms in OPTIONAL:
         other = full.present.copy()
         other[:, [PLACE[name] for name in terms]] = False
         change = _predicted(windows, full, other, resolution, done) - with_all
         gains = 0.5 * change.mean(axis=0)
-        deviations = 0.5 * change.std(axis=0) / np.sqrt(max(1, len(change) - 1))
+        likelier = 0.5 * independent * change
+        total = likelier.sum(axis=0)
+        least = total - likelier.max(axis=0)
         choices += [
-            TermChoice(terms, joint, bool(gain > -deviation), float(gain))
-            for joint, (gain, deviation) in enumerate(zip(gains, deviations, strict=True))
+            TermChoice(
+                terms,
+                joint,
+                present=bool(total[joint] > -_CHANCE),
+                gain=float(gains[joint]),
+                shown=bool(total[joint] > _CHANCE and least[joint] > 0.0),
+            )
+            for joint in range(windows.n_joints)
         ]
     return tuple(choices)
 
@@ -173,8 +181,8 @@ def _predicted(
         fitted = windows.some(np.flatnonzero(~inside))
         estimate = fit(
             fitted, start.prior, present, start.coordinates, resolution, iterations=_TRIAL,
-            scales=(start.scatter[~inside], start.alike), bus=start.bus_delay, rough=True,
-            done=done,
+            scales=(start.scatter[~inside], start.alike), fixed=True, bus=start.bus_delay,
+            rough=True, done=done,
         )  # fmt: skip
         held = np.flatnonzero(inside)
         errors[held] = _errors(windows.some(held), estimate, resolution)

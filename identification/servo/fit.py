@@ -34,6 +34,7 @@ _DAMPINGS: Final = (1e-3, 1e-1, 1.0, 1e1, 1e2)  # that are tried in each iterati
 _LARGEST_STEP: Final = np.where(POSITIVE, 0.7, 0.01)  # of a coordinate in an iteration
 _CONVERGED: Final = 3e-4  # relative decrease of the cost at which a fit ends
 _INITIAL_CORRELATION: Final = 0.5  # s that residuals are correlated over, before a fit says it
+_EXACT: Final = 2  # last iterations with differences to both sides
 _P: Final = len(TERMS)
 
 Done = Callable[[], None]
@@ -163,7 +164,7 @@ class _Fit:
     scatter: Array
     alike: Array
     bus: float
-    rough: bool
+    rough: bool = True
     damping: float = 1.0
     sign: float = 1.0
     cost: Array = field(default_factory=lambda: np.zeros(0))
@@ -321,13 +322,6 @@ class _Fit:
     _least: Array = field(default_factory=lambda: np.zeros(0))
 
 
-def data_cost(windows: ServoWindows, estimate: ServoEstimate, present: NDArray[np.bool_]) -> Array:
-    """Return the cost of the residuals of each joint (n,) with some terms, at an estimate."""
-    values = without_absent(natural(estimate.coordinates), present)
-    relative = windows.residuals(values[None])[:, 0] / estimate.scatter
-    return np.asarray(losses(relative).sum(axis=(0, 1)) / estimate.alike)
-
-
 def fit(
     windows: ServoWindows,
     prior: Prior,
@@ -337,6 +331,7 @@ def fit(
     *,
     iterations: int = 24,
     scales: tuple[Array, Array] | None = None,
+    fixed: bool = False,
     bus: float | None = None,
     rough: bool = False,
     done: Done = lambda: None,
@@ -350,10 +345,11 @@ def fit(
         start: coordinates (n, P).
         resolution: standard deviation of the measured positions (n,).
         iterations: at most.
-        scales: scatter and number of residuals that count as one of each joint, which then stay;
-            None to find them.
+        scales: scatter and number of residuals that count as one of each joint, to start with.
+        fixed: whether they stay.
         bus: delay of the bus to start with [s].
-        rough: whether derivatives are differences to one side, in half of the time.
+        rough: whether derivatives are differences to one side throughout, in half of the time;
+            else the last ones are to both, of which the covariance is.
         done: called after each iteration.
     """
     step = windows.inputs.step * windows.every
@@ -365,18 +361,23 @@ def fit(
         scatter, alike = scales
     progress = _Fit(
         windows, prior, present, start.copy(), scatter, alike,
-        float(np.median(start[:, PLACE["delay"]])) if bus is None else bus, rough,
+        float(np.median(start[:, PLACE["delay"]])) if bus is None else bus,
     )  # fmt: skip
     progress._least = resolution
     calm = 0
-    for k in range(iterations):
+    last = 0 if rough else _EXACT
+    for k in range(iterations - last):
         decrease = progress.iterate()
         done()
-        if scales is None and k % 3 == 2:
+        if not fixed and k % 3 == 2:
             progress.rescale()
         calm = calm + 1 if decrease < _CONVERGED else 0
         if calm >= 3 and k > 8:
             break
+    progress.rough = False
+    for _ in range(last):
+        progress.iterate()
+        done()
     return ServoEstimate(
         progress.coordinates,
         present,

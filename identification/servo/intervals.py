@@ -24,7 +24,8 @@ from identification.servo.parameters import (
 )
 
 _LEARNT: Final = 0.5  # of the prior's deviation, above which the motion says little
-_FACTOR: Final = 3.0  # upper end over value, above which a parameter is not determined
+_FACTOR: Final = 2.0  # upper end over value, above which a parameter is not determined
+_VANISHES: Final = np.array([name not in ABSENT for name in NAMES])  # without effect at zero
 _POWER: Final = np.array([term.torque for term in TERMS])
 
 
@@ -33,7 +34,10 @@ class ServoIntervals:
     """Values of n joints in SI units with ends of their 95 % intervals, each (n, P).
 
     Attributes:
-        determined: whether the motion determines a parameter, not the prior.
+        determined: whether the motion determines a parameter, not the prior: its interval ends
+            within a factor of two, is a good deal narrower than that of the prior, and if the term
+            is in some models only, unseen windows show it. Nor does a term that they do not show
+            change it by more than that factor.
     """
 
     values: Array
@@ -46,22 +50,24 @@ def intervals_of(fit: ServoFit) -> ServoIntervals:
     """Return the intervals of a fit; that of a term that is not shown includes no effect."""
     estimate = fit.estimate
     values = in_units(estimate.values)
-    spread = _spread(estimate)
+    covariance = _covariances(fit)
+    spread = np.sqrt(np.maximum(np.einsum("npp->np", covariance), 0.0))
     prior = _prior_spread(estimate)
-    reach = student_limit(0.025, max(1, fit.windows - 1)) * spread
+    reach = _reach(fit) * spread
     ends = [
         np.where(POSITIVE, values * np.exp(sign * np.minimum(reach, 700.0)), values + sign * reach)
         for sign in (-1.0, 1.0)
     ]
     narrow = np.where(POSITIVE, np.exp(np.minimum(reach, 700.0)) <= _FACTOR, True)
+    least, most = _changed_by_unseen(fit, covariance)
+    narrow &= (least >= 1.0 / _FACTOR) & (most <= _FACTOR)
     determined = np.asarray((spread <= _LEARNT * prior) & narrow & estimate.present & fit.shown)
     absent = without_absent(natural(estimate.coordinates), estimate.present)
     lower, upper = (np.where(estimate.present, end, absent) for end in ends)
     unseen = estimate.present & ~fit.shown
     without = without_absent(natural(estimate.coordinates), ~unseen)
-    friction = np.array([name not in ABSENT for name in NAMES])
-    lower = np.where(unseen & friction, 0.0, lower)
-    upper = np.where(unseen & ~friction & np.isinf(without), np.inf, upper)
+    lower = np.where(_unseen(fit), 0.0, lower)
+    upper = np.where(unseen & np.isinf(without), np.inf, upper)
     return ServoIntervals(values, lower, upper, determined)
 
 
@@ -94,23 +100,46 @@ def sampled(
     return in_units(without_absent(natural(samples), present))
 
 
-def widened_covariance(estimate: ServoEstimate) -> Array:
+def _unseen(fit: ServoFit) -> NDArray[np.bool_]:
+    """Return the terms of the model (n, P) that are not shown and may as well be zero."""
+    return np.asarray(fit.estimate.present & ~fit.shown & _VANISHES)
+
+
+def _reach(fit: ServoFit) -> float:
+    """Return the half-width of a 95 % interval in standard deviations."""
+    return float(student_limit(0.025, max(1, fit.windows - 1)))
+
+
+def widened_covariance(fit: ServoFit) -> Array:
     """Return the covariance of the coordinates and of the delay of the bus (n P + 1, n P + 1).
 
     Residuals of a window are alike for longer in some directions than in others. So what they add
-    to the variance is in no direction less than its scatter when a window each is left out.
+    to the variance is in no direction less than its scatter when a window each is left out. And a
+    term that is not shown may as well have no effect: other terms then take its place, as far as
+    the fit lets them.
     """
+    estimate = fit.estimate
     n, count = estimate.coordinates.shape
     widened = estimate.covariance.copy()
+    unseen = _unseen(fit)
     for joint in range(n):
-        places = joint * count + np.flatnonzero(estimate.present[joint])
+        own = np.flatnonzero(estimate.present[joint])
+        places = joint * count + own
         inside = np.ix_(places, places)
-        own = np.ix_(places - joint * count, places - joint * count)
         whole = estimate.covariance[inside]
-        spread = estimate.prior.spread[joint, places - joint * count]
+        spread = estimate.prior.spread[joint, own]
         of_residuals = whole - (whole * spread**-2.0) @ whole
-        widened[inside] += _excess(of_residuals, estimate.between[joint][own])
-    return widened
+        widened[inside] += _excess(of_residuals, estimate.between[joint][np.ix_(own, own)])
+        for place in places[unseen[joint, own]]:
+            # Of a logarithm, 1 is the whole effect, to first order.
+            variance = widened[place, place]
+            response = widened[:, place] / variance
+            lacking = max(_reach(fit) ** -2.0 - variance, 0.0)
+            widened += lacking * np.outer(response, response)
+    # No motion widens what is known before.
+    prior = np.append(estimate.prior.spread.ravel(), np.inf)
+    shrunk = np.minimum(1.0, prior / np.sqrt(np.maximum(np.diag(widened), 1e-300)))
+    return np.asarray(widened * np.outer(shrunk, shrunk))
 
 
 def _excess(covariance: Array, other: Array) -> Array:
@@ -125,19 +154,43 @@ def _excess(covariance: Array, other: Array) -> Array:
     return np.asarray((lacking * np.maximum(relative - 1.0, 0.0)) @ lacking.T)
 
 
-def _spread(estimate: ServoEstimate) -> Array:
-    """Return standard deviations of the parameters (n, P), logarithms of positive ones."""
+def _covariances(fit: ServoFit) -> Array:
+    """Return covariances of the parameters of each joint (n, P, P), logarithms of positive ones."""
+    estimate = fit.estimate
     n, count = estimate.coordinates.shape
     combinations = np.eye(count)
     combinations[_POWER == 1, PLACE["kp"]] -= 1.0
-    covariance = widened_covariance(estimate)
-    variances = []
+    covariance = widened_covariance(fit)
+    covariances = []
     for joint in range(n):
         part = slice(joint * count, (joint + 1) * count)
         present = np.outer(estimate.present[joint], estimate.present[joint])
         whole = np.where(present, covariance[part, part], 0.0)
-        variances.append(np.einsum("pa,ab,pb->p", combinations, whole, combinations))
-    return np.sqrt(np.maximum(variances, 0.0))
+        covariances.append(combinations @ whole @ combinations.T)
+    return np.array(covariances)
+
+
+def _changed_by_unseen(fit: ServoFit, covariance: Array) -> tuple[Array, Array]:
+    """Return factors (n, P) by which terms that are not shown may change each parameter.
+
+    Between no effect of such a term and the largest that the motion or the prior leaves; other
+    terms give way in proportion to the effect, not to its logarithm.
+    """
+    n, count, _ = covariance.shape
+    least, most = np.ones((n, count)), np.ones((n, count))
+    unseen = _unseen(fit)
+    for joint, place in np.argwhere(unseen).tolist():
+        variance = covariance[joint, place, place]
+        response = np.where(POSITIVE, covariance[joint, :, place] / variance, 0.0)
+        prior = fit.estimate.prior.spread[joint, place] ** -2.0
+        shown = max(1.0 / variance - prior, 1e-12)
+        reach = _reach(fit)
+        largest = min(np.expm1(reach * np.sqrt(variance)), reach / np.sqrt(shown))
+        ends = np.stack([-response, largest * response])
+        own = np.arange(count) == place
+        least[joint] = np.where(own, least[joint], np.minimum(least[joint], 1.0 + ends.min(axis=0)))
+        most[joint] = np.where(own, most[joint], np.maximum(most[joint], 1.0 + ends.max(axis=0)))
+    return least, most
 
 
 def _prior_spread(estimate: ServoEstimate) -> Array:

@@ -1,9 +1,12 @@
 r"""Parameters of a joint that a position servo drives, and what is known of them before a fit.
 
 .. math::
-    \tau_m &= \mathrm{sat}(k_p\,\mathrm{dz}(q_c(t-d) + o - q) + k_d (\dot q_c(t-d) - \dot q)) \\
+    \tau_m &= \mathrm{sat}(k_p\,\mathrm{dz}(s + o - q) + k_d (\dot s - \dot q)) \\
     I_a \ddot q + \tau_{bodies} &= \tau_m - f_1 \dot q - F \mathrm{sign}(\dot q)\\
     F &= f_0 + f_s e^{-(\dot q / v_s)^2} + \mu |\tau_{bodies}|
+
+The set-point :math:`s` follows the command :math:`q_c(t-d)`, with limited acceleration where the
+servo plans its way to each command, as bus servos do.
 
 A fit works with every torque divided by :math:`k_p`, that is with position errors of the servo:
 positions show these, and only gravity and the inertia of the bodies show the torque itself.
@@ -54,15 +57,19 @@ TERMS: Final = (
     Term("kd", "N·m·s/rad", "N·s/m", 1, True, 2.0, False),
     Term("limit", "N·m", "N", 1, True, 1.5, False),
     Term("dead_band", "rad", "m", 0, True, 1.5, False),
+    Term("acceleration", "rad/s²", "m/s²", 0, True, 1.5, False),
 )
 """Parameters of a joint, in the order of a row of :class:`Coordinates`."""
 NAMES: Final = tuple(term.name for term in TERMS)
 PLACE: Final = {name: place for place, name in enumerate(NAMES)}
-OPTIONAL: Final = (("load",), ("static", "speed"), ("limit",), ("kd",), ("dead_band",))
+OPTIONAL: Final = (
+    *(("load",), ("static", "speed"), ("limit",), ("kd",), ("dead_band",)),
+    ("acceleration",),
+)
 """Terms that are chosen together, by prediction."""
 POSITIVE: Final = np.array([term.positive for term in TERMS])
 BUS_DELAY_SPREAD: Final = 0.03  # s, about zero: half of a normal distribution
-ABSENT: Final = {"limit": np.inf, "speed": 1.0}
+ABSENT: Final = {"limit": np.inf, "speed": 1.0, "acceleration": np.inf}
 """Values of terms that are not in a model, where that is not zero."""
 
 

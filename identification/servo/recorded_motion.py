@@ -101,8 +101,14 @@ class Grid(NamedTuple):
         period = float(np.median(np.diff(recording.time)))
         if period < STEP:
             return cls(period * max(1, round(STEP / period)), 1)
-        every = int(np.ceil(period / STEP - 1e-6))
+        every = max(1, round(period / STEP))
         return cls(period / every, every)
+
+    @property
+    def coarser(self) -> Grid:
+        """The grid with half of the steps, for what is tried."""
+        every = max(1, self.every // 2)
+        return Grid(self.step * self.every / every, every)
 
     @property
     def halved(self) -> Grid:

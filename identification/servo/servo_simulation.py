@@ -13,12 +13,19 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import Final, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from identification.arrays import Array
+from identification.servo.parameters import NAMES
+
+_SIMULATED: Final = (
+    *("kp", "armature", "viscous", "coulomb", "delay", "offset", "load", "static", "speed"),
+    *("kd", "limit", "dead_band"),
+)
+_UNLIMITED: Final = 1e6  # rad/s² or m/s²
 
 
 @dataclass(frozen=True, eq=False)
@@ -68,50 +75,62 @@ def simulate(inputs: JointInputs, values: Array, every: int = 1) -> Array:
     """
     h = inputs.step
     count, joints = inputs.bias.shape
+    by_name = dict(zip(NAMES, np.ascontiguousarray(np.moveaxis(values, -1, 0)), strict=True))
     compliance, armature, viscous, coulomb, delay, offset, load, static, speed, kd, limit, dead = (
-        np.ascontiguousarray(np.moveaxis(values, -1, 0))
+        by_name[name] for name in _SIMULATED
     )
-    place, part, stop = _places(inputs, delay)
-    command = inputs.command.ravel()
-    decay = 1.0 / speed**2
+    place, part = _places(inputs, delay)
+    whole = 1.0 - part
+    command = np.concatenate([inputs.command, np.tile(inputs.command[-1], (2, 1))]).ravel()
+    slower = -1.0 / speed**2
     has_static, has_kd, has_load = (bool(each.any()) for each in (static, kd, load))
     parts = _Parts(bool(dead.any()), has_kd, bool(np.isfinite(limit).any()))
+    at_zero = inputs.bias - inputs.slope * inputs.reference
+    braking = h * viscous
+    half_braking = 0.5 * braking
+    damped = (0.5 * h) * kd
     position = np.broadcast_to(inputs.position, part.shape).copy()
     velocity = np.broadcast_to(inputs.velocity, part.shape).copy()
     change: Array | float = 0.0
     positions = np.empty((-(-count // every), *part.shape))
-    earlier = command[place - joints] * (1.0 - part) + command[place - 2 * joints] * part
-    wanted = command[place] * (1.0 - part) + command[place - joints] * part
+    planner = _SetPoint.of(by_name["acceleration"], h)
+    newest = command[place]
+    before = command[place - joints]
+    earlier = before * whole + command[place - 2 * joints] * part
+    wanted = newest * whole + before * part
     for k in range(count):
         if k % every == 0:
             positions[k // every] = position
         place += joints
-        ahead = np.minimum(place, stop - 1)
-        later = command[ahead] * (1.0 - part) + command[place - joints] * part
-        rate = (later - earlier) / (2.0 * h) - velocity if has_kd else 0.0
-        motor, stiff = _motor(wanted + offset - position, rate, kd, limit, dead, parts)
+        before, newest = newest, command.take(place, mode="clip")
+        later = newest * whole + before * part
+        if planner is None:
+            target, pace = wanted, (later - earlier) / (2.0 * h) if has_kd else 0.0
+        else:
+            target, pace = planner.moved(wanted, later)
+        rate = pace - velocity if has_kd else 0.0
+        motor, stiff = _motor(target + offset - position, rate, kd, limit, dead, parts)
         earlier, wanted = wanted, later
-        bodies = compliance * (inputs.bias[k] + inputs.slope[k] * (position - inputs.reference[k]))
+        bodies = compliance * (at_zero[k] + inputs.slope[k] * position)
         inertia = compliance * inputs.inertia[k]
         friction = coulomb
         if has_load:
             friction = friction + load * np.abs(bodies + inertia * change)
         if has_static:
-            friction = friction + static * np.exp(-decay * velocity * velocity)
-        own = armature + inertia
-        remaining = own + (0.5 * h * h) * stiff
-        braking = h * viscous
+            friction = friction + static * np.exp(slower * velocity * velocity)
+        remaining = armature + inertia + (0.5 * h * h) * stiff
         # Half of the damping acts on the velocity before, unless it would turn that round.
-        share = np.minimum(0.5 * braking, remaining)
-        push = (remaining - share) * velocity + h * (motor - bodies)
-        held = remaining + braking - share
+        share = np.minimum(half_braking, remaining)
+        left = remaining - share
+        push = left * velocity + h * (motor - bodies)
+        held = left + braking
         if has_kd:
             # The motor has it at the velocity before; half of it belongs to the one after.
-            half = (0.5 * h) * kd * stiff
+            half = damped * stiff
             push = push + half * velocity
             held = held + half
-        push = push - np.clip(push, -h * friction, h * friction)
-        new = push / held
+        friction = h * friction
+        new = (push - _limited(push, friction)) / held
         if has_load:
             change = (new - velocity) / h
         velocity = new
@@ -119,15 +138,66 @@ def simulate(inputs: JointInputs, values: Array, every: int = 1) -> Array:
     return positions
 
 
-def _places(inputs: JointInputs, delay: Array) -> tuple[NDArray[np.intp], Array, int]:
-    """Return where in all commands a delayed one is at the start, and its part before (V, c).
+def _limited(values: Array, most: Array) -> Array:
+    """Return values within plus or minus `most`; `np.clip` takes twice the time."""
+    return np.minimum(np.maximum(values, -most), most)
 
-    And how many commands there are.
-    """
+
+def _places(inputs: JointInputs, delay: Array) -> tuple[NDArray[np.intp], Array]:
+    """Return where in all commands a delayed one is at the start, and its part before (V, c)."""
     joints = inputs.bias.shape[1]
     late = np.clip(delay / inputs.step, 0.0, inputs.lead - 2.01)
     whole = np.floor(late).astype(np.intp)
-    return (inputs.lead - whole) * joints + np.arange(joints), late - whole, inputs.command.size
+    return (inputs.lead - whole) * joints + np.arange(joints), late - whole
+
+
+@dataclass(eq=False)
+class _SetPoint:
+    """The set-point that a servo plans to its command, with limited acceleration (V, c).
+
+    It brakes so as to stand where the command is, and stands there where it can within a step.
+
+    Attributes:
+        step: time step [s].
+        most: the largest acceleration.
+        position, velocity: of the set-point.
+    """
+
+    step: float
+    most: Array
+    position: Array | None = None
+    velocity: Array | float = 0.0
+
+    @classmethod
+    def of(cls, acceleration: Array, step: float) -> _SetPoint | None:
+        """Return it at rest; None if no joint has a limit."""
+        if np.isinf(acceleration).all():
+            return None
+        return cls(step, np.minimum(acceleration, _UNLIMITED))
+
+    def __post_init__(self) -> None:
+        self._twice = 2.0 * self.most
+        self._change = self.step * self.most
+        self._half = 0.5 * self._change
+        self._square = self._half**2
+
+    def moved(self, command: Array, later: Array) -> tuple[Array, Array]:
+        """Return position and velocity at an instant, and move on to the next.
+
+        Args:
+            command: at this instant.
+            later: at the next.
+        """
+        if self.position is None:
+            self.position = command
+        here, before = self.position, self.velocity
+        # The velocity of a step fits the distance in the middle of it, but passes no command.
+        root = np.sqrt(self._twice * np.abs(0.5 * (command + later) - here) + self._square)
+        away = (later - here) / self.step
+        braked = np.copysign(np.minimum(root - self._half, np.abs(away)), away)
+        self.velocity = before + _limited(braked - before, self._change)
+        self.position = here + self.step * self.velocity
+        return here, 0.5 * (before + self.velocity)
 
 
 class _Parts(NamedTuple):
@@ -144,13 +214,13 @@ def _motor(
     """Return the torque of motors over their stiffness, and where it follows the error (V, c)."""
     stiff: Array | float = 1.0
     if parts.dead_band:
-        inside = np.clip(error, -dead, dead)
+        inside = _limited(error, dead)
         stiff = inside != error
         error = error - inside
     if parts.kd:
         error = error + kd * rate
     if parts.limit:
-        limited = np.clip(error, -limit, limit)
+        limited = _limited(error, limit)
         stiff = stiff * (limited == error)
         error = limited
     return error, stiff

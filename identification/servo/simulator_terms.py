@@ -12,7 +12,7 @@ from typing import Final, Literal, get_args
 import numpy as np
 
 from identification.arrays import Array
-from identification.servo.choice import ServoFit, shown_terms
+from identification.servo.choice import ServoFit
 from identification.servo.fit import ServoWindows, fit
 from identification.servo.parameters import NAMES
 from identification.servo.recorded_motion import ServoMotion
@@ -57,5 +57,5 @@ def fits_in_simulators(
             windows, best.prior, present, best.coordinates, resolution, iterations=ITERATIONS,
             bus=best.bus_delay, done=done,
         )  # fmt: skip
-        fits[engine] = ServoFit(estimate, (), found.windows, shown_terms(windows, estimate))
+        fits[engine] = ServoFit(estimate, (), found.windows, found.shown & present)
     return fits

@@ -6,11 +6,12 @@ from collections.abc import Sequence
 from typing import Final
 
 import numpy as np
+import scipy
 
 from identification.arrays import Array
 from identification.servo.fit import Prior
 from identification.servo.parameters import PLACE, TERMS
-from identification.servo.recorded_motion import ServoMotion
+from identification.servo.recorded_motion import SMOOTHED, ServoMotion
 
 STARTS: Final = ({"delay": 0.01}, {"delay": 0.06, "kd": 0.1})
 """A servo that follows at once, and one that leads a late command: a fit finds the other from
@@ -24,7 +25,9 @@ _SHARES: Final = {
     "dead_band": 0.05,
 }  # of the root mean square of the position errors
 _RATIOS: Final = {"load": 0.1, "speed": 0.1}
-_SATURATED: Final = 0.99  # quantile of the position errors at which a torque limit is sought
+_SATURATED: Final = 0.99
+"""Quantile of position errors and commanded accelerations at which a limit is sought."""
+_STEADY: Final = 1e-2  # rad/s² or m/s², of a command that does not move
 _SLOW: Final = 20.0  # samples that count as one
 
 
@@ -47,7 +50,19 @@ def prior_of(motions: Sequence[ServoMotion], resolution: Array) -> Prior:
         mean[:, PLACE[name]] = np.log(share * size)
     limit = np.quantile(np.abs(errors), _SATURATED, axis=0)
     mean[:, PLACE["limit"]] = np.log(np.maximum(limit, resolution))
+    mean[:, PLACE["acceleration"]] = np.log(_commanded_acceleration(motions))
     return Prior(mean, spread)
+
+
+def _commanded_acceleration(motions: Sequence[ServoMotion]) -> Array:
+    """Return the acceleration that the smoothed commands seldom exceed (n,)."""
+    accelerations = []
+    for motion in motions:
+        width = SMOOTHED / motion.step
+        smooth = scipy.ndimage.gaussian_filter1d(motion.command, width, axis=0, mode="nearest")
+        accelerations.append(np.gradient(np.gradient(smooth, axis=0), axis=0) / motion.step**2)
+    size = np.quantile(np.abs(np.concatenate(accelerations)), _SATURATED, axis=0)
+    return np.asarray(np.maximum(size, _STEADY))
 
 
 def start_of(prior: Prior, start: dict[str, float]) -> Array:

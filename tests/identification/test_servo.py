@@ -1,5 +1,7 @@
 """Servos identified from positions alone: simulation against other integrators, planted arms."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import scipy
@@ -8,7 +10,7 @@ from benchmarks import servo_arm as arm
 from identification import RobotModel
 from identification.servo.choice import fit_servos
 from identification.servo.intervals import intervals_of, sampled, widened_covariance
-from identification.servo.parameters import NAMES, PLACE, TERMS, in_errors, in_units
+from identification.servo.parameters import ABSENT, NAMES, PLACE, TERMS, in_errors, in_units
 from identification.servo.prediction import predicted
 from identification.servo.pushes import pushes_of
 from identification.servo.recorded_motion import Grid, motions_of
@@ -32,7 +34,7 @@ def alone(command, *, start=0.0, bias=0.0, step=STEP):
 
 def values(**given):
     """Return parameters of one joint in position errors (1, 1, P), by their values in SI units."""
-    row = np.array([{"limit": np.inf, "speed": 1.0}.get(term.name, 0.0) for term in TERMS])
+    row = np.array([ABSENT.get(term.name, 0.0) for term in TERMS])
     for name, value in given.items():
         row[PLACE[name]] = value
     return in_errors(row)[None, None]
@@ -79,6 +81,42 @@ def test_a_joint_rests_where_friction_holds_it():
     assert simulated[-1] > 0.0
 
 
+@pytest.mark.parametrize("step", [1e-2, 2.5e-3])
+def test_a_set_point_is_behind_by_the_square_of_its_speed(step):
+    """Braked by a limited acceleration it would stand at the command: v² / 2a behind a ramp.
+
+    The servo that follows it is behind by its damping over its stiffness.
+    """
+    command = np.arange(0.0, 1.0, step)
+    stiff = values(kp=100.0, armature=1e-3, viscous=0.6, acceleration=40.0)
+    simulated = simulate(alone(command, step=step), stiff)[:, 0, 0]
+    assert (command - simulated)[len(command) // 2 :] == pytest.approx(
+        1.0 / 80.0 + 0.6 / 100.0, rel=0.01
+    )
+
+
+def test_a_set_point_reaches_a_step_by_half_and_half():
+    """Accelerated and braked alike, at 2 sqrt(distance / acceleration), without overshoot."""
+    step = 2.5e-3
+    command = np.where(np.arange(400) < 20, 0.0, 0.4)
+    stiff = values(kp=100.0, armature=1e-3, viscous=0.6, acceleration=10.0)
+    simulated = simulate(alone(command, step=step), stiff)[:, 0, 0]
+    reached = step * (np.argmax(simulated > 0.399) - 20)
+    assert reached == pytest.approx(2.0 * np.sqrt(0.4 / 10.0), abs=0.02)
+    assert simulated.max() < 0.401
+    assert np.abs(np.diff(simulated, 2)).max() / step**2 < 1.2 * 10.0
+
+
+def test_a_set_point_without_limit_is_the_command():
+    command = 0.2 * np.sin(np.arange(400) * 0.05)
+    given = {"kp": 15.0, "kd": 0.3, "armature": 0.03, "viscous": 0.4}
+    free, fast = (values(**given, acceleration=a) for a in (np.inf, 1e6))
+    # v² / 2a is 2e-6 rad
+    np.testing.assert_allclose(
+        simulate(alone(command), fast), simulate(alone(command), free), atol=3e-6
+    )
+
+
 def test_friction_grows_with_the_load():
     command = np.zeros(200)
     light = values(kp=10.0, armature=0.01, viscous=0.3, load=0.5)
@@ -86,6 +124,30 @@ def test_friction_grows_with_the_load():
     sags, stands = (simulate(alone(command, bias=1.0), each)[-1, 0, 0] for each in (light, held))
     assert -0.15 < sags < -0.05
     assert stands == 0.0
+
+
+def fitted_arm(truth, rng, duration):
+    """Return the fit of a simulated arm, and another motion of it with its prediction."""
+    model, bodies = model_of_arm()
+    recordings = []
+    for seconds in (duration, 15.0):
+        time, command = arm.commands(rng, seconds)
+        position = arm.simulated(truth, time, command)
+        recordings.append(
+            Recording(
+                time=time, position=position, joint_names=arm.NAMES, commanded_position=command
+            )
+        )
+    fitted, other = recordings
+    grid = Grid.of(fitted)
+    fit = fit_servos(
+        lambda on: motions_of(fitted, model, bodies, on),
+        grid,
+        np.full(3, arm.COUNT / np.sqrt(12.0)),
+    )
+    (unseen,) = motions_of(other, model, bodies, grid)
+    (simulated,) = predicted(model, bodies, unseen, [intervals_of(fit).values])
+    return fit, unseen, simulated
 
 
 def model_of_arm():
@@ -103,22 +165,9 @@ def planted():
     """Truth, fit and prediction of a simulated arm."""
     rng = np.random.default_rng(11)
     truth = arm.Planted.drawn(rng)
-    model, bodies = model_of_arm()
-    motions = []
-    fine = []
-    for duration in (40.0, 15.0):
-        time, command = arm.commands(rng, duration)
-        position = arm.simulated(truth, time, command)
-        recording = Recording(
-            time=time, position=position, joint_names=arm.NAMES, commanded_position=command
-        )
-        grid = Grid.of(recording)
-        motions += motions_of(recording, model, bodies, grid)
-        fine += motions_of(recording, model, bodies, grid.halved)
-    fit = fit_servos(motions[:1], fine[:1], np.full(3, arm.COUNT / np.sqrt(12.0)))
+    fit, unseen, simulated = fitted_arm(truth, rng, 40.0)
     intervals = intervals_of(fit)
-    (simulated,) = predicted(model, bodies, motions[1], [intervals.values])
-    return truth, fit, intervals, motions[1], simulated
+    return truth, fit, intervals, unseen, simulated
 
 
 @pytest.mark.long
@@ -148,10 +197,42 @@ def test_a_limit_that_no_motion_reaches_is_not_determined(planted):
 
 
 @pytest.mark.long
+def test_what_unseen_motion_does_not_show_is_not_determined(planted):
+    """Nor what such a term may stand for: Coulomb friction and a dead band look alike."""
+    _, fit, intervals, *_ = planted
+    dead, coulomb = PLACE["dead_band"], PLACE["coulomb"]
+    assert intervals.determined[1, [dead, coulomb]].all()
+    shown = fit.shown.copy()
+    shown[1, dead] = False
+    doubted = intervals_of(replace(fit, shown=shown))
+    assert not doubted.determined[1, dead]
+    assert doubted.lower[1, dead] == 0.0
+    for k in range(len(NAMES)):
+        assert doubted.upper[1, k] >= intervals.upper[1, k] * (1.0 - 1e-9)
+    width, before = (
+        np.log(each.upper[1, coulomb] / each.lower[1, coulomb]) for each in (doubted, intervals)
+    )
+    assert width > before
+    assert (doubted.determined[[0, 2]] == intervals.determined[[0, 2]]).all()
+
+
+@pytest.mark.long
+def test_the_acceleration_of_set_points_is_found():
+    rng = np.random.default_rng(4)
+    truth = replace(arm.Planted.drawn(rng), acceleration=5.0)
+    fit, unseen, simulated = fitted_arm(truth, rng, 30.0)
+    intervals = intervals_of(fit)
+    place = PLACE["acceleration"]
+    assert intervals.values[:, place] == pytest.approx(5.0, rel=0.1)
+    assert intervals.determined[:, place].all()
+    assert np.sqrt(np.mean((simulated - unseen.position) ** 2)) < 2.0 * arm.COUNT
+
+
+@pytest.mark.long
 def test_draws_scatter_as_the_intervals_say(planted):
     _, fit, intervals, *_ = planted
     estimate = fit.estimate
-    covariance = widened_covariance(estimate)
+    covariance = widened_covariance(fit)
     draws = sampled(estimate.coordinates, estimate.present, covariance, fit.windows - 1, 4000, 1)
     assert len(NAMES) == draws.shape[2]
     for name in ("kp", "armature", "viscous", "coulomb"):
@@ -167,17 +248,19 @@ def test_draws_scatter_as_the_intervals_say(planted):
 
 @pytest.mark.long
 def test_intervals_are_as_wide_as_the_scatter_of_windows(planted):
-    """In every direction of the parameters of a joint, not only along each of them."""
+    """In every direction of the parameters of a joint that are known better than before."""
     _, fit, *_ = planted
     estimate = fit.estimate
-    covariance = widened_covariance(estimate)
+    covariance = widened_covariance(fit)
     count = len(NAMES)
     for joint in range(3):
         own = slice(joint * count, (joint + 1) * count)
         for least in (estimate.between[joint], estimate.covariance[own, own]):
             present = np.outer(estimate.present[joint], estimate.present[joint])
-            excess = np.where(present, covariance[own, own] - least, 0.0)
             scale = np.sqrt(np.diag(covariance[own, own]))
+            learnt = scale < (1.0 - 1e-9) * estimate.prior.spread[joint]
+            present &= np.outer(learnt, learnt)
+            excess = np.where(present, covariance[own, own] - least, 0.0)
             assert np.linalg.eigvalsh(excess / np.outer(scale, scale)).min() > -1e-6
 
 

@@ -170,3 +170,15 @@ def test_the_load_of_a_public_report(shared_data: Path, tmp_path: Path) -> None:
     is_measured = np.abs(torque) < 1.0229 * np.array(rated)  # more does not fit below the bit
     assert is_measured.mean() > 0.9
     assert error[is_measured].max() < 0.51e-3
+
+
+def test_a_factor_after_the_name_scales_the_numbers(tmp_path: Path, urdf: Path) -> None:
+    source = write(tmp_path, ("load{}", np.rint(340.0 * TORQUE)))
+    assert not refusal(source, urdf, "--columns", "torque=load{}*0.0029411765")
+    torque = read(source).columns["torque"]
+    np.testing.assert_allclose(torque, TORQUE, atol=0.51 / 340.0)
+
+
+def test_a_factor_alone_is_no_name(tmp_path: Path, urdf: Path) -> None:
+    source = write(tmp_path, ("load{}", TORQUE))
+    assert "torque" in refusal(source, urdf, "--columns", "torque=*2")

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 import sys
 from pathlib import Path
 from types import ModuleType, SimpleNamespace
@@ -15,7 +16,8 @@ import pytest
 from typer.testing import CliRunner
 
 from benchmarks import servo_arm as arm
-from hil.base.errors import InputError
+from hil.archive import open_archive
+from hil.base.errors import InputError, SourceError
 from hil.base.one_screen import one_screen
 from hil.cli import app
 from hil.results.servo_result import ServoPush, ServoResults, is_servo_result
@@ -409,3 +411,78 @@ def test_a_real_arm_is_predicted_from_its_commands(tmp_path: Path) -> None:
     circular, backlash = ServoResults.load(tmp_path / "out" / "results.json").validation
     assert circular.position_error_mrad < 8.0
     assert backlash.position_error_mrad < 6.0
+
+
+@pytest.fixture(scope="module")
+def lerobot_log(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A log as LeRobot's robots name it: degrees, loads 340 times the torque of the motors."""
+    folder = tmp_path_factory.mktemp("lerobot")
+    rng = np.random.default_rng(7)
+    truth = arm.Planted.drawn(rng)
+    time, command = arm.commands(rng, 20.0)
+    position = arm.simulated(truth, time, command)
+    load = np.round(340.0 * truth.kp * (command - position))
+    names = [
+        "timestamp",
+        *(f"{name}.pos" for name in arm.NAMES),
+        *(f"{name}.load" for name in arm.NAMES),
+        *(f"action.{name}.pos" for name in arm.NAMES),
+    ]
+    rows = np.column_stack([time, np.degrees(position), load, np.degrees(command)])
+    text = "\n".join([",".join(names), *(",".join(map(str, row)) for row in rows.tolist())])
+    (folder / "log.csv").write_text(text + "\n")
+    (folder / "arm.urdf").write_text(arm.urdf())
+    return folder / "log.csv"
+
+
+def imported_torque(log: Path, *options: str) -> tuple[Any, str]:
+    """Return the torque of a log as an identification reads it, None if none, and what it says."""
+    output = log.with_name("out.mcap")
+    line = ["import", "log", log, "--urdf", log.with_name("arm.urdf"), "--force", "-o", output]
+    done = CliRunner().invoke(app, [*map(str, line), *options])
+    assert done.exit_code == 0, done.output
+    return open_archive(output).columns.get("torque"), " ".join(done.output.split())
+
+
+class TestLoad:
+    def test_it_is_a_torque_beside_no_commands_only_if_it_is_stated(
+        self, lerobot_log: Path
+    ) -> None:
+        """Nor where there is a torque."""
+        rows = [line.split(",") for line in lerobot_log.read_text().splitlines()]
+        torque = [name for name in rows[0] if name.endswith(".load")]
+        without = [rows[0].index(name) for name in rows[0] if not name.startswith("action.")]
+        text = "\n".join(",".join(row[k] for k in without) for row in rows)
+        path = lerobot_log.with_name("other.csv")
+        path.write_text(text)
+        done = CliRunner().invoke(
+            app, ["identify", str(path), "--urdf", str(path.with_name("arm.urdf"))]
+        )
+        assert isinstance(done.exception, InputError | SourceError)
+        assert "--columns 'torque=" in str(done.exception)
+        both = [name.replace(".load", ".torque") for name in torque]
+        head = ",".join([rows[0][k] for k in without] + both)
+        body = "\n".join(
+            ",".join([row[k] for k in without] + ["1.0"] * len(both)) for row in rows[1:]
+        )
+        path.write_text(f"{head}\n{body}\n")
+        found, _ = imported_torque(path)
+        assert (found == 1.0).all()
+
+    def test_a_load_in_a_unit_of_its_own_is_left_out_with_its_factor(
+        self, lerobot_log: Path
+    ) -> None:
+        torque, output = imported_torque(lerobot_log)
+        assert torque is None
+        (ratio,) = re.findall(
+            r"it is ([\d.e+]+) times the torque that the URDF's masses need", output
+        )
+        assert 250.0 < float(ratio) < 550.0  # 340, and what friction takes of it
+        (factor,) = re.findall(r"--columns 'torque=NAME\*([\d.]+)'", output)
+        assert float(factor) == pytest.approx(1.0 / float(ratio), rel=0.1)
+
+    def test_the_factor_makes_a_torque_of_it(self, lerobot_log: Path) -> None:
+        torque, output = imported_torque(lerobot_log, "--columns", "torque={}.load*0.002941")
+        assert torque is not None and "left out" not in output
+        as_logged, _ = imported_torque(lerobot_log, "--columns", "torque={}.load")
+        np.testing.assert_allclose(torque, 0.002941 * as_logged)
