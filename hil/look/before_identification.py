@@ -76,15 +76,14 @@ def concluded(
     if may_be_load and _has_no_sign(imported.archive):
         return _without_torque(imported, source, robot_of, use, NoJointTorque())
     few = _few_rows(imported.archive)
+    if may_be_load and _is_named_load(imported):
+        size = None if few is None else Size.of(few[0], few[0].model, few[1])
+        ratio = size.factor if size is not None and size.by_masses else None
+        reason = NoJointTorque(is_load=True, ratio=ratio)
+        return _without_torque(imported, source, robot_of, use, reason)
     if few is None:
         return imported
     cell, samples, score = few
-    if may_be_load and _is_named_load(imported):
-        size = Size.of(cell, cell.model, samples)
-        if size.is_off:
-            return _without_torque(
-                imported, source, robot_of, use, NoJointTorque(None, size.factor)
-            )
     is_bag = imported.map_text is None  # its joints have names: no other order is searched
     suspect = _is_suspect(cell, samples, score, source)
     if is_bag or not (suspect or _hangs_otherwise(cell, samples, score)):

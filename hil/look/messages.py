@@ -694,16 +694,18 @@ def _(explained: ExplainedTorque) -> str:
 
 @import_messages.worded.register
 def _(none: NoJointTorque) -> str:
-    reason = "it is never negative, although the joints move in both directions"
-    name = "NAME"
+    factor = "" if none.ratio is None else f"*{1.0 / none.ratio:.2g}"
     if none.unexplained is not None:
-        reason = f"no masses explain {percentage(none.unexplained)} of it"
+        reason = f"no masses explain {percentage(none.unexplained)} of it, as of the load"
     elif none.ratio is not None:
-        reason = f"it is {none.ratio:.2g} times the torque that the URDF's masses need"
-        name = f"NAME*{1.0 / none.ratio:.2g}"
+        reason = f"it is {none.ratio:.2g} times the torque that the URDF's masses need, the load"
+    elif none.is_load:
+        reason = "it is named as the load"
+    else:
+        reason = "it is never negative, although the joints move in both directions, as of the load"
     return (
-        f"torque: left out, {reason}, as of the load or the duty of a servo; to use it in spite of"
-        f" that, name it: --columns 'torque={name}'"
+        f"torque: left out, {reason} or the duty of a servo; to use it in spite of that, name it:"
+        f" --columns 'torque=NAME{factor}'"
     )
 
 

@@ -599,12 +599,13 @@ class NoJointTorque(Conclusion):
 
     Attributes:
         unexplained: share of it that no masses of the arm explain; None where that is not why.
-        ratio: of it to the torque that the URDF's masses need, of a load in a unit of its own; None
-            where that is not why. Without both it has no sign, although joints move in both
+        is_load: whether its name says so. Without both it has no sign, although joints move in both
             directions.
+        ratio: of a load to the torque that the URDF's masses need; None where it is not known.
     """
 
     unexplained: float | None = None
+    is_load: bool = False
     ratio: float | None = None
 
 

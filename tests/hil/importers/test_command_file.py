@@ -109,5 +109,5 @@ def test_names_of_lerobot_are_known(tmp_path: Path, urdf: Path) -> None:
     }
     assert meanings["position"] == "pan.pos .. gripper.pos"
     assert meanings["commanded_position"] == "action.pan.pos .. action.gripper.pos"
-    assert "torque" not in meanings
+    assert meanings["torque"] == "pan.load .. gripper.load"  # until its numbers are judged
     np.testing.assert_allclose(recording.archive.columns["commanded_position"], at(time), atol=1e-5)
