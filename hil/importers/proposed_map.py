@@ -34,7 +34,7 @@ from hil.importers.name_words import is_measured, kind_by_words, kinds_said, wor
 from hil.importers.row_names import row_names
 from hil.importers.stated_units import other_unit
 from hil.importers.text_table import TextTable
-from hil.importers.units import JOINT_KINDS, Kind, kind_named, unit_of
+from hil.importers.units import JOINT_KINDS, UNITS, Kind, kind_named, unit_of
 from hil.importers.unnamed_columns import ColumnBlocks, blocks_of, roughness
 
 _MOST_NAMED: Final = 30
@@ -222,7 +222,7 @@ class _Search:
             and self._is_load(columns["torque"])
         ):
             # Whether it is a torque is judged by its numbers, however a servo encodes them.
-            table["torque"] = {"columns": columns["torque"], "unit": "N.m"}
+            table["torque"] = {"columns": columns["torque"], "unit": next(iter(UNITS["torque"]))}
         if self._rate is not None:
             table = {"sample_rate": self._rate, **table}
         else:

@@ -11,12 +11,11 @@ joint comes to rest exactly.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from typing import Final, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from identification.arrays import Array
 from identification.servo.parameters import NAMES
@@ -74,14 +73,12 @@ def simulate(inputs: JointInputs, values: Array, every: int = 1) -> Array:
         every: steps between the instants that are returned.
     """
     h = inputs.step
-    count, joints = inputs.bias.shape
+    count = len(inputs.bias)
     by_name = dict(zip(NAMES, np.ascontiguousarray(np.moveaxis(values, -1, 0)), strict=True))
     compliance, armature, viscous, coulomb, delay, offset, load, static, speed, kd, limit, dead = (
         by_name[name] for name in _SIMULATED
     )
-    place, part = _places(inputs, delay)
-    whole = 1.0 - part
-    command = np.concatenate([inputs.command, np.tile(inputs.command[-1], (2, 1))]).ravel()
+    commands = _delayed(inputs, delay)
     slower = -1.0 / speed**2
     has_static, has_kd, has_load = (bool(each.any()) for each in (static, kd, load))
     parts = _Parts(bool(dead.any()), has_kd, bool(np.isfinite(limit).any()))
@@ -89,21 +86,16 @@ def simulate(inputs: JointInputs, values: Array, every: int = 1) -> Array:
     braking = h * viscous
     half_braking = 0.5 * braking
     damped = (0.5 * h) * kd
-    position = np.broadcast_to(inputs.position, part.shape).copy()
-    velocity = np.broadcast_to(inputs.velocity, part.shape).copy()
+    position = np.broadcast_to(inputs.position, delay.shape).copy()
+    velocity = np.broadcast_to(inputs.velocity, delay.shape).copy()
     change: Array | float = 0.0
-    positions = np.empty((-(-count // every), *part.shape))
+    positions = np.empty((-(-count // every), *delay.shape))
     planner = _SetPoint.of(by_name["acceleration"], h)
-    newest = command[place]
-    before = command[place - joints]
-    earlier = before * whole + command[place - 2 * joints] * part
-    wanted = newest * whole + before * part
+    earlier, wanted = next(commands), next(commands)
     for k in range(count):
         if k % every == 0:
             positions[k // every] = position
-        place += joints
-        before, newest = newest, command.take(place, mode="clip")
-        later = newest * whole + before * part
+        later = next(commands)
         if planner is None:
             target, pace = wanted, (later - earlier) / (2.0 * h) if has_kd else 0.0
         else:
@@ -143,12 +135,20 @@ def _limited(values: Array, most: Array) -> Array:
     return np.minimum(np.maximum(values, -most), most)
 
 
-def _places(inputs: JointInputs, delay: Array) -> tuple[NDArray[np.intp], Array]:
-    """Return where in all commands a delayed one is at the start, and its part before (V, c)."""
+def _delayed(inputs: JointInputs, delay: Array) -> Iterator[Array]:
+    """Yield commands (V, c) after delays (V, c), from the instant before the first step on."""
     joints = inputs.bias.shape[1]
     late = np.clip(delay / inputs.step, 0.0, inputs.lead - 2.01)
-    whole = np.floor(late).astype(np.intp)
-    return (inputs.lead - whole) * joints + np.arange(joints), late - whole
+    steps = np.floor(late).astype(np.intp)
+    part = late - steps
+    whole = 1.0 - part
+    command = np.concatenate([inputs.command, inputs.command[-1:]]).ravel()
+    place = (inputs.lead - steps - 2) * joints + np.arange(joints)
+    newest = command[place]
+    while True:
+        place += joints
+        before, newest = newest, command.take(place, mode="clip")
+        yield newest * whole + before * part
 
 
 @dataclass(eq=False)
