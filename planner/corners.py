@@ -349,8 +349,8 @@ def round_corners(
     corners = [STOP] * len(before)
     slowing = moves.slowing_down[before]
     speeding = moves.speeding_up[after]
-    asked = np.flatnonzero((slowing > 0.0) & (speeding > 0.0) & (fly >= LEAST_SHARE))
-    if len(asked) == 0:  # stops need no solver, of whatever version
+    requested = np.flatnonzero((slowing > 0.0) & (speeding > 0.0) & (fly >= LEAST_SHARE))
+    if len(requested) == 0:  # stops need no solver, of whatever version
         return corners
 
     def cuts(rows: Rows, shares: Array) -> tuple[Array, Array]:
@@ -377,19 +377,19 @@ def round_corners(
     def stopped(rows: Rows) -> Mask:
         return np.array([corners[row].join is None for row in rows.tolist()], dtype=np.bool_)
 
-    shares = np.multiply.outer(FIRST_SHARES, fly[asked]).ravel()
-    rows = np.tile(asked, len(FIRST_SHARES))
+    shares = np.multiply.outer(FIRST_SHARES, fly[requested]).ravel()
+    rows = np.tile(requested, len(FIRST_SHARES))
     candidates = solved(rows, shares)
     saving = sum(cuts(rows, shares)) - candidates.durations
     saving = saving.reshape(len(FIRST_SHARES), -1)
     for index in ranked(saving):
         picked = np.flatnonzero(np.take_along_axis(saving, index[None], axis=0)[0] >= 0.0)
-        picked = picked[stopped(asked[picked])]
+        picked = picked[stopped(requested[picked])]
         if len(picked) > 0:
-            chosen = index[picked] * len(asked) + picked
+            chosen = index[picked] * len(requested) + picked
             finish(rows[chosen], shares[chosen], candidates.take(chosen))
     for part in LAST_SHARES:
-        rows = asked[stopped(asked)]
+        rows = requested[stopped(requested)]
         if len(rows) == 0:
             break
         shares = fly[rows] * part

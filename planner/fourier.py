@@ -66,8 +66,8 @@ def harmonic_bounds(limits: JointLimits, offset: ArrayLike, harmonics: int) -> H
         (centre > limits.lower) & (centre < limits.upper)
     ):
         raise InvalidSetting("offset", offset, "a position strictly inside the joint limits")
-    room = np.minimum(limits.upper - centre, centre - limits.lower)
-    return HarmonicBounds(room / harmonics, np.sqrt(limits.acceleration / room))
+    margin = np.minimum(limits.upper - centre, centre - limits.lower)
+    return HarmonicBounds(margin / harmonics, np.sqrt(limits.acceleration / margin))
 
 
 @dataclass(frozen=True, eq=False)

@@ -341,13 +341,13 @@ class Scan:
                 parser.channels[number].topic: channel_messages
                 for number, channel_messages in by_number.items()
             }
-            wanted = [topic for topic in self.topics if topic in by_topic]
+            read = [topic for topic in self.topics if topic in by_topic]
             numbers = by_topic.keys() & set(NUMBERS)
-            new = self._numbers not in (set(), numbers) or numbers.isdisjoint(wanted)
+            new = self._numbers not in (set(), numbers) or numbers.isdisjoint(read)
             if numbers and new:
                 raise Damage(offset, "(chunk) has samples in other channels than those before")
             verified = (
-                by_topic if self._all_channels else {topic: by_topic[topic] for topic in wanted}
+                by_topic if self._all_channels else {topic: by_topic[topic] for topic in read}
             )
             missing = self._missing_messages(verified, offset)
             newest = self._check_times(verified, offset)
@@ -366,7 +366,7 @@ class Scan:
             self.counts[topic] = self.counts.get(topic, 0) + len(messages)
         self._layouts |= layouts
         self.events += [event for event in events if self._times[0] <= event.stamp < self._times[1]]
-        self._append({topic: by_topic[topic] for topic in wanted if topic != schema.EVENTS})
+        self._append({topic: by_topic[topic] for topic in read if topic != schema.EVENTS})
 
     def _check_layouts(
         self, by_topic: Mapping[str, ChunkMessages], offset: int
@@ -410,12 +410,12 @@ class Scan:
             stamps = stamps[chosen]
         begin = self._count
         self._count = self._count + len(stamps)
-        room = max(self._room, len(self._stamps))
-        if self._count > room:
-            room = 2 * self._count
-        if room > len(self._stamps):
-            self._stamps = np.resize(self._stamps, room)
-            self._raw = {key: np.resize(raw, room) for key, raw in self._raw.items()}
+        capacity = max(self._room, len(self._stamps))
+        if self._count > capacity:
+            capacity = 2 * self._count
+        if capacity > len(self._stamps):
+            self._stamps = np.resize(self._stamps, capacity)
+            self._raw = {key: np.resize(raw, capacity) for key, raw in self._raw.items()}
         self._stamps[begin : self._count] = stamps
         for topic, messages in by_topic.items():
             fields: Mapping[str, Any] = self._layouts[topic].dtype.fields or {}
@@ -424,7 +424,7 @@ class Scan:
                 wanted = self._fields is None or _COLUMN_OF.get(name, name) in self._fields
                 if wanted and name not in ("sec", "nanosec"):
                     if (topic, name) not in self._raw:
-                        self._raw[topic, name] = np.empty(room, f"V{dtype.itemsize}")
+                        self._raw[topic, name] = np.empty(capacity, f"V{dtype.itemsize}")
                     columns.append((self._raw[topic, name], start))
             first = 0
             at = begin

@@ -100,9 +100,9 @@ def to_reduce(refs: Sequence[ArchiveRef]) -> list[ToReduce]:
     return [ToReduce(ref, ref in shown, parts if ref.use == "excitation" else 1) for ref in refs]
 
 
-def reduction_key(wanted: Sequence[ToReduce], settings: Settings) -> str:
+def reduction_key(archives: Sequence[ToReduce], settings: Settings) -> str:
     """Return the key of archives that are reduced, and added in this order."""
-    each = [(one.ref.sha256, one.unmodelled, one.parts) for one in wanted]
+    each = [(one.ref.sha256, one.unmodelled, one.parts) for one in archives]
     return json_digest(["sum", each, settings_digest(settings)])
 
 
@@ -208,7 +208,7 @@ def summarise(
 
 
 def reduce_archives(
-    wanted: Sequence[ToReduce], settings: Settings, cache: CacheLocation
+    archives: Sequence[ToReduce], settings: Settings, cache: CacheLocation
 ) -> ReducedArchives:
     """Reduce archives of one campaign and add them up.
 
@@ -217,37 +217,37 @@ def reduce_archives(
     Raises:
         CacheError: the cache cannot be written.
     """
-    cached = cached_reduction(wanted, settings, cache)
+    cached = cached_reduction(archives, settings, cache)
     if cached is not None:
         return cached
-    if len(wanted) == 1:
-        return _reduce_archive(wanted[0], settings, cache)
-    result = added(_reduce_archive(one, settings, cache) for one in wanted)
+    if len(archives) == 1:
+        return _reduce_archive(archives[0], settings, cache)
+    result = added(_reduce_archive(one, settings, cache) for one in archives)
     if not result.broken:
-        _write(wanted, result, settings, cache)
+        _write(archives, result, settings, cache)
     return result
 
 
-def _reduce_archive(wanted: ToReduce, settings: Settings, cache: CacheLocation) -> ReducedArchives:
-    cached = cached_reduction((wanted,), settings, cache)
+def _reduce_archive(archive: ToReduce, settings: Settings, cache: CacheLocation) -> ReducedArchives:
+    cached = cached_reduction((archive,), settings, cache)
     if cached is not None:
         return cached
-    ref = wanted.ref
+    ref = archive.ref
     try:
-        summary, reduction = reduced_archive(wanted, settings)
+        summary, reduction = reduced_archive(archive, settings)
     except Exception as error:
         return ReducedArchives(
             broken=(SkippedArchive(ref.origin, reason_of(error, ref.origin)),), read=1
         )
     total = reduction if ref.use == "excitation" else None
     result = ReducedArchives((summary,), total, read=1)
-    _write((wanted,), result, settings, cache)
+    _write((archive,), result, settings, cache)
     return result
 
 
-def ensure_reduced(wanted: ToReduce, settings: Settings, cache: CacheLocation) -> None:
+def ensure_reduced(archive: ToReduce, settings: Settings, cache: CacheLocation) -> None:
     """Reduce one archive, to find out whether that ends the process."""
-    reduce_archives((wanted,), settings, cache)
+    reduce_archives((archive,), settings, cache)
 
 
 def added(parts: Iterable[ReducedArchives]) -> ReducedArchives:
@@ -284,11 +284,11 @@ FIT: Final = ("values", "covariance", "noise_std", "samples")
 
 
 def cached_reduction(
-    wanted: Sequence[ToReduce], settings: Settings, cache: CacheLocation
+    archives: Sequence[ToReduce], settings: Settings, cache: CacheLocation
 ) -> ReducedArchives | None:
     """Return the cached reduction of exactly these archives; None if there is none."""
-    refs = [one.ref for one in wanted]
-    entry = cache.read(refs[0].origin, reduction_key(wanted, settings))
+    refs = [one.ref for one in archives]
+    entry = cache.read(refs[0].origin, reduction_key(archives, settings))
     if entry is None:
         return None
     try:
@@ -298,13 +298,13 @@ def cached_reduction(
 
 
 def _write(
-    wanted: Sequence[ToReduce],
+    archives: Sequence[ToReduce],
     reduced: ReducedArchives,
     settings: Settings,
     cache: CacheLocation,
 ) -> None:
-    place = wanted[0].ref.origin
-    cache.write(place, reduction_key(wanted, settings), *_packed(reduced))
+    place = archives[0].ref.origin
+    cache.write(place, reduction_key(archives, settings), *_packed(reduced))
 
 
 def _packed(reduced: ReducedArchives) -> tuple[dict[str, Any], Arrays]:

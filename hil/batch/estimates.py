@@ -215,7 +215,7 @@ def estimate_cached(
     Raises:
         CacheError: a damaged sum is computed again, and the cache cannot be written.
     """
-    parts = [reduce_archives(wanted, settings, cache) for wanted in partitions]
+    parts = [reduce_archives(partition, settings, cache) for partition in partitions]
     return estimate_campaign(parts, arm, settings, campaign)
 
 

@@ -430,15 +430,15 @@ class _Batch:
             place = campaign.key.campaign
             partitions = campaign.partitions
             estimated = (arm.model, campaign.ready, place)
-            if all(self._has(wanted, campaign) for wanted in partitions):
+            if all(self._has(partition, campaign) for partition in partitions):
                 pair = submit(place, estimate_cached, partitions, self.cache, *estimated)
                 receivers[id(pair)] = _advance(advance, sum(map(len, partitions)), place)
                 yield pair
             else:
                 parts = []
-                for wanted in partitions:
-                    reduced = submit(place, reduce_archives, wanted, campaign.ready, self.cache)
-                    receivers[id(reduced)] = _advance(advance, len(wanted), place)
+                for partition in partitions:
+                    reduced = submit(place, reduce_archives, partition, campaign.ready, self.cache)
+                    receivers[id(reduced)] = _advance(advance, len(partition), place)
                     parts.append(reduced)
                 pair = submit(place, estimate_campaign, parts, *estimated)
                 yield from parts
@@ -473,20 +473,20 @@ class _Batch:
     def _uncached(self, campaign: _Campaign) -> int:
         """Return how many archives of a campaign have to be read."""
         count = 0
-        for wanted in campaign.partitions:
-            if not self._has(wanted, campaign):
-                count += sum(not self._has([one], campaign) for one in wanted)
+        for partition in campaign.partitions:
+            if not self._has(partition, campaign):
+                count += sum(not self._has([one], campaign) for one in partition)
         return count
 
-    def _has(self, wanted: Sequence[ToReduce], campaign: _Campaign) -> bool:
-        return self.cache.has(wanted[0].ref.origin, reduction_key(wanted, campaign.ready))
+    def _has(self, partition: Sequence[ToReduce], campaign: _Campaign) -> bool:
+        return self.cache.has(partition[0].ref.origin, reduction_key(partition, campaign.ready))
 
     def _remove_deadly(self, campaign: _Campaign) -> None:
         """Remove the archives of a campaign that end the process that reduces them."""
         tasks = [
             ClusterTask(one.ref.origin, ensure_reduced, (one, campaign.ready, self.cache))
-            for wanted in campaign.partitions
-            for one in wanted
+            for partition in campaign.partitions
+            for one in partition
         ]
         results = self._results(tasks, "reducing archives one by one", len(tasks))
         deadly = [result for result in results if result is not None]

@@ -142,9 +142,9 @@ def _require_own_link(campaign: CampaignState, link: MotionLink | None) -> None:
     other = getattr(link, "cell", None)
     if not isinstance(other, Cell) or other is campaign.cell:
         return
-    wanted = _sent_by(campaign.cell)
+    expected = _sent_by(campaign.cell)
     present = _sent_by(other)
-    if differ := [name for name in wanted if wanted[name] != present[name]]:
+    if differ := [name for name in expected if expected[name] != present[name]]:
         raise CampaignFolderError(
             campaign.folder.root,
             f"its link was opened with another cell ({', '.join(differ)} differ)",

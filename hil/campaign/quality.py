@@ -114,10 +114,10 @@ def problem_of(executed: Executed, trajectory: Motion, cell: Cell) -> QualityPro
     """Return the problem of a single motion, None for none."""
     if (problem := incomplete_or_slowed(executed, trajectory, cell)) is not None:
         return problem
-    wanted = int(np.ceil(trajectory.duration / cell.period - 1e-6))
-    if executed.missed > MISSED_SHARE * wanted:
+    cycles = int(np.ceil(trajectory.duration / cell.period - 1e-6))
+    if executed.missed > MISSED_SHARE * cycles:
         return QualityProblem(
-            f"{executed.missed} of {wanted} packets were missed; {percentage(MISSED_SHARE)} are "
+            f"{executed.missed} of {cycles} packets were missed; {percentage(MISSED_SHARE)} are "
             "allowed"
         )
     high = np.abs(executed.current) >= SATURATED * cell.drive_train.current_limit
@@ -142,10 +142,10 @@ def incomplete_or_slowed(
     executed: Executed, trajectory: Motion, cell: Cell
 ) -> QualityProblem | None:
     """Return the problem of a motion that is incomplete, or was held or slowed; None for none."""
-    wanted = int(np.ceil(trajectory.duration / cell.period - 1e-6))
+    cycles = int(np.ceil(trajectory.duration / cell.period - 1e-6))
     rows = len(executed.commanded)
-    if rows < wanted - 1:
-        return QualityProblem(f"{rows} of its {wanted} cycles are archived")
+    if rows < cycles - 1:
+        return QualityProblem(f"{rows} of its {cycles} cycles are archived")
     times = np.minimum(np.arange(rows) * cell.period, trajectory.duration)
     off = executed.commanded - trajectory.sample(times)[0]
     off = np.abs(off - off[0]).max(axis=1)

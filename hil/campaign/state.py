@@ -105,15 +105,15 @@ class CampaignState:
             )
         return cls(there, Cell.load(there.cell), CampaignPlan.load(there.plan))
 
-    def _require_same(self, cell: Cell, wanted: Excitation | CampaignPlan) -> Self:
+    def _require_same(self, cell: Cell, plan: Excitation | CampaignPlan) -> Self:
         """Return this campaign if it has this cell and excitation (CampaignFolderError if not)."""
         own_cell = cell.with_urdf(self.folder.cell, self.folder.urdf.name)
         same = (own_cell.text, own_cell.urdf) == (self.cell.text, self.cell.urdf)
-        if isinstance(wanted, CampaignPlan):
-            fits = self.plan.to_text() == wanted.to_text()
+        if isinstance(plan, CampaignPlan):
+            fits = self.plan.to_text() == plan.to_text()
         else:
             mine = self.plan.excitation.trajectory.to_dict()
-            fits = json.dumps(mine) == json.dumps(wanted.trajectory.to_dict())
+            fits = json.dumps(mine) == json.dumps(plan.trajectory.to_dict())
         if not same or not fits:
             what = "excitation" if same else "cell"
             raise CampaignFolderError(

@@ -365,7 +365,7 @@ def rosbag2(
     """
     names = _names(rename or [])
     options = ImportOptions(outside_limits=outside_limits)
-    asked = Asking(source, arm.robot, options, kind)
+    asking = Asking(source, arm.robot, options, kind)
     recording = import_bag(
         source,
         output,
@@ -375,9 +375,9 @@ def rosbag2(
         held_joints=held or (),
         use=kind,
         force=force,
-        asked=asked,
+        asked=asking,
     )
-    _print(recording, asked.refusal, json=json)
+    _print(recording, asking.refusal, json=json)
 
 
 @with_options(Described, "arm")
@@ -414,7 +414,7 @@ def log(
             what they contribute.
     """
     options = reading.options
-    asked = Asking(source, arm.robot, options, kind)
+    asking = Asking(source, arm.robot, options, kind)
     recording = import_recording(
         source,
         output or source.with_suffix(".mcap"),
@@ -424,12 +424,12 @@ def log(
         use=kind,
         coupled=not uncoupled,
         force=force,
-        asked=asked,
+        asked=asking,
     )
     proposed = not recording.is_stated and recording.text is not None
     if proposed:
         write_output(recording.archive.path.with_suffix(".map.toml"), recording.text or "")
-    _print(recording, asked.refusal, json=json)
+    _print(recording, asking.refusal, json=json)
     if proposed and not json:
         say(f"wrote {recording.archive.path.with_suffix('.map.toml')}")
 

@@ -104,9 +104,9 @@ def screen(result: Look) -> list[str]:
     ]
     questions = [part for choices in result.questions for part in question(choices)]
     parts += ["", *questions, *_options(result), "reasons, and all rows: -v"]
-    room = LINES - len([part for part in parts if part])
+    lines_left = LINES - len([part for part in parts if part])
     if not questions:
-        parts[-1:-1] = steps[: max(1, min(_STEPS, room))]
+        parts[-1:-1] = steps[: max(1, min(_STEPS, lines_left))]
     return one_screen(parts)
 
 

@@ -193,11 +193,11 @@ def _print(result: RunResult, *, verbose: bool, json: bool) -> None:
     if json:
         print_json({**result.to_dict(), "verdict": None})
         return
-    done, wanted = result.repetitions
+    done, requested = result.repetitions
     tested, tests = result.validations
     lines = [
-        f"{result.campaign}: dry run {result.dry_run}, repetitions {done} of {wanted}, validation "
-        f"{tested} of {tests}, {len(result.rejected)} rejected"
+        f"{result.campaign}: dry run {result.dry_run}, repetitions {done} of {requested}, "
+        f"validation {tested} of {tests}, {len(result.rejected)} rejected"
     ]
     lines += [result.precision] if result.precision else []
     lines += result.notes

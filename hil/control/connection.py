@@ -117,10 +117,10 @@ class Connection:
         event = self.switched_off
         if event is None:
             return ""
-        asked = "the controller for drive-off (505)"
+        requested = "the controller for drive-off (505)"
         if self.cell is not None and self.cell.is_ur:
-            asked = "the program on the controller to stop"
-        return f"this PC asked {asked}: {self._sentence(event)}"
+            requested = "the program on the controller to stop"
+        return f"this PC asked {requested}: {self._sentence(event)}"
 
     def _sentence(self, event: Refused) -> str:
         text = str(event.error) if self.cell is None else refusal_text(self.cell, event.error)

@@ -79,8 +79,8 @@ def _against_limits(axes: Axes, low: float, high: float, values: Array) -> None:
         axes.axhline(bound, color=style.LIMIT, linewidth=0.9, linestyle=(0, (5, 2)))
     least = min(low, float(values.min()))
     most = max(high, float(values.max()))
-    room = 0.1 * (most - least)
-    axes.set_ylim(least - room, most + room)
+    margin = 0.1 * (most - least)
+    axes.set_ylim(least - margin, most + margin)
     axes.set_yticks([low, *([0.0] if low < 0.0 < high else []), high])
     axes.yaxis.set_major_formatter("{x:.4g}")
 

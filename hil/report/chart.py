@@ -64,10 +64,10 @@ def padded(values: Array) -> tuple[float, float]:
     high = float(finite.max())
     # Neighbouring floats have no ticks between them.
     if not high - low > 1e-9 * max(abs(low), abs(high)):
-        room = 0.05 * abs(low) or 1.0
-        return low - room, high + room
-    room = _MARGIN * (high - low)
-    return low - room, high + room
+        margin = 0.05 * abs(low) or 1.0
+        return low - margin, high + margin
+    margin = _MARGIN * (high - low)
+    return low - margin, high + margin
 
 
 def joined(arrays: Iterable[Array]) -> Array:

@@ -232,14 +232,14 @@ def friction_charts(series: ReportSeries, joints: Sequence[Joint]) -> list[Chart
         caption = Caption(f"k{j}", name, f"{ends} {unit}", "friction over velocity")
         shown = np.percentile(torque, _SHOWN) if torque.size else np.empty(0)
         values = np.concatenate([shown, law, [0.0]])
-        room = 0.08 * float(np.ptp(values)) or 1.0
+        margin = 0.08 * float(np.ptp(values)) or 1.0
         dots = replace(
             MEASURED_FRICTION.trace(torque), x=series.friction_speed[there, j], dots=True
         )
         traces = [dots, replace(FRICTION_LAW.trace(law), x=speed)]
         plot = Plot(
             150.0, f"friction [{unit}]", traces,
-            limits=(float(values.min()) - room, float(values.max()) + room), origin=True,
+            limits=(float(values.min()) - margin, float(values.max()) + margin), origin=True,
         )  # fmt: skip
         foot = f"speed [{joints[j].angle}/s]"
         charts.append(Chart(caption, speed, [plot], foot, joint=j, shares_x=False))

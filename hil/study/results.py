@@ -130,11 +130,11 @@ class ConditionResult(Frozen):
         self, first: Method, second: Method, motions: str, *, printed_sizes: bool = False
     ) -> StudyComparison:
         """Return one of the comparisons."""
-        wanted = (first, second, motions, printed_sizes)
+        key = (first, second, motions, printed_sizes)
         return next(
             row
             for row in self.comparisons
-            if (row.first, row.second, row.motions, row.printed_sizes) == wanted
+            if (row.first, row.second, row.motions, row.printed_sizes) == key
         )
 
 
@@ -216,7 +216,7 @@ class StudyResults(Frozen):
 
     def relation(self, criterion: Criterion, quantity: Quantity, condition: str) -> Relation:
         """Return one of the relations."""
-        wanted = (criterion, quantity, condition)
+        key = (criterion, quantity, condition)
         return next(
-            row for row in self.relations if (row.criterion, row.quantity, row.condition) == wanted
+            row for row in self.relations if (row.criterion, row.quantity, row.condition) == key
         )

@@ -288,8 +288,10 @@ class PayloadCampaign:
 
         while True:
             for loaded in _order(pairs):
-                wanted = max(pairs + 1, FEWEST) if loaded else pairs + 1
-                self._record_side(loaded, wanted, executed, mounting, choices, links or _own_link)
+                recordings = max(pairs + 1, FEWEST) if loaded else pairs + 1
+                self._record_side(
+                    loaded, recordings, executed, mounting, choices, links or _own_link
+                )
             pairs += 1
             if record is not None and record.measured < pairs:
                 result = self._weighed_so_far(pairs, reporter)
@@ -310,7 +312,7 @@ class PayloadCampaign:
     def _record_side(
         self,
         loaded: bool,
-        wanted: int,
+        recordings: int,
         execute: Execute,
         mounting: PayloadMounting,
         choices: Mapping[str, Any],
@@ -319,7 +321,7 @@ class PayloadCampaign:
         """Run a side up to a number of repetitions, if some are missing."""
         side = self.side(loaded)
         missing = [
-            k for k in range(wanted) if side.folder.complete_archive("excitation", k) is None
+            k for k in range(recordings) if side.folder.complete_archive("excitation", k) is None
         ]
         if not missing:
             return
@@ -332,7 +334,7 @@ class PayloadCampaign:
                 {
                     **choices,
                     "accept_dry_run": choices.get("accept_dry_run", False) and seen,
-                    "repetitions": wanted,
+                    "repetitions": recordings,
                     "link": links(side, 2 * missing[0] + loaded),
                 },
             )

@@ -75,8 +75,8 @@ def with_siblings(estimates: Sequence[Estimate]) -> Siblings | None:
         shift = np.where(determined[number, used], scaled[number] - centred[number], 0.0)
         covariance = own + pulled @ of_mean @ pulled.T
         alone = np.where(determined[number, used], stds[number, used] / rms, 0.0) ** 2
-        room = np.maximum(alone - np.diag(covariance), 0.0)  # no wider than without siblings
-        covariance = covariance + np.diag(np.minimum(doubt * shift**2, room))
+        excess = np.maximum(alone - np.diag(covariance), 0.0)  # no wider than without siblings
+        covariance = covariance + np.diag(np.minimum(doubt * shift**2, excess))
         found.append(_replaced(each, used, centred[number] * rms, covariance, rms))
     every = np.full((2, len(stds[0])), np.nan)
     every[:, used] = mean * rms, np.sqrt(spread) * rms

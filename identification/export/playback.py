@@ -50,15 +50,15 @@ def played_back(
     controls = [driven.index(joint) for joint in joints]
     step = float(model.opt.timestep)
     grid = np.arange(time[0], time[-1] + 0.5 * step, step)
-    wanted = np.column_stack([np.interp(grid, time, column) for column in command.T])
+    targets = np.column_stack([np.interp(grid, time, column) for column in command.T])
     data.qpos[places] = start
-    for control, first in zip(controls, wanted[0], strict=True):
+    for control, first in zip(controls, targets[0], strict=True):
         samples = int(model.actuator_history[control][0])
         if samples:  # the first command acts before the motion as well
             times = step * np.arange(-samples, 0.0)
             mujoco.mj_initCtrlHistory(model, data, control, times, np.full((samples, 1), first))
-    positions = np.empty_like(wanted)
-    for k, row in enumerate(wanted):
+    positions = np.empty_like(targets)
+    for k, row in enumerate(targets):
         positions[k] = data.qpos[places]
         data.ctrl[controls] = row
         mujoco.mj_step(model, data)

@@ -186,8 +186,8 @@ class _Reading:
         for key, count in _NUMBERS[tag].items():
             text = attributes.get(key)
             if text is not None and not (_FORMS[count].fullmatch(text) and _finite(text)):
-                wanted = "one number" if count == 1 else f"{count} numbers"
-                return f"link {self._link!r} has {key}={text[:40]!r} {where}; write only {wanted}"
+                expected = "one number" if count == 1 else f"{count} numbers"
+                return f"link {self._link!r} has {key}={text[:40]!r} {where}; write only {expected}"
         if tag == "mass" and (mass := float(attributes["value"])) < 0.0:
             return f"link {self._link!r} has a mass of {mass:g} kg; write 0 or more"
         if self._has_blanks():
