@@ -189,6 +189,6 @@ class MotorSide:
         return motor
 
     def joint_difference(self, motor: Array) -> Array:
-        """Convert differences of motor revolutions (n,) to those of joint positions (n,) rad."""
+        """Convert differences (n,) of motor revolutions to those of joint positions [rad]."""
         difference: Array = np.dot(motor, self._to_joint)
         return difference

@@ -104,7 +104,7 @@ class ModeRefused(RefusalError):
 
 
 class ExitTimeout(RefusalError):
-    """The controller did not end open mode after the session asked for it."""
+    """The controller did not end open mode after the session requested it."""
 
 
 class SessionFailed(RefusalError):

@@ -2,7 +2,7 @@
 
 All fields are little-endian int32 or IEEE float32 without padding. The cyclic layout is the same
 in both directions; the controller sends first and every reply has the received number plus one.
-Quantities are those of the wire (motor revolutions, revolutions per cycle, A).
+Quantities are as on the wire (motor revolutions, revolutions per cycle, A).
 Layout and codes: facts on the C4G Open wire, sections 2 to 4.
 """
 

@@ -403,7 +403,7 @@ def ranked(savings: Array) -> NDArray[np.intp]:
     """Return the order in which to try the rows of savings (s, ...) [s], best first.
 
     Rows are those of `FIRST_SHARES`, -inf where there is no corner; the first, which was
-    requested, comes first unless another one is better by `BETTER`.
+    requested, comes first unless another is better by `BETTER`.
     """
     preferred = savings.copy()
     preferred[0] += BETTER

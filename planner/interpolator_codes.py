@@ -1,6 +1,6 @@
 """Codes, events and steps of the services of RRS-1.
 
-The numbers are those of public clients of RRS-1 and of COMAU's ORL, where not said otherwise.
+The numbers are as in public clients of RRS-1 and in COMAU's ORL, unless stated otherwise.
 """
 
 from __future__ import annotations

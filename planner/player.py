@@ -130,8 +130,8 @@ class TrajectoryPlayer:
 
     Each may be called between any two cycles, also while the rate changes. An override during a
     hold takes effect with `resume`. An override while a resumed motion accelerates changes the
-    target at once, within the bounds of a stop if those of an override do not suffice. While the
-    arm is at rest at the start of the motion, every rate applies at once.
+    target at once, within the bounds of a stop if the bounds of an override do not suffice. While
+    the arm is at rest at the start of the motion, every rate applies at once.
 
     Args:
         trajectory: Motion within `limits`.
@@ -139,7 +139,7 @@ class TrajectoryPlayer:
         limits: Limits of the trajectory, to which the factors refer.
         override_acceleration, override_jerk: Largest acceleration and jerk while an override
             changes, as multiples (> 1) of the limits.
-        stop_acceleration, stop_jerk: The same during a stop; not below those of an override.
+        stop_acceleration, stop_jerk: The same during a stop; not below the bounds of an override.
         start_tolerance: Largest distance of a joint from the start of the trajectory [rad].
         extendable: Bounds of changes of the rate hold for any motion within `limits`, and `extend`
             may be called.

@@ -132,7 +132,7 @@ class TimeLaw:
         self._follow(ramp(self.rate, self.slope, target, bounds))
 
     def advance(self) -> None:
-        """Let one period pass."""
+        """Advance by one period."""
         # Counted from the last change of target, so that no rounding accumulates.
         self._ticks += 1
         t = self._ticks * self._period

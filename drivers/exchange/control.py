@@ -1,7 +1,7 @@
 """The block of shared memory through which the processes of one cell exchange requests and state.
 
 Fields of eight bytes, each with one writer, read without locks: a store of eight aligned bytes
-is atomic. Times are those of CLOCK_MONOTONIC, the same in every process.
+is atomic. Times are of CLOCK_MONOTONIC, the same in every process.
 """
 
 from __future__ import annotations

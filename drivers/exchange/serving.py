@@ -121,7 +121,7 @@ class CommandHandler:
 
     Runs the commands of the supervisor and publishes state and events.
 
-    `terminated` returns whether the process was asked to end: stop on the path, leave open mode,
+    `terminated` returns whether the process is to end: stop on the path, leave open mode,
     end. With `needs_archive` motions are stopped and refused while the archive is not written.
 
     Attributes:

@@ -1,4 +1,4 @@
-"""Cycles of a session beside the real one, which bring the code of a cycle into the caches."""
+"""Cycles of a second session, which bring the code of a cycle into the caches."""
 
 from __future__ import annotations
 
@@ -107,7 +107,7 @@ class WarmUp:
         self.session.events()
 
     def cycle(self, *, opened: bool = True) -> None:
-        """Let the session reply to one more packet."""
+        """Have the session reply to one more packet."""
         packet = self._packets.next(opened=opened)
         if self._link is not None:
             self._link.send(packet)

@@ -214,7 +214,7 @@ class UdpTransport:
         return counts
 
     def forget_peer(self) -> None:
-        """Let the next datagram of the controller's host select its port."""
+        """Take the controller's port from the next datagram of its host."""
         self._peer = None
 
     def close(self) -> None:

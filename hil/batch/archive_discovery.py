@@ -243,7 +243,7 @@ def _inspected(
     cluster: Cluster,
     advance: Callable[[float], None],
 ) -> dict[str, ArchiveRef | SkippedArchive]:
-    """Return what workers find in archives; those of a task that fails are tried one by one."""
+    """Return what workers find in archives; the archives of a failed task are tried one by one."""
     refs: dict[str, ArchiveRef | SkippedArchive] = {}
     chunks = [places[k : k + _CHUNK] for k in range(0, len(places), _CHUNK)]
     tasks = [ClusterTask(chunk[0], inspect_archives, (chunk, cache)) for chunk in chunks]
@@ -283,7 +283,7 @@ def open_ref(ref: ArchiveRef) -> Archive:
 
 @contextmanager
 def errors_of_origin(ref: ArchiveRef) -> Iterator[None]:
-    """Let errors about the archive of a log name the log."""
+    """Name the log in errors about its archive."""
     try:
         yield
     except InputError as error:

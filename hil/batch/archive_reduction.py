@@ -36,7 +36,7 @@ Term = TypeVar("Term", Factor, Reduction)
 
 @dataclass(frozen=True, eq=False)
 class Summary:
-    """Results of one archive, beside the sum of several."""
+    """Results of one archive, in addition to the sum of several."""
 
     ref: ArchiveRef
     #: its factor as one block, or as several parts if the archives are few

@@ -1,6 +1,6 @@
 """Clusters that execute the tasks of a batch.
 
-Those of few archives run in a thread of this process, others on a local Dask cluster of one process
+Few archives run in a thread of this process, others on a local Dask cluster of one process
 per core, or on the cluster of a scheduler. Linear algebra has one thread in the processes of a
 local cluster, so that the bits do not depend on their number.
 """
@@ -377,7 +377,7 @@ def _unexpected(error: BaseException) -> BaseException:
 
 
 def error_of(future: AnyFuture) -> BaseException | None:
-    """Return the error of a future that is done; one of Dask is asked only if it has one."""
+    """Return the error of a future that is done; Dask's is read only if there is one."""
     if isinstance(future, LocalFuture) or future.status == "error":
         error: BaseException | None = future.exception()
         return error

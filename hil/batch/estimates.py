@@ -90,7 +90,7 @@ class BatchEstimate:
 
 @dataclass(frozen=True)
 class ArmModel:
-    """Everything that an estimate of an arm needs beside factors; pickled to workers."""
+    """Everything that an estimate of an arm needs in addition to factors; pickled to workers."""
 
     digest: str
     cell: str  #: text of its cell file
@@ -289,7 +289,7 @@ class Estimator:
         return posterior, notes
 
     def of_archive(self, summary: Summary, posterior: Posterior, share: float) -> Estimate:
-        """Return the estimate from one archive, this share of those of the posterior.
+        """Return the estimate from one archive, this share of the archives of the posterior.
 
         That of the consistent estimator is unconstrained, as in `hil identify`. The scatter of the
         scores is that of the archive by itself.

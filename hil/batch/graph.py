@@ -188,7 +188,7 @@ def reidentify(
 ) -> BatchResult:
     """Identify every arm from all its archives: by repetition, by campaign, and pooled.
 
-    The numbers are those of `hil identify` on the archives of a campaign with the same held out.
+    The numbers equal those of `hil identify` on the archives of a campaign with the same held out.
     They depend neither on the order in which archives are found nor on the workers. A single
     recording is never split.
 
@@ -258,7 +258,7 @@ class _ArmWork:
 
     @property
     def has_pooled(self) -> bool:
-        """Whether the pooled estimate is another one than that of its only campaign."""
+        """Whether the pooled estimate differs from that of its only campaign."""
         return len(self.campaigns) > 1
 
 
@@ -282,8 +282,8 @@ class _Batch:
     def with_settings(self, campaigns: Sequence[_Campaign]) -> list[_Campaign]:
         """Decide the settings of campaigns; return those that have some.
 
-        Those of a type of arm are decided on its first readable campaign; the others use them with
-        their own noise: comparisons need one friction law, and sums the same columns.
+        The settings of a type of arm are decided on its first readable campaign; the others use
+        them with their own noise: comparisons need one friction law, and sums the same columns.
         """
         arms: dict[str, Settings] = {}
         types = {campaign.key: campaign.arm_type for campaign in campaigns}
@@ -387,7 +387,7 @@ class _Batch:
     def _estimate(
         self, arms: Sequence[_ArmWork], advance: Callable[[float, str], None]
     ) -> list[_ArmWork]:
-        """Execute the graphs of some arms; return those of which a task ended its process.
+        """Execute the graphs of some arms; return the arms of which a task ended its process.
 
         The archives that did are removed from these, and reported.
         """
@@ -495,7 +495,7 @@ class _Batch:
         campaign.refs = [ref for ref in campaign.refs if ref.origin not in paths]
 
     def _model(self, digest: str, members: Sequence[_Campaign]) -> ArmModel:
-        """Return what the estimates of an arm need beside factors."""
+        """Return what the estimates of an arm need in addition to factors."""
         ref = members[0].refs[0]
         texts = self.cache.get(ref.origin, ref.cell, CellTexts)
         if texts is None:

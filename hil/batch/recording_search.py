@@ -1,4 +1,4 @@
-"""Search for recordings at and below places: archives, and where asked for, logs and bags."""
+"""Search for recordings at and below places: archives, and on request logs and bags."""
 
 from __future__ import annotations
 

@@ -281,7 +281,7 @@ def _starts_with(file: Path, signature: bytes) -> bool:
 
 @contextmanager
 def _named(path: Path, file: Path) -> Iterator[None]:
-    """Name the user's file in errors on another one."""
+    """Name the user's file in errors on another file."""
     try:
         yield
     except SourceError as error:
@@ -293,7 +293,7 @@ def _named(path: Path, file: Path) -> Iterator[None]:
 def _provide(file: Path, target: Path) -> None:
     """Make a file readable at a path without special characters: linked, or decompressed.
 
-    A database that was not closed has its last messages in a log beside it: those are merged in a
+    A database that was not closed has its last messages in a log next to it: they are merged in a
     copy.
     """
     if file.suffix in _PACKED:

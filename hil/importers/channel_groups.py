@@ -29,7 +29,7 @@ class ChannelGroup:
         names: in the order of the joints, without units.
         size: numbers in a sample.
         unit: that the log states for the first, None without one.
-        by_joint: whether the names are those of joints of the URDF.
+        by_joint: whether the names are of joints of the URDF.
         by_words: how words in names say the quantity; None where a whole name does.
     """
 

@@ -75,7 +75,7 @@ class Channel:
 
     Attributes:
         name: as a column map names it.
-        size: numbers in a sample: 1, or those of a whole array.
+        size: numbers in a sample: 1, or all of an array.
         samples: how many there are.
         unit: that the log states, None if it states none.
         dtype: numpy's name of the type that the file has, ``text`` in a table.
@@ -227,7 +227,7 @@ _Place = TypeVar("_Place", int, str)
 
 
 def _repeated_times(table: TextTable | ArrayFile, places: Sequence[_Place]) -> set[_Place]:
-    """Return the columns of times that are all those of a column before."""
+    """Return the columns whose times are all the same as in an earlier column."""
     repeated = set()
     earlier: list[Sequence[int | None]] = []
     for place in places if len(places) > 1 else ():

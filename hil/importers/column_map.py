@@ -72,8 +72,8 @@ class Quantity(_Table):
         offset: added to the recorded numbers, one for all joints or one each.
         scale: factor after that, one for all joints or one each.
         side: ``motor`` if it was measured before the gears.
-        time: its own times, where they are not those of `[time]`; by default in its own file.
-        coupled: angles or velocities that contain those of other joints, as terms ``[joint, other,
+        time: its own times, where they differ from `[time]`; by default in its own file.
+        coupled: angles or velocities that contain other joints', as terms ``[joint, other,
             factor]``, numbered from 1: with ``[3, 2, 1.0]`` axis 3 is stated relative to the base.
     """
 

@@ -299,7 +299,7 @@ class MergedMessages(Conclusion):
 
 @dataclass(frozen=True)
 class OneTimeBase(Conclusion):
-    """Quantities with times of their own, interpolated to those of one of them.
+    """Quantities with times of their own, interpolated to the times of one of them.
 
     Attributes:
         counts: samples of each quantity.

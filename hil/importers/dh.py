@@ -122,7 +122,7 @@ def _link(name: str) -> str:
 def _fixed(
     parent: str, child: str, position: tuple[float, float, float], roll: float
 ) -> tuple[str, str]:
-    """Return a link fixed to another one, translated and then rotated about x."""
+    """Return a link fixed to another, translated and then rotated about x."""
     xyz = " ".join(map(repr, position))
     joint = (
         f'<joint name="fixed_{child}" type="fixed"><parent link="{parent}"/>'
@@ -132,7 +132,7 @@ def _fixed(
 
 
 def _moving(row: _Row, parent: str, child: str, lift: float) -> tuple[str, str]:
-    """Return a link that rotates about, or slides along, the z axis of another one."""
+    """Return a link that rotates about, or slides along, the z axis of another."""
     limit = (
         "" if row.type == "continuous" else '<limit lower="0" upper="0" effort="0" velocity="0"/>'
     )

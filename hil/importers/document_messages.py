@@ -1,6 +1,6 @@
 """Messages in JSON or Protobuf to arrays: one column for each number in them.
 
-Both are trees of names and numbers; a list beside a list of names of the same length has a column
+Both are trees of names and numbers; a list next to a list of names of the same length has a column
 for each name.
 """
 

@@ -1,7 +1,7 @@
 """A folder with a file for each quantity, such as ``q.txt``, ``dq.txt`` and ``tau.txt``.
 
-What a file holds is said by the names of its columns, or else by its own name; its times are a
-column of its own, or those of a file that holds nothing else.
+The names of its columns, or else its own name, say what a file holds; its times are a
+column of its own, or in a file that holds nothing else.
 """
 
 from __future__ import annotations

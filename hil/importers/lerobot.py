@@ -115,7 +115,7 @@ class DataSet:
         """Return the column map of each episode for a robot, TOML, and the units that it has.
 
         Args:
-            robot: whose joints are named as those of the data set, or in their order.
+            robot: whose joints have the names of the data set, or its order.
             calibration: LeRobot's calibration of the arm, JSON; None without one.
             unit: of the joints, None to conclude it.
 

@@ -489,7 +489,7 @@ class _Search:
         raise SourceError(self._log, problem, field=", ".join(missing), remedy=remedy)
 
     def _files(self) -> dict[Kind, str]:
-        """Return the files beside the log whose names say a quantity."""
+        """Return the files next to the log whose names say a quantity."""
         files: dict[Kind, str] = {}
         for path in sorted(self._log.parent.glob(f"*{self._log.suffix}")):
             for kind in kinds_of_file(path):

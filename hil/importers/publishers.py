@@ -1,4 +1,4 @@
-"""Samples of a second publisher among those of a recording."""
+"""Samples of a second publisher in a recording."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ class FrozenSamples(NamedTuple):
 
 
 def second_publisher(position: Array, sample: Sample) -> FrozenSamples:
-    """Find those of positions (m, n) [rad or m]."""
+    """Find samples of a second publisher in positions (m, n) [rad or m]."""
     rows = _of_one_pose(position)
     if not rows.any():
         return FrozenSamples(rows, None)

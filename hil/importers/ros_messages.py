@@ -40,7 +40,7 @@ class MessageError(ValueError):
 
 @lru_cache(maxsize=64)
 def typestore_of(kind: str, definition: str, encoding: str) -> Typestore:
-    """Return the types of messages: those of a definition, or of ROS 2 where there is none.
+    """Return the types of messages: by a definition, or by ROS 2 where there is none.
 
     `encoding` is that of the definition, ``ros2msg``, ``ros2idl`` or empty.
 
@@ -66,7 +66,7 @@ def typestore_of(kind: str, definition: str, encoding: str) -> Typestore:
 
 
 def definitions_of(kind: str, definition: str) -> tuple[str, ...]:
-    """Return the definitions that messages may have: the given one, or those of releases of ROS 2.
+    """Return the definitions that messages may have: the given one, or of releases of ROS 2.
 
     Bags of Humble and before have none, and `rosbags` none of the messages of controllers.
     """

@@ -155,7 +155,7 @@ def recorded_joints(
     topic: str | None = None,
     joint_names: Mapping[str, str] | None = None,
 ) -> tuple[str, ...]:
-    """Return the joints of a bag, by their names in the URDF: those of all its messages.
+    """Return the joints in all messages of a bag, by their names in the URDF.
 
     Raises:
         SourceError: no bag, no such topic, or no message.
@@ -201,7 +201,7 @@ def joint_state_topics(topics: Mapping[str, Topic]) -> list[str]:
 
 @dataclass
 class _Part:
-    """Messages of some of the joints: those of one publisher, in most bags the only one."""
+    """Messages of some of the joints, by one publisher, in most bags the only one."""
 
     joints: tuple[str, ...]  #: of the robot, in its order
     numbers: list[int] = field(default_factory=list)  #: of the messages in the topic

@@ -24,7 +24,7 @@ _LARGEST_PART: Final = 10_000.0  # per mille
 
 
 class Encoder(NamedTuple):
-    """Ticks of an encoder: those of a turn, and the one at which the angle is zero."""
+    """Ticks of an encoder: in a turn, and at the zero of the angle."""
 
     ticks: int
     middle: int
@@ -72,7 +72,7 @@ def sign_bit_of(values: Array) -> int | None:
 
 
 def are_per_mille(names: Sequence[str], values: Array) -> bool:
-    """Return whether values (m, n) are those of the objects 6077h or 6078h of a drive.
+    """Return whether values (m, n) are of the objects 6077h or 6078h of a drive.
 
     These are whole, in per mille of its rated torque or current.
     """

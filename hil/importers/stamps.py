@@ -158,9 +158,9 @@ def is_clock(values: Array) -> bool:
 
 
 def check_clock(stamp: Stamps, path: Path, remedy: str | None = None) -> None:
-    """Check that stamps (m,) [ns] of a file can be those of a motion.
+    """Check that stamps (m,) [ns] of a file can be of a motion.
 
-    `remedy` replaces those of a log with a column map.
+    `remedy` replaces the remedies of a log with a column map.
 
     Raises:
         SourceError: they run backwards, are all the same, or are too far apart.

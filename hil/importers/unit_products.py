@@ -1,6 +1,6 @@
 """Units that are products and quotients of others: ``kgf cm``, ``ozf-in``, ``lbf.ft``, ``gon/s``.
 
-Factors are those of NIST SP 811, appendix B.
+Factors by NIST SP 811, appendix B.
 """
 
 from __future__ import annotations

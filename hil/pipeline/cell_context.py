@@ -1,4 +1,4 @@
-"""Facts about cell and recordings that an estimate and its verdict need beside the model."""
+"""What an estimate and its verdict need of cell and recordings in addition to the model."""
 
 from __future__ import annotations
 

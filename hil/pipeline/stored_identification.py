@@ -71,7 +71,7 @@ def read_or_identify(
 
 
 class NotReusableError(Exception):
-    """Why the files of an earlier identification are not those of its archives."""
+    """Why the files of an earlier identification do not belong to its archives."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -225,7 +225,7 @@ def _files_of(folder: Path) -> tuple[Results, Mapping[str, Any], Mapping[str, st
 
 
 def _archives_of(folder: Path, settings: SettingsResult) -> list[Path]:
-    """Return the archives that `hil identify` uses of a folder, or those of its results beside it.
+    """Return the archives that `hil identify` uses of a folder, or of its results next to it.
 
     Raises:
         NotReusableError: there are none.

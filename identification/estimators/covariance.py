@@ -225,7 +225,7 @@ def block_length(scores: Array) -> int:
 
 
 def lag_correlation(scores: Array) -> float:
-    """Return the mean correlation of scores (B, k) with those of the next block."""
+    """Return the mean correlation of scores (B, k) with the scores of the next block."""
     power = (scores**2).sum(axis=0)
     both = (scores[1:] * scores[:-1]).sum(axis=0)
     return float(np.mean(both[power > 0.0] / power[power > 0.0])) if power.any() else 0.0

@@ -101,7 +101,7 @@ def predicted_rate(samples: Samples, torque: Array) -> Array:
 def rate_products(model: RobotModel, samples: Samples) -> Array:
     """Return sums ``W' d[W | t]/dt`` per joint (n, p, p + 1); t is of the known payload.
 
-    Of all rows: those of a stretch do not cancel as those of a whole motion do.
+    Of all rows: over a stretch they do not cancel as they do over a whole motion.
     """
     products = np.zeros((model.n_joints, model.n_parameters, model.n_parameters + 1))
     m = len(samples.torque)
@@ -227,7 +227,7 @@ class DelayEstimate:
         Errors of the stated value are Gaussian, with the variance of uniform ones of up to `bound`
         either way; the estimate, significant or not, has its own and a `bias` (standard deviation).
         A determined estimate may also show the stated value to be wrong: before it, errors of up to
-        `LONGEST_DELAY` are as likely. A minimum at a limit, or beside another one, tells nothing.
+        `LONGEST_DELAY` are as likely. A minimum at a limit, or next to another, tells nothing.
         """
         near = bound**2 / 3.0
         narrow = self.half_interval <= WIDEST_INTERVAL

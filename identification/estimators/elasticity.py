@@ -8,7 +8,7 @@ gears grows with the square of the frequency, as torques of inertia do at low on
 
 Parameters take most of that up, so that no residual shows their error. Compliances are fitted
 beside them, about zero with the standard deviation of `RESONANCE`, and their mean square is added
-to the covariance of the parameters, which stay those of rigid gears.
+to the covariance of the parameters, which stay as of rigid gears.
 """
 
 from __future__ import annotations
@@ -167,7 +167,7 @@ def open_compliance(
 
     Args:
         inverse: of the information (p, p).
-        products: of the parameters' columns with those of the compliances (p, n).
+        products: of the parameters' columns with the compliances' (p, n).
         squares: of the compliances' columns (n, n).
         design_effect: rows that count as one.
     """
@@ -181,7 +181,7 @@ def expected_square(covariance: Array, *, rigid: bool) -> Array:
 
     `covariance` (n, n) is what its recordings will leave open. Their means scatter about zero: of
     rigid gears by the noise, else with what the recordings show of the expected ones. None is
-    negative; those of different gears are taken for independent.
+    negative; different gears are taken for independent.
     """
     shown = np.eye(len(covariance)) - covariance
     variance = np.diag(covariance @ shown if rigid else shown)
@@ -212,7 +212,7 @@ def with_elastic_gears(
             rows.
         design_effect: rows that count as one.
         precision: information (p, p) of a prior in addition to the rows.
-        believed: parameters (p,) of rigid gears by that prior, by default those of the estimate;
+        believed: parameters (p,) of rigid gears by that prior, by default of the estimate;
             what a stronger prior leaves unexplained is no torque of gears.
         times: see `torque`.
         excess: scores (p,) of the rows of `torque`, each `times`, beyond those of the factor; of

@@ -111,7 +111,7 @@ def form_uncertainty(
         estimate: with this law.
         factor: of the fitted rows.
         forms: :func:`form_factor` of them, or of some repetitions of the same motion.
-        precision: information (p, p) of a prior beside the factor.
+        precision: information (p, p) of a prior, in addition to the factor.
     """
     trials = _trials(model, estimate, factor, forms, precision)
     # Student's t, as a normal variable that is exceeded as rarely.
@@ -151,7 +151,7 @@ def _share(model: RobotModel, estimate: Estimate, factor: Factor, shift: Array) 
 def _trials(
     model: RobotModel, estimate: Estimate, factor: Factor, forms: Factor, precision: Array | None
 ) -> _Trials:
-    """Fit the coefficient of each further term beside the parameters."""
+    """Fit the coefficient of each further term together with the parameters."""
     n = model.n_joints
     p = model.n_parameters
     q = len(FORMS)

@@ -286,7 +286,7 @@ def mass_difference(model: RobotModel, runs: Sequence[Run]) -> tuple[float, floa
 
 
 def _consistent(mass: float, centre: Array, six: Array) -> Body:
-    """Return the body whose second moments about its centre are those of a tensor (6,), or zero."""
+    """Return the body with the second moments of a tensor (6,) about its centre, or zero."""
     about = body(np.concatenate([six, np.zeros(3), [mass]]))
     moments, axes = np.linalg.eigh(pseudo_inertia(inertial_parameters(about)))
     inside = inertial_from_pseudo((axes * np.maximum(moments, 0.0)) @ axes.T)

@@ -1,6 +1,6 @@
 """The joint problem of recordings without and with a body, see :mod:`.payload_estimate`.
 
-Its unknowns are those of arm and body, and drifts of each recording.
+Its unknowns are of arm and body, and drifts of each recording.
 """
 
 from __future__ import annotations

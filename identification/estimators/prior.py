@@ -105,7 +105,7 @@ class TorqueSums(NamedTuple):
         return np.maximum((self.gram @ augmented) @ augmented, 0.0)
 
     def each(self) -> Iterator[TorqueSums]:
-        """Yield those of each of K torques."""
+        """Yield the sums of each of K torques."""
         return map(TorqueSums, self.gram, self.samples)
 
     def posterior(
@@ -320,7 +320,7 @@ def with_prior(
         model: of the arm.
         factor: of the data.
         prior: of the parameters.
-        weights: of the joints (n,), by default those of an ordinary fit without prior.
+        weights: of the joints (n,), by default of an ordinary fit without prior.
         design_effect: by which the information of the data is divided.
 
     Raises:
@@ -650,7 +650,7 @@ def _mean_and_deviations(
 
 
 def _standard_deviations(model: RobotModel, share: float, masses: Array, length: Array) -> Array:
-    """Return those of the standard parameters (s,) of bodies and rotors."""
+    """Return standard deviations of the standard parameters (s,) of bodies and rotors."""
     std = np.zeros(model.layout.size)
     std[model.layout.links] = _body_deviations(share * masses, length)
     std[model.layout.rotors] = _outboard_inertia(model, masses, length)
@@ -665,7 +665,7 @@ def nominal_deviations(model: RobotModel, share: float = BODY_SHARE) -> Array:
 
 
 def _friction_deviations(model: RobotModel, sums: TorqueSums, whole_torque: Array) -> Array:
-    """Return those of friction and elements ([K,] k), of coefficients that each may have alone."""
+    """Return standard deviations of friction and elements ([K,] k), each as if it acted alone."""
     std = whole_torque.copy()
     one_way = _one_way(model, sums)
     for k, term in enumerate(model.friction.terms):
@@ -697,7 +697,7 @@ def _one_way(model: RobotModel, sums: TorqueSums) -> Array:
 
 
 def _body_deviations(mass: Array, length: Array) -> Array:
-    """Return those of inertia, moment and mass (n, 10) of deviating masses of these lengths."""
+    """Return standard deviations of inertia, moment and mass (n, 10) of bodies of these lengths."""
     sizes = np.column_stack([mass * length**2, mass * length, mass])
     return np.repeat(sizes, [6, 3, 1], axis=1)
 
@@ -829,7 +829,7 @@ def _is_placeholder(model: RobotModel, sums: TorqueSums) -> NDArray[np.bool_]:
 def nominal_ratio(model: RobotModel, factor: Factor) -> tuple[float, float]:
     """Return the ratio of measured to nominal torque over all joints, and its deviation.
 
-    Friction, offsets and rotors are fitted beside it. NaN and infinity without nominal torque.
+    Friction, offsets and rotors are fitted with it. NaN and infinity without nominal torque.
     """
     ratio, std = _nominal_ratio(model, TorqueSums.of(factor))
     return float(ratio), float(std)

@@ -108,7 +108,7 @@ def _expected(
 ) -> tuple[Array, Array, Array, Array]:
     """Return mean (p,), its covariance, the values of the arms (r, p), and their covariances.
 
-    The covariances (r, p, p) are those of the differences of the arms from the mean.
+    The covariances (r, p, p) are of the differences of the arms from the mean.
     """
     identity = np.eye(len(spread))
     own = np.asarray(np.linalg.inv(information + np.diag(1.0 / spread)))

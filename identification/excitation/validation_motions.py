@@ -45,8 +45,7 @@ def random_validation_motions(
     """Return random motions across the joint ranges to validate predictions on.
 
     They satisfy the same constraints as an excitation. Their random numbers are independent of
-    those of any search. The same seed gives the same motions bit for bit, the first ones for any
-    `count`.
+    every search. The same seed gives the same motions bit for bit, the first ones for any `count`.
 
     Args:
         limits: of the joints.

@@ -34,7 +34,7 @@ def patched(text: str, actuators: Actuators) -> str:
 
     Args:
         text: of the file.
-        actuators: of joints, all of which the file has to have by name.
+        actuators: of joints; the file must have all of them by name.
 
     Raises:
         PatchError: it is neither, or a joint is missing.

@@ -194,7 +194,7 @@ def urdf(arm: ExportedArm, name: str, remarks: Sequence[str] = ()) -> str:
 def pinocchio_arm(arm: ExportedArm, name: str) -> pin.Model:
     """Return the arm as pinocchio's model, with armature, damping and dry friction.
 
-    It is read from the arm's URDF, so that limits and frames are those of the user's file.
+    It is read from the arm's URDF, so that it has the limits and frames of the user's file.
     """
     model = pinocchio_model(urdf(arm, name), arm.model.locked)
     model.name = name
@@ -410,7 +410,7 @@ def _left_out(form: ModelFormat, arm: ExportedArm, motion: Motion) -> dict[str, 
 def _rounding(arm: ExportedArm, motion: Motion) -> tuple[Array, Array]:
     """Return the torque (m, n) by which links and rotors differ from the base parameters', and it.
 
-    Base parameters are those of a URDF with rounded angles.
+    Base parameters are of a URDF with rounded angles.
     """
     model = arm.model
     base = np.where(np.arange(model.n_parameters) < model.base.rank, arm.values, 0.0)

@@ -1,4 +1,4 @@
-"""Factors of other columns than those of the regressor W.
+"""Factors of other columns than the regressor's W.
 
 Instrumental variables use [Z | W | y], gains [W | t | 1 | i], a search for the direction of gravity
 [W0 | Wx | Wy | Wz | y], uncertain friction laws [W | F | y].

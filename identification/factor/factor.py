@@ -55,7 +55,7 @@ class Factor:
     """Sums over the rows of [W | y] in B blocks of time, joint by joint.
 
     Blocks give the scores of a cluster-robust covariance for any weights and parameters; estimates
-    need their sum only. Other columns than those of W are in
+    need their sum only. Other columns than W are in
     :mod:`identification.factor.columns`.
     """
 

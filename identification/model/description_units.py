@@ -150,7 +150,7 @@ _SI: Final = (1.0, 1.0, 1.0, 1.0)
 
 @lru_cache(maxsize=8)
 def wrong_units(urdf: str) -> tuple[WrongUnit, ...]:
-    """Return the quantities of a URDF in other units than those of SI; none where an arm has them.
+    """Return the quantities of a URDF that are not in SI units; none where an arm has such sizes.
 
     Raises:
         ModelError: the text is not XML.

@@ -1,4 +1,4 @@
-"""Whether the masses of a description can be those of an arm."""
+"""Whether an arm can have the masses of a description."""
 
 from __future__ import annotations
 

@@ -260,7 +260,7 @@ class _Workspace:
     def _add(
         self, link: int, joints: Rows, symbols: Sequence[int], moments_only: bool, first: int
     ) -> None:
-        """Prepare the columns of one link; those of moments of inertia have no force."""
+        """Prepare the columns of one link; moments of inertia have no force."""
         size = self.rows.shape[2]
         twists = self._motion.twists[link]
         part = twists[:, 0] if moments_only else twists.reshape(len(twists), 6, size)

@@ -1,4 +1,4 @@
-"""What stands around an arm."""
+"""Obstacles around an arm."""
 
 from __future__ import annotations
 

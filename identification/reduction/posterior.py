@@ -48,7 +48,7 @@ class Posterior:
 
     @property
     def precision(self) -> Array:
-        """Information of what is believed, as it counts beside that of all rows (p, p)."""
+        """Information of the prior, with the weight that it has against all rows (p, p)."""
         return self.design_effect * self.prior.belief.gaussian.information
 
     def believed(self, factor: Factor) -> Array:

@@ -112,7 +112,7 @@ def reduce(
         uncertain_delay: whether the sums by which a delay moves the parameters are needed.
         known: mean and standard deviation of parameters that are known beforehand, by name.
         unmodelled: whether the recording is one of those that show what the model lacks.
-        elastic: whether positions are those of motors, in front of elastic gears.
+        elastic: whether positions are of motors, in front of elastic gears.
     """
     reduce_rows = form_factor if unmodelled else Factor.by_time
     rows = mean_factor([reduce_rows(model, samples) for samples in versions], shares)

@@ -169,7 +169,7 @@ def _without_timers() -> Iterator[None]:
 def _without_unstable(position: Array, reference: Array) -> Array:
     """Return positions that are not finite from the first on that is far from the reference.
 
-    Those of the joint that is the first to be so are infinite, those of the others NaN.
+    Positions of the joint that becomes unstable first are infinite, all others NaN.
     """
     with np.errstate(invalid="ignore", over="ignore"):
         near = np.abs(position - reference) < LARGEST_ERROR

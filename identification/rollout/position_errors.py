@@ -60,7 +60,7 @@ class RecordedMotion:
         return force if servo is None else force + self._held(servo)
 
     def _held(self, servo: PositionServo) -> Array:
-        """Return the constant torque beside a servo in each window (w, 1, n)."""
+        """Return the constant torque in addition to a servo in each window (w, 1, n)."""
         torque = []
         for stretch in self.windows.stretches:
             position, rate = command_of(stretch, servo.delay)

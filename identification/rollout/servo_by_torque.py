@@ -24,7 +24,7 @@ class NoServoError(IdentificationError):
 
 
 class PositionServo(NamedTuple):
-    """Joint torque ``kp (q_c(t - delay) - q) + kd (v_c(t - delay) - v)`` beside a constant."""
+    """Joint torque ``kp (q_c(t - delay) - q) + kd (v_c(t - delay) - v)`` plus a constant."""
 
     kp: Array  # (n,) [N·m/rad or N/m]
     kd: Array  # (n,) [N·m·s/rad or N·s/m]

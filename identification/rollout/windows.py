@@ -109,7 +109,7 @@ def stretches_of(
 ) -> list[Stretch]:
     """Return the stretches of a recording without gap.
 
-    The positions are interpolated by a cubic spline, of which the velocity is the derivative.
+    The positions are interpolated by a cubic spline, whose derivative is the velocity.
 
     Args:
         samples: of the recording.

@@ -180,7 +180,7 @@ def _jumps(recording: Recording, gap: Rows) -> Iterator[tuple[int, NDArray[np.in
 
 
 def _written_before(recording: Recording, row: int) -> int:
-    """Return how many rows from this one on are those of an earlier place, bit for bit."""
+    """Return how many rows from this one on repeat earlier ones, bit for bit."""
     rows = np.hstack(
         [recording.position, *([] if recording.torque is None else [recording.torque])]
     )

@@ -91,7 +91,7 @@ def repetition_noise(
 
 @dataclass(frozen=True, eq=False)
 class CellContext:
-    """Data on the cell beside its model; None where unknown."""
+    """Data on the cell in addition to its model; None where unknown."""
 
     torque_limit: Array | None = None  # of each joint (n,) [N·m or N], NaN where unknown
     saturated: Array | None = None  # share of samples at the limit of torque or current (n,)
@@ -160,7 +160,7 @@ class Evidence:
 
     @property
     def explanations(self) -> tuple[Explanation, ...] | None:
-        """Changes that explain the errors of the fit; None if not asked."""
+        """Changes that explain the errors of the fit; None if not searched for."""
         return None if self.diagnosis is None else self.diagnosis.explanations
 
     @property

@@ -64,7 +64,7 @@ class WordedFinding:
 
 @dataclass(frozen=True)
 class Naming:
-    """Names in messages: those of the joints, and of the motion that was predicted."""
+    """Names in messages: of the joints, and of the motion that was predicted."""
 
     joints: tuple[str, ...] = ()
     motion: str = UNSEEN

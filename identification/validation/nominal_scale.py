@@ -64,7 +64,7 @@ class NominalScale(NamedTuple):
         return bool(sure >= min(2, len(self.scale)) and np.all(finite_scale < 0.0))
 
     def without(self, joints: Iterable[int]) -> NominalScale:
-        """Return the scales with those of some axes unknown."""
+        """Return the scales with some axes unknown."""
         scale = self.scale.copy()
         scale[sorted(set(joints))] = np.nan
         return self._replace(scale=scale)

@@ -71,8 +71,8 @@ def implausibilities(
         model: of the arm.
         estimate: of its parameters.
         motion: factor of a motion, on which the torque of wrong signs is compared with an error.
-        error_rms: of the prediction of that motion (n,), of which the torque must be a multiple on
-            axes of little torque.
+        error_rms: of the prediction of that motion (n,); on axes of little torque, the torque must
+            be a multiple of it.
         speed: highest of each joint (n,), up to which friction is evaluated.
         added: symbols of friction terms that were chosen, not stated: they follow the friction
             within the fitted speeds and are no reason against a model.

@@ -59,6 +59,6 @@ class Purpose:
 
 
 def good_for(purposes: Sequence[Purpose], asked: Sequence[PurposeName]) -> bool:
-    """Return whether a model is good for every purpose that was asked for."""
+    """Return whether a model is good for every requested purpose."""
     judged = {purpose.name: purpose.good for purpose in purposes}
     return all(judged.get(name) is True for name in asked)

@@ -32,7 +32,7 @@ def purposes_in_a_sentence(
 ) -> str:
     """Return what a model is good for, what not, and what it would notice.
 
-    Purposes that were asked for and could not be judged are named with the reason.
+    Requested purposes that could not be judged are named with the reason.
     """
     good = [_with_figure(p, joints) for p in purposes if p.good]
     bad = [_with_figure(p, joints) for p in purposes if p.good is False]

@@ -209,7 +209,7 @@ def _stated(coefficient: Coefficient) -> float:
 
 
 def _numbers(placed: PlacedElement, coefficients: list[float]) -> Iterator[tuple[str, list[float]]]:
-    """Yield kind and numbers of an element; of a torque ripple those of each order."""
+    """Yield kind and numbers of an element; of a torque ripple for each order."""
 
     def between(anchors: Anchors) -> list[float]:
         return [anchors.base, anchors.link, anchors.angle]

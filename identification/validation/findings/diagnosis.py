@@ -52,7 +52,7 @@ def _without_gravity(found: TorqueDiagnosis) -> Finding:
 
 
 def _zeros(found: TorqueDiagnosis) -> Finding | None:
-    """Return zeros of joints that are other than those of the URDF, or nearest to the data."""
+    """Return zeros of joints that differ from the URDF's, or the nearest to the data."""
     steps = found.zeros
     if not steps:
         return None

@@ -10,7 +10,7 @@ from identification.validation.physical_signs import SIGMAS
 
 
 def nothing_held_out(evidence: Evidence, _: Thresholds) -> Finding | None:
-    """Return that all errors are those of the fit."""
+    """Return that all errors are of the fit."""
     if not evidence.in_sample:
         return None
     return Finding("nothing held out", "wrong", "hold out a motion")
