@@ -435,8 +435,10 @@ def _beyond_chance(
 
 
 def posterior_method(origin: str, design_effect: float, scatter: str) -> str:
-    """Return the description of an estimate from a prior; `scatter` is that of its covariance."""
-    return f"posterior of the prior ({origin}), {design_effect:.3g} rows count as one; {scatter}"
+    """Return the description of an estimate from a prior; `scatter` describes its covariance."""
+    size = f"{design_effect:.3g}"
+    rows = "each row counts" if size == "1" else f"{size} rows count as one"
+    return f"posterior of the prior ({origin}), {rows}; {scatter}"
 
 
 @dataclass(frozen=True, eq=False)

@@ -173,7 +173,7 @@
         if (sharedX.length <= 6) axis.ticker = new Bokeh.FixedTicker({ ticks: Array.from(sharedX) });
         else axis.ticker.desired_num_ticks = 4;
       });
-      if (!chart.log) figure.yaxis.each(function (axis) { axis.ticker.desired_num_ticks = plot.height > 80 ? 5 : 3; });
+      if (!chart.log) figure.yaxis.each(function (axis) { axis.ticker.desired_num_ticks = plot.height > 80 ? 5 : 4; });
       if (!last) figure.xaxis.each(function (axis) { axis.visible = false; });
       if (plot.shaded.length) {
         view.strips.push(figure.vstrip({
