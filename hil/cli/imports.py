@@ -193,7 +193,7 @@ RARE = (
 
 @dataclass(frozen=True)
 class Reading:
-    """Options that state what the channels of a recording are, where that is not concluded."""
+    """Options that state what the channels of a recording are, where that cannot be inferred."""
 
     columns: Annotated[
         Path | None,
@@ -460,7 +460,7 @@ def maps(
 
 
 def _print(recording: ImportedRecording, refusal: SourceError | None, *, json: bool) -> None:
-    """Print what was concluded, what was found, and why an identification would refuse it."""
+    """Print what was inferred, what was found, and why an identification would refuse it."""
     found = [*map(sentence, recording.concluded), *map(sentence, recording.examined.found)]
     warnings = [*map(sentence, recording.examined.warnings)]
     warnings += [] if refusal is None else [str(refusal)]

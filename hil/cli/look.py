@@ -31,7 +31,7 @@ from hil.look.readings import Fact
 from identification.text import joined, percentage
 
 IN_DOUBT = 2
-"""Exit status of a recording with two readings that fit alike."""
+"""Exit status of a recording that two explanations fit equally well."""
 
 
 @with_options(Described, "arm", but=("friction", "standstill_speed"))
@@ -49,7 +49,7 @@ def look(
 
     Names and units say a part, the slope of the positions another, and with --urdf the torque:
     side, sign, order and zero of the joints, gravity, mounting, delay and low-pass. Where two
-    readings fit alike, both are shown with their errors; on a terminal one is asked for, else the
+    explanations fit equally well, both are shown with their errors; on a terminal you choose, else the
     lines to choose from are printed, to be added to the map, and the exit status is 2.
 
     **Example:** `hil look log.csv --urdf arm.urdf`
@@ -77,7 +77,7 @@ def look(
     if output is not None and text is not None:
         write_output(output, text)
         if not json:
-            say(f"wrote {output}{', without what is open: add a line' if is_open else ''}")
+            say(f"wrote {output}{', without what is undetermined: add a line' if is_open else ''}")
     if is_open:
         raise typer.Exit(IN_DOUBT)
 
@@ -111,7 +111,7 @@ def screen(result: Look) -> list[str]:
 
 
 def question(choices: Sequence[TiedReading]) -> list[Paragraph]:
-    """Return a question about readings that fit alike, and the setting for each of them."""
+    """Return a question about explanations that fit equally well, and the setting for each of them."""
     question = f"{choices[0].aspect}: {fit_alike(choices)}; choose one line for the map:"
     parts = [Paragraph(question)]
     for number, choice in enumerate(choices, 1):
@@ -129,7 +129,7 @@ def _options(result: Look) -> list[str]:
 
 
 def _ask(choices: Sequence[TiedReading]) -> TiedReading | None:
-    """Ask which reading is right; None if that is not known."""
+    """Ask which explanation is right; None if that is not known."""
     numbers = "1 or 2" if len(choices) == 2 else f"1 to {len(choices)}"
     answer = typer.prompt(f"{choices[0].aspect}: {numbers}, or 0 if unknown", type=int, default=0)
     return choices[answer - 1] if 1 <= answer <= len(choices) else None

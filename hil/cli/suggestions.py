@@ -1,4 +1,4 @@
-"""Former names of commands and options, and what is said of misspelt and missing ones."""
+"""Former names of commands and options, and answers to misspelt and missing ones."""
 
 from __future__ import annotations
 
