@@ -49,8 +49,8 @@ def look(
 
     Names and units say a part, the slope of the positions another, and with --urdf the torque:
     side, sign, order and zero of the joints, gravity, mounting, delay and low-pass. Where two
-    explanations fit equally well, both are shown with their errors; on a terminal you choose, else the
-    lines to choose from are printed, to be added to the map, and the exit status is 2.
+    explanations fit equally well, both are shown with their errors; on a terminal you choose, else
+    the lines to choose from are printed, to be added to the map, and the exit status is 2.
 
     **Example:** `hil look log.csv --urdf arm.urdf`
 
@@ -72,8 +72,9 @@ def look(
             is_open = True
         elif text is not None and chosen.entries:
             text = with_entries(text, chosen.entries)
+    text = text if text is not None else result.bag_text
     if output is not None and text is None:
-        say(f"note: {output} is not written: a bag has no columns to map", err=True)
+        say(f"note: {output} is not written: an archive needs no map", err=True)
     if output is not None and text is not None:
         write_output(output, text)
         if not json:
@@ -111,7 +112,7 @@ def screen(result: Look) -> list[str]:
 
 
 def question(choices: Sequence[TiedReading]) -> list[Paragraph]:
-    """Return a question about explanations that fit equally well, and the setting for each of them."""
+    """Return a question about explanations that fit equally well, with the setting of each."""
     question = f"{choices[0].aspect}: {fit_alike(choices)}; choose one line for the map:"
     parts = [Paragraph(question)]
     for number, choice in enumerate(choices, 1):

@@ -652,11 +652,8 @@ def _by_map(
     concluded: tuple[Conclusion, ...],
 ) -> ImportedRecording:
     """Return what a column map read, with the map as which it is read again."""
-    text = with_arm(text, robot.links)
-    if request.outside_limits and not columns.outside_limits:
-        text = with_values(text, {"outside_limits": True})
     request = replace(request, outside_limits=request.outside_limits or columns.outside_limits)
-    return request.imported(content, text, concluded)
+    return request.imported(content, with_arm(text, robot.links), concluded)
 
 
 def _bag_map(options: ImportOptions) -> BagMap:
@@ -698,7 +695,7 @@ def _read_bag(
     keys = ("topic", "clock", "effort", "command_topic")
     read = {key: entries[key] for key in keys if key in entries}
     request = replace(request, outside_limits=request.outside_limits or stated.outside_limits)
-    others = {"arm": robot.links, "outside_limits": request.outside_limits}
+    others = {"arm": robot.links, "outside_limits": stated.outside_limits}
     bag = BagMap.model_validate({**read, "rename": _used(names, robot), **others})
     basis = NameBasis.MESSAGE, UnitBasis.MESSAGE
     concluded = tuple(

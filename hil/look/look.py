@@ -76,10 +76,12 @@ def look_at(source: Path, robot_of: RobotOf | None, options: ImportOptions) -> L
     except (RecordingError, SourceError) as error:
         raise SourceError(source, str(error)) from error
     rows = signals.rows(recorded, imported, cell if described else None)
-    if not described:
+    if described:
+        look = _with_torque(source, recorded, imported, cell, rows)
+    else:
         rows.append(_without_robot(recorded.recording))
-        return Look(source.name, tuple(rows), (), (), imported.map_text)
-    return _with_torque(source, recorded, imported, cell, rows)
+        look = Look(source.name, tuple(rows), (), (), imported.map_text)
+    return replace(look, bag_text=None if imported.bag is None else imported.bag.text)
 
 
 def _no_longer_certain_unit(row: Row, error: float) -> Row:

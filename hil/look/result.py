@@ -111,6 +111,7 @@ class Look:
         gravity: for `hil identify`, beside the map [m/s²]; None if it is as stated.
         error: of the torque as read, predicted from other parts of the recording, as a share of
             it; None without a torque or an arm.
+        bag_text: how the joint states of a bag were read, as a map; None for other recordings.
     """
 
     source: str
@@ -120,6 +121,7 @@ class Look:
     map_text: str | None
     gravity: Vector | None = None
     error: float | None = None
+    bag_text: str | None = None
 
 
 @dataclass(frozen=True)

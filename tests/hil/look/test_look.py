@@ -22,6 +22,7 @@ from benchmarks.look import measure
 from hil.archive import open_archive
 from hil.base.errors import SourceError
 from hil.cli import app
+from hil.importers.bag_map import BagMap
 from hil.importers.column_map import ColumnMap
 from hil.importers.conclusions import Certainty
 from hil.importers.imported_robot import Robot
@@ -278,7 +279,7 @@ class TestConclusions:
         write_log(path, ["t", "q{}", "v{}", "tau{}"], *planted.values())
         looked = hil("look", path, "--urdf", urdf, "-o", target)
         assert looked.exit_code == 2
-        assert "map.toml, without what is open: add a line" in looked.output
+        assert "map.toml, without what is undetermined: add a line" in looked.output
         line = r'\[torque\] (side = "motor"); \[drive\] (gear_ratio = \[.*?\])'
         side = re.search(line, looked.output)
         assert side is not None
@@ -478,12 +479,25 @@ def test_payload_is_part_of_what_the_motion_determines(
     assert re.search(r"determines \d+ of the \d+ parameters of the body of", reason)
 
 
-def test_a_bag_has_no_columns_to_map(tmp_path: Path) -> None:
+def test_the_map_of_a_bag_says_how_it_was_read(tmp_path: Path) -> None:
     path = bag(tmp_path / "a.db3", {"/joint_states": (STATE, states(300))})
     output = tmp_path / "map.toml"
     result = hil("look", path, "-o", output)
-    assert "a bag has no columns to map" in result.output
-    assert not output.exists()
+    assert f"wrote {output}" in result.output
+    stated = BagMap.load(output)
+    assert stated is not None
+    assert (stated.topic, stated.outside_limits) == ("/joint_states", False)
+
+
+def test_a_map_accepts_no_positions_outside_the_limits_by_itself(
+    tmp_path: Path, urdf: Path, table: Mapping[str, Floats]
+) -> None:
+    """Although a look itself reads them."""
+    path = tmp_path / "a.csv"
+    write_log(path, ["t", "q{}", "v{}", "tau{}"], *table.values())
+    output = tmp_path / "map.toml"
+    assert hil("look", path, "--urdf", urdf, "-o", output).exit_code == 0
+    assert not ColumnMap.load(output).outside_limits
 
 
 def test_axes_of_changes_become_entries_of_a_map(tmp_path: Path) -> None:
