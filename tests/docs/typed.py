@@ -5,6 +5,7 @@ from __future__ import annotations
 import re
 import shlex
 from collections.abc import Sequence
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -69,13 +70,14 @@ def parse(typed: Sequence[str]) -> None:
     command.make_context(command.name, arguments)
 
 
-def options(command: Any = None) -> set[str]:
+@cache
+def options(command: Any = None) -> frozenset[str]:
     """Options of a command and of all below it; by default of the whole command line."""
     command = command or typer.main.get_command(app)
     below = getattr(command, "commands", {}).values()
-    names = {
+    names = frozenset(
         option
         for parameter in command.params
         for option in (*parameter.opts, *parameter.secondary_opts)
-    }
+    )
     return names.union(*map(options, below))

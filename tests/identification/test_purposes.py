@@ -153,6 +153,7 @@ def exceeded(peaks: Array, limit: Array) -> Array:
 
 
 @cache
+@cache
 def peaks_of(duration: float, seed: int) -> Array:
     (part,) = slow_residuals(MODEL, truth(), [quiet(duration, seed)])
     size = np.abs(part.torque)

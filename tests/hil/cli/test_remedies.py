@@ -160,6 +160,7 @@ class TestIdentify:
         }[remedy]
         assert typed(*line, *corrected).exit_code == 0
 
+    @pytest.mark.long
     def test_a_model_that_predicts_only_what_was_fitted(
         self, archive: Path, tmp_path: Path
     ) -> None:
@@ -173,6 +174,7 @@ class TestIdentify:
         assert predicted.exit_code == 0
         assert option not in steps(tmp_path / "result")
 
+    @pytest.mark.long
     def test_a_torque_that_is_late(self, folder: Path, tmp_path: Path) -> None:
         line = ["identify", log(tmp_path / "late.csv", late=0.03), "--urdf", folder / "arm.urdf"]
         line += ["-q", "-o", tmp_path / "result"]
@@ -183,6 +185,7 @@ class TestIdentify:
         results = json.loads((tmp_path / "result" / "results.json").read_text())
         assert results["delays"]["applied"] == pytest.approx([0.03] * 3, abs=1e-3)
 
+    @pytest.mark.long
     def test_friction_that_grows_with_the_load(self, folder: Path, tmp_path: Path) -> None:
         line = ["identify", log(tmp_path / "worm.csv", load=0.2), "--urdf", folder / "arm.urdf"]
         line += ["-q", "-o", tmp_path / "result"]
@@ -191,6 +194,7 @@ class TestIdentify:
         assert typed(*line, *option.split()).exit_code == 0
         assert "friction over load" not in findings(tmp_path / "result")
 
+    @pytest.mark.long
     def test_isolated_outliers(self, folder: Path, tmp_path: Path) -> None:
         line = ["identify", log(tmp_path / "spikes.csv", spikes=60.0), "--urdf"]
         line += [folder / "arm.urdf", "-q", "-o", tmp_path / "result"]

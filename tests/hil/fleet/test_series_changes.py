@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 import pytest
@@ -10,6 +11,7 @@ import pytest
 from hil.compare.comparison import holm
 from hil.fleet.series_changes import FEWEST, SIBLINGS, Series, common_course, courses
 
+LONG = partial(pytest.param, marks=pytest.mark.long)
 MONTHS = 24
 SEASON = 0.06
 
@@ -182,7 +184,7 @@ class TestAllTogether:
             assert min(holm(np.array([each.p_value for each in courses(family)]))) > 0.01
 
     @pytest.mark.parametrize("heat", [True, False])
-    @pytest.mark.parametrize("months", [13, 18, 24, 36])
+    @pytest.mark.parametrize("months", [13, LONG(18), 24, LONG(36)])
     def test_is_not_invented(self, months, heat):
         p_values = [
             common_course(fleet(seed, months=months, heat=heat)).course.p_value

@@ -299,9 +299,18 @@ class TestLoaded:
 class TestDataFrame:
     """A table in memory is a log."""
 
+    @pytest.fixture(scope="class")
+    def of_file(self, folder: Path) -> Any:
+        return hil.identify(folder / "a.csv", urdf=folder / "three.urdf")
+
     @pytest.mark.parametrize("indexed", [False, True])
     def test_it_gives_what_its_file_gives(
-        self, folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, indexed: bool
+        self,
+        folder: Path,
+        of_file: Any,
+        tmp_path: Path,
+        monkeypatch: pytest.MonkeyPatch,
+        indexed: bool,
     ) -> None:
         import pandas
 
@@ -309,9 +318,8 @@ class TestDataFrame:
         if indexed:
             frame = frame.set_index(frame.columns[0])
         identified = hil.identify(frame, urdf=folder / "three.urdf")
-        log = hil.identify(folder / "a.csv", urdf=folder / "three.urdf")
-        assert identified.verdict == log.verdict
-        assert identified.parameters.equals(log.parameters)
+        assert identified.verdict == of_file.verdict
+        assert identified.parameters.equals(of_file.parameters)
         monkeypatch.chdir(tmp_path)
         assert identified.save().resolve() == tmp_path / "recording"
         assert hil.load(tmp_path / "recording").verdict.good

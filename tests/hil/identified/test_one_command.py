@@ -366,13 +366,12 @@ class TestIdentify:
         assert len(shown) <= one_screen.LINES and max(map(len, shown)) <= one_screen.COLUMNS
         assert "fitted    a.csv: 3 joints" in result.output
         assert "predicted b.csv: 3 joints" in result.output
+        before = (folder / "results.json").stat().st_mtime_ns
         everything = hil("identify", first, "--urdf", urdf, "--predict", second, "-v").output
         assert f"report: {report}" in everything
         assert "a.csv: tau1 .. tau3: torque, by the name; no unit stated, read as N.m" in everything
         names = {path.name for path in folder.iterdir()}
         assert names >= {"a.mcap", "b.mcap", "map.toml", "results.json", "report.html", SOURCES}
-        before = (folder / "results.json").stat().st_mtime_ns
-        assert hil("identify", first, "--urdf", urdf, "--predict", second).exit_code == 0
         assert (folder / "results.json").stat().st_mtime_ns > before
         assert not (tmp_path / "a-2").exists()
         report.unlink()
