@@ -276,7 +276,7 @@ def plus(first: Term | None, second: Term | None) -> Term | None:
 
 # Files
 
-ELASTIC: Final = ("products", "squares", "measured", "compliance")
+ELASTIC: Final = ("products", "squares", "measured", "lost", "compliance")
 """Arrays of the torque of elastic gears."""
 
 FIT: Final = ("values", "covariance", "noise_std", "samples")

@@ -9,6 +9,10 @@ gears grows with the square of the frequency, as torques of inertia do at low on
 Parameters take most of that up, so that no residual shows their error. Compliances are fitted
 beside them, about zero with the standard deviation of `RESONANCE`, and their mean square is added
 to the covariance of the parameters, which stay as of rigid gears.
+
+The smoothed motion lacks some of the arm's fast motion, and its torque grows less with the
+frequency than the measured one: as if the gears were elastic. So the torque that smoothing takes
+from the model is subtracted from the measured one here.
 """
 
 from __future__ import annotations
@@ -36,6 +40,7 @@ arms have their lowest ones at 5 to 25 Hz."""
 _POSTURES: Final = 20  # in which the inertia of the links is averaged
 _RATE: Final = 125.0  # Hz, at which the torque of elastic gears is computed: it has no more than
 # `DELAY_BANDWIDTH`, as its second derivative would have the noise of accelerations
+_TERMS: Final = 3  # of a power series
 _LINEAR: Final = 1e-3  # share of the expected compliances by which it is linearised
 
 
@@ -45,7 +50,8 @@ class ElasticTorque:
 
     products: Array  #: W' E (n, p, n)
     squares: Array  #: E' E (n, n, n)
-    measured: Array  #: E' t (n, n)
+    measured: Array  #: E' t (n, n), of the measured torque less that lost by smoothing
+    lost: Array  #: W' of the torque that is lost by smoothing the motion (n, p)
     #: expected compliances (n,) [rad/(N·m) or m/N], summed over the recordings
     compliance: Array
     recordings: float = 1.0
@@ -58,16 +64,20 @@ class ElasticTorque:
         products = np.zeros((n, model.n_parameters, n))
         squares = np.zeros((n, n, n))
         measured = np.zeros((n, n))
+        lost = np.zeros((n, model.n_parameters))
+        missing = lost_torque(model, samples, values)
         torque = elastic_torque(model, samples, values, compliance)
         torque /= np.where(compliance > 0.0, compliance, 1.0)
         for rows, tables in augmented_rows(model, samples):
             for joint, (table, used) in enumerate(zip(tables, model.plan.columns, strict=True)):
                 usable = samples.usable[rows, joint]
                 effect = torque[rows][usable, joint]
+                without = missing[rows][usable, joint]
                 products[joint][used] += table[:-1, usable] @ effect
                 squares[joint] += effect.T @ effect
-                measured[joint] += effect.T @ table[-1, usable]
-        return cls(products, squares, measured, compliance)
+                measured[joint] += effect.T @ (table[-1, usable] - without)
+                lost[joint][used] += table[:-1, usable] @ without
+        return cls(products, squares, measured, lost, compliance)
 
     def plus(self, other: ElasticTorque) -> ElasticTorque:
         """Return the sums over both."""
@@ -75,6 +85,7 @@ class ElasticTorque:
             self.products + other.products,
             self.squares + other.squares,
             self.measured + other.measured,
+            self.lost + other.lost,
             self.compliance + other.compliance,
             self.recordings + other.recordings,
         )
@@ -85,6 +96,7 @@ class ElasticTorque:
             share * self.products,
             share * self.squares,
             share * self.measured,
+            share * self.lost,
             share * self.compliance,
             share * self.recordings,
         )
@@ -100,6 +112,27 @@ class ElasticTorque:
             for part in (self.products, self.squares, self.measured)
         )
         return products * size, squares * np.outer(size, size), measured * size
+
+
+def lost_torque(model: RobotModel, samples: Samples, values: Array) -> Array:
+    """Return the torque of bodies and drives (m, n) that smoothing has taken from the motion.
+
+    With the smoother S, the smoothed torque lacks ``1/S - 1`` of itself, which is the sum of the
+    powers of 1 - S.
+    """
+    inertial = np.where(model.friction_columns, 0.0, values)
+    torque = model.torque(inertial, samples.motion)
+    lost = np.zeros_like(torque)
+    for segment in samples.segments:
+        time = samples.motion.time[segment]
+        step = float(np.median(np.diff(time))) if len(time) > 1 else np.inf
+        for joint, bandwidth in enumerate(samples.position_bandwidth):
+            if 2.0 * bandwidth * step < 1.0:
+                term = torque[segment, joint : joint + 1]
+                for _ in range(_TERMS):
+                    term = term - low_passed(time, term, bandwidth)
+                    lost[segment, joint] += term[:, 0]
+    return lost
 
 
 def expected_compliance(model: RobotModel, samples: Samples, values: Array) -> Array:
@@ -227,8 +260,8 @@ def with_elastic_gears(
     determined = np.isfinite(np.diag(estimate.covariance))
     inverse = np.where(determined[:, None], solve(equations).inverse, 0.0)
     moved, covariance = open_compliance(inverse, products, squares, design_effect)
-    if excess is not None:
-        errors = errors - moved.T @ excess
+    lost = times * np.tensordot(weights, torque.lost, axes=1)
+    errors = errors + moved.T @ (lost if excess is None else lost - excess)
     # Correlated compliances cannot be cut off at zero one by one.
     root = np.linalg.cholesky(np.linalg.inv(covariance))
     mean, _ = scipy.optimize.nnls(root.T, root.T @ (covariance @ errors) / design_effect)

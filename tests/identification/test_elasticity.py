@@ -3,12 +3,15 @@
 from dataclasses import replace
 
 import numpy as np
+import pytest
 
+from identification.estimators import elasticity
 from identification.estimators.elasticity import (
     RESONANCE,
     ElasticTorque,
     elastic_torque,
     expected_compliance,
+    lost_torque,
     open_compliance,
     with_elastic_gears,
 )
@@ -17,7 +20,16 @@ from identification.factor.estimate import inverse_variance
 from identification.factor.factor import Factor
 from identification.factor.normal_equations import solve
 from identification.model.motion import Motion
-from tests.identification.two_link import MODEL, NOISE, as_samples, four_sines, truth
+from identification.signals.recording import Recording
+from identification.signals.samples import Preprocessing, prepare
+from tests.identification.two_link import (
+    MODEL,
+    NOISE,
+    as_samples,
+    four_sines,
+    sine_motion,
+    truth,
+)
 
 STEP = 0.002
 COMPLIANCE = np.array([2e-5, 2e-4])
@@ -88,6 +100,37 @@ def test_data_of_rigid_gears_widen_intervals_little():
     assert np.max(wider.std / estimate.std) < 1.5
 
 
+def smoothed(bandwidth, noise):
+    """A fast motion of rigid gears, and its samples."""
+    time = np.arange(0.0, 12.0, STEP)
+    rates = 2.0 * np.pi * np.array([[0.5, 0.7], [3.0, 4.0], [5.0, 6.0]])
+    motion = sine_motion(time, np.array([[0.3], [0.02], [0.01]]), rates, rates)
+    torque = MODEL.torque(truth(), motion)
+    torque += noise * np.random.default_rng(0).standard_normal(torque.shape)
+    recording = Recording(time, motion.position, MODEL.joint_names, torque)
+    how = Preprocessing(rigid_bandwidth=bandwidth)
+    return motion, prepare(recording, MODEL, noise_variance=np.full(2, 1e-14), options=how)
+
+
+@pytest.mark.parametrize("bandwidth", [10.0, 14.0, 20.0])
+def test_the_torque_that_smoothing_takes_is_known(bandwidth):
+    motion, samples = smoothed(bandwidth, 0.0)
+    inertial = np.where(MODEL.friction_columns, 0.0, truth())
+    exact, left = (MODEL.torque(inertial, each) for each in (motion, samples.motion))
+    missing = (exact - left - lost_torque(MODEL, samples, truth()))[500:-500]
+    assert np.linalg.norm(missing) < 0.2 * np.linalg.norm((exact - left)[500:-500])
+
+
+@pytest.mark.parametrize("bandwidth", [10.0, 14.0])
+def test_smoothing_makes_no_gears_elastic(bandwidth, monkeypatch):
+    """It takes more of the torque at higher frequencies, where elastic gears add."""
+    _, samples = smoothed(bandwidth, NOISE)
+    estimate, wider = fitted(samples)
+    monkeypatch.setattr(elasticity, "lost_torque", lambda *_: np.zeros_like(samples.torque))
+    _, unaware = fitted(samples)
+    assert np.max(wider.std / estimate.std) < 2.0 < np.max(unaware.std / estimate.std)
+
+
 def test_the_noise_of_rigid_gears_makes_none_elastic():
     """Where two gears add nearly the same torque, one of which cannot have a negative share."""
     samples = recorded(np.zeros(2), NOISE)
@@ -126,7 +169,8 @@ def _sums(samples, each):
         products[joint][used] = block[some].T @ effect
         squares[joint] = effect.T @ effect
         measured[joint] = effect.T @ samples.torque[some, joint]
-    return ElasticTorque(products, squares, measured, compliance=np.ones(2))
+    lost = np.zeros((2, MODEL.n_parameters))
+    return ElasticTorque(products, squares, measured, lost, compliance=np.ones(2))
 
 
 def test_repetitions_count_like_more_rows():
