@@ -187,8 +187,7 @@ class DelayEstimate:
     cycle: float  # usual step of the clock [s]
     interval_factor: float  # standard deviations in half a 95 % interval
     reason: str | None  # why the delay is undetermined, or None
-    # whether the delay differs from `assumed` at 99 %, is likelier, and predicts left-out blocks
-    # better
+    # whether the delay differs from `assumed` at 99 % and predicts left-out blocks better
     significant: bool
     # whether it differs so and does not predict left-out blocks better; without a prior, parts
     # that determine little are predicted badly with any delay
@@ -320,8 +319,7 @@ def _estimated(
     factor, by_chance = (float(student_limit(share, count - 1)) for share in (0.025, _CHANCE))
     at_limit = shift <= ends[0] or shift >= ends[1]
 
-    beyond = max(by_chance, _likelier_than_none(std)) * std
-    differs = not at_limit and bool(np.isnan(other)) and abs(shift) > beyond
+    differs = not at_limit and bool(np.isnan(other)) and abs(shift) > by_chance * std
     confirmed = False
     if differs:
         unshifted = reader.linearised(0.0, values, blocks.weights)
@@ -336,16 +334,6 @@ def _estimated(
         significant=differs and confirmed,
         unconfirmed=differs and not confirmed,
     )
-
-
-def _likelier_than_none(std: float) -> float:
-    """Return from how many standard deviations [s] on a delay is likelier than none.
-
-    If both were as likely before, and any delay up to `LONGEST_DELAY` (Jeffreys 1961, section 5.2):
-    the narrower the interval, the fewer of these would have been so near to none.
-    """
-    odds = 2.0 * LONGEST_DELAY / (math.sqrt(2.0 * math.pi) * std) if std > 0.0 else math.inf
-    return math.sqrt(2.0 * math.log(max(odds, 1.0)))
 
 
 def _narrow(options: Preprocessing) -> Preprocessing:

@@ -1373,16 +1373,6 @@ class TestDelay:
         assert abs(np.log(claimed / scatter)) < 3 * 0.21
         assert all(estimate.significant for estimate in estimates)
 
-    def test_it_must_be_likelier_than_none(self):
-        """At three standard deviations of 1e-4 s none is likelier than any of up to 50 ms."""
-        none = estimate_delay(delayed(0.0), MODEL)
-        for sigmas, significant in ((3.0, False), (5.0, True)):
-            planted = sigmas * none.std - none.delay
-            estimate = estimate_delay(delayed(planted), MODEL)
-            assert estimate.delay == pytest.approx(sigmas * estimate.std, rel=0.1)
-            assert estimate.excludes(0.0)
-            assert estimate.significant == significant
-
     def test_motion_above_its_bandwidth_does_not_spoil_it(self):
         """Fast moves have accelerations at 12 and 17 Hz; the torque has them as well."""
         time = np.arange(6000) * STEP
