@@ -168,14 +168,14 @@ def _motion(start: Array, by: float) -> TrajectoryPlayer:
     return player_of(cell(), planned.motion.trajectory)
 
 
-def _controller(*faults: UrFault) -> _Peer:
+def controller(*faults: UrFault) -> _Peer:
     return _Peer(simulated_ur(cell(), faults=faults))
 
 
 @cache
 def cycles_without_a_fault(is_held: bool) -> Mapping[str, int]:
     """First cycle of each situation."""
-    run = UrRun(_controller(), True, is_held=is_held)
+    run = UrRun(controller(), True, is_held=is_held)
     run.play(())
     assert run.outcome == "completed", run.outcome
     assert not run.broken, run.broken
@@ -197,7 +197,7 @@ def play(fault: str, situation: str) -> UrRun:
     else:
         of_controller = (parse_ur_fault(line.format(c=cycle - 1)),)
         count = of_controller[0].count if of_controller[0].kind == "freedrive" else 1
-    run = UrRun(_controller(*of_controller), True, is_held=is_held)
+    run = UrRun(controller(*of_controller), True, is_held=is_held)
     run.play(link, cycle, cycle + count)
     return run
 

@@ -25,6 +25,8 @@ STREAM, END, STOP = 1, 2, 3
 WAITING, STREAMING, STOPPING = 1, 2, 3
 RUNNING, PLAYING, STOPPED, NORMAL = 7, 2, 1, 1
 FREEDRIVE = 4
+LOSS_WINDOW = 100
+"""Cycles in which more than `max_gap` set-points that were not used stop a motion."""
 Frame = Mapping[str, np.ndarray]
 
 
@@ -74,6 +76,8 @@ class UrConduct(SetPointLaws):
         self.token = -1
         self.number: int | None = None
         self.stamp = 0.0
+        self.unused = 0
+        self.lost: list[tuple[int, int]] = []
 
     def judge(self, frame: Frame, reply: bytes, record: np.void) -> None:
         """Check the reply to one new frame."""
@@ -91,6 +95,7 @@ class UrConduct(SetPointLaws):
         if not ours:
             self.barrier = False
         echo = np.array([frame[f"output_double_register_{24 + k}"][0] for k in range(6)])
+        self._count_lost(int(record["cycle"]), self._int(frame, "output_int_register_26"), stage)
         used = echo if stage in (WAITING, STREAMING, STOPPING) else frame["target_q"]
         commanded = record["commanded_position"]
         if not (stage == STREAMING and self._normal(frame)):
@@ -111,6 +116,17 @@ class UrConduct(SetPointLaws):
                 assert np.abs(q - self.sent[-1]).max() < 1e-12, "leaving: not held"
                 self._advance(q, 1, 0.0)
             self._count("end" if demand == END else "refused")
+
+    def _count_lost(self, cycle: int, unused: int, stage: int) -> None:
+        """More than `max_gap` set-points in `LOSS_WINDOW` that the program did not get are a stop.
+
+        The program counts its cycles without a new one.
+        """
+        if stage == STREAMING and self.sent:
+            self.lost.append((cycle, max(0, unused - self.unused)))
+        self.unused = unused
+        self.lost = [loss for loss in self.lost if loss[0] > cycle - LOSS_WINDOW]
+        self.stopping = self.stopping or sum(count for _, count in self.lost) > self.max_gap
 
     def _numbered(self, number: int, stamp: float) -> None:
         if self.number is not None:
