@@ -103,7 +103,7 @@ class TimedUr(SimulatedUr):
     def upload(self, text: str) -> None:
         """See `SimulatedUr.upload`; a stall of this computer is to be measured, not stopped at."""
         super().upload(text)
-        if self._loaded is not None:
+        if self._loaded is not None and self._loaded[1] is not None:
             self._loaded = (self._loaded[0], replace(self._loaded[1], watchdog=3600.0))
 
 

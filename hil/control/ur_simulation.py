@@ -29,7 +29,7 @@ from sim_fixtures.ur import (
     wire,
 )
 from sim_fixtures.ur.controller import UrPayload, parse_ur_fault
-from sim_fixtures.ur.server import dashboard_reply, state_of
+from sim_fixtures.ur.server import PRIMARY_PORT, REALTIME_PORT, dashboard_reply, state_of
 
 _CB3 = (3, 15, 8, 0)
 _WITHIN = 0.9
@@ -183,6 +183,8 @@ def served_arm(
             rtde=table.rtde.port,
             primary=table.rtde.primary_port,
             dashboard=table.rtde.dashboard_port,
+            # At the maker's ports programs of others find it, which send theirs to this one.
+            realtime=REALTIME_PORT if table.rtde.primary_port == PRIMARY_PORT else None,
             cycle_extension=cycle_extension,
         )
     except (SettingError, SimulationError) as error:

@@ -15,6 +15,7 @@ from sim_fixtures.arrays import Array
 from sim_fixtures.plant import Carried
 from sim_fixtures.settings import SettingError
 from sim_fixtures.ur.arm import UR5E_URDF, SimulatedUrArm, UrArmTruth
+from sim_fixtures.ur.control_script import FIRST_LINE, ControlScript
 from sim_fixtures.ur.program import (
     ENDED,
     STOPPING,
@@ -273,10 +274,11 @@ class SimulatedUr:
         self.slider = self.settings.slider
         self.inputs = Registers()
         self.output_registers = Registers()
-        self.stream: RegisterProgram | None = None
+        self.stream: RegisterProgram | ControlScript | None = None
         self.said: list[Said] = []
         self._arriving: deque[tuple[int, Mapping[str, float]]] = deque()
-        self._loaded: tuple[int, ProgramConstants] | None = None
+        # None for the script of ur-rtde, whose constants come with each command.
+        self._loaded: tuple[int, ProgramConstants | None] | None = None
         self._written_at = 0
         self._moved_at = -round(_STEADY / self.period)
         self._commanded: Array | None = None  # by servoj in the last cycle
@@ -312,7 +314,8 @@ class SimulatedUr:
             self.said.append(Said("program refused: the arm is not ready"))
         else:
             try:
-                constants = ProgramConstants.of(text)
+                ours = not text.lstrip().startswith(FIRST_LINE)
+                constants = ProgramConstants.of(text) if ours else None
             except ProgramError as error:
                 self.said.append(Said(str(error)))
                 return
@@ -344,7 +347,12 @@ class SimulatedUr:
             constants = self._loaded[1]
             self._loaded = None
             position = self._target[0]
-            self.stream = RegisterProgram(constants, self.inputs, self.output_registers, position)
+            registers = self.inputs, self.output_registers
+            self.stream = (
+                ControlScript(*registers, position, self.period)
+                if constants is None
+                else RegisterProgram(constants, *registers, position)
+            )
             self._written_at = self.cycle
         if self.stream is not None or self._rest is not None:
             self._step_stream()
@@ -378,7 +386,7 @@ class SimulatedUr:
             return
         self._brake(_STOP_DECELERATION)
 
-    def _run_program(self, program: RegisterProgram) -> None:
+    def _run_program(self, program: RegisterProgram | ControlScript) -> None:
         """Run a cycle of the program, and of the filter of servoj behind it."""
         constants = program.constants
         silent = (self.cycle - self._written_at) * self.period
@@ -480,6 +488,11 @@ class SimulatedUr:
         self._freedrive_until = -1
         self.slider = 1.0
         self._leave_program()
+
+    @property
+    def takes_set_points(self) -> bool:
+        """Whether a program runs that needs one in each cycle."""
+        return isinstance(self.stream, RegisterProgram)
 
     @property
     def playing(self) -> bool:

@@ -20,6 +20,8 @@ from sim_fixtures.ur import wire
 from sim_fixtures.ur.controller import SimulatedUr, UrSettings
 
 RTDE_PORT: Final = 30004
+PRIMARY_PORT: Final = 30001
+REALTIME_PORT: Final = 30003
 _MOST_UNREAD: Final = 1 << 19
 """Bytes that wait for a client in real time; further frames are skipped, as on a controller."""
 _MOST_AHEAD: Final = 1 << 16
@@ -67,7 +69,8 @@ class UrServer:
     Args:
         controller: the controller, which is stepped here.
         host: address to listen at.
-        rtde, primary, dashboard: ports; 0 for a free one, None for none.
+        rtde, primary, dashboard, realtime: ports; 0 for a free one, None for none. The last
+            one takes programs alone.
         cycle_extension: longest time by which a cycle is extended to wait for the set-point of a
             client, while a program takes set-points [s]: the computers of tests are busy.
         real_time: cycles last their period; otherwise as long as the clients read, and none pass
@@ -91,6 +94,7 @@ class UrServer:
         rtde: int = 0,
         primary: int | None = 0,
         dashboard: int | None = 0,
+        realtime: int | None = None,
         real_time: bool = True,
         cycle_extension: float = 0.0,
     ) -> None:
@@ -111,6 +115,7 @@ class UrServer:
             ("rtde", rtde, self._serve_rtde),
             ("primary", primary, self._serve_primary),
             ("dashboard", dashboard, self._serve_dashboard),
+            ("real-time", realtime, self._serve_program),
         )
         for name, port, serve in services:
             if port is not None:
@@ -193,7 +198,7 @@ class UrServer:
     def _waits(self) -> bool:
         """Whether a program takes set-points and that of this cycle has not come."""
         controller = self.controller
-        return controller.stream is not None and any(
+        return controller.takes_set_points and any(
             client.inputs and client.started and client.written_in < controller.cycle
             for client in self._clients
         )
@@ -322,13 +327,16 @@ class UrServer:
             client.inputs.append(wire.InputRecipe(number, tuple(names)))
         return wire.package("I", bytes([number]) + ",".join(types).encode())
 
-    def _serve_primary(self, client: _Client) -> None:
+    def _serve_program(self, client: _Client) -> None:
         client.program += client.received
         client.received.clear()
         if client.program[-5:] == b"\nend\n":
             program = bytes(client.program)
             client.program.clear()
             self.controller.upload(program.decode("utf-8", "replace"))
+
+    def _serve_primary(self, client: _Client) -> None:
+        self._serve_program(client)
         if not client.greeted:
             client.greeted = True
             client.waiting += wire.message_package("URControl") + state_of(self.controller.settings)

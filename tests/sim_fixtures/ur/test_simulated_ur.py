@@ -217,6 +217,55 @@ def test_another_client_writes_registers_of_its_own(served: None) -> None:
     assert number == 1
 
 
+CONTROLLED = """
+from sim_fixtures.ur import SimulatedUr, UrServer, UrSettings
+robot = SimulatedUr(UrSettings(remote_control=True))
+server = UrServer(
+    robot, rtde=30004, primary=30001, dashboard=29999, realtime=30003, cycle_extension=0.5
+)
+print("ready", flush=True)
+server.run()
+"""
+
+
+@pytest.fixture
+def controlled() -> Iterator[None]:
+    """A controller in remote control, in another process, at the maker's ports."""
+    with subprocess.Popen([sys.executable, "-c", CONTROLLED], stdout=subprocess.PIPE) as process:
+        assert process.stdout is not None
+        try:
+            if process.stdout.readline() != b"ready\n":
+                pytest.skip("the maker's ports, the only ones that ur-rtde connects to, are taken")
+            yield
+        finally:
+            process.kill()
+
+
+def test_another_client_moves_the_arm_by_a_script_of_its_own(controlled: None) -> None:
+    """The control interface of ur-rtde: movej, servoj, and the end of its script."""
+    control = pytest.importorskip("rtde_control", reason="ur-rtde is not installed (extra `ur`)")
+    receive = pytest.importorskip("rtde_receive", reason="ur-rtde is not installed (extra `ur`)")
+    client = control.RTDEControlInterface("127.0.0.1")
+    reader = receive.RTDEReceiveInterface("127.0.0.1")
+    try:
+        assert client.isProgramRunning()
+        start = np.array(reader.getActualQ())
+        target = start + np.array([0.2, 0.0, -0.1, 0.0, 0.0, 0.3])
+        assert client.moveJ(target.tolist(), 0.5, 1.0)
+        assert np.abs(np.array(reader.getActualQ()) - target).max() < 5e-3
+        for step in range(1, 101):
+            q = target + np.array([1e-3 * step, 0.0, 0.0, 0.0, 0.0, 0.0])
+            assert client.servoJ(q.tolist(), 0.5, 0.5, 0.002, 0.1, 300)
+            time.sleep(0.002)
+        time.sleep(0.3)
+        assert np.abs(np.array(reader.getActualQ()) - q).max() < 5e-3
+        client.servoStop()
+        client.stopScript()
+    finally:
+        client.disconnect()
+        reader.disconnect()
+
+
 def test_the_makers_client_reads_the_same(served: None) -> None:
     """That of Universal Robots, in Python, which is not in the package index."""
     rtde = pytest.importorskip("rtde.rtde", reason="UR's RTDE_Python_Client_Library is not there")
