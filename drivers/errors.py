@@ -80,8 +80,10 @@ class RefusalError(DriverError):
     Attributes:
         cycle: the controller's cycle in which it was due.
         remedy: what the operator should do.
+        is_general: whether that is said of any refusal; a controller may have a better remedy.
     """
 
+    is_general = True
     remedy = "look at the arm, close open mode and switch the drive on again at the controller"
 
     def __init__(self, message: str, cycle: int) -> None:
@@ -100,6 +102,7 @@ class AxisNotInMode(RefusalError):
 class ModeRefused(RefusalError):
     """A joint reports an unknown mode, or is open without having been closed."""
 
+    is_general = False
     remedy = "have the controller's program go from mode 0 to the open mode of the cell file"
 
 
@@ -130,7 +133,7 @@ def error_text(error: BaseException) -> str:
 
 
 _BEYOND: Final = "the motion exceeds the limits and would be refused again: design another one"
-_REST_FIRST: Final = "let the arm come to rest before open mode is asked for"
+_REST_FIRST: Final = "let the arm come to rest before the motion begins"
 _LOOK_FOR_LOSSES: Final = "look for lost packets: the cable, other traffic, hil doctor"
 _CHECK_ARM: Final = "check that the arm is free, check its payload, then go slower"
 _CHECK_AXIS: Final = "check that the axis is free, then its following_error in [drive_train]"
@@ -171,10 +174,11 @@ class Check(Enum):
         _LOOK_FOR_LOSSES,
     )
 
-    def __init__(self, quantity: str, unit: str, remedy: str = RefusalError.remedy) -> None:
+    def __init__(self, quantity: str, unit: str, remedy: str | None = None) -> None:
         self.quantity = quantity
         self.unit = unit
-        self.remedy = remedy
+        self.is_general = remedy is None
+        self.remedy = RefusalError.remedy if remedy is None else remedy
 
 
 class GuardError(RefusalError):
@@ -207,6 +211,7 @@ class GuardError(RefusalError):
         super().__init__(message, cycle)
         self.check = check
         self.remedy = check.remedy
+        self.is_general = check.is_general
         self.joint = joint
         self.value = value
         self.bound = bound

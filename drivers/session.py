@@ -477,6 +477,8 @@ class Session:
             self._count_rejected(answer.rejected)
         if isinstance(answer, Refuse):
             refusal = answer.error
+            if refusal.is_general and axes.remedy:
+                refusal.remedy = axes.remedy
             self._ring.commanded[row] = math.nan
             self._apply(Input.REFUSAL)
             self._offending = _offending(refusal)

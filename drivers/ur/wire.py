@@ -120,6 +120,8 @@ _IDLE: Final = np.zeros(N_JOINTS, dtype=np.bool_)
 class ArmNotReadyError(RefusalError):
     """The controller is in a state in which no motion may begin, or go on."""
 
+    is_general = False
+
     def __init__(self, message: str, remedy: str, cycle: int) -> None:
         super().__init__(message, cycle)
         self.remedy = remedy

@@ -2,9 +2,14 @@
 
 from __future__ import annotations
 
+import re
+
 import numpy as np
 import pytest
 
+from drivers.errors import Check, GuardError
+from drivers.events import Refused
+from drivers.guard import Guard
 from drivers.states import State
 from drivers.transports.simulated import Delay, Duplicate, Lose
 from sim_fixtures.ur import UrProgram
@@ -151,6 +156,26 @@ def test_the_operator_slows_holds_releases_and_stops_it() -> None:
     assert (bench.ended.outcome, bench.state) == ("stopped", State.CLOSED)
     assert bench.run(100).rests and not bench.robot.playing
     assert not bench.session.counters.rejected
+
+
+C4G_WORDS = re.compile(r"open mode|drive on|cabinet|Open program|C4G|mode \d|TP ")
+
+
+@pytest.mark.parametrize("check", [*Check])
+def test_remedies_have_no_words_of_another_controller(
+    check: Check, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    bench = UrBench()
+
+    def refuses(guard: Guard, *arguments: object) -> None:
+        if bench.transport.cycle > MIDST:
+            raise GuardError(check, 0, 2.0, 1.0, bench.transport.cycle)
+
+    monkeypatch.setattr(Guard, "check_set_point", refuses)
+    bench.move()
+    (refused,) = [event.error for event in bench.events if isinstance(event, Refused)]
+    assert bench.ended.outcome == "refused" and refused.remedy
+    assert not C4G_WORDS.search(f"{refused} {refused.remedy}")
 
 
 class TestBefore:
