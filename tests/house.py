@@ -29,7 +29,7 @@ CEILINGS: Final[Mapping[str, int]] = {
     "tests of hil outside a room": 0,
     "class names defined twice": 0,
     "helpers of other test modules": 7,
-    "long signatures without Args": 46,
+    "long signatures without Args": 20,
 }
 """Figures that no change may exceed. Size has none: features are not traded for lines."""
 BANNED: Final = {

@@ -388,7 +388,14 @@ def _figures(
 
 
 def figure(value: float, variance: float, freedom: float, repetitions: Array) -> Figure:
-    """Combine a pooled estimate (variance NaN if undetermined) with repetitions (m,)."""
+    """Combine a pooled estimate with repetitions.
+
+    Args:
+        value: pooled.
+        variance: of it, NaN if undetermined.
+        freedom: degrees of freedom.
+        repetitions: values (m,).
+    """
     if not np.isfinite(variance):
         return Figure(math.nan, math.nan, 1.0)
     finite = repetitions[np.isfinite(repetitions)]

@@ -139,7 +139,14 @@ def disk_trial(folder: Path) -> DiskTrial | None:
 
 
 def measure(name: str, period: float, seconds: float, reporter: Reporter) -> Latency | None:
-    """Run a latency probe (`wake-up` or `turnaround`) with a progress bar; None if it failed."""
+    """Run a latency probe with a progress bar; None if it failed.
+
+    Args:
+        name: `wake-up` or `turnaround`.
+        period: of the cycle [s].
+        seconds: of the probe.
+        reporter: of progress.
+    """
     with tempfile.TemporaryDirectory() as folder, reporter.task(name, seconds) as task:
         file = Path(folder) / "latency.npy"
         if run_probe([name, repr(period), repr(seconds), str(file)], seconds, task.advance) is None:
@@ -224,7 +231,15 @@ def examine(
     place: Path,
     reporter: Reporter,
 ) -> Diagnosis:
-    """Run all checks, and measure for twice `seconds`; archives will be written to `place`."""
+    """Run all checks, and measure.
+
+    Args:
+        link: to the controller, if any.
+        cycle_ms: cycle of the controller [ms].
+        seconds: of each of two probes.
+        place: where archives will be written.
+        reporter: of progress.
+    """
     system = System()
     reporter.step("checking this PC; no packet is sent to the controller")
     checks = [

@@ -171,6 +171,12 @@ def checked(
 ) -> CompiledCheck | str:
     """Compile code in a temporary folder, and compare its torque with pinocchio's.
 
+    Args:
+        code: of the arm.
+        name: of the function.
+        arm: that was written.
+        precision: of the numbers.
+
     Returns:
         the comparison, or why there is none.
 
@@ -213,6 +219,13 @@ class CompiledArm:
         cls, code: CSource, name: str, folder: Path, compiler: str, precision: Precision
     ) -> CompiledArm:
         """Compile code in a folder, with every warning an error.
+
+        Args:
+            code: of the arm.
+            name: of the function.
+            folder: of the files.
+            compiler: its command.
+            precision: of the numbers.
 
         Raises:
             WriteBackError: it does not compile.

@@ -160,7 +160,14 @@ def default_drive_output(sources: Sequence[Path], to: DriveName) -> Path:
 
 
 def write_ranges(model: IdentifiedModel, beside: Path, to: str, what: WhatToExport) -> Path:
-    """Write the ranges of a file's fields next to it, and return their path."""
+    """Write the ranges of a file's fields next to it, and return their path.
+
+    Args:
+        model: identified arm.
+        beside: the file.
+        to: its format.
+        what: is exported.
+    """
     files = _ranges_file(drives_of(model, what.count or 0, what.seed), model, beside, to)
     write_files(beside.parent, files)
     (name,) = files

@@ -170,6 +170,13 @@ def export_ensemble(
 ) -> ExportedEnsemble:
     """Write drawn arms as files in a folder, or as arrays if the output is an .npz file.
 
+    Args:
+        model: identified arm.
+        output: folder or file.
+        to: format of the files.
+        count: of the arms.
+        seed: of the random numbers.
+
     Raises:
         InputError: there are no physically consistent parameters, or no posterior.
         IdentificationError: an arm cannot be written, or reads back with other parameters.

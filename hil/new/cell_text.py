@@ -333,12 +333,21 @@ def cell_of_urdf(
     tip: str | None = None,
     moved: bool = False,
 ) -> NewCell:
-    """Return the cell of the URDF of an open chain (else InputError).
+    """Return the cell of the URDF of an open chain.
 
-    Joints in `fixed` are fixed at these positions [rad or m], prismatic joints at zero (or the
-    nearest position in their range), mimic joints at their offset; notes report this. A prismatic
-    joint along gravity is not fixed, unless the arm is to be `moved` or the joint is of a gripper.
-    With links `base` and `tip`, all joints that do not lie between them are fixed as well.
+    Prismatic joints are fixed at zero (or the nearest position in their range), mimic joints at
+    their offset; notes report this. A prismatic joint along gravity is not fixed, unless the arm is
+    to be moved or the joint is of a gripper.
+
+    Args:
+        path: of the URDF.
+        fixed: positions of joints to be fixed, by name [rad or m].
+        base: link below the arm; joints that do not lie between base and tip are fixed.
+        tip: link above it.
+        moved: whether the arm is to be moved.
+
+    Raises:
+        InputError: the URDF is not of an open chain.
     """
     text = read_input(path, "name a URDF")
     names = _moving_joints(path, text)

@@ -273,10 +273,17 @@ _PLACEHOLDER_PERIOD = 0.002
 def read_init(
     spec: TransportSpec, n_joints: int, *, arm: int, wait: float, stop: Stop
 ) -> InitPacket:
-    """Wait `wait` s for a controller to start a session, and return its init packet.
+    """Wait for a controller to start a session, and return its init packet.
 
     Motion is impossible: the drive train of ones differs from any controller's, and there is no
-    archive. Replies continue until the axes are closed. `arm` counts from 1.
+    archive. Replies continue until the axes are closed.
+
+    Args:
+        spec: of the transport.
+        n_joints: of the cell.
+        arm: from 1.
+        wait: longest time [s].
+        stop: request of the operator.
 
     Raises:
         ControllerError: the link cannot be opened, or no session started in time.

@@ -40,7 +40,14 @@ def check_by_found_shapes(
     limits: JointLimits,
     mesh_folders: Sequence[str],
 ) -> PartialCheck:
-    """Return which postures (m, n) are clear; links without shapes are checked for the floor only.
+    """Return which postures are clear; links without shapes are checked for the floor only.
+
+    Args:
+        urdf: text.
+        postures: (m, n) [rad or m].
+        workspace: around the arm.
+        limits: of the joints.
+        mesh_folders: in which meshes are searched for.
 
     Raises:
         CollisionModelError: a shape that is there cannot be read.

@@ -99,7 +99,11 @@ def view_of(
 ) -> ArchiveView:
     """Read the content of a plot.
 
-    Times are s since the first sample; joints are names or numbers from 1, all if empty.
+    Args:
+        path: of the archive.
+        start: since the first sample [s].
+        stop: likewise.
+        joints: names, or numbers from 1; all if empty.
 
     Raises:
         ArchiveError: the archive cannot be read, or has no sample in that interval.

@@ -42,7 +42,12 @@ def draw_motion(
 ) -> None:
     """Draw a row per joint: position, velocity and, if there is a third column, acceleration.
 
-    Limits are URDF angles, displayed in `frame`.
+    Args:
+        rows: of axes.
+        trajectory: that is drawn.
+        limits: URDF angles.
+        joint_names: of the rows.
+        frame: of the angles that are shown.
     """
     time = np.linspace(0.0, trajectory.duration, _SAMPLES)
     q, *rates = trajectory.sample(time)
@@ -88,7 +93,14 @@ def _against_limits(axes: Axes, low: float, high: float, values: Array) -> None:
 def draw_plan(
     plan: MotionPlan, joint_names: Sequence[str], frame: AngleFrame, *, title: str = ""
 ) -> Figure:
-    """Draw a plan in angles of a frame, with its targets, one row per joint."""
+    """Draw a plan with its targets, one row per joint.
+
+    Args:
+        plan: of the motion.
+        joint_names: of the rows.
+        frame: of the angles that are shown.
+        title: of the figure.
+    """
     n = len(joint_names)
     height = _TOP + n * _ROW + _BOTTOM
     targets = np.array([frame.shown(move.target) for move in plan.moves])

@@ -172,7 +172,14 @@ class Matrix:
 
 
 def correlations(values: Array, names: Sequence[str], key: str, title: str) -> Matrix:
-    """Return the matrix of a normalised covariance (n, n), with a name for each row."""
+    """Return the matrix of a normalised covariance.
+
+    Args:
+        values: (n, n).
+        names: of the rows.
+        key: of the figure.
+        title: of the figure.
+    """
     n = len(names)
     absolute = np.abs(values)
     note = f"{int(np.sum(np.triu(absolute, 1) > 0.9))} of {n * (n - 1) // 2} pairs above 0.9"
@@ -181,7 +188,14 @@ def correlations(values: Array, names: Sequence[str], key: str, title: str) -> M
 
 
 def error_bars(at: Array, ends: Array, colour: str, width: float) -> Trace:
-    """Return vertical lines at places (m,), each from one end to the other (m, 2)."""
+    """Return vertical lines.
+
+    Args:
+        at: their places (m,).
+        ends: of each (m, 2).
+        colour: of the lines.
+        width: of the lines.
+    """
     gap = np.full((len(at), 1), np.nan)
     places = np.column_stack([at, at, gap[:, 0]]).ravel()
     return Trace(np.hstack([ends, gap]).ravel(), colour, width, x=places)

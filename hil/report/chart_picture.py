@@ -31,8 +31,13 @@ def draw_charts(
 ) -> Figure:
     """Draw columns of charts side by side, with the legends of the lines that they contain.
 
-    The legend of a single column is above it, those of several are in their charts. Plots are
-    `enlarged` in height over those of a page, unless the `size` of the figure is given, in inches.
+    The legend of a single column is above it, those of several are in their charts.
+
+    Args:
+        columns: of charts.
+        legends: of all lines.
+        enlarged: height of plots over that on a page, unless the size is given.
+        size: of the figure [inch].
     """
     heights = [[plot.height for chart in column for plot in chart.plots] for column in columns]
     rows = max(map(len, heights))

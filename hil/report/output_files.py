@@ -187,12 +187,18 @@ def exports_of(
     provenance: Mapping[str, str] | None = None,
     load: Array | None = None,
 ) -> Exports:
-    """Return the exports of an identified model; `provenance` see :func:`provenance_of`.
+    """Return the exports of an identified model.
 
-    `load` as in :func:`write_urdf`.
+    Args:
+        cell: of the arm.
+        estimate: of its parameters.
+        consistent: physically consistent estimate, which the URDF needs, or why there is none.
+        essential: names of the essential parameters.
+        provenance: see :func:`provenance_of`.
+        load: of the gears, as in :func:`write_urdf`.
 
-    The URDF needs a physically consistent estimate (else `consistent` is the
-    reason why there is none). IdentificationError: the estimate is of another model.
+    Raises:
+        IdentificationError: the estimate is of another model.
     """
     model = cell.model
     origin = {key: one_line(value) for key, value in (provenance or {}).items()}

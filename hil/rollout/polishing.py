@@ -20,10 +20,17 @@ def polish(
     *,
     in_sample: bool,
 ) -> tuple[PolishResult, ExportedArm]:
-    """Polish an arm on fitted windows, and judge it on held-out ones by the `identified` errors.
+    """Polish an arm on fitted windows, and judge it on held-out ones.
 
     It is used if the geometric mean of the held-out errors is lower and no more windows are
-    unstable; never without held-out windows (`in_sample`).
+    unstable.
+
+    Args:
+        fitted: windows that are fitted.
+        held_out: windows that judge.
+        identified: errors before the polish.
+        reporter: of progress.
+        in_sample: whether there are no held-out windows; it is never used then.
 
     Raises:
         NotSimulatedError: MuJoCo does not accept the arm.

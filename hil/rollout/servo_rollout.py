@@ -70,7 +70,13 @@ def roll_out_servo(
 ) -> Rollout:
     """Identify the servo from the fitted positions, and simulate the held-out ones with it.
 
-    The bodies are those of the URDF.
+    The bodies are the URDF's.
+
+    Args:
+        paths: archives that are fitted.
+        predict: archives that are held out.
+        split: part of a single recording that is held out.
+        reporter: of progress.
 
     Raises:
         InputError: there are no masses, no commanded positions, no servo or no window.

@@ -318,7 +318,16 @@ def leading_effect(
     measured: Array,
     joint: int,
 ) -> str:
-    """Return the effect of which a change lessens the error of a joint most; empty if none does."""
+    """Return the effect whose adjustment reduces the joint's error most, or "".
+
+    Args:
+        arm: that was simulated.
+        motion: that was recorded.
+        feedback: to the measured positions.
+        positions: simulated (w, h, n).
+        measured: positions (w, h, n).
+        joint: from 0.
+    """
 
     def square(positions: Array) -> float:
         at = positions[:, JUDGED, joint]

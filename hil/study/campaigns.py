@@ -68,6 +68,12 @@ def plan_study(
 ) -> list[StudyExecution]:
     """Return a campaign for each search; the first of A has the held-out sines, of B the fly-bys.
 
+    Args:
+        folder: of the study.
+        cell: that is simulated.
+        settings: of the study.
+        searches: whose motions are run.
+
     Raises:
         NoExcitationError: there are no held-out motions that satisfy all constraints.
     """

@@ -24,7 +24,14 @@ def in_children(
     reporter: Reporter,
     cluster: Cluster,
 ) -> list[T]:
-    """Call a function in child processes with the arguments of each place; results in order.
+    """Call a function in child processes; results in order.
+
+    Args:
+        function: that is called.
+        calls: place and arguments of each.
+        title: of the progress.
+        reporter: of it.
+        cluster: of workers.
 
     Raises:
         StudyError: a call failed, crashed or timed out.

@@ -120,7 +120,15 @@ def torques_under(
     plan: PlannedTorque,
     elapsed: float,
 ) -> Array:
-    """Return the measured torque under each condition (c, m, n)."""
+    """Return the measured torque under each condition (c, m, n).
+
+    Args:
+        conditions: of the study.
+        samples: of the motion.
+        errors: of the model.
+        plan: planned torque.
+        elapsed: duration for which the arm has moved like this before [s].
+    """
     time = samples.motion.time - samples.origin
     return np.array(
         [

@@ -129,7 +129,14 @@ class ConditionResult(Frozen):
     def comparison(
         self, first: Method, second: Method, motions: str, *, printed_sizes: bool = False
     ) -> StudyComparison:
-        """Return one of the comparisons."""
+        """Return one of the comparisons.
+
+        Args:
+            first: method.
+            second: method that it is compared with.
+            motions: on which errors are compared.
+            printed_sizes: whether A was fitted to as many rows as in the print.
+        """
         key = (first, second, motions, printed_sizes)
         return next(
             row

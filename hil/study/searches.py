@@ -150,6 +150,13 @@ def run_searches(
 ) -> list[Search]:
     """Run the searches that are not complete; an interrupted one resumes from its journal.
 
+    Args:
+        folder: of the study.
+        cell: that is simulated.
+        plans: of the searches.
+        reporter: of progress.
+        cluster: of workers.
+
     Raises:
         NoExcitationError: a search found no motion with any of its choices.
         StudyError: a search was not completed; a restart resumes.

@@ -58,10 +58,17 @@ def run_study(
     workers: int = 2,
     cell: Cell | None = None,
 ) -> StudyResults:
-    """Compare the paper's methods on a simulated cell (default: the NS 16); write results and page.
+    """Compare the paper's methods on a simulated cell; write results and page.
 
     An interrupted study resumes with the searches and campaigns that are not complete. Results do
     not depend on the number of workers.
+
+    Args:
+        root: folder of the study.
+        settings: of the study.
+        reporter: of progress.
+        workers: processes.
+        cell: that is simulated, by default the NS 16.
 
     Raises:
         CellError: the cell is not simulated.
