@@ -49,11 +49,6 @@ class TestOtherArms:
         )
         assert np.mean(figures["quantities_inside"]) > 0.88
 
-    @pytest.mark.xfail(
-        strict=True,
-        reason="the reached interval of torque counts with elastic gears, the promise does not: "
-        "promise over reached is 0.5",
-    )
     def test_the_ns16(self) -> None:
         kept(Cell.load(CELL_PATH), "parameters 20 %, torque 12, friction 3 %", range(1, 3), _ONE)
 
