@@ -491,6 +491,14 @@ class ZeroTorque(Conclusion):
 
 
 @dataclass(frozen=True)
+class ConstantTorque(Conclusion):
+    """A joint that moved under one and the same torque [N·m or N], which was not measured."""
+
+    joint: str
+    torque: float
+
+
+@dataclass(frozen=True)
 class LargeTorque(Conclusion):
     """The largest torque of a joint, and its limit in the URDF [N·m or N]."""
 

@@ -15,6 +15,7 @@ from hil.importers.conclusions import (
     ConcludedUnit,
     Conclusion,
     ConstantPositions,
+    ConstantTorque,
     CopiedCommands,
     CounterContinued,
     DifferentCommands,
@@ -474,6 +475,14 @@ def _(none: NoTorque) -> str:
 @worded.register
 def _(zero: ZeroTorque) -> str:
     return f"the torque of {zero.joint} is zero throughout"
+
+
+@worded.register
+def _(constant: ConstantTorque) -> str:
+    return (
+        f"the torque of {constant.joint} is {constant.torque:.3g} throughout, although it moves:"
+        " it was not measured"
+    )
 
 
 @worded.register

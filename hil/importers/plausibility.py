@@ -21,6 +21,7 @@ from hil.cell.toml_edits import UrdfLimits, urdf_limits
 from hil.importers.conclusions import (
     Conclusion,
     ConstantPositions,
+    ConstantTorque,
     Examined,
     FastJoint,
     JointRange,
@@ -372,6 +373,19 @@ def _torques(samples: ImportedSamples, names: Sequence[str], limits: Array) -> I
             yield ZeroTorque(name)
         elif largest > _TOO_FAST * limit:
             yield LargeTorque(name, float(largest), float(limit))
+    yield from constant_torques(samples.position, samples.torque, names)
+
+
+def constant_torques(
+    position: Array, torque: Array, names: Sequence[str]
+) -> tuple[ConstantTorque, ...]:
+    """Return the joints that moved (m, n) under one torque (m, n) that is not zero."""
+    moved = np.ptp(position, axis=0) > STUCK_MOVEMENT
+    is_constant = moved & (np.ptp(torque, axis=0) == 0.0) & (torque[0] != 0.0)
+    return tuple(
+        ConstantTorque(names[joint], float(torque[0, joint]))
+        for joint in np.flatnonzero(is_constant).tolist()
+    )
 
 
 def _torque_size(

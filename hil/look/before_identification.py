@@ -15,7 +15,9 @@ from hil.base.terminal_text import typed
 from hil.cell import Cell
 from hil.importers.conclusions import Certainty, ChannelMeaning
 from hil.importers.imported_robot import Robot
+from hil.importers.messages import sentence
 from hil.importers.name_words import words_of
+from hil.importers.plausibility import constant_torques
 from hil.importers.recording_content import Use
 from hil.importers.recording_import import ImportedRecording, ImportOptions, RobotOf, read_again
 from hil.look.look import SETTINGS, look_at_joints, mountings
@@ -45,6 +47,7 @@ _OTHER_ARM: Final = 0.5
 _EXPLAINS: Final = 0.5  # of the error, that a low-pass or heavy rotors leave where they are there
 _DRIVES: Final = -4.0  # standard errors of a friction that drives a joint
 _ROWS: Final = 700
+_UNSIGNED: Final = 2  # joints whose torque may be positive throughout, by the weight they hold
 _WARNED: Final = 2  # contradictions: a wrong limit of a right URDF explains one, more are refused
 _OF_AXES: Final = ("order", "signs", "zero", "coupling")
 _REMEDY: Final = (
@@ -70,11 +73,15 @@ def concluded(
     """
     if imported.is_stated or "torque" not in imported.archive.columns:
         return imported
+    _require_measured(imported.archive, source)
     may_be_load = (
         "commanded_position" in imported.archive.columns and "torque" not in options.chosen
     )
-    if may_be_load and _has_no_sign(imported.archive):
-        return _without_torque(imported, source, robot_of, use, NoJointTorque())
+    if unsigned := _unsigned_torques(imported.archive):
+        if may_be_load:
+            return _without_torque(imported, source, robot_of, use, NoJointTorque())
+        if unsigned > _UNSIGNED:
+            raise _without_sign(source, unsigned)
     few = _few_rows(imported.archive)
     if may_be_load and _is_named_load(imported):
         size = None if few is None else Size.of(few[0], few[0].model, few[1])
@@ -147,6 +154,15 @@ class Asking:
             return imported
 
 
+def _require_measured(archive: Archive, source: Path) -> None:
+    """Raise SourceError if a joint moves under one and the same torque."""
+    position, torque = (np.asarray(archive.columns[name]) for name in ("position", "torque"))
+    constant = constant_torques(position, torque, cell_of(archive).joint_names)
+    if constant:
+        remedy = "name the channel that was measured (--columns 'torque=NAME{}'), or record it"
+        raise SourceError(source, sentence(constant[0]), field="torque", remedy=remedy)
+
+
 def _is_suspect(cell: Cell, samples: Samples, score: Score, source: Path) -> bool:
     """Return whether a torque does not follow its arm as it is read.
 
@@ -164,11 +180,12 @@ def _is_suspect(cell: Cell, samples: Samples, score: Score, source: Path) -> boo
     )
 
 
-def _has_no_sign(archive: Archive) -> bool:
-    """Return whether no torque is ever negative, although joints move in both directions."""
+def _unsigned_torques(archive: Archive) -> int:
+    """Return the number of joints that move, if no torque is ever negative; else, or of one, 0."""
     torque = np.asarray(archive.columns["torque"])
     moving = np.ptp(np.asarray(archive.columns["position"]), axis=0) > STUCK_MOVEMENT
-    return bool(np.count_nonzero(moving) > 1 and (torque >= 0.0).all() and torque.any())
+    count = int(np.count_nonzero(moving))
+    return count if count > 1 and (torque >= 0.0).all() and torque.any() else 0
 
 
 def _is_named_load(imported: ImportedRecording) -> bool:
@@ -340,6 +357,18 @@ def _without_bodies(source: Path, rigid: RigidTorque) -> SourceError:
         " --urdf ARM.urdf -o map.toml`, --map map.toml)"
     )
     return SourceError(source, finding.words, field="torque", remedy=remedy)
+
+
+def _without_sign(source: Path, count: int) -> SourceError:
+    problem = (
+        f"no torque is ever negative, although {count} joints move there and back: its sign was"
+        " not recorded"
+    )
+    remedy = (
+        "record the torque with its sign; where a bit of the numbers has it, give a column map with"
+        " [torque] sign_bit = N (`hil look LOG --urdf ARM.urdf -o map.toml`, --map map.toml)"
+    )
+    return SourceError(source, problem, field="torque", remedy=remedy)
 
 
 def _other_arm(source: Path, error: float) -> SourceError:

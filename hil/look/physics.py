@@ -61,6 +61,7 @@ from identification.estimators.prior import LEARNED, body_prior, fit_posterior
 from identification.factor.factor import Factor
 from identification.hypotheses.changes import COUPLED, IN_ORDER, Axes, Change, Meaning
 from identification.hypotheses.diagnosis import RigidTorque, rigid_torque
+from identification.hypotheses.scores import is_backwards
 from identification.hypotheses.search import EXPLAINED, SEPARATE, Readings, Step
 from identification.model.link_wrenches import LINK_SYMBOLS
 from identification.model.motion import Motion
@@ -217,6 +218,12 @@ class TorqueFindings:
         """How much of the torque is that of bodies."""
         return rigid_torque(self.readings.model, self.readings.samples)
 
+    @cached_property
+    def is_backwards(self) -> bool:
+        """Whether the rows run backwards in time."""
+        readings = self.readings
+        return is_backwards(readings.model, readings.samples, readings.score)
+
     def rows(self, groups: Sequence[ParameterGroup] = ()) -> list[Row]:
         """Return the rows of the table; `groups` are the parameters that are determined."""
         rows = [
@@ -231,12 +238,17 @@ class TorqueFindings:
             self._size(),
             self._payload(groups),
         ]
+        if self.is_backwards:
+            backwards = (Basis.DRIVING_FRICTION,)
+            step = Decide.REVERSE_THE_ROWS
+            rows.insert(0, Row("time", Fact.BACKWARDS, Certainty.LIKELY, backwards, step))
         if self.rigid.is_nothing:
             rest = [row for row in rows if row.aspect != "side"]
             rows = [self._no_bodies(), *map(_says_nothing, rest)]
         error = self.readings.score.overall
         adequacy = self.readings.adequacy
-        if self.readings.steps and not adequacy.is_enough:
+        doubted = any(not step.sure for step in self.readings.steps)
+        if doubted and not adequacy.is_enough:
             beside = FreeFit(adequacy.ratio)
             rows.append(Row("explanation", Fact.NONE_FITS, Certainty.UNDETERMINED, (beside,)))
         if error > EXPLAINED:
@@ -309,6 +321,10 @@ class TorqueFindings:
         decider = Decide.PUSH_A_JOINT
         if steps:
             return self._changed("signs", steps, self._changes(steps), decider)
+        if self.is_backwards:
+            undetermined = Certainty.UNDETERMINED
+            backwards = (Basis.DRIVING_FRICTION,)
+            return Row("signs", Fact.SIGNS_OF_URDF, undetermined, backwards, decider)
         friction = self.readings.score.friction
         share = self.readings.score.share
         dissipates = (friction > SEPARATE) & (share > 0.0)
@@ -418,7 +434,9 @@ class TorqueFindings:
 
     def questions(self) -> tuple[tuple[TiedReading, ...], ...]:
         """Return the readings that fit alike, the best of each meaning."""
-        choices = []
+        choices: list[tuple[TiedReading, ...]] = []
+        if self.readings.score.overall > EXPLAINED:
+            return ()  # none of them is right
         for step in self.readings.steps:
             if not step.alike:
                 continue

@@ -32,6 +32,7 @@ class Fact(Enum):
     CONTINUOUS = auto()
     WITHIN_LIMITS = auto()
     COMMANDED = auto()
+    BACKWARDS = auto()  #: the rows run backwards in time
     MEASURED = auto()
     SLOPE = auto()  #: the velocity is that of the position
     SCALED_SLOPE = auto()
@@ -512,6 +513,7 @@ class NextStep(Enum):
     MOVE_ALL_OR_LOCK = auto()
     MOVE_EACH_JOINT = auto()
     PUSH_A_JOINT = auto()
+    REVERSE_THE_ROWS = auto()
     COMPARE_A_POSTURE = auto()
     WEIGH_A_LOAD = auto()
     RECORD_ALL_TORQUE = auto()

@@ -23,7 +23,14 @@ from identification.hypotheses.column_search import (
     find_columns,
     find_columns_of_unseen,
 )
-from identification.hypotheses.scores import ROWS_PER_FACT, Comparison, Score, compare, score_of
+from identification.hypotheses.scores import (
+    ROWS_PER_FACT,
+    Comparison,
+    Score,
+    compare,
+    is_backwards,
+    score_of,
+)
 from identification.hypotheses.search import (
     EXPLAINED,
     SEPARATE,
@@ -92,6 +99,7 @@ class TorqueDiagnosis:
         explanations: changes that explain errors of a fit, the signs and orders of which nothing
             fits alike first; None where that was not asked.
         begun: changes that begin within unseen recordings.
+        is_backwards: whether the rows run backwards in time.
     """
 
     weightless: Comparison | None
@@ -99,6 +107,7 @@ class TorqueDiagnosis:
     readings: Readings | None = None
     explanations: tuple[Explanation, ...] | None = None
     begun: tuple[Explanation, ...] = ()
+    is_backwards: bool = False
 
     @property
     def is_weightless(self) -> bool:
@@ -158,7 +167,7 @@ def diagnose(
 
 
 def torque_of(model: RobotModel, samples: Samples, score: Score) -> TorqueDiagnosis:
-    """Return whether there are bodies in the torque of some rows with this score, and gravity."""
+    """Return whether bodies and gravity are in the torque of rows with this score; their order."""
     read = model
     weightless = None
     if np.any(model.gravity):
@@ -166,7 +175,8 @@ def torque_of(model: RobotModel, samples: Samples, score: Score) -> TorqueDiagno
         weightless = compare(score_of(without, samples), score, model)
         if weightless.ratio < 1.0:
             read = without
-    return TorqueDiagnosis(weightless, rigid_torque(read, samples))
+    backwards = is_backwards(model, samples, score)
+    return TorqueDiagnosis(weightless, rigid_torque(read, samples), is_backwards=backwards)
 
 
 def _is_predicted(score: Score, samples: Samples, noise: Array | None) -> bool:

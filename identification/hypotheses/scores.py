@@ -64,6 +64,12 @@ class Score:
         return (self.friction < -DISSIPATES) & (self.share < -_LEAST_FRICTION)
 
     @property
+    def is_all_driven(self) -> bool:
+        """Whether friction would drive every joint of which its sign is clear, two or more."""
+        clear = self.friction[np.abs(self.friction) > DISSIPATES]
+        return len(clear) > 1 and bool(np.all(clear < 0.0))
+
+    @property
     def joints(self) -> NDArray[np.intp]:
         """The joint that each recorded column of the torque is read as (n,)."""
         return np.argsort(self.columns)
@@ -146,6 +152,15 @@ def inertial_torque(model: RobotModel, samples: Samples) -> Array:
     )
     acceleration = np.sqrt(np.mean(motion.acceleration**2, axis=0))
     return np.asarray(inertia * acceleration)
+
+
+def is_backwards(model: RobotModel, samples: Samples, score: Score) -> bool:
+    """Return whether the rows run backwards in time, by a score of them.
+
+    Then friction drives every joint, and inertia is as it should be: a torque with the opposite
+    sign has a negative one as well.
+    """
+    return score.is_all_driven and bool(inertial_torque(model, samples).sum() > 0.0)
 
 
 def _squares(factor: Factor, values: Array, blocks: slice | NDArray[np.bool_]) -> Array:

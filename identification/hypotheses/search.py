@@ -51,7 +51,6 @@ from identification.hypotheses.joint_fit import (
 )
 from identification.hypotheses.little_torque import little_torque
 from identification.hypotheses.scores import (
-    DISSIPATES,
     ROWS_PER_FACT,
     Comparison,
     Score,
@@ -399,16 +398,12 @@ class _Search:
         joints = tuple(np.flatnonzero(self.score.driven).tolist())
         if not joints:
             return []
-        friction = self.score.friction
-        clear = friction[np.abs(friction) > DISSIPATES]
         kinds: tuple[Meaning, ...] = ("torque sign", "position sign")
         # All torques negated: with other bodies an arm predicts them alike, so that the error does
         # not decide, but friction and inertia do: a lag of the torque turns none of all.
-        everywhere = (
-            len(clear) > 1
-            and bool(np.all(clear < 0.0))
-            and inertial_torque(self.model, self.samples).sum() < 0.0
-        )
+        everywhere = self.score.is_all_driven
+        if everywhere and inertial_torque(self.model, self.samples).sum() > 0.0:
+            return []  # the rows run backwards: no sign is wrong
         if everywhere:
             kinds = ("torque sign",)
             joints = tuple(range(self.model.n_joints))

@@ -46,6 +46,7 @@ FindingKey = Literal[
     # what the recordings are
     "no bodies",
     "no gravity",
+    "rows backwards",
     "zeros",
     "zeros, nearest",
     "alike",
@@ -155,6 +156,7 @@ RemedyKey = Literal[
     "move in both directions",
     "record all torque",
     "state that gravity was removed",
+    "reverse the rows",
     "correct the zeros",
     "compare a posture",
     "jog and compare",

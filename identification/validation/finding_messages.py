@@ -319,6 +319,11 @@ SENTENCES: Final[Mapping[FindingKey, Sentence]] = {
         "gravity was removed from the torque: without it, the fitted motion is predicted with"
         " {ratio:.2f} times the error",
     ),
+    "rows backwards": Sentence(
+        "time",
+        "the rows run backwards in time: friction would drive every axis, while gravity and"
+        " inertia have the right sign",
+    ),
     "zeros": Sentence(
         "zeros",
         "the zeros of joints differ from the URDF: {each} to be added; with that, rows"
@@ -713,6 +718,7 @@ REMEDIES: Final[Mapping[RemedyKey, str]] = {
         "state it: `--gravity 0 0 0` where a log is read with its URDF, or gravity of [robot] in"
         " the cell file"
     ),
+    "reverse the rows": "reverse the order of the rows, the times kept, and see what wrote them so",
     "correct the zeros": (
         "correct them: [position] offset = [{offsets:.4f}] (rad) in the column map; compare with a"
         " posture of the arm"

@@ -8,6 +8,7 @@ from numpy.typing import NDArray
 
 from identification import Recording
 from identification.hypotheses.diagnosis import TorqueDiagnosis, diagnose
+from identification.hypotheses.search import Adequacy
 from identification.signals.samples import Preprocessing, prepare
 from tests.identification.test_readings import HIP, KNEE, NAMES, TIME, model, motion
 
@@ -85,3 +86,20 @@ def test_zeros_of_several_joints_are_seen_at_once() -> None:
 def test_what_is_no_zero_is_called_none(more: object) -> None:
     q, torque, _ = motion()
     assert not diagnosed(q, torque + more(q)).zeros  # type: ignore[operator]
+
+
+def test_rows_that_run_backwards_are_no_wrong_sign() -> None:
+    """Friction drives both joints, and inertia is as it should be; not so with torques negated."""
+    q, torque, _ = motion()
+    found = diagnosed(q[::-1], torque[::-1])
+    assert found.is_backwards
+    assert not found.discrete
+    negated = diagnosed(q, -torque)
+    assert not negated.is_backwards
+    assert [step.change.meaning for step in negated.discrete] == ["torque sign"]
+
+
+def test_a_reading_is_judged_joint_by_joint() -> None:
+    """A mean over the joints hides one that is ten times worse than a free fit has it."""
+    assert Adequacy(1.1, 1.5, agrees=True).is_enough
+    assert not Adequacy(1.1, 10.0, agrees=True).is_enough

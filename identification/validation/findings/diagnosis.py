@@ -16,12 +16,12 @@ _OTHER_SCALE: Final = 3.0  # of the torque to that of the masses; descriptions i
 
 
 def is_other(evidence: Evidence) -> bool:
-    """Whether the torque is other than stated: without bodies or gravity, or of other zeros."""
+    """Whether a torque is other than stated: without bodies or gravity, backwards, other zeros."""
     found = evidence.diagnosis
     if found is None:
         return False
     zeros = any(step.sure for step in found.zeros)
-    return found.rigid.is_nothing or found.is_weightless or zeros
+    return found.rigid.is_nothing or found.is_weightless or found.is_backwards or zeros
 
 
 def other_meanings(evidence: Evidence, _: Thresholds) -> tuple[Finding, ...]:
@@ -30,12 +30,14 @@ def other_meanings(evidence: Evidence, _: Thresholds) -> tuple[Finding, ...]:
 
 
 def of_diagnosis(found: TorqueDiagnosis) -> tuple[Finding, ...]:
-    """Return what a torque is other than stated: without bodies, gravity, zeros, open signs."""
+    """Return what a torque is other than stated: of no bodies, backwards, of zeros, open signs."""
     findings = [_zeros(found), *(_open(step) for step in found.discrete if not step.sure)]
     if found.rigid.is_nothing:
         findings.insert(0, without_bodies(found.rigid))
     elif found.is_weightless:
         findings.insert(0, _without_gravity(found))
+    if found.is_backwards:
+        findings.insert(0, Finding("rows backwards", "wrong", "reverse the rows", "cause"))
     return tuple(finding for finding in findings if finding is not None)
 
 

@@ -77,17 +77,28 @@ def _negated(evidence: Evidence, found: _TorqueScale | None) -> Mask:
     return np.isfinite(found.scale) & found.negated
 
 
+def _is_backwards(evidence: Evidence) -> bool:
+    return evidence.diagnosis is not None and evidence.diagnosis.is_backwards
+
+
 def _driven(evidence: Evidence, found: _TorqueScale | None) -> Mask:
     """Return the axes that friction would drive, if it drives all with a known one (n,)."""
     dissipation = evidence.dissipation
     positive = found is not None and bool(np.any(found.scale - found.tolerance > 0.0))
-    if dissipation is None or positive or _negated(evidence, found).any():
+    if (
+        dissipation is None
+        or _is_backwards(evidence)
+        or positive
+        or _negated(evidence, found).any()
+    ):
         return np.zeros(len(evidence.held_out.rows), dtype=np.bool_)
     return dissipation.all_driving
 
 
 def all_opposite(evidence: Evidence) -> bool:
-    """Whether the torques of all axes have the opposite sign, one cause of many signs."""
+    """Whether all torques have the opposite sign, or time runs backwards: one cause of many."""
+    if _is_backwards(evidence):
+        return True
     found = _torque_scale(evidence)
     return bool(_negated(evidence, found).any() or _driven(evidence, found).any())
 

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -109,3 +111,25 @@ def test_a_look_at_an_archive_is_that_of_its_log(log: Path, aspect: str, tmp_pat
 
 def is_certain(row: Row) -> bool:
     return row.certainty is Certainty.CERTAIN
+
+
+@pytest.mark.parametrize(
+    ("damage", "sentence"),
+    [
+        (lambda torque: np.where(np.arange(6) == 1, 3.0, torque), "of j2 is 3 throughout"),
+        (np.abs, "no torque is ever negative, although 6 joints move"),
+    ],
+    ids=["one value", "no sign"],
+)
+def test_a_torque_that_was_not_measured_is_refused(
+    damage: Callable[[Any], Any], sentence: str, tmp_path: Path
+) -> None:
+    """By what it is, not as that of another arm."""
+    log = CASES / "11-urdf-units" / "log.csv"
+    table = np.loadtxt(log, delimiter=",", skiprows=1)
+    table[:, 7:] = damage(table[:, 7:])
+    damaged = tmp_path / "log.csv"
+    header = log.read_text().split("\n", 1)[0]
+    np.savetxt(damaged, table, delimiter=",", header=header, comments="", fmt="%.10g")
+    with pytest.raises(SourceError, match=sentence):
+        identified(damaged)
