@@ -169,7 +169,7 @@ _STEPS: Final[Mapping[NextStep, str]] = {
     NextStep.CHECK_COLUMNS: "check the order of the columns of both",
     NextStep.MOVE_ALL_OR_LOCK: "record a motion of all joints, or fix these (--locked NAME)",
     NextStep.MOVE_EACH_JOINT: "move the joints one by one",
-    NextStep.REVERSE_THE_ROWS: "reverse the order of the rows, the times kept",
+    NextStep.REVERSE_THE_ROWS: "reverse the order of the rows, but not the times",
     NextStep.PUSH_A_JOINT: "push one joint by hand and see its torque",
     NextStep.COMPARE_A_POSTURE: "compare a posture with the URDF's (viewer)",
     NextStep.RECORD_ALL_TORQUE: "record the torque before a model is subtracted from it",

@@ -469,8 +469,18 @@ class TorqueFindings:
         factor = self.size.factor or 1.0
         joints = self.cell.joint_names
         factors = self.size.of_joints or (None,) * len(joints)
-        ratios = tuple(1.0 / (each or factor) for each in factors)
-        unseen = tuple(name for name, each in zip(joints, factors, strict=True) if each is None)
+        # Of what was recorded: scales and signs that are not in the map are those of the gears.
+        gears = [step.change for step in self.readings.steps if not step.sure]
+        axes = Axes.of(gears, len(joints))
+        of_joints = axes.torque_sign / axes.torque_scale
+        ratios = tuple(
+            float(each) / (seen or factor) for each, seen in zip(of_joints, factors, strict=True)
+        )
+        unseen = tuple(
+            name
+            for name, seen, each in zip(joints, factors, of_joints, strict=True)
+            if seen is None and each == 1.0
+        )
         settings = (MotorTorque(ratios, unseen), MotorCurrents(ratios, unseen))
         return tuple(TiedReading("side", None, None, setting) for setting in settings)
 

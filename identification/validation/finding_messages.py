@@ -718,7 +718,9 @@ REMEDIES: Final[Mapping[RemedyKey, str]] = {
         "state it: `--gravity 0 0 0` where a log is read with its URDF, or gravity of [robot] in"
         " the cell file"
     ),
-    "reverse the rows": "reverse the order of the rows, the times kept, and see what wrote them so",
+    "reverse the rows": (
+        "reverse the order of the rows but not the times, and check the program that wrote them"
+    ),
     "correct the zeros": (
         "correct them: [position] offset = [{offsets:.4f}] (rad) in the column map; compare with a"
         " posture of the arm"

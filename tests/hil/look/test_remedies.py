@@ -350,3 +350,26 @@ def test_an_import_that_reads_again_keeps_its_options(cases: Path, tmp_path: Pat
     moved = columns(archive)["position"][0] - table[0, 1:7]
     assert np.degrees(moved) == pytest.approx([0.0, 20.1, -11.5, 0.0, 8.6, 0.0], abs=1.0)
     assert open_archive(archive).header.held_joints == ("j6",)
+
+
+def test_gear_ratios_that_differ_by_joint_are_those_of_the_motors(
+    cases: Path, tmp_path: Path
+) -> None:
+    """Forces of MuJoCo's actuators: the line that a look prints, with the maker's ratios."""
+    gears = np.array([50.0, -80.0, 50.0, 30.0, 30.0, 20.0])
+    rows = np.loadtxt(cases / "11-urdf-units" / "log.csv", delimiter=",", skiprows=1)
+    quantities = {"time": rows[:, 0], "qpos_{}": rows[:, 1:7], "actuator_force_{}": rows[:, 7:]}
+    quantities["actuator_force_{}"] = rows[:, 7:] / gears
+    log = written(tmp_path / "log.csv", **quantities)
+    line = (log, "--urdf", cases / "arm.urdf", "--columns", "torque=actuator_force_{}")
+    entries = tmp_path / "map.toml"
+    code, shown = typed("look", *line, "-v", "-o", entries)
+    assert code == 2
+    (found,) = re.findall(r'\[torque\] side = "motor"; \[drive\] gear_ratio = \[([^]]*)\]', shown)
+    masses = 1.08  # of the description over those of the arm
+    assert [*map(float, found.split(","))] == pytest.approx((masses * gears).tolist(), rel=0.1)
+    text = entries.read_text().replace("[torque]\n", '[torque]\nside = "motor"\n')
+    entries.write_text(f"{text}\n[drive]\ngear_ratio = {gears.tolist()}\n")
+    code, shown = typed("identify", *line[:3], "--map", entries, "-o", tmp_path / "found")
+    assert code == 0
+    assert "Good for feed-forward" in shown
