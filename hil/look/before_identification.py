@@ -73,10 +73,11 @@ def concluded(
     """
     if imported.is_stated or "torque" not in imported.archive.columns:
         return imported
-    _require_measured(imported.archive, source)
     may_be_load = (
         "commanded_position" in imported.archive.columns and "torque" not in options.chosen
     )
+    if not may_be_load:
+        _require_measured(imported.archive, source)
     if unsigned := _unsigned_torques(imported.archive):
         if may_be_load:
             return _without_torque(imported, source, robot_of, use, NoJointTorque())
