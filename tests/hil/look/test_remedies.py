@@ -352,9 +352,7 @@ def test_an_import_that_reads_again_keeps_its_options(cases: Path, tmp_path: Pat
     assert open_archive(archive).header.held_joints == ("j6",)
 
 
-def test_gear_ratios_that_differ_by_joint_are_those_of_the_motors(
-    cases: Path, tmp_path: Path
-) -> None:
+def test_gear_ratios_that_differ_by_joint(cases: Path, tmp_path: Path) -> None:
     """Forces of MuJoCo's actuators: the line that a look prints, with the maker's ratios."""
     gears = np.array([50.0, -80.0, 50.0, 30.0, 30.0, 20.0])
     rows = np.loadtxt(cases / "11-urdf-units" / "log.csv", delimiter=",", skiprows=1)
