@@ -272,7 +272,7 @@ def _with_a_sign(
     """Return a reading with a sign, and zeros and scales fitted beside it; the one found if better.
 
     One after the other, neither need lessen the error: a joint whose sign is wrong has no zero that
-    fits, and one whose zero is wrong no sign. Where both fit alike, the steps say so.
+    fits, and one whose zero is wrong no sign. Where both fit alike, no step is adequate.
     """
     tried = list(_signed(started))
     if not tried:
@@ -284,24 +284,39 @@ def _with_a_sign(
     )
     is_better = against.ratio < 1.0 - _LARGE and against.sigmas < -SEPARATE
     if not is_better and not (is_alike and len(more) + 1 < len(steps)):
-        other = [(change, best.score.overall)]
-        if not is_alike or any(step.change == change for step in steps):
+        is_other = is_alike and not _contains([step.change for step in more], steps)
+        if not is_other or any(step.change == change for step in steps):
             return found, steps
-        return found, [replace(step, alike=(*step.alike, *other)) for step in steps]
+        return found, [replace(step, is_adequate=False) for step in steps]
     before = started()
     without = started([step.change for step in more])
     alone = compare(best.score, without.score, found.model)
-    alike = [
-        (other, again.score.overall)
-        for other, again, _ in tried
-        if other != change
+    is_alone = not any(
+        other != change
         and compare(again.score, best.score, found.model).sigmas < SEPARATE
         and again.score.overall < (1.0 + _ALIKE) * best.score.overall
-    ]
+        for other, again, _ in tried
+    )
     sign = Step(
-        change, best.score.overall, before.score.overall, alone.ratio, alone.sigmas, tuple(alike)
+        change,
+        best.score.overall,
+        before.score.overall,
+        alone.ratio,
+        alone.sigmas,
+        is_adequate=is_alone,
     )
     return best, [sign, *more, *best.more_steps()]
+
+
+def _contains(changes: Sequence[Change], steps: Sequence[Step]) -> bool:
+    """Return whether all of some steps are among changes, about of the same size."""
+    return all(
+        any(
+            change[:2] == step.change[:2] and abs(change.size - step.change.size) < _SAME_SIZE
+            for change in changes
+        )
+        for step in steps
+    )
 
 
 def _signed(started: Callable[..., _Search]) -> Iterator[tuple[Change, _Search, list[Step]]]:
