@@ -359,7 +359,11 @@ def _without_common(family: Sequence[Series]) -> list[Series]:
         common = np.where(count >= SIBLINGS, common, 0.0)
         variance = np.where(count >= SIBLINGS, variance, 0.0)
         subtracted.append(
-            replace(each, value=_divided(each.value, common), variance=each.variance + variance)
+            replace(
+                each,
+                value=_divided(each.value, common),
+                variance=each.variance / np.maximum(1.0 + common, _LEAST_EFFECT) ** 2 + variance,
+            )
         )
     return subtracted
 
@@ -386,6 +390,20 @@ def _at(time: Array, known: Array, values: Array) -> Array:
     found = np.interp(time, known, values)
     nearest = np.min(np.abs(time[:, None] - known[None, :]), axis=1)
     return np.where(nearest <= 1.0, found, np.nan)
+
+
+def scattered(family: Sequence[Series]) -> list[Series]:
+    """Return series with the variance of values that scatter by a share of themselves.
+
+    As errors of torque do. The share is that of all of them, by the second differences of their
+    logarithms.
+    """
+    logs = [np.log(np.maximum(1.0 + each.value, _LEAST_EFFECT)) for each in family]
+    every = np.concatenate([*(np.diff(each, n=2) for each in logs), np.empty(0)])
+    share = float(np.median(np.abs(every))) / _NORMAL_MAD / math.sqrt(6.0) if len(every) else 0.0
+    return [
+        replace(each, variance=each.variance + (share * (1.0 + each.value)) ** 2) for each in family
+    ]
 
 
 def _noise_of_steps(family: Sequence[Series]) -> _Noise:

@@ -25,7 +25,7 @@ from hil.fleet.series import (
     RelativeSeries,
     TypeSeries,
 )
-from hil.fleet.series_changes import SIBLINGS, Course, common_course, courses
+from hil.fleet.series_changes import SIBLINGS, Course, common_course, courses, scattered
 from hil.fleet.trend_limits import TrendLimit
 
 FALSE_ALARMS: Final = 0.01
@@ -296,7 +296,7 @@ def _family_trends(
     members = warmed([each.series for each in series.values()], names)
     if followed.quantity == "reference error":
         pairs = zip(series.values(), members, strict=True)
-        members = [each.of_an_error(member) for each, member in pairs]
+        members = scattered([each.of_an_error(member) for each, member in pairs])
     for (robot, each), course in zip(series.items(), courses(members), strict=True):
         if course is not None:
             trend = _trend(robot, followed, each, course, origin, names, limits)

@@ -9,7 +9,7 @@ import pytest
 
 from hil.fleet.covariates import chosen, may_explain, names_of_joint, warmed
 from hil.fleet.series import RelativeSeries
-from hil.fleet.series_changes import Series, courses
+from hil.fleet.series_changes import Series, courses, scattered
 
 JOINTS = ("shoulder", "elbow", "wrist")
 
@@ -103,6 +103,22 @@ def test_the_error_of_the_first_model_grows_to_both_sides():
     series = Series(np.arange(4.0), np.zeros(4), np.zeros(4), columns)
     of_two = RelativeSeries(series, (), np.zeros(4), np.zeros(4), 1.0, 2)
     np.testing.assert_allclose(of_two.of_an_error(series).covariates[:, 0], [1.0, 1.0, 11.0, 9.0])
+
+
+def test_an_error_that_scatters_by_a_share_of_itself_is_no_change():
+    """It grows in all robots, as in a season, by about four times, and is then less certain."""
+    p_values = []
+    for seed in range(20):
+        random = np.random.default_rng(seed)
+        growth = 4.0 * np.exp(0.4 * random.standard_normal((5, 1)))
+        size = 1.0 + np.maximum(0.0, np.arange(10.0) - 2.0) / 7.0 * (growth - 1.0)
+        values = size * np.exp(0.2 * random.standard_normal((5, 10)))
+        family = [
+            Series(np.arange(10.0), each / each[:3].mean() - 1.0, np.zeros(10), np.empty((10, 0)))
+            for each in values
+        ]
+        p_values += [course.p_value for course in courses(scattered(family))]
+    assert min(p_values) > 0.01 / 150  # of a fleet of five robots with six joints
 
 
 def test_an_unknown_temperature_is_worth_less_and_costs_no_other():
