@@ -105,7 +105,7 @@ def test_the_error_of_the_first_model_grows_to_both_sides():
     np.testing.assert_allclose(of_two.of_an_error(series).covariates[:, 0], [1.0, 1.0, 11.0, 9.0])
 
 
-def test_an_error_that_scatters_by_a_share_of_itself_is_no_change():
+def test_an_error_that_grows_in_all_robots_is_no_change():
     """It grows in all robots, as in a season, by about four times, and is then less certain."""
     p_values = []
     for seed in range(20):
