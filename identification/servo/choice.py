@@ -26,6 +26,7 @@ _TRIAL: Final = 4  # of each fit of a fold
 _FOLDS: Final = 2
 _FEWEST_WINDOWS: Final = 4  # of which one half is predicted from the other
 _CHANCE: Final = 1.92  # of a log-likelihood with one parameter more, 95 %
+_DEVIATIONS: Final = 2.0  # of the mean over windows, from which on a term harms
 _LARGEST: Final = 1.0  # rad or m of an error, as of a model that falls over
 
 
@@ -141,29 +142,38 @@ def _errors(windows: ServoWindows, estimate: ServoEstimate, resolution: Array) -
 def _choices(
     windows: ServoWindows, full: ServoEstimate, resolution: Array, done: Callable[[], None]
 ) -> tuple[TermChoice, ...]:
-    """Choose by the errors of windows that were not fitted, for each joint by itself."""
+    """Choose by the errors of windows that were not fitted, for each joint by itself.
+
+    A joint is left without one term at most: that with which they are predicted worst.
+    """
     with_all = _predicted(windows, full, full.present, resolution, done)
     independent = len(windows.measured) / full.alike  # residuals of a window
-    choices = []
-    for terms in OPTIONAL:
+    gains = np.empty((len(OPTIONAL), windows.n_joints))
+    harms = np.empty_like(gains)
+    shown = np.empty(gains.shape, np.bool_)
+    for k, terms in enumerate(OPTIONAL):
         other = full.present.copy()
         other[:, [PLACE[name] for name in terms]] = False
         change = _predicted(windows, full, other, resolution, done) - with_all
-        gains = 0.5 * change.mean(axis=0)
+        gains[k] = 0.5 * change.mean(axis=0)
+        deviation = 0.5 * change.std(axis=0) / np.sqrt(max(1, len(change) - 1))
         likelier = 0.5 * independent * change
         total = likelier.sum(axis=0)
-        least = total - likelier.max(axis=0)
-        choices += [
-            TermChoice(
-                terms,
-                joint,
-                present=bool(total[joint] > -_CHANCE),
-                gain=float(gains[joint]),
-                shown=bool(total[joint] > _CHANCE and least[joint] > 0.0),
-            )
-            for joint in range(windows.n_joints)
-        ]
-    return tuple(choices)
+        harms[k] = np.where(gains[k] < -_DEVIATIONS * deviation, -total, 0.0)
+        shown[k] = (total > _CHANCE) & (total > likelier.max(axis=0))
+    # What others do is known with the worst term alone: without it they may well help.
+    left_out = (harms > _CHANCE) & (harms == harms.max(axis=0))
+    return tuple(
+        TermChoice(
+            terms,
+            joint,
+            present=not left_out[k, joint],
+            gain=float(gains[k, joint]),
+            shown=bool(shown[k, joint]),
+        )
+        for k, terms in enumerate(OPTIONAL)
+        for joint in range(windows.n_joints)
+    )
 
 
 def _predicted(
