@@ -189,12 +189,7 @@ def drives_of(model: IdentifiedModel, count: int, seed: int) -> Actuators:
         InputError: the estimator has no posterior.
     """
     arm = model.arm
-    ensemble = ensemble_of(model, max(count, _DRAWS), seed)
-    by_arm = [
-        _quantities(replace(arm, standard=standard, values=values))
-        for standard, values in zip(ensemble.standard, ensemble.values, strict=True)
-    ]
-    draws = {name: np.stack([each[name] for each in by_arm]) for name in by_arm[0]}
+    draws = _drawn(model, max(count, _DRAWS), seed)
     known = _prior_deviations(model)
     reach = model.estimate.interval_factor
     fields: dict[Quantity, FieldRange] = {}
@@ -206,8 +201,19 @@ def drives_of(model: IdentifiedModel, count: int, seed: int) -> Actuators:
         )
     fields["limit"] = FieldRange.exact(np.asarray(arm.ranges.effort))
     turning = np.asarray(arm.model.chain.revolute, np.bool_)
-    some = {name: values[:count] for name, values in draws.items()} if count else {}
+    # Arms are drawn so that their mean is the estimate: fewer are others.
+    some = _drawn(model, count, seed) if count else {}
     return Actuators(arm.model.joint_names, turning, fields, some)
+
+
+def _drawn(model: IdentifiedModel, count: int, seed: int) -> dict[Quantity, Array]:
+    """Return friction and rotors (count, n) of the arms that an ensemble of this size has."""
+    ensemble = ensemble_of(model, count, seed)
+    by_arm = [
+        _quantities(replace(model.arm, standard=standard, values=values))
+        for standard, values in zip(ensemble.standard, ensemble.values, strict=True)
+    ]
+    return {name: np.stack([each[name] for each in by_arm]) for name in by_arm[0]}
 
 
 def _quantities(arm: ExportedArm) -> dict[Quantity, Array]:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import ast
 import json
+import runpy
 import shutil
 from pathlib import Path
 from typing import Any
@@ -64,6 +65,44 @@ def test_isaac_lab_gets_the_identified_drives_without_gains(folder: Path, tmp_pa
         entry = ranges["VISCOUS_FRICTION"][name]
         assert entry["low"] <= values["VISCOUS_FRICTION"][name] <= entry["high"]
         assert entry["from"] == "data"
+
+
+def test_genesis_gets_the_identified_drives_with_ranges_and_draws(
+    folder: Path, tmp_path: Path
+) -> None:
+    path = tmp_path / "arm.py"
+    done = run("export", folder, "--to", "genesis", "-o", path, "--ranges", "--ensemble", 5)
+    assert done.exit_code in (0, 5), done.output
+    values = runpy.run_path(str(path))
+    assert "KP" not in values and "DELAY" not in values  # a log of torques shows no servo
+    document = json.loads((tmp_path / "arm.ranges.json").read_text())
+    for k, link in enumerate(links_of(folder)):
+        name = values["JOINTS"][k]
+        assert values["ARMATURE"][name] == pytest.approx(link["rotor_inertia"], rel=1e-5)
+        for field in ("ARMATURE", "DAMPING", "FRICTIONLOSS"):
+            entry = document["ranges"][field][name]
+            assert entry["low"] <= values[field][name] <= entry["high"]
+            draws = [draw[k] for draw in document["draws"][field]]
+            assert len(set(draws)) == 5 and min(draws) >= 0.0
+
+
+def test_draws_of_drives_are_those_of_the_arms_of_an_ensemble(folder: Path, tmp_path: Path) -> None:
+    """An ensemble of Isaac Lab's drives and one of MJCFs, of one seed, are the same arms."""
+    drives, arms = tmp_path / "drives.py", tmp_path / "arms"
+    for to, path in (("isaaclab", drives), ("mjcf", arms)):
+        line = ("export", folder, "--to", to, "-o", path, "--ranges", "--ensemble", 3)
+        done = run(*line)
+        assert done.exit_code in (0, 5), done.output
+    of_drives, of_arms = (
+        json.loads(path.with_suffix(".ranges.json").read_text())["draws"] for path in (drives, arms)
+    )
+    assert of_drives["ARMATURE"] == of_arms["armature"]
+    files = sorted(arms.glob("*.xml"))
+    assert len(files) == 3
+    for k, path in enumerate(files):
+        joints = ElementTree.parse(path).getroot().iter("joint")
+        armature = [float(each.attrib["armature"]) for each in joints if "armature" in each.attrib]
+        assert armature == pytest.approx(of_arms["armature"][k], rel=1e-5)
 
 
 def test_ranges_are_written_next_to_an_mjcf(folder: Path, tmp_path: Path) -> None:

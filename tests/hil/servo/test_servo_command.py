@@ -230,6 +230,27 @@ class TestExports:
         for setter in ("armature", "damping", "frictionloss", "force_range"):
             assert getattr(entity, f"set_dofs_{setter}").called
 
+    def test_genesis_itself_reads_the_values_back(
+        self, identified: tuple[Path, str, int], tmp_path: Path
+    ) -> None:
+        """genesis-world needs no GPU, but 3 GB: it is tried where it is installed."""
+        genesis = pytest.importorskip("genesis", reason="genesis-world is not installed")
+        folder, _, _ = identified
+        path, urdf = tmp_path / "arm.py", tmp_path / "arm.urdf"
+        assert exported(folder, "--to", "genesis", "-o", path)[0] == 0
+        urdf.write_text(arm.urdf())
+        genesis.init(backend=genesis.cpu, logging_level="error")
+        scene = genesis.Scene(show_viewer=False)
+        entity = scene.add_entity(genesis.morphs.URDF(file=str(urdf), fixed=True))
+        scene.build()
+        drives = executed(path)
+        drives["apply"](entity)
+        dofs = [entity.get_joint(name).dofs_idx_local[0] for name in arm.NAMES]
+        for field in ("KP", "ARMATURE", "DAMPING", "FRICTIONLOSS"):
+            found = getattr(entity, f"get_dofs_{field.lower()}")(dofs)
+            stated = [drives[field][name] for name in arm.NAMES]
+            assert np.asarray(found) == pytest.approx(stated, rel=1e-5)
+
     def test_ranges_contain_the_values_and_say_where_they_are_from(
         self, identified: tuple[Path, str, int], tmp_path: Path
     ) -> None:
