@@ -189,7 +189,7 @@ def drives_of(model: IdentifiedModel, count: int, seed: int) -> Actuators:
         InputError: the estimator has no posterior.
     """
     arm = model.arm
-    draws = _drawn(model, max(count, _DRAWS), seed)
+    draws = _sampled_drives(model, max(count, _DRAWS), seed)
     known = _prior_deviations(model)
     reach = model.estimate.interval_factor
     fields: dict[Quantity, FieldRange] = {}
@@ -202,11 +202,11 @@ def drives_of(model: IdentifiedModel, count: int, seed: int) -> Actuators:
     fields["limit"] = FieldRange.exact(np.asarray(arm.ranges.effort))
     turning = np.asarray(arm.model.chain.revolute, np.bool_)
     # Arms are drawn so that their mean is the estimate: fewer are others.
-    some = _drawn(model, count, seed) if count else {}
+    some = _sampled_drives(model, count, seed) if count else {}
     return Actuators(arm.model.joint_names, turning, fields, some)
 
 
-def _drawn(model: IdentifiedModel, count: int, seed: int) -> dict[Quantity, Array]:
+def _sampled_drives(model: IdentifiedModel, count: int, seed: int) -> dict[Quantity, Array]:
     """Return friction and rotors (count, n) of the arms that an ensemble of this size has."""
     ensemble = ensemble_of(model, count, seed)
     by_arm = [

@@ -67,9 +67,7 @@ def test_isaac_lab_gets_the_identified_drives_without_gains(folder: Path, tmp_pa
         assert entry["from"] == "data"
 
 
-def test_genesis_gets_the_identified_drives_with_ranges_and_draws(
-    folder: Path, tmp_path: Path
-) -> None:
+def test_genesis_gets_drives_with_ranges_and_draws(folder: Path, tmp_path: Path) -> None:
     path = tmp_path / "arm.py"
     done = run("export", folder, "--to", "genesis", "-o", path, "--ranges", "--ensemble", 5)
     assert done.exit_code in (0, 5), done.output
