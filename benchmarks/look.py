@@ -160,7 +160,7 @@ def plants(arm: Arm) -> Iterator[Planted]:
     relative = np.eye(n)
     relative[third, 1] = 1.0
     yield of(
-        "coupled", "coupling", f"{names[third]} is recorded plus that of {names[1]}",
+        "coupled", "coupling", f"{names[third]} is recorded plus the angle of {names[1]}",
         position=q @ relative.T, velocity=None if v is None else v @ relative.T,
     )  # fmt: skip
     for joint, angle in ((1, 0.6), (2, -0.6), (3, np.pi / 2.0)):
