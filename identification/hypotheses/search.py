@@ -221,7 +221,8 @@ def find_readings(
 
     search, steps = _one_by_one(started)
     adequacy = search.adequacy()
-    if not adequacy.is_enough or any(not step.sure or step.is_far for step in steps):
+    is_doubted = not adequacy.is_enough or any(not step.sure or step.is_far for step in steps)
+    if is_doubted and (steps or search.score.overall > EXPLAINED):
         search, steps = _with_a_sign(started, search, steps)
         adequacy = search.adequacy()
     nearest = search.nearest()
