@@ -32,7 +32,7 @@ ALTERNATIVES: Final[Mapping[str, tuple[Any, ...]]] = {
     "WORTHWHILE": (0.0, 0.03),
     "TERM_WORTHWHILE": (0.0, 0.05),
     "REVERSAL_WORTHWHILE": (0.02, 0.10),
-    "LEFT_OUT": (("halts", "rests", "slow"),),
+    "EXCLUDED_ROWS": (("halts", "rests", "slow"),),
     "BANDWIDTHS": ((10.0, 14.0, 7.0, 20.0, 40.0), (20.0, 14.0, 40.0, 10.0, 7.0)),
     "VELOCITIES": (("position", "measured"),),
     "PRESLIDING": (

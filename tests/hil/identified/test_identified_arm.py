@@ -296,12 +296,13 @@ class TestLoaded:
             hil.load(tmp_path)
 
 
+@pytest.fixture(scope="module")
+def of_file(folder: Path) -> Any:
+    return hil.identify(folder / "a.csv", urdf=folder / "three.urdf")
+
+
 class TestDataFrame:
     """A table in memory is a log."""
-
-    @pytest.fixture(scope="class")
-    def of_file(self, folder: Path) -> Any:
-        return hil.identify(folder / "a.csv", urdf=folder / "three.urdf")
 
     @pytest.mark.parametrize("indexed", [False, True])
     def test_it_gives_what_its_file_gives(
