@@ -1,8 +1,9 @@
 """A fleet of simulated arms with known faults, and how soon `hil trend` finds them.
 
 Run with ``python -m benchmarks.fleet [--fleets N] [--logged WHAT]``: fleets of 20 robots over 24
-months, which are asked about every month, as a nightly job does. The friction of each joint is
-known from each log to half a per cent, as from 30 s of motion; what follows is the trend.
+months, which are asked about every month, as a nightly job does. The friction of each joint, and
+the gravity load of joints that bear the arm's weight, are known from each log to half a per cent,
+as from 30 s of motion; what follows is the trend.
 `write_fleet` simulates logs by pinocchio's recursive Newton-Euler with this module's friction,
 temperature and noise; it uses nothing of `hil` or `identification`.
 """
@@ -31,6 +32,7 @@ from hil.fleet.trend import FALSE_ALARMS
 Array = NDArray[np.float64]
 FaultKind = Literal["wear", "lubricant", "replacement", "tool"]
 Known = Literal["temperature", "minutes since start", "nothing"]
+Followed = Literal["friction", "gravity load"]
 
 EVERY: Final = -1
 """Number in place of that of a robot: what happens to all of them."""
@@ -74,6 +76,11 @@ class Fault:
     def passes_tenth(self) -> float:
         """Month in which friction has changed by 10 %; of a tool that of its begin."""
         return self.month + 0.1 / self.size if self.kind == "wear" else self.month
+
+    @property
+    def quantity(self) -> Followed:
+        """What a trend sees of it."""
+        return "gravity load" if self.kind == "tool" else "friction"
 
 
 @dataclass(frozen=True)
@@ -133,6 +140,14 @@ def urdf() -> Path:
         if file.name == "ur10_robot.urdf":
             return Path(str(file.locate()))
     raise FileNotFoundError("ur10_robot.urdf")
+
+
+def loaded_arm(load: float) -> pin.Model:
+    """Return the arm with a load [kg] on its flange."""
+    model = pin.buildModelFromUrdf(str(urdf()))
+    body = pin.Inertia(load, np.array([0.0, 0.05, 0.1]), 0.01 * load * np.eye(3))
+    model.appendBodyToJoint(model.njoints - 1, body, pin.SE3.Identity())
+    return model
 
 
 @dataclass(eq=False)
@@ -197,14 +212,23 @@ class Fleet:
     def _without_friction(self, load: float) -> Array:
         """Return the torque of the arm with a load [kg] on its flange (m, 6)."""
         if load not in self._rigid:
-            model = pin.buildModelFromUrdf(str(urdf()))
-            body = pin.Inertia(load, np.array([0.0, 0.05, 0.1]), 0.01 * load * np.eye(3))
-            model.appendBodyToJoint(model.njoints - 1, body, pin.SE3.Identity())
+            model = loaded_arm(load)
             data = model.createData()
             states = zip(self.position, self.velocity, self.acceleration, strict=True)
             rigid = np.array([pin.rnea(model, data, *state) for state in states])
             self._rigid[load] = rigid + _ROTORS * self.acceleration
         return self._rigid[load]
+
+    def gravity_shares(self, load: float) -> Array:
+        """Return by what share a load [kg] on the flange changes the gravity of each joint (6,)."""
+        bare, loaded = (self._gravity(each) for each in (0.0, load))
+        shares: Array = np.einsum("mj,mj->j", bare, loaded) / np.einsum("mj,mj->j", bare, bare)
+        return shares - 1.0
+
+    def _gravity(self, load: float) -> Array:
+        model = loaded_arm(load)
+        data = model.createData()
+        return np.array([pin.computeGeneralizedGravity(model, data, q) for q in self.position])
 
 
 def write_log(path: Path, log: FleetLog, *, clock: bool = True, temperature: bool = True) -> Path:
@@ -236,7 +260,8 @@ def write_fleet(folder: Path, fleet: Fleet, *, months: Sequence[int] = ()) -> li
 
 # The benchmark
 
-_MEASURED: Final = 0.005  # standard deviation of the friction from one log
+_MEASURED: Final = 0.005  # standard deviation of a quantity from one log
+_BEARING: Final = (1, 2)  # joints whose gravity load is followed: the shoulder and the elbow
 _FIRST_ASKED: Final = 6  # months of logs
 _MOST_FAULTS: Final = 3
 _IN_TIME: Final = 2.0  # months from 10 % to an alarm
@@ -246,8 +271,16 @@ class Outcome(NamedTuple):
     """What was said of one fleet over all months."""
 
     found: list[tuple[Fault, int | None, float]]  #: month of the alarm; error of its begin at last
-    alarms: int  #: joints without a fault that were called changed at any time
+    alarms: int  #: places without a fault that were called changed at any time
     years: float
+
+
+class Place(NamedTuple):
+    """Where a change is found."""
+
+    robot: int  #: its number, or `EVERY`
+    quantity: Followed
+    joint: int
 
 
 def planned(seed: int, *, faulty: bool) -> FleetPlan:
@@ -258,13 +291,14 @@ def planned(seed: int, *, faulty: bool) -> FleetPlan:
     random = np.random.default_rng(seed)
     faults = []
     robots = random.permutation(20)
-    kinds: tuple[FaultKind, ...] = ("wear", "lubricant", "replacement")
+    kinds = get_args(FaultKind)
     for robot in robots[: random.integers(1, _MOST_FAULTS + 1)] if faulty else ():
         kind = kinds[random.integers(len(kinds))]
         size = {
             "wear": random.uniform(0.02, 0.08),
             "lubricant": random.uniform(0.12, 0.4),
             "replacement": -random.uniform(0.12, 0.3),
+            "tool": random.uniform(2.0, 6.0),
         }[kind]
         month = float(random.uniform(6.0, 15.0))
         faults.append(Fault(int(robot), kind, int(random.integers(6)), month, float(size)))
@@ -279,8 +313,17 @@ def watched(plan: FleetPlan, known: Known = "temperature") -> Outcome:
     fleet = Fleet(plan)
     random = np.random.default_rng(plan.seed)
     conditions = [[fleet.condition(r, m) for m in range(plan.months)] for r in range(plan.robots)]
-    friction = np.array([[each.friction for each in robot] for robot in conditions])
-    friction *= 1.0 + _MEASURED * random.standard_normal(friction.shape)
+    values: dict[Followed, Array] = {
+        "friction": np.array([[each.friction for each in robot] for robot in conditions]),
+        "gravity load": np.ones((plan.robots, plan.months, 6)),
+    }
+    for fault in plan.faults:
+        if fault.kind == "tool":
+            begun = np.arange(plan.months) >= fault.month
+            shares = fleet.gravity_shares(fault.size)
+            values["gravity load"][fault.robot] += begun[:, None] * shares
+    for value in values.values():
+        value *= 1.0 + _MEASURED * random.standard_normal(value.shape)
     months = np.array([[(e.when - FIRST) / MONTH for e in robot] for robot in conditions])
     told = {
         "temperature": [[[each.temperature] for each in robot] for robot in conditions],
@@ -288,15 +331,18 @@ def watched(plan: FleetPlan, known: Known = "temperature") -> Outcome:
         "nothing": [[[] for _ in robot] for robot in conditions],
     }
     columns = np.array(told[known])
-    places = {(fault.robot, fault.joint): fault for fault in plan.faults}
-    first: dict[tuple[int, int], int] = {}
-    last: dict[tuple[int, int], Course] = {}
+    followed: list[tuple[Followed, int]] = [
+        *(("friction", joint) for joint in range(6)),
+        *(("gravity load", joint) for joint in _BEARING),
+    ]
+    first: dict[Place, int] = {}
+    last: dict[Place, Course] = {}
     for month in range(_FIRST_ASKED, plan.months + 1):
-        found: dict[tuple[int, int], Course] = {}
-        for joint in range(6):
+        found: dict[Place, Course] = {}
+        for quantity, joint in followed:
             family = []
             for robot in range(plan.robots):
-                value = friction[robot, :month, joint]
+                value = values[quantity][robot, :month, joint]
                 relative = value / value[:3].mean() - 1.0
                 variance = np.full(month, _MEASURED**2)
                 family.append(
@@ -305,20 +351,25 @@ def watched(plan: FleetPlan, known: Known = "temperature") -> Outcome:
             family = warmed(family, [known][: columns.shape[2]])
             for robot, course in enumerate(courses(family)):
                 if course is not None:
-                    found[robot, joint] = course
+                    found[Place(robot, quantity, joint)] = course
             if (common := common_course(family)) is not None:
-                found[EVERY, joint] = common.course
+                found[Place(EVERY, quantity, joint)] = common.course
         adjusted = holm(np.array([each.p_value for each in found.values()]))
         for (place, each), p_value in zip(found.items(), adjusted.tolist(), strict=True):
             if p_value < FALSE_ALARMS and each.largest >= LEAST:
                 first.setdefault(place, month - 1)
                 last[place] = each
     results = []
-    for place, fault in places.items():
-        begins = [change.shape.begin for change in last[place].changes] if place in last else []
+    caused: set[Place] = set()
+    for fault in plan.faults:
+        joints = _BEARING if fault.kind == "tool" else (fault.joint,)
+        places = [Place(fault.robot, fault.quantity, joint) for joint in joints]
+        caused.update(places)
+        alarms = [first[place] for place in places if place in first]
+        begins = [c.shape.begin for place in places if place in last for c in last[place].changes]
         error = min((abs(begin - fault.month) for begin in begins), default=np.inf)
-        results.append((fault, first.get(place), float(error)))
-    return Outcome(results, len(first.keys() - places.keys()), plan.months / 12.0)
+        results.append((fault, min(alarms, default=None), float(error)))
+    return Outcome(results, len(first.keys() - caused), plan.months / 12.0)
 
 
 def main() -> None:

@@ -121,7 +121,7 @@ class ArrayFile:
         Raises:
             SourceError: no such array or column, or arrays of different lengths.
         """
-        parts = [self._column(name, field, array, rows=rows).astype(np.float64) for name in columns]
+        parts = [_floats(self._column(name, field, array, rows=rows)) for name in columns]
         if len({len(part) for part in parts}) > 1:
             lengths = ", ".join(f"{c} {len(part)}" for c, part in zip(columns, parts, strict=True))
             problem = f"its arrays differ in length: {lengths}"
@@ -130,7 +130,7 @@ class ArrayFile:
 
     def matrix(self, name: str | None, field: str) -> Array:
         """Return an array as a matrix; without a name the only one there is, else SourceError."""
-        return self._matrix(name, field).astype(np.float64)
+        return _floats(self._matrix(name, field))
 
     def times(
         self, column: Column, decimals: int, array: str | None = None
@@ -312,6 +312,12 @@ def read_mcap(path: Path) -> dict[str, NDArray[Any]]:
 
 def _is_readable(topic: mcap_messages.Topic) -> bool:
     return topic.is_ros2 or topic.encoding in ENCODINGS
+
+
+def _floats(array: Any) -> Array:
+    with np.errstate(invalid="ignore"):  # a signalling NaN is refused later, as any NaN
+        floats: Array = array.astype(np.float64)
+    return floats
 
 
 def _columns(
