@@ -219,9 +219,9 @@ class Fleet:
             self._rigid[load] = rigid + _ROTORS * self.acceleration
         return self._rigid[load]
 
-    def gravity_shares(self, load: float) -> Array:
-        """Return by what share a load [kg] on the flange changes the gravity of each joint (6,)."""
-        bare, loaded = (self._gravity(each) for each in (0.0, load))
+    def gravity_shares(self, load: float, joints: Sequence[int]) -> Array:
+        """Return by what share a load [kg] on the flange changes the gravity of joints (k,)."""
+        bare, loaded = (self._gravity(each)[:, joints] for each in (0.0, load))
         shares: Array = np.einsum("mj,mj->j", bare, loaded) / np.einsum("mj,mj->j", bare, bare)
         return shares - 1.0
 
@@ -298,7 +298,7 @@ def planned(seed: int, *, faulty: bool) -> FleetPlan:
             "wear": random.uniform(0.02, 0.08),
             "lubricant": random.uniform(0.12, 0.4),
             "replacement": -random.uniform(0.12, 0.3),
-            "tool": random.uniform(2.0, 6.0),
+            "tool": random.uniform(0.5, 3.0),
         }[kind]
         month = float(random.uniform(6.0, 15.0))
         faults.append(Fault(int(robot), kind, int(random.integers(6)), month, float(size)))
@@ -320,8 +320,8 @@ def watched(plan: FleetPlan, known: Known = "temperature") -> Outcome:
     for fault in plan.faults:
         if fault.kind == "tool":
             begun = np.arange(plan.months) >= fault.month
-            shares = fleet.gravity_shares(fault.size)
-            values["gravity load"][fault.robot] += begun[:, None] * shares
+            shares = fleet.gravity_shares(fault.size, _BEARING)
+            values["gravity load"][fault.robot][:, _BEARING] += begun[:, None] * shares
     for value in values.values():
         value *= 1.0 + _MEASURED * random.standard_normal(value.shape)
     months = np.array([[(e.when - FIRST) / MONTH for e in robot] for robot in conditions])
