@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import json
 import signal
+import socket
 import subprocess
 import sys
+import time
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -87,6 +89,17 @@ def cell() -> Cell:
     return Cell.load(CELL_PATH).with_values(values)
 
 
+def wait_until_it_listens(process: subprocess.Popen[str], port: int) -> None:
+    latest = time.monotonic() + 60.0
+    while process.poll() is None and time.monotonic() < latest:
+        try:
+            socket.create_connection(("127.0.0.1", port), timeout=1.0).close()
+            return
+        except ConnectionRefusedError:
+            time.sleep(0.1)
+    raise AssertionError("the simulated controller does not listen")
+
+
 @pytest.fixture
 def simulated(cell: Cell, tmp_path: Path) -> Iterator[subprocess.Popen[str]]:
     """`hil simulate` of that arm, until Ctrl-C."""
@@ -97,6 +110,7 @@ def simulated(cell: Cell, tmp_path: Path) -> Iterator[subprocess.Popen[str]]:
     command += [f"rtde:127.0.0.1:{cell.controller.rtde.port}", "--patience", str(PATIENCE)]
     process = subprocess.Popen(command, stdout=subprocess.PIPE, text=True)
     try:
+        wait_until_it_listens(process, cell.controller.rtde.port)
         yield process
     finally:
         if process.poll() is None:
