@@ -325,12 +325,12 @@ def watched(plan: FleetPlan, known: Known = "temperature") -> Outcome:
     for value in values.values():
         value *= 1.0 + _MEASURED * random.standard_normal(value.shape)
     months = np.array([[(e.when - FIRST) / MONTH for e in robot] for robot in conditions])
-    told = {
+    logged = {
         "temperature": [[[each.temperature] for each in robot] for robot in conditions],
         "minutes since start": [[[each.minutes] for each in robot] for robot in conditions],
         "nothing": [[[] for _ in robot] for robot in conditions],
     }
-    columns = np.array(told[known])
+    columns = np.array(logged[known])
     followed: list[tuple[Followed, int]] = [
         *(("friction", joint) for joint in range(6)),
         *(("gravity load", joint) for joint in _BEARING),

@@ -174,7 +174,7 @@ def cell_at_free_ports() -> Cell:
 
 
 def measure(cycles: int, folder: Path) -> dict[str, Any]:
-    """Run once; return the times of the controller and those of the exchange."""
+    """Run once; return the times at the controller and at the exchange."""
     cell = cell_at_free_ports()
     processors = os.sched_getaffinity(0)
     answering = RealTimeSettings(priority=50, cpu=max(processors))

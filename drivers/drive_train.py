@@ -189,6 +189,6 @@ class MotorSide:
         return motor
 
     def joint_difference(self, motor: Array) -> Array:
-        """Convert differences (n,) of motor revolutions to those of joint positions [rad]."""
+        """Convert changes (n,) of motor revolutions to changes of joint position [rad]."""
         difference: Array = np.dot(motor, self._to_joint)
         return difference

@@ -80,7 +80,7 @@ class RefusalError(DriverError):
     Attributes:
         cycle: the controller's cycle in which it was due.
         remedy: what the operator should do.
-        is_general: whether that is said of any refusal; a controller may have a better remedy.
+        is_general: whether the remedy suits any controller; a link may have a better one.
     """
 
     is_general = True

@@ -188,7 +188,7 @@ def reidentify(
 ) -> BatchResult:
     """Identify every arm from all its archives: by repetition, by campaign, and pooled.
 
-    The numbers equal those of `hil identify` on the archives of a campaign with the same held out.
+    Equals `hil identify` on the archives of a campaign, with the same motions held out.
     They depend neither on the order in which archives are found nor on the workers. A single
     recording is never split.
 

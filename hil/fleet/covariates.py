@@ -44,10 +44,10 @@ def chosen(
     joint: str,
     joints: Sequence[str],
 ) -> list[str]:
-    """Return the covariates of a joint: its own, and two at most of no joint, stated ones first.
+    """Return the covariates of a joint: its own, and at most two of the whole robot, stated first.
 
-    Those are used that are stated or that most recordings have, and that vary in a robot by
-    themselves.
+    A covariate is used if it is stated or most recordings have it, and if it varies within a robot
+    independently of the others.
 
     Args:
         recordings: of each robot, their numbers by name.
@@ -77,7 +77,7 @@ def chosen(
 
 
 def _independent(columns: Sequence[Array]) -> list[int]:
-    """Return the columns that vary in robots (m, c), and not as those before them do."""
+    """Return which columns (m, c) vary within robots, and not as an earlier column does."""
     if not columns:
         return []
     every = np.nan_to_num(np.concatenate([each - mean_of_known(each) for each in columns]))
@@ -94,7 +94,7 @@ def _independent(columns: Sequence[Array]) -> list[int]:
 def names_of_joint(
     names: Sequence[str], joint: str, joints: Sequence[str]
 ) -> tuple[list[str], list[str]]:
-    """Return the covariate of a joint itself, and the names of those of no joint.
+    """Return a joint's own covariate, and the covariates of the whole robot.
 
     Covariates of joints end with the names of all of these, or with their numbers from 0 or 1.
     """
