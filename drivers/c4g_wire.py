@@ -497,6 +497,10 @@ class C4gWire:
         """See `Wire.require_other_targets`."""
         self._builder.require_targets(self._status.other_slots, cycle)
 
+    def record_state(self, state: NDArray[np.void]) -> None:
+        """Do nothing: its packets say no more than cycle records."""
+        del state
+
     def not_used(self) -> int:
         """Return 0: it shows in the target."""
         return 0
@@ -567,6 +571,8 @@ class _OwnPackets:
 @dataclass(frozen=True)
 class C4gProtocol:
     """The protocol of C4G Open."""
+
+    state: np.dtype[np.void] | None = None
 
     def wire(self, settings: ArmSettings) -> C4gWire:
         """Return the wire of a session; ValueError for an arm that does not exist."""

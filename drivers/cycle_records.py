@@ -8,9 +8,10 @@ processor become visible to others in order and that loads are not reordered, as
 
 from __future__ import annotations
 
+import json
 import mmap
 import os
-from typing import Final, Self
+from typing import Any, Final, Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -30,10 +31,14 @@ MEASURED = (
 """Values received of each joint, in the order of the wire (D1..D5, extra1..3)."""
 COMMANDED = ("commanded_position", "commanded_velocity")
 """Values sent in the reply."""
+ARM_STATE: Final = "arm_state"
+"""Field of what a controller sends beyond the others, if it sends any such."""
 
 
-def cycle_dtype(n_joints: int) -> np.dtype[np.void]:
+def cycle_dtype(n_joints: int, state: np.dtype[np.void] | None = None) -> np.dtype[np.void]:
     """Return the layout of one cycle record of an arm with `n_joints` joints.
+
+    `state` is the layout of ``arm_state``, which is absent without it.
 
     ``cycle`` controller's cycles since its init packet, missed ones counted in; ``number`` wire
     sequence number; ``arrival`` s, for diagnosis only; ``gap`` packets missed before this one;
@@ -43,7 +48,7 @@ def cycle_dtype(n_joints: int) -> np.dtype[np.void]:
     those of the reply, NaN where no set-point was sent.
     """
     joint = (n_joints,)
-    fields: list[tuple[str, str] | tuple[str, str, tuple[int]]] = [
+    fields: list[tuple[str, Any] | tuple[str, str, tuple[int]]] = [
         ("cycle", "<i8"),
         ("arrival", "<f8"),
         ("number", "<i4"),
@@ -54,7 +59,7 @@ def cycle_dtype(n_joints: int) -> np.dtype[np.void]:
         *((name, "<f8", joint) for name in (*MEASURED, *COMMANDED)),
         ("mode", "<i4", joint),
     ]
-    return np.dtype(fields, align=True)
+    return np.dtype(fields if state is None else [*fields, (ARM_STATE, state)], align=True)
 
 
 def create_memory(name: str, size: int) -> int:
@@ -70,11 +75,14 @@ def attach_memory(fd: int) -> mmap.mmap:
 
 
 _TAG: Final = 0x31474E4952434948
-_HEADER_BYTES: Final = 256
+_HEADER_BYTES: Final = 4096
+_STATE_AT: Final = 256
+"""Where in the header the layout of the arm's state is, as JSON; the words are before it."""
 # Indices of 8-byte words, those of different writers on different cache lines.
 _KIND = 0
 _JOINTS = 1
 _CAPACITY = 2
+_STATE_LENGTH = 3
 _WRITTEN = 8
 _READ = 16
 
@@ -102,15 +110,17 @@ class RingReader:
         self._read = self._oldest()
 
     def _map(self, memory: memoryview, n_joints: int) -> None:
-        self._words = words = memory.cast("B")[:_HEADER_BYTES].cast("q")
-        if len(words) < _HEADER_BYTES // 8 or words[_KIND] != _TAG:
+        whole = memory.cast("B")
+        self._words = words = whole[:_STATE_AT].cast("q")
+        if len(whole) < _HEADER_BYTES or words[_KIND] != _TAG:
             raise ValueError("this memory is not a ring of cycle records")
         if words[_JOINTS] != n_joints:
             raise ValueError(f"this ring is for {words[_JOINTS]} joints, not {n_joints}")
         self.n_joints = n_joints
         self.capacity = int(words[_CAPACITY])
-        data = memory.cast("B")[_HEADER_BYTES:]
-        self.rows: NDArray[np.void] = np.frombuffer(data, cycle_dtype(n_joints), self.capacity)
+        description = bytes(whole[_STATE_AT : _STATE_AT + words[_STATE_LENGTH]])
+        dtype = cycle_dtype(n_joints, _layout_of(description))
+        self.rows: NDArray[np.void] = np.frombuffer(whole[_HEADER_BYTES:], dtype, self.capacity)
         self.missed = 0
 
     def _oldest(self) -> int:
@@ -132,20 +142,27 @@ class RingReader:
 class CycleRing(RingReader):
     """The last `capacity` cycle records, written in place; `shared` ones can be read elsewhere.
 
-    If records are not drained in time, the oldest are overwritten.
+    If records are not drained in time, the oldest are overwritten. `state` is the layout of the
+    arm's state in them (`ControllerProtocol.state`); shared memory states it itself.
 
     Attributes:
         fd: descriptor of the memory, -1 for its own memory.
         written: records written.
         overflow: records overwritten before they were drained.
+        arm_state: states of the arm (capacity,), None where records have none.
     """
 
-    def __init__(self, n_joints: int, capacity: int = 4096, *, fd: int | None = None) -> None:
+    def __init__(
+        self,
+        n_joints: int,
+        capacity: int = 4096,
+        *,
+        state: np.dtype[np.void] | None = None,
+        fd: int | None = None,
+    ) -> None:
         if fd is None:
-            memory = memoryview(
-                bytearray(_HEADER_BYTES + capacity * cycle_dtype(n_joints).itemsize)
-            )
-            _describe(memory, n_joints, capacity)
+            memory = memoryview(bytearray(_bytes_of(n_joints, capacity, state)))
+            _describe(memory, n_joints, capacity, state)
             self._map(memory, n_joints)
             self._readable = capacity
             self._acknowledge = True
@@ -164,17 +181,20 @@ class CycleRing(RingReader):
         self.state = self.rows["state"]
         self.status = self.rows["status"]
         self.mode = self.rows["mode"]
+        names = self.rows.dtype.names or ()
+        self.arm_state: NDArray[np.void] | None = (
+            self.rows[ARM_STATE] if ARM_STATE in names else None
+        )
         self.measured = self._block(MEASURED)
         self.commanded = self._block(COMMANDED)
 
     @classmethod
-    def shared(cls, n_joints: int, capacity: int) -> Self:
+    def shared(cls, n_joints: int, capacity: int, state: np.dtype[np.void] | None = None) -> Self:
         """Allocate shared memory for `capacity` records."""
         if capacity < 2:
             raise ValueError(f"a shared ring of {capacity} cycle records; at least 2 are needed")
-        size = _HEADER_BYTES + capacity * cycle_dtype(n_joints).itemsize
-        fd = create_memory("hil-cycles", size)
-        _describe(memoryview(attach_memory(fd)), n_joints, capacity)
+        fd = create_memory("hil-cycles", _bytes_of(n_joints, capacity, state))
+        _describe(memoryview(attach_memory(fd)), n_joints, capacity, state)
         return cls(n_joints, fd=fd)
 
     def commit(self) -> None:
@@ -208,7 +228,26 @@ class CycleRing(RingReader):
         return self.rows.take(np.arange(self.written - count, self.written), mode="wrap")
 
 
-def _describe(memory: memoryview, n_joints: int, capacity: int) -> None:
+def _bytes_of(n_joints: int, capacity: int, state: np.dtype[np.void] | None) -> int:
+    """Return the size of a ring."""
+    return _HEADER_BYTES + capacity * cycle_dtype(n_joints, state).itemsize
+
+
+def _describe(
+    memory: memoryview, n_joints: int, capacity: int, state: np.dtype[np.void] | None
+) -> None:
     """Write the header of a ring."""
-    words = memory.cast("B")[:_HEADER_BYTES].cast("q")
+    whole = memory.cast("B")
+    words = whole[:_STATE_AT].cast("q")
+    description = b"" if state is None else json.dumps(state.descr).encode()
+    words[_STATE_LENGTH] = len(description)
+    whole[_STATE_AT : _STATE_AT + len(description)] = description
     words[_JOINTS], words[_CAPACITY], words[_KIND] = n_joints, capacity, _TAG
+
+
+def _layout_of(description: bytes) -> np.dtype[np.void] | None:
+    """Return the layout of a state, None of no description."""
+    if not description:
+        return None
+    fields = [(name, kind, *map(tuple, shape)) for name, kind, *shape in json.loads(description)]
+    return np.dtype(fields)

@@ -145,7 +145,8 @@ class Session:
     Args:
         drive_train: of the arm.
         guard: checks each set-point; its period must be the controller's cycle.
-        ring: receives one record per cyclic packet replied to.
+        ring: receives one record per cyclic packet replied to, with the arm's state if it has room
+            for that of `protocol`.
         mode: open mode in which the arm is moved, one of `SERVED_MODES`.
         max_gap: packets that may be missed in a row without stopping a motion, 0..`MAX_GAP`.
         arm: number of the arm, 1..4.
@@ -492,6 +493,8 @@ class Session:
         ring = self._ring
         ring.status[row] = axes.status
         ring.commanded[row] = math.nan
+        if ring.arm_state is not None:
+            self.wire.record_state(ring.arm_state[row : row + 1])
         if self._open_mode is None:
             ring.mode[row] = -1
             ring.measured[row] = math.nan

@@ -7,9 +7,12 @@ Robots.
 
 from __future__ import annotations
 
-from collections.abc import Collection
+from collections.abc import Collection, Mapping
 from dataclasses import dataclass
-from typing import NamedTuple, Protocol, TypeAlias
+from typing import Any, NamedTuple, Protocol, TypeAlias
+
+import numpy as np
+from numpy.typing import NDArray
 
 from drivers.arrays import Array
 from drivers.drive_train import DriveTrain, MotorSide
@@ -112,6 +115,9 @@ class Wire(Protocol):
     def record(self, measured: Array) -> None:
         """Write the values of the packet into (8, n), joint side in SI; also into `motors`."""
 
+    def record_state(self, state: NDArray[np.void]) -> None:
+        """Write what the packet says beyond that into (1,) of `ControllerProtocol.state`."""
+
     def fill_safe(self, requested: bool, cycle: int) -> None:
         """Begin a reply that moves nothing; `requested` is whether a motion waits or runs.
 
@@ -197,6 +203,10 @@ class ArmSettings:
 class ControllerProtocol(Protocol):
     """Protocol of a kind of controller."""
 
+    @property
+    def state(self) -> np.dtype[np.void] | None:
+        """Layout of what its packets say beyond those of other controllers; None if nothing."""
+
     def wire(self, settings: ArmSettings) -> Wire:
         """Return the wire of one session; ValueError for settings that it cannot have."""
 
@@ -211,3 +221,9 @@ class ControllerProtocol(Protocol):
             period: of a cycle [s].
             limits: largest following error and current of each joint (n,).
         """
+
+
+def state_of(session: Mapping[str, Any]) -> np.dtype[np.void] | None:
+    """Return the `state` of the protocol in keyword arguments of a `Session`."""
+    protocol: ControllerProtocol | None = session.get("protocol")
+    return None if protocol is None else protocol.state

@@ -23,6 +23,7 @@ from drivers.exchange.realtime import RealTimeReport, RealTimeSettings
 from drivers.guard import GuardLimits
 from drivers.motion_source import MotionSource
 from drivers.transports.base import TransportSpec
+from drivers.wire import state_of
 
 
 @dataclass(frozen=True, eq=False)
@@ -84,7 +85,8 @@ class ExchangeProcess:
 
     def __init__(self, settings: ExchangeSettings) -> None:
         n_joints = settings.drive_train.n_joints
-        self.ring_fd = CycleRing.shared(n_joints, settings.ring_capacity).fd
+        state = state_of(settings.session)
+        self.ring_fd = CycleRing.shared(n_joints, settings.ring_capacity, state).fd
         self.event_fd = event_log.create()
         self.control_fd = control.create()
         self._control = SharedState(self.control_fd)

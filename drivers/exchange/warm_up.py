@@ -98,7 +98,8 @@ class WarmUp:
         self._packets = own.own_packets(
             drives, position, period, (limits.following_error, limits.current)
         )
-        self.session = Session(drives, Guard(limits, period), CycleRing(n, 16), protocol=own)
+        ring = CycleRing(n, 16, state=own.state)
+        self.session = Session(drives, Guard(limits, period), ring, protocol=own)
         self.session.reply(self._packets.first(), 0.0)
         self.session.request(_Rest(position))
         self.cycle(opened=False)

@@ -1,85 +1,25 @@
-"""Frames of a controller as cycle records, and as states that other controllers do not send."""
+"""Frames of a controller as cycle records, with the arm's state in them."""
 
 from __future__ import annotations
 
-from typing import Final, NamedTuple
+from typing import Final
 
 import numpy as np
+from numpy.lib.recfunctions import structured_to_unstructured
 from numpy.typing import NDArray
 
 from drivers.arrays import Array
-from drivers.cycle_records import cycle_dtype
+from drivers.cycle_records import ARM_STATE, cycle_dtype
 from drivers.drive_train import DriveTrain
 from drivers.packets import DRIVE_ON
 from drivers.states import State
+from drivers.ur.arm_state import STATE_DTYPE, StateColumns
 from drivers.ur.outputs import N_JOINTS, POWER_MODES, ROBOT_RUNNING
 from drivers.ur.reader import OutputFrames
 from drivers.ur.rtde import RtdeError
 
-UNKNOWN: Final = -1
-"""Of integers that the controller does not send; other numbers are NaN."""
-_JOINT: Final = (N_JOINTS,)
-STATE_DTYPE: Final = np.dtype(
-    [
-        ("controller_time", "f8"),
-        ("target_acceleration", "f8", _JOINT),
-        ("target_moment", "f8", _JOINT),
-        ("control_current", "f8", _JOINT),
-        ("current_as_torque", "f8", _JOINT),
-        ("joint_temperature", "f8", _JOINT),
-        ("speed_scaling", "f8"),
-        ("speed_fraction", "f8"),
-        ("position_deviation_ratio", "f8"),
-        ("collision_ratio", "f8"),
-        ("payload_mass", "f8"),
-        ("payload_centre", "f8", (3,)),
-        ("payload_inertia", "f8", (6,)),
-        ("robot_mode", "i4"),
-        ("safety_mode", "i4"),
-        ("runtime_state", "i4"),
-        ("robot_status", "i4"),
-        ("safety_status", "i4"),
-    ]
-)
-"""State of a controller in one cycle.
-
-``controller_time`` s since its start; joint arrays in the sense of the URDF, ``target_moment`` N·m
-of its rigid-body model (payload and gravity included, no friction), currents A; temperatures °C;
-``payload_*`` as set at the controller, in the frame of its flange, inertia xx, xy, xz, yy, yz, zz;
-``*_status`` are bits.
-"""
-_OUTPUT_OF: Final = {
-    "controller_time": "timestamp",
-    "target_acceleration": "target_qdd",
-    "target_moment": "target_moment",
-    "control_current": "joint_control_output",
-    "current_as_torque": "actual_current_as_torque",
-    "joint_temperature": "joint_temperatures",
-    "speed_scaling": "speed_scaling",
-    "speed_fraction": "target_speed_fraction",
-    "position_deviation_ratio": "joint_position_deviation_ratio",
-    "collision_ratio": "collision_detection_ratio",
-    "payload_mass": "payload",
-    "payload_centre": "payload_cog",
-    "payload_inertia": "payload_inertia",
-    "robot_mode": "robot_mode",
-    "safety_mode": "safety_mode",
-    "runtime_state": "runtime_state",
-    "robot_status": "robot_status_bits",
-    "safety_status": "safety_status_bits",
-}
-_SIGNED: Final = ("target_acceleration", "target_moment", "control_current", "current_as_torque")
-_INERTIA_ORDER: Final = [0, 3, 4, 1, 5, 2]
-"""xx, xy, xz, yy, yz, zz in the controller's xx, yy, zz, xy, xz, yz."""
 _MOST_OFF_GRID: Final = 0.25
 """Of a time stamp, in cycles."""
-
-
-class CycleFrames(NamedTuple):
-    """Records (k,) of `drivers.cycle_dtype`, and states (k,) of `STATE_DTYPE`."""
-
-    records: NDArray[np.void]
-    states: NDArray[np.void]
 
 
 class CycleCounter:
@@ -100,8 +40,8 @@ class CycleCounter:
         self._cycle = -1
         self._fault: RtdeError | None = None
 
-    def records(self, frames: OutputFrames) -> CycleFrames:
-        """Return records and states of frames, in their order.
+    def records(self, frames: OutputFrames) -> NDArray[np.void]:
+        """Return the records (k,) of frames, in their order.
 
         Raises:
             RtdeError: time stamps that do not increase by whole cycles.
@@ -111,7 +51,7 @@ class CycleCounter:
         cycle = self._cycle + np.cumsum(steps)
         if len(cycle):
             self._cycle = int(cycle[-1])
-        records = np.zeros(len(values), cycle_dtype(N_JOINTS))
+        records = np.zeros(len(values), cycle_dtype(N_JOINTS, STATE_DTYPE))
         records["cycle"] = cycle
         records["number"] = cycle % (1 << 31)
         records["gap"] = steps - 1
@@ -129,7 +69,11 @@ class CycleCounter:
         records["model_current"] = values["target_current"]
         for name in ("diagonal_inertia", "extra3", "commanded_position", "commanded_velocity"):
             records[name] = np.nan
-        return CycleFrames(records, self._arm_states(values))
+        states = np.empty(len(values), STATE_DTYPE)
+        columns = StateColumns(values.dtype, self._sign)
+        columns.write(structured_to_unstructured(values, np.float64), states)
+        records[ARM_STATE] = states
+        return records
 
     def _steps(self, stamps: Array) -> NDArray[np.int64]:
         """Return the cycles since the frame before, of those before a fault; 1 for the first."""
@@ -156,19 +100,6 @@ class CycleCounter:
             return RtdeError("the controller's time stamps go back: it was started again")
         problem = f"the controller's time stamps are not {1e3 * self._period:g} ms apart"
         return RtdeError(f"{problem}: correct controller.cycle_ms")
-
-    def _arm_states(self, values: NDArray[np.void]) -> NDArray[np.void]:
-        states = np.zeros(len(values), STATE_DTYPE)
-        sent = values.dtype.names or ()
-        for name, output in _OUTPUT_OF.items():
-            if output in sent:
-                states[name] = values[output]
-            else:
-                states[name] = UNKNOWN if STATE_DTYPE[name].kind == "i" else np.nan
-        for name in _SIGNED:
-            states[name] *= self._sign
-        states["payload_inertia"] = states["payload_inertia"][:, _INERTIA_ORDER]
-        return states
 
 
 def _states(robot_mode: NDArray[np.int32]) -> NDArray[np.uint8]:

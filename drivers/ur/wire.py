@@ -26,6 +26,7 @@ from dataclasses import dataclass, replace
 from typing import Final
 
 import numpy as np
+from numpy.typing import NDArray
 
 from drivers.arrays import Array
 from drivers.drive_train import TURN, DriveTrain, MotorSide
@@ -35,6 +36,8 @@ from drivers.guard import Joints
 from drivers.packet_losses import LossTracker
 from drivers.packets import DRIVE_ON
 from drivers.states import AxesReport, Input, State
+from drivers.ur import outputs
+from drivers.ur.arm_state import STATE_DTYPE, StateColumns
 from drivers.ur.description import START, UrDescription
 from drivers.ur.expected import ExpectedArm
 from drivers.ur.identity import ArmIdentity
@@ -79,7 +82,10 @@ REQUIRED: Final = (
     "robot_status_bits", "speed_scaling", "target_speed_fraction", *OUTPUTS,
 )  # fmt: skip
 """Outputs without which nothing is moved."""
-OPTIONAL: Final = ("payload", "payload_cog", "joint_position_deviation_ratio")
+OPTIONAL: Final = tuple(
+    name for name in (*outputs.REQUIRED, *outputs.OPTIONAL) if name not in REQUIRED
+)
+"""Further outputs, that are recorded where this version has them."""
 OLDEST: Final = (5, 10)
 """Oldest software, major and minor, on which motions run."""
 NEWEST_MAJOR: Final = 5
@@ -138,6 +144,8 @@ class UrProtocol:
 
     expected: ExpectedArm
     program: StreamProgram
+
+    state = STATE_DTYPE
 
     def wire(self, settings: ArmSettings) -> UrWire:
         """Return the wire of a session; ValueError for settings that it cannot have."""
@@ -269,6 +277,8 @@ class UrWire:
             raise PacketError("outputs", missing, "all that a motion needs")
         self.description = description
         self._layout = _Layout(description.recipe)
+        joint_sign = self._settings.drive_train.joint_sign
+        self._columns = StateColumns(description.recipe.dtype, joint_sign)
         self._forget_cycles()
         self._broken = False
         settings = self._settings
@@ -417,6 +427,10 @@ class UrWire:
         raw[5] = values[at["target_current"]]
         raw[6:] = np.nan
         self.motors.to_joints(measured)
+
+    def record_state(self, state: NDArray[np.void]) -> None:
+        """See `Wire.record_state`."""
+        self._columns.write(self._values, state)
 
     def fill_safe(self, requested: bool, cycle: int) -> None:
         """Begin a reply by which the arm stays where it was commanded.
@@ -636,10 +650,15 @@ class _OwnPackets:
 _TYPES: Final = {
     "timestamp": "DOUBLE", "speed_scaling": "DOUBLE", "target_speed_fraction": "DOUBLE",
     "payload": "DOUBLE", "joint_position_deviation_ratio": "DOUBLE", "payload_cog": "VECTOR3D",
+    "collision_detection_ratio": "DOUBLE", "safety_status_bits": "UINT32",
     "joint_mode": "VECTOR6INT32", "robot_mode": "INT32", "safety_mode": "INT32",
     "runtime_state": "UINT32", "robot_status_bits": "UINT32",
     **dict.fromkeys(
-        ("target_q", "target_qd", "target_current", "actual_q", "actual_qd", "actual_current"),
+        (
+            "target_q", "target_qd", "target_qdd", "target_current", "target_moment", "actual_q",
+            "actual_qd", "actual_current", "joint_temperatures", "joint_control_output",
+            "payload_inertia", "actual_current_as_torque",
+        ),
         "VECTOR6D",
     ),
 }  # fmt: skip

@@ -17,6 +17,7 @@ import numpy as np
 from mcap.writer import CompressionType, Writer
 from numpy.typing import NDArray
 
+from drivers.cycle_records import ARM_STATE
 from hil.archive.cdr import Rows
 from hil.archive.header import (
     DESCRIPTION,
@@ -329,7 +330,7 @@ class ArchiveWriter:
         joint_names: joints in the order of the records' columns.
         period: cycle time of the controller [s].
         metadata: see `ArchiveFile`. Times of day only if a real arm moves.
-        states: topics (`hil.archive.schema.STATES`) of what the controller sends beyond records.
+        states: topics (`hil.archive.schema.STATES`) of the arm's state in each record.
         attachments: ``cell.toml``, ``robot.urdf``, ``drive_train.json``, ``plan.json`` by name.
         durable: wait at each flush until the data are on the disk.
 
@@ -357,7 +358,7 @@ class ArchiveWriter:
         self.period = period
         self._joint_names = tuple(joint_names)
         self._cycles_per_chunk = max(1, round(FLUSH_PERIOD / period))
-        self._pending: list[tuple[Rows, Array, Mapping[str, Rows]]] = []
+        self._pending: list[tuple[Rows, Array]] = []
         self._states = tuple(states)
         self._first: int | None = None
         self.newest = -1
@@ -378,19 +379,13 @@ class ArchiveWriter:
         begun = 0 if self._first is None else self.newest + 1 - self._first
         return (self._cycles_per_chunk - begun % self._cycles_per_chunk) * self.period
 
-    def write(
-        self,
-        records: Rows,
-        torque: Array | None = None,
-        states: Mapping[str, Rows] | None = None,
-    ) -> None:
+    def write(self, records: Rows, torque: Array | None = None) -> None:
         """Append cycle records.
 
         Args:
             records: (k,), of type `drivers.cycle_dtype`; referenced until their chunk is written,
                 so pass a copy. Batches of some 100 cycles are most efficient.
             torque: joint torque of each record, (k, n) [N·m]; None where unknown.
-            states: of each record (k,), for every topic of the archive's `states`.
 
         Raises:
             ArchiveWriteError: the disk fails, the archive is closed, or the cycles do not increase,
@@ -404,18 +399,15 @@ class ArchiveWriter:
         torques = unknown if torque is None else np.asarray(torque, np.float64)
         if not records["position"].shape == torques.shape == unknown.shape:
             raise ValueError(f"records and torques of {unknown.shape} are expected")
-        states = states or {}
-        if {topic: len(rows) for topic, rows in states.items()} != dict.fromkeys(
-            self._states, len(records)
-        ):
-            raise ValueError(f"{len(records)} states of {list(self._states)} are expected")
+        if self._states and ARM_STATE not in (records.dtype.names or ()):
+            raise ValueError(f"records without the state of {self._states[0]}")
         cycles = records["cycle"]
         self._check_growth(cycles)
         if self._first is None:
             self._first = int(cycles[0])
         self.newest = int(cycles[-1])
         self.missed += int(records["gap"].sum())
-        self._pending.append((records, torques, states))
+        self._pending.append((records, torques))
         oldest = int(self._pending[0][0]["cycle"][0])
         if self._slot(oldest) != self._slot(self.newest + 1):
             self._emit(everything=False)
@@ -500,28 +492,21 @@ class ArchiveWriter:
         """Write the pending records slot by slot; those of the open slot only if `everything`."""
         if not self._pending:
             return
-        records = np.concatenate([part for part, _, _ in self._pending])
-        torque = np.concatenate([part for _, part, _ in self._pending])
-        states = {
-            topic: np.concatenate([part[topic] for _, _, part in self._pending])
-            for topic in self._states
-        }
+        records = np.concatenate([part for part, _ in self._pending])
+        torque = np.concatenate([part for _, part in self._pending])
         slots = (records["cycle"] - (self._first or 0)) // self._cycles_per_chunk
         cuts = [0, *(np.flatnonzero(np.diff(slots)) + 1).tolist(), len(records)]
         if not everything and self._slot(self.newest + 1) == slots[-1]:
             cuts.pop()
         for start, stop in pairwise(cuts):
             part = records[start:stop]
-            of_part = {topic: rows[start:stop] for topic, rows in states.items()}
-            batch = cycle_messages(
-                self._joint_names, self.period, part, torque[start:stop], of_part
-            )
+            states = dict.fromkeys(self._states, part[ARM_STATE]) if self._states else {}
+            batch = cycle_messages(self._joint_names, self.period, part, torque[start:stop], states)
             self.file.add(batch)
             self.file.flush()
         written = cuts[-1]
-        rest = {topic: rows[written:] for topic, rows in states.items()}
         remains = written < len(records)
-        self._pending = [(records[written:], torque[written:], rest)] if remains else []
+        self._pending = [(records[written:], torque[written:])] if remains else []
 
 
 @dataclass(frozen=True, eq=False)

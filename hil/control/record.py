@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from hil.archive import CONTROLLER_PROGRAM, ArchiveName, ArchiveSpec
+from hil.archive.schema import UR_STATE
 from hil.base.errors import InputError
 from hil.base.files import make_folder
 from hil.base.version import software
@@ -64,7 +65,6 @@ def archive_spec(
     plan: Mapping[str, Any] | None = None,
     *,
     durable: bool,
-    states: tuple[str, ...] = (),
 ) -> ArchiveSpec:
     """Return the specification of an archive with cell, URDF, drive train and plan attached.
 
@@ -74,7 +74,6 @@ def archive_spec(
         metadata: of the archive.
         plan: of the motion; a motion of the controller's own program has none.
         durable: each flush waits for the disk.
-        states: topics of what the controller sends beyond cycle records.
     """
     attachments = {
         "cell.toml": cell.text.encode(),
@@ -90,7 +89,7 @@ def archive_spec(
         metadata={"cell": cell.name, **metadata},
         attachments=attachments,
         durable=durable,
-        states=states,
+        states=(UR_STATE,) if cell.is_ur else (),
     )
 
 

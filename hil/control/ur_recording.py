@@ -14,10 +14,12 @@ from pathlib import Path
 from typing import Final, Self
 
 import numpy as np
+from numpy.typing import NDArray
 
+from drivers.cycle_records import ARM_STATE
 from drivers.errors import DriverError
 from drivers.states import State
-from drivers.ur.cycles import CycleCounter, CycleFrames
+from drivers.ur.cycles import CycleCounter
 from drivers.ur.description import UrDescription, identity_document
 from drivers.ur.identity import ArmIdentity, ask_identity
 from drivers.ur.outputs import (
@@ -33,7 +35,7 @@ from drivers.ur.torque_constants import UNCERTAINTY, by_size, stated_constants
 from drivers.ur.transport import RtdeSpec
 from hil.archive import CONTROLLER_PROGRAM, open_archive
 from hil.archive.recorder import Recorded
-from hil.archive.schema import UR_STATE, Level
+from hil.archive.schema import Level
 from hil.archive.writer import ArchiveWriter
 from hil.base.arrays import Array
 from hil.base.errors import ControllerError, OperatorStopError
@@ -142,7 +144,7 @@ def record_arm(
         **origin_of(cell),
         **_statements(arm),
     }
-    spec = archive_spec(cell, path, metadata, durable=durable, states=(UR_STATE,))
+    spec = archive_spec(cell, path, metadata, durable=durable)
     identity = json.dumps(identity_document(arm.identity)).encode()
     spec = replace(spec, attachments={**spec.attachments, UrDescription.attachment: identity})
     with spec.open() as writer:
@@ -192,17 +194,16 @@ class _Recording:
 
     def _add(self, frames: OutputFrames, limit: int | None) -> None:
         """Archive frames up to the limit of cycles."""
-        records, states = self._counter.records(frames)
+        records = self._counter.records(frames)
         for text in frames.texts:
             self._event("ControllerText", f"{text.source}: {text.message}", Level.INFO)
         if limit is not None:
-            within = records["cycle"] < limit
-            records, states = records[within], states[within]
+            records = records[records["cycle"] < limit]
         if not len(records):
             return
         torque = self._cell.drive_train.joint_torque(records["target_current"])
-        self._writer.write(records, torque, {UR_STATE: states})
-        self._note_changes(CycleFrames(records, states))
+        self._writer.write(records, torque)
+        self._note_changes(records)
         self._progress = Progress(
             cycles=self._progress.cycles + len(records),
             missed=self._writer.missed,
@@ -210,9 +211,10 @@ class _Recording:
             position=records["position"][-1],
         )
 
-    def _note_changes(self, frames: CycleFrames) -> None:
+    def _note_changes(self, records: NDArray[np.void]) -> None:
         """Archive and report the changes of modes, and of the payload."""
-        for record, state in zip(frames.records, frames.states, strict=True):
+        for record in records:
+            state = record[ARM_STATE]
             for name, text, level in _changes(self._last, state):
                 self._event(name, text, level, int(record["cycle"]))
             if self._last is None and (text := _payload_difference(self._cell, state)):

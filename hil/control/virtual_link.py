@@ -18,6 +18,7 @@ from drivers.session import Session
 from drivers.states import HAS_SET_POINTS
 from drivers.transports.base import Transport
 from drivers.transports.simulated import SimulatedTransport
+from drivers.wire import state_of
 from hil.archive import ArchiveSpec, Recorder
 from hil.archive.live import LiveView
 from hil.archive.recorder import Recorded
@@ -322,9 +323,11 @@ class VirtualLink(MotionLink):
                 f"{type(transport).__name__} is not virtual time: on a real link the exchange "
                 "must not share a thread with the archive"
             )
-        ring = CycleRing(len(cell.joint_names), capacity=10 * DRAIN_CYCLES)
-        guard = Guard(cell.guard_limits, cell.period)
         settings = cell.session_settings(only_axis=only_axis)
+        ring = CycleRing(
+            len(cell.joint_names), capacity=10 * DRAIN_CYCLES, state=state_of(settings)
+        )
+        guard = Guard(cell.guard_limits, cell.period)
         return cls(
             transport, Session(cell.drive_train, guard, ring, **settings), ring, cell, finish
         )

@@ -17,6 +17,7 @@ from drivers.cycle_records import (
     MEASURED,
     CycleRing,
     RingReader,
+    cycle_dtype,
 )
 from drivers.errors import (
     AxisNotInMode,
@@ -96,6 +97,19 @@ class TestRing:
         reader.rows = Overtaken()
         assert reader.drain()["number"].tolist() == [4, 5, 6, 7, 8]
         assert reader.missed == 4
+
+    def test_shared_memory_states_what_its_records_have(self):
+        state = np.dtype([("temperature", "f8", (2,)), ("mode", "i4")])
+        ring = CycleRing(2, fd=CycleRing.shared(2, 10, state).fd)
+        reader = RingReader(ring.fd, 2)
+        ring.arm_state[ring.slot] = ([20.5, 21.0], 7)
+        write(ring, [3])
+        (row,) = reader.drain()
+        assert row["number"] == 3
+        assert row["arm_state"]["temperature"].tolist() == [20.5, 21.0]
+        assert row["arm_state"]["mode"] == 7
+        assert CycleRing.shared(2, 10).arm_state is None
+        assert "arm_state" not in cycle_dtype(2).names
 
     def test_other_memory_is_refused(self):
         ring = CycleRing.shared(N, 10)

@@ -11,6 +11,7 @@ import numpy as np
 
 from drivers import CycleRing, Guard, Session, State
 from drivers.packets import Mode
+from drivers.wire import state_of
 from hil.cell import Cell
 from hil.control.motions import player_of
 from hil.control.move import plan_move
@@ -95,9 +96,9 @@ class UrRun(Run):
 
     def _make_session(self) -> JudgedUrSession:
         at = cell()
-        ring = CycleRing(6, 8192)
         limits = at.guard_limits
         settings = at.session_settings() | {"silence_timeout": SILENCE, "settle_cycles": 10}
+        ring = CycleRing(6, 8192, state=state_of(settings))
         made = Session(at.drive_train, Guard(limits, at.period), ring, **settings)
         assert settings["mode"] == Mode.POSITION
         return JudgedUrSession(made, ring, UrConduct(limits, at.drive_train, at.period, at.max_gap))

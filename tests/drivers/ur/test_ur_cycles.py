@@ -7,6 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from drivers.cycle_records import ARM_STATE
 from drivers.drive_train import DriveTrain
 from drivers.packets import DRIVE_ON
 from drivers.states import State
@@ -57,7 +58,7 @@ def test_missing_frames_are_gaps_and_never_a_shift(
     counter = CycleCounter(drives(), PERIOD)
     stamps = [begin + PERIOD * cycle for cycle in cycles]
     parts = [
-        counter.records(frames_at(stamps[start:stop])).records
+        counter.records(frames_at(stamps[start:stop]))
         for start, stop in zip([0, *cuts], [*cuts, len(stamps)], strict=True)
     ]
     records = np.concatenate(parts)
@@ -80,7 +81,7 @@ def test_frames_before_a_fault_of_time_are_recorded(
     counter = CycleCounter(drives(), PERIOD)
     sound, wrong = [100.0, 100.002], [100.002 + later, 100.002 + later + 0.002]
     frames = frames_at(sound + wrong) if together else frames_at(sound)
-    assert counter.records(frames).records["cycle"].tolist() == [0, 1]
+    assert counter.records(frames)["cycle"].tolist() == [0, 1]
     for _ in range(2):
         with pytest.raises(RtdeError, match=fault):
             counter.records(frames_at(wrong))
@@ -91,10 +92,10 @@ def test_angles_and_torques_are_those_of_the_urdf() -> None:
     names = ("actual_q", "target_q", "actual_qd", "target_moment", "actual_current")
     frames = frames_at([1.0], target_current=2.0 * angle, **dict.fromkeys(names, angle))
     train = drives(sign=-1.0, offset=0.3)
-    records, states = CycleCounter(train, PERIOD).records(frames)
+    records = CycleCounter(train, PERIOD).records(frames)
     np.testing.assert_allclose(records["position"], -(angle - 0.3))
     np.testing.assert_allclose(records["velocity"], -angle)
-    np.testing.assert_allclose(states["target_moment"], -angle)
+    np.testing.assert_allclose(records[ARM_STATE]["target_moment"], -angle)
     # The current is that of the motor; its torque has the joint's sign.
     np.testing.assert_allclose(records["target_current"], angle)
     np.testing.assert_allclose(records["model_current"], 2.0 * angle)
@@ -104,13 +105,13 @@ def test_angles_and_torques_are_those_of_the_urdf() -> None:
 
 def test_modes_say_when_the_drives_are_on() -> None:
     counter = CycleCounter(drives(), PERIOD)
-    records = counter.records(frames_at([1.0, 1.002, 1.004], robot_mode=[3, 5, 7])).records
+    records = counter.records(frames_at([1.0, 1.002, 1.004], robot_mode=[3, 5, 7]))
     assert records["state"].tolist() == [State.DRIVE_OFF, State.DRIVING_ON, State.CLOSED]
     assert records["status"].tolist() == [0, 0, DRIVE_ON]
 
 
 def test_what_a_version_does_not_send_is_unknown() -> None:
-    states = CycleCounter(drives(), PERIOD).records(frames_at([1.0])).states
+    states = CycleCounter(drives(), PERIOD).records(frames_at([1.0]))[ARM_STATE]
     assert states["safety_status"][0] == -1
     for name in ("payload_mass", "payload_inertia", "current_as_torque", "speed_fraction"):
         assert np.isnan(states[name]).all(), name
@@ -120,5 +121,6 @@ def test_the_inertia_of_a_payload_is_in_our_order() -> None:
     layout = np.dtype([*LAYOUT.descr, ("payload_inertia", "f8", (6,))])
     values = np.zeros(1, layout)
     values["payload_inertia"] = [[1.0, 2.0, 3.0, 0.12, 0.13, 0.23]]  # xx, yy, zz, xy, xz, yz
-    states = CycleCounter(drives(), PERIOD).records(OutputFrames(values, np.zeros(1), ())).states
+    records = CycleCounter(drives(), PERIOD).records(OutputFrames(values, np.zeros(1), ()))
+    states = records[ARM_STATE]
     assert states["payload_inertia"][0].tolist() == [1.0, 0.12, 0.13, 2.0, 0.23, 3.0]

@@ -41,6 +41,25 @@ def test_the_target_is_the_set_point_of_two_cycles_before() -> None:
     assert np.ptp(commanded[:, 0]) > 0.3
 
 
+def test_each_record_has_the_state_of_the_arm_in_its_cycle() -> None:
+    bench = UrBench(f"stop@{MIDST}").move()
+    records = bench.ring.last(4000)
+    state = records["arm_state"]
+    cycles = records["cycle"] * PERIOD
+    np.testing.assert_allclose(np.diff(state["controller_time"]), np.diff(cycles), atol=1e-9)
+    first = np.flatnonzero(state["safety_mode"] == 3)[0]
+    assert first == np.flatnonzero(records["state"] == State.FAULTED)[0]
+    assert {*state["safety_mode"][:first]} == {1}
+    assert {*state["robot_mode"]} == {7} and np.all(state["joint_temperature"] > 20.0)
+    assert np.isfinite(state["target_moment"]).all()
+
+
+def test_an_arm_that_is_not_moved_is_recorded_nevertheless() -> None:
+    records = UrBench(remote_control=False).run(5).ring.last(5)
+    assert np.isnan(records["position"]).all()
+    assert {*records["arm_state"]["robot_mode"]} == {7}
+
+
 def test_each_motion_has_a_program_of_its_own() -> None:
     bench = UrBench().move()
     first = bench.robot.output_registers.ints[27]

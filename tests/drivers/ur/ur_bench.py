@@ -15,6 +15,7 @@ from drivers.guard import Guard
 from drivers.session import Session
 from drivers.states import State
 from drivers.transports.simulated import Fault, SimulatedTransport
+from drivers.wire import state_of
 from hil.cell import Cell
 from hil.control.motions import player_of
 from hil.control.move import plan_move
@@ -53,12 +54,13 @@ class UrBench:
         self.robot: SimulatedUr = robot
         self.peer = UrPeer(robot)
         self.transport = SimulatedTransport(self.peer, link)
-        self.ring = CycleRing(6, capacity=8192)
+        settings_of_session = self.cell.session_settings()
+        self.ring = CycleRing(6, capacity=8192, state=state_of(settings_of_session))
         self.session = Session(
             self.cell.drive_train,
             Guard(self.cell.guard_limits, self.cell.period),
             self.ring,
-            **self.cell.session_settings(),
+            **settings_of_session,
         )
         self.events: list[Event] = []
         self.positions: list[np.ndarray] = []

@@ -222,6 +222,13 @@ class TestBadInput:
         assert back.complete
         assert same(back.cycles(), rows)
 
+    def test_records_without_a_state_to_archive_are_refused(self, tmp_path):
+        with (
+            writer(tmp_path / NAME, states=(schema.UR_STATE,)) as archive,
+            pytest.raises(ValueError, match=schema.UR_STATE),
+        ):
+            archive.write(records(3))
+
     def test_full_disk_leaves_what_was_flushed(self, tmp_path, monkeypatch):
         rows = records(500)
         archive = writer(tmp_path / NAME)

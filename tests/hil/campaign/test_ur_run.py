@@ -8,7 +8,7 @@ import socket
 import subprocess
 import sys
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -124,6 +124,20 @@ def run(campaign: Campaign, hand: Hand, stop: Stop) -> Any:
     )
 
 
+def require_states(columns: Mapping[str, Any], cell: Cell) -> None:
+    """Each record has the state of the arm in its cycle."""
+    stamps = columns["controller_time"]
+    period = cell.period
+    np.testing.assert_allclose(np.diff(stamps), period * np.diff(columns["cycle"]), atol=1e-9)
+    assert {*columns["robot_mode"]} == {7} and {*columns["safety_mode"]} == {1}
+    assert {*columns["speed_scaling"]} == {*columns["speed_fraction"]} == {1.0}
+    assert np.all(columns["joint_temperature"] > 20.0)
+    # The controller's current is that of its own torque and friction, by its own constants.
+    rests = (np.abs(columns["velocity"]) < 1e-2).all(axis=1)
+    ratio = columns["target_moment"][rests, 1] / columns["model_current"][rests, 1]
+    np.testing.assert_allclose(np.median(ratio), 9.84, rtol=0.02)
+
+
 def test_a_campaign_over_the_ports_runs_to_its_end(
     cell: Cell, simulated: subprocess.Popen[str], tmp_path: Path
 ) -> None:
@@ -149,4 +163,5 @@ def test_a_campaign_over_the_ports_runs_to_its_end(
         assert archive.complete
         assert np.isfinite(archive.columns["position"]).all()
         assert "ur_arm.json" in archive.attachments
+        require_states(archive.columns, cell)
     assert simulated.poll() is None
