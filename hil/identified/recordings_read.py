@@ -24,6 +24,7 @@ from hil.importers.recording_import import ImportedRecording
 from hil.look.readings import DoubtfulArm
 from hil.look.result import ChangedReading
 from hil.results.results import RecordingResult
+from identification.signals.messages import clock_lines
 
 _USUAL: Final = (
     ChannelMeaning,
@@ -66,7 +67,7 @@ def content(recording: ImportedRecording) -> str:
     parts = [plural(joints, "joint")]
     if clock is not None:
         parts = [f"{parts[0]}, {clock.duration:.3g} s at {clock.rate:.4g} Hz"]
-        parts += clock.describe()[1:]
+        parts += clock_lines(clock)[1:]
     return "; ".join([*parts, *map(sentence, _unusual(recording))])
 
 

@@ -64,6 +64,7 @@ from hil.importers.conclusions import (
     ZeroTorque,
 )
 from hil.importers.units import UNITS
+from identification.signals.messages import clock_lines
 
 _BASIS: Final[Mapping[NameBasis, str]] = {
     NameBasis.NAME: "by the name",
@@ -350,7 +351,7 @@ def _(locked: LockedJoints) -> str:
 
 @worded.register
 def _(clock: RecordedClock) -> str:
-    return f"time: {'; '.join(clock.base.describe())}"
+    return f"time: {'; '.join(clock_lines(clock.base))}"
 
 
 @worded.register

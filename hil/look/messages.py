@@ -83,6 +83,7 @@ from hil.look.readings import (
 )
 from hil.look.result import ChangedReading, Look, Row, TiedReading
 from identification.hypotheses.changes import COUPLED, IN_ORDER, Meaning
+from identification.signals.messages import clock_lines, fault_words, time_lines
 from identification.text import percentage
 
 _FACTS: Final[Mapping[Fact, str]] = {
@@ -353,13 +354,13 @@ def _(step: NextStep) -> str:
 def _(clock: ClockReading) -> str:
     unit = "stamps of the messages; " if clock.of_messages else ""
     unit = f"{clock.unit}; " if clock.unit is not None else unit
-    return f"{unit}{'; '.join(clock.base.describe())}"
+    return f"{unit}{'; '.join(clock_lines(clock.base))}"
 
 
 @_worded.register
 def _(rows: RowsReading) -> str:
-    times = () if rows.times is None else rows.times.describe()
-    return "; ".join([*(fault.describe() for fault in rows.faults), *times])
+    times = () if rows.times is None else time_lines(rows.times)
+    return "; ".join([*map(fault_words, rows.faults), *times])
 
 
 @_worded.register

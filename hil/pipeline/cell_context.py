@@ -198,9 +198,9 @@ def _rows(sources: Sequence[Source]) -> Iterator[Finding]:
     """Yield findings about rows that are not of one motion, once for both parts of a recording."""
     for source in {source.path: source for source in sources}.values():
         for fault in source.faults:
-            name, described_fault = source.path.name, fault.describe()
+            name = source.path.name
             remedy = _ROW_REMEDIES[fault.kind]
-            yield _doubtful("faulty rows", remedy, recording=name, fault=described_fault)
+            yield _doubtful("faulty rows", remedy, recording=name, fault=fault)
 
 
 def _spikes(prepared: Prepared) -> Iterator[Finding]:
@@ -249,8 +249,7 @@ def _clock(prepared: Prepared) -> Iterator[Finding]:
     retimed = [source for source in prepared.sources.training if source.retimed]
     if retimed and (times := retimed[0].times) is not None:
         names = tuple(source.name for source in retimed)
-        described_times = "; ".join(times.describe())
-        yield _doubtful("retimed", "log the time", recordings=names, times=described_times)
+        yield _doubtful("retimed", "log the time", recordings=names, times=times)
 
 
 def _log(steps: Sequence[PositionJump]) -> Iterator[Finding]:

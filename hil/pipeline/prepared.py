@@ -40,6 +40,7 @@ from identification.selection.scores import Known
 from identification.selection.settings import Settings
 from identification.signals.clock import time_base
 from identification.signals.masks import SHORTEST_STRETCH
+from identification.signals.messages import clock_lines, time_lines
 from identification.signals.recording import Recording, in_succession
 from identification.signals.samples import (
     RIGID_BANDWIDTH,
@@ -585,8 +586,20 @@ def _step(recording: Recording) -> float:
     return float(np.median(np.diff(recording.time)))
 
 
+def _delay_words(estimate: DelayEstimate) -> str:
+    if not estimate.determined and not estimate.significant:
+        return f"all axes: not determined; {estimate.reason}"
+    half = estimate.half_interval
+    differs = "" if estimate.significant or estimate.unconfirmed else "not "
+    return (
+        f"all axes: {estimate.delay * 1e3:.3f} ms ± {half * 1e3:.3f} ms"
+        f" ({estimate.delay / estimate.cycle:.2f} ± {half / estimate.cycle:.2f} cycles),"
+        f" {differs}significantly different from the {estimate.assumed * 1e3:.3g} ms assumed"
+    )
+
+
 def _described(estimate: DelayEstimate) -> tuple[str, ...]:
-    note = f"delay of the torque behind the position, {estimate.describe()}"
+    note = f"delay of the torque behind the position, {_delay_words(estimate)}"
     if estimate.significant:
         return (note,)
     return note, f"no other delay than the assumed {estimate.assumed * 1e3:.3g} ms was applied"
@@ -676,11 +689,11 @@ def prepare_sources(sources: Sources, options: Options, reporter: Reporter) -> P
     notes = []
     stated = stated_settings(sources.cell, options)
     for source in (*sources.training, *sources.held_out):
-        lines = [] if source.times is None else source.times.describe()
+        lines = [] if source.times is None else time_lines(source.times)
         notes += [f"{source.name}: {line}" for line in (source.merged, *lines) if line]
         base = time_base(source.recording.time, source.recording.gap_before)
         if not base.uniform or base.gaps:
-            notes.append(f"{source.name}: {'; '.join(base.describe())}")
+            notes.append(f"{source.name}: {'; '.join(clock_lines(base))}")
     _require_torques(sources)
     noise = "the noise of the positions was estimated from their high-frequency part"
     if sources.noise_variance is not None:

@@ -28,6 +28,7 @@ from identification.selection.essential import Elimination
 from identification.signals.samples import Samples
 from identification.validation.consistency import ConsistencyCheck
 from identification.validation.evidence import Evidence
+from identification.validation.finding_messages import consistency_words, impossible_words
 from identification.validation.prediction import (
     PredictionError,
     pooled_error,
@@ -126,7 +127,8 @@ def _consistency(model: RobotModel, check: ConsistencyCheck) -> results.Consiste
         shift=consistent.shift,
         status=consistent.status,
         moved=check.shifted_parameters,
-        bounds=check.violations,
+        sentence=consistency_words(check),
+        bounds=[impossible_words(violation) for violation in check.violations],
         links=results.LinkResult.rows(
             joint=model.joint_names,
             mass=inertial[:, 9],

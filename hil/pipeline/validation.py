@@ -16,6 +16,7 @@ from identification.selection.essential import Elimination, choose_essential
 from identification.validation.calibration import Calibration, TorqueMeans, calibrate
 from identification.validation.consistency import ConsistencyCheck, check_consistency
 from identification.validation.evidence import Evidence, gather
+from identification.validation.finding_messages import consistency_words
 from identification.validation.verdict import Verdict, judge
 
 from .cell_context import cell_context_of, joint_ranges
@@ -120,7 +121,7 @@ def _warnings(consistency: ConsistencyCheck | str, essential: Elimination | str)
     if isinstance(consistency, str):
         yield f"no physically consistent parameters were found: {consistency}"
     elif consistency.costly and not consistency.impossible:  # which is a finding
-        yield consistency.sentence
+        yield consistency_words(consistency)
     if isinstance(essential, str):
         yield f"no essential parameters: {essential}"
 

@@ -244,18 +244,6 @@ class DelayEstimate:
         variances = priors * (1.0 - shares) + (shares * difference - mean) ** 2
         return CombinedDelay(stated + mean, float(odds @ variances))
 
-    def describe(self) -> str:
-        """Return the result as a sentence."""
-        if not self.determined and not self.significant:
-            return f"all axes: not determined; {self.reason}"
-        half = self.half_interval
-        differs = "" if self.significant or self.unconfirmed else "not "
-        return (
-            f"all axes: {self.delay * 1e3:.3f} ms ± {half * 1e3:.3f} ms"
-            f" ({self.delay / self.cycle:.2f} ± {half / self.cycle:.2f} cycles),"
-            f" {differs}significantly different from the {self.assumed * 1e3:.3g} ms assumed"
-        )
-
 
 def estimate_delay(
     recording: Recording,

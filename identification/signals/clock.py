@@ -17,7 +17,6 @@ from numpy.typing import NDArray
 
 from identification.arrays import Array
 from identification.signals.recording import GAP_STEPS, PAUSE, Recording, RecordingError
-from identification.text import percentage
 
 Rows = NDArray[np.bool_]
 
@@ -69,29 +68,6 @@ class TimeBase:
         """Whether segments between gaps are uniformly sampled."""
         even = self.largest_deviation <= UNIFORM
         return even and self.repeated == self.backward == self.dropped == 0
-
-    def describe(self) -> list[str]:
-        """Return lines on the time stamps, at least one."""
-        lines = [f"{self.samples} samples in {self.duration:.6g} s, {self.rate:.6g} Hz"]
-        if self.largest_deviation > UNIFORM:
-            lines.append(
-                f"uneven: steps scatter by {percentage(self.jitter, 1)} of the usual one, at most"
-                f" {percentage(self.largest_deviation)}"
-            )
-        if self.repeated:
-            lines.append(f"{self.repeated} samples repeat the time stamp before them")
-        if self.backward:
-            lines.append(f"{self.backward} samples are older than the one before them")
-        if self.dropped:
-            lines.append(f"{self.dropped} samples are missing one by one")
-        if gaps := self.gaps - self.pauses:
-            lines.append(f"{gaps} gap{'s' if gaps > 1 else ''}")
-        if self.pauses == 1:
-            lines.append(f"cut at a pause of {self.longest_pause:.4g} s")
-        elif self.pauses:
-            longest = f"{self.longest_pause:.4g} s"
-            lines.append(f"cut at {self.pauses} pauses, the longest of {longest}")
-        return lines
 
 
 def time_base(time: Array, gap_before: NDArray[np.bool_] | None = None) -> TimeBase:
@@ -189,27 +165,6 @@ class SampleTimes:
     def certain(self) -> bool:
         """Whether the positions decide: the share is not between the hypotheses."""
         return bool(abs(self.share - 0.5) > max(_MARGIN * self.deviation, 0.25))
-
-    def describe(self) -> list[str]:
-        """Return sentences on the decision, none where the stamps are even and nothing repeats."""
-        sentences = []
-        if self.removed:
-            sentences.append(
-                f"{self.removed} rows repeat the sample before them while the arm moves and"
-                " were removed"
-            )
-        if self.even or not np.isnan(self.share):
-            used = f"even times, {self.missing} missing samples counted"
-            used = used if self.even else "the stamps"
-            if not self.certain or (self.share < 0.5 and not self.even):
-                used += " (positions are inconclusive)"
-            sentences.append(
-                f"the time stamps scatter by {percentage(self.scatter, 1)} of a step;"
-                f" share confirmed by the positions: {self.share:.2f} ± {self.deviation:.1g};"
-                f" high-frequency residual in multiples of noise: {self.residuals[0]:.3g} with the"
-                f" stamps, {self.residuals[1]:.3g} with even times; used: {used}"
-            )
-        return sentences
 
 
 def true_times(recording: Recording) -> tuple[Recording, SampleTimes]:

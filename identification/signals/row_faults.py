@@ -52,22 +52,6 @@ class RowFault:
     rows: int
     joints: tuple[str, ...] = ()
 
-    def describe(self) -> str:
-        """Return what is wrong, and what was done about it."""
-        at = f"at {self.time:.4g} s"
-        if self.kind is RowFaultKind.FROZEN:
-            return (
-                f"the log repeats one row for {self.duration:.3g} s {at} while the arm moved on: "
-                f"{self.rows} rows were left out"
-            )
-        if self.kind is RowFaultKind.WRITTEN_TWICE:
-            return f"{self.rows} rows {at} were written before, bit for bit, and were left out"
-        return (
-            f"the positions of {', '.join(self.joints)} jump {at}, further than any arm moves in "
-            "a step: two motions in one file, or rows missing that the stamps do not show; both "
-            "parts are used, and no row beside the jump"
-        )
-
 
 def without_faulty_rows(recording: Recording) -> tuple[Recording, tuple[RowFault, ...]]:
     """Return a recording without such rows, with gaps where they were, and what was found."""

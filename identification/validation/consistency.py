@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Final
+from typing import Final, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,28 +18,42 @@ from identification.hypotheses.little_torque import little_torque
 from identification.model.motion import Motion
 from identification.model.pseudo_inertia import pseudo_inertia, reference_bodies
 from identification.model.robot import RobotModel
-from identification.text import joined
 from identification.validation.physical_signs import SIGMAS
 
 # Smallest second moment of a link relative to the nominal body's at which a bound counts as active.
 _EDGE: Final = 0.01
-_SHOWN_VIOLATIONS: Final = 4
 # Rise of the relative held-out torque error over all joints, and of one joint, that is noticeable,
 # or means that no consistent parameters exist. NS 16 campaigns without a fault: below 0.0001 over
 # all joints. With torque or position of one joint negated: at least 0.13 for joints 1 and 2; for
 # wrist joints 0.004 to 0.02, but more than 0.5 of their own torque.
 _COSTLY: Final = (0.001, 0.005)
 _IMPOSSIBLE: Final = (0.02, 0.1)
-_NEGATIVE: Final = {
+Quantity = Literal["rotor inertia", "Coulomb friction", "viscous friction", "body"]
+
+_NEGATIVE: Final[Mapping[str, Quantity]] = {
     "I{}m": "rotor inertia",
     "f0_{}": "Coulomb friction",
     "f1_{}": "viscous friction",
 }
-ELEMENTS: Final = "a spring, a balancer or a hydraulic counterweight"
 # Least torque of gravity, over the measured one, of an axis that gravity loads; below, friction and
 # inertia dominate.
 _LOADED: Final = 0.2
 _POSTURES: Final = 50
+
+
+@dataclass(frozen=True)
+class ImpossibleParameter:
+    """A parameter of the unconstrained estimate that no body or drive can have.
+
+    Attributes:
+        quantity: what is negative; a mass or a moment of inertia of a "body".
+        joint: whose link or drive it is.
+        value: of the parameter [SI]; None for a body.
+    """
+
+    quantity: Quantity
+    joint: str
+    value: float | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -53,8 +68,8 @@ class ConsistencyCheck:
     # at the bound
     margin: Array
     shifted_parameters: tuple[str, ...]  # changed by more than three standard deviations
-    # messages on impossible parameters of the unconstrained estimate, by rise of the joint's error
-    violations: tuple[str, ...]
+    # impossible parameters of the unconstrained estimate, by rise of the joint's error
+    violations: tuple[ImpossibleParameter, ...]
     judged_on: str = "held-out"  # "held-out" or "in-sample"
     # the joint that gravity loads, if the rise of the error is mostly its own; else empty
     overloaded: str = ""
@@ -79,40 +94,14 @@ class ConsistencyCheck:
         return self.cost > overall or worse_axis
 
     @property
+    def predicts_better(self) -> bool:
+        """Whether the consistent estimate predicts noticeably better."""
+        return self.cost < -_COSTLY[0]
+
+    @property
     def is_balanced(self) -> bool:
         """Whether one joint carries a weight that no body can, as a spring or balancer does."""
         return bool(self.overloaded) and self.costly
-
-    @property
-    def remedy(self) -> str:
-        """What to check if no consistent parameters fit.
-
-        A spring or balancer bears the weight on one axis, which no body can do; a wrong sign or
-        coupling spoils several.
-        """
-        usual = "check signs, torque constants, coupling and URDF"
-        if not self.is_balanced:
-            return usual
-        return (
-            f"describe {ELEMENTS} on {self.overloaded} as [[robot.elements]] of the cell file;"
-            f" if it has none, {usual}"
-        )
-
-    @property
-    def sentence(self) -> str:
-        """Result as a sentence."""
-        points = round(100.0 * self.cost, 2) + 0.0
-        error = f"{self.judged_on} torque error {points:+.2f} points"
-        if not self.costly:
-            better = self.cost < -_COSTLY[0]
-            return f"consistent parameters predict {'better' if better else 'as well'} ({error})"
-        start = (
-            "no physically consistent parameters fit the data"
-            if self.impossible
-            else "the parameters are not physically consistent, and the nearest consistent ones"
-            " predict worse"
-        )
-        return f"{start} ({error}): {joined(self.violations, _SHOWN_VIOLATIONS)}".removesuffix(": ")
 
 
 def check_consistency(
@@ -156,18 +145,18 @@ def check_consistency(
     inner = np.linalg.solve(frames, pseudo_inertia(consistent.standard[links]))
     inner = np.linalg.solve(frames, inner.transpose(0, 2, 1))
     margin = np.asarray(np.linalg.eigvalsh(inner)[:, 0])
-    violations: list[str] = []
+    violations: list[ImpossibleParameter] = []
     single = np.count_nonzero(model.base.grouping, axis=1) == 1
     for joint in np.argsort(-np.nan_to_num(rise), kind="stable").tolist():
         name = model.joint_names[joint]
-        for pattern, what in _NEGATIVE.items():
+        for pattern, quantity in _NEGATIVE.items():
             if (parameter := pattern.format(joint + 1)) in unconstrained.names:
                 k = unconstrained.names.index(parameter)
                 alone = k >= model.base.rank or bool(single[k])
                 if alone and free[k] < -SIGMAS * unconstrained.std[k]:
-                    violations.append(f"{what} of {name} would be negative ({free[k]:.3g})")
+                    violations.append(ImpossibleParameter(quantity, name, float(free[k])))
         if margin[joint] < _EDGE:
-            violations.append(f"the link of {name} would need a negative mass or moment of inertia")
+            violations.append(ImpossibleParameter("body", name))
     return ConsistencyCheck(
         consistent=consistent,
         held_out=held_out.relative_error(values),

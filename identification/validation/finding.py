@@ -12,6 +12,9 @@ from numpy.typing import NDArray
 from identification.hypotheses.carried_load import LOAD
 from identification.hypotheses.changes import Change
 from identification.hypotheses.little_torque import MINOR
+from identification.signals.clock import SampleTimes
+from identification.signals.row_faults import RowFault
+from identification.validation.consistency import ConsistencyCheck
 from identification.validation.position_jumps import PositionJump
 
 Mask = NDArray[np.bool_]
@@ -232,6 +235,9 @@ Value = (
     Figure
     | Change
     | PositionJump
+    | RowFault
+    | SampleTimes
+    | ConsistencyCheck
     | tuple[str, ...]
     | tuple[int, ...]
     | tuple[float, ...]

@@ -16,8 +16,11 @@ from typing import Any, Final, NamedTuple
 
 from identification.hypotheses.changes import COUPLED, IN_ORDER, SIGNS, Change, Meaning
 from identification.hypotheses.column_search import UNSEEN
+from identification.signals.clock import SampleTimes
+from identification.signals.messages import fault_words, time_lines
+from identification.signals.row_faults import RowFault
 from identification.text import joined, percentage
-from identification.validation.consistency import ELEMENTS
+from identification.validation.consistency import ConsistencyCheck, ImpossibleParameter
 from identification.validation.finding import (
     Finding,
     FindingKey,
@@ -40,6 +43,10 @@ FORM: Final = "form of friction"
 """Name of the check whether a friction law lacks a term."""
 LEFT_OPEN: Final = "left open by the motion"
 """Name of the check whether models of the same fit predict alike."""
+
+_ELEMENTS: Final = "a spring, a balancer or a hydraulic counterweight"
+_SHOWN_VIOLATIONS: Final = 4
+_NO_CONSISTENT: Final = "no physically consistent parameters fit the data"
 
 
 @dataclass(frozen=True)
@@ -108,6 +115,47 @@ def worded(finding: Finding, naming: Naming) -> WordedFinding:
     )
 
 
+def impossible_words(violation: ImpossibleParameter) -> str:
+    """Return what is impossible about a parameter."""
+    if violation.value is None:
+        return f"the link of {violation.joint} would need a negative mass or moment of inertia"
+    return f"{violation.quantity} of {violation.joint} would be negative ({violation.value:.3g})"
+
+
+def consistency_words(check: ConsistencyCheck) -> str:
+    """Return what physical consistency costs, and which parameters prevent it."""
+    cost = _consistency_cost(check)
+    if check.impossible:
+        return f"{_NO_CONSISTENT} {cost}"
+    if check.costly:
+        return (
+            "the parameters are not physically consistent, and the nearest consistent ones predict"
+            f" worse {cost}"
+        )
+    return (
+        f"consistent parameters predict {'better' if check.predicts_better else 'as well'} {cost}"
+    )
+
+
+def _consistency_cost(check: ConsistencyCheck) -> str:
+    points = round(100.0 * check.cost, 2) + 0.0
+    error = f"({check.judged_on} torque error {points:+.2f} points)"
+    if not check.costly or not check.violations:
+        return error
+    return f"{error}: {joined([*map(impossible_words, check.violations)], _SHOWN_VIOLATIONS)}"
+
+
+def _consistency_remedy(check: ConsistencyCheck) -> str:
+    """A spring bears the weight on one axis, which no body can; a wrong sign spoils several."""
+    usual = "check signs, torque constants, coupling and URDF"
+    if not check.is_balanced:
+        return usual
+    return (
+        f"describe {_ELEMENTS} on {check.overloaded} as [[robot.elements]] of the cell file; if it"
+        f" has none, {usual}"
+    )
+
+
 class _Text(string.Formatter):
     """Format strings filled with what a finding has."""
 
@@ -146,6 +194,12 @@ class _Text(string.Formatter):
                 after = f"after {value.time:.3f} s of {value.recording}"
                 size = "" if format_spec == "time" else f"by {value.size:+.3g} "
                 return f"{value.joint} {size}{after}"
+            case RowFault():
+                return fault_words(value)
+            case SampleTimes():
+                return "; ".join(time_lines(value))
+            case ConsistencyCheck():
+                return f"{_consistency_cost(value)}: {_consistency_remedy(value)}"
             case RepeatedSamples():
                 return f"{value.joint} {value.count} in {value.recording}"
             case tuple() if format_spec == "names":
@@ -461,7 +515,7 @@ SENTENCES: Final[Mapping[FindingKey, Sentence]] = {
     "negative parameter": Sentence(
         IMPOSSIBLE, "{name} is negative: {value:.3g} ± {std:.2g} {unit}"
     ),
-    "no consistent parameters": Sentence(IMPOSSIBLE, "{violations}: {remedy}"),
+    "no consistent parameters": Sentence(IMPOSSIBLE, f"{_NO_CONSISTENT} {{consistency}}"),
     "friction law lacks a term": Sentence(
         FORM,
         "the friction law of {joints} lacks a term, such as {each}; the intervals of its"
@@ -787,7 +841,7 @@ REMEDIES: Final[Mapping[RemedyKey, str]] = {
     ),
     "check all signs": f"{_ALL_SIGNS} in the column map or cell",
     "describe a balancer": (
-        f"describe {ELEMENTS} that carries part of the weight in [[robot.elements]] of the cell"
+        f"describe {_ELEMENTS} that carries part of the weight in [[robot.elements]] of the cell"
         f" file; else {_ALL_SIGNS}"
     ),
     "use the consistent estimate": (
@@ -802,7 +856,7 @@ REMEDIES: Final[Mapping[RemedyKey, str]] = {
     ),
     "keep the stated friction": ("keep it with `hil identify --friction {option}` if it is known"),
     "describe elements, or check the drives": (
-        f"describe {ELEMENTS}, if the arm has one, in [[robot.elements]] of the cell file; else"
+        f"describe {_ELEMENTS}, if the arm has one, in [[robot.elements]] of the cell file; else"
         " check gear ratios, signs, torque constants and the delay between torque and position"
     ),
     "cover the motion": _COVER,

@@ -1531,9 +1531,8 @@ class TestUndeterminedDelay:
         slow = estimate_delay(delayed(0.0, speed=0.05), MODEL)
         assert not slow.determined
         assert slow.applied == 0.0
-        line = slow.describe()
-        assert line.startswith("all axes: not determined; 95 % interval of ± ")
-        assert line.endswith(messages.TORQUES_TOO_SLOW_OR_NOISY)
+        assert slow.reason.startswith("95 % interval of ± ")
+        assert slow.reason.endswith(messages.TORQUES_TOO_SLOW_OR_NOISY)
         unknown = replace(slow, std=np.inf)
         assert unknown.variance == pytest.approx(LONGEST_DELAY**2 / 3.0)
         assert replace(slow, std=1e-4).variance == pytest.approx(1e-8)
@@ -1542,8 +1541,6 @@ class TestUndeterminedDelay:
         estimate = estimate_delay(delayed(0.045, speed=0.3, seed=2), MODEL)
         assert estimate.reason is not None and estimate.significant
         assert estimate.applied == estimate.delay
-        line = estimate.describe()
-        assert line.endswith("cycles), significantly different from the 0 ms assumed")
 
     def test_a_recording_without_motion_raises(self):
         still = delayed(0.0, speed=0.0)

@@ -30,6 +30,7 @@ from identification.signals.masks import (
     mask_rows,
     spiking,
 )
+from identification.signals.messages import clock_lines
 from identification.signals.noise import (
     difference_variance,
     noiseless_above,
@@ -349,7 +350,7 @@ class TestTimeBase:
         # Long steps after the repeat and the fall compensate the short ones.
         assert base.dropped == 3
         assert not base.uniform
-        description = " ".join(base.describe())
+        description = " ".join(clock_lines(base))
         for part in ("repeat", "older", "missing", "gap"):
             assert part in description
         reported = np.arange(100) == 50  # without a time step

@@ -162,10 +162,7 @@ def physical_signs(evidence: Evidence, _: Thresholds) -> tuple[Finding, ...]:
     none_fit: tuple[Finding, ...] = ()
     if consistency is not None and consistency.impossible:
         step: RemedyKey = "describe a balancer" if consistency.is_balanced else "check all signs"
-        values: dict[str, Value] = {
-            "violations": consistency.sentence,
-            "remedy": consistency.remedy,
-        }
+        values: dict[str, Value] = {"consistency": consistency}
         none_fit = (Finding("no consistent parameters", "wrong", step, "symptom", values),)
     return (
         *(_of_sign(sign, "wrong") for sign in signs.impossible),
