@@ -1,0 +1,74 @@
+"""Rows and clock of a recording in words."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from identification.signals.clock import UNIFORM, SampleTimes, TimeBase
+from identification.signals.row_faults import RowFault, RowFaultKind
+from identification.text import percentage
+
+
+def clock_lines(clock: TimeBase) -> list[str]:
+    """Return lines on the time stamps, at least one."""
+    lines = [f"{clock.samples} samples in {clock.duration:.6g} s, {clock.rate:.6g} Hz"]
+    if clock.largest_deviation > UNIFORM:
+        lines.append(
+            f"uneven: steps scatter by {percentage(clock.jitter, 1)} of the usual one, at most"
+            f" {percentage(clock.largest_deviation)}"
+        )
+    if clock.repeated:
+        lines.append(f"{clock.repeated} samples repeat the time stamp before them")
+    if clock.backward:
+        lines.append(f"{clock.backward} samples are older than the one before them")
+    if clock.dropped:
+        lines.append(f"{clock.dropped} samples are missing one by one")
+    if gaps := clock.gaps - clock.pauses:
+        lines.append(f"{gaps} gap{'s' if gaps > 1 else ''}")
+    if clock.pauses == 1:
+        lines.append(f"cut at a pause of {clock.longest_pause:.4g} s")
+    elif clock.pauses:
+        longest = f"{clock.longest_pause:.4g} s"
+        lines.append(f"cut at {clock.pauses} pauses, the longest of {longest}")
+    return lines
+
+
+def time_lines(times: SampleTimes) -> list[str]:
+    """Return lines on the times that are used, none for even stamps of which none repeats."""
+    lines = []
+    if times.removed:
+        lines.append(
+            f"{times.removed} rows repeat the sample before them while the arm moves and were"
+            " removed"
+        )
+    if times.even or not np.isnan(times.share):
+        used = f"even times, {times.missing} missing samples counted"
+        used = used if times.even else "the stamps"
+        if not times.certain or (times.share < 0.5 and not times.even):
+            used += " (positions are inconclusive)"
+        lines.append(
+            f"the time stamps scatter by {percentage(times.scatter, 1)} of a step;"
+            f" share confirmed by the positions: {times.share:.2f} ± {times.deviation:.1g};"
+            f" high-frequency residual in multiples of noise: {times.residuals[0]:.3g} with the"
+            f" stamps, {times.residuals[1]:.3g} with even times; used: {used}"
+        )
+    return lines
+
+
+def fault_words(fault: RowFault) -> str:
+    """Return what is wrong with rows, and what was done about it."""
+    at = f"at {fault.time:.4g} s"
+    match fault.kind:
+        case RowFaultKind.FROZEN:
+            return (
+                f"the log repeats one row for {fault.duration:.3g} s {at} while the arm moved on: "
+                f"{fault.rows} rows were left out"
+            )
+        case RowFaultKind.WRITTEN_TWICE:
+            return f"{fault.rows} rows {at} were written before, bit for bit, and were left out"
+        case RowFaultKind.JUMP:
+            return (
+                f"the positions of {', '.join(fault.joints)} jump {at}, further than any arm moves"
+                " in a step: two motions in one file, or missing rows that the stamps do not show;"
+                " both parts are used, but not the rows next to the jump"
+            )
