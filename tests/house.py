@@ -29,7 +29,7 @@ CEILINGS: Final[Mapping[str, int]] = {
     "tests of hil outside a room": 0,
     "class names defined twice": 0,
     "helpers of other test modules": 7,
-    "long signatures without Args": 20,
+    "long signatures without Args": 0,
 }
 """Figures that no change may exceed. Size has none: features are not traded for lines."""
 BANNED: Final = {
@@ -214,7 +214,7 @@ class Sources:
         """Public functions and methods of `_MANY` parameters or more without a block `Args:`.
 
         One that says "See `...`" has the parameters of what it names; the options of a command
-        have their help.
+        have their help, and the parameters of a fixture are fixtures.
         """
         return [
             f"{name}:{node.lineno} {node.name}, {count} parameters"
@@ -222,6 +222,7 @@ class Sources:
             if not name.startswith("hil.cli.")
             for node in _public_functions(tree)
             if (count := _parameters(node)) >= _MANY
+            and not any("fixture" in ast.unparse(each) for each in node.decorator_list)
             and "Args:" not in (text := ast.get_docstring(node) or "")
             and not text.startswith("See ")
         ]

@@ -121,7 +121,7 @@ class LogReading:
         robot_of: the robot of all logs.
         options: how they are read where it is not concluded.
         robot: digest of its description, for the cache.
-        facts: columns, and entries of the metadata, that are read beside the motion.
+        facts: columns, and entries of the metadata, that are read in addition to the motion.
     """
 
     robot_of: RobotOf
@@ -137,7 +137,13 @@ class LogReading:
         description: str,
         facts: ExtraChannels = ExtraChannels(),  # noqa: B008 - frozen
     ) -> LogReading:
-        """Return how logs are read of a robot, described by this text beside its files.
+        """Return how the logs of a robot are read.
+
+        Args:
+            robot_of: reads its cell or URDF.
+            options: of the import.
+            description: text that distinguishes the robot in addition to its files.
+            facts: columns and metadata entries to read in addition to the motion.
 
         Raises:
             InputError: the description of the robot or a stated map is invalid.
@@ -176,7 +182,13 @@ class LogReading:
 def read_log(log: str, maps: Sequence[LogMap], reading: LogReading, cache: CacheLocation) -> (
     ReadLog | UnreadLog
 ):  # fmt: skip
-    """Read a log by the first of some maps that describes it, and write its archive to the cache.
+    """Read a log by the first map that describes it, and write its archive to the cache.
+
+    Args:
+        log: its path.
+        maps: in the order in which they are tried.
+        reading: how logs of the robot are read.
+        cache: where archives are kept.
 
     Raises:
         CacheError: the cache cannot be written.
@@ -238,7 +250,7 @@ def _read(
     cache: CacheLocation,
     files: LogFiles,
 ) -> ReadLog:
-    """Return a log that was read, with its archive and the facts that are wanted of it."""
+    """Return a log that was read, with its archive and the requested facts."""
     ref = described_archive(place.as_posix(), cache, log)
     facts = facts_of(Path(log), reading.facts, files)
     content = json_digest([digest for _, digest in _digests(Path(log))])

@@ -78,8 +78,13 @@ def examine(
 ) -> Examined:
     """Return the findings on samples of the joint side, in SI units.
 
-    `locked` are positions [rad or m] of joints that are not in the model, by name; `nominal` is the
-    torque of the nominal inertias, None if the URDF has none; `held_joints` were clamped.
+    Args:
+        samples: of a recording.
+        joint_names: of its joints.
+        urdf: text of the description.
+        locked: positions [rad or m] of joints that are not in the model, by name.
+        nominal: torque of the nominal inertias; None if the URDF has none.
+        held_joints: that were clamped.
     """
     time = np.asarray((samples.stamp - samples.stamp[0]) * 1e-9)
     limits = urdf_limits(urdf, joint_names)
@@ -160,9 +165,14 @@ def limit_excess(low: Array, high: Array, limits: UrdfLimits) -> Array:
 def whole_turns(
     low: Array, high: Array, limits: UrdfLimits, turning: NDArray[np.bool_], most: int
 ) -> Array:
-    """Return the angles of whole turns [rad] that bring ranges nearest to the limits (n,).
+    """Return the whole turns [rad] that bring ranges nearest to the limits (n,).
 
-    At most `most` turns, and none where that is as near.
+    Args:
+        low: lower ends of the ranges (n,) [rad or m].
+        high: upper ends.
+        limits: of the joints.
+        turning: joints that turn (n,).
+        most: largest number of turns; fewer where they bring a range as near.
     """
     counts = np.array(sorted(range(-most, most + 1), key=abs))
     turns = 2.0 * np.pi * counts[:, None] * turning
@@ -222,7 +232,13 @@ def outside_limits(position: Array, names: Sequence[str], urdf: str) -> OutsideL
 
 
 def check_positions(position: Array, names: Sequence[str], urdf: str, path: Path) -> None:
-    """Check that some row of positions (m, n) [rad or m] is within the limits of the URDF.
+    """Check that at least one row of positions is within the limits of the URDF.
+
+    Args:
+        position: of the joints (m, n) [rad or m].
+        names: of the joints.
+        urdf: text of the description.
+        path: of the recording, for the error.
 
     Raises:
         SourceError: none is.
@@ -234,9 +250,13 @@ def check_positions(position: Array, names: Sequence[str], urdf: str, path: Path
 
 
 def are_degrees(position: Array, converted: Array, names: Sequence[str], urdf: str) -> bool:
-    """Return whether positions (m, n) leave the limits of the URDF by far and are within converted.
+    """Return whether positions leave the limits by far, but not if they are degrees.
 
-    `converted` are the same numbers [rad], read as degrees.
+    Args:
+        position: numbers of the recording (m, n).
+        converted: the same numbers read as degrees (m, n) [rad].
+        names: of the joints.
+        urdf: text of the description.
     """
     limits = urdf_limits(urdf, names)
     turning = _turning(urdf, names)

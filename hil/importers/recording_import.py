@@ -268,8 +268,16 @@ def import_recording(
 ) -> ImportedRecording:
     """Read a recording and write its archive; see :func:`read_recording`.
 
-    With `force` the archive replaces another; `asked` returns the recording as its motion and
-    torque say that it is.
+    Args:
+        source: file or folder of the recording.
+        output: path of the archive.
+        robot_of: reads the robot's cell or URDF.
+        options: of the import.
+        held_joints: joints that were clamped.
+        use: what the recording is for.
+        coupled: whether coupled angles are searched for.
+        force: whether an existing archive is replaced.
+        asked: returns the recording as its motion and torque say that it is.
 
     Raises:
         SourceError: it cannot be read, or its channels leave a quantity open.
@@ -293,7 +301,14 @@ def import_recording(
 def read_again(
     imported: ImportedRecording, source: Path, robot_of: RobotOf, text: str, use: Use
 ) -> ImportedRecording:
-    """Read a log by another column map, TOML; its files are not parsed again.
+    """Read a log by another column map; its files are not parsed again.
+
+    Args:
+        imported: the log as it was read before.
+        source: its file or folder.
+        robot_of: reads the robot's cell or URDF.
+        text: of the map, TOML.
+        use: what the recording is for.
 
     Raises:
         SourceError: the map leaves a quantity open.
@@ -324,7 +339,18 @@ def read_by_map(
     held_joints: Sequence[str] = (),
     coupled: bool = True,
 ) -> ImportedRecording:
-    """Read a log or a bag by the text of its map, TOML; see :func:`read_recording`.
+    """Read a log or a bag by its map; see :func:`read_recording`.
+
+    Args:
+        source: file or folder of the recording.
+        robot_of: reads the robot's cell or URDF.
+        text: of the map, TOML.
+        place: path that its archive will have.
+        use: what the recording is for.
+        outside_limits: whether positions may leave the limits of the URDF.
+        files: parsed before.
+        held_joints: joints that were clamped.
+        coupled: whether coupled angles are searched for.
 
     Raises:
         SourceError: it cannot be read, or the map leaves a quantity open.
@@ -358,7 +384,23 @@ def import_bag(
     force: bool = False,
     asked: Callable[[ImportedRecording], ImportedRecording] = _as_it_is,
 ) -> ImportedRecording:
-    """Import the joint states of a bag that `bag` describes; see :func:`import_recording`."""
+    """Import joint states of a bag.
+
+    Args:
+        source: file or folder of the bag.
+        output: path of the archive.
+        robot_of: reads the robot's cell or URDF.
+        bag: map of its topics.
+        options: of the import.
+        held_joints: joints that were clamped.
+        use: what the recording is for.
+        force: whether an existing archive is replaced.
+        asked: returns the recording as its motion and torque say that it is.
+
+    Raises:
+        SourceError: it cannot be read, or its channels leave a quantity open.
+        ArchiveWriteError: the archive exists or cannot be written.
+    """
     require_writable(output, [source], force=force)
     request = _Request(
         source, output, tuple(held_joints), use, coupled=True,

@@ -63,10 +63,17 @@ def concluded(
     options: ImportOptions,
     use: Use,
 ) -> ImportedRecording:
-    """Return a log imported again with what its motion and torque say, if that is sure.
+    """Return a log read again as its motion and torque say it is, if that is certain.
 
     A log that a map describes, or whose torque follows its arm, is returned as it is, and so is a
-    bag. A warning is among its lines if the URDF may describe another arm.
+    bag. It has a warning if the URDF may describe another arm.
+
+    Args:
+        imported: the log as its names and units say it is.
+        source: its file or folder.
+        robot_of: reads the robot's cell or URDF.
+        options: of the import.
+        use: what the recording is for.
 
     Raises:
         SourceError: two readings fit alike, or the URDF is that of another arm.

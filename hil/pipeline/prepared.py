@@ -92,8 +92,12 @@ def samples_of(
 ) -> Samples:
     """Return the samples of a source, for a fit.
 
-    The friction law is that of the cell; `model` replaces the cell's. `motions` keeps smoothed
-    motions of the source for several calls.
+    Args:
+        source: a recording.
+        cell: with the friction law.
+        settings: of the preparation.
+        model: replaces the cell's.
+        motions: keeps smoothed motions of the source for several calls.
 
     Raises:
         RecordingError: the recording cannot be prepared.
@@ -123,9 +127,14 @@ def versions_of(
     *,
     for_fit: bool = True,
 ) -> tuple[Samples, ...]:
-    """Return the samples of a source, and those of the bandwidth it is averaged with, if any.
+    """Return the samples of a source for each bandwidth over which the fit is averaged.
 
-    With the load of the gears that the settings state; not `for_fit` :func:`validation_samples`.
+    Args:
+        source: a recording.
+        cell: with the friction law.
+        settings: of the preparation, with the load of the gears.
+        motions: keeps smoothed motions of the source for several calls.
+        for_fit: otherwise :func:`validation_samples`.
 
     Raises:
         RecordingError: the recording cannot be prepared.
@@ -143,7 +152,14 @@ def versions_of(
 def reduction_of(
     cell: Cell, settings: Settings, versions: Sequence[Samples], *, unmodelled: bool
 ) -> Reduction:
-    """Reduce a recording by :func:`versions_of`; `unmodelled` as of the reduction."""
+    """Reduce a recording.
+
+    Args:
+        cell: with the model and the parameters that are known.
+        settings: of the preparation.
+        versions: samples for each bandwidth, by :func:`versions_of`.
+        unmodelled: whether what the model lacks is estimated, as of the reduction.
+    """
     return reduce(
         cell.model,
         versions,
@@ -162,6 +178,12 @@ def validation_samples(
     motions: dict[Preprocessing, Smoothed] | None = None,
 ) -> Samples:
     """Return the samples of a source for a verdict: rows in motion, torque as recorded.
+
+    Args:
+        source: a recording.
+        cell: with the friction law.
+        settings: of the preparation.
+        motions: keeps smoothed motions of the source for several calls.
 
     Raises:
         RecordingError: the recording cannot be prepared.

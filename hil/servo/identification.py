@@ -79,9 +79,14 @@ def identify_servos(
     predict: Sequence[Path | Archive] = (),
     name: str = "",
 ) -> ServoIdentification:
-    """Identify servos from archives of positions and commands; `predict` is held out.
+    """Identify servos from positions and commands, with the bodies of the URDF.
 
-    The bodies are those of the URDF.
+    Args:
+        archives: that are fitted.
+        reporter: is told of the progress.
+        options: of the identification.
+        predict: archives that are held out.
+        name: of the result; by default the first archive's.
 
     Raises:
         InputError: there are no masses, no commanded positions, or no motion.

@@ -124,12 +124,23 @@ def choose_settings(
     springs: Sequence[str] = (),
     stated: Known | None = None,
 ) -> Settings:
-    """Choose settings one after the other, from data that `ready` prepares for the arm's `model`.
+    """Choose settings one after the other.
 
-    `delays` of the torque are candidates for "delay" that must predict no worse than that of
-    `start`, or better if they are not determined; `ripples` those for "ripple", and joints
-    `springs` those for "springs". Returns settings with their choices; `start` if the data are too
-    short, or predict no part of themselves.
+    Args:
+        model: of the arm.
+        ready: prepares data by settings.
+        start: settings to begin with.
+        questions: settings that are chosen.
+        low_passes: of the torque, that are candidates.
+        delays: of the torque, which must predict no worse than the delay of `start`, or better if
+            they are not determined.
+        ripples: candidates for torque ripple.
+        springs: joints that may have a spring.
+        stated: parameters that are known.
+
+    Returns:
+        Settings with their choices; `start` if the data are too short, or predict no part of
+        themselves.
     """
     trial = SettingsTrial(model, ready, stated, ripples)
     now = _first_candidates(start, questions)

@@ -161,13 +161,20 @@ class SettingsTrial:
         certainty: float = 1.0,
         transfer: float = 0.0,
     ) -> SettingDecision:
-        """Return the first candidate, or the best one if it is clearly better, and `possible`.
+        """Return the first candidate, or the best one if it is clearly better and possible.
 
-        Better by a share (`WORTHWHILE`), and by more than the standard error of the difference over
-        the segments times the certainty: over all joints, by their geometric mean `by_joint`, or of
-        one `joint`. With `transfer`, a relative standard deviation in addition (`TRANSFER`), it is
-        the first one that is not clearly worse than the best: candidates are then in the order of
-        their distance from the first.
+        Args:
+            name: of the setting.
+            candidates: settings, the default first.
+            share: by which the error must fall; by default `WORTHWHILE`.
+            by_joint: whether the geometric mean over the joints is compared.
+            joint: the only joint whose error counts.
+            rows: whose error counts.
+            possible: whether a candidate may be chosen.
+            certainty: standard errors of the difference over the segments by which it must fall.
+            transfer: relative standard deviation between motions in addition (`TRANSFER`). With it
+                the first candidate wins that is not clearly worse than the best, so the candidates
+                are ordered by their distance from the first.
         """
         share = WORTHWHILE if share is None else share
         scores = [self.errors(each, rows) for each in candidates]
@@ -496,9 +503,14 @@ def _correlation(pairs: Sequence[tuple[Array, Array]]) -> Array:
 def clearly_better(
     errors: Array, first: Array, share: float, certainty: float, transfer: float = 0.0
 ) -> bool:
-    """Return whether errors of segments (k,) are lower than others by share and standard error.
+    """Return whether errors of segments are clearly lower than others.
 
-    `transfer` is a relative standard deviation that adds to it.
+    Args:
+        errors: of the candidate (k,).
+        first: of the default (k,).
+        share: by which they must be lower.
+        certainty: standard errors of the difference by which they must be lower.
+        transfer: relative standard deviation between motions, which adds to the standard error.
     """
     if errors.shape != first.shape or not errors.size:
         return False
