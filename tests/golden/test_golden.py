@@ -50,7 +50,7 @@ class TestGoldenResults:
         "name",
         # The heavy arm asks most of the consistent estimate.
         [
-            pytest.param(robot, marks=() if robot == "kr300" else pytest.mark.slow)
+            pytest.param(robot, marks=pytest.mark.long if robot == "kr300" else pytest.mark.slow)
             for robot in PUBLISHED
         ],
     )

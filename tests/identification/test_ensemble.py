@@ -45,6 +45,7 @@ def test_torques_vary_as_the_stated_intervals(posterior, ensemble) -> None:
     assert ensemble.spread == pytest.approx(np.sqrt(drawn / stated))
 
 
+@pytest.mark.long
 def test_the_scale_of_the_torque_moves_no_arm(posterior, ensemble) -> None:
     """They are for use with the torques of the same arm."""
     prior, estimate, factor = posterior

@@ -142,6 +142,7 @@ class TestSearch:
         expected = [(value(genes + d) - value(genes - d)) / 2.0 for d in changes]
         assert np.corrcoef(changes @ gradient, expected)[0, 1] > 0.95
 
+    @pytest.mark.long
     def test_the_gradient_makes_a_motion_more_precise(self) -> None:
         problem = search_problem()
         effort = {"population": 16, "generations": 2, "mutation": 0.1}

@@ -475,6 +475,7 @@ class TestOwnMotion:
         return made
 
     @given(there=st.tuples(angles, angles), then=st.tuples(angles, angles))
+    @pytest.mark.long
     def test_it_rests_in_its_postures_within_its_limits(
         self, there: tuple[float, float], then: tuple[float, float]
     ) -> None:

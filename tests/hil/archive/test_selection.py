@@ -94,6 +94,7 @@ def long(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return file
 
 
+@pytest.mark.long
 def test_work_holds_little_more_than_the_part(long):
     """Checks and repairs hold a chunk at a time."""
     column = CYCLES * 8

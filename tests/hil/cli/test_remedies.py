@@ -101,6 +101,7 @@ def refusal(result: Result) -> str:
 
 
 class TestJointsThatWereNotRecorded:
+    @pytest.mark.long
     def test_the_last_ones_are_locked(self, folder: Path) -> None:
         line = ["identify", folder / "log.csv", "--urdf", folder / "longer.urdf", "-q"]
         refused = message(typed(*line))
@@ -119,6 +120,7 @@ class TestJointsThatWereNotRecorded:
         done = typed(*line, "--map", folder / "joints.toml")
         assert done.exit_code == 0, message(done)
 
+    @pytest.mark.long
     def test_a_position_that_is_none(self, folder: Path) -> None:
         line = ["identify", folder / "log.csv", "--urdf", folder / "longer.urdf", "-q"]
         refused = message(typed(*line, "--locked", "lift=half"))
@@ -215,6 +217,7 @@ class TestExport:
         again = typed(*line, option)
         assert again.exit_code == 0 and option not in again.output
 
+    @pytest.mark.long
     def test_arms_drawn_of_an_estimate_without_posterior(
         self, archive: Path, tmp_path: Path
     ) -> None:

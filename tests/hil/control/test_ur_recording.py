@@ -165,6 +165,7 @@ def test_a_batch_has_the_mean_temperature_of_each_joint(recorded: Path, tmp_path
     )
 
 
+@pytest.mark.long
 def test_a_known_load_decides_the_torque_constants(recorded: Path, tmp_path: Path) -> None:
     """Those that the arm states are 1 to 7 % off."""
     load = Payload(3.0, (0.0, 0.0, 0.05), (0.0,) * 6, "flange")
@@ -180,6 +181,7 @@ def test_a_known_load_decides_the_torque_constants(recorded: Path, tmp_path: Pat
     assert np.all(error < np.maximum(gains.interval_factor * gains.std[:5], 0.005 * true))
 
 
+@pytest.mark.long
 def test_a_look_needs_nothing_but_the_archive(recorded: Path) -> None:
     """Its robot is in it, and its channels state what they are."""
     rows = {row.aspect: row for row in look_at(recorded, None, ImportOptions()).rows}

@@ -257,6 +257,7 @@ def test_the_command_sends_the_controller_nothing(tmp_path: Path) -> None:
     assert os.sched_getscheduler(0) == scheduling
 
 
+@pytest.mark.long
 def test_every_remedy_is_valid_shell(tmp_path: Path) -> None:
     examined = examine(UdpSpec("10.99.99.99", 999), 1, 0.1, tmp_path, Silent())
     for check in examined.checks:

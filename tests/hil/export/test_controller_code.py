@@ -45,6 +45,7 @@ from tests.hil.structured_text_reader import Block, blocks_of
 from tests.identification.exported_arm import WRIST, an_arm
 from tests.identification.robots import random_urdf
 from tests.identification.two_link import four_sines
+from tests.tiers import quick_ones
 
 COMPILER = next(filter(shutil.which, ("cc", "gcc", "clang")), None)
 pytestmark = pytest.mark.skipif(COMPILER is None, reason="there is no C compiler")
@@ -101,7 +102,7 @@ def whole(tmp_path_factory: pytest.TempPathFactory) -> tuple[ExportedArm, Compil
 
 
 @pytest.mark.parametrize("precision", AGREES)
-@pytest.mark.parametrize("name", ARMS)
+@pytest.mark.parametrize("name", quick_ones(("everything",), ARMS))
 def test_the_compiled_torque_is_pinocchios(name: str, precision: Precision) -> None:
     """Without a warning of the compiler, under another prefix."""
     arm = ARMS[name]()
@@ -377,6 +378,7 @@ class TestStructuredText:
             mass.mass.values.ravel(), called(code, "mass_matrix", n * n, pointer(q)), atol=1e-9
         )
 
+    @pytest.mark.long
     def test_the_observer_follows_the_motion(self) -> None:
         arm = a_whole_arm()
         motion = slow_motion(arm.model.n_joints).rows(slice(0, 120))

@@ -208,6 +208,7 @@ def test_the_python_example_predicts_the_torque_of_the_model(
     np.testing.assert_allclose(shown, expected, rtol=1e-6)
 
 
+@pytest.mark.long
 def test_the_python_example_fixes_a_gripper(text: str, tmp_path: Path) -> None:
     """Verbatim, of an arm whose fingers were not recorded."""
     folder = tmp_path / "runs" / "demo"

@@ -132,7 +132,7 @@ class TestNotInvented:
             alarms += courses([noisy, *family[1:]])[0].p_value < 0.01
         assert alarms <= 2
 
-    @pytest.mark.parametrize("place", [0, 3, -2, -1])
+    @pytest.mark.parametrize("place", [LONG(0), LONG(3), LONG(-2), -1])
     def test_one_outlier_is_none(self, place):
         """Neither by a slope to the last recording, nor by two changes between three of them."""
         alarms = 0
@@ -184,7 +184,7 @@ class TestAllTogether:
             assert min(holm(np.array([each.p_value for each in courses(family)]))) > 0.01
 
     @pytest.mark.parametrize("heat", [True, False])
-    @pytest.mark.parametrize("months", [13, LONG(18), 24, LONG(36)])
+    @pytest.mark.parametrize("months", [LONG(13), LONG(18), 24, LONG(36)])
     def test_is_not_invented(self, months, heat):
         p_values = [
             common_course(fleet(seed, months=months, heat=heat)).course.p_value

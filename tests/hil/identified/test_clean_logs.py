@@ -17,6 +17,7 @@ from hil.cli import app
 from hil.identified.identified_arm import IdentifiedArm
 from tests.hil.importers.moving_log import URDF
 from tests.hil.simulated_logs import urdf_path
+from tests.tiers import quick_ones
 
 COMPLAINTS = {"resolution", "outliers", "generalisation", "joint order"}
 
@@ -60,10 +61,7 @@ ARMS = ["three joints", "on a lift", "UR5", "UR5, stamps repeated", "smooth 0.05
 
 @pytest.fixture(
     scope="module",
-    params=[
-        pytest.param(name, marks=pytest.mark.long) if name == "UR5, stamps repeated" else name
-        for name in ARMS
-    ],
+    params=quick_ones(("three joints", "smooth 0.05"), ARMS),
 )
 def arm(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> IdentifiedArm:
     folder = tmp_path_factory.mktemp("clean")

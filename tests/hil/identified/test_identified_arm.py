@@ -27,6 +27,7 @@ from hil.results.results import Results
 from tests.hil.browser import OpenedPage, chromium
 from tests.hil.importers.moving_log import URDF
 from tests.hil.simulated_logs import write_moving_log
+from tests.tiers import quick_ones
 
 
 @pytest.fixture(scope="module")
@@ -133,6 +134,7 @@ class TestResult:
             again.predict(state, state, state), result.predict(state, state, state)
         )
 
+    @pytest.mark.long
     def test_a_notebook_shows_it(self, result: Any, tmp_path: Path) -> None:
         page = tmp_path / "cell.html"
         text = result._repr_html_()
@@ -158,6 +160,7 @@ class TestResult:
 class TestWhatWasRead:
     """Report and `results.json` say what is not as the log has it."""
 
+    @pytest.mark.long
     def test_turned_torques_are_named(self, folder: Path, tmp_path: Path) -> None:
         import pandas
 
@@ -198,6 +201,7 @@ class TestSaved:
             path.name for path in (tmp_path / "command").iterdir()
         }
 
+    @pytest.mark.long
     def test_without_a_folder_it_is_that_of_the_log(self, folder: Path, tmp_path: Path) -> None:
         log = tmp_path / "a.csv"
         log.write_bytes((folder / "a.csv").read_bytes())
@@ -269,6 +273,7 @@ class TestLoaded:
         assert loaded.verdict == result.verdict
         assert loaded.results.remarks == ["a.mcap: the clock jumps"]
 
+    @pytest.mark.long
     def test_its_plot_and_its_page_are_the_same(self, result: Any, loaded: Any) -> None:
         assert loaded.plot().series.equals(result.plot().series)
         assert loaded._repr_html_() == result._repr_html_()
@@ -304,7 +309,7 @@ def of_file(folder: Path) -> Any:
 class TestDataFrame:
     """A table in memory is a log."""
 
-    @pytest.mark.parametrize("indexed", [False, True])
+    @pytest.mark.parametrize("indexed", quick_ones([True], [False, True]))
     def test_it_gives_what_its_file_gives(
         self,
         folder: Path,

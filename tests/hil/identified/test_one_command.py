@@ -348,6 +348,7 @@ def test_a_map_of_a_bag_with_a_wrong_entry(tmp_path: Path, urdf: Path) -> None:
 
 
 class TestIdentify:
+    @pytest.mark.long
     def test_json_is_all_that_is_printed_of_it(self, tmp_path: Path, urdf: Path) -> None:
         result = hil("identify", moving(tmp_path / "a.csv"), "--urdf", urdf, "--json")
         printed = json.loads(result.stdout)

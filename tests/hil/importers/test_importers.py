@@ -1247,6 +1247,7 @@ class TestRobotOptions:
         assert "locked, rad or m: shoulder at 0" in result.output
         assert open_archive(place / "o.mcap").joint_names == ("elbow",)
 
+    @pytest.mark.long
     def test_joints_of_a_bag_are_renamed(self, place: Path) -> None:
         (place / "bag.db3").unlink()
         messages = [state(10**7 * k, [0.1 * k], names=["j2"]) for k in range(9)]
@@ -1356,6 +1357,7 @@ class TestReadyMaps:
         )
         assert np.diff(stored["stamp"]) == pytest.approx(1e7, abs=300)
 
+    @pytest.mark.long
     def test_listed_and_printed(self) -> None:
         listing = CliRunner().invoke(app, ["import", "maps"]).stdout
         assert all(name in listing for name in READY)

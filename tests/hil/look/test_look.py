@@ -54,6 +54,7 @@ from identification.signals.samples import prepare
 from tests.hil.importers.bags import STATE, bag, state, states
 from tests.hil.importers.moving_log import JOINTS, URDF
 from tests.hil.simulated_logs import write_log, write_moving_log
+from tests.tiers import quick_ones
 
 Floats = NDArray[np.float64]
 UPRIGHT = ArmChange(Change("mounting", name="upright"), JOINTS)
@@ -249,6 +250,7 @@ class TestConclusions:
         text = (tmp_path / "a" / "map.toml").read_text()
         assert "scale = [-1.0, -1.0, -1.0]" in text
 
+    @pytest.mark.long
     def test_a_coupled_angle_is_its_own_in_the_archive(
         self, tmp_path: Path, urdf: Path, table: Mapping[str, Floats]
     ) -> None:
@@ -301,7 +303,10 @@ class TestConclusions:
         assert "state --gravity 0 0 -9.81; or write the map with `hil look 'my log.csv'" in message
         assert "-o map.toml`, add [position] offset = [0, 3], and give it with --map" in message
 
-    @pytest.mark.parametrize("mounted", [(0.0, 9.81, 0.0), (0.0, 0.0, 0.0)])
+    @pytest.mark.parametrize(
+        "mounted",
+        [(0.0, 9.81, 0.0), pytest.param((0.0, 0.0, 0.0), marks=pytest.mark.long)],
+    )
     def test_another_gravity_is_stated_wrongly(
         self,
         tmp_path: Path,
@@ -458,7 +463,7 @@ class TestOtherArm:
         write_log(path, ["t", "q{}", "v{}", "tau{}"], *turned.values())
         assert not self.contradictions(path, urdf).found
 
-    @pytest.mark.parametrize("change", ["narrow", "weak"])
+    @pytest.mark.parametrize("change", quick_ones(["narrow"], ["narrow", "weak"]))
     def test_one_of_them_alone_may_be_a_limit_that_is_wrong(
         self, tmp_path: Path, table: Mapping[str, Floats], change: str
     ) -> None:
@@ -537,7 +542,7 @@ class TestTerminal:
         os.close(leader)
         return status, screen.decode()
 
-    @pytest.mark.parametrize(("answer", "status"), [("0", 2), ("2", 0)])
+    @pytest.mark.parametrize(("answer", "status"), quick_ones([("2", 0)], [("0", 2), ("2", 0)]))
     def test_it_asks_which_of_two(
         self, tmp_path: Path, urdf: Path, table: Mapping[str, Floats], answer: str, status: int
     ) -> None:

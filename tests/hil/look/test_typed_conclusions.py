@@ -79,6 +79,7 @@ class TestNamesOfChannels:
         result = hil("look", path, "--urdf", urdf, "-v")
         assert re.search(r"next best: \w+ \(error \d+\.\d+ times", result.output)
 
+    @pytest.mark.long
     def test_the_recorded_arm_has_a_row_of_its_own(self, tmp_path: Path) -> None:
         urdf = robot_of_arms(tmp_path, ("left", 3), ("head", 1))
         time = np.arange(400) * 0.01

@@ -33,6 +33,7 @@ def kept(cell: Cell, required: str, seeds: range, within: float = 1.25) -> dict:
     return figures
 
 
+@pytest.mark.long
 def test_a_promise_that_is_kept_asks_for_no_other_motion() -> None:
     """Two joints in cycles of 2 ms: intervals of the delay were ten times its error."""
     cell = Cell.load(TWO_JOINTS)
