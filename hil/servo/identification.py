@@ -82,10 +82,10 @@ def identify_servos(
     """Identify servos from positions and commands, with the bodies of the URDF.
 
     Args:
-        archives: that are fitted.
-        reporter: is told of the progress.
+        archives: to fit.
+        reporter: shows the progress.
         options: of the identification.
-        predict: archives that are held out.
+        predict: archives to hold out.
         name: of the result; by default the first archive's.
 
     Raises:
