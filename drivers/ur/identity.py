@@ -80,10 +80,12 @@ class ArmIdentity:
 
     def named(self, major: int) -> str | None:
         """Return the name of the type for a major version of the software, such as "UR5e"."""
-        if self.kind is None or self.kind not in MODELS:
+        kinds = {name: kind for kind, name in MODELS.items()}
+        kind = kinds.get(self.model or "") if self.kind is None else self.kind
+        if kind is None or kind not in MODELS:
             return self.model
-        suffix = "" if self.kind in _WITHOUT_E or major <= 3 else "e"
-        return MODELS[self.kind] + suffix
+        suffix = "" if kind in _WITHOUT_E or major <= 3 else "e"
+        return MODELS[kind] + suffix
 
 
 def ask_identity(

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from drivers.drive_train import DriveTrain
 from drivers.errors import GuardError
 from drivers.events import (
+    ControllerRemark,
     GapSeen,
     HoldChanged,
     InitReceived,
@@ -52,6 +53,7 @@ _TEXTS: Final[Mapping[type, tuple[Level, str]]] = {
     OverrideChanged: (Level.INFO, "override {0.fraction:g} in cycle {0.cycle}"),
     HoldChanged: (Level.INFO, "{details} at cycle {0.cycle}"),
     MotionEnded: (Level.INFO, "{0.outcome} in cycle {0.cycle}: {0.reason}"),
+    ControllerRemark: (Level.INFO, "{0.text}"),
     Refused: (Level.ERROR, "{0.error}; {0.error.remedy}"),
     LinkLost: (
         Level.ERROR,

@@ -129,12 +129,20 @@ def quick_settings(cell: Cell) -> DesignSettings:
     campaign = cell.campaign
     motions = max(LEAST, campaign.candidates)
     population = max(LEAST, isqrt(4 * motions // 3))
-    return preset("b").replaced(
+    settings = preset("b").replaced(
         seed=campaign.seed,
         search={"population": population, "generations": motions // population},
         via_points={"n_via": campaign.n_via, "fly": campaign.fly, "slowest": SLOWEST},
         constraints={"closed": True, "collision": True, "current": True, "max_duration": LONGEST},
     )
+    return within_ranges(settings, cell)
+
+
+def within_ranges(settings: DesignSettings, cell: Cell) -> DesignSettings:
+    """Return settings with via points in the part of the ranges that `[campaign]` names."""
+    if settings.via_points is None or cell.campaign.range_share == 1.0:
+        return settings
+    return settings.replaced(via_points={"range_share": cell.campaign.range_share})
 
 
 def plan_around(
@@ -172,6 +180,7 @@ def validation_motions(cell: Cell, checks: MotionChecks) -> tuple[ViaPointMotion
             count=settings.validation_runs,
             n_via=settings.n_via,
             fly=settings.fly,
+            range_share=settings.range_share,
             checker=checks.checker,
             currents=planned(checks.currents),
         )

@@ -576,6 +576,9 @@ class CampaignTable(Table):
     fly: Annotated[Number, Field(ge=0, le=1)] = field(
         "fly-by fraction, 0 (stop at every via point) to 1", 0.5
     )
+    range_share: Annotated[Number, Field(gt=0, le=1)] = field(
+        "central fraction of each joint's range for via points, above 0, at most 1", 1.0
+    )
     candidates: Whole = field(
         "motions of the quick search of a campaign without a design", 300, ge=1
     )

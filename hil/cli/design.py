@@ -17,7 +17,7 @@ from hil.base.progress import Collecting, Reporter, say
 from hil.base.progress import reporter as make_reporter
 from hil.base.terminal_text import printable, typed
 from hil.campaign.campaign import campaign_of_design, require_replaceable
-from hil.campaign.plan import quick_settings, validation_motions
+from hil.campaign.plan import quick_settings, validation_motions, within_ranges
 from hil.campaign.trajectory_files import write_trajectories
 from hil.cell import Cell
 from hil.cli.arguments import JsonOption, QuietOption, VerboseOption, at_most_one, print_json
@@ -165,7 +165,8 @@ def design(
     elif settings is not None:
         requested = load_settings(settings)
     else:
-        requested = preset(method or "gradient") if method or there is None else there
+        searched = within_ranges(preset(method or "gradient"), loaded)
+        requested = searched if method or there is None else there
     if given:
         requested = requested.replaced(objective={"given": [str(path.resolve()) for path in given]})
     if precision:

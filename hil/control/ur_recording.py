@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 
 from drivers.cycle_records import ARM_STATE
 from drivers.errors import DriverError
+from drivers.events import ControllerRemark
 from drivers.states import State
 from drivers.ur.cycles import CycleCounter
 from drivers.ur.description import UrDescription, identity_document
@@ -196,7 +197,7 @@ class _Recording:
         """Archive frames up to the limit of cycles."""
         records = self._counter.records(frames)
         for text in frames.texts:
-            self._event("ControllerText", f"{text.source}: {text.message}", Level.INFO)
+            self._event(ControllerRemark.__name__, f"{text.source}: {text.message}", Level.INFO)
         if limit is not None:
             records = records[records["cycle"] < limit]
         if not len(records):

@@ -27,8 +27,9 @@ def criteria_text(measures: Iterable[float], n_parameters: int | None = None) ->
 
 
 _REMEDIES: Final = {
-    "collision": "restrict via points to the middle of the joint ranges ([via_points] range_share),"
-    " use another mean posture of sines ([sines] offset), or check floor, walls, margin and home",
+    "collision": "restrict via points to the middle of the joint ranges ([campaign] range_share of "
+    "the cell, e.g. 0.5; [via_points] range_share of settings), use another mean posture of sines "
+    "([sines] offset), or check floor, walls, margin and home",
     "current": "allow slower motions ([via_points] slowest, [sines] fastest), or check current "
     "limits and uncertainty of the cell",
     "torque": "allow slower motions ([via_points] slowest, [sines] fastest)",

@@ -139,6 +139,18 @@ def from_arm(arm: UrArmStatements, urdf: str) -> CellValues:
     return values
 
 
+def _range_share(identity: ArmIdentity) -> float | None:
+    """Return the share of the widest range that is one turn; None if all are at most that.
+
+    Every posture is within one turn, and between two that are further apart an arm on a table
+    sweeps through the table.
+    """
+    if identity.lower is None or identity.upper is None:
+        return None
+    turns = float(np.max(identity.upper - identity.lower)) / (2.0 * np.pi)
+    return round(1.0 / turns, 3) if turns > 1.0 else None
+
+
 def _stated(arm: UrArmStatements, urdf: str) -> Iterator[tuple[str, Any]]:
     identity = arm.identity
     name = " ".join(filter(None, (arm.model or "Universal Robots", identity.serial_number)))
@@ -226,6 +238,8 @@ def _assumed(arm: UrArmStatements) -> Iterator[tuple[str, Any]]:
     yield "drive_train.following_error", _following_error(arm)
     yield "drive_train.encoder_counts_per_revolution", _COUNTS
     acceleration, velocity = arm.identity.acceleration, arm.identity.velocity
+    if (share := _range_share(arm.identity)) is not None:
+        yield "campaign.range_share", share
     if acceleration is not None:
         yield "limits.jerk_deg", np.round(np.degrees(acceleration) / _JERK_TIME, 1).tolist()
     torques = TORQUES.get(arm.model or "")

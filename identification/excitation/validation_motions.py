@@ -39,6 +39,7 @@ def random_validation_motions(
     count: int,
     n_via: int = 6,
     fly: float = 0.5,
+    range_share: float = 1.0,
     checker: CollisionChecker | None = None,
     currents: CurrentModel | None = None,
 ) -> tuple[ViaPointMotion, ...]:
@@ -54,13 +55,14 @@ def random_validation_motions(
         count: of the motions.
         n_via: points between the ends.
         fly: how far corners are rounded, from 0 to 1.
+        range_share: central fraction of each joint's range that the points lie in.
         checker: of collisions.
         currents: of the motors.
 
     Raises:
         NoFeasibleMotionError: 100 attempts in a row without a feasible motion.
     """
-    attempts = _Attempts(limits, home, n_via, fly, checker, currents)
+    attempts = _Attempts(limits, home, n_via, fly, range_share, checker, currents)
     contact = None if checker is None else clearance(checker, home[None])
     if contact is not None:
         attempts.reject([replace(contact, subject=f"{contact.subject} at home")])
@@ -92,6 +94,7 @@ class _Attempts:
         home: Array,
         n_via: int,
         fly: float,
+        range_share: float,
         checker: CollisionChecker | None,
         currents: CurrentModel | None,
     ) -> None:
@@ -101,7 +104,7 @@ class _Attempts:
         self._fly = fly
         self._checker = checker
         self._currents = currents
-        self._half = (limits.upper - limits.lower) / 2.0 * _RANGE_SHARE
+        self._half = (limits.upper - limits.lower) / 2.0 * (_RANGE_SHARE * range_share)
         self._middle = (limits.upper + limits.lower) / 2.0
         self.rejected = Counter[str]()
         self.nearest = dict[str, Violation]()

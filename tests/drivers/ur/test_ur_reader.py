@@ -12,7 +12,7 @@ import pytest
 from drivers.errors import DriverError, TransportClosed
 from drivers.transports.base import TransportError
 from drivers.ur import reader as reader_module
-from drivers.ur.identity import ask_identity
+from drivers.ur.identity import ArmIdentity, ask_identity
 from drivers.ur.outputs import OPTIONAL
 from drivers.ur.reader import RtdeReader
 from drivers.ur.rtde import OutputsMissingError, RtdeError
@@ -153,6 +153,15 @@ def test_an_arm_says_who_it_is() -> None:
     np.testing.assert_allclose(np.degrees(identity.upper), [360, 360, 180, 360, 360, 360])
     np.testing.assert_allclose(np.degrees(identity.velocity), 180.0)
     np.testing.assert_allclose(identity.acceleration, 40.0)
+
+
+@pytest.mark.parametrize(
+    ("model", "name"), [("UR5", "UR5e"), ("UR5e", "UR5e"), ("UR20", "UR20"), ("other", "other")]
+)
+def test_a_type_that_only_the_dashboard_states_has_its_full_name(model: str, name: str) -> None:
+    """It leaves out the e of the e-Series."""
+    assert ArmIdentity(model=model).named(5) == name
+    assert ArmIdentity(model="UR5").named(3) == "UR5"
 
 
 def test_what_cannot_be_asked_is_stated() -> None:

@@ -6,6 +6,7 @@ Also the buffer of what arrives while no archive is open.
 from __future__ import annotations
 
 from pathlib import Path
+from typing import get_args
 
 import numpy as np
 import pytest
@@ -14,16 +15,19 @@ from numpy.typing import NDArray
 from drivers.cycle_records import cycle_dtype
 from drivers.drive_train import DriveTrain
 from drivers.events import (
+    ControllerRemark,
     InitReceived,
     LinkLost,
     MotionEnded,
     MotionStarted,
     StateChanged,
 )
+from drivers.exchange.event_log import ExchangeEvent
 from drivers.packets import InitPacket
 from drivers.states import State
 from hil.archive import Archive, ArchiveSpec, Recorder, open_archive
 from hil.archive.process import BUFFERED_CYCLES, PreTriggerBuffer
+from hil.archive.recorder import _TEXTS
 from hil.cell import Cell
 from hil.control.simulated_cell import simulated_controller
 from sim_fixtures.ns16 import CELL_PATH
@@ -129,6 +133,17 @@ class TestRecorder:
         assert "no valid packet for 1.200 s" in silent
         assert lost == "7 records overwritten"
         assert archive.columns["torque"] == pytest.approx(GEAR * CONSTANT * 2.0), "of these drives"
+
+    def test_what_the_controller_says_is_archived(self, recorder: Recorder) -> None:
+        said = "C153A1: position deviates from path"
+        recorder.record(cycles(0, 10), [ControllerRemark(said, 5)])
+        (event,) = read(recorder).events
+        assert (event.name, event.text) == ("ControllerRemark", said)
+        assert event.time == pytest.approx(5 * PERIOD)
+
+
+def test_every_event_has_a_text_and_a_level() -> None:
+    assert _TEXTS.keys() == {*get_args(ExchangeEvent)}
 
 
 def at(*numbers: int) -> NDArray[np.void]:

@@ -14,9 +14,12 @@ import pytest
 from typer.testing import CliRunner
 
 from hil.base.errors import InputError
+from hil.base.progress import Silent
+from hil.campaign.plan import design
 from hil.cell import Cell
 from hil.cell.schema import RtdeTable
 from hil.cli import app, new
+from hil.control.motion_checks import MotionChecks
 from hil.control.motion_watch import Stop
 from hil.control.ur_recording import ConstantsFound, listening, record_arm
 from sim_fixtures.plant import build_model
@@ -116,6 +119,22 @@ def test_a_moving_arm_states_no_constants(tmp_path: Path, monkeypatch: pytest.Mo
         said, _ = made_by(server, tmp_path, monkeypatch)
     assert said["unknown"] == ["drive_train.torque_constant", "drive_train.current_limit"]
     assert any("hold the arm still" in note for note in said["notes"])
+
+
+def test_a_motion_is_found_for_the_new_cell_as_it_is(
+    server: UrServer, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """On a floor, with a margin of 2 cm: joints that turn twice need one turn."""
+    urdf = tmp_path / "ur5e.urdf"
+    urdf.write_text(UR5E_URDF)
+    _, path = made_by(server, tmp_path, monkeypatch, "--urdf", str(urdf))
+    cell = Cell.load(path)
+    assert (cell.workspace.floor, cell.workspace.margin) == (0.0, 0.02)
+    assert cell.campaign.range_share == 0.5
+    plan = design(cell, Silent())
+    checks = MotionChecks.of(cell)
+    for motion in (plan.excitation, *plan.validation):
+        assert checks.refusal(motion.trajectory) is None
 
 
 def test_without_services_a_urdf_is_needed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

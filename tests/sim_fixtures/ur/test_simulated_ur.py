@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import socket
+import struct
 import subprocess
 import sys
 import time
 from collections.abc import Iterator
 from contextlib import closing, suppress
+from typing import ClassVar
 
 import numpy as np
 import pinocchio as pin
@@ -23,6 +26,7 @@ from sim_fixtures.ur import (
     UrArmTruth,
     UrFault,
     UrProgram,
+    UrServer,
     UrSettings,
 )
 from sim_fixtures.ur.controller import UrPayload
@@ -264,6 +268,76 @@ def test_another_client_moves_the_arm_by_a_script_of_its_own(controlled: None) -
     finally:
         client.disconnect()
         reader.disconnect()
+
+
+class MakersBytes:
+    """What UR's RTDE_Python_Client_Library (rtde/rtde.py) sends, byte by byte, and reads.
+
+    It waits a second for a reply, skips other packages meanwhile, and raises where a type in it is
+    none that it knows.
+    """
+
+    TYPES: ClassVar = {
+        "DOUBLE": "d", "VECTOR6D": "6d", "INT32": "i", "UINT32": "I", "VECTOR6INT32": "6i"
+    }  # fmt: skip
+
+    def __init__(self, port: int) -> None:
+        self._socket = socket.create_connection(("127.0.0.1", port), timeout=1.0)
+        self._received = b""
+
+    def ask(self, command: bytes, payload: bytes = b"") -> bytes:
+        self.send(command, payload)
+        return self.receive(command)
+
+    def send(self, command: bytes, payload: bytes) -> None:
+        self._socket.sendall(struct.pack(">HB", 3 + len(payload), command[0]) + payload)
+
+    def receive(self, command: bytes) -> bytes:
+        while True:
+            while len(self._received) >= 3:
+                size, kind = struct.unpack_from(">HB", self._received)
+                if len(self._received) < size:
+                    break
+                package, self._received = self._received[3:size], self._received[size:]
+                if kind == command[0]:
+                    return package
+            self._received += self._socket.recv(4096)
+
+    def close(self) -> None:
+        self._socket.close()
+
+
+def test_the_bytes_of_the_makers_client_are_answered() -> None:
+    """Its order: V, v, O, I, S, U, P; names without a comma at the end."""
+    robot = SimulatedUr(program=UrProgram(), repeats=True)
+    with UrServer(robot).running() as server:
+        client = MakersBytes(server.ports["rtde"])
+        assert client.ask(b"V", b"\x00\x02") == b"\x01"
+        assert struct.unpack(">4I", client.ask(b"v")) == (5, 15, 2, 0)
+        names = b"timestamp,actual_q,robot_mode,joint_mode"
+        reply = client.ask(b"O", struct.pack(">d", 500) + names)
+        assert reply[1:] == b"DOUBLE,VECTOR6D,INT32,VECTOR6INT32"
+        inputs = client.ask(b"I", b"input_int_register_30,input_double_register_40")
+        assert inputs[0] > 0 and inputs[1:] == b"INT32,DOUBLE"
+        assert client.ask(b"S") == b"\x01"
+        layout = ">B" + "".join(MakersBytes.TYPES[name] for name in reply[1:].decode().split(","))
+        first, second = (struct.unpack(layout, client.receive(b"U")) for _ in range(2))
+        assert first[0] == reply[0]
+        assert second[1] - first[1] == pytest.approx(0.002)
+        assert first[8] == 7 and first[9:] == (253,) * 6
+        client.send(b"U", inputs[:1] + struct.pack(">id", 5, 2.5))
+        until = time.monotonic() + 10.0
+        while robot.inputs.ints.get(30) != 5 and time.monotonic() < until:
+            time.sleep(0.01)
+        assert (robot.inputs.ints[30], robot.inputs.floats[40]) == (5, 2.5)
+        assert client.ask(b"P") == b"\x01"
+
+        other = MakersBytes(server.ports["rtde"])
+        other.ask(b"V", b"\x00\x02")
+        assert other.ask(b"I", b"input_int_register_30")[1:] == b"IN_USE"
+        assert b"NOT_FOUND" in other.ask(b"O", struct.pack(">d", 500) + b"no_such_output")
+        other.close()
+        client.close()
 
 
 def test_the_makers_client_reads_the_same(served: None) -> None:
