@@ -24,6 +24,9 @@ _LINK = """
 NAMES = ("pan", "lift", "elbow")
 STEP = 2e-3
 RATE = 50.0
+TIP = np.array([0.18, 0.0, 0.0])  # in the last link
+STIFF = 3e3  # N/m, of a floor
+DAMPED = 10.0  # N·s/m
 COUNT = 2.0 * np.pi / 4096.0
 
 
@@ -91,6 +94,18 @@ def commands(rng: np.random.Generator, duration: float) -> tuple[Array, Array]:
     return time, command[0] + (command - command[0]) * smooth
 
 
+def poses(rng: np.random.Generator, duration: float) -> tuple[Array, Array]:
+    """Return times (m,) and commands (m, 3) that stop at a pose for three of every four seconds."""
+    time = np.arange(0.0, duration, 1.0 / RATE)
+    count = int(np.ceil(duration / 4.0)) + 1
+    targets = np.array([0.0, -0.6, 0.8]) + rng.uniform(-0.5, 0.5, (count, 3))
+    place, moved = np.divmod(time / 4.0, 1.0)
+    share = np.minimum(4.0 * moved, 1.0)[:, None]
+    share = share**2 * (3.0 - 2.0 * share)
+    before = place.astype(np.intp)
+    return time, targets[before] + share * (targets[before + 1] - targets[before])
+
+
 def planned(command: Array, acceleration: float) -> Array:
     """Return set-points (m, 3) that follow commands, and brake by an acceleration to meet them."""
     fine = 20
@@ -125,8 +140,32 @@ def _stepped(
     return new
 
 
-def simulated(planted: Planted, time: Array, command: Array) -> Array:
-    """Return measured positions at the times (m, 3), in counts of the encoder."""
+def tip_heights(positions: Array) -> Array:
+    """Return the heights (m,) of the arm's end along positions (m, 3) [m]."""
+    model = pin.buildModelFromXML(urdf())
+    data = model.createData()
+    return np.array([_tip(model, data, q)[0] for q in positions])
+
+
+def _tip(model: pin.Model, data: pin.Data, q: Array) -> tuple[float, Array]:
+    """Return the height of the arm's end and its slope by the joints (3,)."""
+    pin.computeJointJacobians(model, data, q)
+    placement = data.oMi[model.njoints - 1]
+    jacobian = pin.getJointJacobian(model, data, model.njoints - 1, pin.ReferenceFrame.WORLD)
+    linear, angular = jacobian[:3], jacobian[3:]
+    place = placement.act(TIP)
+    return float(place[2]), np.asarray(linear[2] + np.cross(angular.T, place)[:, 2])
+
+
+def simulated(planted: Planted, time: Array, command: Array, floor: float = -np.inf) -> Array:
+    """Return measured positions at the times (m, 3), in counts of the encoder.
+
+    Args:
+        planted: true parameters.
+        time: (m,) [s].
+        command: (m, 3).
+        floor: height of a stiff, smooth floor under the arm's end [m].
+    """
     model = pin.buildModelFromXML(urdf())
     data = model.createData()
     grid = np.arange(0.0, time[-1] + STEP, STEP)
@@ -148,6 +187,10 @@ def simulated(planted: Planted, time: Array, command: Array) -> Array:
         inertia = pin.crba(model, data, q)
         inertia = np.triu(inertia) + np.triu(inertia, 1).T
         bias = pin.nle(model, data, q, v)
+        if np.isfinite(floor):
+            height, slope = _tip(model, data, q)
+            if height < floor:
+                bias = bias - slope * max(0.0, STIFF * (floor - height) - DAMPED * float(slope @ v))
         # Damping acts on the mean of the velocities before and after a step: of second order.
         half = 0.5 * STEP * np.diag(planted.viscous + planted.kd * free)
         masses = inertia + np.diag(planted.armature)

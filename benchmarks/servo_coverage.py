@@ -12,6 +12,9 @@ at another step and with another integrator than what is fitted), a motion and e
   interval misses the truth by more than its own width.
 - ``error``: root mean square of a motion that was not fitted, simulated from its commands alone,
   over that of the command itself; median over the seeds.
+- ``contacts``: ten poses without a floor, and with one at the height above which the arm's end was
+  in 70 % of the time. Share of the time on the floor, and of the arms on it, in which a contact is
+  found; and the number of contacts found where there is none, in all motions.
 """
 
 from __future__ import annotations
@@ -20,8 +23,8 @@ import argparse
 import json
 import time
 from collections import defaultdict
-from collections.abc import Iterator
-from dataclasses import dataclass
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, replace
 from typing import Any, Final
 
 import numpy as np
@@ -30,10 +33,11 @@ from numpy.typing import NDArray
 from benchmarks import servo_arm as planted
 from identification import RobotModel
 from identification.servo.choice import fit_servos
+from identification.servo.contacts import Contact, contacts_of
 from identification.servo.intervals import intervals_of
 from identification.servo.parameters import PLACE
 from identification.servo.prediction import predicted
-from identification.servo.recorded_motion import Grid, motions_of
+from identification.servo.recorded_motion import Grid, ServoMotion, motions_of
 from identification.signals.recording import Recording
 
 Array = NDArray[np.float64]
@@ -42,6 +46,9 @@ PLANTED: Final = (
     *("load", "limit", "dead_band", "delay"),
 )
 _WRONG_FACTOR: Final = 2.0
+_POSES: Final = 40.0  # s
+_FLOOR: Final = 0.3  # quantile of the heights of the arm's end
+_TOUCHING: Final = 1e-3  # m above the floor, of positions in encoder counts
 
 
 @dataclass(frozen=True)
@@ -73,8 +80,32 @@ class Judged:
         return self.determined and (far or missed)
 
 
-def judged(seed: int, seconds: float) -> tuple[list[Judged], float]:
-    """Return the intervals of an arm, and the error of an unseen motion over its command's."""
+@dataclass(frozen=True)
+class Touched:
+    """What is found of a floor, and where there is none [s]."""
+
+    touched: float
+    found: float
+    false: int  #: contacts
+
+
+@dataclass(frozen=True)
+class Arm:
+    """What is judged of an arm.
+
+    Attributes:
+        rows: its intervals.
+        error: of an unseen motion over its command's.
+        touched: contacts.
+    """
+
+    rows: list[Judged]
+    error: float
+    touched: Touched
+
+
+def judged(seed: int, seconds: float) -> Arm:
+    """Return what is judged of an arm."""
     rng = np.random.default_rng(seed)
     truth = planted.Planted.drawn(rng)
     model, bodies = _model()
@@ -91,11 +122,8 @@ def judged(seed: int, seconds: float) -> tuple[list[Judged], float]:
         )
     fitted, other = recordings
     grid = Grid.of(fitted)
-    found = fit_servos(
-        lambda on: motions_of(fitted, model, bodies, on),
-        grid,
-        np.full(3, planted.COUNT / np.sqrt(12.0)),
-    )
+    resolution = np.full(3, planted.COUNT / np.sqrt(12.0))
+    found = fit_servos(lambda on: motions_of(fitted, model, bodies, on), grid, resolution)
     (unseen,) = motions_of(other, model, bodies, grid)
     intervals = intervals_of(found)
     (simulated,) = predicted(model, bodies, unseen, [intervals.values])
@@ -116,7 +144,34 @@ def judged(seed: int, seconds: float) -> tuple[list[Judged], float]:
         for name in PLANTED
         for joint in range(3)
     ]
-    return rows, float(error / command_error)
+    instants, command = planted.poses(rng, _POSES)
+    free = planted.simulated(truth, instants, command)
+    floor = float(np.quantile(planted.tip_heights(free), _FLOOR))
+    on_floor = planted.simulated(truth, instants, command, floor)
+    poses = [replace(other, time=instants, position=positions, commanded_position=command)
+             for positions in (free, on_floor)]  # fmt: skip
+    *untouched, touching = [
+        motion
+        for each in (fitted, other, *poses)
+        for motion in motions_of(each, model, bodies, grid)
+    ]
+    false = sum(len(contacts_of(motion, found, resolution)) for motion in untouched)
+    on = planted.tip_heights(touching.position) < floor + _TOUCHING
+    touched = _touched(touching, on, contacts_of(touching, found, resolution))
+    touched = replace(touched, false=touched.false + false)
+    return Arm(rows, float(error / command_error), touched)
+
+
+def _touched(motion: ServoMotion, on: NDArray[np.bool_], contacts: Sequence[Contact]) -> Touched:
+    """Return what contacts say of a motion, in some of whose instants (g,) there is one."""
+    instants = motion.step * np.arange(len(on))
+    marked = np.zeros(len(on), np.bool_)
+    false = 0
+    for contact in contacts:
+        rows = (instants >= contact.start) & (instants <= contact.end)
+        marked |= rows
+        false += not (rows & on).any()
+    return Touched(float(motion.step * on.sum()), float(motion.step * (marked & on).sum()), false)
 
 
 def _model() -> tuple[RobotModel, Array]:
@@ -128,10 +183,12 @@ def _model() -> tuple[RobotModel, Array]:
     return model, bodies
 
 
-def figures(rows: list[Judged], errors: list[float]) -> dict[str, Any]:
+def figures(arms: Sequence[Arm]) -> dict[str, Any]:
     """Return the figures of all seeds."""
+    rows = [row for arm in arms for row in arm.rows]
+    touched = [arm.touched for arm in arms]
 
-    def share(chosen: Iterator[bool]) -> float | None:
+    def share(chosen: Iterable[float]) -> float | None:
         values = list(chosen)
         return round(float(np.mean(values)), 3) if values else None
 
@@ -148,7 +205,12 @@ def figures(rows: list[Judged], errors: list[float]) -> dict[str, Any]:
             for row in rows
             if row.wrong
         ],
-        "error": round(float(np.median(errors)), 4),
+        "error": round(float(np.median([arm.error for arm in arms])), 4),
+        "contacts": {
+            "time": share([sum(t.found for t in touched) / sum(t.touched for t in touched)]),
+            "arms": share(each.found > 0.0 for each in touched if each.touched > 0.0),
+            "false": sum(each.false for each in touched),
+        },
         "by_parameter": {
             name: {
                 "covered_determined": share(row.covers for row in group if row.determined),
@@ -168,15 +230,13 @@ def main() -> None:
     parser.add_argument("--seconds", type=float, default=40.0)
     parser.add_argument("--json", action="store_true")
     options = parser.parse_args()
-    rows: list[Judged] = []
-    errors: list[float] = []
+    arms: list[Arm] = []
     started = time.process_time()
     for seed in range(options.first, options.first + options.seeds):
-        more, error = judged(seed, options.seconds)
-        rows += more
-        errors.append(error)
+        arm = judged(seed, options.seconds)
+        arms.append(arm)
         if not options.json:
-            known = [row for row in more if row.determined]
+            known = [row for row in arm.rows if row.determined]
             held = sum(row.covers for row in known)
             for row in known:
                 if not row.covers:
@@ -185,10 +245,12 @@ def main() -> None:
                         f" ({row.lower:.4g} to {row.upper:.4g}), true {row.true:.4g}"
                     )
             print(
-                f"seed {seed}: {held} of {len(known)} determined held, error {error:.3f}",
+                f"seed {seed}: {held} of {len(known)} determined held, error {arm.error:.3f};"
+                f" on a floor for {arm.touched.touched:.1f} s, {arm.touched.found:.1f} found,"
+                f" {arm.touched.false} contacts elsewhere",
                 flush=True,
             )
-    result = figures(rows, errors)
+    result = figures(arms)
     result["processor_seconds"] = round((time.process_time() - started) / options.seeds, 1)
     if options.json:
         print(json.dumps(result, indent=1))

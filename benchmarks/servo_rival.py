@@ -26,6 +26,7 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
+from benchmarks import mujoco_sysid
 from benchmarks import servo_arm as planted
 from identification import RobotModel
 from identification.servo.choice import fit_servos
@@ -41,7 +42,7 @@ Array = NDArray[np.float64]
 
 # Extensions in C++, without types.
 mujoco: Any = import_module("mujoco")
-sysid: Any = import_module("mujoco.sysid")
+sysid: Any = mujoco_sysid.load()
 
 _FITTED: Final = ("kp", "viscous", "coulomb", "armature")
 _MOST: Final = 50.0  # times the start: largest value

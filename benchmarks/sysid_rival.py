@@ -17,6 +17,7 @@ from typing import Any, Final, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from benchmarks import mujoco_sysid
 from identification.export.exported_arm import ExportedArm
 from identification.export.simulators import mjcf
 from identification.rollout.mujoco_simulation import Feedback, RolloutArm
@@ -26,7 +27,7 @@ Array = NDArray[np.float64]
 
 # Extensions in C++, without types.
 mujoco: Any = import_module("mujoco")
-sysid: Any = import_module("mujoco.sysid")
+sysid: Any = mujoco_sysid.load()
 pi_from_theta: Any = import_module("mujoco.sysid._src.model_modifier").pi_from_theta
 
 _SHARE: Final = 0.05

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from os import PathLike
 from pathlib import Path
 
@@ -13,9 +13,10 @@ from hil.base.errors import InputError
 from hil.base.files import make_folder, write_files
 from hil.base.output_folder import SOURCES, folder_beside, sources_text
 from hil.base.progress import Reporter, Silent
+from hil.identified.recordings_read import recording_results
 from hil.identified.staging import Staging
 from hil.importers.recording_import import is_archive
-from hil.importers.required_signals import has_servo
+from hil.importers.required_signals import has_servo, require_commands
 from hil.pipeline.options import Options
 from hil.report.output_files import REPORT
 from hil.report.servo_page import LEGENDS, motion_charts, servo_page_bytes
@@ -94,10 +95,17 @@ def identified_servo(
         channels: a line for each group of channels.
         reporter: of progress.
     """
+    for archives, fitted in ((staging.fitted, True), (staging.predicted, False)):
+        for archive in archives:
+            if isinstance(archive, Archive):
+                require_commands(archive, staging.sources[archive.path], fitted=fitted)
     servo = ServoOptions(split=options.split, in_sample=options.in_sample, compare=compare)
     identification = identify_servos(
         staging.fitted, reporter, servo, predict=staging.predicted, name=recordings[0].stem
     )
+    read = recording_results(staging, predicted)
+    results = identification.results.model_copy(update={"recordings": read})
+    identification = replace(identification, results=results)
     return IdentifiedServo(tuple(recordings), tuple(predicted), identification, channels, staging)
 
 

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
+from itertools import chain
 from pathlib import Path
 from typing import Final
 
 from hil.base.terminal_text import plural
 from hil.identified.identified_arm import IdentifiedArm
 from hil.identified.identified_servo import IdentifiedServo
-from hil.identified.recordings_read import content
+from hil.identified.recordings_read import content, size, unusual_of_servo
 from hil.importers.messages import sentence
 from hil.look.readings import DoubtfulArm
 from hil.look.result import ChangedReading
@@ -51,17 +52,20 @@ def servo_read_lines(servo: IdentifiedServo) -> list[tuple[str, str]]:
     staging = servo.staging
     if staging is None or not staging.recordings:
         return [("fitted", plural(len(servo.recordings), "archive"))]
-    lines = [
-        (
-            "predicted" if staging.sources[place] in servo.predicted else "fitted",
-            f"{staging.sources[place].name}: {content(recording)}",
-        )
-        for place, recording in staging.recordings.items()
+    unusual = {place: unusual_of_servo(each) for place, each in staging.recordings.items()}
+    common = [
+        text
+        for text in dict.fromkeys(chain(*unusual.values()))
+        if len(unusual) > 1 and all(text in texts for texts in unusual.values())
     ]
-    if len(lines) <= _MOST:
-        return lines
-    more = len(lines) - _MOST + 1
-    return [*lines[: _MOST - 1], ("", f"and {plural(more, 'recording')} more")]
+    lines = []
+    for place, recording in staging.recordings.items():
+        use = "predicted" if staging.sources[place] in servo.predicted else "fitted"
+        own = [text for text in unusual[place] if text not in common]
+        lines.append((use, f"{staging.sources[place].name}: {'; '.join([size(recording), *own])}"))
+    if (more := len(lines) - _MOST) > 0:
+        lines = [*lines[: _MOST - 1], ("", f"and {plural(more + 1, 'recording')} more")]
+    return [*lines, *(("of all", text) for text in common)]
 
 
 def _same(arm: IdentifiedArm) -> bool:

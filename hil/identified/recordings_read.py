@@ -16,8 +16,14 @@ from hil.importers.conclusions import (
     JointRange,
     KnownCommands,
     LockedJoints,
+    NoTorque,
+    PartialVelocity,
     RecordedClock,
+    ScaledVelocity,
     StatedUnit,
+    UnrelatedVelocity,
+    UnusedChannels,
+    VelocityOrder,
 )
 from hil.importers.messages import sentence
 from hil.importers.recording_import import ImportedRecording
@@ -38,6 +44,16 @@ _USUAL: Final = (
     ChangedReading,
     DoubtfulArm,
 )
+
+
+_NOT_OF_SERVOS: Final = (
+    NoTorque,
+    PartialVelocity,
+    ScaledVelocity,
+    UnrelatedVelocity,
+    VelocityOrder,
+)
+"""What does not matter where no torque is identified: velocities are slopes of positions there."""
 
 
 def recording_results(staging: Staging, predicted: Sequence[Path]) -> list[RecordingResult]:
@@ -61,6 +77,11 @@ def recording_results(staging: Staging, predicted: Sequence[Path]) -> list[Recor
 
 def content(recording: ImportedRecording) -> str:
     """Return joints, duration and rate of a recording, and what is unusual about it."""
+    return "; ".join([size(recording), *map(sentence, _unusual(recording))])
+
+
+def size(recording: ImportedRecording) -> str:
+    """Return joints, duration and rate of a recording."""
     found = (*recording.concluded, *recording.examined.found)
     clock = next((each.base for each in found if isinstance(each, RecordedClock)), None)
     joints = sum(isinstance(each, JointRange) for each in found)
@@ -68,7 +89,19 @@ def content(recording: ImportedRecording) -> str:
     if clock is not None:
         parts = [f"{parts[0]}, {clock.duration:.3g} s at {clock.rate:.4g} Hz"]
         parts += clock_lines(clock)[1:]
-    return "; ".join([*parts, *map(sentence, _unusual(recording))])
+    return "; ".join(parts)
+
+
+def unusual_of_servo(recording: ImportedRecording) -> list[str]:
+    """Return what is unusual about a recording of positions and commands."""
+    converted = [
+        each
+        for each in (*recording.concluded, *recording.examined.found)
+        if isinstance(each, ConcludedUnit) and each.kind == "commanded_position"
+    ]
+    others = [each for each in _unusual(recording) if not isinstance(each, _NOT_OF_SERVOS)]
+    found = [*converted, *others]
+    return [*map(sentence, sorted(found, key=lambda each: isinstance(each, UnusedChannels)))]
 
 
 def _unusual(recording: ImportedRecording) -> list[Conclusion]:

@@ -10,7 +10,7 @@ from typing import Final
 
 from hil.importers.channels import Channel, kind_of
 from hil.importers.conclusions import NameBasis
-from hil.importers.name_words import kind_by_words
+from hil.importers.name_words import is_commanded_position, kind_by_words
 from hil.importers.stated_units import without_unit
 from hil.importers.units import Kind
 
@@ -86,7 +86,8 @@ def grouped(channels: Iterable[Channel], joints: Sequence[str]) -> list[ChannelG
         if joint is not None:
             quantity = _REPEATED_MARK.sub(r"\1", bare.replace(joint, "")).strip(" _.-/")
             of_joint = kind_of(quantity, channel.unit)[0] or kind_by_words(quantity)
-            if of_joint is not None and (kind in (None, of_joint) or "/" in bare):
+            is_of_kind = of_joint is not None and (kind in (None, of_joint) or "/" in bare)
+            if is_of_kind or (kind is None and is_commanded_position(quantity)):
                 kind = of_joint
                 by_joint = True
                 pattern = bare.replace(joint, "{}")

@@ -103,7 +103,7 @@ class _Search:
         self._form = form or Format()
         self._files = files
         self._clocks: list[str] = []  # files that hold times only
-        self._unread: list[str] = []
+        self._unread: list[tuple[str, str]] = []  # files that are no tables, and why
         self._held: dict[Kind, list[_Held]] = {}
         for path in files_in(folder):
             self._read(path)
@@ -216,8 +216,8 @@ class _Search:
         try:
             channels = channels_of(path, self._form, self._files)
             file = self._files.file(path, self._form)
-        except SourceError:  # such as notes, or a list of joints
-            self._unread.append(path.name)
+        except SourceError as error:  # such as notes, or a list of joints
+            self._unread.append((path.name, error.problem))
             return
         stem = next(iter(kinds_of_file(path)), None)
         if stem == "time" and sum(channel.size for channel in channels) == 1:
@@ -277,10 +277,17 @@ class _Search:
     def _refuse_missing(self, missing: Sequence[str]) -> NoReturn:
         names = ", ".join(path.name for path in files_in(self._folder))
         problem = f"none of its files is named as {' or '.join(missing)}; they are {names}"
+        unread = [f"{name} {why}" for name, why in self._unread if Path(name).suffix != ".txt"]
+        if unread:
+            problem = f"{problem}; {', '.join(unread)}"
         options = " ".join(f"--columns '{kind}=FILE'" for kind in missing)
-        raise SourceError(
-            self._folder, problem, field=", ".join(missing), remedy=f"name them: {options}"
-        )
+        remedy = f"name them: {options}"
+        if [*missing] == ["torque"]:
+            remedy += (
+                "; without torque, commanded positions (--columns 'commanded_position=FILE') are"
+                " enough to identify the servos"
+            )
+        raise SourceError(self._folder, problem, field=", ".join(missing), remedy=remedy)
 
 
 def _meaning(kind: Kind, held: Sequence[_Held]) -> ChannelMeaning:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 import os
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from decimal import Decimal
@@ -39,7 +40,7 @@ from hil.importers.conclusions import (
 )
 from hil.importers.imported_robot import NOT_RECORDED, Robot
 from hil.importers.log_files import LogFiles
-from hil.importers.plausibility import are_degrees, has_degrees_per_second
+from hil.importers.plausibility import are_degrees, command_size, has_degrees_per_second
 from hil.importers.publishers import second_publisher
 from hil.importers.recording_content import RecordingContent, Use
 from hil.importers.resampling import Timed, are_interleaved, on_one_base
@@ -63,6 +64,7 @@ from hil.importers.text_table import TextTable
 from hil.importers.units import RATED, TIMES, UNITS, factor_of, kind_named, unit_of
 
 _MORE: Final = 64  # columns or files beyond the joints that are tried
+_ALIKE: Final = 1.5  # factor between the travels of a joint and of its command
 _LATEST: Final = 2**31 * 10**9  # ns, largest stamp of an archive
 _FARTHEST: Final = 2**62  # ns between two times, 146 years
 
@@ -535,7 +537,8 @@ class _Log:
 
         Positions are taken as degrees, or as ticks of an encoder, if as radians they leave the
         limits of the URDF by far and in this unit none does; velocities, if they are 57.3 times the
-        slope of the positions.
+        slope of the positions; commands, if they move 57.3 times as far as the positions, or as
+        positions in degrees that were converted.
         """
         joint = _joint_side(values, self._map, self)
         names = robot.joint_names
@@ -553,6 +556,9 @@ class _Log:
                 values = others
                 self.concluded.append(unit)
                 break
+        if "commanded_position" in self._unstated:
+            values = self._commands_as_positions(values, joint)
+            joint = _joint_side(values, self._map, self)
         if "velocity" in self._unstated and len(stamp) > 1:
             time = (stamp - stamp[0]) * 1e-9
             if has_degrees_per_second(time, joint["position"], joint["velocity"]):
@@ -560,6 +566,23 @@ class _Log:
                 joint = _joint_side(degrees, self._map, self)
                 self.concluded.append(ConcludedUnit("velocity", "deg/s"))
         return joint
+
+    def _commands_as_positions(
+        self, values: dict[str, Array], joint: Mapping[str, Array]
+    ) -> dict[str, Array]:
+        """Return quantities with commands in the unit of the positions, if they are in the other.
+
+        Args:
+            values: as in the file.
+            joint: of the joint side.
+        """
+        size = command_size(joint["position"], joint["commanded_position"])
+        for unit, factor in (("deg", math.radians(1.0)), ("rad", math.degrees(1.0))):
+            if size is not None and 1.0 / _ALIKE < size * factor < _ALIKE:
+                self.concluded.append(ConcludedUnit("commanded_position", unit))
+                commanded = values["commanded_position"] * factor
+                return {**values, "commanded_position": commanded}
+        return values
 
     def _other_units(self, position: Array) -> Iterator[tuple[ConcludedUnit, float, float]]:
         """Yield units of positions (m, k) where none is stated: zero, and factor to rad."""

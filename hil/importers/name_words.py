@@ -35,16 +35,19 @@ _ALONE: Final = frozenset(
     | {"nsec", "nsecs", "nanoseconds", "elapsed", "uhrzeit"}
 )
 """Words that say a time where a name has no others: ``velocity_per_sec`` is none."""
+_COMMANDED: Final = frozenset(
+    {"target", "targets", "cmd", "cmds", "command", "commands", "commanded", "desired", "des"}
+    | {"setpoint", "setpoints", "ref", "reference", "goal", "goals", "soll"}
+)
 _WANTED: Final = """
-target targets cmd command commanded desired des d setpoint setpoints ref reference goal soll
-planned plan model feedforward ff error err delta predicted estimated est nominal"""
+d planned plan model feedforward ff error err delta predicted estimated est nominal"""
 _OUTSIDE: Final = """
 ext external hat residual contact tcp ee eef tool flange cart cartesian pose gripper finger hand
 wheel battery supply bus"""
 _PART: Final = """
 motor motors rotor gravity friction coriolis inertia ddq qdd acc acceleration dtau temp temperature
 limit limits max min offset std var"""
-_OTHER: Final = frozenset(f"{_WANTED} {_OUTSIDE} {_PART}".split())
+_OTHER: Final = _COMMANDED.union(f"{_WANTED} {_OUTSIDE} {_PART}".split())
 """Words of channels that are not the measured quantity of a joint."""
 
 
@@ -94,6 +97,13 @@ def kinds_said(name: str) -> list[Kind]:
     if len(kinds) > 1 and "time" in kinds and "t" in words:
         kinds.remove("time")  # the t of an axis or a tool
     return kinds
+
+
+def is_commanded_position(name: str) -> bool:
+    """Return whether a name says a command, and of no other quantity than positions."""
+    words = set(words_of(name))
+    denied = not (_OTHER - _COMMANDED).isdisjoint(words)
+    return not _COMMANDED.isdisjoint(words) and not denied and set(kinds_said(name)) <= {"position"}
 
 
 def kind_by_words(name: str) -> Kind | None:

@@ -134,7 +134,8 @@ def _stopped(
         first = int(changes[-1]) + 1 if len(changes) else len(places)
         if len(places) - first < _STANDS * len(places):
             continue
-        travel = float(np.nan_to_num(np.ptp(commands[first:][np.isfinite(commands[first:])])))
+        known = commands[first:][np.isfinite(commands[first:])]
+        travel = float(np.ptp(known)) if len(known) else 0.0
         if travel > STUCK_MOVEMENT:
             yield StoppedJoint(name, float(time[first]), travel)
 
@@ -281,6 +282,21 @@ def has_degrees_per_second(time: Array, position: Array, velocity: Array) -> boo
     per_degree = math.radians(1.0) * factor
     itself = np.diag(correlation)
     return bool((itself >= _CORRELATED).all() and (abs(per_degree - 1.0) < _SCALE_TOLERANCE).all())
+
+
+def command_size(position: Array, commanded: Array) -> float | None:
+    """Return how far commands (m, n) move over how far positions do, the median of the joints.
+
+    None where no joint moves with its command.
+    """
+    known = np.isfinite(commanded).all(axis=1)
+    if np.count_nonzero(known) < 2:
+        return None
+    travels = [np.ptp(values[known], axis=0) for values in (commanded, position)]
+    moving = np.min(travels, axis=0) > 0.0
+    if not moving.any():
+        return None
+    return float(np.median(travels[0][moving] / travels[1][moving]))
 
 
 def _positions(

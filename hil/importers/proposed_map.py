@@ -30,7 +30,13 @@ from hil.importers.conclusions import (
 )
 from hil.importers.imported_robot import Robot
 from hil.importers.log_files import LogFiles
-from hil.importers.name_words import is_measured, kind_by_words, kinds_said, words_of
+from hil.importers.name_words import (
+    is_commanded_position,
+    is_measured,
+    kind_by_words,
+    kinds_said,
+    words_of,
+)
 from hil.importers.row_names import row_names
 from hil.importers.stated_units import other_unit
 from hil.importers.text_table import TextTable
@@ -289,6 +295,8 @@ class _Search:
         given = set(self._chosen.values())
         groups = [g for g in self._groups if g.pattern not in given]
         named = [g for g in groups if g.kind == kind]
+        if not named and kind == "commanded_position":
+            return self._commands_by_words(groups)
         if not named:
             named = self._by_words(kind, [g for g in groups if g.kind is None])
         if kind != "time":
@@ -304,6 +312,20 @@ class _Search:
             self.nanoseconds = parts[0].names[0]
             self._used.add(parts[0].pattern)
         return single or named
+
+    def _commands_by_words(self, groups: Sequence[ChannelGroup]) -> list[ChannelGroup]:
+        """Return the groups that a word calls commands, of a log without torque and current.
+
+        Where there is a torque, commands are not needed, and are used only where they are named.
+        """
+        motors: list[Kind] = ["torque", "motor_current"]
+        measured = [g for kind in motors for g in self._groups_of(kind)]
+        if not all(self._is_load(g.pattern) for g in measured):
+            return []
+        count = len(self._columns_of)
+        said = [g for g in groups if g.size == count and is_commanded_position(g.pattern)]
+        positions = [g for g in said if "position" in kinds_said(g.pattern)]
+        return [replace(g, by_words=NameBasis.WORD) for g in positions or said]
 
     def _by_words(self, kind: Kind, groups: Sequence[ChannelGroup]) -> list[ChannelGroup]:
         """Return the groups whose names say a quantity by a word in them."""

@@ -9,8 +9,11 @@ import numpy as np
 
 from hil.archive import Archive
 from hil.base.errors import SourceError
+from hil.importers.plausibility import command_size
 
 _SHORTEST: Final = 1.0  # s
+_COPIED: Final = 0.999  # of the rows
+_FARTHEST: Final = 10.0  # factor between the travels of joints and of their commands
 
 
 def require_motion(archive: Archive, recording: Path) -> None:
@@ -46,6 +49,43 @@ def has_servo(archive: Archive) -> bool:
     columns = archive.columns
     currents = {"target_current", "motor_current"}
     return "commanded_position" in columns and not columns.keys() & {"torque", *currents}
+
+
+def require_commands(archive: Archive, recording: Path, *, fitted: bool) -> None:
+    """Check that commanded positions and measured ones are those of a servo.
+
+    Args:
+        archive: of a recording.
+        recording: from which it was read.
+        fitted: whether its servo is to be found, not only predicted.
+
+    Raises:
+        SourceError: positions are the commands themselves, or move farther by a factor of ten or
+            less far; or no command changes in what is fitted.
+    """
+    position, commanded = (
+        np.asarray(archive.columns[name], np.float64) for name in ("position", "commanded_position")
+    )
+    known = np.isfinite(commanded).all(axis=1)
+    position, commanded = position[known], commanded[known]
+    field = "commanded_position"
+    if not len(commanded):
+        problem = "has no part in which the commanded positions are known"
+        remedy = "record the commanded positions, or name them (--columns)"
+        raise SourceError(recording, problem, field=field, remedy=remedy)
+    if fitted and not np.ptp(commanded, axis=0).any():
+        problem = "no command changes, so that nothing is seen of a servo"
+        remedy = "record motion from commands, or name their channels (--columns)"
+        raise SourceError(recording, problem, field=field, remedy=remedy)
+    if np.ptp(position, axis=0).any() and np.mean((position == commanded).all(axis=1)) >= _COPIED:
+        problem = "the positions are the commands, bit for bit: nobody measured them"
+        remedy = "record or name measured positions (--columns 'position=NAME{}')"
+        raise SourceError(recording, problem, field="position", remedy=remedy)
+    size = command_size(position, commanded)
+    if fitted and size is not None and not 1.0 / _FARTHEST < size < _FARTHEST:
+        problem = f"the commands move {size:.3g} times as far as the positions"
+        remedy = "check channels and units of both (--columns, or a map with units: --map)"
+        raise SourceError(recording, problem, field=field, remedy=remedy)
 
 
 def require_torque(archive: Archive, recording: Path) -> None:

@@ -103,6 +103,7 @@ class Plot:
     traces: Sequence[Trace]  #: its lines, the lowest first
     #: shaded intervals of x
     shaded: Sequence[tuple[float, float]] = ()
+    shade: str = "not in motion"  #: what these are, in a legend
     #: largest value of a range about zero; the range of the lines if None
     reach: float | None = None
     limits: tuple[float, float] | None = None  #: the range, if neither

@@ -89,9 +89,9 @@ def _entries(charts: Sequence[Chart], legends: Sequence[Legend]) -> tuple[list[A
         for legend in shown
     ]
     texts = [legend.text for legend in shown]
-    if any(plot.shaded for plot in plots):
-        lines.append(Patch(color=style.colour("band")))
-        texts.append("not in motion")
+    if shades := dict.fromkeys(plot.shade for plot in plots if plot.shaded):
+        lines += [Patch(color=style.colour("band")) for _ in shades]
+        texts += shades
     return lines, texts
 
 

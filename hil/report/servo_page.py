@@ -19,6 +19,23 @@ COMMANDED: Final = Legend("commanded", "command", "--muted", 1.0, dashed=True)
 IDENTIFIED: Final = Legend("identified", "identified, from the commands alone", "--second", 1.6)
 COMPARED: Final = Legend("compared", "parameters of the maker's file", "--wide", 1.4)
 LEGENDS: Final = (MEASURED, COMMANDED, COMPARED, IDENTIFIED)
+MEANINGS: Final = {
+    "kp": "stiffness of the servo",
+    "kd": "damping of the servo, by the velocity of its position error",
+    "armature": "inertia of the rotor, at the joint",
+    "viscous": "friction by velocity",
+    "coulomb": "dry friction of a moving joint",
+    "static": "dry friction above it at rest",
+    "speed": "velocity at which static friction has faded to 37 %",
+    "load": "dry friction for each N·m (N) that the bodies load the joint with",
+    "limit": "largest torque of the servo",
+    "dead_band": "position error up to which the servo exerts nothing",
+    "acceleration": "largest acceleration of the set-point on its way to a command",
+    "delay": "time from a command to the servo",
+    "offset": "zero of the servo above that of the encoder",
+}
+HELD: Final = "something held the arm"
+_MOTIONS: Final = 4  # on a page
 _JOINTS: Final = 3  # of the picture
 _HEIGHT: Final = 170.0  # px
 _BINS: Final = 400
@@ -43,18 +60,28 @@ def _chart(results: ServoResults, series: ServoSeries, joint: int) -> Chart:
         *([] if series.compared is None else [COMPARED.trace(series.compared[:, joint])]),
         IDENTIFIED.trace(series.identified[:, joint]),
     ]
+    held = [(contact.start, contact.end) for contact in series.contacts]
     note = f"{label(series.archive)}: {error:.3g} {'mrad' if unit == 'rad' else 'mm'} rms"
     return Chart(
-        Caption(f"motion-{joint}", label(results.joint_names[joint]), note, "position over time"),
+        Caption(
+            f"{label(series.archive)}-{joint}",
+            label(results.joint_names[joint]),
+            note,
+            "position over time",
+        ),
         series.time,
-        [Plot(_HEIGHT, f"position [{unit}]", traces)],
+        [Plot(_HEIGHT, f"position [{unit}]", traces, shaded=held, shade=HELD)],
         joint=joint,
     )
 
 
 def servo_page_bytes(results: ServoResults, series: Sequence[ServoSeries]) -> bytes:
     """Return the page as one HTML file; the same input gives the same bytes."""
-    charts = motion_charts(results, series[0], len(results.joint_names)) if series else []
+    count = len(results.joint_names)
+    figures = {
+        f"motion-{k}": motion_charts(results, each, count)
+        for k, each in enumerate(series[:_MOTIONS])
+    }
     by_joint = {
         joint: [value for value in results.servo if value.joint == joint]
         for joint in results.joint_names
@@ -62,13 +89,23 @@ def servo_page_bytes(results: ServoResults, series: Sequence[ServoSeries]) -> by
     context = {
         "results": results,
         "by_joint": by_joint,
-        "motions": [report.chart_panel(chart, _BINS) for chart in charts],
+        "meanings": {
+            name: meaning
+            for name, meaning in MEANINGS.items()
+            if any(value.name == name and value.present for value in results.servo)
+        },
+        "motions": [
+            (name, each.archive, [report.chart_panel(chart, _BINS) for chart in charts], held)
+            for (name, charts), each in zip(figures.items(), series, strict=False)
+            for held in [bool(each.contacts)]
+        ],
         "legends": [
             legend
             for legend in LEGENDS
             if legend is not COMPARED or (series and series[0].compared is not None)
         ],
-        "chart_data": chart_data({"motions": charts}, results.joint_names),
+        "held_legend": HELD,
+        "chart_data": chart_data(figures, results.joint_names),
     }
     scripts = (*library(), template_text("charts.js"))
     return page_bytes(environment(*scripts).get_template("servo.html.j2").render(**context))

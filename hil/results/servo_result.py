@@ -9,11 +9,11 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Final, Literal
 
-from pydantic import ValidationError
+from pydantic import Field, ValidationError
 
 from hil.base.errors import InputError
 from hil.base.safe_input import parse_json, read_text
-from hil.results.results import Frozen, Known
+from hil.results.results import Frozen, Known, RecordingResult
 
 KIND: Final = "servo"
 SERVO_SCHEMA_VERSION: Final = 1
@@ -40,6 +40,25 @@ class ServoPush(Frozen):
     change_mrad: float
 
 
+class ServoContact(Frozen):
+    """A joint that something held: it stood though its servo exceeded all friction."""
+
+    joint: str
+    start: float  #: from the start of the motion [s]
+    end: float
+    torque: float  #: beyond the friction [N·m or N]; as uncertain as `kp` of the joint
+
+
+class ServoFree(Frozen):
+    """Errors of a motion without the stretches in which something held a joint."""
+
+    share: float  #: of the samples
+    position_error_mrad: float
+    joint_errors_mrad: list[float]
+    command_error_mrad: float
+    compared_error_mrad: Known = None
+
+
 class ServoPrediction(Frozen):
     """Error of a motion that was simulated from its commands alone."""
 
@@ -51,7 +70,9 @@ class ServoPrediction(Frozen):
     command_joint_errors_mrad: list[float]
     compared_error_mrad: Known = None  #: of the parameters of the file to compare with
     compared_joint_errors_mrad: list[float] | None = None
-    pushed: tuple[ServoPush, ...] = ()  #: joints that something touched
+    pushed: tuple[ServoPush, ...] = ()  #: joints that something pushed
+    contacts: tuple[ServoContact, ...] = ()  #: joints that something held; in the errors above
+    free: ServoFree | None = None  #: the errors without these; null if there are none
 
 
 class ServoTermChoice(Frozen):
@@ -112,7 +133,12 @@ class ServoResults(Frozen):
     verdict: ServoVerdict
     posterior: ServoPosterior
     simulators: dict[str, SimulatorServo]  #: by engine: mujoco, physx
+    stuck: list[str] = Field(default_factory=list)  #: joints in no error over all joints
+    #: of fitted motions, by archive
+    fitted_contacts: dict[str, list[ServoContact]] = Field(default_factory=dict)
     split: float  #: fraction of a single recording that was fitted
+    #: what was read of logs
+    recordings: list[RecordingResult] = Field(default_factory=list)
     notes: list[str]
 
     @classmethod

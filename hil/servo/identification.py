@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Final
 
 import numpy as np
+from numpy.typing import NDArray
 
 from hil.archive import Archive, place_of
 from hil.base.arrays import Array
@@ -20,6 +21,8 @@ from hil.cell import Cell
 from hil.cell.nominal import nominal_of
 from hil.pipeline.sources import Source, Sources, gather_sources
 from hil.results.servo_result import (
+    ServoContact,
+    ServoFree,
     ServoPosterior,
     ServoPrediction,
     ServoPush,
@@ -33,12 +36,14 @@ from hil.results.servo_series import ServoSeries
 from hil.servo.maker_file import maker_parameters
 from hil.servo.messages import verdict_of
 from identification.servo.choice import ServoFit, fit_servos, steps_of_a_fit
+from identification.servo.contacts import contacts_of
 from identification.servo.intervals import intervals_of, widened_covariance
 from identification.servo.parameters import TERMS, in_units
 from identification.servo.prediction import predicted
 from identification.servo.pushes import pushes_of
 from identification.servo.recorded_motion import Grid, ServoMotion, motions_of
 from identification.servo.simulator_terms import ENGINES, ITERATIONS, Engine, fits_in_simulators
+from identification.signals.recording import STUCK_MOVEMENT
 
 _FINEST: Final = 1e-5  # rad or m, least resolution of positions
 _MILLI: Final = 1e3
@@ -102,10 +107,17 @@ def identify_servos(
         compared = maker_parameters(options.compare, cell.joint_names)
     grid = Grid.of(sources.training[0].recording)
 
-    def motions_on(on: Grid) -> list[ServoMotion]:
-        return [each for source in sources.training for each in _motions(source, cell, bodies, on)]
+    def named_on(on: Grid) -> list[tuple[str, ServoMotion]]:
+        return [
+            (source.name, each)
+            for source in sources.training
+            for each in _motions(source, cell, bodies, on)
+        ]
 
-    fitted = motions_on(grid)
+    def motions_on(on: Grid) -> list[ServoMotion]:
+        return [motion for _, motion in named_on(on)]
+
+    fitted = named_on(grid)
     if not fitted:
         problem = "has no part in which the commanded positions are known"
         remedy = "record the commanded positions, or name them (--columns)"
@@ -114,15 +126,22 @@ def identify_servos(
     started = time.process_time()
     with reporter.task("servos", steps_of_a_fit() + len(ENGINES) * ITERATIONS) as task:
         fit = fit_servos(motions_on, grid, resolution, done=lambda: task.advance(1))
-        simulators = fits_in_simulators(fitted, fit, resolution, done=lambda: task.advance(1))
-    found = _Found(fit, simulators, time.process_time() - started)
+        simulators = fits_in_simulators(
+            [motion for _, motion in fitted], fit, resolution, done=lambda: task.advance(1)
+        )
+    stuck = _stuck(sources, resolution)
+    found = _Found(fit, simulators, resolution, stuck, time.process_time() - started)
     with reporter.task("held-out motions", len(sources.held_out)) as task:
         series = []
         for source in sources.held_out:
             motions = _motions(source, cell, bodies, grid)
             series += _series(source.name, motions, cell, bodies, found, compared)
             task.advance(1)
-    results = _results(name or first.stem, sources, found, series, options)
+    touched: dict[str, list[ServoContact]] = {}
+    for archive, motion in fitted:
+        if contacts := _contacts(motion, found, cell.joint_names):
+            touched.setdefault(archive, []).extend(contacts)
+    results = _results(name or first.stem, sources, found, series, touched, options)
     results = results.model_copy(update={"verdict": verdict_of(results)})
     paths = tuple(map(place_of, (*archives, *predict)))
     return ServoIdentification(paths, cell, fit, results, tuple(series))
@@ -130,10 +149,20 @@ def identify_servos(
 
 @dataclass(frozen=True, eq=False)
 class _Found:
-    """What was fitted: with all terms, and with those of each engine; processor time [s]."""
+    """What was fitted: with all terms, and with those of each engine.
+
+    Attributes:
+        fit: with all terms.
+        simulators: with the terms of each engine.
+        resolution: standard deviation of the measured positions (n,).
+        stuck: joints (n,) that never moved, though their command did.
+        seconds: processor time.
+    """
 
     fit: ServoFit
     simulators: Mapping[Engine, ServoFit]
+    resolution: Array
+    stuck: NDArray[np.bool_]
     seconds: float
 
 
@@ -165,6 +194,22 @@ def _resolution(sources: Sources) -> Array:
     return np.asarray(np.maximum(np.where(np.isfinite(least), least, 0.0) / np.sqrt(12.0), _FINEST))
 
 
+def _stuck(sources: Sources, resolution: Array) -> NDArray[np.bool_]:
+    """Return the joints (n,) that stay within a step in all motions, and whose command does not.
+
+    Nothing of their servo is seen, be it broken, switched off or held by friction.
+    """
+    stuck = np.ones(len(resolution), np.bool_)
+    commanded = np.zeros(len(resolution), np.bool_)
+    for source in sources.training:
+        recording = source.recording
+        stuck &= np.ptp(recording.position, axis=0) <= 1.5 * np.sqrt(12.0) * resolution
+        commands = recording.commanded_position
+        if commands is not None and (known := np.isfinite(commands).all(axis=1)).any():
+            commanded |= np.ptp(commands[known], axis=0) > STUCK_MOVEMENT
+    return stuck & commanded
+
+
 def _series(
     name: str,
     motions: Sequence[ServoMotion],
@@ -191,34 +236,73 @@ def _series(
                 identified,
                 simulators,
                 others[-1] if compared is not None else None,
+                _contacts(motion, found, cell.joint_names),
+                found.stuck,
             )
         )
     return series
 
 
+def _contacts(motion: ServoMotion, found: _Found, names: Sequence[str]) -> tuple[ServoContact, ...]:
+    """Return the joints that something held in a motion."""
+    return tuple(
+        ServoContact(
+            joint=names[contact.joint],
+            start=contact.start,
+            end=contact.end,
+            torque=contact.torque,
+        )
+        for contact in contacts_of(motion, found.fit, found.resolution)
+    )
+
+
 def _prediction(series: ServoSeries, engine: Engine | None = None) -> ServoPrediction:
     """Return the errors of a simulated motion, or with the terms of an engine."""
-
-    def errors(simulated: Array) -> list[float]:
-        mean = np.sqrt(np.mean((simulated - series.measured) ** 2, axis=0))
-        return [float(each) for each in _MILLI * mean]
-
-    def overall(each: list[float]) -> float:
-        return float(np.sqrt(np.mean(np.square(each))))
-
-    own = errors(series.identified if engine is None else series.simulators[engine])
-    command = errors(series.commanded)
-    other = None if series.compared is None else errors(series.compared)
+    simulated = series.identified if engine is None else series.simulators[engine]
+    every = np.ones(len(series.time), np.bool_)
+    own = _errors(series, simulated, every)
+    command = _errors(series, series.commanded, every)
+    compared = None if series.compared is None else _errors(series, series.compared, every)
     return ServoPrediction(
         archive=series.archive,
         duration=float(series.time[-1]),
-        position_error_mrad=overall(own),
+        position_error_mrad=_overall(own, series),
         joint_errors_mrad=own,
-        command_error_mrad=overall(command),
+        command_error_mrad=_overall(command, series),
         command_joint_errors_mrad=command,
-        compared_error_mrad=None if other is None else overall(other),
-        compared_joint_errors_mrad=other,
+        compared_error_mrad=None if compared is None else _overall(compared, series),
+        compared_joint_errors_mrad=compared,
+        contacts=series.contacts,
+        free=_free(series, simulated),
     )
+
+
+def _free(series: ServoSeries, simulated: Array) -> ServoFree | None:
+    """Return the errors without what something held; None if that is nothing, or all."""
+    free = series.free
+    if free.all() or not free.any():
+        return None
+    own = _errors(series, simulated, free)
+    other = None if series.compared is None else _errors(series, series.compared, free)
+    return ServoFree(
+        share=float(free.mean()),
+        position_error_mrad=_overall(own, series),
+        joint_errors_mrad=own,
+        command_error_mrad=_overall(_errors(series, series.commanded, free), series),
+        compared_error_mrad=None if other is None else _overall(other, series),
+    )
+
+
+def _errors(series: ServoSeries, positions: Array, rows: NDArray[np.bool_]) -> list[float]:
+    """Return the root mean square error of each joint in some rows [mrad or mm]."""
+    squares = (positions[rows] - series.measured[rows]) ** 2
+    return [float(each) for each in _MILLI * np.sqrt(squares.mean(axis=0))]
+
+
+def _overall(errors: Sequence[float], series: ServoSeries) -> float:
+    """Return the root mean square of the errors of all joints but those that are stuck."""
+    moving = ~series.stuck if not series.stuck.all() else np.ones(len(errors), np.bool_)
+    return float(np.sqrt(np.mean(np.square(errors)[moving])))
 
 
 def _pushes(series: ServoSeries, names: Sequence[str]) -> tuple[ServoPush, ...]:
@@ -236,9 +320,19 @@ def _results(
     sources: Sources,
     found: _Found,
     series: Sequence[ServoSeries],
+    touched: dict[str, list[ServoContact]],
     options: ServoOptions,
 ) -> ServoResults:
-    """Return the results, without a verdict."""
+    """Return the results, without a verdict.
+
+    Args:
+        name: of the identification.
+        sources: its recordings.
+        found: what was fitted.
+        series: the motions that were predicted.
+        touched: joints that something held in fitted motions, by archive.
+        options: of the identification.
+    """
     cell = sources.cell
     turning = cell.model.chain.revolute
     estimate = found.fit.estimate
@@ -255,7 +349,7 @@ def _results(
         windows=found.fit.windows,
         seconds=found.seconds,
         delay=estimate.bus_delay,
-        servo=_values(found.fit, cell),
+        servo=_values(found.fit, cell, found.stuck),
         validation=[
             _prediction(each).model_copy(update={"pushed": _pushes(each, names)}) for each in series
         ],
@@ -275,18 +369,20 @@ def _results(
         posterior=_posterior(found.fit),
         simulators={
             engine: SimulatorServo(
-                servo=_values(fit, cell),
+                servo=_values(fit, cell, found.stuck),
                 validation=[_prediction(each, engine) for each in series],
                 posterior=_posterior(fit),
             )
             for engine, fit in found.simulators.items()
         },
+        stuck=[name for name, is_stuck in zip(names, found.stuck, strict=True) if is_stuck],
+        fitted_contacts=touched,
         split=options.split,
         notes=list(sources.warnings),
     )
 
 
-def _values(fit: ServoFit, cell: Cell) -> list[ServoValue]:
+def _values(fit: ServoFit, cell: Cell, stuck: NDArray[np.bool_]) -> list[ServoValue]:
     """Return all parameters of all joints with their intervals."""
     intervals = intervals_of(fit)
     turning = cell.model.chain.revolute
@@ -298,7 +394,7 @@ def _values(fit: ServoFit, cell: Cell) -> list[ServoValue]:
             value=float(intervals.values[j, k]),
             lower=float(intervals.lower[j, k]),
             upper=float(intervals.upper[j, k]),
-            determined=bool(intervals.determined[j, k]),
+            determined=bool(intervals.determined[j, k]) and not stuck[j],
             present=bool(fit.estimate.present[j, k]),
         )
         for j, joint in enumerate(cell.joint_names)

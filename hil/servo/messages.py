@@ -8,7 +8,13 @@ from typing import Final
 import numpy as np
 
 from hil.base.one_screen import COLUMNS, Paragraph, Part, columns
-from hil.results.servo_result import ServoPrediction, ServoResults, ServoValue, ServoVerdict
+from hil.results.servo_result import (
+    ServoContact,
+    ServoPrediction,
+    ServoResults,
+    ServoValue,
+    ServoVerdict,
+)
 
 _GOOD: Final = 0.5
 """Share of the command's own error, up to which a simulated motion is of use: a quarter of what the
@@ -26,6 +32,7 @@ _SHOWN: Final = {
     "dead_band": "dead band",
 }
 """Parameters of the table of joints, as its heads call them; the last ones if there is room."""
+_MOSTLY: Final = 0.5  # of a motion, from which on it is judged without what something held
 _MOST_ROWS: Final = 8  # of the table of joints
 _MOST: Final = 3  # recordings, warnings and next steps on a screen
 
@@ -45,46 +52,115 @@ def verdict_of(results: ServoResults) -> ServoVerdict:
         line = "No motion was held out: whether the model predicts another motion is not known."
         steps.append("predict another recording: --predict RECORDING")
         return ServoVerdict(good=False, line=line, warnings=warnings, next_steps=steps)
-    worst = max(
-        results.validation,
-        key=lambda each: each.position_error_mrad / max(each.command_error_mrad, 1e-9),
-    )
-    share = worst.position_error_mrad / max(worst.command_error_mrad, 1e-9)
+    worst = max(results.validation, key=_share)
+    share = _share(worst)
     good = share <= _GOOD
-    figures = ", ".join(
-        f"{each.archive} {each.position_error_mrad:.3g}" for each in results.validation
-    )
+    figures = ", ".join(_figure(each) for each in results.validation)
     line = (
         f"The servo model {'predicts' if good else 'does not predict'} {results.tested_on} from its"
-        f" commands: {figures} {unit} (command itself {worst.command_error_mrad:.3g})."
+        f" commands: {figures} {unit} (command itself {_judged(worst)[1]:.3g})."
     )
-    for each in results.validation:
-        pairs = zip(
-            results.joint_names, each.joint_errors_mrad, each.command_joint_errors_mrad, strict=True
+    if results.stuck:
+        warnings.append(
+            f"{', '.join(results.stuck)} never moved in the fitted motions, though commanded to:"
+            " nothing is known of these servos, and errors over all joints are without them"
         )
-        poor = [joint for joint, own, command in pairs if own > max(command, 1.0)]
-        pushed = max(each.pushed, key=lambda push: abs(push.change_mrad), default=None)
-        if pushed is not None:
-            joints = ", ".join(push.joint for push in each.pushed)
-            warnings.append(
-                f"{each.archive}: something touched the arm: {joints} moved while the command"
-                f" rested and the model stood, {pushed.joint} by {pushed.change_mrad:.0f} {unit} at"
-                f" {pushed.time:.0f} s"
-            )
+    for archive, contacts in results.fitted_contacts.items():
+        warnings.append(
+            f"in {archive}, which was fitted, {_held(contacts)}: identify without this recording"
+        )
+    for each in results.validation:
+        own, commands = each.joint_errors_mrad, each.command_joint_errors_mrad
+        pairs = zip(results.joint_names, own, commands, strict=True)
+        poor = [
+            joint
+            for joint, error, command in pairs
+            if error > max(command, 1.0) and joint not in results.stuck
+        ]
+        if each.contacts or each.pushed:
+            warnings.append(_touched(each, unit))
         elif poor:
             warnings.append(
-                f"{each.archive}: {', '.join(poor)} predicted worse than by the command itself"
+                f"in {each.archive}, {', '.join(poor)} predicted worse than by the command itself"
             )
     if not good:
         steps.append("look at the report: a joint that touched something cannot be predicted")
         steps.append("fit slow and fast motions over the range that is used")
-    scale = [value.joint for value in results.servo if value.name == "kp" and not value.determined]
+    scale = [
+        value.joint
+        for value in results.servo
+        if value.name == "kp" and not value.determined and value.joint not in results.stuck
+    ]
     if scale:
         warnings.append(
             f"the torque scale of {', '.join(scale)} is not determined: gravity and inertia of the"
             " bodies hardly show in its position; gains and friction hold together only"
         )
     return ServoVerdict(good=good, line=line, warnings=warnings, next_steps=steps)
+
+
+def _judged(prediction: ServoPrediction) -> tuple[float, float]:
+    """Return the errors of the model and of the command by which a motion is judged.
+
+    Without what something held, if that is not most of the motion: no model of the arm predicts it.
+    """
+    free = prediction.free
+    if free is not None and free.share >= _MOSTLY:
+        return free.position_error_mrad, free.command_error_mrad
+    return prediction.position_error_mrad, prediction.command_error_mrad
+
+
+def _share(prediction: ServoPrediction) -> float:
+    """Return the error of the model over that of the command."""
+    own, command = _judged(prediction)
+    return own / max(command, 1e-9)
+
+
+def _figure(prediction: ServoPrediction) -> str:
+    """Return the name of a motion and its error, with and without what something held."""
+    text = f"{prediction.archive} {prediction.position_error_mrad:.3g}"
+    if prediction.free is None:
+        return text
+    return f"{text}, {prediction.free.position_error_mrad:.3g} where nothing held it"
+
+
+def _touched(prediction: ServoPrediction, unit: str) -> str:
+    """Return what something did to an arm, and the errors with it and without."""
+    parts = []
+    if prediction.contacts:
+        parts.append(_held(prediction.contacts))
+    if prediction.pushed:
+        most = max(prediction.pushed, key=lambda push: abs(push.change_mrad))
+        joints = ", ".join(push.joint for push in prediction.pushed)
+        parts.append(
+            f"something pushed {joints}, which moved while the command rested and the model stood,"
+            f" {most.joint} by {most.change_mrad:.0f} {unit} at {most.time:.1f} s"
+        )
+    text = f"in {prediction.archive}, {'; '.join(parts)}"
+    if (free := prediction.free) is None:
+        return text
+    return (
+        f"{text}; error {prediction.position_error_mrad:.3g} {unit},"
+        f" {free.position_error_mrad:.3g} without it"
+    )
+
+
+def _held(contacts: Sequence[ServoContact]) -> str:
+    """Return when something held the arm, and which joints."""
+    joints = ", ".join(dict.fromkeys(contact.joint for contact in contacts))
+    spans = ", ".join(f"{start:.1f} to {end:.1f} s" for start, end in held_spans(contacts))
+    return f"something held the arm from {spans} (beyond all friction of {joints})"
+
+
+def held_spans(contacts: Sequence[ServoContact]) -> list[tuple[float, float]]:
+    """Return start and end [s] of the stretches in which something held any joint."""
+    spans: list[tuple[float, float]] = []
+    for start, end in sorted((contact.start, contact.end) for contact in contacts):
+        if spans and start <= spans[-1][1]:
+            spans[-1] = (spans[-1][0], max(end, spans[-1][1]))
+        else:
+            spans.append((start, end))
+    return spans
 
 
 def screen(results: ServoResults, read: Sequence[Part] = ()) -> list[Part]:
@@ -143,6 +219,13 @@ def _errors(results: ServoResults, shown: Sequence[ServoPrediction]) -> list[lis
         if other:
             overall.append(each.compared_error_mrad or 0.0)
         rows.append([each.archive, *(f"{number:.3g}" for number in overall)])
+        if each.free is None or simple.free is None:
+            continue
+        free = [each.free.position_error_mrad, simple.free.position_error_mrad]
+        free.append(each.free.command_error_mrad)
+        if other:
+            free.append(each.free.compared_error_mrad or 0.0)
+        rows.append(["  where nothing held it", *(f"{number:.3g}" for number in free)])
     return rows
 
 

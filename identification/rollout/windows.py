@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from identification.arrays import Array
 from identification.errors import IdentificationError
 from identification.model.motion import Motion
+from identification.signals.masks import runs_of
 from identification.signals.samples import Samples
 
 STEP: Final = 5e-3
@@ -123,7 +124,11 @@ def stretches_of(
     if commanded is not None:
         with_command = np.asarray(np.isfinite(commanded).all(axis=1))
     if with_command.any():
-        parts = [run for part in parts for run in _runs(with_command, part)]
+        parts = [
+            slice(part.start + first, part.start + end)
+            for part in parts
+            for first, end in runs_of(with_command[part])
+        ]
     for part in parts:
         motion = samples.motion.rows(part)
         time = motion.time
@@ -141,14 +146,6 @@ def stretches_of(
         torque = mean_about(time, (samples.torque + load)[part], grid)
         stretches.append(Stretch(on_grid, before, after, torque, time, part, command))
     return stretches
-
-
-def _runs(inside: NDArray[np.bool_], part: slice) -> list[slice]:
-    """Return the runs of rows inside (m,) in a part of them."""
-    edges = np.flatnonzero(np.diff(inside[part].astype(np.int8), prepend=0, append=0))
-    return [
-        slice(part.start + int(first), part.start + int(end)) for first, end in edges.reshape(-1, 2)
-    ]
 
 
 def mean_about(time: Array, values: Array, grid: Array) -> Array:

@@ -38,7 +38,8 @@ class TermChoice:
         terms: names.
         joint: index.
         present: whether they are in the model.
-        gain: by which they lower the root mean square of the prediction error, as a fraction.
+        gain: by which they lower the root mean square of the prediction error, as a fraction of
+            that without them.
         shown: whether windows that were not fitted are predicted better with them by more than
             chance, and not in one window alone.
     """
@@ -168,7 +169,7 @@ def _choices(
             terms,
             joint,
             present=not left_out[k, joint],
-            gain=float(gains[k, joint]),
+            gain=float(-np.expm1(-gains[k, joint])),
             shown=bool(shown[k, joint]),
         )
         for k, terms in enumerate(OPTIONAL)

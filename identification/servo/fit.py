@@ -28,7 +28,7 @@ from identification.servo.servo_simulation import JointInputs, simulate
 _LONGEST: Final = 10.0  # s of a window
 _SHORTEST: Final = 4.0
 _WINDOWS: Final = 24  # that a short recording is cut to
-_ROBUST: Final = 3.0  # scatters from which on a residual counts less
+ROBUST: Final = 3.0  # scatters from which on a residual counts less
 _DIFFERENCE: Final = np.where(POSITIVE, 0.03, 3e-4)  # of the coordinates, for derivatives
 _DAMPINGS: Final = (1e-3, 1e-1, 1.0, 1e1, 1e2)  # that are tried in each iteration, times the last
 _LARGEST_STEP: Final = np.where(POSITIVE, 0.7, 0.01)  # of a coordinate in an iteration
@@ -145,12 +145,12 @@ class ServoEstimate:
 
 
 def _weights(relative: Array) -> Array:
-    return np.asarray(1.0 / np.sqrt(1.0 + (relative / _ROBUST) ** 2))
+    return np.asarray(1.0 / np.sqrt(1.0 + (relative / ROBUST) ** 2))
 
 
 def losses(relative: Array) -> Array:
     """Return the robust squares of residuals over their scatter, about r² where these are small."""
-    return np.asarray(2.0 * _ROBUST**2 * (np.sqrt(1.0 + (relative / _ROBUST) ** 2) - 1.0))
+    return np.asarray(2.0 * ROBUST**2 * (np.sqrt(1.0 + (relative / ROBUST) ** 2) - 1.0))
 
 
 @dataclass(eq=False)

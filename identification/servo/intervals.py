@@ -53,7 +53,7 @@ def intervals_of(fit: ServoFit) -> ServoIntervals:
     covariance = _covariances(fit)
     spread = np.sqrt(np.maximum(np.einsum("npp->np", covariance), 0.0))
     prior = _prior_spread(estimate)
-    reach = _reach(fit) * spread
+    reach = reach_of(fit) * spread
     ends = [
         np.where(POSITIVE, values * np.exp(sign * np.minimum(reach, 700.0)), values + sign * reach)
         for sign in (-1.0, 1.0)
@@ -105,7 +105,7 @@ def _unseen(fit: ServoFit) -> NDArray[np.bool_]:
     return np.asarray(fit.estimate.present & ~fit.shown & _VANISHES)
 
 
-def _reach(fit: ServoFit) -> float:
+def reach_of(fit: ServoFit) -> float:
     """Return the half-width of a 95 % interval in standard deviations."""
     return float(student_limit(0.025, max(1, fit.windows - 1)))
 
@@ -134,7 +134,7 @@ def widened_covariance(fit: ServoFit) -> Array:
             # Of a logarithm, 1 is the whole effect, to first order.
             variance = widened[place, place]
             response = widened[:, place] / variance
-            lacking = max(_reach(fit) ** -2.0 - variance, 0.0)
+            lacking = max(reach_of(fit) ** -2.0 - variance, 0.0)
             widened += lacking * np.outer(response, response)
     # No motion widens what is known before.
     prior = np.append(estimate.prior.spread.ravel(), np.inf)
@@ -184,7 +184,7 @@ def _changed_by_unseen(fit: ServoFit, covariance: Array) -> tuple[Array, Array]:
         response = np.where(POSITIVE, covariance[joint, :, place] / variance, 0.0)
         prior = fit.estimate.prior.spread[joint, place] ** -2.0
         shown = max(1.0 / variance - prior, 1e-12)
-        reach = _reach(fit)
+        reach = reach_of(fit)
         largest = min(np.expm1(reach * np.sqrt(variance)), reach / np.sqrt(shown))
         ends = np.stack([-response, largest * response])
         own = np.arange(count) == place

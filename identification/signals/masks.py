@@ -163,7 +163,7 @@ def long_rests(time: Array, still: Rows) -> Rows:
     """Return rows (m, n) in runs of resting rows (m, n) longer than `LONGEST_HALT`."""
     resting = np.zeros_like(still)
     for joint, column in enumerate(still.T):
-        for start, stop in _runs(column):
+        for start, stop in runs_of(column):
             resting[start:stop, joint] = time[stop - 1] - time[start] > LONGEST_HALT
     return resting
 
@@ -183,7 +183,7 @@ def flat_topped(values: Array, moving: Rows) -> Rows:
             continue
         resolution = float(steps[steps > 0.0].min())
         for top in tops:
-            for start, stop in _runs(top):
+            for start, stop in runs_of(top):
                 if stop - start >= SHORTEST_TOP and _leaves_peak(channel, start, stop, resolution):
                     clipped[start:stop, j] = True
     return clipped & moving
@@ -210,7 +210,7 @@ def spiking(values: Array, segments: Sequence[slice]) -> Rows:
         least = np.maximum(_STANDS_OUT * spread, _OF_RANGE * (high - low))
         beyond = np.maximum(part - high, low - part) > 0.5 * _OF_RANGE * (high - low)
         for joint, far in enumerate(((apart > least) & beyond).T):
-            for start, stop in _runs(far):
+            for start, stop in runs_of(far):
                 if stop - start > _LONGEST_SPIKE:
                     continue
                 around = np.delete(part[:, joint], slice(start, stop))[
@@ -257,7 +257,7 @@ def edge_rows(recording: Recording, end: float, delay: float = 0.0) -> NDArray[n
     return edge
 
 
-def _runs(flags: NDArray[np.bool_]) -> list[tuple[int, int]]:
+def runs_of(flags: NDArray[np.bool_]) -> list[tuple[int, int]]:
     """Return start and stop of every run of True."""
     edges = np.flatnonzero(np.diff(flags.astype(np.int8), prepend=0, append=0))
     return list(zip(edges[::2].tolist(), edges[1::2].tolist(), strict=True))

@@ -9,6 +9,7 @@ import scipy
 from benchmarks import servo_arm as arm
 from identification import RobotModel
 from identification.servo.choice import fit_servos
+from identification.servo.contacts import contacts_of
 from identification.servo.intervals import intervals_of, sampled, widened_covariance
 from identification.servo.parameters import ABSENT, NAMES, PLACE, TERMS, in_errors, in_units
 from identification.servo.prediction import predicted
@@ -296,3 +297,35 @@ def test_a_joint_that_moves_while_its_command_rests_was_pushed():
     assert push.joint == 0
     assert push.change == pytest.approx(-0.06)
     assert push.time == pytest.approx(6.0, abs=0.6)
+
+
+def poses_of(truth, rng, floor=-np.inf):
+    """Ten poses of an arm, with a floor under its end, as a motion."""
+    model, bodies = model_of_arm()
+    time, command = arm.poses(rng, 40.0)
+    position = arm.simulated(truth, time, command, floor)
+    recording = Recording(
+        time=time, position=position, joint_names=arm.NAMES, commanded_position=command
+    )
+    (motion,) = motions_of(recording, model, bodies, Grid.of(recording))
+    return motion
+
+
+@pytest.mark.long
+def test_a_floor_is_found_where_the_arm_stands_on_it(planted):
+    truth, fit, *_ = planted
+    resolution = np.full(3, arm.COUNT / np.sqrt(12.0))
+    free = poses_of(truth, np.random.default_rng(3))
+    assert contacts_of(free, fit, resolution) == []
+    floor = np.quantile(arm.tip_heights(free.position), 0.3)
+    touching = poses_of(truth, np.random.default_rng(3), floor)
+    on = arm.tip_heights(touching.position) < floor + 1e-3
+    contacts = contacts_of(touching, fit, resolution)
+    assert contacts
+    assert {arm.NAMES[contact.joint] for contact in contacts} <= {"lift", "elbow"}
+    instants = touching.step * np.arange(len(on))
+    for contact in contacts:
+        assert contact.end - contact.start >= 1.0
+        inside = (instants > contact.start + 0.1) & (instants < contact.end - 0.1)
+        assert on[inside].mean() > 0.95
+        assert contact.torque < 0.0  # the floor lifts the arm, against both axes

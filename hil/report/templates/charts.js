@@ -40,13 +40,14 @@
     this.holders = [];
   }
 
-  /* Axes of time are linked over all figures but the excitation's, those of frequency within one,
-     and a chart may have its own. A document of Bokeh's has models of its own, so the axes
+  /* Axes of time are linked over all figures but those of other motions, those of frequency within
+     one, and a chart may have its own. A document of Bokeh's has models of its own, so the axes
      of two figures follow each other here. */
   var axes = [];
+  var OF_OTHER_MOTIONS = /^(excitation$|motion-)/;
 
   function axisOf(group, chart) {
-    var link = chart.foot.indexOf("time") === 0 && group.name !== "excitation" ? "time" : group.name;
+    var link = chart.foot.indexOf("time") === 0 && !OF_OTHER_MOTIONS.test(group.name) ? "time" : group.name;
     var key = group.name + (chart.own ? chart.key : "");
     var axis = axes.find(function (other) { return other.key === key; });
     if (axis) return axis;

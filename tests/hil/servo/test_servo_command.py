@@ -20,7 +20,13 @@ from hil.archive import open_archive
 from hil.base.errors import InputError, SourceError
 from hil.base.one_screen import one_screen
 from hil.cli import app
-from hil.results.servo_result import ServoPush, ServoResults, is_servo_result
+from hil.results.servo_result import (
+    ServoContact,
+    ServoFree,
+    ServoPush,
+    ServoResults,
+    is_servo_result,
+)
 from hil.servo.maker_file import maker_parameters
 from hil.servo.messages import screen, verdict_of
 from identification.servo.parameters import PLACE
@@ -121,6 +127,61 @@ class TestCommand:
         )
         (warning,) = [w for w in verdict_of(touched).warnings if "touched" in w]
         assert "lift by -60 mrad at 36 s" in warning
+
+    def test_errors_are_told_with_and_without_what_held_the_arm(
+        self, identified: tuple[Path, str, int]
+    ) -> None:
+        """It is judged without, and neither figure is left out."""
+        folder, _, _ = identified
+        results = ServoResults.load(folder / "results.json")
+        (unseen,) = results.validation
+        assert not unseen.contacts
+        assert unseen.free is None
+        contacts = tuple(
+            ServoContact(joint=joint, start=start, end=end, torque=-1.0)
+            for joint, start, end in (("lift", 3.5, 6.5), ("elbow", 3.8, 7.0), ("lift", 9.0, 10.5))
+        )
+        free = ServoFree(
+            share=0.6,
+            position_error_mrad=7.98,
+            joint_errors_mrad=[7.98] * 3,
+            command_error_mrad=31.9,
+        )
+        held = unseen.model_copy(
+            update={
+                "contacts": contacts,
+                "free": free,
+                "position_error_mrad": 25.3,
+                "command_error_mrad": 31.6,
+            }
+        )
+        verdict = verdict_of(results.model_copy(update={"validation": [held]}))
+        assert verdict.good
+        assert "25.3, 7.98 where nothing held it" in verdict.line
+        (warning,) = [text for text in verdict.warnings if "held the arm" in text]
+        assert "3.5 to 7.0 s, 9.0 to 10.5 s" in warning
+        mostly = held.model_copy(update={"free": free.model_copy(update={"share": 0.4})})
+        assert not verdict_of(results.model_copy(update={"validation": [mostly]})).good
+
+    def test_a_fitted_motion_that_something_held_is_said(
+        self, identified: tuple[Path, str, int]
+    ) -> None:
+        folder, _, _ = identified
+        results = ServoResults.load(folder / "results.json")
+        assert results.fitted_contacts == {}
+        contact = ServoContact(joint="lift", start=3.5, end=6.5, torque=-1.0)
+        held = results.model_copy(update={"fitted_contacts": {"fast.mcap": [contact]}})
+        assert any("fast.mcap, which was fitted" in text for text in verdict_of(held).warnings)
+
+    def test_results_and_report_say_what_was_read(self, identified: tuple[Path, str, int]) -> None:
+        folder, _, _ = identified
+        results = ServoResults.load(folder / "results.json")
+        assert [(read.file, read.use) for read in results.recordings] == [
+            ("fast", "fitted"),
+            ("slow", "predicted"),
+        ]
+        assert all("torque: left out" in read.content for read in results.recordings)
+        assert "torque: left out" in (folder / "report.html").read_text()
 
     def test_the_screen_is_short(self, identified: tuple[Path, str, int]) -> None:
         folder, _, _ = identified
@@ -463,6 +524,108 @@ def imported_torque(log: Path, *options: str) -> tuple[Any, str]:
     done = CliRunner().invoke(app, [*map(str, line), *options])
     assert done.exit_code == 0, done.output
     return open_archive(output).columns.get("torque"), " ".join(done.output.split())
+
+
+def servo_log(
+    folder: Path, position: np.ndarray, command: np.ndarray, name: str = "command_{}"
+) -> Path:
+    """Write a log of positions and commands at 50 Hz, and the description of the arm."""
+    names = ["time", *(f"position_{joint}" for joint in arm.NAMES)]
+    names += [name.replace("{}", joint) for joint in arm.NAMES]
+    rows = np.column_stack([np.arange(len(position)) / arm.RATE, position, command])
+    text = "\n".join([",".join(names), *(",".join(map(str, row)) for row in rows.tolist())])
+    (folder / "log.csv").write_text(text.replace("nan", "") + "\n")
+    (folder / "arm.urdf").write_text(arm.urdf())
+    return folder / "log.csv"
+
+
+@pytest.fixture(scope="module")
+def motion() -> tuple[np.ndarray, np.ndarray]:
+    """Positions and commands of an arm for 12 s."""
+    rng = np.random.default_rng(8)
+    time, command = arm.commands(rng, 12.0)
+    return arm.simulated(arm.Planted.drawn(rng), time, command), command
+
+
+def constant(command: np.ndarray) -> np.ndarray:
+    return np.tile(command[:1], (len(command), 1))
+
+
+class TestNonsense:
+    """Each ends in one sentence that names the field and what to do."""
+
+    @pytest.mark.parametrize(
+        ("change", "field", "problem"),
+        [
+            (lambda q, c: (q, np.full_like(c, np.nan)), "commanded_position", "known"),
+            (lambda q, c: (q, constant(c)), "commanded_position", "no command changes"),
+            (lambda q, c: (c, c), "position", "bit for bit"),
+            (lambda q, c: (q, 1000.0 * c), "commanded_position", "times as far"),
+            (lambda q, c: (constant(q), c), "position", "no joint moves"),
+            (lambda q, c: (1e6 * q, 1e6 * c), "position", "leaves the limits"),
+        ],
+        ids=["empty", "constant", "copied", "millimetres", "still", "no angles"],
+    )
+    def test_commands_that_are_none_are_refused(self, tmp_path, motion, change, field, problem):
+        log = servo_log(tmp_path, *change(*motion))
+        done = CliRunner().invoke(
+            app,
+            ["identify", str(log), "--urdf", str(tmp_path / "arm.urdf"), "-o", f"{tmp_path}/out"],
+        )
+        assert isinstance(done.exception, InputError | SourceError), done.output
+        assert done.exception.field == field
+        assert problem in done.exception.problem
+        assert done.exception.remedy
+        assert not (tmp_path / "out").exists()
+
+    @pytest.mark.long
+    def test_a_joint_that_never_moves_takes_only_itself_out(self, tmp_path, motion):
+        position, command = motion
+        position = position.copy()
+        position[:, 1] = position[0, 1]
+        log = servo_log(tmp_path, position, command)
+        done = CliRunner().invoke(
+            app,
+            ["identify", str(log), "--urdf", str(tmp_path / "arm.urdf"), "-o", f"{tmp_path}/out"],
+        )
+        assert done.exit_code == 0, done.output
+        results = ServoResults.load(tmp_path / "out" / "results.json")
+        assert results.stuck == ["lift"]
+        assert not any(value.determined for value in results.servo if value.joint == "lift")
+        (rest,) = results.validation
+        moving = np.array(rest.joint_errors_mrad)[[0, 2]]
+        assert rest.position_error_mrad == pytest.approx(np.sqrt(np.mean(moving**2)))
+        assert any("lift never moved" in warning for warning in results.verdict.warnings)
+
+
+class TestCommandNames:
+    @pytest.mark.parametrize(
+        "name",
+        ["commanded_position_{}", "target_position_{}", "goal_pos_{}", "cmd_{}", "{}_setpoint"],
+    )
+    def test_a_word_says_commands_where_there_is_no_torque(self, tmp_path, motion, name):
+        assert commanded_in(servo_log(tmp_path, *motion, name)) is not None
+
+    @pytest.mark.parametrize("name", ["cmd_vel_{}", "position_error_{}", "target_effort_{}"])
+    def test_other_quantities_are_no_commanded_positions(self, tmp_path, motion, name):
+        assert commanded_in(servo_log(tmp_path, *motion, name)) is None
+
+    def test_commands_in_degrees_are_read_as_the_positions_say(self, tmp_path, motion):
+        position, command = motion
+        np.testing.assert_allclose(
+            commanded_in(servo_log(tmp_path, position, np.degrees(command))), command, atol=1e-9
+        )
+
+
+def commanded_in(log: Path) -> np.ndarray | None:
+    """Return the commands of a log as an identification reads them; None if it has none."""
+    output = log.with_name("out.mcap")
+    line = ["import", "log", log, "--urdf", log.with_name("arm.urdf"), "--force", "-o", output]
+    done = CliRunner().invoke(app, [*map(str, line)])
+    if isinstance(done.exception, InputError | SourceError):
+        return None
+    assert done.exit_code == 0, done.output
+    return open_archive(output).columns.get("commanded_position")
 
 
 class TestLoad:

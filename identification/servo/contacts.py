@@ -1,0 +1,124 @@
+r"""Stretches in which something held a joint: it stands though its servo exceeds all friction.
+
+Where a joint stands, dry friction holds the rest of its servo's torque and that of the bodies,
+
+.. math:: |\mathrm{sat}(k_p\,\mathrm{dz}(q_c + o - q)) - \tau_{bodies}|
+    \le f_0 + f_s + \mu |\tau_{bodies}|,
+
+and what is beyond is the torque of something else: a table, an object in a gripper, an end stop.
+Weaker contacts are within the friction, and cannot be distinguished from it.
+"""
+
+from __future__ import annotations
+
+from typing import Final, NamedTuple
+
+import numpy as np
+import scipy
+from numpy.typing import NDArray
+
+from identification.arrays import Array
+from identification.servo.choice import ServoFit
+from identification.servo.fit import ROBUST
+from identification.servo.intervals import reach_of, widened_covariance
+from identification.servo.parameters import PLACE, POSITIVE, natural, without_absent
+from identification.servo.recorded_motion import ServoMotion
+from identification.signals.masks import runs_of
+
+_OVER: Final = 1.0  # s that a joint stands, longer than any answer to a command takes
+_PERIOD: Final = 0.05  # s between rows that are judged
+_RESTING: Final = 2.0  # steps of the encoder that a joint at rest may move
+_DIFFERENCE: Final = np.where(POSITIVE, 1e-3, 1e-5)  # of the coordinates, for derivatives
+
+
+class Contact(NamedTuple):
+    """A joint that something held.
+
+    Attributes:
+        joint: index.
+        start, end: from the start of the motion [s].
+        torque: of what held it, beyond the friction, in the middle of its rows [N·m or N].
+    """
+
+    joint: int
+    start: float
+    end: float
+    torque: float
+
+
+def contacts_of(motion: ServoMotion, fit: ServoFit, resolution: Array) -> list[Contact]:
+    """Return the contacts of a motion, by joint and time.
+
+    Friction is exceeded for a second, in one direction, by more than the 95 % interval of the
+    servo's parameters and three times the scatter of the positions that they were fitted to.
+
+    Args:
+        motion: as it was measured.
+        fit: of the servos.
+        resolution: standard deviation of the measured positions (n,).
+    """
+    every = max(1, round(_PERIOD / motion.step))
+    period = every * motion.step
+    over = max(1, round(_OVER / period))
+    position = motion.position[::every]
+    if len(position) <= over:
+        return []
+    still = _at_rest(position, _RESTING * np.sqrt(12.0) * resolution, over)
+    scatter = np.sqrt(np.mean(fit.estimate.scatter**2, axis=0))
+    least = ROBUST * np.maximum(scatter, resolution)
+    compliance = fit.estimate.values[:, PLACE["kp"]]
+    beyond, deviation = _beyond(motion, every, fit)
+    contacts = []
+    for sign in (1.0, -1.0):
+        surely = sign * beyond - reach_of(fit) * deviation - least
+        held = still & (scipy.ndimage.minimum_filter(surely, (over, 1)) > 0.0)
+        for joint in np.flatnonzero(held.any(axis=0)).tolist():
+            for first, end in runs_of(surely[:, joint] > 0.0):
+                if held[first:end, joint].any():
+                    torque = float(np.median(beyond[first:end, joint])) / compliance[joint]
+                    contacts.append(Contact(joint, first * period, (end - 1) * period, -torque))
+    return sorted(contacts, key=lambda each: (each.joint, each.start))
+
+
+def _beyond(motion: ServoMotion, every: int, fit: ServoFit) -> tuple[Array, Array]:
+    """Return what no friction at rest explains (m, n), and its standard deviation (m, n).
+
+    In position errors of the servo, of every so many instants of a motion.
+    """
+    estimate = fit.estimate
+    n, count = estimate.coordinates.shape
+    shifted = np.repeat(estimate.coordinates[None], 1 + count, axis=0)
+    terms = np.arange(count)
+    shifted[1 + terms, :, terms] += _DIFFERENCE[:, None]
+    values = without_absent(natural(shifted), estimate.present)
+
+    def of(name: str) -> Array:
+        return values[:, None, :, PLACE[name]]
+
+    instants = motion.step * np.arange(len(motion.command))
+    late = instants[::every, None] - estimate.values[:, PLACE["delay"]]
+    command = np.column_stack(
+        [np.interp(late[:, joint], instants, motion.command[:, joint]) for joint in range(n)]
+    )
+    error = command - motion.position[::every] + of("offset")
+    error = error - np.clip(error, -of("dead_band"), of("dead_band"))
+    bodies = of("kp") * motion.bodies.bias[::every]
+    rest = np.clip(error, -of("limit"), of("limit")) - bodies
+    friction = of("coulomb") + of("static") + of("load") * np.abs(bodies)
+    direction = np.sign(rest[0])
+    over = direction * rest - friction
+    slopes = (over[1:] - over[0]) / _DIFFERENCE[:, None, None]
+    covariance = widened_covariance(fit)
+    variance = np.empty_like(over[0])
+    for joint in range(n):
+        part = slice(joint * count, (joint + 1) * count)
+        own = slopes[..., joint]
+        variance[:, joint] = np.einsum("pm,pq,qm->m", own, covariance[part, part], own)
+    return direction * np.maximum(over[0], 0.0), np.sqrt(np.maximum(variance, 0.0))
+
+
+def _at_rest(position: Array, most: Array, over: int) -> NDArray[np.bool_]:
+    """Return where each joint moves by `most` (n,) at most in the rows about each (m, n)."""
+    size = (over, 1)
+    highest = scipy.ndimage.maximum_filter(position, size)
+    return np.asarray(highest - scipy.ndimage.minimum_filter(position, size) <= most)
