@@ -2,7 +2,13 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
+from typing import Final
+
+_LARGEST_DECIMAL: Final = 1e6
+_LONGEST_IN_SECONDS: Final = 300.0
+_LONGEST_IN_MINUTES: Final = 180.0
 
 
 def percentage(share: float, decimals: int = 0, *, signed: bool = False) -> str:
@@ -23,3 +29,22 @@ def joined(names: Sequence[str], most: int = 6) -> str:
     """Return names separated by commas, the first few of many."""
     omitted = len(names) - most
     return ", ".join(names[:most]) + (f" and {omitted} more" if omitted > 0 else "")
+
+
+def number(value: float, digits: int = 3) -> str:
+    """Format with `digits` significant digits, without an exponent from 1e-4 to 1e6: 1324."""
+    is_whole = 10.0**digits <= abs(float(f"{value:.{digits}g}")) < _LARGEST_DECIMAL
+    return f"{value:.0f}" if is_whole else f"{value:.{digits}g}"
+
+
+def interval_text(low: float, high: float) -> str:
+    """Format an interval that may have no upper end: 0.3 to 1.2, above 0.3."""
+    return f"above {number(low)}" if high == math.inf else f"{number(low)} to {number(high)}"
+
+
+def duration_text(seconds: float) -> str:
+    """Format a duration in seconds, minutes or hours: 27.5 s, 22 min, 3.4 h."""
+    if seconds < _LONGEST_IN_SECONDS:
+        return f"{number(seconds)} s"
+    minutes = seconds / 60.0
+    return f"{minutes:.0f} min" if minutes < _LONGEST_IN_MINUTES else f"{minutes / 60.0:.1f} h"

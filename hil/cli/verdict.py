@@ -14,7 +14,7 @@ from hil.base.one_screen import Paragraph, Part, columns, one_screen
 from hil.base.progress import say
 from hil.base.terminal_text import printable, typed
 from hil.results.results import JointJudgement, OverallJudgement, Results
-from identification.text import percentage
+from identification.text import number, percentage
 from identification.validation.purpose_messages import TITLES, figure, requirement
 from identification.validation.verdict import fault_of
 
@@ -151,7 +151,7 @@ def _table(
 ) -> list[str]:
     of_joint: list[tuple[str, Callable[[JointJudgement], str]]] = [
         ("joint", lambda joint: joint.joint),
-        ("RMS error", lambda joint: f"{joint.rms:.3g} {joint.unit}"),
+        ("RMS error", lambda joint: f"{number(joint.rms)} {joint.unit}"),
         ("of limit", lambda joint: _percent(joint.share_of_limit) if everything else _MISSING),
     ]
     of_both: list[tuple[str, Callable[[JointJudgement | OverallJudgement], str]]] = [

@@ -17,6 +17,7 @@ from hil.base.toml_text import to_text
 from hil.cell import AngleFrame, Cell
 from hil.control.motion_checks import violation_text
 from identification import excitation
+from identification.text import duration_text
 
 from .messages import criteria_text, infeasible_text, no_excitation
 from .problem import problem_of, search_settings
@@ -162,7 +163,9 @@ def run_design(
     problem = problem_of(carrying or cell, settings, given, precision)
     if problem.objective.given is not None:
         seconds = problem.objective.given.duration
-        reporter.say(f"the criteria count {seconds:.3g} s of motion in the given recordings")
+        reporter.say(
+            f"the criteria count {duration_text(seconds)} of motion in the given recordings"
+        )
     with lock_folder(folder.root, "search", "-o"):
         if resume:
             if settings != folder.resumed_settings():

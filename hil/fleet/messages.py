@@ -101,6 +101,8 @@ def limit_text(limit: LimitReached) -> str:
     assert limit.date is not None
     until = "later" if limit.latest is None else month(limit.latest)
     since = month(limit.date) if limit.earliest is None else month(limit.earliest)
+    if since == until:
+        return f"reaches {reached} in {since}"
     return f"reaches {reached} in {month(limit.date)} ({since} to {until})"
 
 

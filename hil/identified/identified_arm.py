@@ -55,7 +55,7 @@ from identification.export.parameter_table import parameter_table
 from identification.export.simulators import pinocchio_arm
 from identification.model.motion import Motion
 from identification.model.single_state import SingleStateTorque
-from identification.text import percentage
+from identification.text import number, percentage
 from identification.validation.verdict import Verdict
 
 if TYPE_CHECKING:
@@ -233,7 +233,7 @@ class IdentifiedArm:
             [
                 (
                     joint.joint,
-                    f"{joint.rms:.3g} {joint.unit}",
+                    f"{number(joint.rms)} {joint.unit}",
                     joint.relative,
                     joint.nominal_relative,
                 )

@@ -15,6 +15,7 @@ from hil.importers.messages import sentence
 from hil.look.readings import DoubtfulArm
 from hil.look.result import ChangedReading
 from hil.pipeline.sources import Source
+from identification.text import duration_text
 
 _MOST: Final = 3
 
@@ -96,4 +97,4 @@ def _archives(sources: Sequence[Source]) -> str:
         float(source.recording.time[-1] - source.recording.time[0]) for source in sources
     )
     joints = plural(sources[0].recording.n_joints, "joint")
-    return f"{names}: {joints}, {duration:.3g} s"
+    return f"{names}: {joints}, {duration_text(duration)}"

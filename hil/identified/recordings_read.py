@@ -31,6 +31,7 @@ from hil.look.readings import DoubtfulArm
 from hil.look.result import ChangedReading
 from hil.results.results import RecordingResult
 from identification.signals.messages import clock_lines
+from identification.text import duration_text, number
 
 _USUAL: Final = (
     ChannelMeaning,
@@ -87,7 +88,7 @@ def size(recording: ImportedRecording) -> str:
     joints = sum(isinstance(each, JointRange) for each in found)
     parts = [plural(joints, "joint")]
     if clock is not None:
-        parts = [f"{parts[0]}, {clock.duration:.3g} s at {clock.rate:.4g} Hz"]
+        parts = [f"{parts[0]}, {duration_text(clock.duration)} at {number(clock.rate, 4)} Hz"]
         parts += clock_lines(clock)[1:]
     return "; ".join(parts)
 

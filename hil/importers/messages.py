@@ -65,6 +65,7 @@ from hil.importers.conclusions import (
 )
 from hil.importers.units import UNITS
 from identification.signals.messages import clock_lines
+from identification.text import number
 
 _BASIS: Final[Mapping[NameBasis, str]] = {
     NameBasis.NAME: "by the name",
@@ -168,7 +169,7 @@ def _(fixed: FixedFingers) -> str:
 
 def places_of(fixed: FixedFingers) -> str:
     """Return where the joints of a gripper are fixed, and why."""
-    places = ", ".join(f"{place:.3g}" for place in fixed.positions.values())
+    places = ", ".join(number(place) for place in fixed.positions.values())
     return f"at {places} (rad or m), as of an unrecorded gripper"
 
 
@@ -252,7 +253,7 @@ def _(swapped: SortedSamples) -> str:
 
 @worded.register
 def _(publisher: SecondPublisher) -> str:
-    where = ", ".join(f"{angle:.3g}" for angle in publisher.pose) or "0"
+    where = ", ".join(number(angle) for angle in publisher.pose) or "0"
     return (
         f"{publisher.count} of {publisher.total} {publisher.sample}s have {where} for all positions"
         " between others that do not; dropped, as they come from a second publisher"
@@ -345,7 +346,7 @@ def _(few: TooFewSamples) -> str:
 
 @worded.register
 def _(locked: LockedJoints) -> str:
-    held = [f"{name} at {place:.4g}" for name, place in locked.positions.items()]
+    held = [f"{name} at {number(place, 4)}" for name, place in locked.positions.items()]
     return f"locked, rad or m: {', '.join(held)}"
 
 
@@ -367,7 +368,7 @@ def _(found: JointRange) -> str:
 
 @worded.register
 def _(unusual: UnusualRate) -> str:
-    return f"{unusual.rate:.3g} samples per second are unusual: check the unit of the time"
+    return f"{number(unusual.rate)} samples per second are unusual: check the unit of the time"
 
 
 @worded.register
@@ -382,7 +383,7 @@ def _(same: SameStamp) -> str:
 @worded.register
 def _(alternation: Alternation) -> str:
     return (
-        f"samples go to and fro between two sequences up to {alternation.apart:.3g} "
+        f"samples go to and fro between two sequences up to {number(alternation.apart)} "
         f"rad or m apart ({alternation.count} samples): two sources write these joints, one of them"
         " other or older samples; record one of them"
     )
@@ -396,7 +397,7 @@ def _(outside: OutsideLimits) -> str:
 def problem_of(outside: OutsideLimits) -> str:
     """Return how positions leave the limits of the URDF."""
     ranges = ", ".join(
-        f"{name}: {low:.3g} .. {high:.3g}" for name, (low, high) in outside.ranges.items()
+        f"{name}: {number(low)} .. {number(high)}" for name, (low, high) in outside.ranges.items()
     )
     some = f"{_percent(outside.fraction)} of the rows leave"
     share = "every row leaves" if outside.fraction == 1.0 else some
@@ -419,14 +420,14 @@ def remedy_of(outside: OutsideLimits) -> str:
 
 def _percent(share: float) -> str:
     """Return a share below 1 that does not read as all."""
-    return f"{min(100.0 * share, 99.9):.3g} %"
+    return f"{number(min(100.0 * share, 99.9))} %"
 
 
 @worded.register
 def _(little: LittleMotion) -> str:
     return (
-        f"no joint moves further than {little.travel:.2g} rad or m "
-        f"({math.degrees(little.travel):.2g} if these were degrees): check the unit of the"
+        f"no joint moves further than {number(little.travel, 2)} rad or m "
+        f"({number(math.degrees(little.travel), 2)} if these were degrees): check the unit of the"
         " positions"
     )
 
@@ -434,8 +435,8 @@ def _(little: LittleMotion) -> str:
 @worded.register
 def _(fast: FastJoint) -> str:
     return (
-        f"{fast.joint} would move at {fast.speed:.3g} rad/s (or m/s), its limit in the URDF is "
-        f"{fast.limit:.3g}: check the units of position (degrees?) and time (milliseconds?)"
+        f"{fast.joint} would move at {number(fast.speed)} rad/s (or m/s), its limit in the URDF is "
+        f"{number(fast.limit)}: check the units of position (degrees?) and time (milliseconds?)"
     )
 
 
@@ -458,7 +459,9 @@ def _(velocity: UnrelatedVelocity) -> str:
 
 @worded.register
 def _(scaled: ScaledVelocity) -> str:
-    factors = ", ".join(f"{factor:.4g} for {name}" for name, factor in scaled.factors.items())
+    factors = ", ".join(
+        f"{number(factor, 4)} for {name}" for name, factor in scaled.factors.items()
+    )
     return (
         f"the velocity is the slope of the position times {factors}: check units, signs "
         "and gears of both, and the unit of the time"
@@ -481,16 +484,16 @@ def _(zero: ZeroTorque) -> str:
 @worded.register
 def _(constant: ConstantTorque) -> str:
     return (
-        f"the torque of {constant.joint} is {constant.torque:.3g} throughout, although it moves:"
-        " it was not measured"
+        f"the torque of {constant.joint} is {number(constant.torque)} throughout, although it"
+        " moves: it was not measured"
     )
 
 
 @worded.register
 def _(large: LargeTorque) -> str:
     return (
-        f"the torque of {large.joint} reaches {large.torque:.3g}, its limit in the URDF is "
-        f"{large.limit:.3g} N·m (or N): check its unit and side (motor or joint)"
+        f"the torque of {large.joint} reaches {number(large.torque)}, its limit in the URDF is "
+        f"{number(large.limit)} N·m (or N): check its unit and side (motor or joint)"
     )
 
 
@@ -499,7 +502,7 @@ def _(size: TorqueSize) -> str:
     reference = (
         "the torques of the URDF's masses" if size.by_masses else "the effort limits of the URDF"
     )
-    listing = ", ".join(f"{name}: {ratio:.2g}" for name, ratio in size.ratios.items())
+    listing = ", ".join(f"{name}: {number(ratio, 2)}" for name, ratio in size.ratios.items())
     which = "large" if size.too_large else "small"
     start = f"the torques are too {which} for this arm: measured over {reference} {listing}; check "
     if size.too_large:
@@ -515,7 +518,7 @@ def _(size: TorqueSize) -> str:
 @worded.register
 def _(stopped: StoppedJoint) -> str:
     return (
-        f"the position of {stopped.joint} stays the same from {stopped.time:.3g} s to the end "
+        f"the position of {stopped.joint} stays the same from {stopped.time:.3f} s to the end "
         f"while its command moves by {stopped.travel:.3g} rad or m: it is assumed to stand still; "
         "if it moved, its encoder failed"
     )

@@ -10,6 +10,7 @@ import numpy as np
 from hil.archive import Archive
 from hil.base.errors import SourceError
 from hil.importers.plausibility import command_size
+from identification.text import duration_text
 
 _SHORTEST: Final = 1.0  # s
 _COPIED: Final = 0.999  # of the rows
@@ -27,7 +28,7 @@ def require_motion(archive: Archive, recording: Path) -> None:
     duration = float(stamp[-1] - stamp[0]) * 1e-9
     if duration < _SHORTEST:
         samples = f"{len(stamp)} {'sample' if len(stamp) == 1 else 'samples'}"
-        problem = f"has {samples} in {duration:.3g} s, too few to identify from"
+        problem = f"has {samples} in {duration_text(duration)}, too few to identify from"
         remedy = "record a motion of all joints, of 10 s or more"
         raise SourceError(recording, problem, remedy=remedy)
     if not np.ptp(np.asarray(columns["position"]), axis=0).any():

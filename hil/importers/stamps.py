@@ -14,6 +14,7 @@ from hil.base.arrays import Array
 from hil.base.errors import SourceError
 from hil.importers.conclusions import ClockRestarted, CounterContinued, Sample, SortedSamples
 from hil.importers.units import TIMES
+from identification.text import number
 
 Stamps = NDArray[np.int64]
 
@@ -170,7 +171,7 @@ def check_clock(stamp: Stamps, path: Path, remedy: str | None = None) -> None:
     if backward.size:
         first = int(backward[0]) + 1
         problem = (
-            f"sample {first} is {-1e-9 * steps[first - 1]:.3g} s older than the one before it "
+            f"sample {first} is {number(-1e-9 * steps[first - 1])} s older than the one before it "
             f"({backward.size} such steps)"
         )
         cut = "cut the recording where its clock runs backwards"
@@ -182,9 +183,9 @@ def check_clock(stamp: Stamps, path: Path, remedy: str | None = None) -> None:
         raise SourceError(path, problem, field="time", remedy=other)
     rate = 1e9 / float(np.median(steps[steps > 0])) if steps.size else np.inf
     if rate < _NO_MOTION:
-        problem = f"has {rate:.2g} samples per second, too few for a motion"
+        problem = f"has {number(rate, 2)} samples per second, too few for a motion"
         other = remedy or (
             "check its unit ([time] unit, or sample_rate in Hz): milliseconds read as seconds "
-            f"would give {1e3 * rate:.4g} samples per second; at least {SLOWEST:g} are needed"
+            f"would give {1e3 * rate:.0f} samples per second; at least {SLOWEST:g} are needed"
         )
         raise SourceError(path, problem, field="time", remedy=other)

@@ -84,7 +84,7 @@ from hil.look.readings import (
 from hil.look.result import ChangedReading, Look, Row, TiedReading
 from identification.hypotheses.changes import COUPLED, IN_ORDER, Meaning
 from identification.signals.messages import clock_lines, fault_words, time_lines
-from identification.text import percentage
+from identification.text import number, percentage
 
 _FACTS: Final[Mapping[Fact, str]] = {
     Fact.EVERY_JOINT_MOVES: "every joint moves",
@@ -283,7 +283,7 @@ def described(change: ArmChange) -> str:
     elif meaning == "zero":
         text = f"zero moved by {np.degrees(change.change.size):.0f} deg"
     elif meaning == "scale":
-        text = f"torque recorded {1.0 + change.change.size:.3g} times"
+        text = f"torque recorded {number(1.0 + change.change.size)} times"
     else:
         text = _CHANGES[meaning]
     if meaning in COUPLED:
@@ -390,7 +390,7 @@ def _(wrapped: Wrapped) -> str:
 
 @_worded.register
 def _(positions: SmoothPositions) -> str:
-    return f"low-passed below {positions.above:.2g} Hz, or commanded"
+    return f"low-passed below {number(positions.above, 2)} Hz, or commanded"
 
 
 @_worded.register
@@ -440,7 +440,7 @@ def _(payload: StatedPayload) -> str:
 
 @_worded.register
 def _(error: ErrorAsRead) -> str:
-    return f"torque predicted to {100.0 * error.error:.2g} % from other parts"
+    return f"torque predicted to {number(100.0 * error.error, 2)} % from other parts"
 
 
 @_worded.register
@@ -453,7 +453,7 @@ def _(delay: TorqueDelay) -> str:
 
 @_worded.register
 def _(low_pass: LowPassedTorque) -> str:
-    return f"torque low-passed at {low_pass.bandwidth:.2g} Hz"
+    return f"torque low-passed at {number(low_pass.bandwidth, 2)} Hz"
 
 
 @_worded.register
@@ -495,7 +495,7 @@ def _(outside: OutsideLimits) -> str:
 
 @_worded.register
 def _(travel: Travel) -> str:
-    return f"{'at least' if travel.at_least else 'less than'} {travel.travel:.2g} rad or m"
+    return f"{'at least' if travel.at_least else 'less than'} {number(travel.travel, 2)} rad or m"
 
 
 @_worded.register
@@ -510,7 +510,7 @@ def _(slope: SlopeRatio) -> str:
 
 @_worded.register
 def _(slope: SlopeFactors) -> str:
-    return ", ".join(f"{name} {factor:.4g}" for name, factor in slope.factors.items())
+    return ", ".join(f"{name} {number(factor, 4)}" for name, factor in slope.factors.items())
 
 
 @_worded.register
@@ -547,18 +547,18 @@ def _(error: StillUnexplained) -> str:
 def _(rigid: RigidShare) -> str:
     return (
         f"at most {percentage(rigid.over_friction)} of the friction of a joint, and "
-        f"{rigid.scale:.2g} times the torque of the URDF's masses"
+        f"{number(rigid.scale, 2)} times the torque of the URDF's masses"
     )
 
 
 @_worded.register
 def _(fit: FreeFit) -> str:
-    return f"{fit.ratio:.2g} times the error of a fit of any masses, zeros and scales"
+    return f"{number(fit.ratio, 2)} times the error of a fit of any masses, zeros and scales"
 
 
 @_worded.register
 def _(size: SizeRatio) -> str:
-    return f"measured over expected by {_expected(size)}: {size.ratio:.2g}"
+    return f"measured over expected by {_expected(size)}: {number(size.ratio, 2)}"
 
 
 @_worded.register
@@ -589,29 +589,29 @@ def _(shape: FilterShape) -> str:
 
 @_worded.register
 def _(found: BeyondRange) -> str:
-    far = f"{np.degrees(found.excess):.0f}°" if found.turns else f"{found.excess:.2g} m"
+    far = f"{np.degrees(found.excess):.0f}°" if found.turns else f"{number(found.excess, 2)} m"
     return f"{found.joint} moves {far} beyond its range"
 
 
 @_worded.register
 def _(found: BeyondSpeed) -> str:
-    return f"{found.joint} moves at {found.ratio:.3g} times its largest speed"
+    return f"{found.joint} moves at {number(found.ratio)} times its largest speed"
 
 
 @_worded.register
 def _(found: BeyondEffort) -> str:
-    return f"the torque of {found.joint} reaches {found.ratio:.3g} times its limit"
+    return f"the torque of {found.joint} reaches {number(found.ratio)} times its limit"
 
 
 @_worded.register
 def _(found: BeyondMasses) -> str:
-    return f"the torque is {found.ratio:.2g} times the torque of {_expected(found)}"
+    return f"the torque is {number(found.ratio, 2)} times the torque of {_expected(found)}"
 
 
 @_worded.register
 def _(lengths: OtherLengths) -> str:
     return (
-        f"the torque fits links {lengths.factor:.2g} times as long (error "
+        f"the torque fits links {number(lengths.factor, 2)} times as long (error "
         f"{percentage(lengths.error)}, with the URDF's {percentage(lengths.stated)})"
     )
 
@@ -644,7 +644,7 @@ def _(entries: MapEntries) -> str:
 
 @_worded.register
 def _(scaled: TorqueFactor) -> str:
-    return f"check the unit; --columns 'torque=NAME*{scaled.factor:.2g}' applies the scale"
+    return f"check the unit; --columns 'torque=NAME*{number(scaled.factor, 2)}' applies the scale"
 
 
 def _toml(value: Any) -> str:
@@ -677,7 +677,7 @@ def _(currents: MotorCurrents) -> str:
 
 def _about(motors: MotorTorque | MotorCurrents) -> str:
     """Return the ratios of each joint, and of which they are not seen, in an open bracket."""
-    each = ", ".join(f"{ratio:.3g}" for ratio in motors.ratios)
+    each = ", ".join(number(ratio) for ratio in motors.ratios)
     if not motors.unseen or len(motors.unseen) == len(motors.ratios):
         return f"[{each}] (about"
     return f"[{each}] (about; {', '.join(motors.unseen)} as the others"
@@ -689,7 +689,7 @@ def _about(motors: MotorTorque | MotorCurrents) -> str:
 @import_messages.worded.register
 def _(explained: ExplainedTorque) -> str:
     parts = (
-        f"low-passed at {explained.low_pass:.2g} Hz" if explained.low_pass else "",
+        f"low-passed at {number(explained.low_pass, 2)} Hz" if explained.low_pass else "",
         "with rotors heavier than the links" if explained.heavy_rotors else "",
     )
     return f"torque: follows the arm of the URDF, {', '.join(filter(None, parts))}"
@@ -697,11 +697,13 @@ def _(explained: ExplainedTorque) -> str:
 
 @import_messages.worded.register
 def _(none: NoJointTorque) -> str:
-    factor = "" if none.ratio is None else f"*{1.0 / none.ratio:.2g}"
+    factor = "" if none.ratio is None else f"*{number(1.0 / none.ratio, 2)}"
     if none.unexplained is not None:
         reason = f"no masses explain {percentage(none.unexplained)} of it, as of the load"
     elif none.ratio is not None:
-        reason = f"it is {none.ratio:.2g} times the torque that the URDF's masses need, the load"
+        reason = (
+            f"it is {number(none.ratio, 2)} times the torque that the URDF's masses need, the load"
+        )
     elif none.is_load:
         reason = "it is named as the load"
     else:

@@ -33,7 +33,7 @@ from identification.reduction.posterior import Posterior
 from identification.reduction.reduction import Reduction
 from identification.selection.settings import Settings, Strength
 from identification.signals.samples import Samples
-from identification.text import joined, percentage
+from identification.text import duration_text, joined, number, percentage
 from identification.validation.calibration import Refit
 
 from .cell_context import TorqueScale, torque_scale_of
@@ -234,7 +234,7 @@ def _poorly_separated(estimate: Estimate) -> list[str]:
     if estimate.undetermined or estimate.condition <= QR_CONDITION:
         return []
     return [
-        f"the scaled condition number is {estimate.condition:.2g}: the motion separates some"
+        f"the scaled condition number is {number(estimate.condition, 2)}: the motion separates some"
         " parameters poorly (solved by QR)"
     ]
 
@@ -244,7 +244,7 @@ def _require_usable_rows(prepared: Prepared) -> None:
     model = prepared.sources.cell.model
     for source, samples in zip(prepared.sources.training, prepared.fitted, strict=True):
         if not samples.usable.any():
-            lasts = f"it lasts {np.ptp(samples.motion.time):.3g} s"
+            lasts = f"it lasts {duration_text(np.ptp(samples.motion.time))}"
             raise ArchiveError(
                 Path(source.name), f"{no_rows_message(model)} ({lasts})", remedy="leave it out"
             )

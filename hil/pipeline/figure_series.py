@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Final
 
 import numpy as np
@@ -15,6 +16,7 @@ from identification.export.friction_curve import friction_curve, friction_torque
 from identification.signals.samples import Samples
 
 from .prepared import Prepared, moving_rows
+from .sources import Source
 
 FIGURE_SAMPLES: Final = 4000
 """Maximum number of rows of a time series in a figure."""
@@ -22,6 +24,7 @@ FRICTION_POINTS: Final = 600
 """Points per joint in a friction figure."""
 _RECORDINGS: Final = 4  # fitted recordings in a friction figure
 _FRICTION_ROWS: Final = 20 * FRICTION_POINTS  # of each; a joint rests in many of them
+_CLOCK_STAMPS: Final = 4000  # whose intervals are in a figure
 _MARGIN: Final = 1.0  # time shown before and after the motion, s
 
 
@@ -55,6 +58,7 @@ def report_series(prepared: Prepared, estimate: RepeatedEstimate) -> ReportSerie
         friction_torque=torque,
         law_speed=np.column_stack([curve.speed for curve in curves]),
         law_torque=np.column_stack([curve.torque for curve in curves]),
+        clock_time=_clock_time(sources.training),
         **example_series(
             model,
             values,
@@ -63,6 +67,13 @@ def report_series(prepared: Prepared, estimate: RepeatedEstimate) -> ReportSerie
             _shown(example),
         ),
     )
+
+
+def _clock_time(sources: Sequence[Source]) -> Array | None:
+    """Return the stamps of the first recording whose samples were given other times."""
+    stamps = (source.stamps for source in sources if source.retimed)
+    found = next((each for each in stamps if each is not None), None)
+    return None if found is None else found[:_CLOCK_STAMPS]
 
 
 def _shown(samples: Samples) -> slice:

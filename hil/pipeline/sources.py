@@ -49,6 +49,7 @@ class Source:
     merged: str = ""  #: note about repeated time stamps
     times: SampleTimes | None = None  #: of its samples; None where the controller counts cycles
     faults: tuple[RowFault, ...] = ()  #: rows that are not of its motion
+    stamps: Array | None = None  #: time stamps of the archive's rows, where `times` is known [s]
     #: of a part: the complete recording, with torques set to zero outside the part, and the index
     #: of its first sample, so that filters see the motion beyond its ends
     context: tuple[Recording, int] | None = None
@@ -437,6 +438,7 @@ def _usable(archive: Archive, cell: Cell, recording: Recording) -> Source:
         averaged if merged else "",
         times,
         faults,
+        None if times is None else sound.time,
     )
 
 

@@ -142,7 +142,9 @@ def draw_plot(axes: Axes, plot: Plot, chart: Chart, scale: float, bins: int | No
     if chart.log:
         if axes.get_yscale() != "log":
             axes.loglog()
-        axes.yaxis.set_major_formatter(StrMethodFormatter("{x:g}"))
+        for axis in (axes.xaxis, axes.yaxis):
+            axis.set_major_formatter(StrMethodFormatter("{x:g}"))
+        axes.xaxis.set_minor_formatter(NullFormatter())
         few = plot.y_limits[1] < 20.0 * plot.y_limits[0]
         axes.yaxis.set_minor_formatter(StrMethodFormatter("{x:g}") if few else NullFormatter())
     axes.set_xlim(*chart.x_limits)

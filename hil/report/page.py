@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import replace
+from collections.abc import Sequence
 from functools import partial
 from typing import TYPE_CHECKING, Final, NamedTuple
 
@@ -12,7 +11,7 @@ import numpy as np
 
 from hil import report  # its pictures load matplotlib, on first use
 from hil.report import figures
-from hil.report.chart import Chart
+from hil.report.finding_pictures import found_rows
 from hil.report.interactive import chart_data, library
 from hil.report.numbers import capitalised
 from hil.report.rendering import environment, page_bytes, template_text
@@ -23,11 +22,11 @@ from hil.results.rollout_result import RolloutResult
 from hil.results.series import ReportSeries
 from identification.excitation import CRITERIA, METHODS
 from identification.selection.settings import Choice
-from identification.validation.finding import Level
 from identification.validation.purpose_messages import TITLES, figure, requirement
+from identification.validation.verdict import fault_of
 
 if TYPE_CHECKING:
-    from hil.report.panels import Panel
+    pass
 
 _MOST_CANDIDATES: Final = 6
 """Candidates shown of one choice: the first, and the best of the others."""
@@ -46,28 +45,6 @@ _USES: Final = {
     "parameters_covariance.csv": "their covariance",
     RESULTS: "every number of this page",
 }
-_PICTURES: Final = {
-    "error on unseen motion": "torque",
-    "generalisation": "torque",
-    "systematic error": "torque",
-    "outliers": "torque",
-    "friction": "friction",
-    "friction law": "friction",
-    "friction over time": "friction",
-    "residual over speed": "residuals",
-    "residual over position": "residuals",
-    "excitation": "correlation",
-    "physical signs": "consistency",
-    "clock": "excitation",
-}
-"""Section of the figure that shows what a check found."""
-_CHARTS: Final = {
-    "torque": "torques",
-    "friction": "friction",
-    "residuals": "speed",
-    "excitation": "excitation",
-}
-"""Charts of these sections, with one for each joint."""
 
 
 def report_bytes(
@@ -106,7 +83,7 @@ def report_bytes(
         "has_truth": any(p.truth is not None for p in results.parameters),
         "has_ids": any(p.table2_id is not None for p in results.parameters),
         "has_prior": any(p.data_share is not None for p in results.parameters),
-        "found": found_rows(results, charts, draw),
+        "found": found_rows(results, series, joints, charts, draw),
         "passed": [
             finding
             for finding in results.judgement.worst_first
@@ -117,7 +94,7 @@ def report_bytes(
         "by_id": by_id,
         "purposes": purpose_rows(results),
         "files": files_of(results),
-        "picture_of": picture_of,
+        "other_reasons": other_reasons(results),
         "offset_parameters": [p for p in results.parameters if _OFFSET.fullmatch(p.name)],
         "of_paper": partial(of_paper, is_of_paper=any(p.table2_id for p in results.parameters)),
         "joint_of": lambda parameter: joint_of(parameter, results.joint_names),
@@ -167,59 +144,20 @@ def files_of(results: Results) -> list[tuple[str, str]]:
     return [(name, use) for name, use in _USES.items() if name in written or name == RESULTS]
 
 
-def picture_of(check: str) -> str:
-    """Return the section whose figure shows what a check found; empty if there is none."""
-    return _PICTURES.get(check, "")
-
-
 def of_paper(place: str, *, is_of_paper: bool) -> str:
     """Return a reference to the paper, for the arm of the paper only."""
     return f" (paper, {place})" if is_of_paper else ""
 
 
-class FoundRow(NamedTuple):
-    """A finding of the page, with the figure that shows it."""
-
-    level: Level
-    words: str
-    step: str
-    section: str  #: whose figure shows it; empty without one
-    panel: Panel | None  #: of the joint with the largest error that it names
-
-
-def found_rows(
-    results: Results, charts: Mapping[str, Sequence[Chart]], draw: Callable[[Chart], Panel]
-) -> list[FoundRow]:
-    """Return what is wrong or doubtful, the most consequential first; then remarks."""
-    rows: list[FoundRow] = []
-    for finding in results.judgement.worst_first:
-        if finding.level not in ("wrong", "doubtful"):
-            continue
-        section = picture_of(finding.check)
-        panel = None
-        shown = {row.section for row in rows}
-        if section not in shown:
-            joint = worst_joint(results, finding.joints)
-            panel = _panel_of(section, joint, charts, draw)
-        rows.append(FoundRow(finding.level, finding.words, finding.next_step, section, panel))
-    return rows + [FoundRow("doubtful", remark, "", "", None) for remark in results.remarks]
-
-
-def worst_joint(results: Results, joints: Sequence[int] = ()) -> int:
-    """Return the joint with the largest relative error of these, or of all, from 0."""
-    errors = np.nan_to_num([joint.relative or 0.0 for joint in results.judgement.joints])
-    return max(joints or range(len(errors)), key=lambda joint: errors[joint])
-
-
-def _panel_of(
-    section: str, joint: int, charts: Mapping[str, Sequence[Chart]], draw: Callable[[Chart], Panel]
-) -> Panel | None:
-    """Return a panel of a joint out of the figure of a section, None where it has no such."""
-    for chart in charts.get(_CHARTS.get(section, ""), ()):
-        if chart.joint == joint:
-            key = f"found-{chart.caption.key}"
-            return draw(replace(chart, caption=chart.caption._replace(key=key)))
-    return None
+def other_reasons(results: Results) -> list[str]:
+    """Return why a model is not good, in addition to what the verdict's sentence says."""
+    wrong = [finding for finding in results.judgement.findings if finding.level == "wrong"]
+    if len(wrong) != len(results.verdict.reasons):  # files of earlier versions
+        return list(results.verdict.reasons)
+    headline = fault_of(wrong)
+    if headline is None and wrong and not results.verdict.purposes:
+        headline = wrong[0]
+    return [finding.words for finding in wrong if finding is not headline]
 
 
 def joint_of(parameter: ParameterResult, joint_names: Sequence[str]) -> str:

@@ -13,6 +13,7 @@ from hil.report.interactive import chart_data, library
 from hil.report.rendering import environment, page_bytes, template_text
 from hil.results.servo_result import ServoResults
 from hil.results.servo_series import ServoSeries
+from identification.text import interval_text
 
 MEASURED: Final = Legend("measured", "measured", "--first", 1.6)
 COMMANDED: Final = Legend("commanded", "command", "--muted", 1.0, dashed=True)
@@ -99,6 +100,7 @@ def servo_page_bytes(results: ServoResults, series: Sequence[ServoSeries]) -> by
             for (name, charts), each in zip(figures.items(), series, strict=False)
             for held in [bool(each.contacts)]
         ],
+        "interval": interval_text,
         "legends": [
             legend
             for legend in LEGENDS

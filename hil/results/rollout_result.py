@@ -12,7 +12,7 @@ from pydantic import Field, ValidationError
 from hil.base.errors import InputError
 from hil.base.safe_input import read_text
 from hil.results.results import Frozen, Known
-from identification.text import percentage
+from identification.text import number, percentage
 
 ROLLOUT: Final = "rollout.json"
 JUDGED: Final = 2
@@ -101,9 +101,9 @@ class ServoResult(Frozen):
 
 
 def _with_deviation(parameter: ServoParameter) -> str:
-    if not parameter.determined:
+    if not parameter.determined or parameter.deviation is None:
         return "not determined"
-    return f"{parameter.value:.4g} ± {parameter.deviation:.2g}"
+    return f"{number(parameter.value, 4)} ± {number(parameter.deviation, 2)}"
 
 
 class RolloutResult(Frozen):
@@ -289,4 +289,4 @@ def milli(value: float | None) -> str:
     """Return a thousandth of the unit with three digits, a dash if it is unknown."""
     if value is None:
         return "-"
-    return f"{1e3 * value:.0f}" if abs(value) >= 1.0 else f"{1e3 * value:.3g}"
+    return f"{1e3 * value:.0f}" if abs(value) >= 1.0 else number(1e3 * value)

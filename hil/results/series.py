@@ -71,6 +71,8 @@ class ReportSeries:
     #: amplitude spectral density of the measured torque of the example (f, n) [N·m/√Hz]
     spectrum_measured: Array | None = None
     spectrum_residual: Array | None = None  #: of measured minus predicted torque (f, n)
+    #: recorded time stamps of the excitation, where its samples were given other times (c,)
+    clock_time: Array | None = None
 
     def __post_init__(self) -> None:
         n = self.excitation_position.shape[-1]
@@ -79,6 +81,7 @@ class ReportSeries:
             "example": len(self.example_time),
             "friction": len(self.friction_torque),
             "law": len(self.law_torque),
+            "clock": 0 if self.clock_time is None else len(self.clock_time),
             "spectrum": 0 if self.spectrum_frequency is None else len(self.spectrum_frequency),
         }
         for name, array in self.arrays.items():

@@ -55,6 +55,7 @@ from identification.rollout.servo_by_torque import (
     lead_of,
 )
 from identification.rollout.windows import STEP, Stretch, windows_of
+from identification.text import number
 
 PICTURE = "rollout.png"
 POLISHED = "polished.xml"
@@ -184,19 +185,19 @@ def _servo_of(model: IdentifiedModel, options: RolloutOptions) -> tuple[Position
         servo = PositionServo(
             np.broadcast_to(stated.kp, n), np.broadcast_to(stated.kd, n), stated.delay
         )
-        return servo, f"a servo as stated, delay {1e3 * servo.delay:.3g} ms"
+        return servo, f"a servo as stated, delay {number(1e3 * servo.delay)} ms"
     fitted = with_commands(prepared.sources.training, prepared.fitted)
     stretches, _ = recorded_stretches(arm.model, fitted, STEP)
     servo = identify_servo(stretches, STEP, arm.model.joint_names)
     gains = "; ".join(
-        f"{joint} {kp:.3g} {'N·m/rad' if turns else 'N/m'}"
+        f"{joint} {number(kp)} {'N·m/rad' if turns else 'N/m'}"
         for joint, kp, turns in zip(
             arm.model.joint_names, servo.kp, arm.model.chain.revolute, strict=True
         )
     )
     return servo, (
         f"a servo identified from the fitted motion (gains {gains}; delay"
-        f" {1e3 * servo.delay:.3g} ms)"
+        f" {number(1e3 * servo.delay)} ms)"
     )
 
 

@@ -15,6 +15,7 @@ from hil.results.servo_result import (
     ServoValue,
     ServoVerdict,
 )
+from identification.text import interval_text
 
 _GOOD: Final = 0.5
 """Share of the command's own error, up to which a simulated motion is of use: a quarter of what the
@@ -188,7 +189,7 @@ def whole(results: ServoResults) -> list[str]:
             value.joint,
             value.name,
             f"{value.value:.4g}",
-            f"{value.lower:.3g} to {value.upper:.3g}",
+            interval_text(value.lower, value.upper),
             value.unit,
             "" if value.determined else "not determined",
         )

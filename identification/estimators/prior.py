@@ -35,6 +35,7 @@ from identification.factor.factor import Factor, require_rows
 from identification.factor.normal_equations import Solution, solve_positive, solve_rows
 from identification.model.nominal_masses import without_masses
 from identification.model.robot import RobotModel
+from identification.text import number
 
 # Posterior over prior standard deviation of a parameter that is determined by the data, which then
 # gave three quarters of its information (inverse variance).
@@ -342,7 +343,7 @@ def with_prior(
     )
     method = f"weighted least squares with a Gaussian prior ({prior.origin}), posterior covariance"
     if design_effect > 1.0:
-        method += f", design effect {design_effect:.3g}"
+        method += f", design effect {number(design_effect)}"
     estimate = estimate_of(model.units, factor, solution, weights / design_effect, method)
     return PosteriorEstimate(
         estimate, prior.mean, prior.std, prior.origin, design_effect, np.zeros_like(prior.mean)
@@ -436,7 +437,7 @@ def _beyond_chance(
 
 def posterior_method(origin: str, design_effect: float, scatter: str) -> str:
     """Return the description of an estimate from a prior; `scatter` describes its covariance."""
-    size = f"{design_effect:.3g}"
+    size = number(design_effect)
     rows = "each row counts" if size == "1" else f"{size} rows count as one"
     return f"posterior of the prior ({origin}), {rows}; {scatter}"
 
@@ -549,7 +550,7 @@ def body_prior(
         reason = without_masses(model)
         if not reason:
             scale, _ = nominal_ratio(model, factor)
-            reason = f"the torque is {scale:.2g} times that of the bodies of the description"
+            reason = f"the torque is {number(scale, 2)} times that of the bodies of the description"
         origin = f"bodies of the size of the torque, as {reason}"
     for name, (value, spread) in (stated or {}).items():
         mean[names.index(name)] = value

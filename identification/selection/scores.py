@@ -32,6 +32,7 @@ from identification.model.robot import RobotModel
 from identification.selection.folds import FOLDS, Errors, Folds, PredictedRows, mean_error
 from identification.selection.settings import Choice, Settings, Strength
 from identification.signals.samples import Preprocessing, Samples
+from identification.text import number
 
 Rows = NDArray[np.bool_]
 
@@ -550,8 +551,8 @@ def _description(model: RobotModel, settings: Settings) -> tuple[str, ...]:
         ripple,
         f"torsion springs of {', '.join(springs)}" if springs else "no torsion spring",
         rows_of.get(how.exclude_rows or "", "by the friction law"),
-        f"delay of {1e3 * how.torque_delay:.3g} ms",
-        "no low-pass" if width is None else f"low-pass of {width:.3g} Hz, {how.torque_shape}",
+        f"delay of {number(1e3 * how.torque_delay)} ms",
+        "no low-pass" if width is None else f"low-pass of {number(width)} Hz, {how.torque_shape}",
         *settings.strength.describe(),
     )
 

@@ -6,7 +6,7 @@ import numpy as np
 
 from identification.signals.clock import UNIFORM, SampleTimes, TimeBase
 from identification.signals.row_faults import RowFault, RowFaultKind
-from identification.text import percentage
+from identification.text import duration_text, number, percentage
 
 
 def clock_lines(clock: TimeBase) -> list[str]:
@@ -26,9 +26,9 @@ def clock_lines(clock: TimeBase) -> list[str]:
     if gaps := clock.gaps - clock.pauses:
         lines.append(f"{gaps} gap{'s' if gaps > 1 else ''}")
     if clock.pauses == 1:
-        lines.append(f"cut at a pause of {clock.longest_pause:.4g} s")
+        lines.append(f"cut at a pause of {duration_text(clock.longest_pause)}")
     elif clock.pauses:
-        longest = f"{clock.longest_pause:.4g} s"
+        longest = f"{duration_text(clock.longest_pause)}"
         lines.append(f"cut at {clock.pauses} pauses, the longest of {longest}")
     return lines
 
@@ -57,12 +57,12 @@ def time_lines(times: SampleTimes) -> list[str]:
 
 def fault_words(fault: RowFault) -> str:
     """Return what is wrong with rows, and what was done about it."""
-    at = f"at {fault.time:.4g} s"
+    at = f"at {number(fault.time, 4)} s"
     match fault.kind:
         case RowFaultKind.FROZEN:
             return (
-                f"the log repeats one row for {fault.duration:.3g} s {at} while the arm moved on: "
-                f"{fault.rows} rows were left out"
+                f"the log repeats one row for {duration_text(fault.duration)} {at} while the arm"
+                f" moved on: {fault.rows} rows were left out"
             )
         case RowFaultKind.WRITTEN_TWICE:
             return f"{fault.rows} rows {at} were written before, bit for bit, and were left out"

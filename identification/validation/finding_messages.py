@@ -19,7 +19,7 @@ from identification.hypotheses.column_search import UNSEEN
 from identification.signals.clock import SampleTimes
 from identification.signals.messages import fault_words, time_lines
 from identification.signals.row_faults import RowFault
-from identification.text import joined, percentage
+from identification.text import joined, number, percentage
 from identification.validation.consistency import ConsistencyCheck, ImpossibleParameter
 from identification.validation.finding import (
     Finding,
@@ -214,9 +214,12 @@ class _Text(string.Formatter):
             case float() if "pc" in format_spec:
                 decimals = int(format_spec[-1])
                 return percentage(value, decimals, signed=format_spec.startswith("+"))
+            case float() if format_spec in _SIGNIFICANT:
+                return number(value, _SIGNIFICANT[format_spec])
         return format(value, format_spec)
 
 
+_SIGNIFICANT: Final = {".2g": 2, ".3g": 3}  # digits by format
 _SIGN: Final = "direction of axes"
 _ORDER: Final = "order of joints"
 _COUPLED_ANGLES: Final = "coupled angles"

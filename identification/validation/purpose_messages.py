@@ -6,7 +6,7 @@ import math
 from collections.abc import Sequence
 from typing import Final
 
-from identification.text import percentage
+from identification.text import number, percentage
 from identification.validation.purpose import NoFigure, Purpose, PurposeName
 
 TITLES: Final[dict[PurposeName, str]] = {
@@ -76,7 +76,7 @@ def figure(purpose: Purpose, joints: Sequence[str]) -> str:
             return _gravity(purpose, joints)
         case "simulation":
             horizon = purpose.references["horizon"]
-            return f"flange {1e3 * purpose.figure:.2g} mm off after {horizon:g} s"
+            return f"flange {number(1e3 * purpose.figure, 2)} mm off after {horizon:g} s"
         case "parameters":
             roughly, unknown = (int(purpose.references[name]) for name in ("roughly", "not"))
             return f"{int(purpose.figure)} known to 10 %, {roughly} to 50 %, {unknown} not"
@@ -121,9 +121,9 @@ def requirement(purpose: Purpose) -> str:
         case "gravity":
             return "off by less than dry friction"
         case "simulation":
-            return f"at most {1e3 * purpose.limit:.3g} mm"
+            return f"at most {number(1e3 * purpose.limit)} mm"
         case _:
-            return f"at most {purpose.limit:.3g} {purpose.unit}"
+            return f"at most {number(purpose.limit)} {purpose.unit}"
 
 
 def _decimals(share: float) -> int:

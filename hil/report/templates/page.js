@@ -62,11 +62,11 @@
 
   document.querySelectorAll("table").forEach(addCopyButton);
 
-  /* Paper cannot be unfolded. The appendix is printed if it is open: it is most of the pages. */
+  /* Paper cannot be unfolded. Appendix and essential parameters, most of the pages, are printed if they are open. */
 
   var unfolded = [];
   window.addEventListener("beforeprint", function () {
-    unfolded = Array.prototype.slice.call(document.querySelectorAll("details:not([open]):not(#appendix)"));
+    unfolded = Array.prototype.slice.call(document.querySelectorAll("details:not([open]):not(#appendix):not(.essential)"));
     unfolded.forEach(function (part) { part.open = true; });
   });
   window.addEventListener("afterprint", function () {

@@ -927,7 +927,7 @@ ERRORS = {
     "no velocity": ({"velocity": 0.0}, "does not follow its position"),
     "torque": ({"torque": 1000.0}, "its limit in the URDF is 150 N·m (or N): check its unit"),
     "slow clock": ({"clock": 1e3}, "0.1 samples per second are unusual"),
-    "fast clock": ({"clock": 1e-3}, "1e+05 samples per second are unusual"),
+    "fast clock": ({"clock": 1e-3}, "100000 samples per second are unusual"),
     "order": (
         {"order": (1, 2, 0, 3, 4, 5)},
         "in the order shoulder_lift_joint, elbow_joint, shoulder_pan_joint, wrist_1_joint, "

@@ -19,7 +19,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from matplotlib.image import imread
 
-from hil.report import figures, numbers, page
+from hil.report import figures, finding_pictures, numbers, page
 from hil.report.chart import Caption, Chart, Plot, Trace, thinned
 from hil.report.interactive import chart_data, encoded
 from hil.report.page import report_bytes
@@ -30,6 +30,7 @@ from hil.results.series import ReportSeries, SeriesError
 from identification.excitation import CRITERIA, METHODS
 from identification.excitation.criteria import Criterion
 from identification.selection.settings import Choice
+from identification.validation.finding_messages import SENTENCES
 from identification.validation.purpose import Purpose
 from sim_fixtures.ns16 import N_ESSENTIAL
 from tests.hil.report.pages import (
@@ -309,7 +310,56 @@ class TestPage:
             judgement["findings"] = [finding | {"joints": named}]
             html = render(make_results(judgement=judgement))
             section = html[html.index('<ol class="found">') :].split("</ol>")[0]
-            assert f"{shown} in torque" in Page(section).text
+            assert f"{shown} : measured and predicted torque" in Page(section).text
+
+    @pytest.mark.parametrize("check", sorted({each.check for each in SENTENCES.values()}))
+    def test_every_finding_has_a_picture_or_a_section(self, check):
+        if check != "{change:check}":  # of a sign, an order or an angle
+            assert finding_pictures.picture_of(check, "") is not None
+
+    @pytest.mark.parametrize(
+        ("check", "key", "what"),
+        [
+            ("torque constant", "", "measured torque over the torque of the identified model"),
+            ("scale of the torque", "", "measured torque over the torque of the nominal model"),
+            ("friction over time", "", "friction over velocity, first third"),
+            ("friction law", "", "friction over velocity"),
+            ("outliers", "", "torque of held-out motion"),
+            ("zeros", "", "mean residual over position"),
+            ("clock", "retimed", "intervals between time stamps"),
+        ],
+    )
+    def test_a_finding_has_the_picture_that_shows_it(self, check, key, what):
+        series = replace(make_series(), clock_time=np.array([0.0, 0.01, 0.03, 0.04]))
+        finding = {"check": check, "level": "doubtful", "words": "it is", "key": key}
+        html = render(make_results(judgement=_judgement() | {"findings": [finding]}), series)
+        section = html[html.index('<ol class="found">') :].split("</ol>")[0]
+        assert what in Page(section).text
+        assert section.count("<svg") == 1
+
+    def test_a_picture_is_shown_once(self):
+        judgement = _judgement()
+        finding = {"check": "generalisation", "level": "doubtful", "words": "it grew"}
+        same = {"check": "delay", "level": "doubtful", "words": "it lags"}
+        judgement["findings"] = [finding, same]
+        section = render(make_results(judgement=judgement))
+        section = section[section.index('<ol class="found">') :].split("</ol>")[0]
+        assert section.count("<svg") == 1
+        assert "shown in torque" in Page(section).text
+
+    def test_reasons_do_not_repeat_the_sentence_of_the_verdict(self):
+        words = ["2 kg more", "the error is large"]
+        findings = [
+            {"check": "load", "level": "wrong", "words": words[0], "role": "cause"},
+            {"check": "overall", "level": "wrong", "words": words[1], "role": "symptom"},
+        ]
+        line = "The model must not be relied on: 2 kg more."
+        verdict = {"good": False, "line": line, "reasons": words, "warnings": []}
+        html = render(
+            make_results(verdict=verdict, judgement=_judgement() | {"findings": findings})
+        )
+        section = html[html.index('class="verdict') :].split("</section>")[0]
+        assert re.findall(r"<li>(.*?)</li>", section) == [words[1]]
 
     def test_ranks_findings_by_role_and_by_what_they_explain(self):
         found = {
