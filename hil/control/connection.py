@@ -148,42 +148,78 @@ class StartTimeout:
         return None
 
 
-def waiting_text(state: State, received: str) -> str:
-    """Return what keeps a controller from moving, with a remedy; "" while it is getting ready.
+@dataclass(frozen=True)
+class ControllerWords:
+    """What to do at a controller that is not ready.
 
-    `received` is what came from a controller without a session.
+    Attributes:
+        begin, again: to have it begin a session, and one more.
+        restart: what helps if it does neither.
+        no_drive: that the arm has no drive.
+        drive_on: the state that it lacks then.
+        switch_on: what an operator does about it.
     """
-    match state:
-        case State.SYNC:
-            return f"{received}; start its Open program"
-        case State.DRIVE_OFF | State.FAULTED:
-            return "its drive is off; switch it on"
-        case State.ENDED:
-            return "it has ended its session; start its Open program again"
-        case _:
-            return ""
+
+    begin: str
+    again: str
+    restart: str
+    no_drive: str
+    drive_on: str
+    switch_on: str
+
+    def waiting(self, state: State, received: str) -> str:
+        """Return what keeps the controller from moving, with a remedy; "" while it gets ready.
+
+        `received` is what came from a controller without a session.
+        """
+        match state:
+            case State.SYNC:
+                return f"{received}; {self.begin}"
+            case State.DRIVE_OFF | State.FAULTED:
+                return f"{self.no_drive}; {self.switch_on}"
+            case State.ENDED:
+                return f"it has ended its session; {self.again}"
+            case _:
+                return ""
+
+    def not_ready(self, state: State, waited: float, why_off: str = "") -> ControllerError:
+        """Return the error of a controller that was not ready for a motion after `waited` s.
+
+        `why_off` is why this PC had its drive switched off, or "".
+        """
+        after = f"within {waited:.3g} s"
+        match state:
+            case State.SYNC:
+                problem = (
+                    f"did not begin a session {after} (state SYNC): it is silent, or still in one "
+                    f"that began before this program; {self.restart} and try again"
+                )
+            case State.ENDED:
+                problem = f"ended the session {after} before its {self.drive_on}"
+                problem += f"; {self.restart} and try again"
+            case _:
+                because = f": {why_off}" if why_off else ""
+                problem = f"was not ready {after} (state {state.name}): {self.no_drive}{because}; "
+                problem += f"{self.switch_on} and try again"
+        return ControllerError(f"the controller {problem}")
 
 
-def not_ready(state: State, waited: float, why_off: str = "") -> ControllerError:
-    """Return the error of a controller that was not ready for a motion after `waited` s.
-
-    `why_off` is why this PC had its drive switched off, or "".
-    """
-    after = f"within {waited:.3g} s"
-    restart = "restart the program on the controller"
-    match state:
-        case State.SYNC:
-            problem = (
-                f"did not begin a session {after} (state SYNC): it is silent, or still in one that "
-                f"began before this program; {restart} and try again"
-            )
-        case State.ENDED:
-            problem = f"ended the session {after} before its drive was on; {restart} and try again"
-        case _:
-            because = f": {why_off}" if why_off else ""
-            problem = f"did not reach drive-on {after} (state {state.name}){because}; switch the"
-            problem += " drive on and try again"
-    return ControllerError(f"the controller {problem}")
+C4G_WORDS: Final = ControllerWords(
+    begin="start its Open program",
+    again="start its Open program again",
+    restart="restart the program on the controller",
+    no_drive="its drive is off",
+    drive_on="drive was on",
+    switch_on="switch it on",
+)
+UR_WORDS: Final = ControllerWords(
+    begin="make sure that it is on and its RTDE enabled (Settings, Security, Services)",
+    again="run the same command again",
+    restart="switch the controller off and on",
+    no_drive="the arm is off, held by its brakes, or stopped",
+    drive_on="arm ran",
+    switch_on="end the stop, switch the arm on, release its brakes at the pendant (hil does not)",
+)
 
 
 def described(spec: ArchiveSpec, connection: Connection) -> ArchiveSpec:

@@ -1,8 +1,9 @@
 """Kill the processes of a real campaign at random moments: `python -m tests.process_death`.
 
-Each round runs a short campaign over loopback UDP, kills one to three of its processes by SIGKILL,
-and checks that the arm came to rest, open mode was left, every recording is readable, and the next
-run completes the campaign. The number of a round is its seed.
+Each round runs a short campaign over real sockets, of a C4G or with `--link rtde` of a UR, kills
+one to three of its processes by SIGKILL, and checks that the arm came to rest, open mode was left,
+every recording is readable, and the next run completes the campaign. The number of a round is its
+seed.
 
     python -m tests.process_death --rounds 1000 --jobs 2 --journal deaths.jsonl
     python -m tests.process_death --rounds 1 --start 417      # this one again
@@ -27,7 +28,7 @@ from collections import Counter
 from collections.abc import Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from pathlib import Path
-from typing import Any
+from typing import Any, get_args
 
 # Before numpy is imported: the machine is small.
 for _variable in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):
@@ -36,10 +37,10 @@ for _variable in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):
 from tests.arguments import at_least_one, parser_of, whole_number  # noqa: E402
 from tests.faults import Strikes, parse_strikes  # noqa: E402
 from tests.journal import Journal, JournalError, rounds  # noqa: E402
-from tests.process_death.controller import die_with_parent  # noqa: E402
 from tests.process_death.laws import PROMISED  # noqa: E402
+from tests.process_death.page import die_with_parent  # noqa: E402
 from tests.process_death.play import DEFECTS, Stage, planted, play  # noqa: E402  # noqa: E402
-from tests.process_death.rounds import VICTIMS, round_of  # noqa: E402
+from tests.process_death.rounds import VICTIMS, LinkName, round_of  # noqa: E402
 
 _stage: Stage | None = None  # What rounds share; their processes are forked from one that has it
 
@@ -50,6 +51,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     option = parser.add_argument
     option("--rounds", type=whole_number, default=50, help="how many (50)")
     option("--start", type=whole_number, default=0, help="number of the first (0)")
+    option("--link", choices=get_args(LinkName), default="udp", help="of the campaign (udp)")
     option("--jobs", type=at_least_one, default=1, help="rounds at a time (1)")
     option("--only", choices=VICTIMS, help="those rounds in which this process dies first")
     option("--script", type=Path, metavar="FILE", help="script in place of those of the rounds")
@@ -62,13 +64,16 @@ def main(arguments: Sequence[str] | None = None) -> int:
         signal.signal(number, signal.default_int_handler)
     try:
         strikes = None if given.script is None else script_of(given.script)
-        recorded = rounds(given.journal, "broken", "seconds", "processor")
+        recorded = rounds(given.journal, "link", "broken", "seconds", "processor")
         journal = Journal(given.journal)
     except (JournalError, ValueError) as error:
         sys.stderr.write(f"error: {error}\n")
         return 2
     numbers = range(given.start, given.start + given.rounds)
     wanted = [n for n in numbers if given.only in (None, round_of(n).strikes.victims[0])]
+    if other := {result["link"] for result in recorded.values()} - {given.link}:
+        sys.stderr.write(f"error: {given.journal} is of {other.pop()}; name another --journal\n")
+        return 2
     results = [recorded[n] for n in wanted if n in recorded]
     missing = [n for n in wanted if n not in recorded]
     began = time.monotonic()
@@ -76,7 +81,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     interrupted = False
     try:
         with journal:
-            for result in _played(missing, given.jobs, folder, given.defect, strikes):
+            for result in _played(missing, given.link, given.jobs, folder, given.defect, strikes):
                 results.append(result)
                 journal.add(**result)
                 _print(result, len(results), len(wanted), folder, quiet=given.json)
@@ -105,6 +110,7 @@ def script_of(path: Path) -> Strikes:
 
 def _played(
     numbers: Sequence[int],
+    link: LinkName,
     jobs: int,
     folder: Path,
     defect: str | None,
@@ -116,7 +122,7 @@ def _played(
     if sys.dont_write_bytecode:  # else each process compiles everything
         os.environ.pop("PYTHONDONTWRITEBYTECODE", None)
         os.environ["PYTHONPYCACHEPREFIX"] = str(folder / "compiled")
-    _stage = Stage.set_up(folder, None if defect is None else planted(defect, folder))
+    _stage = Stage.set_up(folder, link, None if defect is None else planted(defect, folder))
     context = multiprocessing.get_context("fork")
     with ProcessPoolExecutor(jobs, mp_context=context, initializer=die_with_parent) as pool:
         try:
@@ -139,7 +145,8 @@ def _print(result: dict[str, Any], done: int, of: int, folder: Path, *, quiet: b
         lines = [
             f"BROKEN {result['what']}",
             *(f"  {text}" for text in broken),
-            f"  again: python -m tests.process_death --rounds 1 --start {result['round']}",
+            f"  again: python -m tests.process_death --link {result['link']} --rounds 1"
+            f" --start {result['round']}",
             f"  kept: {folder}/round_{result['round']:05d}",
         ]
         sys.stderr.write("\n".join(lines) + "\n")

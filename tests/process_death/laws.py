@@ -25,7 +25,7 @@ from tests.laws.errors import names_one
 from tests.laws.evidence import ArchiveFile, Evidence, entries_of
 from tests.laws.motions import on_path
 from tests.laws.second_reader import read
-from tests.process_death.controller import REST, STILL, at_rest
+from tests.process_death.page import REST, STILL, at_rest
 from tests.process_death.rig import Death, Seen
 
 Records = NDArray[np.void]

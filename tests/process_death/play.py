@@ -12,23 +12,21 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Final
 
-from drivers.transports.simulated import SimulatedTransport
 from hil.base.progress import Silent
-from hil.campaign import Campaign, CampaignPlan, Stop, VirtualLink
+from hil.campaign import Campaign, CampaignPlan, Stop
 from hil.campaign.identified_campaign import identify_campaign
 from hil.campaign.plan import design
 from hil.cell import Cell
-from hil.control.simulated_cell import simulated_controller
 from hil.pipeline.options import FIXED
 from identification import Estimate
 from tests.faults import Strikes
-from tests.hil.fast_cell import fast_cell
 from tests.laws.evidence import Evidence, entries_of
 from tests.laws.manifests import Entry
 from tests.laws.table import Scenario, judged
+from tests.process_death.ends import ENDS
 from tests.process_death.laws import evidence_of, lost_cycles, torn
-from tests.process_death.rig import ARCHIVE, EXCHANGE, made, run
-from tests.process_death.rounds import Round, round_of
+from tests.process_death.rig import ARCHIVE, EXCHANGE, run
+from tests.process_death.rounds import LinkName, Round, round_of
 
 
 @dataclass(frozen=True)
@@ -75,45 +73,33 @@ def planted(name: str, folder: Path) -> Path:
     return there
 
 
-SHORT: Final = {
-    "repetitions": 2,
-    "validation_runs": 1,
-    "n_via": 2,
-    "standstill_s": 0.1,
-    "settle_s": 0.15,
-    "candidates": 6,
-}  # Of the cell's `[campaign]`: a campaign of four seconds
-NOISE: Final = 0.004
-"""A, of the simulated currents. With the cell's own the arm trembles at rest about as fast as what
-still counts as standstill, and some runs are refused for it without anybody having died."""
 ESTIMATED: Final = 3  # In every so many rounds the campaign is estimated from when it is complete
 
 
 @dataclass(frozen=True, eq=False)
 class Stage:
     folder: Path  # of the rounds
-    cell: Cell  # of the small arm
+    link: LinkName  # of the campaign
+    cell: Cell  # of the arm
     plan: CampaignPlan  # of its campaign
     undisturbed: Estimate  # of an undisturbed run
     planted: Path | None = None  # folder of a planted defect, None for none
 
     @classmethod
-    def set_up(cls, folder: Path, planted: Path | None = None) -> Stage:
+    def set_up(cls, folder: Path, link: LinkName, planted: Path | None = None) -> Stage:
         """Design the campaign, and run it undisturbed in virtual time."""
-        cell = fast_cell(folder, **SHORT).with_values({"simulation.current_noise": NOISE})
+        ends = ENDS[link]
+        cell = ends.cell(folder)
         plan = design(cell, Silent())
-        campaign = made(folder / "undisturbed", cell, plan)
-        finish_in_virtual_time(campaign, seed=0)
-        return cls(folder, cell, plan, estimate_of(campaign), planted)
+        campaign = ends.made(folder / "undisturbed", cell, plan)
+        finish_in_virtual_time(campaign, link, seed=0)
+        return cls(folder, link, cell, plan, estimate_of(campaign), planted)
 
 
-def finish_in_virtual_time(campaign: Campaign, seed: int) -> None:
+def finish_in_virtual_time(campaign: Campaign, link: LinkName, seed: int) -> None:
     """Run what is missing, with the arm jogged home."""
-    cell = campaign.cell
-    at_home = cell.with_values({"simulation.initial_deg": cell.campaign.home_deg})
-    controller = simulated_controller(at_home, seed=seed)
     Campaign.open(campaign.folder.root).run(
-        VirtualLink.over(SimulatedTransport(controller), cell, finish=controller.finish),
+        ENDS[link].in_virtual_time(campaign.cell, seed),
         Stop(),
         Silent(),
         durable=False,
@@ -131,15 +117,15 @@ def play(stage: Stage, number: int, strikes: Strikes | None = None) -> dict[str,
 
     The folder remains if a law was broken.
     """
-    played = round_of(number)
+    played = round_of(number, stage.link)
     began = time.monotonic()
     played = played if strikes is None else replace(played, strikes=strikes)
     used = os.times()
     folder = stage.folder / f"round_{number:05d}"
     shutil.rmtree(folder, ignore_errors=True)
     folder.mkdir(parents=True)
-    result: dict[str, Any] = {"round": number, "what": str(played)}
-    campaign = made(folder, stage.cell, stage.plan)
+    result: dict[str, Any] = {"round": number, "link": stage.link, "what": str(played)}
+    campaign = ENDS[stage.link].made(folder, stage.cell, stage.plan)
 
     def killed() -> Evidence:
         with _error_in(folder):
@@ -195,7 +181,7 @@ def resumed(campaign: Campaign, played: Round, folder: Path) -> Scenario:
                 seen = run(campaign, played, None, folder / "report-again.json")
                 of_run = evidence_of(seen, campaign, earlier, undisturbed=True)
             else:
-                finish_in_virtual_time(campaign, seed=played.seed)
+                finish_in_virtual_time(campaign, played.link, seed=played.seed)
                 of_run = Evidence()
             return completed_evidence(campaign, before, of_run)
 

@@ -6,7 +6,6 @@ from outside: by their memory, their files, and the controller's account.
 
 from __future__ import annotations
 
-import errno
 import json
 import mmap
 import os
@@ -21,7 +20,6 @@ from contextlib import suppress
 from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
-from socket import AF_INET, SOCK_DGRAM, socket
 from typing import Any, Final, Self
 
 import numpy as np
@@ -33,19 +31,16 @@ from drivers.exchange.control import SharedState
 from drivers.states import State
 from hil.base.errors import HilError
 from hil.base.progress import Silent
-from hil.campaign import Campaign, CampaignPlan, stop_on_interrupt
-from hil.cell import Cell
-from hil.control.simulator_process import LOOPBACK
+from hil.campaign import Campaign, stop_on_interrupt
 from tests.faults import StrikeKind, Strikes, Trigger, Victim
-from tests.hil.loopback import on_loopback
 from tests.laws.manifests import Entry, manifest_of
-from tests.process_death.controller import Page, Rows, at_rest, forked, serve
+from tests.process_death.ends import ENDS
+from tests.process_death.page import Page, Rows, at_rest, forked
 from tests.process_death.rounds import Round
 
 EXCHANGE: Final = "drivers.exchange"
 ARCHIVE: Final = "hil.archive.process"
 MODULES: Final[dict[Victim, str]] = {"exchange": EXCHANGE, "archive": ARCHIVE}
-JOINTS: Final = 2
 _RING, _CONTROL = 2, 4  # places in the exchange's command line, behind the module's name
 
 
@@ -89,7 +84,8 @@ def _descriptor(exchange: int, place: int) -> int:
 class Memory:
     """Shared memory of an exchange, also after its death; OSError if it is gone."""
 
-    def __init__(self, exchange: int) -> None:
+    def __init__(self, exchange: int, joints: int) -> None:
+        self._joints = joints
         self._ring = _descriptor(exchange, _RING)
         descriptor = _descriptor(exchange, _CONTROL)
         self.control = SharedState(descriptor)
@@ -108,7 +104,7 @@ class Memory:
 
     def records(self) -> NDArray[np.void]:
         """All records of the session; none was overwritten."""
-        return RingReader(self._ring, JOINTS, acknowledge=False).drain()
+        return RingReader(self._ring, self._joints, acknowledge=False).drain()
 
     def close(self) -> None:
         os.close(self._ring)
@@ -172,8 +168,12 @@ class Watched:
     ) -> None:
         self.campaign = campaign
         self.played = played
-        self.page = Page()
-        controller = forked(lambda: serve(campaign.cell, played, self.page))
+        self.ends = ends = ENDS[played.link]
+        self.page = Page(ends.joints)
+        controller = forked(lambda: ends.serve(campaign.cell, played, self.page))
+        deadline = time.monotonic() + PATIENCE
+        while not self.page.serving and time.monotonic() < deadline:
+            time.sleep(LOOK)
         supervisor = forked(lambda: supervise(campaign.folder.root, report, planted))
         self.pids: dict[Victim, int] = {"supervisor": supervisor, "controller": controller}
         self.status: dict[Victim, int] = {}
@@ -227,7 +227,7 @@ class Watched:
                 self.page.exchange = self.pids.get("exchange", 0)
         if self.memory is None and "exchange" in self.pids:
             with suppress(OSError):
-                self.memory = Memory(self.pids["exchange"])
+                self.memory = Memory(self.pids["exchange"], self.ends.joints)
         if self.memory is not None:
             self._behind.append(self.memory.behind)
         if not self.played.loops and self._left_alone():
@@ -334,11 +334,6 @@ def _kill(pid: int) -> None:
         os.kill(pid, signal.SIGKILL)
 
 
-def made(folder: Path, cell: Cell, plan: CampaignPlan) -> Campaign:
-    """A campaign in a new folder, on a port of the loopback device that is free."""
-    return Campaign.create(folder / "campaign", on_loopback(cell), plan)
-
-
 def supervise(campaign: Path, report: Path, planted: Path | None) -> int:
     """Run what is missing; return the exit status, and write the result to `report`."""
     os.setsid()
@@ -418,7 +413,8 @@ def run(
         watched.wait("supervisor", "exchange", "archive")
         rows = watched.rest()
         memory = watched.memory
-        records = np.zeros(0, cycle_dtype(JOINTS)) if memory is None else memory.records()
+        nothing = np.zeros(0, cycle_dtype(watched.ends.joints))
+        records = nothing if memory is None else memory.records()
         watched.page.abandoned = 1
         watched.wait("controller")
         killed = "supervisor" in {death_of.victim for death_of in deaths}
@@ -430,16 +426,5 @@ def run(
             records,
             entered,
             left=watched.left(),
-            port_in_use=_port_in_use(campaign.cell.controller.port or 0),
+            port_in_use=watched.ends.port_in_use(campaign.cell),
         )
-
-
-def _port_in_use(port: int) -> bool:
-    with socket(AF_INET, SOCK_DGRAM) as probe:
-        try:
-            probe.bind((LOOPBACK, port))
-        except OSError as error:
-            if error.errno != errno.EADDRINUSE:
-                raise
-            return True
-    return False

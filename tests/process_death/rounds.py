@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import random
 from dataclasses import dataclass
-from typing import Final
+from typing import Final, Literal
 
 from drivers.states import State
 from sim_fixtures.settings import WHILE_SILENT, WhileSilent
 from tests.faults import Moment, Strikes, Trigger, Victim
 
+LinkName = Literal["udp", "rtde"]
+"""Links whose processes are killed: of a C4G, and of a UR."""
 VICTIMS: Final[tuple[Victim, ...]] = ("exchange", "archive", "supervisor", "controller")
 OVER_SOCKETS: Final = 10
 """Every so many rounds the campaign is finished over sockets again, and not in virtual time."""
@@ -20,7 +22,8 @@ MINUTES: Final = 0.1
 """Share of the early deaths of a controller that are played: a supervisor waits a minute for a
 drive to be switched on."""
 CYCLES: Final = 150  # Cycles within which the controller has begun, and switched its drive on
-LONGEST: Final = 0.8  # s that the longest motion of the small cell takes
+LONGEST: Final[dict[LinkName, float]] = {"udp": 0.8, "rtde": 1.5}
+"""Time that the longest motion of the cell takes, s."""
 REPORTED: Final = 0.07  # s between two moments at which the exchange reports the motion time
 ARCHIVES: Final = 6
 """Archives of a whole campaign: two moves, standstill, two repetitions, validation."""
@@ -31,6 +34,7 @@ STATES: Final = (State.CLOSED, State.OPENING, State.OPEN, State.EXITING)
 class Round:
     """What happens in one round."""
 
+    link: LinkName  # of the campaign
     number: int  # of the round, and its seed
     strikes: Strikes  # who is killed, and when
     over_sockets: bool  # whether the campaign is finished over sockets, with a new controller
@@ -45,21 +49,23 @@ class Round:
         return 1 + self.number
 
     def __str__(self) -> str:
-        return f"round {self.number}: {', '.join(self.strikes.lines)}"
+        return f"{self.link} round {self.number}: {', '.join(self.strikes.lines)}"
 
 
-def round_of(number: int) -> Round:
+def round_of(number: int, link: LinkName = "udp") -> Round:
     """Return the round of that number; the first victims alternate, everything else is random."""
     chance = random.Random(f"process death {number}")
+    longest = LONGEST[link]
     first = VICTIMS[number % len(VICTIMS)]
     others = [victim for victim in VICTIMS if victim != first]
     more = chance.choices((0, 1, 2), (8, 2, 1))[0]
     victims = (first, *chance.sample(others, more))
-    trigger = _trigger(chance)
+    trigger = _trigger(chance, longest)
     while "controller" in victims and trigger.moment in EARLY and chance.random() > MINUTES:
-        trigger = _trigger(chance)
+        trigger = _trigger(chance, longest)
     apart = chance.choice((0.0, chance.uniform(0.0, 0.05), chance.uniform(0.0, 0.6)))
     return Round(
+        link=link,
         number=number,
         strikes=Strikes("kill", trigger, victims, apart if more else 0.0),
         over_sockets=number % OVER_SOCKETS == 0,
@@ -70,7 +76,7 @@ def round_of(number: int) -> Round:
     )
 
 
-def _trigger(chance: random.Random) -> Trigger:
+def _trigger(chance: random.Random, longest: float) -> Trigger:
     moment: Moment = chance.choices(
         ("start", "cycle", "motion", "archive", "entered", "state"), (1, 1, 8, 4, 3, 5)
     )[0]
@@ -79,7 +85,7 @@ def _trigger(chance: random.Random) -> Trigger:
     if moment == "cycle":
         return Trigger(moment, chance.randrange(CYCLES), chance.uniform(0.0, 0.002))
     if moment == "motion":
-        way = chance.uniform(0.0, LONGEST)
+        way = chance.uniform(0.0, longest)
         return Trigger(moment, chance.randint(1, ARCHIVES), chance.uniform(0.0, REPORTED), way)
     if moment == "archive":
         return Trigger(moment, chance.randint(1, ARCHIVES), chance.expovariate(10.0))

@@ -19,12 +19,11 @@ from hil.base.progress import Silent
 from hil.campaign.plan import design
 from sim_fixtures import Phase
 from tests.faults import Moment, StrikeKind, Victim, parse_strikes
-from tests.hil.fast_cell import fast_cell
 from tests.laws.evidence import Evidence
 from tests.laws.second_reader import Archived
 from tests.laws.table import LAWS, broken, judged
 from tests.messages import ARCHIVE_SILENT, NOTHING_RECEIVED
-from tests.process_death.controller import ROW
+from tests.process_death.ends import ENDS
 from tests.process_death.laws import (
     PROMISED,
     Processes,
@@ -33,13 +32,15 @@ from tests.process_death.laws import (
     file_of,
     lost_cycles,
 )
-from tests.process_death.play import DEFECTS, NOISE, SHORT, resumed
-from tests.process_death.rig import Death, Seen, made, run
-from tests.process_death.rounds import VICTIMS, round_of
+from tests.process_death.page import row_dtype
+from tests.process_death.play import DEFECTS, resumed
+from tests.process_death.rig import Death, Seen, run
+from tests.process_death.rounds import VICTIMS, LinkName, round_of
 
 pytestmark = pytest.mark.safety
 
 CYCLES = 3000
+ROW = row_dtype(2)
 
 
 def seen(*victims: Victim, text: str = "", behind: int = 0) -> Seen:
@@ -158,18 +159,24 @@ def process_death(*options: str) -> tuple[dict[str, Any], str]:
     return report, done.stderr
 
 
-@pytest.mark.parametrize("first", [0, 25])
-def test_the_arm_rests_and_the_campaign_is_completed(first: int) -> None:
+@pytest.mark.parametrize(
+    ("link", "first", "count"), [("udp", 0, 25), ("udp", 25, 25), ("rtde", 0, 4)]
+)
+def test_the_arm_rests_and_the_campaign_is_completed(
+    link: LinkName, first: int, count: int
+) -> None:
     """Whoever is killed; two rounds at a time: a busy machine stops runs by their heartbeats."""
-    report, errors = process_death("--start", str(first), "--rounds", "25", "--jobs", "2")
-    assert report["ran"] == 25
+    where = ("--link", link, "--start", str(first), "--rounds", str(count))
+    report, errors = process_death(*where, "--jobs", "2")
+    assert report["ran"] == count
     assert not report["failed"], errors
-    assert report["nobody_killed"] <= 6, "the rounds must come to their kills"
+    assert report["nobody_killed"] <= count // 4, "the rounds must come to their kills"
 
 
-def test_rounds_are_known_by_number_and_kill_all_at_all_moments() -> None:
-    assert round_of(417) == round_of(417)
-    rounds = [round_of(number) for number in range(1000)]
+@pytest.mark.parametrize("link", ENDS)
+def test_rounds_are_known_by_number_and_kill_all_at_all_moments(link: LinkName) -> None:
+    assert round_of(417, link) == round_of(417, link)
+    rounds = [round_of(number, link) for number in range(1000)]
     assert len({str(played) for played in rounds[:200]}) > 190
     assert [played.strikes.victims[0] for played in rounds[:4]] == list(VICTIMS)
     assert all(len(set(played.strikes.victims)) == len(played.strikes.victims) for played in rounds)
@@ -218,6 +225,7 @@ def round_in_which(victim: Victim) -> int:
     raise AssertionError("no round is like that")
 
 
+@pytest.mark.parametrize("link", ENDS)
 @pytest.mark.parametrize(
     ("victim", "kind", "status", "message"),
     [
@@ -233,12 +241,12 @@ def round_in_which(victim: Victim) -> int:
     ],
 )
 def test_what_is_no_kill_brings_the_arm_to_rest_too(
-    victim: Victim, kind: StrikeKind, status: int, message: str, tmp_path: Path
+    link: LinkName, victim: Victim, kind: StrikeKind, status: int, message: str, tmp_path: Path
 ) -> None:
     """Ctrl-C, a terminal that is closed, an archive process that hangs, a full disk."""
-    cell = fast_cell(tmp_path, **SHORT).with_values({"simulation.current_noise": NOISE})
-    campaign = made(tmp_path, cell, design(cell, Silent()))
-    played = replace(round_of(round_in_which(victim)), over_sockets=False)
+    cell = ENDS[link].cell(tmp_path)
+    campaign = ENDS[link].made(tmp_path, cell, design(cell, Silent()))
+    played = replace(round_of(round_in_which(victim), link), over_sockets=False)
     strikes = replace(played.strikes, kind=kind)
     seen = run(campaign, played, strikes, tmp_path / "report.json")
     assert broken(evidence_of(seen, campaign)) == []

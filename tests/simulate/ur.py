@@ -37,7 +37,7 @@ _AT_CONTROLLER: Final[Mapping[str, str]] = {
     "stop": "", "safeguard": "", "emergency-stop": "", "power-off": "", "pause": "", "resume": "",
     "halt": "", "restart": "", "freedrive": "x20", "slider": "x70", "push": "x40",
 }  # fmt: skip
-_CONTROLLER: Final = "ur:"
+PREFIX: Final = "ur:"
 """Prefix of faults of the controller and of the person at its pendant."""
 
 
@@ -47,7 +47,7 @@ def _of_controller(kind: str) -> Draw:
         size = _AT_CONTROLLER[kind]
         if kind in ("slider", "push") and chance.random() < 0.5:
             size = f"x{chance.choice((0, 99, 250))}"
-        return f"{_CONTROLLER}{kind}@{at}{size}"
+        return f"{PREFIX}{kind}@{at}{size}"
 
     return draw
 
@@ -61,7 +61,7 @@ def _corrupt(chance: random.Random, story: Story) -> str:
 DRAWS: Final[Mapping[str, tuple[float, Draw]]] = {
     **{kind: OF_CAMPAIGNS[kind] for kind in (*_OF_LINK, *_OF_OPERATOR)},
     "corrupt": (1.0, _corrupt),
-    **{f"{_CONTROLLER}{kind}": (0.7, _of_controller(kind)) for kind in _AT_CONTROLLER},
+    **{f"{PREFIX}{kind}": (0.7, _of_controller(kind)) for kind in _AT_CONTROLLER},
 }
 """Relative frequency of each kind, and the function that draws a line."""
 
@@ -102,8 +102,8 @@ class SeededRun(UrRun):
 
 def play(lines: Sequence[str]) -> SeededRun:
     """Play a script."""
-    ours = [line for line in lines if line.startswith(_CONTROLLER)]
-    at_controller: list[UrFault] = [parse_ur_fault(line.removeprefix(_CONTROLLER)) for line in ours]
+    ours = [line for line in lines if line.startswith(PREFIX)]
+    at_controller: list[UrFault] = [parse_ur_fault(line.removeprefix(PREFIX)) for line in ours]
     script = parse_script(line for line in lines if line not in ours)
     acts = [(event.at, event.kind, event.value / 100.0) for event in script.of("cycle")]
     # A hold ends by itself after some time.

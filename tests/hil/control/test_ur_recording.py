@@ -39,7 +39,9 @@ from hil.look.look import look_at
 from hil.look.readings import Fact
 from hil.pipeline.identification import identify_archives
 from hil.pipeline.options import FIXED
+from hil.pipeline.sources import source_of
 from hil.pipeline.torque_constants import find_gains
+from identification.estimators.delay import estimate_delay
 from identification.model.known_payload import Payload
 from sim_fixtures.plant import Carried
 from sim_fixtures.ur import (
@@ -135,6 +137,21 @@ def test_torques_are_currents_times_the_cells_constants(recorded: Path) -> None:
     np.testing.assert_allclose(
         archive.columns["torque"], constants * archive.columns["target_current"]
     )
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("share", [0.3, 0.5])
+def test_dry_friction_does_not_bias_the_delay_of_a_slow_program(
+    share: float, tmp_path: Path
+) -> None:
+    """The current of a frame acted over the cycle before it: half a cycle."""
+    program = UrProgram(amplitude=share * UrProgram().amplitude)
+    with served(program=program) as server:
+        recording_of(tmp_path / NAME, server, duration=program.duration)
+    cell = Cell.load(CELL_PATH)
+    recording = source_of(open_archive(tmp_path / NAME), cell).recording
+    found = estimate_delay(recording, cell.model)
+    assert not found.excludes(0.5 * cell.period), found.describe()
 
 
 @pytest.mark.long

@@ -16,16 +16,19 @@ import pytest
 from typer.testing import CliRunner
 
 from drivers.transports.base import TransportError
+from drivers.transports.simulated import SimulatedTransport
 from drivers.ur.identity import ask_identity
 from drivers.ur.reader import RtdeReader
 from drivers.ur.torque_constants import stated_constants
 from drivers.ur.transport import RtdeSpec
-from hil.base.errors import InputError
+from hil.base.errors import ControllerError, InputError
 from hil.cell import Cell
 from hil.cli import app
+from hil.control.motion_watch import Stop
 from hil.control.simulated_cell import with_simulation
-from hil.control.ur_simulation import served_arm
-from sim_fixtures.ur import CELL_PATH, UR5E_URDF, UrArmTruth
+from hil.control.ur_simulation import UrPeer, served_arm, simulated_ur
+from hil.control.virtual_link import VirtualLink
+from sim_fixtures.ur import CELL_PATH, UR5E_URDF, UrArmTruth, UrFault
 
 HOST = "127.0.0.1"
 
@@ -134,3 +137,18 @@ def connected(spec: RtdeSpec) -> RtdeReader:
             if time.monotonic() > deadline:
                 raise
             time.sleep(0.1)
+
+
+def test_an_arm_without_power_is_switched_on_at_its_pendant() -> None:
+    cell = Cell.load(CELL_PATH).with_values({"controller.transport": "simulated"})
+    peer = UrPeer(simulated_ur(cell, faults=[UrFault("power-off", 0)]))
+    link = VirtualLink.over(SimulatedTransport(peer), cell, finish=peer.finish)
+    said: list[str] = []
+    link.connection.report = said.append
+    with pytest.raises(ControllerError, match="not ready within 10 s") as refused:
+        link.connect(Stop(), timeout=10.0)
+    (waiting,) = said
+    for text in (str(refused.value), waiting):
+        assert "release its brakes at the pendant (hil does not)" in text
+        assert "drive" not in text.lower().replace("drive_off", "")
+    assert not peer.controller.playing and peer.controller.robot_mode_name == "POWER_OFF"
