@@ -42,7 +42,7 @@ def test_whole_campaigns_keep_all_laws() -> None:
     assert len(ends) > 1, "some faults must end a run"
 
 
-def test_campaign_seeds_have_faults_of_link_controller_and_operator() -> None:
+def test_campaign_seeds_have_all_kinds_of_faults() -> None:
     assert ur_campaign.draw_script(7) == ur_campaign.draw_script(7) != ur_campaign.draw_script(8)
     lines = [line for seed in range(200) for line in ur_campaign.draw_script(seed)]
     assert {line.partition("@")[0] for line in lines} == {*DRAWS} - {"override", "hold"}

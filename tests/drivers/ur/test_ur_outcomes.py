@@ -60,6 +60,23 @@ def test_an_arm_that_is_not_moved_is_recorded_nevertheless() -> None:
     assert {*records["arm_state"]["robot_mode"]} == {7}
 
 
+@pytest.mark.parametrize(
+    ("robot_mode", "state"),
+    [
+        *((mode, State.DRIVE_OFF) for mode in (-1, 0, 1, 2, 3, 6, 8)),
+        *((mode, State.DRIVING_ON) for mode in (4, 5)),
+        (7, State.CLOSED),
+    ],
+)
+def test_an_arm_without_power_or_with_brakes_is_not_ready(
+    robot_mode: int, state: State, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    bench = UrBench()
+    outputs = bench.robot.outputs
+    monkeypatch.setattr(bench.robot, "outputs", lambda: {**outputs(), "robot_mode": robot_mode})
+    assert bench.run(5).state is state
+
+
 def test_each_motion_has_a_program_of_its_own() -> None:
     bench = UrBench().move()
     first = bench.robot.output_registers.ints[27]

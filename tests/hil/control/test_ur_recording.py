@@ -141,9 +141,7 @@ def test_torques_are_currents_times_the_cells_constants(recorded: Path) -> None:
 
 @pytest.mark.long
 @pytest.mark.parametrize("share", [0.3, 0.5])
-def test_dry_friction_does_not_bias_the_delay_of_a_slow_program(
-    share: float, tmp_path: Path
-) -> None:
+def test_dry_friction_does_not_bias_the_delay(share: float, tmp_path: Path) -> None:
     """The current of a frame acted over the cycle before it: half a cycle."""
     program = UrProgram(amplitude=share * UrProgram().amplitude)
     with served(program=program) as server:
