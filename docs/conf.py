@@ -24,7 +24,7 @@ exclude_patterns = ["_build"]
 source_suffix = {".md": "markdown"}
 
 myst_enable_extensions = ["dollarmath"]
-myst_heading_anchors = 3
+myst_heading_anchors = 4
 myst_dmath_double_inline = True
 
 highlight_language = "none"  # shell lines, verdicts and file excerpts are no Python
