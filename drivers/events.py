@@ -78,7 +78,7 @@ class StateChanged:
 
 @dataclass(frozen=True)
 class GapSeen:
-    """`missed` packets before the one of `cycle` did not arrive."""
+    """`missed` packets before the packet of `cycle` did not arrive."""
 
     missed: int
     cycle: int
@@ -86,7 +86,7 @@ class GapSeen:
 
 @dataclass(frozen=True)
 class RepliesLost:
-    """The target received in `cycle` is that of an earlier set-point; `count` were not accepted.
+    """The target received in `cycle` belongs to an earlier set-point; `count` were not accepted.
 
     Detected only while a joint moves by more than the standstill threshold per
     cycle and the controller holds its target.

@@ -79,7 +79,7 @@ class Execution:
         return running and callable(getattr(self._source, "resume_from", None))
 
     def begin(self, position: Array, cycle: int) -> None:
-        """Begin at the first set-point, (n,) rad; hold at once if that was requested before.
+        """Begin at the first set-point, (n,) rad; hold immediately if requested before.
 
         Raises:
             SourceFailed: the source does not begin there, or does not hold.

@@ -407,7 +407,7 @@ class Guard:
             require(joints, np.abs(measured - step), bound, Check.GAP_VELOCITY, cycle)
 
     def check_after_pause(self, velocity: Array, cycle: int, where: Joints) -> None:
-        """Check after a late packet that the velocity (n,) rad/s is that of the set-points sent.
+        """Check after a late packet that the velocity (n,) rad/s agrees with the sent set-points.
 
         The servo may lag behind by what it gains in `LAG` at the allowed acceleration.
         """

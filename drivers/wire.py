@@ -104,7 +104,7 @@ class Wire(Protocol):
         """
 
     def forget(self) -> None:
-        """Forget the controller: it begins anew."""
+        """Forget the controller: it starts over."""
 
     def lost(self) -> None:
         """A silence ended the sequence of packets: the next, whichever it is, is new."""
@@ -132,7 +132,7 @@ class Wire(Protocol):
         """Require that open axes can be held by their targets; raises RefusalError."""
 
     def require_other_targets(self, cycle: int) -> None:
-        """Require that of open axes that are not joints of the arm; raises RefusalError."""
+        """Require targets of open axes that are not joints of the arm; raises RefusalError."""
 
     def not_used(self) -> int:
         """Return how many replies since the last packet the controller states not to have used."""
@@ -205,7 +205,7 @@ class ControllerProtocol(Protocol):
 
     @property
     def state(self) -> np.dtype[np.void] | None:
-        """Layout of what its packets say beyond those of other controllers; None if nothing."""
+        """Layout of what its packets contain beyond other controllers' packets; None if nothing."""
 
     def wire(self, settings: ArmSettings) -> Wire:
         """Return the wire of one session; ValueError for settings that it cannot have."""

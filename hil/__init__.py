@@ -178,6 +178,6 @@ def __getattr__(name: str) -> Any:
 
 
 def __dir__() -> list[str]:
-    """Return all public names, also those that are not loaded yet, and the modules loaded."""
+    """Return all public names, loaded or not, and the loaded modules."""
     helpers = {"Any", "TYPE_CHECKING", "annotations", "import_module"}
     return sorted({*globals(), *__all__} - helpers)

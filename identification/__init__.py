@@ -21,5 +21,5 @@ def __getattr__(name: str) -> Any:
 
 
 def __dir__() -> list[str]:
-    """All names, also those that are not loaded yet: the reference documents them."""
+    """All names, loaded or not: the reference documents them."""
     return [*globals(), *import_module("identification.api").__all__]

@@ -1,4 +1,4 @@
-"""Straight moves from rest to rest, many at once, and the fly-by corners that join them.
+"""Straight moves from rest to rest, many together, and the fly-by corners that join them.
 
 One scalar profile of seven pieces along each line keeps it straight for any ratio between the
 limits of the joints; ruckig's phase synchronisation does not. Results do not depend on what else is

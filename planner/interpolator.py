@@ -194,7 +194,7 @@ class Interpolator(MoveSettings):
     def set_override_speed(
         self, percent: float, correction: SpeedCorrection = SpeedCorrection.GENERAL
     ) -> None:
-        """Set GEN_OVR, in 0..100 %, which acts at once; or PROG_SPD_OVR, in (0, 100] %."""
+        """Set GEN_OVR, in 0..100 %, which acts immediately; or PROG_SPD_OVR, in (0, 100] %."""
         share = percent / 100.0
         if SpeedCorrection(correction) is SpeedCorrection.PROGRAM:
             self._overrides = replace(self._overrides, speed=share)

@@ -113,7 +113,7 @@ SEGMENT_JERK: Final = 0.98
 
 
 class Legs(NamedTuple):
-    """Moves planned from rest to rest, with limits and those of deceleration (s, n) [rad/s²]."""
+    """Moves planned from rest to rest, with limits, also of deceleration (s, n) [rad/s²]."""
 
     moves: StraightMoves
     bounds: Allowance
@@ -151,7 +151,7 @@ class Legs(NamedTuple):
         return Legs(StraightMoves(*moves), Allowance(*bounds), deceleration)
 
     def corners(self, before: Rows, after: Rows, fly: Array) -> list[Corner]:
-        """Plan the corners at the targets of legs `before` (c,), towards those of `after`.
+        """Plan the corners at the targets of legs `before` (c,), towards the targets of `after`.
 
         `fly` (c,) is the share of the deceleration that the next acceleration overlaps.
 

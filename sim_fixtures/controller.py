@@ -169,7 +169,7 @@ class LoopProgram:
         return self._start[self._age]
 
     def finish(self) -> None:
-        """End the session, at once or when open axes are at rest."""
+        """End the session, immediately or when open axes are at rest."""
         self._finishing = True
 
     def drive_on(self) -> None:
@@ -652,7 +652,7 @@ class Targets:
         return target, [period * v for v in self._drive.motor_speeds(velocity.tolist())]
 
     def _follow(self, demand: CycleDemand, wanted: Wanted) -> None:
-        """Replace the controller's targets by those of the PC."""
+        """Replace the controller's targets by the PC's."""
         feeds = self._settings.open_mode == 1
         for i, fields in enumerate(wanted):
             if fields is None:
@@ -813,7 +813,7 @@ class SimulatedController:
         self.program.trip(reason)
 
     def restart(self, *, warm: bool) -> None:
-        """Restart: cold after `boot_time` of silence, warm with the init packet at once."""
+        """Restart: cold after `boot_time` of silence, warm with the init packet immediately."""
         self.program = self.program.restarted(replace(self.settings, cold_start=not warm))
         self._number = 10 if warm else 1
         self._silent = 0 if warm else round(self.settings.boot_time / self.period)

@@ -229,7 +229,7 @@ def _matched(name: str, kind: _Kind, options: Iterable[str]) -> dict[str, re.Mat
 def split_faults(
     faults: Iterable[Fault],
 ) -> tuple[tuple[link.Fault, ...], tuple[InjectedFault, ...]]:
-    """Return the faults of the link and those of the controller."""
+    """Return the faults of the link and the faults of the controller."""
     every = tuple(faults)
     of_link = tuple(fault for fault in every if not isinstance(fault, InjectedFault))
     return of_link, tuple(fault for fault in every if isinstance(fault, InjectedFault))

@@ -26,7 +26,7 @@ from sim_fixtures.settings import PlantDiverged, SettingError
 
 
 class Carried(NamedTuple):
-    """A body that a joint carries beside its link, in the frame of the joint."""
+    """A body that a joint carries in addition to its link, in the frame of the joint."""
 
     joint: int  # from 0
     mass: float  # kg
@@ -179,7 +179,7 @@ def carry(model: pin.Model, carried: Carried | None) -> None:
 
 
 def _as_revolute(urdf: str) -> str:
-    """Return the URDF with continuous joints as revolute: pinocchio gives those one angle."""
+    """Return the URDF with continuous joints as revolute, which have one angle in pinocchio."""
     root = ET.fromstring(urdf)
     # pinocchio ignores a namespace; ET would write it before every name.
     namespace = root.tag[: root.tag.rfind("}") + 1]
@@ -260,7 +260,7 @@ class Plant:
 
     @property
     def motor_position(self) -> Array:
-        """Motor positions as joint angles (n,) [rad]; those of the joints with rigid gears."""
+        """Motor positions as joint angles (n,) [rad]; with rigid gears, the joint positions."""
         return self.position
 
     def set_state(self, position: ArrayLike, velocity: ArrayLike) -> None:
@@ -277,7 +277,7 @@ class Plant:
             self._set_coulomb()
 
     def scale_friction(self, factor: Array) -> None:
-        """Set the factor on all friction except that of brakes, (n,)."""
+        """Set the factor on all friction except brakes, (n,)."""
         self._scale = factor
         self._set_coulomb()
 

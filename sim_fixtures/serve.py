@@ -171,7 +171,7 @@ class ServeCounts:
         self._without_reply.append(number)
 
     def count_discarded(self, number: int | None) -> None:
-        """Count a reply that is not that of the present cycle; None if it has no number."""
+        """Count a reply to another than the present cycle; None if it has no number."""
         if number is not None and number in self._without_reply:
             self.late += 1
             self._without_reply.remove(number)
@@ -356,7 +356,7 @@ class _Server:
         return True
 
     def _apply(self, request: Request) -> bool:
-        """Apply a request of the operator; return False to stop at once."""
+        """Apply a request of the operator; return False to stop immediately."""
         if request is Request.END:
             now = self.clock.monotonic()
             if self.finish_by is None:

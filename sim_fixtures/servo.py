@@ -296,7 +296,7 @@ class CycleServo:
         self._take_state()
 
     def _take_state(self) -> None:
-        """Set the values of the cycle to those of released loops."""
+        """Set the values of the cycle from released loops."""
         loops = self._loops
         self.target = list(loops.target)
         self.delta = list(loops.delta)
@@ -356,7 +356,7 @@ class CycleServo:
         self._end_cycle()
 
     def _end_cycle(self) -> None:
-        """Take the encoder positions of the loops as those of the cycle."""
+        """Take the encoder positions of the loops for the cycle."""
         measured = list(self._loops.measured)
         self.measured_delta = [p - q for p, q in zip(measured, self.measured, strict=True)]
         self.measured = measured

@@ -39,7 +39,7 @@ LEFT_TOO_LATE: Final = "consecutive replies left too late"
 LOAD_AT_ORIGIN: Final = "the load's centre of mass is assumed at the origin"
 MERGED_MESSAGES: Final = "merged from messages of their own, with the same stamps"
 MISSED_IN_A_ROW: Final = "packets were missed in a row"
-MISSED_IN_IT_ONLY: Final = "packets were missed in it, and none in those"
+MISSED_IN_IT_ONLY: Final = "packets were missed in it, and none in the other recordings"
 MOTION_BEING_STOPPED: Final = "the motion is being stopped"
 MOTION_NOT_AT_FAULT: Final = (
     "the motion is not at fault; correct delay and elasticity in [simulation]"

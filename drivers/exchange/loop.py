@@ -145,7 +145,7 @@ class ReceiveQueue:
         return Arrival(packet, now if stamp is None else stamp, stamp is not None)
 
     def _newest(self, first: Arrival, period: float) -> tuple[Arrival, ...]:
-        """Return the newest of each kind among a packet and those queued behind it."""
+        """Return the newest of each kind among a packet and the packets queued behind it."""
         transport = self._transport
         backlog = _Backlog(self._session.wire)
         backlog.add(first)

@@ -91,7 +91,7 @@ _DESCRIPTOR: Final = struct.Struct("@i")
 
 
 class Inbox:
-    """The exchange's end of the socket; never waits. `identity` is that of the last motion."""
+    """The exchange's end of the socket; never waits. `identity` belongs to the last motion."""
 
     def __init__(self, channel: socket.socket) -> None:
         self.identity = 0

@@ -262,7 +262,7 @@ class ExchangeProcess:
                 setattr(self, name, closed)
 
     def _answer_to(self, identity: int, poll: Callable[[], None] = lambda: None) -> Any:
-        """Receive the next message about this motion; those about earlier ones are dropped."""
+        """Receive the next message about this motion; messages about earlier ones are dropped."""
         while True:
             answered, reply = self._receive(ANSWER_TIMEOUT, poll)
             if answered == identity:

@@ -89,7 +89,7 @@ def _schedule(priority: int, refused: list[str]) -> str:
 
 
 def _lock_memory(refused: list[str]) -> Literal["all", "in use", "nothing"]:
-    """Lock the memory of this process, and return which of it."""
+    """Lock the memory of this process, and return which part."""
     remedy = (
         f"permit it with the line '@realtime - memlock unlimited' in {LIMITS_FILE}, join that "
         "group and log in again"

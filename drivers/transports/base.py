@@ -116,7 +116,7 @@ class FreePort:
 
 @dataclass(frozen=True)
 class CanBus:
-    """A CAN FD interface at these bit rates, bit/s; None for those of the profile."""
+    """A CAN FD interface at these bit rates, bit/s; None for the profile's."""
 
     interface: str
     channel: str

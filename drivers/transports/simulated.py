@@ -39,7 +39,7 @@ class Duplicate(_Packets):
 
 
 class Reorder(_Packets):
-    """The packet of each of these cycles is overtaken by that of the next."""
+    """The packet of each of these cycles is overtaken by the next one."""
 
 
 @dataclass(frozen=True)

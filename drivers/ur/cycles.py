@@ -76,7 +76,7 @@ class CycleCounter:
         return records
 
     def _steps(self, stamps: Array) -> NDArray[np.int64]:
-        """Return the cycles since the frame before, of those before a fault; 1 for the first."""
+        """Return the cycles since the previous frame, up to a fault; 1 for the first."""
         if self._fault is not None:
             raise self._fault
         if not len(stamps):

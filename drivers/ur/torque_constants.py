@@ -1,4 +1,4 @@
-"""Torque constants that an arm states of itself: those of its own model, at rest.
+"""Torque constants that an arm states itself, from its own model at rest.
 
 The controller computes its target current from the torque of its rigid-body model and of its
 friction model. At rest there is no friction in it, and the ratio of both is the torque constant.
@@ -45,7 +45,7 @@ def stated_constants(target_moment: Array, target_current: Array, target_velocit
 
 
 def by_size(constants: Array, torques: Sequence[float]) -> Array:
-    """Return constants with those of joints of the same size where they are NaN.
+    """Return constants, where NaN the ones of joints of the same size.
 
     Joints of one size have the same largest torque [N·m].
     """

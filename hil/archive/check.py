@@ -89,7 +89,7 @@ def _entry_faults(path: Path, scan: Scan) -> Iterator[str]:
 
 
 def archive_files(paths: Sequence[Path]) -> list[Path]:
-    """Return files, and all archives of folders; of a campaign those in its `archives`.
+    """Return files, and all archives of folders; of a campaign the ones in its `archives`.
 
     Raises:
         InputError: a folder has none.

@@ -216,7 +216,7 @@ class ArchiveProcessHandle:
             self._lose()
 
     def answer(self, timeout: float, job: int) -> Answer | None:
-        """Return the next answer about archive `job`; those about earlier ones are dropped.
+        """Return the next answer about archive `job`; answers about earlier archives are dropped.
 
         None if none comes within `timeout` s, or the process has ended.
         """

@@ -171,7 +171,7 @@ def opened(archive: Path | Archive) -> Archive:
 
 
 def place_of(archive: Path | Archive) -> Path:
-    """Return the path of an archive, of one in memory that of the file that may be written."""
+    """Return the path of an archive; for one in memory, of the file that may be written."""
     return archive.path if isinstance(archive, Archive) else archive
 
 

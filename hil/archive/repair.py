@@ -91,7 +91,7 @@ def repair(
 
 
 def amend_outcome(path: str | PathLike[str], outcome: str, reason: str) -> None:
-    """Replace outcome and reason of an intact archive, of which always one version exists.
+    """Replace outcome and reason of an intact archive; one version exists at all times.
 
     Raises:
         ArchiveError: it is not an intact archive.
@@ -209,7 +209,7 @@ def _copy(
 
 
 def _registered(writer: Any, parser: ChunkParser) -> dict[int, int]:
-    """Define the channels of an archive; return their new numbers by those in the archive."""
+    """Define the channels of an archive; return their new numbers by the numbers in the archive."""
     schemas: dict[int, int] = {}
     channels: dict[int, int] = {}
     for channel in parser.channels.values():

@@ -267,7 +267,7 @@ class Scan:
     def _note_gap(self, offset: int) -> None:
         """Note that a chunk is missing in front of that at `offset`, unless damage explains it."""
         if not self._gap:
-            reason = "(chunk) does not continue the one before it: a chunk is missing"
+            reason = "(chunk) does not continue the previous chunk: a chunk is missing"
             self.damages.setdefault(offset, reason)
         self.lost = True
 
@@ -345,7 +345,9 @@ class Scan:
             numbers = by_topic.keys() & set(NUMBERS)
             new = self._numbers not in (set(), numbers) or numbers.isdisjoint(read)
             if numbers and new:
-                raise Damage(offset, "(chunk) has samples in other channels than those before")
+                raise Damage(
+                    offset, "(chunk) has samples in other channels than the previous chunks"
+                )
             verified = (
                 by_topic if self._all_channels else {topic: by_topic[topic] for topic in read}
             )
@@ -385,7 +387,7 @@ class Scan:
                 except LayoutError as error:
                     raise Damage(offset, f"(chunk) has messages of {topic}: {error}") from error
             if not all(map(layout.matches, messages.data)):
-                raise Damage(offset, "(chunk) has messages that differ from those before")
+                raise Damage(offset, "(chunk) has messages that differ from the previous ones")
             layouts[topic] = layout
         return layouts
 
@@ -450,7 +452,7 @@ class Scan:
             gap = first - self._next.get(topic, first if self._skipped else 0)
             gap %= _SEQUENCES
             if gap > _SEQUENCES // 2:
-                raise Damage(offset, "(chunk) repeats messages of those before")
+                raise Damage(offset, "(chunk) repeats messages of previous chunks")
             if gap:
                 missing[topic] = gap
         return missing
@@ -478,7 +480,7 @@ class Scan:
         if (np.diff(stamp) <= 0).any():
             raise Damage(offset, "(chunk) has cycles that do not increase")
         if stamp[0] <= self._newest:
-            raise Damage(offset, "(chunk) has cycles that do not follow those before")
+            raise Damage(offset, "(chunk) has cycles that do not follow the previous ones")
         return int(stamp[-1])
 
 

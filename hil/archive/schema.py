@@ -71,7 +71,7 @@ float64[] effort
 
 _CYCLE = """\
 # One cycle of the controller link as the PC saw it. Joints in the order of the archive's
-# joint_names. Angles are those of the robot description (URDF); SI units.
+# joint_names. Angles follow the robot description (URDF); SI units.
 # header.stamp is the time since the controller's initialisation: cycle * period.
 std_msgs/Header header
 int64 cycle                     # cycles of the controller since its initialisation

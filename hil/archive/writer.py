@@ -298,7 +298,7 @@ def described(
 
 
 def _checked_metadata(path: Path, metadata: Mapping[str, str]) -> dict[str, str]:
-    """Return the caller's entries with those of the file name, which must agree."""
+    """Return the caller's entries with the entries of the file name, which must agree."""
     name = ArchiveName.parse(path)
     named = name.metadata() if name else {}
     entries = {**named, **{key: str(value) for key, value in metadata.items()}}
@@ -449,7 +449,7 @@ class ArchiveWriter:
         self.file.add_event(ArchivedEvent(time, name, text, level, data or {}))
 
     def flush(self) -> None:
-        """Write all pending records, also those of an incomplete chunk."""
+        """Write all pending records, including an incomplete chunk."""
         self._emit(everything=True)
         self.file.flush()
 
@@ -489,7 +489,7 @@ class ArchiveWriter:
         return (cycle - (self._first or 0)) // self._cycles_per_chunk
 
     def _emit(self, *, everything: bool) -> None:
-        """Write the pending records slot by slot; those of the open slot only if `everything`."""
+        """Write the pending records slot by slot; the open slot only if `everything`."""
         if not self._pending:
             return
         records = np.concatenate([part for part, _ in self._pending])

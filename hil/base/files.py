@@ -68,7 +68,7 @@ def write_atomically(path: Path, content: str | bytes) -> None:
 
 @contextmanager
 def replace_file(path: Path, temporary: Path | None = None) -> Iterator[Path]:
-    """Replace `path` by the yielded file beside it; keep `path` if writing fails."""
+    """Replace `path` by the yielded file next to it; keep `path` if writing fails."""
     temporary = temporary or path.with_name(f".{path.name[:200]}.{token_hex(4)}.tmp")
     try:
         yield temporary

@@ -1,4 +1,4 @@
-"""Ends of a program that a signal asks for, at once."""
+"""Immediate exit of a program on a signal."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ def leave_if_interrupted() -> Iterator[None]:
 
 @contextmanager
 def leave_on(signals: Sequence[signal.Signals], text: str, *, say: str = "") -> Iterator[None]:
-    """Exit at once on a signal, also one that the shell made a program in the background ignore.
+    """Exit immediately on a signal, even if the shell made a background program ignore it.
 
     Its children and theirs are killed, so that files must be whole at any time. In another thread
     than the main one, which cannot handle signals, it does nothing.

@@ -1,4 +1,4 @@
-"""The folder of results that nobody named: called after the recording, beside it."""
+"""Default results folder: named after the recording, next to it."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ def sources_text(fitted: Sequence[Path], predicted: Sequence[Path]) -> str:
 
 
 def folder_beside(recording: Path, sources: str) -> Path:
-    """Return the folder for results of a recording: of its name without suffix, beside it.
+    """Return the results folder of a recording: its name without suffix, next to it.
 
     A folder of that name that has results of other recordings, or anything else, is left alone;
     the next number that is free, or has the results of these `sources`, is appended.

@@ -198,7 +198,7 @@ _MOST_SIBLINGS = 10_000
 
 
 def similar_path(path: Path) -> Path | None:
-    """Return the path beside a missing one whose name is most like it, or None.
+    """Return the existing path with the most similar name in the same folder, or None.
 
     Where the folder itself is missing, that is the path in the folder most like it.
     """

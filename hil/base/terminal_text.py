@@ -38,7 +38,7 @@ def plural(number: int, noun: str) -> str:
 
 
 def printable(text: str, *, keep: str = "\n") -> str:
-    """Return the text with nonprintable characters, except those in `keep`, as Python escapes."""
+    """Return the text with nonprintable characters as Python escapes, except the ones in `keep`."""
     if text.isprintable():
         return text
     return "".join(c if c.isprintable() or c in keep else escape(c) for c in text)

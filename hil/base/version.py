@@ -10,7 +10,7 @@ _PACKAGES = ("hil", "numpy", "scipy", "pin", "ruckig", "pymoo", "mcap")
 
 @cache
 def software() -> dict[str, str]:
-    """Versions of this package and of those its numbers depend on."""
+    """Versions of this package and of the packages its numbers depend on."""
     return {name: version(name) for name in _PACKAGES}
 
 

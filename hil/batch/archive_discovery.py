@@ -1,4 +1,4 @@
-"""Search for archives below folders, and selection of those that are fitted."""
+"""Search for archives below folders, and selection of the fitted ones."""
 
 from __future__ import annotations
 
@@ -493,7 +493,7 @@ def _key(place: str) -> str:
 
 
 def campaign_of(place: str) -> str:
-    """Return the folder of the campaign of an archive: that of the archives, or the one above."""
+    """Return the campaign folder of an archive: its own folder, or the folder above."""
     folder = folder_of(place)
     return folder.removesuffix(_ARCHIVES) or folder
 
@@ -605,7 +605,7 @@ def _exclusion(ref: ArchiveRef, latest: _Attempts) -> str:
 
 
 def _copy(ref: ArchiveRef, seen: dict[str, str]) -> SkippedArchive | None:
-    """Return an archive that is a copy of one `seen`; else None, and add it to those."""
+    """Return the archive in `seen` that this one copies; else add it to `seen` and return None."""
     content = ref.content or ref.sha256
     if content in seen and ref.use != "standstill":
         return SkippedArchive(ref.origin, "is a copy", seen[content])

@@ -76,7 +76,7 @@ def settings_digest(settings: Settings) -> str:
 
 
 class ToReduce(NamedTuple):
-    """An archive, and what its campaign needs of it."""
+    """An archive, and what its campaign needs from it."""
 
     ref: ArchiveRef
     unmodelled: bool = False  #: whether it is one of those that show what the model lacks
@@ -268,7 +268,7 @@ def added(parts: Iterable[ReducedArchives]) -> ReducedArchives:
 
 
 def plus(first: Term | None, second: Term | None) -> Term | None:
-    """Return the sum of two terms, of which None is zero."""
+    """Return the sum of two terms; None counts as zero."""
     if first is None or second is None:
         return second if first is None else first
     return first + second

@@ -60,7 +60,7 @@ class CacheError(InputError):
 
 @dataclass(frozen=True)
 class CacheLocation:
-    """Cache of the results of archives: a folder for those in the same folder."""
+    """Cache of the results of archives: one folder for all archives of a folder."""
 
     #: folder of the whole cache; None: beside each archive, or in the user's cache folder (XDG)
     #: where that is not writable or not a folder, and for URLs
@@ -134,7 +134,7 @@ class CacheLocation:
             )
 
     def get(self, location: str, key: str, kind: type[T]) -> T | None:
-        """Return the JSON data of a key as this type; None if there is no intact entry of it."""
+        """Return the JSON data of a key as this type; None without an intact entry."""
         if not self.keep:
             return None
         try:

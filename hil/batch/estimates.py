@@ -201,7 +201,7 @@ def estimate_cached(
     settings: Settings,
     campaign: str,
 ) -> tuple[CampaignResult, EstimateGroup]:
-    """Estimate one campaign from its archives, of which each partition has a cached sum.
+    """Estimate one campaign from its archives; each partition has a cached sum.
 
     Reading a sum takes less time than a task of its own.
 

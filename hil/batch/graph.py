@@ -83,7 +83,7 @@ def decision_digest(options: Options, arms: Settings | None, refs: Sequence[Arch
 def archives_for_settings(
     refs: Sequence[ArchiveRef], arms: Settings | None
 ) -> tuple[ArchiveRef, ...]:
-    """Return the archives that determine a campaign's settings, those at standstill first.
+    """Return the archives that determine a campaign's settings, standstill first.
 
     Where the arm has settings only noise and cell are the campaign's own: one excitation is read.
     """
@@ -258,7 +258,7 @@ class _ArmWork:
 
     @property
     def has_pooled(self) -> bool:
-        """Whether the pooled estimate differs from that of its only campaign."""
+        """Whether the pooled estimate differs from the estimate of its only campaign."""
         return len(self.campaigns) > 1
 
 
@@ -280,7 +280,7 @@ class _Batch:
     # Settings
 
     def with_settings(self, campaigns: Sequence[_Campaign]) -> list[_Campaign]:
-        """Decide the settings of campaigns; return those that have some.
+        """Decide the settings of campaigns; return the campaigns that have settings.
 
         The settings of a type of arm are decided on its first readable campaign; the others use
         them with their own noise: comparisons need one friction law, and sums the same columns.
@@ -508,7 +508,7 @@ class _Batch:
         )
 
     def _pooled(self, arm: _ArmWork) -> list[BatchEstimate]:
-        """Return the pooled estimate of an arm; that of its only campaign, if it has one."""
+        """Return the pooled estimate of an arm; with one campaign, its estimate."""
         if arm.has_pooled:
             if isinstance(arm.pooled, SkippedArchive):
                 self.broken.append(arm.pooled)

@@ -91,7 +91,7 @@ class _Search:
         self.refused: list[SkippedArchive] = []
 
     def walk(self, root: Path) -> None:
-        """Search a folder and those below it."""
+        """Search a folder and its subfolders."""
         for name, folders, files in os.walk(root, followlinks=True, onerror=self._refuse):
             folder = Path(name).resolve()
             if folder in self._visited:

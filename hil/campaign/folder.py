@@ -144,7 +144,7 @@ class CampaignFolder(RecordedCampaign):
         return json_digest(self._inputs())
 
     def hash_of(self, cell: Cell, plan: CampaignPlan) -> str:
-        """Return the hash of a cell and a plan in memory, which must be those of the folder.
+        """Return the hash of a cell and a plan in memory, which must equal the folder's.
 
         Raises:
             CampaignFolderError: one of the files was changed since it was read.
@@ -245,7 +245,7 @@ class CampaignFolder(RecordedCampaign):
         return self._checksums(self._contents())
 
     def _checksums(self, contents: dict[str, bytes]) -> dict[str, str]:
-        """Return checksums; a mesh that is not on this computer has that of the manifest."""
+        """Return checksums; for a mesh that is not on this computer, the manifest's."""
         sums = checksums(contents, self.root)
         if MISSING in sums.values():
             sealed = self._manifest().inputs

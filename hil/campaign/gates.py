@@ -165,7 +165,7 @@ def _sent_by(cell: Cell) -> dict[str, Any]:
 
 
 def require_as_rehearsed(campaign: CampaignState, connection: Connection) -> None:
-    """Refuse a controller whose figures are not those of the rehearsal and the checks.
+    """Refuse a controller whose figures differ from rehearsal and checks.
 
     Raises:
         NotRehearsedError: names joints with a narrower following-error threshold in the

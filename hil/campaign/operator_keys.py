@@ -134,7 +134,7 @@ class Keyboard:
 
 
 def _chunk(fd: int) -> bytes:
-    """Return what a terminal sent at once; raise EOFError if it is gone."""
+    """Return what a terminal has sent; raise EOFError if it is gone."""
     chunk = os.read(fd, _CHUNK)
     if not chunk:
         raise EOFError("the terminal is gone")

@@ -346,7 +346,7 @@ class ArchiveReview:
         attempts = ", ".join(alike)
         reason = f"{attempts} and the next repetition agree with each other, not with this"
         if several:
-            reason += ": packets were missed in it, and none in those"
+            reason += ": packets were missed in it, and none in the other recordings"
         for name in accepted:
             self._reject(name, reason)
         later = f"{len(alike) + 1} later ones agree with each other and not with"

@@ -80,7 +80,7 @@ def rehearse(
 def _rehearsed(
     campaign: CampaignState, plan_hash: str, reporter: Reporter, seed: int, stop: Stop
 ) -> Rehearsal:
-    """Run the plan in the folder of the rehearsal, on two simulated arms at once, and judge it."""
+    """Run the plan in the rehearsal folder on two simulated arms in parallel, and judge it."""
     twin = Twin.of(campaign.cell, seed=seed, repetitions=REPETITIONS)
     for sentence in twin.assumed:
         reporter.say(f"assumed: {sentence}")

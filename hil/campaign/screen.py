@@ -305,7 +305,7 @@ class Screen:
             self._messages.append(text)
 
     def step(self, text: str) -> None:
-        """Print a line; a run has no steps but those that its status shows."""
+        """Print a line; a run has no steps other than its status."""
         self.say(text)
 
     @contextmanager

@@ -1,4 +1,4 @@
-"""A long simulated campaign in two sessions of the controller at once, in half the time.
+"""A long simulated campaign in two parallel controller sessions, in half the time.
 
 Each session is a power-up of the same controller and arm (`simulated_link`), with noise of its own,
 and runs its half of the motions from a cold arm. The second one runs in a process and a folder of

@@ -132,7 +132,7 @@ def status_of(campaign: CampaignState) -> CampaignStatus:
 def _weighings(
     folder: CampaignFolder,
 ) -> tuple[tuple[str, ...], tuple[tuple[str, str], ...]]:
-    """Return the payloads that were weighed, and those that were begun with their commands."""
+    """Return the payloads that were weighed, and the unfinished ones with their commands."""
     weighed = []
     weighing = []
     for payload in sorted((folder.root / PAYLOADS).glob("*"), key=lambda path: path.name):

@@ -95,7 +95,7 @@ def joints_between(path: Path | None, text: str, links: Links) -> list[str]:
 def joints_outside(
     path: Path | None, text: str, links: Links, joint_names: Sequence[str]
 ) -> list[str]:
-    """Return those of the moving joints that do not lie between the links.
+    """Return the moving joints that do not lie between the links.
 
     Args:
         path: of the file, for errors.

@@ -99,7 +99,7 @@ class Cell:
 
     @property
     def stated(self) -> CellFile:
-        """Content of the text, without changes such as those of :meth:`with_friction`."""
+        """Content of the text, without changes such as :meth:`with_friction`."""
         return _parse(self.path, self.text)
 
     @cached_property
@@ -463,7 +463,7 @@ class Cell:
         return np.concatenate([model.base.grouping @ standard, friction, model.elements.nominal])
 
     def controller_angles(self, urdf_angles: Array) -> Array:
-        """Convert URDF angles (n,) to those of the teach pendant, rad."""
+        """Convert URDF angles (n,) to teach pendant angles, rad."""
         frame = AngleFrame.pendant(self)
         return np.asarray(urdf_angles * frame.sign + frame.offset, dtype=np.float64)
 
@@ -523,7 +523,7 @@ def _sliding(cell: Cell) -> str:
 
 @dataclass(frozen=True, eq=False)
 class AngleFrame:
-    """Frame of displayed angles, that of `[limits]`: shown = sign x URDF angle + offset.
+    """Frame of displayed angles, as in `[limits]`: shown = sign x URDF angle + offset.
 
     Attributes:
         name: "controller" or "urdf".
@@ -679,7 +679,7 @@ def _check_postures(cell: Cell) -> None:
 
 
 def _check_limits(cell: Cell) -> None:
-    """Check that limits are not wider than those of the URDF."""
+    """Check that limits are not wider than the URDF's."""
     limits = cell.joint_limits
     allowed = urdf_limits(cell.urdf, cell.joint_names)
     for field, values, bounds, beyond in (

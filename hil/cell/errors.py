@@ -100,7 +100,7 @@ def _kinds(model: type[BaseModel]) -> tuple[object, ...]:
 
 
 def models_of(annotation: Any) -> Iterator[type[BaseModel]]:
-    """Yield the models in an annotation, such as those of a union."""
+    """Yield the models in an annotation, such as a union."""
     if isinstance(annotation, type) and issubclass(annotation, BaseModel):
         yield annotation
     for part in get_args(annotation):

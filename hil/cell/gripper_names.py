@@ -26,7 +26,7 @@ def links_of(text: str) -> dict[str, tuple[str, str]]:
 
 
 def gripper_joints(text: str, joint_names: Sequence[str]) -> list[str]:
-    """Return the joints that are of a gripper or hand by their names or those of both links."""
+    """Return the joints of a gripper or hand, by their names or the names of both links."""
     links = links_of(text)
     return [
         name

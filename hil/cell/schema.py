@@ -606,7 +606,7 @@ class CellFile(Table):
     @model_validator(mode="before")
     @classmethod
     def _without_removed(cls, data: Any) -> Any:
-        """Ignore what cell files of earlier versions, and those in archives, may have."""
+        """Ignore fields of cell files of earlier versions, also in archives."""
         if not isinstance(data, dict):
             return data
         return {

@@ -83,7 +83,7 @@ def _append(table: Any, key: str, value: Item) -> None:
 
 
 def _others(text: str, changed: Mapping[str, Any]) -> dict[str, str]:
-    """Return the entries of a text by dotted name, without those below a changed name."""
+    """Return the entries of a text by dotted name, except below a changed name."""
     return {
         name: entry
         for name, entry in _entries(parse_toml(text), "")

@@ -1,4 +1,4 @@
-"""Robot descriptions in other units than those of SI, refused before anything is concluded."""
+"""Robot descriptions in units other than SI, refused before anything is concluded."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ class UnitProblem(NamedTuple):
 
 
 def unit_problem(urdf: str) -> UnitProblem | None:
-    """Return which quantities of a URDF are in other units than those of SI; None if none is."""
+    """Return which quantities of a URDF are not in SI units; None if all are."""
     try:
         wrong = wrong_units(urdf)
     except ModelError:

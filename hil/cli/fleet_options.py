@@ -70,7 +70,7 @@ class Fleet:
         typer.Option(
             metavar="FOLDER|none",
             help="Folder of cached factors, or none. Default: .hil-cache next to the recordings, "
-            "or in the user's cache folder if those are read-only.",
+            "or in the user's cache folder if the recordings are read-only.",
         ),
     ] = None
 

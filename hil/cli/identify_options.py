@@ -86,7 +86,7 @@ class Identifying:
     ] = "auto"
 
     def options(self, **more: Any) -> Options:
-        """Return the options of an identification; `more` are those of one command."""
+        """Return the options of an identification; `more` are the options of one command."""
         low_pass = self.torque_bandwidth
         friction = self.friction
         return Options(

@@ -176,7 +176,7 @@ _AS_DESCRIBED: Final = frozenset(
 
 
 def summary(rows: Sequence[Row]) -> list[str]:
-    """Return a line for each row, and one for those that are as the URDF says."""
+    """Return a line for each row, and one for all rows that agree with the URDF."""
     usual = [row for row in rows if isinstance(row.reading, Fact) and row.reading in _AS_DESCRIBED]
     width = max(len("channel"), *(len(row.aspect) for row in rows))
     lines = [f"{'channel':{width}}  {'meaning':{_MEANING}}  {'certainty':{_CERTAINTY}}  evidence"]

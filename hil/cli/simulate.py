@@ -97,7 +97,7 @@ class PhasePrinter:
         self.say(f"{self._elapsed()}  {text}")
 
     def next_session(self) -> None:
-        """Begin a session: its lines count anew."""
+        """Begin a session: its lines are counted from zero."""
         self._printed.clear()
         self._hidden = 0
         self._phase = None

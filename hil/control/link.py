@@ -1,4 +1,4 @@
-"""The link to a controller: runs motions on it, or records those of its own program.
+"""The link to a controller: runs motions on it, or records motions of its own program.
 
 A `MotionLink` steers over a `ControllerPort`: that of `hil.control.virtual_link` in virtual time,
 that of `hil.control.live_link` in real time.
@@ -114,7 +114,7 @@ class MotionLink:
         return self.port.only_simulated
 
     def notes(self) -> tuple[str, ...]:
-        """Return what the system refused, in sentences; none of it is needed."""
+        """Return what the system refused, in sentences; nothing of it is essential."""
         return self.port.notes()
 
     @property
@@ -185,7 +185,7 @@ class MotionLink:
         override: float = 1.0,
         watch: MotionWatch = unwatched_motion,
     ) -> MotionEnded:
-        """Run one motion, archive every cycle of it, and return how it ended.
+        """Run one motion, archive its every cycle, and return how it ended.
 
         If archiving fails, the arm is brought to rest on its path before the error is raised.
 
@@ -568,7 +568,7 @@ class _Supervision:
             time.sleep(REQUEST_PERIOD)
 
     def _is_archived(self) -> bool:
-        """Return whether the archive is complete; the arm rests before any error of it."""
+        """Return whether the archive is complete; the arm rests before any archive error."""
         try:
             recorded = self._port.archived()
         except Exception:

@@ -13,7 +13,7 @@ from sim_fixtures import SettingError
 
 
 class InterpolatedMoves:
-    """Moves from rest to rest by the services of RRS-1, each when the one before has ended.
+    """Moves from rest to rest by the services of RRS-1, one after the other.
 
     Args:
         limits: of the arm.

@@ -55,7 +55,7 @@ class PortStatus:
 
 
 class ControllerPort(Protocol):
-    """Exchange with one controller, and at most one open archive of it.
+    """Exchange with one controller, with at most one open archive.
 
     Attributes:
         is_virtual: whether time is simulated; then it passes in `exchange_until` only.
@@ -78,7 +78,7 @@ class ControllerPort(Protocol):
         """Return why no packet gets a reply any more; None while they do."""
 
     def notes(self) -> tuple[str, ...]:
-        """Return what the system refused, in sentences; none of it is needed."""
+        """Return what the system refused, in sentences; nothing of it is essential."""
 
     def prepare(self, stop: Stop) -> None:
         """Wait for what an earlier failure left, or a stop; read records from now on.
@@ -148,7 +148,7 @@ class ControllerPort(Protocol):
         """
 
     def archive_failure(self) -> str | None:
-        """Return why nothing is archived any more, beside the disk; None while it is."""
+        """Return why nothing is archived any more, other than the disk; None while archiving."""
 
     def close_archive(self, outcome: str, reason: str) -> Recorded:
         """Complete the open archive, and return what it contains.

@@ -203,7 +203,7 @@ def own_postures(cell: Cell) -> tuple[tuple[float, ...], ...]:
 
 
 def simulated_drive(cell: Cell) -> SimulatedDrive:
-    """Return the true drive train: `[simulation.drive_train]` over that of the cell."""
+    """Return the true drive train: the cell's, overridden by `[simulation.drive_train]`."""
     simulation = cell.file.simulation
     stated = {} if simulation is None else simulation.drive_train.model_dump(exclude_none=True)
     table = cell.drive_table.model_copy(update=stated)

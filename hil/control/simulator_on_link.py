@@ -28,7 +28,7 @@ _PR_SET_TIMERSLACK: Final = 29
 def open_controller_link(
     addresses: Mapping[str, str | None], settings: ControllerSettings, n_axes: int
 ) -> serve.ControllerLink:
-    """Open the controller's end at the one address, by option; that of --link is "NAME:ADDRESS".
+    """Open the controller's end at the one address, by option; --link has "NAME:ADDRESS".
 
     Raises:
         InputError: not one link, or an invalid one, that cannot be opened or cannot carry the
@@ -84,7 +84,7 @@ class Buttons:
         return serve.Request.END if self.interrupted or over else serve.Request.CONTINUE
 
     def press(self, signum: int, frame: FrameType | None = None) -> None:
-        """Handle a signal: SIGINT and SIGTERM end, the second at once; SIGUSR1, 2 are buttons."""
+        """Handle a signal: SIGINT, SIGTERM end, the second immediately; SIGUSR1, 2 are buttons."""
         del frame
         if signum in (signal.SIGUSR1, signal.SIGUSR2):
             self._pressed.add(signum)

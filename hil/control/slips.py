@@ -117,7 +117,7 @@ def _within_velocities(recording: Recording, velocity: Array, jump: PositionJump
 
 
 def _frozen(time: Array, position: Array, names: tuple[str, ...], jump: PositionJump) -> bool:
-    """Return whether a jump ends a position that was repeated, not measured anew."""
+    """Return whether a jump ends a position that was repeated instead of measured."""
     row = int(np.searchsorted(time, time[0] + jump.time))
     column = position[:, names.index(jump.joint)]
     return row < 2 or bool(column[row - 1] == column[row - 2])

@@ -78,7 +78,7 @@ def listening(
     wait: float | None = None,
     report: Callable[[str], object] = lambda _: None,
 ) -> Iterator[ArmListener]:
-    """Connect to the arm of a cell, and make sure that it is that of the cell.
+    """Connect to the arm of a cell, and check its identity.
 
     Args:
         cell: with transport "rtde".
@@ -247,7 +247,7 @@ class _Recording:
 
 @dataclass(frozen=True, eq=False)
 class ConstantsFound:
-    """Torque constants that the arm of a recording states at rest, beside those of the cell.
+    """Torque constants that the arm of a recording states at rest, and the cell's.
 
     Attributes:
         stated: joint torque by current (6,) [N·m/A], gears included; NaN where nothing says it.
@@ -261,7 +261,7 @@ class ConstantsFound:
 
     @classmethod
     def of(cls, path: Path, cell: Cell) -> Self:
-        """Return those of an archive; joints of equal largest torque have the same.
+        """Return the constants of an archive; joints of equal largest torque share one.
 
         Raises:
             ArchiveError: the archive cannot be read.
@@ -280,7 +280,7 @@ class ConstantsFound:
 
     @property
     def differ(self) -> bool:
-        """Whether those of the cell are not those that the arm states."""
+        """Whether the cell's constants differ from what the arm states."""
         off = np.abs(self.stated - self.in_cell) > _SAME * self.in_cell
         return bool((np.isfinite(self.stated) & off).any())
 
@@ -309,7 +309,7 @@ def _changes(before: np.void | None, now: np.void) -> Iterator[tuple[str, str, L
 
 
 def _payload_difference(cell: Cell, state: np.void) -> str:
-    """Return how the payload of the controller differs from that of the cell, or ""."""
+    """Return how the payloads of controller and cell differ, or ""."""
     difference = cell.expected_arm.payload_difference(
         float(state["payload_mass"]), tuple(state["payload_centre"])
     )
@@ -355,7 +355,7 @@ def _connected(
 
 
 def _require_same_arm(cell: Cell, reader: RtdeReader, identity: ArmIdentity) -> None:
-    """Raise ControllerError if the arm is not that of the cell."""
+    """Raise ControllerError unless the arm is the cell's."""
     cycle_ms = round(1000.0 / reader.frequency)
     if cycle_ms != cell.controller.cycle_ms:
         problem = f"the controller's cycle is {cycle_ms} ms, the cell states"

@@ -38,7 +38,7 @@ _LINK_ENDED: Final = "the link ended"
 
 
 class VirtualPort:
-    """A session on a transport, and the recorder of it; see `ControllerPort`.
+    """A session on a transport with its recorder; see `ControllerPort`.
 
     Attributes:
         finish: asks the controller to end the session.

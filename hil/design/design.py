@@ -248,7 +248,7 @@ def run_search(
     problem: excitation.Problem | None = None,
     journal: excitation.Journal | None = None,
 ) -> excitation.Design:
-    """Search a motion for a cell, or for a given problem of it.
+    """Search a motion for a cell, or for a given problem.
 
     Args:
         cell: of the arm.

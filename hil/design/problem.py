@@ -65,7 +65,7 @@ def problem_of(
     if settings.objective.precision and precision is None:
         raise SettingsError(
             None,
-            "names requirements, and what they stand for was not computed",
+            "names requirements, but the required quantities were not computed",
             field="objective.precision",
             remedy="pass precision = hil.precision.forecast.PrecisionDesign.of(...).precision(30)",
         )

@@ -123,7 +123,7 @@ class SineTable(Table):
 
 
 class ConstraintTable(Table):
-    """`[constraints]`: constraints beside the joint limits."""
+    """`[constraints]`: constraints in addition to the joint limits."""
 
     min_duration: NonNegative = field("the shortest duration in s, 0 for any", 0.0)
     max_duration: Positive = field("the longest duration in s, above 0", 20.0)

@@ -309,7 +309,7 @@ def port_check(wanted: FreePort, error: int) -> DoctorCheck:
 
 
 def _address_of(host: str, system: System) -> str | None:
-    """Return an IPv4 address, or that of a name in /etc/hosts; None otherwise. No DNS."""
+    """Return an IPv4 address, also of a name in /etc/hosts; None otherwise. No DNS."""
     lines = [line.split("#")[0].split() for line in system.text("/etc/hosts").splitlines()]
     for text in (host, *(fields[0] for fields in lines if host in fields[1:])):
         try:

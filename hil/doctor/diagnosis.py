@@ -69,7 +69,7 @@ class Latency:
 CYCLES_MS: Final = (1, 2)
 CRITERIA: Final = (
     f"a cycle is fit if no cycle of the measurement was late, with {1e6 * RESERVE:.0f} µs "
-    "reserved for packet work and wire, and 99.9 % of the latencies used at most half of it"
+    "reserved for packet work and wire, and 99.9 % of the latencies used at most half of this time"
 )
 ENOUGH_SECONDS: Final = 60.0
 """Time of measurement below which a verdict is provisional, s."""

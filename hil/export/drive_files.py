@@ -126,7 +126,7 @@ def export_drives(
     make_folder(output.parent)
     write_files(output.parent, files)
     paths = tuple(output.parent / name for name in files)
-    said = "read back: parsed, its values are those written"
+    said = "read back: parsed, its values agree with the ones written"
     return ExportedDrives(paths, said, model.verdict, model.origin)
 
 
@@ -217,7 +217,7 @@ def _sampled_drives(model: IdentifiedModel, count: int, seed: int) -> dict[Quant
 
 
 def _quantities(arm: ExportedArm) -> dict[Quantity, Array]:
-    """Return friction and rotors (n,) of an arm, none of which drives a joint."""
+    """Return friction and rotors (n,) of an arm, none negative."""
     rows = arm.friction[: arm.model.n_joints]
 
     def coefficients(symbol: str) -> Array:

@@ -167,7 +167,7 @@ def export_servo(folder: Path, to: str, export: WhatToExport) -> tuple[ExportedS
         write = isaac_lab if to == "isaaclab" else genesis
         text = write(actuators, results.cell, remarks)
         require_values(text, actuators, form.names)
-        checked = "read back: parsed, its values are those written"
+        checked = "read back: parsed, its values agree with the ones written"
     files[target.name] = text
     if export.ranges or export.count is not None:
         document = ranges_of(actuators, form.names, remarks)
@@ -241,7 +241,7 @@ def _archives(folder: Path, results: ServoResults) -> tuple[Cell, tuple[Source, 
     for path in (*fitted, *predicted):
         if not path_exists(path):
             remedy = "leave archives and results in one folder, or identify again"
-            raise InputError(path, "is missing: the results are of it", remedy=remedy)
+            raise InputError(path, "is missing: the results were computed from it", remedy=remedy)
     sources = gather_sources(
         fitted, results.split, predicted, in_sample=results.in_sample, with_torque=False
     )
@@ -371,11 +371,11 @@ def _remarks(results: ServoResults) -> tuple[str, ...]:
         *(
             [
                 "The servo accelerates its set-point by a limited rate [rad/s² or m/s²],"
-                f" which no simulator has: limit fast commands likewise. {planned}."
+                f" which no simulator has: limit fast commands to this rate. {planned}."
             ]
             if planned
             else []
         ),
-        "Values are those with which the terms of this simulator come closest to the motion.",
+        "With these values the terms of this simulator come closest to the motion.",
         f"archives: {', '.join(results.archives)}",
     )

@@ -149,7 +149,7 @@ class _TypeFits:
         cache: CacheLocation,
         broken: list[SkippedArchive],
     ) -> _TypeFits | None:
-        """Return the estimates of recordings of one type; add to `broken` those without one."""
+        """Return the estimates of recordings of one type; add the others to `broken`."""
         settings = _settings(refs, options, cluster, cache, broken)
         if settings is None:
             return None

@@ -28,7 +28,7 @@ _NO_FACTS: Final = (*_JOINTS, "header", "layout", "variance")
 
 
 class ExtraChannels(NamedTuple):
-    """What is read of each log beside its motion; some columns are found by their names.
+    """What is read from each log in addition to its motion; some columns are found by name.
 
     These are temperatures and the time since the start.
 
@@ -123,7 +123,7 @@ def _numbers(value: object) -> Array:
 
 
 def _means(table: TextTable | ArrayFile, name: str) -> Iterator[tuple[str, float]]:
-    """Yield the mean of a column; of an array with several, that of each, numbered from 1."""
+    """Yield the mean of a column, or of each column of an array, numbered from 1."""
     try:
         if isinstance(table, TextTable):
             values = table.numbers([name], "facts")

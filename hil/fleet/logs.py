@@ -228,7 +228,7 @@ def conclude_map(log: str, reading: LogReading, cache: CacheLocation) -> ReadLog
     recording = concluded(as_stated, source, reading.robot_of, reading.options, "excitation")
     _require_usable(recording, source)
     text = recording.text
-    assert text is not None, "a log has a column map, a bag that of its topic"
+    assert text is not None, "a log has a column map, a bag the map of its topic"
     gravity = _gravity_of(recording)
     log_map = LogMap(
         text=text,
@@ -356,7 +356,7 @@ class LogsOfBatch:
     maps: dict[LogMap, int] = field(default_factory=dict)
 
     def is_log(self, file: Path, siblings: Collection[str]) -> bool:
-        """Return whether a file may be a log or a bag; tables beside results are none."""
+        """Return whether a file may be a log or a bag; tables next to results are neither."""
         suffix = file.suffix.lower()
         if suffix in _PACKED:
             suffix = Path(file.stem).suffix.lower()
@@ -410,7 +410,7 @@ class LogsOfBatch:
     def _imported(
         self, logs: Sequence[str], maps: Sequence[LogMap], advance: Callable[[float], None]
     ) -> dict[str, ReadLog | SkippedArchive]:
-        """Read logs by known maps, and conclude maps for those that none of them describes."""
+        """Read logs by known maps, and infer maps for the others."""
         stated = self.reading.stated
         maps = [*maps] if stated is None else [stated]
         done: dict[str, ReadLog | SkippedArchive] = {}

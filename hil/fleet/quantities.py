@@ -76,7 +76,7 @@ class TrackedQuantity:
         return self.in_estimates([each.fit for each in summaries if each.fit is not None])
 
     def _reference_errors(self, summaries: Sequence[Summary], first: int) -> tuple[Array, Array]:
-        """Return the torque errors of one model in all recordings; their noise is that of days."""
+        """Return the torque errors of one model in all recordings; their noise is by day."""
         fits = [summary.fit.values for summary in summaries[:first] if summary.fit is not None]
         reference = np.mean(fits, axis=0)
         errors = []
@@ -140,7 +140,7 @@ def mean_parameters(fits: Sequence[Estimate]) -> Array:
 
 
 def _best_speed(fits: Sequence[Estimate], weights: Array) -> int:
-    """Return the speed at which friction is largest beside its standard deviation."""
+    """Return the speed at which friction is largest relative to its standard deviation."""
     step = max(1, len(fits) // _SHOWN)
     ratios = []
     for fit in fits[::step]:

@@ -71,7 +71,7 @@ class TypeSeries:
         return {name for recording in every for name in recording.facts}
 
     def covariates_of(self, joint: str, stated: Sequence[str]) -> list[str]:
-        """Return the covariates that concern a joint, with those that were asked for."""
+        """Return the covariates that concern a joint, and the requested ones."""
         numbers = {
             robot: [each.facts for each in recordings]
             for robot, recordings in self.recordings.items()

@@ -145,7 +145,7 @@ class _Noise(NamedTuple):
 
 
 def courses(family: Sequence[Series]) -> list[Course | None]:
-    """Return the model of each series of robots of one type; None of those that are too short."""
+    """Return the model of each series of robots of one type; None for a series too short."""
     without, priors = _without_effects(family)
     known = [prior.mean for prior in priors]
     rest = [prior._replace(mean=np.zeros_like(prior.mean)) for prior in priors]
@@ -177,7 +177,7 @@ class CommonCourse(NamedTuple):
 
 
 def common_course(family: Sequence[Series]) -> CommonCourse | None:
-    """Return the course of all robots together, of those that were there all the time.
+    """Return the common course of the robots that were present all the time.
 
     A year's season, a sine of any phase, is taken into account. None for fewer robots than show
     what they have in common, and before a year has passed: a season is none until then.
@@ -511,7 +511,7 @@ def _largest(series: Series, model: _Model) -> float:
 
 
 def _candidates(time: Array) -> list[ShapeOfChange]:
-    """Return the changes that may be found: steps between recordings, slopes also between those."""
+    """Return the candidate changes: steps between recordings, slopes also inside the intervals."""
     distinct = np.unique(time)
     if len(distinct) < 2 * AFTER:
         return []
@@ -541,7 +541,7 @@ def _p_without_one(
 def _apart(
     time: Array, candidates: Sequence[ShapeOfChange], chosen: Sequence[ShapeOfChange]
 ) -> list[ShapeOfChange]:
-    """Return the changes that have `AFTER` recordings between them and those chosen."""
+    """Return the changes at least `AFTER` recordings away from the chosen ones."""
     if not chosen:
         return list(candidates)
     near = np.any(_near(time, candidates, chosen), axis=1)
@@ -596,7 +596,7 @@ def _likeliest(
     chosen: Sequence[ShapeOfChange],
     candidates: Sequence[ShapeOfChange],
 ) -> tuple[ShapeOfChange | None, float]:
-    """Return the candidate that explains most beside those chosen, and its statistic."""
+    """Return the candidate that explains most in addition to the chosen ones, and its statistic."""
     if not candidates:
         return None, 0.0
     coefficients, covariance, design = _solved(series, prior, weights, chosen)
@@ -678,7 +678,7 @@ def _refined(
     chosen: Sequence[ShapeOfChange],
     candidates: Sequence[ShapeOfChange],
 ) -> list[ShapeOfChange]:
-    """Choose each change again beside the others."""
+    """Choose each change again, given the others."""
     refined = list(chosen)
     for _ in range(2 if len(chosen) > 1 else 1):
         for number in range(len(refined)):
@@ -696,7 +696,7 @@ def _own_scale(
     variance: Array,
     candidates: Sequence[ShapeOfChange],
 ) -> float:
-    """Return by how much the variance of this robot exceeds that of its type, at least 1."""
+    """Return the ratio of this robot's variance to its type's, at least 1."""
     weights = 1.0 / variance
     pair, _ = _likeliest_pair(series, prior, weights, candidates, 1.0)
     freedom = max(1.0, len(series.time) - 1.0 - 2.0 * len(pair))

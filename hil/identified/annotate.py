@@ -1,4 +1,4 @@
-"""Archives with predicted torque and residual beside the measured quantities, for viewers."""
+"""Archives with predicted torque and residual next to the measured quantities, for viewers."""
 
 from __future__ import annotations
 

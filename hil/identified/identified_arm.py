@@ -167,7 +167,7 @@ class IdentifiedArm:
             raise InputError(source.folder, str(error), remedy=remedy) from error
 
     def observer(self, gain: float, dt: float) -> MomentumObserver:
-        """Return an observer of the torque from outside, such as that of a contact.
+        """Return an observer of external torque, such as contact.
 
         Args:
             gain: 1 over the time constant of the estimate [1/s], such as 25.
@@ -186,7 +186,7 @@ class IdentifiedArm:
         size: tuple[float, float] | None = None,
         axes: Axes | Sequence[Axes] | None = None,
     ) -> TorquePlot:
-        """Draw measured torque of the held-out motion, and that of identified and nominal model.
+        """Draw the torque of the held-out motion: measured, identified model, nominal model.
 
         Args:
             joints: names, or numbers from 0; None: all.
@@ -449,7 +449,7 @@ def _of_archives(
 
 
 def _lack_torque(archives: Sequence[Path]) -> bool:
-    """Return whether archives have commands and no torque; what is wrong with one is said later."""
+    """Return whether archives have commands and no torque; their defects are reported later."""
     try:
         return without_torque(archives)
     except InputError:

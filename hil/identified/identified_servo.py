@@ -1,4 +1,4 @@
-"""An arm without torque that was identified, and the files written of it."""
+"""An identified arm without torque, and the files written about it."""
 
 from __future__ import annotations
 

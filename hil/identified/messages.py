@@ -70,7 +70,7 @@ def servo_read_lines(servo: IdentifiedServo) -> list[tuple[str, str]]:
 
 
 def _same(arm: IdentifiedArm) -> bool:
-    """Return whether every recording was imported: those need no line of their archives."""
+    """Return whether every recording was imported: their archives need no line."""
     return arm.staging is not None and not any(
         isinstance(entry, Path) for entry in (*arm.staging.fitted, *arm.staging.predicted)
     )

@@ -62,7 +62,7 @@ class Staging:
                 raise InputError(place, problem, remedy="name another folder: --output FOLDER")
 
     def write_to(self, folder: Path) -> Mapping[Path, Path]:
-        """Write archives and maps to an existing folder; return the paths by those in memory.
+        """Write archives and maps to an existing folder; return their paths by the paths in memory.
 
         Raises:
             InputError: the folder cannot be written to.
@@ -99,7 +99,7 @@ def staged(
     options: ImportOptions,
     reporter: Reporter,
 ) -> Iterator[Staging]:
-    """Read those recordings that are no archives, and report what was concluded.
+    """Read the recordings that are not archives, and report what was concluded.
 
     Errors about an archive in memory name the recording it was read from.
 
@@ -186,7 +186,7 @@ def require_torques(staging: Staging) -> None:
     for place, recording in staging.recordings.items():
         if has_servo(recording.archive):
             problem = "has no torque, and other recordings have"
-            remedy = "identify those with and without torque separately"
+            remedy = "identify recordings with and without torque separately"
             raise SourceError(staging.sources[place], problem, field="torque", remedy=remedy)
 
 

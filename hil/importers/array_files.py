@@ -171,7 +171,7 @@ class ArrayFile:
             vector = self._array(column, field)
             if vector.ndim == 2 and 1 not in vector.shape:
                 problem = f"array {column!r} has the shape {vector.shape}"
-                remedy = "name an array of one dimension, or a column of it by index"
+                remedy = "name an array of one dimension, or one of its columns by index"
                 raise SourceError(self.path, problem, field=field, remedy=remedy)
             return vector.ravel()
         matrix = self._matrix(array, field)
@@ -199,7 +199,9 @@ class ArrayFile:
         if name not in self._loaded:
             stored = self._stored[name]
             if math.prod(stored.shape) > MOST_NUMBERS:
-                problem = f"array {name!r} of shape {stored.shape} is too large to be read at once"
+                problem = (
+                    f"array {name!r} of shape {stored.shape} is too large to be read in one piece"
+                )
                 raise SourceError(self.path, problem, remedy="save the log in parts")
             with _readable(self.path):
                 array = stored.load()
@@ -367,7 +369,7 @@ def _stacked(path: Path, name: str, lists: NDArray[Any]) -> NDArray[Any]:
 
 
 def _as_numbers(values: NDArray[Any]) -> NDArray[Any]:
-    """Return a column of text as numbers, NaN where it is none, if most of it is numbers."""
+    """Return a column of text as numbers, NaN for other cells, if most cells are numbers."""
     if values.dtype != object:
         return values
     import pandas as pd  # 0.4 s

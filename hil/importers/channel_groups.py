@@ -106,5 +106,5 @@ def grouped(channels: Iterable[Channel], joints: Sequence[str]) -> list[ChannelG
 
 
 def _joint_in(name: str, joints: Sequence[str]) -> str | None:
-    """Return the joint whose name is in that of a channel, the longest; None without one."""
+    """Return the joint with the longest name contained in a channel's name, or None."""
     return max((joint for joint in joints if joint in name), key=len, default=None)

@@ -150,7 +150,7 @@ def kind_of(name: str, unit: str | None = None) -> tuple[Kind | None, int | None
 
 
 def named_channels(file: TextTable | ArrayFile) -> list[Channel]:
-    """Return the channels of a file by their names, of which no number is read."""
+    """Return the channels of a file by their names, without reading a number."""
     if isinstance(file, TextTable):
         return [Channel(name, 1, len(file.lines), kind=kind_of(name)[0]) for name in file.names]
     shapes = {name: file.shape(name) for name in file.names}

@@ -94,7 +94,7 @@ def measured_topics(topics: Mapping[str, Topic]) -> list[str]:
 
 
 def as_joint_state(message: BagMessage) -> BagMessage:
-    """Return a message of joint states, or that of a controller as one of its measured state."""
+    """Return a message of joint states; a controller's message as its measured state."""
     content = message.content
     if not hasattr(content, "joint_names"):
         return message
@@ -150,7 +150,7 @@ def commanded_positions(
 
 
 def _candidates(topics: Mapping[str, Topic], states: str) -> list[list[str]]:
-    """Return topics that may carry commands, those whose kind says most first."""
+    """Return topics that may carry commands, the most telling kinds first."""
     controllers = topics_of_kind(topics, CONTROLLER_STATE) + topics_of_kind(
         topics, _DEGREES_OF_FREEDOM
     )
@@ -245,7 +245,7 @@ def _of_states(messages: Iterable[BagMessage], measured: Measured) -> tuple[Arra
 
 
 def _of_arrays(messages: Iterable[BagMessage], measured: Measured) -> tuple[Array, str]:
-    """Return arrays without names, each column of which follows another joint."""
+    """Return arrays without names in which each column follows another joint."""
     stamps = []
     rows = []
     for message in messages:

@@ -332,7 +332,7 @@ class PartialVelocity(Conclusion):
 
 @dataclass(frozen=True)
 class NotCommands(Conclusion):
-    """A topic of commands that was not used; `problem` is that of its messages."""
+    """A topic of commands that was not used; `problem` says what is wrong with its messages."""
 
     topic: str
     problem: str
@@ -340,7 +340,7 @@ class NotCommands(Conclusion):
 
 @dataclass(frozen=True)
 class DifferentCommands(Conclusion):
-    """Two topics that command different positions, of which neither is used."""
+    """Two topics that command different positions; neither is used."""
 
     topics: tuple[str, str]
 

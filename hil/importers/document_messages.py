@@ -77,7 +77,7 @@ def _of_protobuf(kind: str, definition: bytes, messages: Sequence[bytes]) -> lis
 def columns_of_trees(
     received: Sequence[int], messages: Sequence[Mapping[str, Any]]
 ) -> dict[str, NDArray[Any]]:
-    """Return arrays by field; ``stamp`` is the time of the messages [ns], else that of receipt.
+    """Return arrays by field; ``stamp`` is the time of the messages [ns], else of receipt.
 
     Raises:
         MessageError: fields or names change from message to message, or there is no number.
@@ -105,7 +105,7 @@ def columns_of_trees(
 def numbers_of(
     tree: Mapping[str, Any], above: str = "", *, times: bool = False
 ) -> Iterator[tuple[str, Number | list[Number]]]:
-    """Yield numbers and lists of numbers by field, of stamps with `times` those that are numbers.
+    """Yield numbers and lists of numbers by field; with `times`, also numeric stamps.
 
     `above` begins the name of each field.
     """

@@ -47,7 +47,7 @@ def activity(probes: Sequence[Array]) -> Array:
 
 
 def chosen_stretches(moved: Array, most: int) -> NDArray[np.intp]:
-    """Return the stretches to read (k,), rising: those in which something moves, or `most` of them.
+    """Return the stretches to read (k,), rising: all in which something moves, or `most`.
 
     These are spread over the recording, at uneven distances, as programs of robots repeat.
 

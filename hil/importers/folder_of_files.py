@@ -253,7 +253,7 @@ class _Search:
             self._held.setdefault(_commanded(kind, path), []).append(held)
 
     def _nameless(self, file: TextTable | ArrayFile, count: int) -> _Held:
-        """Return the columns of a file without names, the first of which may be its times."""
+        """Return the columns of a file without names; the first may be its times."""
         name = file.path.name
         has_times = isinstance(file, TextTable) and count == len(self._joints) + 1
         if has_times and is_clock(file.numbers([0], "time", None)[:, 0]):

@@ -142,7 +142,7 @@ class Robot:
         return self._checked(text, self.urdf, Path("cell.toml"), self.links)
 
     def without_gripper(self, recorded: Collection[str] = ()) -> Robot:
-        """Return this robot with the joints of a gripper fixed, but those that were recorded."""
+        """Return this robot with the joints of a gripper fixed, except recorded ones."""
         fingers = [
             name for name in gripper_joints(self.urdf, self.joint_names) if name not in recorded
         ]
@@ -203,7 +203,7 @@ def _held(
     path: Path,
     links: Links,
 ) -> dict[str, float]:
-    """Return the positions of locked joints: those given, and all that were not recorded.
+    """Return the positions of locked joints: the given ones, and all that were not recorded.
 
     With `links` also those that do not lie between them.
     """

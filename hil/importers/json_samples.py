@@ -109,7 +109,7 @@ def _of_member(value: Any) -> dict[str, NDArray[Any]]:
 
 
 def _of_rows(rows: Sequence[Any], names: Sequence[str]) -> dict[str, NDArray[Any]]:
-    """Return lists of numbers, the first of which may be of names, as columns."""
+    """Return lists of numbers as columns; the first list may be names."""
     if not names and rows and isinstance(rows[0], list) and rows[0]:
         head = rows[0]
         if all(isinstance(cell, str) for cell in head):

@@ -276,7 +276,7 @@ class _Log:
         raise SourceError(self.path, problem, field=name, remedy=remedy)
 
     def _factor(self, name: str, quantity: Quantity, stated: Sequence[str | None]) -> float | Array:
-        """Return the factors to SI units: of the map's unit, or of those that the file states.
+        """Return the factors to SI units: of the map's unit, or of the units in the file.
 
         Raises:
             SourceError: the file states another unit, or parts of a rated value are of none.
@@ -372,7 +372,7 @@ class _Log:
     def on_one_clock(
         self, clock: _Clock, values: dict[str, Array]
     ) -> tuple[_Clock, dict[str, Array]]:
-        """Return quantities at common times, those with times of their own interpolated.
+        """Return quantities at common times, interpolated if they have their own.
 
         Raises:
             SourceError: they have no common time.
@@ -758,7 +758,7 @@ class _Log:
         return self.files[path]
 
     def _row_names(self, joints: tuple[str, ...]) -> tuple[str, ...]:
-        """Return the joints that the rows name, for columns in their order; else those given."""
+        """Return the joints that the rows name, for columns in their order; else the given ones."""
         quantities = self._map.quantities().values()
         numbered = all("{}" in str(quantity.columns) for quantity in quantities)
         if not numbered or any(quantity.file or quantity.files for quantity in quantities):

@@ -90,7 +90,7 @@ def _arrays(path: str, _changed: int) -> dict[str, NDArray[Any]]:
 
 
 def _variables(path: str) -> dict[str, Any]:
-    """Return the variables of a .mat, without those that only MATLAB can read."""
+    """Return the variables of a .mat that not only MATLAB can read."""
     from pymatreader import read_mat  # with h5py, which only a .mat needs
 
     try:

@@ -79,16 +79,14 @@ def read(
                     messages.append((name, min(record.log_time, _LATEST), record.data))
                     size += len(record.data)
             if size > MOST_BYTES:
-                problem = (
-                    f"has more than {MOST_BYTES} bytes of numbers: too large to be read at once"
-                )
+                problem = f"has more than {MOST_BYTES} bytes of numbers: too large for one reading"
                 remedy = "cut it, or leave out topics (`mcap filter`)"
                 raise SourceError(path, problem, remedy=remedy)
     return topics, sorted(messages, key=lambda message: message[1])
 
 
 def _records(stream: BinaryIO) -> Iterator[McapRecord]:
-    """Yield the records in the order of the file, also those in chunks.
+    """Yield the records in the order of the file, also inside chunks.
 
     Chunks are decompressed in limited memory, which the library does not do.
     """

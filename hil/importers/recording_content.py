@@ -186,7 +186,7 @@ class RecordingContent:
 
 
 def _without_gaps(found: Conclusion) -> Conclusion:
-    """Return a finding of an excerpt; what was left out of it is no gap of the recording."""
+    """Return a finding of an excerpt; parts that were not read are no gaps of the recording."""
     if not isinstance(found, RecordedClock):
         return found
     return replace(found, base=replace(found.base, gaps=0, pauses=0))

@@ -418,7 +418,7 @@ def import_bag(
 def _of_recorded_joints(
     read: Callable[[RobotOf], ImportedRecording], robot_of: RobotOf, source: Path
 ) -> ImportedRecording:
-    """Import with joints fixed that were not recorded, where the URDF says which those are."""
+    """Import with unrecorded joints fixed, where the URDF tells which they are."""
     robots = _OfRecordedJoints(robot_of, source)
     try:
         return read(robots)
@@ -443,7 +443,7 @@ def _of_fewer_joints(
 
 
 class _OfRecordedJoints:
-    """Robots of which joints that were not recorded are fixed, after a refused import.
+    """Robots with unrecorded joints fixed, after a refused import.
 
     Attributes:
         concluded: what was fixed.
@@ -464,7 +464,7 @@ class _OfRecordedJoints:
         return robot
 
     def fix(self, error: UnrecordedJointError) -> bool:
-        """Fix joints of a gripper, then those outside the recorded arm; False if there are none.
+        """Fix joints of a gripper, then joints outside the recorded arm; False without any.
 
         Raises:
             SourceError: several arms have as many joints as were recorded.
@@ -777,5 +777,5 @@ def _joints_of(columns: ColumnMap, path: Path) -> tuple[str, ...]:
 
 def _no_joints(source: Path) -> tuple[str, ...]:
     problem = "does not name the recorded joints"
-    remedy = "name those that were not recorded with --locked NAME, or give a map with joints"
+    remedy = "name the joints that were not recorded with --locked NAME, or give a map with joints"
     raise SourceError(source, problem, field="--lock-others", remedy=remedy)

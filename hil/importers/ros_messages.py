@@ -93,7 +93,7 @@ def _with_msg(kind: str) -> str:
 
 
 def _check_size(node: tuple[Any, Any]) -> None:
-    """Refuse fixed arrays of which one message would fill the memory."""
+    """Refuse fixed arrays if one message would fill the memory."""
     kind, content = node
     if kind == Nodetype.ARRAY and content[1] > _LONGEST:
         raise MessageError(f"it has an array of {content[1]} elements")

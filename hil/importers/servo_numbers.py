@@ -40,7 +40,7 @@ _ENCODERS: Final = (
 
 
 def are_whole(values: Array) -> bool:
-    """Return whether all known values (m, n) are whole numbers, of which some are not 0."""
+    """Return whether all known values (m, n) are whole numbers, and some are not 0."""
     known = values[np.isfinite(values)]
     return bool(known.size and np.any(known) and np.array_equal(known, np.rint(known)))
 

@@ -171,7 +171,7 @@ def check_clock(stamp: Stamps, path: Path, remedy: str | None = None) -> None:
     if backward.size:
         first = int(backward[0]) + 1
         problem = (
-            f"sample {first} is {number(-1e-9 * steps[first - 1])} s older than the one before it "
+            f"sample {first} is {number(-1e-9 * steps[first - 1])} s older than the previous one "
             f"({backward.size} such steps)"
         )
         cut = "cut the recording where its clock runs backwards"

@@ -378,7 +378,7 @@ class TextTable:
 def _numbered_lines(
     path: Path, form: Format, long: LongText | None
 ) -> tuple[list[tuple[int, str]], str]:
-    """Return the lines of a file, or those that are read of a long one, and their text."""
+    """Return the lines of a file, or the sampled lines of a long one, and their text."""
     text = text_of(path, form) if long is None else table_text(path, long.text)
     text = spread_lists(path, text, drop=form.missing != "refuse")
     numbers = count(1) if long is None else long.numbers
@@ -473,7 +473,7 @@ def _first_row(lines: Sequence[tuple[int, str]], dialect: Dialect) -> int:
 
 
 def _are_units(cells: Sequence[str]) -> bool:
-    """Return whether the cells of a line are units, of which some may be missing or not known."""
+    """Return whether the cells of a line are units; some may be missing or unknown."""
     filled = [cell.strip(_BRACKETS) for cell in cells if cell.strip(f"{_BRACKETS}-")]
     known = sum(unit_of(cell) is not None for cell in filled)
     return known > 0.5 * len(filled) and all(map(stated_unit, filled))

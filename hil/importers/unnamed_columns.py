@@ -61,7 +61,7 @@ def blocks_of(values: Array, counts: Sequence[int]) -> ColumnBlocks | None:
 
 
 def _slope_ratio(position: Array, other: Array) -> float | None:
-    """Return the steps of positions (m, n) over other columns, by most of those that move.
+    """Return the steps of positions (m, n) over other columns, by most of the moving ones.
 
     None where the others do not follow the slopes.
     """

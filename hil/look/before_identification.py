@@ -328,7 +328,7 @@ def _again(
 def undecided(
     source: Path, choices: tuple[TiedReading, ...], contradictions: Contradictions
 ) -> SourceError:
-    """Return the refusal of readings that fit alike; a doubtful arm is said first."""
+    """Return the refusal of hypotheses that fit equally well; a doubtful arm comes first."""
     errors = [
         f" (error {percentage(choice.error, 1)})" if choice.error else "" for choice in choices
     ]

@@ -88,7 +88,7 @@ def _terms(axes: Axes, columns: NDArray[np.intp]) -> list[list[float]]:
 
 
 def _names(columns: Any, channels: Collection[str], joints: Sequence[str]) -> list[Any] | None:
-    """Return the columns of a quantity one by one; None where they are those of one array."""
+    """Return the columns of a quantity one by one; None where they belong to one array."""
     if isinstance(columns, list):
         return list(columns)
     if not isinstance(columns, str) or "{}" not in columns:

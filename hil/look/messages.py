@@ -676,7 +676,7 @@ def _(currents: MotorCurrents) -> str:
 
 
 def _about(motors: MotorTorque | MotorCurrents) -> str:
-    """Return the ratios of each joint, and of which they are not seen, in an open bracket."""
+    """Return the ratios of the joints, and the joints without one, in an open bracket."""
     each = ", ".join(number(ratio) for ratio in motors.ratios)
     if not motors.unseen or len(motors.unseen) == len(motors.ratios):
         return f"[{each}] (about"

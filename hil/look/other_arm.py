@@ -141,7 +141,7 @@ class Contradictions:
 def _other_lengths(
     model: RobotModel, samples: Samples, score: Score, size: Size
 ) -> OtherLengths | None:
-    """Return which lengths of the links the torque fits better than those of the URDF.
+    """Return the link lengths that fit the torque better than the URDF's.
 
     Longer links have more weight: that a torque by masses is larger as well is evidence of them.
     """

@@ -177,7 +177,7 @@ def mounted(cell: Cell, gravity: tuple[float, ...]) -> Cell:
 
 
 def _by_reach(model: RobotModel, samples: Samples) -> float | None:
-    """Return the weight that the torque shows over that of an arm of this reach; None if none."""
+    """Return the weight in the torque over the weight of an arm of this reach, or None."""
     if not np.any(model.gravity):
         return None
     factor = Factor.by_time(model, samples)
@@ -215,7 +215,7 @@ class TorqueFindings:
 
     @cached_property
     def rigid(self) -> RigidTorque:
-        """How much of the torque is that of bodies."""
+        """Share of the torque that bodies cause."""
         return rigid_torque(self.readings.model, self.readings.samples)
 
     @cached_property
@@ -489,7 +489,7 @@ class TorqueFindings:
         return entries_of(axes, text, names, self.cell.joint_names)
 
     def entries(self) -> dict[str, Any]:
-        """Return the entries of the map for the sure conclusions."""
+        """Return the entries of the map for the certain conclusions."""
         if self.map_text is None:
             return {}
         sure = [step.change for step in self.readings.steps if step.sure]
@@ -500,7 +500,7 @@ class TorqueFindings:
         return entries
 
     def gravity(self) -> Vector | None:
-        """Return the gravity that the sure conclusions need; None if it is as stated [m/s²]."""
+        """Return the gravity that the certain conclusions need; None if it is as stated [m/s²]."""
         if any(step.sure for step in self.steps("no gravity")):
             return (0.0, 0.0, 0.0)
         if any(step.sure for step in self.steps("mounting")):

@@ -138,7 +138,7 @@ class Changes:
 
 @dataclass(frozen=True)
 class ColumnOrder:
-    """Joints of the columns of torque and position, where they are not those of the URDF."""
+    """Joints of the columns of torque and position, where they differ from the URDF."""
 
     torque: tuple[str, ...] | None
     position: tuple[str, ...] | None
@@ -160,7 +160,7 @@ class Mounting:
 
 @dataclass(frozen=True)
 class Either:
-    """What was recorded, or a change of it that fits alike."""
+    """What was recorded, or a change that fits equally well."""
 
     recorded: Fact
     change: ArmChange
@@ -168,7 +168,7 @@ class Either:
 
 @dataclass(frozen=True)
 class UnseenZeros:
-    """Joints of which the torque does not show the zero."""
+    """Joints whose zero the torque does not show."""
 
     joints: tuple[str, ...]
 
@@ -189,7 +189,7 @@ class StatedPayload:
 
 @dataclass(frozen=True)
 class ErrorAsRead:
-    """Error of the torque as read, as a share of it."""
+    """Relative error of the torque as read."""
 
     error: float
 
@@ -270,7 +270,7 @@ class Basis(Enum):
 
 @dataclass(frozen=True)
 class Travel:
-    """The shortest way of a joint, or the longest of those that do not move [rad or m]."""
+    """The shortest travel of a joint, or the longest of the joints at rest [rad or m]."""
 
     travel: float
     at_least: bool
@@ -337,7 +337,7 @@ class UnseenFriction:
 
 @dataclass(frozen=True)
 class RigidShare:
-    """Torque of bodies over that of friction at most, and over that of the URDF's masses."""
+    """Torque of bodies over friction at most, and over the torque of the URDF's masses."""
 
     over_friction: float
     scale: float
@@ -345,7 +345,7 @@ class RigidShare:
 
 @dataclass(frozen=True)
 class FreeFit:
-    """Error over that of a fit that is free of masses, zeros and scales."""
+    """Error over the error of a fit with free masses, zeros and scales."""
 
     ratio: float
 
@@ -436,7 +436,7 @@ class BeyondMasses:
 
 @dataclass(frozen=True)
 class OtherLengths:
-    """Lengths of the links over those of the URDF, with the errors of both."""
+    """Lengths of the links over the URDF's, with the errors of both."""
 
     factor: float
     error: float

@@ -126,6 +126,6 @@ class Look:
 
 @dataclass(frozen=True)
 class ChangedReading(Conclusion):
-    """A row of a look of which an identification uses what it concludes."""
+    """A row of a look whose conclusion an identification uses."""
 
     row: Row

@@ -75,7 +75,7 @@ _SLOPES: Final[Mapping[float, Fact]] = {
 
 
 def rows(source: Source, imported: ImportedRecording, arm: Cell | None) -> list[Row]:
-    """Return the rows; `arm` is that of the recording, None where nobody described it."""
+    """Return the rows; `arm` is the recorded arm, None without a description."""
     recording = source.recording
     concluded = imported.concluded
     units = [each for each in imported.examined.found if isinstance(each, _UNITS)]

@@ -39,7 +39,7 @@ from .cell_values import ASSUMED, CellValues, assumed_for_design, clear_home, fr
 
 @contextmanager
 def quiet_libraries() -> Iterator[None]:
-    """Suppress output to file descriptor 2, such as that of the C++ library urdfdom."""
+    """Suppress output to file descriptor 2, such as from the C++ library urdfdom."""
     sys.stderr.flush()
     saved = os.dup(2)
     nowhere = os.open(os.devnull, os.O_WRONLY)
@@ -374,7 +374,7 @@ _MOST_NAMES: Final = 12
 
 
 def _note_on_gripper(fingers: Sequence[str], chain: Chain, text: str) -> str:
-    """Return a note on joints that look like those of a gripper."""
+    """Return a note on joints that seem to belong to a gripper."""
     links = links_of(text)
     parents = dict(zip(chain.joint_names, chain.parents.tolist(), strict=True))
     wrists = {

@@ -65,7 +65,7 @@ class CellValues:
         return cls(stated, dict.fromkeys(stated, origin), tuple(notes))
 
     def without(self, table: str) -> CellValues:
-        """Return the values without those of one table."""
+        """Return the values except one table."""
         remaining = {k: v for k, v in self.values.items() if not k.startswith(f"{table}.")}
         return replace(self, values=remaining, origin={k: self.origin[k] for k in remaining})
 
@@ -170,7 +170,7 @@ def clear_home(urdf: str, cell_values: CellValues, mesh_folders: Sequence[str]) 
 
 
 def _turned(home: Array, limits: JointLimits) -> Iterator[Array]:
-    """Yield the home posture, and those with joints turned by 90° within the limits."""
+    """Yield the home posture, and postures with joints turned by 90° within the limits."""
     for n in range(_MOST_TURNED + 1):
         for joints in combinations(range(len(home)), n):
             for turns in product((-0.5 * np.pi, 0.5 * np.pi), repeat=n):

@@ -76,7 +76,7 @@ class UrArmStatements:
 
     @property
     def dh(self) -> DhParameters | None:
-        """Calibrated kinematics, else those of its type."""
+        """Calibrated kinematics, else the kinematics of its type."""
         return self.identity.calibrated or self.identity.nominal
 
 

@@ -24,7 +24,7 @@ KGF_CM_S2: Final = 0.0980665
 
 
 class ControllerLoad(NamedTuple):
-    """A payload, in the flange frame of a controller, and what of it is determined."""
+    """A payload in the flange frame of a controller, and which of its values are determined."""
 
     body: Body
     with_centre: bool

@@ -353,7 +353,7 @@ class _DelayChoice:
         return replace(choice, assumed=combined.mean)
 
     def applied_to(self, chosen: Settings) -> Settings:
-        """Return settings with the determined delay, whatever others they were chosen beside."""
+        """Return settings with the determined delay, whatever they were chosen with."""
         values = [delay.value for delay in self.suggested if delay.determined]
         choices = tuple(choice for choice in chosen.choices if choice.name != DELAY)
         return replace(chosen, choices=choices).preprocessed(

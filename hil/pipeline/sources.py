@@ -180,7 +180,7 @@ def gather_sources(
 
 
 def _by_use(archives: Sequence[Archive], given: int) -> defaultdict[str, list[Archive]]:
-    """Sort archives by purpose; those beyond the first `given` are to be predicted."""
+    """Sort archives by purpose; archives beyond the first `given` are to be predicted."""
     by_use: defaultdict[str, list[Archive]] = defaultdict(list)
     for k, archive in enumerate(archives):
         use = archive.header.purpose if k < given else "validation"
@@ -429,7 +429,9 @@ def _usable(archive: Archive, cell: Cell, recording: Recording) -> Source:
     except RecordingError as error:
         raise ArchiveError(archive.path, str(error), remedy="leave it out") from error
     merged = timed.n_samples - single.n_samples
-    averaged = f"{merged} samples had the time stamp of the one before and were averaged with it"
+    averaged = (
+        f"{merged} samples had the time stamp of the previous sample and were averaged with it"
+    )
     return Source(
         archive.path,
         archive.path.name,
@@ -491,7 +493,7 @@ def _split(whole: Source, share: float) -> tuple[tuple[Source, ...], tuple[Sourc
 
 
 def position_noise(cell: Cell, standstill: Recording) -> Array:
-    """Return the variance of positions at standstill (n,), at least that of their resolution."""
+    """Return the variance of positions at standstill (n,), at least of their resolution."""
     measured = standstill_variance(standstill.time, standstill.position)
     if cell.file.drive_train is None:
         # Smallest difference between two positions of a joint, 0 if all are equal.

@@ -183,7 +183,7 @@ def stored_identification(
     paths = _archives_of(folder, settings)
     present = provenance_of(results, paths)
     if archive_digests(provenance) != archive_digests(present):
-        raise NotReusableError("its archives are others than those that were identified")
+        raise NotReusableError("its archives are not the ones that were identified")
     if provenance.get("verdict") != one_line(present["verdict"]):
         raise NotReusableError(f"{RESULTS} and {PARAMETERS_JSON} are not of one identification")
     try:

@@ -164,7 +164,7 @@ def _warnings(
 
 
 def _name_in(path: Path, paths: Sequence[Path]) -> str:
-    """Return the name of a path, or all of it if others have that name."""
+    """Return the name of a path, or the whole path if others have this name."""
     return path.name if sum(each.name == path.name for each in paths) == 1 else str(path)
 
 

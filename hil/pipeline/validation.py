@@ -1,4 +1,4 @@
-"""Validation of an estimate: what speaks for it and against it, and the verdict."""
+"""Validation of an estimate: evidence for and against it, and the verdict."""
 
 from __future__ import annotations
 

@@ -24,5 +24,5 @@ if not TYPE_CHECKING:  # which would accept any name
 
 
 def __dir__() -> list[str]:
-    """Return all names, also those that are not loaded yet."""
+    """Return all names, including names that are not loaded yet."""
     return [*globals(), *__all__]

@@ -154,7 +154,7 @@ def draw_plan(
 
 
 def check_format(path: Path) -> None:
-    """Raise InputError unless the suffix of a path is that of a picture."""
+    """Raise InputError unless a path has the suffix of a picture."""
     if path.suffix.lower() not in FORMATS:
         problem = f"{path.suffix!r} is not a picture format"
         raise InputError(path, problem, remedy=f"use {', '.join(FORMATS)}")

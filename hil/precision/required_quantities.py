@@ -131,7 +131,7 @@ class ReferenceMotions:
                     yield label, rows[instant], requirement.value
 
     def parameter_sizes(self, values: Array) -> Array:
-        """Return the size (p,) of each parameter, of which per cents are.
+        """Return the size (p,) of each parameter, to which per cents refer.
 
         That is its value, or if that makes less than `MOVED` of the torque of the joint that it
         moves most, what would make as much.

@@ -113,7 +113,7 @@ class Plot:
 
     @property
     def y_limits(self) -> tuple[float, float]:
-        """Range of the vertical axis: that of the lines; a loose one adds at most its length."""
+        """Range of the vertical axis: of the lines; a loose one at most doubles it."""
         if self.reach is not None:
             return -self.reach, self.reach
         if self.limits is not None:

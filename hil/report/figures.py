@@ -72,7 +72,7 @@ def joints_of(results: Results) -> list[Joint]:
 
 
 def _share(fraction: float | None) -> str:
-    """Format a fraction in per cent; that of a joint that stands is missing, without a sign."""
+    """Format a fraction in per cent; a dash without a sign for a joint at rest."""
     text = percent(fraction)
     return text if text == MISSING else f"{text} %"
 

@@ -58,7 +58,7 @@ _COORDINATES: Final = frozenset({"x", "y", "width", "height", "transform", "poin
 
 @dataclass(frozen=True)
 class Panel:
-    """One drawing with the title above it and a note beside the title."""
+    """One drawing with a title above it and a note next to the title."""
 
     title: str
     note: str

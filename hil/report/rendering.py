@@ -97,7 +97,7 @@ def _shown(value: object) -> object:
 
 
 def template_text(name: str) -> str:
-    """Return a style sheet or a script beside the templates."""
+    """Return a style sheet or a script from the folder of templates."""
     return (_TEMPLATES / name).read_text("utf-8")
 
 

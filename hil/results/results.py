@@ -370,7 +370,7 @@ class ParameterResult(Frozen):
 
 
 def by_id(parameters: Sequence[ParameterResult]) -> list[ParameterResult]:
-    """Return parameters in the order of the paper's Table 2, those without a number last."""
+    """Return parameters in the order of the paper's Table 2, the others last."""
     return sorted(parameters, key=lambda parameter: parameter.table2_id or len(parameters) + 1000)
 
 
@@ -555,7 +555,7 @@ class Results(Frozen):
 
     @property
     def remarks(self) -> list[str]:
-        """Warnings that no check found, about the recordings: they follow those of the verdict."""
+        """Warnings about the recordings that no check found; they follow the verdict's."""
         return self.verdict.warnings[len(self.judgement.doubtful) :]
 
     @property

@@ -138,7 +138,7 @@ class RolloutResult(Frozen):
 
     @property
     def ratio(self) -> list[float] | None:
-        """Error of the identified over that of the nominal arm at the horizons."""
+        """Error of the identified over the nominal arm's at the horizons."""
         if self.nominal is None:
             return None
         return [
@@ -177,7 +177,7 @@ class RolloutResult(Frozen):
             f"At {self.horizons[0]:g} s it is further off than joints that continue at their start"
             f" velocity ({milli(error)} against {milli(self.continued[0])} {self._unit}):"
             " --polish, which fits friction, rotor inertias and delay to simulated windows, often"
-            " lessens that."
+            " reduces this."
         )
 
     @property

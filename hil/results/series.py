@@ -192,7 +192,7 @@ def example_series(
 
 
 def _step(samples: Samples) -> int:
-    """Return how many rows one row of a figure stands for, an odd number.
+    """Return how many rows one row of a figure represents, an odd number.
 
     One of a torque with a low-pass, which applies to rows side by side.
     """

@@ -121,7 +121,7 @@ def _samples(sources: Sequence[Source], cell: Cell) -> list[Samples]:
 def _driven(
     fit: EncoderFit, sources: Sequence[Source], samples: Sequence[Samples], most: int
 ) -> Driven:
-    """Return the arm on its servo, in windows of recordings whose torque is that of the model."""
+    """Return the arm on its servo, in windows of recordings with the model's torque."""
     model = fit.arm.model
     with_torque = [
         replace(recording, torque=recording.predicted_torque(model, fit.arm.values))

@@ -164,7 +164,7 @@ def _motion_of(
         remedy = "omit --servo: the recorded torque drives the arm then"
         raise InputError(model.paths[0], str(error), field="--servo", remedy=remedy) from error
     except IdentificationError as error:
-        remedy = f"hold out a longer recording (--predict), or fit less of it; {HORIZONS[-1]:g} s"
+        remedy = f"hold out a longer recording (--predict), or fit less; {HORIZONS[-1]:g} s"
         raise InputError(model.paths[-1], str(error), remedy=f"{remedy} are needed") from error
     feedback = light_feedback(arm, STEP, options.feedback)
     if servo is not None:
@@ -207,7 +207,7 @@ def _stretches(
     samples: Sequence[Samples],
     servo: PositionServo | None,
 ) -> tuple[list[Stretch], list[Samples]]:
-    """Return stretches and their samples; on a servo those whose command is known."""
+    """Return stretches and their samples; on a servo only with known command."""
     recordings: list[tuple[Samples, Array | None]] = [(part, None) for part in samples]
     if servo is not None:
         recordings = with_commands(sources, samples)
@@ -215,7 +215,7 @@ def _stretches(
 
 
 def root_mean_squares(errors: Array) -> list[float]:
-    """Return those of errors (w, h, n) at each horizon, over all windows and joints."""
+    """Return the root mean square of errors (w, h, n) at each horizon, over windows and joints."""
     squares: list[float] = np.sqrt(np.mean(errors**2, axis=(0, 2))).tolist()
     return squares
 

@@ -149,7 +149,7 @@ def identify_servos(
 
 @dataclass(frozen=True, eq=False)
 class _Found:
-    """What was fitted: with all terms, and with those of each engine.
+    """What was fitted: with all terms, and with the terms of each engine.
 
     Attributes:
         fit: with all terms.

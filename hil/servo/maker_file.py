@@ -93,7 +93,7 @@ def _numbers(path: Path, element: Mapping[str, str], name: str) -> list[float]:
 
 
 def _defaults(root: ElementTree.Element) -> dict[str, dict[str, Attributes]]:
-    """Return the attributes of joint and position by default class, with those inherited."""
+    """Return the attributes of joint and position by default class, including inherited ones."""
     classes: dict[str, dict[str, Attributes]] = {_MAIN: {}}
 
     def visit(element: ElementTree.Element, inherited: Mapping[str, Attributes]) -> None:
@@ -119,7 +119,7 @@ def _kind(tag: str) -> str:
 def _joints(
     root: ElementTree.Element, defaults: Mapping[str, Mapping[str, Attributes]]
 ) -> list[tuple[str, Attributes]]:
-    """Return names and attributes of the joints, those of their classes included."""
+    """Return names and attributes of the joints, including attributes of their classes."""
     found = []
 
     def visit(element: ElementTree.Element, inherited: str) -> None:

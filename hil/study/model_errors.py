@@ -54,7 +54,7 @@ _SIGNS: Final = 4  # first number of the random stream of signs and phases
 
 @dataclass(frozen=True)
 class Condition:
-    """One error of the model at one size, none, or all at once."""
+    """One model error at one size, none, or all together."""
 
     error: ErrorName | Literal["none", "all"]
     size: int

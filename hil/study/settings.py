@@ -83,7 +83,7 @@ QUICK: Final = FULL.model_copy(
 
 
 def study_settings(*, quick: bool = False, effects: bool = True, **given: Any) -> StudySettings:
-    """Return the settings of the full or quick study, with those replaced that are not None."""
+    """Return the settings of the full or quick study, replaced where not None."""
     changes = {name: value for name, value in given.items() if value is not None}
     return StudySettings.model_validate(
         (QUICK if quick else FULL).model_dump() | {"effects": effects} | changes
@@ -114,7 +114,7 @@ class StudyFolder:
         return lock_folder(self.root, "study", "--output")
 
     def begin(self, settings: StudySettings) -> None:
-        """Write the settings, or raise InputError unless they are those of the existing study."""
+        """Write the settings, or raise InputError if an existing study has others."""
         remedy = "use another folder (--output)"
         if not self.settings.exists():
             if any(self.root.iterdir()):

@@ -35,5 +35,5 @@ def __getattr__(name: str) -> Any:
 
 
 def __dir__() -> list[str]:
-    """Return all names, also those that are not loaded yet."""
+    """Return all names, including names that are not loaded yet."""
     return [*globals(), *__all__]

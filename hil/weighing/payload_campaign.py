@@ -423,7 +423,7 @@ def assumed_payload(
 
 
 def loaded_cell(cell: Cell, name: str, assumed: Payload) -> Cell:
-    """Return the cell of an arm that carries a payload beside that of its cell.
+    """Return the cell of an arm that carries another payload in addition.
 
     Raises:
         CellError: the cell has a payload on another joint than the last.

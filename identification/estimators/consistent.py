@@ -259,7 +259,7 @@ def consistent_values(
 
 
 def _of_full_rank(matrix: Array) -> Array:
-    """Return rows (r, v), with a unit row for each variable that depends on those before it."""
+    """Return rows (r, v), with a unit row for each variable that depends on previous ones."""
     identity = np.eye(matrix.shape[1])
     square = np.concatenate([matrix, np.zeros_like(identity)])
     distance = np.abs(np.diag(np.linalg.qr(square, mode="r")))

@@ -314,7 +314,7 @@ def _without_by_eigenvectors(share: Array) -> tuple[Array, Array, Array]:
 def _regular(
     shares: Array, scores: Array, symmetric: bool, nodes: Sequence[float]
 ) -> tuple[Array, list[int]]:
-    """Return corrected scores (B, k), zero for blocks of high leverage, and those blocks.
+    """Return corrected scores (B, k), zero for blocks of high leverage, and these blocks.
 
     The correction is the mean of (1 - node H)^-1 over nodes.
     """

@@ -209,7 +209,7 @@ class DelayEstimate:
 
     @property
     def variance(self) -> float:
-        """Variance of the delay [s²], at most that of a uniform one in `LONGEST_DELAY`.
+        """Variance of the delay [s²], at most of a uniform one within `LONGEST_DELAY`.
 
         Also the error variance of an assumed delay inside the interval.
         """

@@ -140,7 +140,7 @@ class _Draws:
 
 
 def _spread(factor: Factor, values: Array, covariance: Array) -> Array:
-    """Return the spread of the torque of each joint (n,) over that of a covariance (p, p)."""
+    """Return the spread of each joint's torque (n,) over the spread of a covariance (p, p)."""
     change = values - values.mean(axis=0)
     grams = factor.gram[:, :-1, :-1]
     scatter = np.einsum("ka,jab,kb->j", change, grams, change) / max(len(values) - 1, 1)

@@ -1,4 +1,4 @@
-"""Drift of friction over recordings, such as that of an arm that gets warm."""
+"""Drift of friction over recordings, as an arm gets warm."""
 
 from __future__ import annotations
 

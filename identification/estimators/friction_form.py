@@ -136,7 +136,7 @@ def form_uncertainty(
 
 
 def _share(model: RobotModel, estimate: Estimate, factor: Factor, shift: Array) -> Array:
-    """Return the largest torque of shifts (p, n) of own friction over that of the friction (n,)."""
+    """Return the largest torque of shifts (p, n) of own friction over the friction (n,)."""
     rows = np.maximum(factor.samples, 1)
     columns = np.diagonal(factor.gram, axis1=1, axis2=2) / rows[:, None]
     largest = np.zeros(model.n_joints)

@@ -96,7 +96,7 @@ class RepeatedEstimate:
     def of(
         cls, model: RobotModel, pooled: Estimate, values: Sequence[Array], factor: Factor
     ) -> RepeatedEstimate:
-        """Combine an estimate from all repetitions with those from each.
+        """Combine the estimate from all repetitions with the estimates from each.
 
         Args:
             model: of the arm.

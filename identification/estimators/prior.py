@@ -220,7 +220,7 @@ class BodyPrior:
 
     @property
     def belief(self) -> BodyPrior:
-        """What is believed: this prior, or that of which it is a stronger one."""
+        """What is believed: this prior, or the weaker one it was made from."""
         return self.believed or self
 
     @cached_property
@@ -550,7 +550,7 @@ def body_prior(
         reason = without_masses(model)
         if not reason:
             scale, _ = nominal_ratio(model, factor)
-            reason = f"the torque is {number(scale, 2)} times that of the bodies of the description"
+            reason = f"the torque is {number(scale, 2)} times the torque of the described bodies"
         origin = f"bodies of the size of the torque, as {reason}"
     for name, (value, spread) in (stated or {}).items():
         mean[names.index(name)] = value

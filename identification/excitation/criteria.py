@@ -149,7 +149,7 @@ def columns(values: Array, criteria: Sequence[str]) -> Array:
 
 
 def friction_of_excitation(model: RobotModel) -> JointFriction:
-    """Return the friction of a model, of which there is less below standstill.
+    """Return the friction of a model, reduced below the standstill speed.
 
     A joint that rests while others move has a speed of rounding or noise, whose sign shows no dry
     friction.
@@ -247,7 +247,7 @@ class Criteria:
 
     @property
     def measures(self) -> tuple[float, ...]:
-        """Values of `CRITERIA`, in their order; NaN of those that an earlier file lacks."""
+        """Values of `CRITERIA`, in their order; NaN where an earlier file lacks them."""
         values = (getattr(self, name) for name in CRITERIA)
         return tuple(np.nan if value is None else value for value in values)
 

@@ -81,7 +81,7 @@ def random_validation_motions(
 
 
 class _Attempts:
-    """Random motions, of which some break constraints.
+    """Random motions; some violate constraints.
 
     Attributes:
         rejected: motions by kind of constraint they break.

@@ -78,12 +78,12 @@ class ExportedArm:
         return stiffness, moment / stiffness if stiffness else 0.0
 
     def link(self, joint: int) -> str:
-        """Return the name of the link that a joint moves, different from that of any joint."""
+        """Return the name of the link that a joint moves, different from every joint's."""
         name = self.model.chain.link(joint) or "link"
         return f"{name}_link" if name in self.model.joint_names else name
 
     def fixed(self, joint: int) -> dict[str, tuple[Array, Array]]:
-        """Return axes (3, 3) and origin (3,) of the links fixed to that of a joint, by name."""
+        """Return axes (3, 3) and origin (3,) of the links fixed to a joint's link, by name."""
         names = {self.link(joint), *self.model.joint_names}
         return {
             name: (frame.rotation, frame.translation)

@@ -94,7 +94,7 @@ class MomentumObserver:
         return inertia @ v, coriolis.T @ v - gravity - springs - ripple, load
 
     def _passive(self, q: Array) -> tuple[Array, Array]:
-        """Return the torque of ripples, and that of springs and balancers (n,)."""
+        """Return the torques of ripples, and of springs and balancers (n,)."""
         elements = self._arm.model.elements
         torque = np.zeros((2, len(q)))
         values = self._arm.values[self._arm.model.element_part]

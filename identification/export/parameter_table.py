@@ -1,4 +1,4 @@
-"""Identified parameters as a table: what each is, of which body and joint, and how well known."""
+"""Identified parameters as a table: meaning, body and joint, and how well each is known."""
 
 from __future__ import annotations
 
@@ -61,7 +61,7 @@ class ParameterRow:
 
 
 class Meaning(NamedTuple):
-    """What a parameter is, and of which body and joint."""
+    """Meaning of a parameter, with its body and joint."""
 
     words: str
     body: str

@@ -111,20 +111,20 @@ def apply(entity):
     return dofs
 '''
 _GENESIS_GAINS: Final = """    entity.set_dofs_kp(values(KP), dofs)
-    entity.set_dofs_kv([0.0] * len(dofs), dofs)  # all damping is that of the joint
+    entity.set_dofs_kv([0.0] * len(dofs), dofs)  # all damping is in the joint
 """
 
 
 def isaac_lab(actuators: Actuators, name: str, remarks: Sequence[str] = ()) -> str:
     """Return a Python file with the actuators of an arm for Isaac Lab."""
     use = _ISAAC_SERVO if actuators.is_servo else _ISAAC_TORQUE
-    title = f"Joint drives of {name} for Isaac Lab: `actuators` returns those of an arm."
+    title = f"Joint drives of {name} for Isaac Lab: `actuators` returns the actuators of an arm."
     return _file(title, (*remarks, *_ISAAC_CONVENTIONS), actuators, ISAAC_LAB) + "\n" + use
 
 
 def genesis(actuators: Actuators, name: str, remarks: Sequence[str] = ()) -> str:
     """Return a Python file that sets the values of an arm in Genesis."""
-    title = f"Joint drives of {name} for Genesis: `apply` sets those of an entity."
+    title = f"Joint drives of {name} for Genesis: `apply` sets the actuators of an entity."
     text = _file(title, (*remarks, *_GENESIS_CONVENTIONS), actuators, GENESIS)
     gains = _GENESIS_GAINS if actuators.is_servo else ""
     return f'{text}INFINITE = float("inf")\n\n' + _GENESIS.replace("{gains}", gains)

@@ -148,7 +148,7 @@ def changed_samples(model: RobotModel, samples: Samples, change: Change) -> Samp
 
 
 def order_change(meaning: Meaning, order: tuple[int, ...]) -> Change:
-    """Return the change to a whole order of n joints, with those that move alone."""
+    """Return the change to a whole order of n joints, with only the moved ones."""
     joints = tuple(joint for joint, place in enumerate(order) if joint != place)
     return Change(meaning, joints, order=tuple(order[joint] for joint in joints))
 

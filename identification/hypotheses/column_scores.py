@@ -32,7 +32,7 @@ MASS: Final = LINK_SYMBOLS.index("m")
 
 
 class ScorePrior(NamedTuple):
-    """What is believed of an arm, beside fitted rows."""
+    """What is believed of an arm in addition to fitted rows."""
 
     gaussian: GaussianPrior
     design_effect: float  # rows that count as one

@@ -184,7 +184,7 @@ def folded(blocks: Array) -> Array:
 
 
 def columns_of(tables: ColumnSums, model: RobotModel, values: Array, change: Change) -> Array:
-    """Return the columns of a change as combinations of those of a table (B, n, q, r).
+    """Return the columns of a change as combinations of a table's columns (B, n, q, r).
 
     Args:
         tables: of the blocks.

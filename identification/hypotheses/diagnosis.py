@@ -57,7 +57,7 @@ _LITTLE_MORE: Final = 1.05
 
 @dataclass(frozen=True, eq=False)
 class RigidTorque:
-    """How much of a torque is that of bodies.
+    """Share of a torque that bodies cause.
 
     Attributes:
         scale: over that of the description's bodies; NaN where it has no masses, or of few rows.
@@ -191,7 +191,7 @@ def _is_predicted(score: Score, samples: Samples, noise: Array | None) -> bool:
 def _explained(
     model: RobotModel, recordings: Sequence[Samples], fitted: ExplainedFit, found: TorqueDiagnosis
 ) -> tuple[Explanation, ...]:
-    """Return what explains the errors of a fit, beside what the recordings are throughout."""
+    """Return what explains the errors of a fit, other than changes throughout the recordings."""
     certain = [step for step in found.steps if step.sure]
     discrete = [step for step in certain if step.change.is_discrete]
     undone: list[Change] = [step.change for step in certain if step.change.meaning != "scale"]
@@ -208,7 +208,7 @@ def _explained(
 
 
 def rigid_torque(model: RobotModel, samples: Samples) -> RigidTorque:
-    """Return how much of the torque is that of bodies."""
+    """Return the share of the torque that bodies cause."""
     factor = Factor.of(model, samples)
     values, _ = posterior_values(factor, body_prior(model, factor).gaussian, ROWS_PER_FACT)
     friction = model.friction_columns

@@ -1,4 +1,4 @@
-r"""Zeros and scales of all joints at once, by one nonlinear least-squares fit.
+r"""Zeros and scales of all joints together, by one nonlinear least-squares fit.
 
 .. math:: y_j = (1 + g_j)\,\tau_j(\pi, q + z) + e_j
 
@@ -107,12 +107,12 @@ class JointFit:
         return bool((np.abs(self.zero) < tolerance)[list(joints)].all())
 
     def ratio_to(self, other: JointFit) -> float:
-        """Return the error over that of another fit of the same torques: mean over the joints."""
+        """Return the error over another fit's of the same torques: mean over the joints."""
         ratios = np.log(self.ratios_to(other))
         return float(np.exp(ratios.mean())) if len(ratios) else 1.0
 
     def ratios_to(self, other: JointFit) -> Array:
-        """Return the error over that of another fit, of each joint with a torque."""
+        """Return the error over the error of another fit, for each joint with a torque."""
         both = (self.error > 0.0) & (other.error > 0.0)
         return np.asarray(self.error[both] / other.error[both])
 
@@ -236,7 +236,7 @@ class _Problem:
         return np.asarray(self.samples.usable.sum(axis=0), dtype=np.float64)
 
     def start(self, fit: JointFit | None) -> _Point:
-        """Return the point of another fit, or that of nothing changed."""
+        """Return the point of another fit, or the unchanged one."""
         weights = self.of_torque()
         zeros = np.zeros(self.n)
         if fit is not None:
@@ -281,7 +281,7 @@ class _Problem:
         return self.weights(np.maximum(self.power, np.finfo(np.float64).tiny))
 
     def settled(self, zero: Array, gain: Array, weights: Array) -> _Point:
-        """Return the point with weights that are those of its own residuals."""
+        """Return the point with weights from its own residuals."""
         point = self.at(zero, gain, weights)
         for _ in range(_WEIGHINGS):
             before = point.cost

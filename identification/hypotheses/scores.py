@@ -65,7 +65,7 @@ class Score:
 
     @property
     def is_all_driven(self) -> bool:
-        """Whether friction would drive every joint of which its sign is clear, two or more."""
+        """Whether friction would drive every joint with a clear sign, at least two."""
         clear = self.friction[np.abs(self.friction) > DISSIPATES]
         return len(clear) > 1 and bool(np.all(clear < 0.0))
 
@@ -80,7 +80,7 @@ class Score:
 
 
 class Comparison(NamedTuple):
-    """Errors of one reading over those of another: mean over the recorded torques, and of each."""
+    """Errors of one hypothesis over another's: mean over the recorded torques, and each."""
 
     ratio: float
     sigmas: float  # negative if the first is better

@@ -109,7 +109,7 @@ class Trial:
 
 @dataclass(frozen=True, eq=False)
 class Step:
-    """A change that was adopted, and those that fit alike.
+    """An adopted change, and the changes that fit equally well.
 
     `error` and `before` are errors over all joints with and without it; `alike` are other changes
     with their errors, of which only knowledge of the arm can choose.
@@ -136,7 +136,7 @@ class Step:
 
     @property
     def by_friction(self) -> bool:
-        """Whether the error speaks for it little or not at all, but friction does."""
+        """Whether friction supports it, and the error little or not at all."""
         return self.ratio > 1.0 - _ALIKE
 
     @property
@@ -247,7 +247,7 @@ def find_readings(
 
 
 def _one_by_one(started: Callable[..., _Search]) -> tuple[_Search, list[Step]]:
-    """Adopt changes one after the other, then zeros and scales of all joints at once."""
+    """Adopt changes one after the other, then zeros and scales of all joints together."""
     search = started()
     as_recorded = search.tried()
     steps = search.more_steps()
@@ -270,7 +270,7 @@ def _one_by_one(started: Callable[..., _Search]) -> tuple[_Search, list[Step]]:
 def _with_a_sign(
     started: Callable[..., _Search], found: _Search, steps: list[Step]
 ) -> tuple[_Search, list[Step]]:
-    """Return a reading with a sign, and zeros and scales fitted beside it; the one found if better.
+    """Return a hypothesis with a sign and fitted zeros and scales, or the found one if better.
 
     One after the other, neither need lessen the error: a joint whose sign is wrong has no zero that
     fits, and one whose zero is wrong no sign. Where both fit alike, no step is adequate.
@@ -361,7 +361,7 @@ def find_zeros_and_scales(model: RobotModel, samples: Samples) -> Readings:
 
 @dataclass(frozen=True, eq=False)
 class _Joints:
-    """Zeros and scales of several joints, tried at once."""
+    """Zeros and scales of several joints, tried together."""
 
     fit: JointFit
     changes: tuple[Change, ...]
@@ -466,7 +466,7 @@ class _Search:
         return steps
 
     def signs_by_joint_fit(self) -> list[Change]:
-        """Return the signs of single joints, those that fit best with zeros and scales first."""
+        """Return the signs of single joints, best fit with zeros and scales first."""
         free = candidates(self.model, self.samples)
         moved = np.flatnonzero(np.ptp(self.samples.motion.position, axis=0) > 0.0).tolist()
         costs = {}
@@ -476,7 +476,7 @@ class _Search:
         return sorted(costs, key=lambda change: costs[change])
 
     def _singles(self, but: _Joints | None = None) -> list[Trial]:
-        """Return single zeros and scales that were fitted, other than those of the best."""
+        """Return single fitted zeros and scales, other than the best."""
         known = [] if but is None else list(but.changes)
         singles = []
         for each in self._fitted:
@@ -513,7 +513,7 @@ class _Search:
         return [self._try(change._replace(size=size))]
 
     def by_joint_fit(self, near: Sequence[Step]) -> list[Step]:
-        """Adopt zeros and scales of all joints at once, near those found before, if any fit."""
+        """Adopt zeros and scales of all joints together, near the ones found before, if any fit."""
         n = self.model.n_joints
         zero = np.zeros(n)
         gain = np.ones(n)
@@ -657,7 +657,7 @@ class _Search:
         return nearest
 
     def unseen_zeros(self) -> tuple[int, ...]:
-        """Return the joints of which other zeros fit alike."""
+        """Return the joints whose zeros may also be others."""
         joints = np.flatnonzero(self.model.chain.revolute).tolist()
         unseen = []
         for joint in joints:
@@ -705,7 +705,7 @@ class _Search:
         return spoils and trial.change.meaning not in COUPLED
 
     def _adopt(self, best: Trial, others: Sequence[Trial]) -> Step:
-        """Adopt a change, with those of others that fit alike."""
+        """Adopt a change, with others that fit equally well."""
         alternatives: list[Trial] = []
         if len(best.change.joints) < self.model.n_joints:  # an arm and its mirror image move alike
             alternatives = [self._try(change) for change in alternatives_to(best.change)]

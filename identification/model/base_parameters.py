@@ -68,7 +68,7 @@ class BaseParameters:
     def expression(
         self, name: str, others: Sequence[tuple[float, str]] = (), digits: int = 6
     ) -> str:
-        """Return a parameter as a formula: with other terms, and with those lumped into it."""
+        """Return a parameter as a formula with the terms lumped into it."""
         text = name
         for value, other in (*others, *self.lumped.get(name, ())):
             factor = f"{abs(value):.{digits}g}"

@@ -36,7 +36,7 @@ _UNITS: Final[Mapping[Quantity, Mapping[str, float]]] = {
 
 @dataclass(frozen=True)
 class _Range:
-    """Bounds of a figure: beyond `possible` no arm lies, within `usual` those that are built.
+    """Bounds of a figure: no arm lies beyond `possible`, existing arms within `usual`.
 
     Of 89 descriptions of arms, hands, legged robots and humanoids none is beyond the bounds that
     are usual by more than the few with placeholders for inertias.
@@ -70,7 +70,7 @@ _CHANGE: Final = 0.5  # decades that another unit for one more quantity costs
 
 @dataclass(frozen=True)
 class WrongUnit:
-    """A quantity of a description in another unit than that of SI.
+    """A quantity of a description that is not in its SI unit.
 
     Attributes:
         quantity: what is in another unit, everywhere in the description.

@@ -40,7 +40,7 @@ class Element(ABC):
 
     @property
     def turns(self) -> Mapping[str, float]:
-        """Derivative of the angle by that of each joint, by joint name."""
+        """Derivative of the angle with respect to each joint angle, by joint name."""
         return {self.joint: 1.0}
 
     @property
@@ -218,7 +218,7 @@ class TorqueRipple(Element):
 
     @property
     def turns(self) -> Mapping[str, float]:
-        """Derivative of the motor's angle by that of each joint."""
+        """Derivative of the motor's angle with respect to each joint angle."""
         return dict(self.motor)
 
     @property
@@ -241,7 +241,7 @@ class PlacedElement(NamedTuple):
 
     element: Element
     joint: int  # that it acts on, from 0
-    turns: tuple[float, ...]  # derivative of its angle by that of each joint (n,)
+    turns: tuple[float, ...]  # derivative of its angle with respect to each joint angle (n,)
     part: slice  # of its parameters among the e of all elements
 
     def columns(self, q: Array) -> Array:

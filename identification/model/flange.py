@@ -18,7 +18,7 @@ class FlangeMotion(NamedTuple):
 
 
 def flange_name(chain: Chain) -> str:
-    """Return the link's name, or that of the last joint without a link of its own."""
+    """Return the link's name, or without a link of its own the last joint's."""
     last = chain.n_joints - 1
     names = [name for name, frame in chain.frames.items() if frame.joint == last]
     return names[-1] if names else chain.joint_names[-1]

@@ -126,7 +126,7 @@ class Chain:
         return len(self.joint_names)
 
     def frame(self, name: str | None) -> LinkFrame:
-        """Return the frame of a moving link, by default that of the last joint.
+        """Return the frame of a moving link, by default the last joint's.
 
         Raises:
             ModelError: the description has no such link, or it is fixed to the base.

@@ -316,7 +316,7 @@ class RobotModel:
         return values
 
     def regressor(self, motion: Motion) -> Regressor:
-        """Return W for m samples of motion; an unknown load is that of the URDF's bodies.
+        """Return W for m samples of motion; without a load, the URDF's bodies are the load.
 
         Raises:
             ShapeError: an array has another shape.
@@ -431,7 +431,7 @@ class RobotModel:
 
 
 def _is_parallel(a: Array, b: Array) -> bool:
-    """Return whether two vectors (3,) have the same direction; none has that of zero."""
+    """Return whether two vectors (3,) have the same direction; zero has none."""
     sizes = float(np.linalg.norm(a) * np.linalg.norm(b))
     return sizes > 0.0 and float(a @ b) > (1.0 - 1e-12) * sizes
 
@@ -494,7 +494,7 @@ def _base_parameters(
 
 
 class _Geometry:
-    """A chain under a gravity, equal to those with the same joints, whatever their links weigh."""
+    """A chain under a gravity, equal to chains with the same joints, whatever the links weigh."""
 
     def __init__(self, chain: Chain, gravity: Array) -> None:
         self.chain = chain

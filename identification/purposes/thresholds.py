@@ -41,7 +41,7 @@ class ContactThreshold:
 def contact_thresholds(
     model: RobotModel, residuals: Sequence[SlowResidual], middle: Array
 ) -> tuple[ContactThreshold, ...]:
-    """Return the threshold that unseen motion shows, and those that it lets be extrapolated.
+    """Return the threshold that unseen motion shows, and the extrapolated ones.
 
     A longer time is left out where the residuals do not determine its threshold within a factor of
     three.

@@ -35,7 +35,7 @@ class Unmodelled:
     elastic: ElasticTorque | None
 
     def scaled(self, times: float) -> Unmodelled:
-        """Return the sums of rows each of which counts so many times."""
+        """Return the sums of rows that count so many times each."""
         elastic = None if self.elastic is None else self.elastic.scaled(times)
         return Unmodelled(self.forms.scaled(times), elastic)
 
@@ -78,7 +78,7 @@ class Reduction:
 
     @property
     def times(self) -> float:
-        """Number of rows over the number of those with unmodelled effects."""
+        """Number of rows over the number of rows with unmodelled effects."""
         if self.unmodelled is None:
             return np.inf
         return float(self.factor.samples.sum()) / max(1, int(self.unmodelled.forms.samples.sum()))

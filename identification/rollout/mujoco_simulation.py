@@ -1,4 +1,4 @@
-"""Forward simulation of windows by MuJoCo, all at once."""
+"""Forward simulation of all windows together by MuJoCo."""
 
 from __future__ import annotations
 

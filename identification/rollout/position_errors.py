@@ -233,7 +233,7 @@ _FEWEST: Final = 3  # arms of which a scatter is computed
 
 @dataclass(frozen=True, eq=False)
 class ResidualTorque:
-    """Residual torque of fitted motions, of which stretches are drawn."""
+    """Residual torque of fitted motions, from which stretches are drawn."""
 
     parts: tuple[Array, ...]  #: residual at the instants of a stretch (g, n), each K or longer
     steps: int  #: number K of steps of a window

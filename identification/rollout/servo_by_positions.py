@@ -161,7 +161,7 @@ class _Joint:
         return np.column_stack([torque, slip, *others]), error
 
     def _with_delay(self, delay: float, fit: _Fit) -> tuple[Array, Array]:
-        """Return the columns with that of a later command (m, 6), and the error (m,)."""
+        """Return the columns with a later command (m, 6), and the error (m,)."""
         columns, error = self._equations(delay)
         _, _, rate, acceleration = self.servo(delay).T
         return np.column_stack([columns, rate + fit.coefficients[1] * acceleration]), error

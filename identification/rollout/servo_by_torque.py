@@ -75,7 +75,7 @@ def identify_servo(
 
 
 def best_delay(error: Callable[[float], float]) -> float:
-    """Return the delay [s] of least error, of those up to `LONGEST_DELAY`."""
+    """Return the delay [s] of least error up to `LONGEST_DELAY`."""
     delays = np.arange(0.0, LONGEST_DELAY + 0.5 * _DELAYS, _DELAYS)
     coarse = delays[int(np.argmin([error(float(delay)) for delay in delays]))]
     ends = np.clip([coarse - _DELAYS, coarse + _DELAYS], 0.0, LONGEST_DELAY)

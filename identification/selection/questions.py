@@ -107,7 +107,7 @@ LowPasses = Callable[[RobotModel, Preprocessing], Sequence[Preprocessing]]
 
 
 class SuggestedDelay(NamedTuple):
-    """A delay of the torque that differs significantly from that of the settings."""
+    """A delay of the torque that differs significantly from the settings."""
 
     value: float  # s
     determined: bool  # whether to a millisecond, and its estimate predicts better with it
@@ -233,7 +233,7 @@ def _choose_prior(
 
 
 def _friction_terms(trial: SettingsTrial, now: Settings) -> SettingDecision:
-    """Choose the terms beside Coulomb and viscous friction, the stated ones first.
+    """Choose the terms in addition to Coulomb and viscous friction, the stated ones first.
 
     A term must also predict fast motion from slower one no worse, and leave friction in a faster
     motion, too: the law is the choice that carries over to another motion least.

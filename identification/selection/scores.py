@@ -430,7 +430,7 @@ class SettingsTrial:
         return True
 
     def has_load_shares(self, settings: Settings) -> bool:
-        """Return whether the fitted shares of load that become friction are those of gears.
+        """Return whether the fitted shares of load that become friction are plausible for gears.
 
         Weighted by the torque of their joints: that of a joint with hardly any torque is open.
         """

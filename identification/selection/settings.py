@@ -66,7 +66,7 @@ class Settings:
 
     @property
     def versions(self) -> tuple[Settings, ...]:
-        """These settings, and those with the bandwidth that theirs is averaged with, if any."""
+        """These settings, and the settings of the bandwidth they are averaged with, if any."""
         if self.hedge is None:
             return (self,)
         return self, self.preprocessed(rigid_bandwidth=self.hedge.bandwidth)

@@ -1,4 +1,4 @@
-"""Which terms a servo's model has: all but those without which other windows are predicted better.
+"""Terms of a servo's model: all except those that make the prediction of windows worse.
 
 A term that neither helps nor harms stays, with the interval that its prior and the motion give it.
 It is shown where other windows are predicted worse without it.

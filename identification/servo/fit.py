@@ -308,7 +308,7 @@ class _Fit:
             self._alike[joint] = np.clip(alike, 1.0, len(here) * 0.5)
 
     def rescale(self) -> None:
-        """Set scatter and correlation of the residuals by those of the present fit."""
+        """Set scatter and correlation of the residuals from the present fit."""
         here = self.windows.residuals(self.values(self.coordinates[None]))[:, 0]
         weights = _weights(here / self.scatter)
         squares = (weights * here**2).mean(axis=0) / weights.mean(axis=0)

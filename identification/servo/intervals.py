@@ -47,7 +47,7 @@ class ServoIntervals:
 
 
 def intervals_of(fit: ServoFit) -> ServoIntervals:
-    """Return the intervals of a fit; that of a term that is not shown includes no effect."""
+    """Return the intervals of a fit; for a term that is not shown, including no effect."""
     estimate = fit.estimate
     values = in_units(estimate.values)
     covariance = _covariances(fit)

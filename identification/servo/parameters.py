@@ -91,7 +91,7 @@ def natural(coordinates: Array) -> Array:
 
 
 def without_absent(values: Array, present: NDArray[np.bool_]) -> Array:
-    """Return values (..., n, P) with those of absent terms that have no effect."""
+    """Return values (..., n, P) in which absent terms have no effect."""
     absent = np.array([ABSENT.get(name, 0.0) for name in NAMES])
     return np.where(present, values, absent)
 

@@ -85,7 +85,7 @@ class Bodies:
 
 
 class Grid(NamedTuple):
-    """Instants of a simulation, among which are those of the samples.
+    """Instants of a simulation, including the samples'.
 
     Attributes:
         step: time step [s].

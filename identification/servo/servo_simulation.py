@@ -29,7 +29,7 @@ _UNLIMITED: Final = 1e6  # rad/s² or m/s²
 
 @dataclass(frozen=True, eq=False)
 class JointInputs:
-    """What acts on c joints over K steps, those of several windows side by side.
+    """What acts on c joints over K steps, several windows side by side.
 
     Attributes:
         step: time step [s].

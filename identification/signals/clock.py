@@ -138,7 +138,7 @@ def _steps_by_phase(time: Array, step: float) -> Array:
 
 @dataclass(frozen=True)
 class SampleTimes:
-    """Which times of the samples were used, and what speaks for them.
+    """Which times of the samples were used, and the evidence for them.
 
     Attributes:
         removed: rows that repeat the sample before them while the arm moves.
@@ -429,7 +429,7 @@ def _odd(wanted: float, samples: int) -> int:
 
 
 def _repeated(time: Array, signals: Array) -> Rows:
-    """Return rows (m,) that repeat the one before with its stamp or during steady motion."""
+    """Return rows (m,) that repeat the previous one with its stamp or during steady motion."""
     equal = np.concatenate([[False], (np.diff(signals, axis=0) == 0.0).all(axis=1)])
     again = np.diff(time) == 0.0
     samples = signals[~equal]
@@ -476,7 +476,7 @@ def _off_cubic(number: Array, values: Array) -> Array:
 def _residuals(
     number: Array, times: Array, signals: Array, late: Array, step: float
 ) -> tuple[Array, Array, Array]:
-    """Return the residual of even signals, that of correct stamps, and the resolution."""
+    """Return the residuals of even signals and of correct stamps, and the resolution."""
     half = round(float(np.clip(_SPEED_TIME / step, _DRIFT // 10, _DRIFT // 2)))
     at = np.arange(len(number))
     # From other samples than the residual, for independent noise.

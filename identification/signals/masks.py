@@ -54,7 +54,7 @@ _LONGEST_SPIKE: Final = 2  # samples
 
 ExcludedRows = Literal["rests", "halts", "slow", "none"]
 
-EDGE: Final = "beside a gap or an end of the recording"
+EDGE: Final = "next to a gap or an end of the recording"
 SATURATED: Final = "torque or current saturated"
 REST: Final = "at rest"
 STANDSTILL: Final = "slower than standstill"

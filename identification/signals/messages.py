@@ -20,7 +20,7 @@ def clock_lines(clock: TimeBase) -> list[str]:
     if clock.repeated:
         lines.append(f"{clock.repeated} samples repeat the time stamp before them")
     if clock.backward:
-        lines.append(f"{clock.backward} samples are older than the one before them")
+        lines.append(f"{clock.backward} samples are older than their predecessors")
     if clock.dropped:
         lines.append(f"{clock.dropped} samples are missing one by one")
     if gaps := clock.gaps - clock.pauses:

@@ -95,7 +95,7 @@ def _fault(kind: RowFaultKind, recording: Recording, start: int, stop: int) -> R
 
 
 def _frozen(recording: Recording) -> Iterator[tuple[int, int]]:
-    """Yield start and stop of rows that repeat the one before them while the arm moves on.
+    """Yield start and stop of rows that repeat the previous row while the arm moves on.
 
     Many more than a slower channel is held for; before or after them a joint would stop or start
     faster than any robot.

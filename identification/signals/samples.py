@@ -217,7 +217,7 @@ class Samples:
         return self._filtered(model.torque(part, replace(self.motion, load=load)))
 
     def known_torque(self, model: RobotModel) -> Array:
-        """Return the torque (m, n) of known payload and elements, filtered likewise."""
+        """Return the torque (m, n) of known payload and elements, filtered in the same way."""
         torque = model.load_torque(self.motion)
         return self._filtered(torque) if model.has_load else torque
 
@@ -362,7 +362,7 @@ def _noise_bandwidth(
 
 
 def _attainable(time: Array, measured: Array, variance: Array | None) -> Array:
-    """Return the noise variance (c,), by default from differences, at least that of rounding."""
+    """Return the noise variance (c,), by default from differences, at least of rounding."""
     if variance is None:
         variance = difference_variance(time, measured)
     rounding = (np.finfo(np.float64).eps * np.abs(measured).max(axis=0)) ** 2

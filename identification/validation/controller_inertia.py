@@ -26,7 +26,7 @@ class InertiaRatio(NamedTuple):
 def inertia_ratio(
     model: RobotModel, values: Array, position: Array, theirs: Array
 ) -> InertiaRatio | None:
-    """Compare a controller's diagonal inertia with that of an estimate.
+    """Compare a controller's diagonal inertia with an estimate's.
 
     None if there is nothing to compare.
 

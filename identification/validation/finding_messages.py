@@ -398,7 +398,7 @@ SENTENCES: Final[Mapping[FindingKey, Sentence]] = {
         " it are predicted with {error:pc0} of the error",
     ),
     "nearest": Sentence("{change:check}", f"{_NEAREST} {{change}}"),
-    "another arm": Sentence(ARM, "its masses would be {scale:.2g} times those described"),
+    "another arm": Sentence(ARM, "its masses would be {scale:.2g} times the described ones"),
     "gravity": Sentence(
         "gravity",
         "with gravity ({best}) m/s² in base axes, {angle:.0f}° from the declared ({declared})"

@@ -1,4 +1,4 @@
-"""Measured torque over that of nominal inertias.
+"""Measured torque over the torque of nominal inertias.
 
 A torque constant or gear ratio wrong by a factor fits equally well: only independent knowledge
 shows it.
@@ -58,7 +58,7 @@ class NominalScale(NamedTuple):
 
     @property
     def negated(self) -> bool:
-        """Whether all known scales are negative, two of them or that of one joint significantly."""
+        """Whether all known scales are negative, at least two, or one joint significantly."""
         finite_scale = self.scale[np.isfinite(self.scale)]
         sure = np.count_nonzero(self.scale + self.tolerance < 0.0)
         return bool(sure >= min(2, len(self.scale)) and np.all(finite_scale < 0.0))
@@ -78,7 +78,7 @@ def nominal_scale(
     rotors_known: bool = False,
     share: float | None = None,
 ) -> NominalScale:
-    """Compare measured torque with that of nominal parameters per axis, without friction.
+    """Compare measured torque with nominal parameters per axis, without friction.
 
     Args:
         model: of the arm.

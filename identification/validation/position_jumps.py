@@ -58,7 +58,7 @@ def position_jumps(recording: Recording, name: str = "the recording") -> list[Po
 
 
 def position_steps(recording: Recording, name: str = "the recording") -> PositionSteps:
-    """Return lasting steps of the positions of a named recording, apart from those of its log."""
+    """Return lasting steps of the positions of a named recording that its log did not make."""
     jumps: list[PositionJump] = []
     logged: list[PositionJump] = []
     rounded = _ROUNDED * np.array([_resolution(column) for column in recording.position.T])
@@ -136,7 +136,7 @@ def _steps_of(
 
 
 def _nearby(marked: NDArray[np.bool_]) -> NDArray[np.bool_]:
-    """Return where a row or one beside it is marked (m, n)."""
+    """Return where a row or a neighbour is marked (m, n)."""
     padded = np.pad(marked, ((1, 1), (0, 0)))
     return np.asarray(padded[:-2] | padded[1:-1] | padded[2:])
 
@@ -166,7 +166,7 @@ def _on_path(time: Array, position: Array, row: int, tolerance: float) -> bool:
 
 
 def _departures(time: Array, position: Array) -> tuple[Array, Array, Array]:
-    """Return how much each step departs from the speed beside it (m - 1, n), and that speed."""
+    """Return how much each step departs from the neighbouring speed (m - 1, n), and this speed."""
     steps = np.diff(time)[:, None]
     speed = np.diff(position, axis=0) / steps
     padded = np.pad(speed, ((_BESIDE, _BESIDE), (0, 0)), mode="edge")

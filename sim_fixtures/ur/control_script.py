@@ -29,7 +29,7 @@ _LOOKAHEAD: Final = 0.03  # s; the PC's own is not used
 
 
 class ControlScript:
-    """A running script; the attributes are those of `RegisterProgram`."""
+    """A running script, with the attributes of `RegisterProgram`."""
 
     watched = False
 
@@ -77,7 +77,7 @@ class ControlScript:
                 )
 
     def _ramp(self, target: Array, speed: float, acceleration: float) -> list[Array]:
-        """Return set-points (6,) of a motion of all joints at once, by trapezoids of speed."""
+        """Return set-points (6,) of a motion of all joints together, by trapezoids of speed."""
         way = target - self.command
         length = float(np.abs(way).max())
         if length == 0.0:

@@ -196,7 +196,7 @@ class UrServer:
 
     @property
     def _waits(self) -> bool:
-        """Whether a program takes set-points and that of this cycle has not come."""
+        """Whether a program takes set-points and this cycle's has not come."""
         controller = self.controller
         return controller.takes_set_points and any(
             client.inputs and client.started and client.written_in < controller.cycle

@@ -55,7 +55,9 @@ def test_every_link_to_a_file_leads_to_one(page: Path) -> None:
 def test_every_page_is_in_the_table_of_contents() -> None:
     docs = ROOT / "docs"
     indexed = set()
-    for block in re.findall(r"```{toctree}\n(.*?)```", (docs / "index.md").read_text("utf-8"), re.S):
+    for block in re.findall(
+        r"```{toctree}\n(.*?)```", (docs / "index.md").read_text("utf-8"), re.S
+    ):
         indexed |= {line for line in block.splitlines() if line and line[0] != ":"}
     assert indexed == {page.stem for page in docs.glob("*.md")} - {"index"}
 

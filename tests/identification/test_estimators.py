@@ -949,7 +949,7 @@ class TestPlaceholders:
     def test_masses_with_another_torque_are_some(self, size):
         prior, _ = self.prior(MODEL, size)
         assert prior.placeholder
-        assert "times that of the bodies of the description" in prior.origin
+        assert "times the torque of the described bodies" in prior.origin
         assert not prior.mean[: MODEL.layout.size].any()
 
     @pytest.mark.parametrize("size", [0.7, 1.0, 1.5])

@@ -47,7 +47,7 @@ class CanError(TransportError):
 
 
 class CanBusLoadError(CanError, remedy="use a longer cycle, a faster bus or fewer axes, or UDP"):
-    """The frames of a cycle take too large a share of it."""
+    """The frames of a cycle take too large a share of its time."""
 
 
 LOAD_LIMIT: Final = 0.70

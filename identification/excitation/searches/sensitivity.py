@@ -202,7 +202,7 @@ def gene_slopes(
 def _changes(
     genome: Genome, sensitivity: Sensitivity, rows: Array, which: NDArray[np.intp]
 ) -> Iterator[LocalChange | None]:
-    """Yield the change of the motion with each row of genes, of which one is changed."""
+    """Yield the change of the motion with each row of genes; one gene is changed in each."""
     local = 0
     if sensitivity.moves is not None and isinstance(genome, ViaPointGenome):
         local = int(np.searchsorted(which, genome.n_point_genes))

@@ -127,7 +127,7 @@ def _comment(tables: ControlTables, remarks: Sequence[str], precision: Precision
     ]
     yield from _folded(f"Joints: {', '.join(joints)}.")
     yield from _folded(
-        "SI units: rad, m, s, kg, N. Angles and their signs are those of the robot description;"
+        "SI units: rad, m, s, kg, N. Angles and their signs follow the robot description;"
         f" a payload is stated in the frame of {tables.payload_frame}. Numbers are of {precision}"
         " precision."
     )
@@ -266,6 +266,8 @@ def _elements(tables: ControlTables, write: _Writer) -> Iterator[str]:
     yield write.integers("element_kind", kinds, "Springs, balancers, orders of ripple.")
     yield write.integers("element_joint", [e.joint for e in elements], "Joint each acts on.")
     turns = np.array([element.turns for element in elements])
-    yield write.reals("element_turns", turns, "Derivative of its angle by that of each joint.")
+    yield write.reals(
+        "element_turns", turns, "Derivative of its angle with respect to the angle of each joint."
+    )
     numbers = np.array([element.numbers for element in elements])
     yield write.reals("element_value", numbers, "As add_elements reads them.")

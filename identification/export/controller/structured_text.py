@@ -75,7 +75,7 @@ def _comment(tables: ControlTables, remarks: Sequence[str]) -> Iterator[str]:
     )
     yield "(*"
     yield f"   Joints: {joints}."
-    yield "   SI units: rad, m, s, kg, N. Angles are those of the robot description;"
+    yield "   SI units: rad, m, s, kg, N. Angles follow the robot description;"
     yield f"   a payload is stated in the frame of {tables.payload_frame}."
     yield ""
     for remark in remarks:
@@ -109,7 +109,7 @@ def _dynamics(tables: ControlTables) -> Iterator[str]:
     joints = [element.joint + 1 for element in elements] or [1]
     yield _integers("element_joint", joints, "that each acts on")
     turns = np.array([element.turns for element in elements] or [np.zeros(tables.n_joints)])
-    yield _reals("element_turns", turns, "derivative of its angle by that of each joint")
+    yield _reals("element_turns", turns, "derivative of its angle with respect to each joint angle")
     numbers = np.array([element.numbers for element in elements] or [np.zeros(ELEMENT_SIZE)])
     yield _reals("element_value", numbers, "")
 

@@ -63,7 +63,7 @@ class PassiveElement:
 
     kind: str  #: of `ELEMENT_KINDS`
     joint: int  #: that it acts on, from 0
-    turns: Array  #: derivative of its angle by that of each joint (n,)
+    turns: Array  #: derivative of its angle with respect to each joint angle (n,)
     numbers: Array  #: as `engine.c` reads them (8,)
 
 

@@ -92,7 +92,7 @@ def _open(step: Step) -> Finding:
 
 
 def another_arm(evidence: Evidence, _: Thresholds) -> Finding | None:
-    """Return that the masses are not those described, however well the model predicts.
+    """Find masses that differ from the description, however well the model predicts.
 
     None where another finding says more.
     """

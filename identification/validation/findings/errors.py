@@ -169,7 +169,7 @@ def left_open(evidence: Evidence, limits: Thresholds) -> Finding | None:
 
 
 def _unexplained_axes(evidence: Evidence, limits: Thresholds) -> tuple[Mask, Mask]:
-    """Return axes that the mean predicts as well, and others of which little is explained (n,)."""
+    """Return axes that the mean predicts as well, and others with little explained (n,)."""
     explained = evidence.held_out.explained
     nothing = (explained <= limits.explained) & ~_minor(evidence, limits)
     return nothing, (explained < limits.little_explained) & ~nothing
@@ -200,13 +200,13 @@ def _nothing(joints: Mask, limits: Thresholds, remedy: RemedyKey) -> Finding | N
 
 
 def little_explained_by_noise(evidence: Evidence, limits: Thresholds) -> Finding | None:
-    """Return axes of which little is explained, whose error may be noise alone."""
+    """Return axes with little explained whose error may be noise alone."""
     _, little = _unexplained_axes(evidence, limits)
     return _little(evidence, little & ~_beyond_noise(evidence), limits, "move faster")
 
 
 def little_explained(evidence: Evidence, limits: Thresholds) -> Finding | None:
-    """Return axes of which little is explained, whose error is more than noise."""
+    """Return axes with little explained whose error exceeds noise."""
     _, little = _unexplained_axes(evidence, limits)
     beyond = little & _beyond_noise(evidence)
     return _little(evidence, beyond, limits, "check the drives and the unit")
@@ -247,13 +247,13 @@ def _far_generalisation(evidence: Evidence, limits: Thresholds) -> tuple[Array, 
 
 
 def poor_generalisation(evidence: Evidence, limits: Thresholds) -> Finding | None:
-    """Return axes whose error is large, and several times that of the fitted motion."""
+    """Return axes whose error is large, and several times the error of the fitted motion."""
     growth, far, _ = _far_generalisation(evidence, limits)
     return _generalisation(evidence, limits, growth, far, "wrong")
 
 
 def weak_generalisation(evidence: Evidence, limits: Thresholds) -> Finding | None:
-    """Return axes whose error is several times that of the fitted motion, and yet small."""
+    """Return axes whose error is small, but several times the error of the fitted motion."""
     growth, _, near = _far_generalisation(evidence, limits)
     return _generalisation(evidence, limits, growth, near, "doubtful")
 

@@ -20,7 +20,7 @@ def _one_way(evidence: Evidence) -> Mask:
 
 
 def _only_sum(evidence: Evidence) -> Mask:
-    """Return the joints of whose friction and offset only the sum is determined (n,).
+    """Return the joints for which only the sum of friction and offset is determined (n,).
 
     Both are the same column for a joint that moved in one direction.
     """
@@ -42,7 +42,7 @@ def undetermined(evidence: Evidence, _: Thresholds) -> Finding | None:
 
 
 def undetermined_in_one_direction(evidence: Evidence, _: Thresholds) -> Finding | None:
-    """Return the joints of whose friction and offset only the sum is determined."""
+    """Return the joints for which only the sum of friction and offset is determined."""
     joints = _only_sum(evidence)
     if not joints.any():
         return None

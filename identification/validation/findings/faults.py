@@ -116,7 +116,7 @@ def _vector(values: Array) -> str:
 
 
 def is_constant(change: Change) -> bool:
-    """Whether a change is that of a torque constant: a scale throughout."""
+    """Whether a change is a torque constant: a scale throughout."""
     return change.meaning == "scale" and change.part is None
 
 

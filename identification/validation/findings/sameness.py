@@ -60,7 +60,7 @@ def _mask(changes: list[int], evidence: Evidence) -> Mask:
 
 
 def changed_torque_of_large_errors(evidence: Evidence, limits: Thresholds) -> Finding | None:
-    """Return the joints whose torque is a multiple of that of the fitted motion."""
+    """Return the joints whose torque is a multiple of the fitted motion's."""
     return _changed_torque(evidence, limits, matters=True)
 
 

@@ -26,7 +26,7 @@ _NEAR: Final = 0.5  # of -1: scale of a torque of the opposite sign
 
 
 class _TorqueScale(NamedTuple):
-    """Measured torque of each axis over that of the nominal inertias."""
+    """Measured torque of each axis over the torque of the nominal inertias."""
 
     scale: Array  # (n,), NaN where unknown
     tolerance: Array  # (n,)
@@ -60,7 +60,7 @@ def _torque_scale(evidence: Evidence) -> _TorqueScale | None:
 
 
 def scale_of_torque(evidence: Evidence, _: Thresholds) -> Finding | None:
-    """Return the axes whose torque has another scale than that of the nominal inertias."""
+    """Return the axes whose torque differs in scale from the nominal inertias."""
     found = _torque_scale(evidence)
     if found is None or not found.off.any():
         return None

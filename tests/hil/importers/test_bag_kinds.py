@@ -280,7 +280,7 @@ class TestClocks:
         back = [message(k, stamp=STAMPS[k] - (10**9 if k >= 200 else 0)) for k in range(COUNT)]
         typed = Typed(urdf, back)
         assert typed.refused
-        assert "older than the one before it" in typed.message
+        assert "older than the previous one" in typed.message
         assert typed.options() == ["--clock", "bag"]
         assert_right(typed.again(*typed.options()).archive)
 

@@ -469,7 +469,7 @@ class TestStructs:
     def test_number_of_elements_is_limited(self, tmp_path, robot, monkeypatch):
         monkeypatch.setattr(array_files, "MOST_NUMBERS", 50)
         savemat(tmp_path / "a.mat", {"log": LOG})
-        with pytest.raises(SourceError, match="too large to be read at once"):
+        with pytest.raises(SourceError, match="too large to be read in one piece"):
             read_arrays(tmp_path / "a.mat", robot, position={"columns": "log.joint.q"})
 
 
@@ -562,7 +562,7 @@ class TestUntrustedFiles:
             archive.writestr("truncated.npy", (tmp_path / "q.npy").read_bytes()[:-1])
         assert np.array_equal(read_arrays(path, robot, position={"columns": "q"})["position"], Q)
         for name, sentence in {
-            "bomb": "too large to be read at once; save the log in parts",
+            "bomb": "too large to be read in one piece; save the log in parts",
             "truncated": "cannot be read",
             "o": "there is no array 'o'",
             "few": "there is no array 'few'",
@@ -1133,7 +1133,7 @@ class TestClock:
         [
             (range(0, 1000, 10), r"x: time: has 0\.1 samples .* would give 100 samples per second"),
             ((0.0, 0.01, 0.02, 0.005, 0.015),
-             r"sample 3 is 0\.015 s older than the one before it \(1 such steps\)"),
+             r"sample 3 is 0\.015 s older than the previous one \(1 such steps\)"),
             ((3.0, 3.0, 3.0), "all 3 samples have the same time"),
         ],
     )  # fmt: skip

@@ -368,7 +368,7 @@ class TestRemedies:
         self, tmp_path: Path, urdf: Path, back: float
     ) -> None:
         time = np.where(np.arange(COUNT) < 200, TIME, TIME - back)
-        with pytest.raises(SourceError, match="older than the one before it"):
+        with pytest.raises(SourceError, match="older than the previous one"):
             imported(tmp_path / "log.csv", text(rows(time=time.tolist())), urdf)
 
     def test_every_row_dropped_is_no_recording(self, tmp_path: Path, urdf: Path) -> None:
