@@ -31,6 +31,7 @@ FormatName = Literal["mjcf", "urdf", "sdf", "pinocchio"]
 
 _SPREAD_TOLERANCE: Final = 0.05  # of drawn arms, from that of the stated intervals
 _ENSEMBLE_STATES: Final = 50  # random states at which each drawn arm is read back
+_LEAST: Final = 1e-3  # of the largest torque of a joint, below which a part is not listed
 _MOST_ROWS: Final = 2000  # of the recorded motion, enough for root mean squares
 
 
@@ -48,10 +49,14 @@ class Exported:
     def lines(self) -> list[str]:
         """Return the summary as lines of text."""
         unit = " or ".join(sorted(set(self.units)))
+        whole = 0.0 if isinstance(self.comparison, str) else float(self.comparison.torque.max())
 
         def row(torque: Array) -> str:
             pairs = zip(self.joint_names, torque, strict=True)
-            return f"{', '.join(f'{name} {component:.3g}' for name, component in pairs)} {unit}"
+            shown = [f"{name} {one:.3g}" for name, one in pairs if one >= _LEAST * whole]
+            return (
+                f"{', '.join(shown)} {unit}" if shown else f"less than {_LEAST * whole:.1g} {unit}"
+            )
 
         lines = [*([f"parameters: {self.origin}"] if self.origin else [])]
         lines.append(f"written: {self.path}")

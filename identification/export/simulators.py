@@ -314,7 +314,7 @@ def random_states(arm: ExportedArm, count: int = STATES) -> Motion:
     )
 
 
-_BEYOND: Final = "beyond that at the load for which it is written"
+_BEYOND: Final = "where it differs from its value at the typical load, which is written"
 _ACCELERATES: Final = "where its coefficient is negative and would accelerate a joint"
 _REVERSALS: Final = "dry friction between the two directions (velocity reversals, standstill)"
 _ROUNDED: Final = "effect of rounded angles of the URDF on the base parameters"
@@ -376,7 +376,7 @@ def _brakes(arm: ExportedArm) -> NDArray[np.bool_]:
 def _friction_of(
     arm: ExportedArm, motion: Motion, kind: FrictionTerm, chosen: NDArray[np.bool_]
 ) -> Array:
-    """Return the torque (m, n) of friction terms of a kind, beyond that at the load."""
+    """Return the torque (m, n) of friction terms of a kind, minus the part at the typical load."""
     torque = _friction(arm, motion, chosen.tolist())
     return torque - _at_load(arm, motion) if kind.of_load else torque
 

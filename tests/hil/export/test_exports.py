@@ -325,7 +325,7 @@ class TestReuse:
             use="validation",
         )
         shown = command("export", folder, "--to", "urdf").stdout
-        assert "identified again: its archives are others" in shown
+        assert "identified again: its archives are not the ones" in shown
 
     @pytest.mark.parametrize(
         ("name", "change", "reason"),
