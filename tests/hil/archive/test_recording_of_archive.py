@@ -90,7 +90,7 @@ def test_restarted_cycles_are_not_read(tmp_path: Path, monkeypatch: pytest.Monke
     rows = np.concatenate([records(100), records(100, first=0)])
     recording = open_recording(archive(tmp_path / NAME, rows))
     assert recording.n_samples == 100
-    assert "cycles that do not follow those before" in recording.provenance["missing"]
+    assert "cycles that do not follow the previous ones" in recording.provenance["missing"]
 
 
 def test_imported_stamps_are_converted_to_seconds(tmp_path: Path) -> None:
