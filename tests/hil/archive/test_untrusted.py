@@ -250,9 +250,9 @@ CONTENTS = {
     ),
     "channel topic": ([bytes, second_cycles], "channel 9 a second time", 33),
     "schema": ([bytes, another_schema], "schema 1 a second time", 33),
-    "cycles begin later": ([without_cycles, with_cycles], "other channels than the previous chunks", 33),
+    "cycles begin later": ([without_cycles, with_cycles], "channels than the previous chunks", 33),
     "imported: other times": ([bytes, later_currents], "channels of different times", 40),
-    "imported: cycles": ([bytes, second_cycles], "other channels than the previous chunks", 40),
+    "imported: cycles": ([bytes, second_cycles], "channels than the previous chunks", 40),
 }  # fmt: skip
 
 
