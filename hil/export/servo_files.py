@@ -183,6 +183,8 @@ def actuators_of(
 ) -> Actuators:
     """Return the servo with the terms of an engine as fields of simulators, with draws.
 
+    A limit of the torque that the motion does not determine is infinite.
+
     Args:
         servo: with the terms of the engine.
         cell: of the arm.
@@ -203,6 +205,10 @@ def actuators_of(
         )
 
     fields = {quantity: field(term) for quantity, term in _TERMS.items()}
+    limit = fields["limit"]
+    # A limit that no motion reached is none: the fit's own is where positions would show one.
+    value, upper = (np.where(limit.from_data, end, np.inf) for end in (limit.value, limit.upper))
+    limit = fields["limit"] = replace(limit, value=value, upper=upper)
     posterior = servo.posterior
     posterior_samples = sampled(
         np.array(posterior.coordinates),
@@ -216,6 +222,8 @@ def actuators_of(
     np.maximum(delays, 0.0, out=delays)
     by_term = dict(zip(NAMES, np.moveaxis(posterior_samples, 2, 0), strict=True))
     draws = {quantity: by_term[term][:count] for quantity, term in _TERMS.items()}
+    if count:
+        draws["limit"] = np.where(limit.from_data, draws["limit"], np.inf)
     above = field("static")
     resting = by_term["coulomb"] + by_term["static"]
     lower, upper = np.quantile(resting, [0.025, 0.975], axis=0)

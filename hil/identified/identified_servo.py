@@ -103,7 +103,11 @@ def identified_servo(
     identification = identify_servos(
         staging.fitted, reporter, servo, predict=staging.predicted, name=recordings[0].stem
     )
-    read = recording_results(staging, predicted)
+    fitted_names = identification.results.archives
+    held_out = [
+        staging.sources[place] for place in staging.recordings if place.name not in fitted_names
+    ]
+    read = recording_results(staging, held_out)
     results = identification.results.model_copy(update={"recordings": read})
     identification = replace(identification, results=results)
     return IdentifiedServo(tuple(recordings), tuple(predicted), identification, channels, staging)

@@ -61,7 +61,7 @@ def servo_read_lines(servo: IdentifiedServo) -> list[tuple[str, str]]:
     ]
     lines = []
     for place, recording in staging.recordings.items():
-        use = "predicted" if staging.sources[place] in servo.predicted else "fitted"
+        use = "fitted" if place.name in servo.results.archives else "predicted"
         own = [text for text in unusual[place] if text not in common]
         lines.append((use, f"{staging.sources[place].name}: {'; '.join([size(recording), *own])}"))
     if (more := len(lines) - _MOST) > 0:

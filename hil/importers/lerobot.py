@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final, Literal
@@ -31,6 +31,10 @@ EpisodeUnit = Literal["deg", "range"]
 """Of the joints of a data set: degrees, or -100 to 100 of the calibrated range."""
 
 INFO: Final = Path("meta") / "info.json"
+_FORMER_INFO: Final = Path("meta_data") / "info.json"  # of versions 1
+_VERSIONS: Final = (2, 3)
+_NAMED: Final = 5  # missing episodes in a message
+_CALIBRATED: Final = (0.1, 2.0)  # least and most of the URDF's range that may be calibrated
 STATE: Final = "observation.state"
 ACTION: Final = "action"
 _TIME: Final = "timestamp"
@@ -102,8 +106,7 @@ class DataSet:
         by_name = [joints.index(n) if missing else actions.index(n) for n in joints]
         tables = sorted((folder / "data").rglob("*.parquet"))
         episodes = [episode for table in tables for episode in _episodes(folder, table)]
-        if not episodes:
-            raise SourceError(folder, "has no episode in data/**/*.parquet")
+        _require_all(folder, info, {each.number for each in episodes})
         states = [each.files.arrays(each.path).matrix(STATE, STATE) for each in episodes]
         largest = np.max([np.abs(state).max(axis=0) for state in states], axis=0)
         episodes.sort(key=lambda each: each.number)
@@ -130,7 +133,8 @@ class DataSet:
         offset = np.zeros(len(joints))
         for j, name in enumerate(self.joints):
             span = limits.upper[j] - limits.lower[j]
-            if ranges is not None:
+            if calibration is not None and ranges is not None:
+                _require_like(calibration, name, ranges[j], span)
                 span = ranges[j]
             if _is_gripper(name):  # closed is the lower end
                 scale[j] = span / _FULL
@@ -191,19 +195,44 @@ _CALIBRATE: Final = (
 
 
 def is_data_set(path: Path) -> bool:
-    """Return whether a folder is a data set of LeRobot."""
-    return path.is_dir() and (path / INFO).is_file()
+    """Return whether a folder is a data set of LeRobot, of whatever version."""
+    return path.is_dir() and any((path / info).is_file() for info in (INFO, _FORMER_INFO))
+
+
+def _require_all(folder: Path, info: Mapping[str, Any], found: Collection[int]) -> None:
+    """Raise SourceError if there are fewer episodes than the data set describes."""
+    whole = info.get("total_episodes")
+    count = whole if isinstance(whole, int) else 0
+    if found and len(found) >= count:
+        return
+    missing = [str(number) for number in range(count) if number not in found]
+    names = f": no {', '.join(missing[:_NAMED])}" if found and missing else ""
+    more = " ..." if found and len(missing) > _NAMED else ""
+    problem = f"has {len(found)} of {count or 'its'} episodes in data/**/*.parquet{names}{more}"
+    remedy = "download the whole data set, its folder data included"
+    raise SourceError(folder, problem, field="total_episodes", remedy=remedy)
 
 
 def _info(folder: Path) -> Mapping[str, Any]:
     path = folder / INFO
+    if not path.is_file():
+        raise _of_other_version(folder / _FORMER_INFO, "1")
     try:
         info = parse_json(read_text(path))
     except (OSError, ValueError) as error:
         raise SourceError(path, f"cannot be read ({error})") from error
     if not isinstance(info, dict) or not isinstance(info.get("features"), dict):
         raise SourceError(path, "does not describe features", field="features")
+    version = re.match(r"v?(\d+)", str(info.get("codebase_version", "v2")))
+    if version is None or int(version[1]) not in _VERSIONS:
+        raise _of_other_version(path, str(info["codebase_version"]).lstrip("v"))
     return info
+
+
+def _of_other_version(path: Path, version: str) -> SourceError:
+    remedy = "convert it to 3.0 by the scripts of LeRobot"
+    problem = f"is of version {version}, and 2.0 to 3 are read"
+    return SourceError(path, problem, field="codebase_version", remedy=remedy)
 
 
 def _names(folder: Path, info: Mapping[str, Any], feature: str) -> tuple[str, ...]:
@@ -259,8 +288,18 @@ def _calibrated(path: Path, joints: Sequence[str]) -> Array:
         raise SourceError(path, problem, field="--calibration", remedy=remedy) from error
     if not min(spans) > 0.0:
         joint = joints[int(np.argmin(spans))]
-        raise SourceError(path, "has an empty range", field=f"{joint}.range_max")
+        remedy = "calibrate the arm again, or give another file"
+        raise SourceError(path, "has an empty range", field=f"{joint}.range_max", remedy=remedy)
     return np.asarray(2.0 * np.pi / _STEPS * np.array(spans))
+
+
+def _require_like(path: Path, joint: str, calibrated: float, described: float) -> None:
+    """Raise SourceError if a calibrated range is by far another than that of the URDF [rad]."""
+    least, most = _CALIBRATED
+    if np.isfinite(described) and not least < calibrated / described < most:
+        problem = f"calibrates {calibrated:.3g} rad, and the URDF has a range of {described:.3g}"
+        remedy = "give the calibration and the URDF of this arm"
+        raise SourceError(path, problem, field=joint, remedy=remedy)
 
 
 def _is_gripper(name: str) -> bool:

@@ -81,9 +81,10 @@ def contacts_of(motion: ServoMotion, fit: ServoFit, resolution: Array) -> list[C
 
 
 def _beyond(motion: ServoMotion, every: int, fit: ServoFit) -> tuple[Array, Array]:
-    """Return what no friction at rest explains (m, n), and its standard deviation (m, n).
+    """Return what neither motion nor friction explains (m, n), and its standard deviation (m, n).
 
-    In position errors of the servo, of every so many instants of a motion.
+    In position errors of the servo, of every so many instants of a motion; friction is that at
+    rest, the largest.
     """
     estimate = fit.estimate
     n, count = estimate.coordinates.shape
@@ -100,10 +101,16 @@ def _beyond(motion: ServoMotion, every: int, fit: ServoFit) -> tuple[Array, Arra
     command = np.column_stack(
         [np.interp(late[:, joint], instants, motion.command[:, joint]) for joint in range(n)]
     )
+    velocity = motion.velocity[::every]
+    acceleration = np.gradient(motion.velocity, motion.step, axis=0)
+    pace = np.gradient(command, every * motion.step, axis=0)
     error = command - motion.position[::every] + of("offset")
     error = error - np.clip(error, -of("dead_band"), of("dead_band"))
-    bodies = of("kp") * motion.bodies.bias[::every]
-    rest = np.clip(error, -of("limit"), of("limit")) - bodies
+    error = error + of("kd") * (pace - velocity)
+    torque = motion.bodies.bias + motion.bodies.inertia * acceleration
+    bodies = of("kp") * torque[::every]
+    moving = of("armature") * acceleration[::every] + of("viscous") * velocity
+    rest = np.clip(error, -of("limit"), of("limit")) - bodies - moving
     friction = of("coulomb") + of("static") + of("load") * np.abs(bodies)
     direction = np.sign(rest[0])
     over = direction * rest - friction

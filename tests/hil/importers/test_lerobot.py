@@ -66,12 +66,14 @@ def written(
     *,
     version: str = "v2.1",
     names: Any = None,
+    fixed: bool = False,
 ) -> Path:
     """Write states and actions of episodes as LeRobot does."""
     stated = [f"{name}.pos" for name in JOINTS] if names is None else names
     feature = {"dtype": "float32", "shape": [3], "names": stated}
     info = {
         "codebase_version": version,
+        "total_episodes": len(episodes),
         "fps": FPS,
         "features": {"observation.state": feature, "action": feature},
     }
@@ -80,7 +82,7 @@ def written(
     chunk = folder / "data" / "chunk-000"
     chunk.mkdir(parents=True)
     tables = []
-    numbers = pa.list_(pa.float32())
+    numbers = pa.list_(pa.float32(), 3) if fixed else pa.list_(pa.float32())
     for k, (state, action) in enumerate(episodes):
         rows = np.arange(len(state))
         tables.append(
@@ -96,7 +98,11 @@ def written(
             )
         )
     if version == "v3.0":
-        parquet.write_table(pa.concat_tables(tables), chunk / "file-000.parquet")
+        parquet.write_table(pa.concat_tables(tables[:2]), chunk / "file-000.parquet")
+        if tables[2:]:
+            second = folder / "data" / "chunk-001"
+            second.mkdir()
+            parquet.write_table(pa.concat_tables(tables[2:]), second / "file-000.parquet")
     else:
         for k, table in enumerate(tables):
             parquet.write_table(table, chunk / f"episode_{k:06d}.parquet")
@@ -132,6 +138,54 @@ def test_episodes_of_every_version_are_recordings(tmp_path: Path, urdf: Path, ve
         assert "torque" not in columns
         stamps = columns["stamp"] - columns["stamp"][0]
         np.testing.assert_allclose(1e-9 * stamps, np.arange(len(position)) / FPS, atol=1e-5)
+
+
+def test_chunks_have_several_files_of_several_episodes(tmp_path: Path, urdf: Path) -> None:
+    motions = [motion(duration, phase) for duration, phase in ((4.0, 0.0), (3.0, 1.0), (5.0, 2.0))]
+    episodes = [(in_degrees(q), in_degrees(q)) for q in motions]
+    folder = written(tmp_path / "pick", episodes, version="v3.0", fixed=True)
+    assert len([*folder.rglob("data/**/*.parquet")]) == 2
+    found = recordings(folder, urdf, units="deg")
+    assert [name[-6:] for name, _, _ in found] == ["000000", "000001", "000002"]
+    for (_, columns, _), position in zip(found, motions, strict=True):
+        np.testing.assert_allclose(columns["position"], position, atol=1e-5)
+
+
+def test_a_missing_episode_is_named(tmp_path: Path) -> None:
+    episodes = [(in_degrees(q), in_degrees(q)) for q in (motion(4.0, 0.0), motion(3.0, 1.0))]
+    folder = written(tmp_path / "pick", episodes)
+    table = folder / "data" / "chunk-000" / "episode_000001.parquet"
+    table.unlink()
+    with pytest.raises(SourceError, match=r"has 1 of 2 episodes .*: no 1") as refused:
+        DataSet.read(folder)
+    assert refused.value.remedy
+    table.with_name("episode_000000.parquet").unlink()
+    with pytest.raises(SourceError, match="has 0 of 2 episodes"):
+        DataSet.read(folder)
+
+
+@pytest.mark.parametrize("version", ["v1.6", "v4.0"])
+def test_other_versions_are_refused(tmp_path: Path, version: str) -> None:
+    data = in_degrees(motion(4.0, 0.0))
+    folder = written(tmp_path / "pick", [(data, data)], version=version)
+    with pytest.raises(SourceError, match=f"is of version {version[1:]}") as refused:
+        DataSet.read(folder)
+    assert refused.value.remedy
+    (folder / "meta").rename(folder / "meta_data")  # as of versions 1
+    assert is_data_set(folder)
+    with pytest.raises(SourceError, match="is of version 1"):
+        DataSet.read(folder)
+
+
+def test_a_calibration_of_another_arm_is_refused(tmp_path: Path, urdf: Path) -> None:
+    data = in_range(motion(4.0, 0.0))
+    folder = written(tmp_path / "pick", [(data, data)])
+    calibration = tmp_path / "arm.json"
+    ends = {"range_min": 2000, "range_max": 2010}
+    calibration.write_text(json.dumps(dict.fromkeys(JOINTS, ends)))
+    with pytest.raises(SourceError, match=r"calibrates 0\.0153 rad") as refused:
+        recordings(folder, urdf, calibration=calibration)
+    assert refused.value.remedy
 
 
 def test_numbers_beyond_100_are_degrees(tmp_path: Path, urdf: Path) -> None:

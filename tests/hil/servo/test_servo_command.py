@@ -125,8 +125,8 @@ class TestCommand:
         touched = results.model_copy(
             update={"validation": [unseen.model_copy(update={"pushed": (push,)})]}
         )
-        (warning,) = [w for w in verdict_of(touched).warnings if "touched" in w]
-        assert "lift by -60 mrad at 36 s" in warning
+        (warning,) = [w for w in verdict_of(touched).warnings if "something pushed" in w]
+        assert "lift by -60 mrad at 35.6 s" in warning
 
     def test_errors_are_told_with_and_without_what_held_the_arm(
         self, identified: tuple[Path, str, int]
@@ -325,10 +325,10 @@ class TestExports:
         }  # fmt: skip
         for field in fields.values():
             for entry in field.values():
-                infinite = entry["high"] is None
-                assert entry["low"] <= entry["value"] and (
-                    infinite or entry["value"] <= entry["high"]
+                low, value, high = (
+                    np.inf if entry[end] is None else entry[end] for end in ("low", "value", "high")
                 )
+                assert low <= value <= high
                 assert entry["from"] in ("data", "prior")
         assert {entry["from"] for entry in fields["kp"].values()} == {"data"}
         assert fields["kp"]["lift"]["unit"] == "N·m/rad"
