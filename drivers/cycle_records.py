@@ -9,12 +9,14 @@ processor become visible to others in order and that loads are not reordered, as
 from __future__ import annotations
 
 import json
+import math
 import mmap
 import os
+from collections.abc import Sequence
 from typing import Any, Final, Self
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from drivers.arrays import Array
 
@@ -60,6 +62,48 @@ def cycle_dtype(n_joints: int, state: np.dtype[np.void] | None = None) -> np.dty
         ("mode", "<i4", joint),
     ]
     return np.dtype(fields if state is None else [*fields, (ARM_STATE, state)], align=True)
+
+
+class RowColumns:
+    """How numbers of packets become fields of rows, a few operations for all of them.
+
+    Args:
+        layout: of a row: its floats, then its integers.
+        places: of each number of a row among those of a packet; -1 where the packet has none.
+        factors: of each.
+        count: numbers of a packet.
+        unknown: integer that the packet does not have; other numbers are NaN.
+    """
+
+    def __init__(
+        self,
+        layout: np.dtype[np.void],
+        places: Sequence[int],
+        factors: Sequence[float],
+        count: int,
+        unknown: int,
+    ) -> None:
+        kinds = [layout[name] for name in layout.names or ()]
+        floats = sum(math.prod(kind.shape) for kind in kinds if kind.base.kind == "f")
+        self._blocks = np.dtype(
+            [("floats", "<f8", (floats,)), ("integers", "<i4", (len(places) - floats,))]
+        )
+        self._count = count
+        self._unknown = unknown
+        self._floats = np.array(places[:floats])
+        self._integers = np.array(places[floats:])
+        self._factors = np.array(factors[:floats])
+
+    def write(self, numbers: ArrayLike, rows: NDArray[np.void]) -> None:
+        """Write numbers (k, count) of packets into rows (k,)."""
+        known = np.empty((len(rows), self._count + 1))
+        known[:, :-1] = numbers
+        blocks = rows.view(self._blocks)
+        known[:, -1] = math.nan
+        np.multiply(known[:, self._floats], self._factors, out=blocks["floats"])
+        known[:, -1] = self._unknown
+        # Bits may be above the range of integers with a sign.
+        blocks["integers"][:] = known[:, self._integers].astype(np.int64)
 
 
 def create_memory(name: str, size: int) -> int:

@@ -6,9 +6,9 @@ import math
 from typing import Final
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
 
 from drivers.arrays import Array
+from drivers.cycle_records import RowColumns
 from drivers.ur.outputs import N_JOINTS
 
 UNKNOWN: Final = -1
@@ -68,53 +68,22 @@ _INERTIA_ORDER: Final = [0, 3, 4, 1, 5, 2]
 """xx, xy, xz, yy, yz, zz in the controller's xx, yy, zz, xy, xz, yz."""
 
 
-_FLOATS: Final = tuple(name for name in STATE_DTYPE.names or () if STATE_DTYPE[name].kind != "i")
-_INTEGERS: Final = tuple(name for name in STATE_DTYPE.names or () if name not in _FLOATS)
-
-
-def _size(name: str) -> int:
-    return math.prod(STATE_DTYPE[name].shape)
-
-
-_BLOCKS: Final = np.dtype(
-    [("floats", "f8", (sum(map(_size, _FLOATS)),)), ("integers", "i4", (len(_INTEGERS),))]
-)
-"""A state as numbers in two rows: its floats come before its integers."""
-
-
-class StateColumns:
-    """Makes states of outputs.
+def state_columns(outputs: np.dtype[np.void], joint_sign: Array) -> RowColumns:
+    """Return how outputs of this layout are written into states of `STATE_DTYPE`.
 
     Args:
-        outputs: layout of the outputs, in their order.
+        outputs: in their order.
         joint_sign: of the drive train (6,).
     """
-
-    def __init__(self, outputs: np.dtype[np.void], joint_sign: Array) -> None:
-        names = outputs.names or ()
-        counts = [math.prod(outputs[name].shape) for name in names]
-        self._count = sum(counts)
-        begins = dict(zip(names, np.cumsum([0, *counts]).tolist(), strict=False))
-
-        def columns(name: str) -> list[int]:
-            begin = begins.get(_OUTPUT_OF[name])
-            if begin is None:  # behind the outputs is what is unknown
-                return [self._count] * _size(name)
-            order = _INERTIA_ORDER if name == "payload_inertia" else range(_size(name))
-            return [begin + index for index in order]
-
-        self._floats = np.concatenate([columns(name) for name in _FLOATS])
-        self._integers = np.concatenate([columns(name) for name in _INTEGERS])
-        signs = {name: joint_sign if name in _SIGNED else np.ones(_size(name)) for name in _FLOATS}
-        self._signs = np.concatenate([*signs.values()])
-
-    def write(self, outputs: ArrayLike, states: NDArray[np.void]) -> None:
-        """Write states (k,) of `STATE_DTYPE`, of outputs (k, m) as numbers in a row."""
-        known = np.empty((len(states), self._count + 1))
-        known[:, :-1] = outputs
-        blocks = states.view(_BLOCKS)
-        known[:, -1] = np.nan
-        np.multiply(known[:, self._floats], self._signs, out=blocks["floats"])
-        known[:, -1] = UNKNOWN
-        # Bits may be above the range of integers with a sign.
-        blocks["integers"][:] = known[:, self._integers].astype(np.int64)
+    names = outputs.names or ()
+    counts = [math.prod(outputs[name].shape) for name in names]
+    begins = dict(zip(names, np.cumsum([0, *counts]).tolist(), strict=False))
+    places: list[int] = []
+    factors: list[float] = []
+    for name in STATE_DTYPE.names or ():
+        size = math.prod(STATE_DTYPE[name].shape)
+        begin = begins.get(_OUTPUT_OF[name])
+        order = _INERTIA_ORDER if name == "payload_inertia" else range(size)
+        places += [-1 if begin is None else begin + index for index in order]
+        factors += joint_sign.tolist() if name in _SIGNED else [1.0] * size
+    return RowColumns(STATE_DTYPE, places, factors, sum(counts), UNKNOWN)

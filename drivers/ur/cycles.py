@@ -13,7 +13,7 @@ from drivers.cycle_records import ARM_STATE, cycle_dtype
 from drivers.drive_train import DriveTrain
 from drivers.packets import DRIVE_ON
 from drivers.states import State
-from drivers.ur.arm_state import STATE_DTYPE, StateColumns
+from drivers.ur.arm_state import STATE_DTYPE, state_columns
 from drivers.ur.outputs import N_JOINTS, POWER_MODES, ROBOT_RUNNING
 from drivers.ur.reader import OutputFrames
 from drivers.ur.rtde import RtdeError
@@ -70,7 +70,7 @@ class CycleCounter:
         for name in ("diagonal_inertia", "extra3", "commanded_position", "commanded_velocity"):
             records[name] = np.nan
         states = np.empty(len(values), STATE_DTYPE)
-        columns = StateColumns(values.dtype, self._sign)
+        columns = state_columns(values.dtype, self._sign)
         columns.write(structured_to_unstructured(values, np.float64), states)
         records[ARM_STATE] = states
         return records

@@ -37,7 +37,7 @@ from drivers.packet_losses import LossTracker
 from drivers.packets import DRIVE_ON
 from drivers.states import AxesReport, Input, State
 from drivers.ur import outputs
-from drivers.ur.arm_state import STATE_DTYPE, StateColumns
+from drivers.ur.arm_state import STATE_DTYPE, state_columns
 from drivers.ur.description import START, UrDescription
 from drivers.ur.expected import ExpectedArm
 from drivers.ur.identity import ArmIdentity
@@ -278,7 +278,7 @@ class UrWire:
         self.description = description
         self._layout = _Layout(description.recipe)
         joint_sign = self._settings.drive_train.joint_sign
-        self._columns = StateColumns(description.recipe.dtype, joint_sign)
+        self._columns = state_columns(description.recipe.dtype, joint_sign)
         self._forget_cycles()
         self._broken = False
         settings = self._settings
