@@ -89,6 +89,8 @@ OPTIONAL: Final = tuple(
 OLDEST: Final = (5, 10)
 """Oldest software, major and minor, on which motions run."""
 NEWEST_MAJOR: Final = 5
+CB3: Final = 3
+"""Newest major version of the software of CB3 controllers."""
 FULL_SPEED: Final = 1e-3
 """Largest distance of speed slider and scaling from 1."""
 MOST_DEVIATION: Final = 0.8
@@ -170,8 +172,13 @@ def reasons_not_to_move(
     """Return why this arm is not moved by this cell, a sentence each."""
     version, identity = description.version, description.identity
     found = [*expected.differences(identity, version.major)]
-    if (version.major, version.minor) < OLDEST or version.major > NEWEST_MAJOR:
-        oldest = ".".join(map(str, OLDEST))
+    oldest = ".".join(map(str, OLDEST))
+    if version.major <= CB3:
+        found.append(
+            f"it is a CB3 controller (software {version}), which is only recorded: motions "
+            f"need an e-Series controller with PolyScope {oldest} or newer"
+        )
+    elif (version.major, version.minor) < OLDEST or version.major > NEWEST_MAJOR:
         found.append(f"its software is {version}; motions need {oldest} or newer of PolyScope 5")
     if abs(description.period - period) > 1e-9:
         ours = f"{1e3 * period:g} ms in the cell"

@@ -91,26 +91,26 @@ def test_each_motion_has_a_program_of_its_own() -> None:
 
 
 @pytest.mark.parametrize(
-    ("faults", "outcome", "reason"),
+    ("faults", "outcome", "reason", "state"),
     [
-        (("stop@{c}",), "lost", "protective stop"),
-        (("emergency-stop@{c}",), "lost", "robot emergency stop"),
-        (("power-off@{c}",), "lost", "power off"),
-        (("safeguard@{c}",), "lost", "safeguard stop"),
-        (("pause@{c}",), "lost", "paused"),
-        (("halt@{c}",), "lost", "was stopped there"),
-        (("freedrive@{c}x50",), "refused", "freedrive"),
-        (("slider@{c}x50",), "refused", "speed slider is at 50 %"),
-        (("push@{c}x90",), "refused", "deviation that stops it"),
-        (("push@{c}x300",), "lost", "too far from its set-point"),
+        (("stop@{c}",), "lost", "protective stop", State.FAULTED),
+        (("emergency-stop@{c}",), "lost", "robot emergency stop", State.DRIVE_OFF),
+        (("power-off@{c}",), "lost", "power off", State.DRIVE_OFF),
+        (("safeguard@{c}",), "lost", "safeguard stop", State.FREEZING),
+        (("pause@{c}",), "lost", "paused", State.FREEZING),
+        (("halt@{c}",), "lost", "was stopped there", State.CLOSED),
+        (("freedrive@{c}x50",), "refused", "freedrive", State.FAULTED),
+        (("slider@{c}x50",), "refused", "speed slider is at 50 %", State.FAULTED),
+        (("push@{c}x90",), "refused", "deviation that stops it", State.FAULTED),
+        (("push@{c}x300",), "lost", "too far from its set-point", State.FAULTED),
     ],
 )
 def test_what_happens_at_the_controller_ends_the_motion(
-    faults: tuple[str, ...], outcome: str, reason: str
+    faults: tuple[str, ...], outcome: str, reason: str, state: State
 ) -> None:
     bench = UrBench(*(fault.format(c=MIDST) for fault in faults)).move()
     assert (bench.ended.outcome, reason in bench.ended.reason) == (outcome, True), bench.ended
-    assert bench.started
+    assert bench.started and bench.state is state
     bench.run(400)
     assert bench.rests
     # Nothing is unlocked, switched on or played again from here.
@@ -250,6 +250,10 @@ class TestBefore:
         [
             ({"remote_control": False}, "local mode"),
             ({"version": (5, 9, 4, 0)}, "5.10"),
+            (
+                {"version": (3, 15, 8, 0)},
+                "a CB3 controller .software 3.15.8.0., which is only recorded",
+            ),
             ({"version": (3, 15, 8, 0)}, "8 ms in the controller"),
             ({"version": (10, 7, 0, 0)}, "PolyScope 5"),
         ],
