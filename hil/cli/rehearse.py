@@ -48,7 +48,7 @@ def rehearse(
         typer.echo(rehearsal.model_dump_json())
     else:
         lines = [] if quiet else _lines(rehearsal, verbose=verbose)
-        for line in [*lines, rehearsal.line] if verbose else brief([*lines, rehearsal.line]):
+        for line in [*lines, rehearsal.line] if verbose else brief([rehearsal.line, *lines]):
             say(line)
     if not rehearsal.passed:
         raise typer.Exit(NOT_GOOD)
@@ -64,6 +64,6 @@ def _lines(rehearsal: Rehearsal, *, verbose: bool) -> list[str]:
     if verbose:
         return [*criteria, *(f"not covered: {sentence}" for sentence in rehearsal.not_seen)]
     if rehearsal.passed:
-        return ["the criteria: -v"]
+        return ["its criteria: -v"]
     passed = len(rehearsal.criteria) - len(rehearsal.failures)
     return [*criteria, f"{passed} of {len(rehearsal.criteria)} criteria are met: -v shows them"]

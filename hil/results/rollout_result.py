@@ -189,21 +189,21 @@ class RolloutResult(Frozen):
             return f"From {worse[0]:g} s on the identified arm is no better than the nominal one."
         return (
             f"The identified arm is better than the nominal one up to {self.horizons[-1]:g} s:"
-            f" {self.ratio[JUDGED]:.2f} of its position error at {self.horizons[JUDGED]:g} s."
+            f" {percentage(self.ratio[JUDGED], 1)} of its position error at"
+            f" {self.horizons[JUDGED]:g} s."
         )
 
     @property
     def _leading(self) -> str:
-        effect = self.leading_effect or "neither dry nor viscous friction nor delay alone"
+        cause = (
+            f"most of this error comes from its {self.leading_effect}"
+            if self.leading_effect
+            else "neither dry friction, viscous friction nor delay explains this error alone"
+        )
         most = max(self.identified.unstable_joints)
         if 2 * most > self.windows:
-            return (
-                f"{self.leading_joint} makes {most} of {self.windows} windows unstable; what leads"
-                f" its error is {effect}."
-            )
-        return (
-            f"{self.leading_joint} leads the error of the tool; what leads its error is {effect}."
-        )
+            return f"{self.leading_joint} makes {most} of {self.windows} windows unstable; {cause}."
+        return f"{self.leading_joint} contributes most to the error of the flange; {cause}."
 
     @property
     def band_message(self) -> str:
