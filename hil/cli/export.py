@@ -94,7 +94,7 @@ def export(
             Default: identified.*, arm.c or arm.st in the campaign folder or working directory.
         ranges: Also write NAME.ranges.json for domain randomisation: value and 95 % interval of
             each field of the simulator, and whether data or prior decide.
-        ensemble: Write so many arms drawn from the posterior, all of them physically consistent;
+        ensemble: Write N arms drawn from the posterior, all physically consistent;
             for isaaclab and genesis in NAME.ranges.json.
         seed: Of the draws.
         into: Your own MJCF or URDF: change its friction, armature and servos, in place or as

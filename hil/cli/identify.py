@@ -69,8 +69,8 @@ def identify(
     Options:
         output: Folder for all files. Default: the campaign folder (--paper: its subfolder), or one
             next to the first recording, named after it.
-        predict: Recording to predict and not to fit (repeatable).
-        paper: Filter torques and regressor alike, as in the paper.
+        predict: Recording to predict instead of fit (repeatable).
+        paper: Filter torques and regressor in the same way, as in the paper.
         split: Fraction fitted without a validation run.
         fit_all: Hold nothing out; no model is then judged good.
         annotate: Also write archives with predicted torque, for viewers.

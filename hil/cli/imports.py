@@ -233,8 +233,8 @@ class Reading:
         str | None,
         typer.Option(
             metavar="TOPIC",
-            help="Topic of the commanded positions of a bag, or none. Default: that which the "
-            "positions follow.",
+            help="Topic of the commanded positions of a bag, or none. Default: the topic that "
+            "the positions follow.",
             rich_help_panel=CHANNELS,
         ),
     ] = None

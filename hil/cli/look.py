@@ -45,12 +45,12 @@ def look(
     verbose: VerboseOption = False,
     json: JsonOption = False,
 ) -> None:
-    """Say what each channel of a recording is, how certain that is, and what it can determine.
+    """Show what each channel of a recording is, how certain that is, and what it can determine.
 
-    Names and units say a part, the slope of the positions another, and with --urdf the torque:
-    side, sign, order and zero of the joints, gravity, mounting, delay and low-pass. Where two
-    explanations fit equally well, both are shown with their errors; on a terminal you choose, else
-    the lines to choose from are printed, to be added to the map, and the exit status is 2.
+    Names, units and the slope of the positions tell a part, and with --urdf the torque tells the
+    rest: side, sign, order and zero of the joints, gravity, mounting, delay and low-pass. Where two
+    explanations fit equally well, both are shown with their errors; on a terminal you choose,
+    otherwise the lines to choose from are printed for the map, and the exit status is 2.
 
     **Example:** `hil look log.csv --urdf arm.urdf`
 

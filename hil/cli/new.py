@@ -75,7 +75,7 @@ def new(
 
     A Universal Robots arm (--controller ur --host HOST) states type, serial number, calibration,
     limits, payload and its torque constants: nothing moves, and nothing is claimed. Without --urdf
-    the kinematics are those that it states, and there are no masses.
+    its own kinematics are used, without masses.
 
     **Examples:** `hil new --urdf robot.urdf --from-controller 10.2.12.150 -o cell.toml`, `hil new
     --dh table.csv --convention modified -o cell.toml`, `hil new --design-only --urdf robot.urdf -o
@@ -95,9 +95,8 @@ def new(
         base: Link from which the arm starts, of a robot with several arms; joints outside it are
             fixed. Default: the root of the URDF.
         tip: Last link of the arm, such as the flange before a gripper. Default: every end.
-        fix: Joint that does not move, at a position in rad or m (default 0; repeatable). Prismatic
-            joints are fixed, but for those along gravity without --design-only and --from-...,
-            which make a cell for recordings.
+        fix: Joint to fix, at a position in rad or m (default 0; repeatable). Prismatic joints are
+            fixed, except along gravity in a cell for recordings.
         design_only: For an arm moved by another controller: no drive train and no link; values that
             a design needs beyond the URDF are assumed and listed.
         force: Replace an earlier file.

@@ -43,13 +43,13 @@ def payload(
     - `hil payload --model runs/mine full.mcap`: without a bare recording of the motion
 
     Options:
-        bare: Archives (*.mcap) recorded without the payload, or campaign folders; with --model
-            those recorded with it.
-        loaded: Archive recorded with it, or campaign folder (repeatable).
+        bare: Archives (*.mcap) recorded without the payload, or campaign folders; with --model,
+            archives recorded with it.
+        loaded: Archive recorded with the payload, or campaign folder (repeatable).
         model: Campaign folder, or archive, of the bare arm in any motion (repeatable): the payload
             is the difference to its model, and friction is free to scale.
         frame: URDF link in whose frame the values are given. Default: tool0 or flange if fixed to
-            the last joint, else the link of that joint.
+            the last joint, else the link of this joint.
         check: Known value, such as mass=4.0 (kg): exit status 5 if it lies outside its 95 %
             interval (repeatable).
     """

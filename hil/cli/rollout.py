@@ -75,7 +75,7 @@ def rollout(
     Options:
         output: Folder for rollout.json and rollout.png. Default: the campaign folder; none for
             single archives.
-        predict: Archive to simulate and not to fit, of any kind (repeatable).
+        predict: Archive to simulate instead of fit, of any kind (repeatable).
         samples: Arms drawn from the posterior.
         seed: Of the draws.
         feedback: Natural frequency of the feedback that keeps the simulated arm near the measured

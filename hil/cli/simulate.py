@@ -161,8 +161,8 @@ def simulate(
     `your_program --listen 2001`.
 
     The order does not matter: the first packet is repeated every second until the reply. Ctrl-C
-    ends the session properly (a second one at once); `kill -USR1` presses drive-on, `kill -USR2`
-    the emergency stop. See `docs/simulate.md`, also for the faults.
+    ends the session properly (a second one immediately); `kill -USR1` presses drive-on,
+    `kill -USR2` the emergency stop. See `docs/simulate.md`, also for the faults.
 
     With --link rtde:HOST[:PORT] it is a Universal Robots controller that listens at that address
     (RTDE, primary interface and dashboard) until Ctrl-C, and runs the program of `hil move`.

@@ -40,12 +40,12 @@ def torque_constants(
     exit status 5.
 
     Options:
-        archives: Archives (*.mcap) with motor currents, or folders of them. Those whose cell has a
-            [robot.payload] were recorded with it, the others without payload.
+        archives: Archives (*.mcap) with motor currents, or folders of them. Archives whose cell has
+            a [robot.payload] were recorded with it, the others without payload.
         loaded: Archive or folder recorded with the payload of --mass (repeatable).
         mass: Mass of that payload, kg.
-        centre: Its centre of mass in the frame, x,y,z in m. Default: the origin of the frame, and
-            the output says so: the constants are wrong if it is elsewhere.
+        centre: Its centre of mass in the frame, x,y,z in m. Default: the origin of the frame, which
+            the output repeats: the constants are wrong if it is elsewhere.
         inertia: Its inertia tensor about the centre of mass, xx,xy,xz,yy,yz,zz in kg·m² in the axes
             of the frame.
         frame: URDF link of that frame. Default: the link of the last joint.

@@ -68,7 +68,7 @@ def trend(
             URLs of archives; or a table of quantities that `hil batch` or `hil trend` wrote.
         output: HTML file for the report. Default: no report.
         table: CSV file with every value of every series. Default: none.
-        limit: Change whose date is foreseen, such as 'friction +50 %' (repeatable).
+        limit: Change whose date is predicted, such as 'friction +50 %' (repeatable).
         covariate: Column that may explain a change, such as a payload (repeatable). Temperatures
             and the time since the start are found by their names.
         conditions: CSV file of what the logs lack, by date (column when) and,

@@ -50,7 +50,7 @@ class WeighingOptions:
         typer.Option(
             min=0.001,
             metavar="KG",
-            help="Largest mass that is expected: motion, rehearsal and dry run are checked with "
+            help="Largest expected mass: motion, rehearsal and dry run are checked with "
             "it. Needed for the first run with a payload.",
             rich_help_panel=PAYLOAD,
         ),
@@ -59,7 +59,7 @@ class WeighingOptions:
         str | None,
         typer.Option(
             metavar="X,Y,Z",
-            help="Its centre of mass as it is expected, m in the frame of the flange. Default: "
+            help="Its expected centre of mass, m in the frame of the flange. Default: "
             f"{','.join(f'{part:g}' for part in CENTRE)}.",
             rich_help_panel=PAYLOAD,
         ),

@@ -113,7 +113,7 @@ _GRAVITY: Final = 9.81
 
 @dataclass(frozen=True)
 class Size:
-    """Measured torque over that which the arm needs.
+    """Measured torque over the torque that the arm needs.
 
     Attributes:
         factor: of the whole arm; None where neither masses nor weight say.
@@ -210,7 +210,7 @@ class TorqueFindings:
 
     @cached_property
     def size(self) -> Size:
-        """Measured torque over that which the arm needs."""
+        """Measured torque over the torque that the arm needs."""
         return Size.of(self.cell, self.readings.model, self.readings.samples)
 
     @cached_property

@@ -359,7 +359,7 @@ class StillUnexplained:
 
 @dataclass(frozen=True)
 class SizeRatio:
-    """Measured torque over that which the arm needs, by its masses or by its reach."""
+    """Measured torque over the torque that the arm needs, by its masses or by its reach."""
 
     ratio: float
     by_masses: bool
@@ -428,7 +428,7 @@ class BeyondEffort:
 
 @dataclass(frozen=True)
 class BeyondMasses:
-    """Torque over that which the arm needs, by its masses or by its reach."""
+    """Torque over the torque that the arm needs, by its masses or by its reach."""
 
     ratio: float
     by_masses: bool
