@@ -45,7 +45,7 @@ ALTERNATIVES: Final[Mapping[str, tuple[Any, ...]]] = {
     "CERTAIN": (1.0, 2.0),
     "TRANSFER": (0.0, 0.02, 0.1),
     "ROTORS_WORTHWHILE": (0.0, 0.1, 0.2),
-    "IMPOSSIBLE_WORTHWHILE": (0.02, 0.1),
+    "IMPOSSIBLE_WORTHWHILE": (0.02, 0.05, 0.1),
     "OFFSET_SHARE": (0.2, 0.3, 0.5, 1.0),
 }
 """Other values of each default; of a sequence, the first is the one that others have to beat."""

@@ -420,6 +420,15 @@ class TestChosenSettings:
         decision = next(choice for choice in choices if choice.name == CONSISTENT)
         assert decision.errors[1] < (1.0 - WORTHWHILE) * decision.errors[0]
 
+    @pytest.mark.parametrize(("noise", "possible"), [(6.0, False), (9.0, True)])
+    def test_four_per_cent_refuse_possible_bodies_and_two_do_not(self, noise, possible):
+        """A negative friction that shows beside noise: impossible bodies gain as much."""
+        values = truth()
+        values[MODEL.parameter_names.index("f1_1")] = -2.0
+        recording = a_recording(values=values, noise=noise, duration=LONG)
+        settings, _ = chosen(recording, {"estimator"})
+        assert settings.strength.consistent == possible
+
     @pytest.mark.parametrize(
         ("frequencies", "stiffness", "possible"),
         [(1, 2.0, True), (1, 15.0, False), (3, 15.0, False)],
