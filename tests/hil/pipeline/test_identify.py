@@ -496,7 +496,7 @@ class TestEstimators:
         free = replace(prepared.settings, strength=Strength(consistent=False))
         expected = estimate_with(replace(prepared, settings=free), Options(), Silent())
         failing = raiser(SolverError("no solution was found"))
-        monkeypatch.setattr("hil.pipeline.estimating.consistent_values", failing)
+        monkeypatch.setattr("identification.reduction.posterior.consistent_values", failing)
         restricted = replace(prepared.settings, strength=Strength(consistent=True))
         estimation = estimate_with(replace(prepared, settings=restricted), Options(), Silent())
         np.testing.assert_array_equal(
