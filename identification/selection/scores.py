@@ -46,8 +46,8 @@ presliding displacements (1 to 12 %). Measured once, at ab6d0d94."""
 # Improvement required to replace the first, simpler candidate, beside its standard error.
 WORTHWHILE: Final = 0.01
 # Bodies that cannot exist are of no use in a simulator, so they must predict better by more than
-# what is worthwhile elsewhere. On the board three of eight real arms have gains of 3 to 5 %, and
-# keep them on what is held out (`docs/method.md`); the others have none.
+# what is worthwhile elsewhere. 3 % in place of 5 % decides eight splits of three of eight real arms
+# otherwise, and what is held out is then predicted 5 % better on average (-11 to +1 %).
 IMPOSSIBLE_WORTHWHILE: Final = 0.03
 # An error above the torque itself chooses nothing, nor does one that no sensor resolves.
 MEANINGLESS: Final = 1.0
