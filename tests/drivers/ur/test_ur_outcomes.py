@@ -119,6 +119,35 @@ def test_what_happens_at_the_controller_ends_the_motion(
     assert bench.robot.outputs()["safety_mode"] == safety.get(faults[0].partition("@")[0], 1)
 
 
+@pytest.mark.parametrize(
+    ("outputs", "problem", "remedy"),
+    [
+        ({"robot_status_bits": 0b111}, "a person moves the arm by hand", "release the freedrive"),
+        ({"target_speed_fraction": 0.6}, "speed slider is at 60 %", "set it to 100 %"),
+        ({"speed_scaling": 0.6}, "slows the arm down to 60 %", "at the pendant for the limit"),
+        ({"speed_scaling": np.nan}, "slows the arm down to nan %", "at the pendant for the limit"),
+        (
+            {"joint_position_deviation_ratio": 0.81},
+            "81 % of the deviation",
+            "payload and obstacles",
+        ),
+    ],
+)
+def test_a_disturbed_motion_is_refused_with_its_remedy(
+    outputs: dict[str, float], problem: str, remedy: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    bench = UrBench()
+    own = bench.robot.outputs
+    monkeypatch.setattr(
+        bench.robot, "outputs", lambda: own() | (outputs if bench.robot.cycle >= MIDST else {})
+    )
+    bench.move()
+    (refused,) = [event.error for event in bench.events if isinstance(event, Refused)]
+    assert bench.ended.outcome == "refused" and bench.started
+    assert problem in str(refused) and remedy in refused.remedy
+    assert bench.run(200).rests and not bench.robot.playing
+
+
 @pytest.mark.parametrize("first", ["stop", "safeguard", "pause"])
 @pytest.mark.parametrize("pc_lives", [True, False])
 def test_a_program_that_an_operator_resumes_ends_without_moving(first: str, pc_lives: bool) -> None:
