@@ -31,7 +31,7 @@ FormatName = Literal["mjcf", "urdf", "sdf", "pinocchio"]
 
 _SPREAD_TOLERANCE: Final = 0.05  # of drawn arms, from that of the stated intervals
 _ENSEMBLE_STATES: Final = 50  # random states at which each drawn arm is read back
-_LEAST: Final = 1e-3  # of the largest torque of a joint, below which a part is not listed
+_LEAST: Final = 1e-3  # of the torque of a joint, below which a part is not listed
 _MOST_ROWS: Final = 2000  # of the recorded motion, enough for root mean squares
 
 
@@ -49,14 +49,13 @@ class Exported:
     def lines(self) -> list[str]:
         """Return the summary as lines of text."""
         unit = " or ".join(sorted(set(self.units)))
-        whole = 0.0 if isinstance(self.comparison, str) else float(self.comparison.torque.max())
 
-        def row(torque: Array) -> str:
-            pairs = zip(self.joint_names, torque, strict=True)
-            shown = [f"{name} {one:.3g}" for name, one in pairs if one >= _LEAST * whole]
-            return (
-                f"{', '.join(shown)} {unit}" if shown else f"less than {_LEAST * whole:.1g} {unit}"
-            )
+        def row(torque: Array, whole: Array) -> str:
+            pairs = zip(self.joint_names, torque, _LEAST * whole, strict=True)
+            shown = [f"{name} {one:.3g}" for name, one, least in pairs if one >= least]
+            if not shown:
+                return "less than a thousandth of the torque of each joint"
+            return f"{', '.join(shown)} {unit} rms"
 
         lines = [*([f"parameters: {self.origin}"] if self.origin else [])]
         lines.append(f"written: {self.path}")
@@ -66,8 +65,12 @@ class Exported:
             lines += [
                 f"read back: torque error at most {self.comparison.difference:.1e} of the joint's"
                 f" largest torque, at {STATES} random states",
-                *(f"left out: {k}: {row(v)} rms" for k, v in self.comparison.left_out.items()),
-                f"whole torque of the recorded motion: {row(self.comparison.torque)} rms",
+                *(
+                    f"left out: {k}: {row(v, self.comparison.torque)}"
+                    for k, v in self.comparison.left_out.items()
+                ),
+                "whole torque of the recorded motion: "
+                + row(self.comparison.torque, self.comparison.torque),
             ]
         return [*lines, self.verdict]
 

@@ -109,6 +109,8 @@ _ROBUST: Final = 1.4826  # standard deviation over median absolute deviation, of
 _WIDTH: Final = 300.0  # of a picture beside its finding [px]
 _HEIGHT: Final = 150.0
 _LOWER: Final = 0.7  # of the height in the figure of all joints
+_WITHOUT_GAPS: Final = 99.5  # per cent of the intervals: a single gap would hide the others
+_MOST_SHOWN: Final = 1.2  # of these
 _FIGURE_ROWS: Final = 2000  # dots
 
 Draw = Callable[..., "Panel"]
@@ -302,7 +304,8 @@ def _clock(series: ReportSeries) -> Chart | None:
     usual = float(np.median(intervals))
     what = f"intervals between time stamps; usual one {significant(usual)} ms"
     traces = [_line(intervals, WIDE), Trace(intervals, FIRST, 1.8, x=time, dots=True)]
-    plot = Plot(_HEIGHT, "interval [ms]", traces)
+    most = _MOST_SHOWN * float(np.percentile(intervals, _WITHOUT_GAPS))
+    plot = Plot(_HEIGHT, "interval [ms]", traces, limits=(min(0.0, float(intervals.min())), most))
     x_range = float(time[0]), max(float(time[-1]), float(time[0]) + 1e-9)
     return Chart(Caption("u", "Time stamps", "", what), time, [plot], x_range=x_range)
 
