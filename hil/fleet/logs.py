@@ -225,7 +225,8 @@ def conclude_map(log: str, reading: LogReading, cache: CacheLocation) -> ReadLog
     source = Path(log)
     as_stated = read_recording(source, reading.robot_of, reading.options)
     _require_usable(as_stated, source)
-    recording = concluded(as_stated, source, reading.robot_of, reading.options, "excitation")
+    found = concluded(as_stated, source, reading.robot_of, reading.options, "excitation")
+    recording = found.recording
     _require_usable(recording, source)
     text = recording.text
     assert text is not None, "a log has a column map, a bag the map of its topic"

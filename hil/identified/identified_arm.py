@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import base64
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from functools import cached_property, partial
 from html import escape
 from os import PathLike
 from pathlib import Path
+from types import MappingProxyType
 from typing import TYPE_CHECKING, TypeAlias
 
 import numpy as np
@@ -53,6 +54,7 @@ from identification.errors import ModelError
 from identification.export.observer import MomentumObserver
 from identification.export.parameter_table import parameter_table
 from identification.export.simulators import pinocchio_arm
+from identification.hypotheses.diagnosis import TorqueDiagnosis
 from identification.model.motion import Motion
 from identification.model.single_state import SingleStateTorque
 from identification.text import number, percentage
@@ -415,7 +417,9 @@ def identify_recordings(
             )
         refuse_comparison(compare)
         require_torques(staging)
-        identification = _identified(staging.fitted, staging.predicted, options, reporter)
+        identification = _identified(
+            staging.fitted, staging.predicted, options, reporter, staging.diagnoses
+        )
     read = recording_results(staging, predict)
     results = identification.results.model_copy(update={"recordings": read})
     return IdentifiedArm(
@@ -461,9 +465,12 @@ def _identified(
     predict: Sequence[Path | Archive],
     options: Options,
     reporter: Reporter,
+    diagnoses: Mapping[Path, TorqueDiagnosis] = MappingProxyType({}),
 ) -> Identification:
     """Identify from archives or a folder of them; a campaign with its conduct."""
-    identification = identify_paths(archives, reporter, options, predict=predict)
+    identification = identify_paths(
+        archives, reporter, options, predict=predict, diagnoses=diagnoses
+    )
     first = place_of(archives[0])
     if not RecordedCampaign(first).sealed:
         return identification

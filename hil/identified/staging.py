@@ -29,7 +29,8 @@ from hil.importers.recording_import import (
     read_recording,
 )
 from hil.importers.required_signals import has_servo, require_motion, require_torque
-from hil.look.before_identification import concluded
+from hil.look.before_identification import Concluded, concluded
+from identification.hypotheses.diagnosis import TorqueDiagnosis
 
 MAP: Final = "map.toml"
 """File of the column map in a folder of results."""
@@ -45,12 +46,14 @@ class Staging:
         predicted: archives to predict.
         recordings: those that were imported, by the path of their archive.
         sources: the files that those are from, likewise.
+        diagnoses: what their torques are, likewise, where that was asked.
     """
 
     fitted: list[Path | Archive] = field(default_factory=list)
     predicted: list[Path | Archive] = field(default_factory=list)
     recordings: dict[Path, ImportedRecording] = field(default_factory=dict)
     sources: dict[Path, Path] = field(default_factory=dict)
+    diagnoses: dict[Path, TorqueDiagnosis] = field(default_factory=dict)
 
     def check_places(self, folder: Path) -> None:
         """Raise InputError if an archive in this folder would replace a recording."""
@@ -125,9 +128,11 @@ def staged(
                     archives.append(path)
                     continue
                 for source, place, recording in _read(path, robot_of, options, use, staging):
-                    recording = _concluded(recording, source, robot_of, options, use, reporter)
-                    archives.append(recording.archive)
-                    staging.recordings[place] = recording
+                    found = _concluded(recording, source, robot_of, options, use, reporter)
+                    archives.append(found.recording.archive)
+                    staging.recordings[place] = found.recording
+                    if found.diagnosis is not None:
+                        staging.diagnoses[place] = found.diagnosis
         yield staging
     except InputError as error:
         if error.path not in staging.sources:
@@ -169,16 +174,16 @@ def _concluded(
     options: ImportOptions,
     use: Use,
     reporter: Reporter,
-) -> ImportedRecording:
+) -> Concluded:
     """Report what is concluded of a recording, and return it without the text of its log.
 
     That takes more memory than its numbers.
     """
     require_motion(recording.archive, source)
     require_torque(recording.archive, source)
-    recording = concluded(recording, source, robot_of, options, use)
-    _report(recording, source, reporter)
-    return replace(recording, files=LogFiles())
+    found = concluded(recording, source, robot_of, options, use)
+    _report(found.recording, source, reporter)
+    return found._replace(recording=replace(found.recording, files=LogFiles()))
 
 
 def require_torques(staging: Staging) -> None:

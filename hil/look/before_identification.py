@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Final, NamedTuple
@@ -24,29 +25,39 @@ from hil.look.look import SETTINGS, look_at_joints, mountings
 from hil.look.messages import choice_text, fit_alike, sentences, setting_text
 from hil.look.other_arm import Contradictions
 from hil.look.physics import Size
-from hil.look.readings import DoubtfulArm, ExplainedTorque, GravityOption, NoJointTorque
+from hil.look.readings import (
+    DoubtfulArm,
+    DoubtfulTime,
+    ExplainedTorque,
+    GravityOption,
+    NoJointTorque,
+)
 from hil.look.result import ChangedReading, Look, Row, TiedReading
 from hil.pipeline.sources import cell_of, source_of
 from identification.errors import IdentificationError
 from identification.estimators.torque_channel import possible_low_passes
-from identification.hypotheses.diagnosis import RigidTorque, torque_of
+from identification.hypotheses.diagnosis import (
+    UNEXPLAINED,
+    TorqueDiagnosis,
+    few_rows,
+    torque_of,
+    with_readings,
+)
 from identification.hypotheses.scores import Score, compare, score_of
-from identification.hypotheses.search import SURE, find_zeros_and_scales
+from identification.hypotheses.search import SURE
 from identification.signals.recording import STUCK_MOVEMENT
 from identification.signals.samples import Samples, prepare
 from identification.text import percentage
+from identification.validation.finding import Finding
 from identification.validation.finding_messages import Naming, worded
-from identification.validation.findings.diagnosis import without_bodies
+from identification.validation.findings.diagnosis import rate_of_torque, without_bodies
 
 _SUSPECT: Final = 0.15
 """Error of the torque, predicted from other parts, above which a log is looked at closely. Right
 logs of four real arms have 0.04 to 0.11, with URDFs of other arms 0.09 to 1.1."""
 _MUCH_BETTER: Final = 0.85  # error ratio of another mounting that chance alone does not make
-_OTHER_ARM: Final = 0.5
-"""The same, above which no masses of this arm explain the torque."""
 _EXPLAINS: Final = 0.5  # of the error, that a low-pass or heavy rotors leave where they are there
 _DRIVES: Final = -4.0  # standard errors of a friction that drives a joint
-_ROWS: Final = 700
 _UNSIGNED: Final = 2  # joints whose torque may be positive throughout, by the weight they hold
 _WARNED: Final = 2  # contradictions: a wrong limit of a right URDF explains one, more are refused
 _OF_AXES: Final = ("order", "signs", "zero", "coupling")
@@ -56,13 +67,20 @@ _REMEDY: Final = (
 )
 
 
+class Concluded(NamedTuple):
+    """A recording as it is to be read, and what it is then; None where that was not asked."""
+
+    recording: ImportedRecording
+    diagnosis: TorqueDiagnosis | None = None
+
+
 def concluded(
     imported: ImportedRecording,
     source: Path,
     robot_of: RobotOf,
     options: ImportOptions,
     use: Use,
-) -> ImportedRecording:
+) -> Concluded:
     """Return a log read again as its motion and torque say it is, if that is certain.
 
     A log that a map describes, or whose torque follows its arm, is returned as it is, and so is a
@@ -79,55 +97,69 @@ def concluded(
         SourceError: two readings fit alike, or the URDF is that of another arm.
     """
     if imported.is_stated or "torque" not in imported.archive.columns:
-        return imported
+        return Concluded(imported)
     may_be_load = (
         "commanded_position" in imported.archive.columns and "torque" not in options.chosen
     )
     if not may_be_load:
         _require_measured(imported.archive, source)
+    asked = _asked(imported.archive)
     if unsigned := _unsigned_torques(imported.archive):
         if may_be_load:
-            return _without_torque(imported, source, robot_of, use, NoJointTorque())
-        if unsigned > _UNSIGNED:
+            return Concluded(_without_torque(imported, source, robot_of, use, NoJointTorque()))
+        if unsigned > _UNSIGNED and (asked is None or asked.score.overall > _SUSPECT):
             raise _without_sign(source, unsigned)
-    few = _few_rows(imported.archive)
     if may_be_load and _is_named_load(imported):
-        size = None if few is None else Size.of(few[0], few[0].model, few[1])
+        size = None if asked is None else Size.of(asked.cell, asked.cell.model, asked.rows)
         ratio = size.factor if size is not None and size.by_masses else None
         reason = NoJointTorque(is_load=True, ratio=ratio)
-        return _without_torque(imported, source, robot_of, use, reason)
-    if few is None:
-        return imported
-    cell, samples, score = few
+        return Concluded(_without_torque(imported, source, robot_of, use, reason))
+    if asked is None:
+        return Concluded(imported)
+    found = asked.diagnosis()
+    _require_torque_of_arm(source, found)
+    if found.time is not None:
+        warned = (*imported.concluded, DoubtfulTime(found.time))
+        return Concluded(replace(imported, concluded=warned), found)
+    suspect = asked.is_suspect(found)
     is_bag = imported.map_text is None  # its joints have names: no other order is searched
-    suspect = _is_suspect(cell, samples, score, source)
-    if is_bag or not (suspect or _hangs_otherwise(cell, samples, score)):
-        contradictions = Contradictions.of(cell, cell.model, samples, score, score.overall)
-        return _of_this_arm(imported, source, contradictions)
-    if score.overall > _SUSPECT and (explained := _explained(imported.archive)):
+    if is_bag or not (suspect or _hangs_otherwise(asked.cell, asked.rows, asked.score)):
+        imported = _of_this_arm(imported, source, asked.contradictions())
+        return Concluded(imported, found if found.is_complete else None)
+    if asked.score.overall > _SUSPECT and (explained := _explained(imported.archive)):
         imported = replace(imported, concluded=(*imported.concluded, explained.how))
-        error = explained.score.overall
-        contradictions = Contradictions.of(cell, cell.model, samples, explained.score, error)
-        return _of_this_arm(imported, source, contradictions)
+        return Concluded(_of_this_arm(imported, source, asked.contradictions(explained.score)))
+    return Concluded(_as_a_look_says(imported, source, robot_of, use, asked, may_be_load))
+
+
+def _as_a_look_says(
+    imported: ImportedRecording,
+    source: Path,
+    robot_of: RobotOf,
+    use: Use,
+    asked: _Asked,
+    may_be_load: bool,
+) -> ImportedRecording:
+    """Return a log read again where a look is certain that it is other than recorded."""
     look = look_at_joints(source, imported)
-    error = score.overall if look.error is None else look.error
-    if error > _OTHER_ARM:
+    error = asked.score.overall if look.error is None else look.error
+    if error > UNEXPLAINED:
         if may_be_load:
-            return _without_torque(imported, source, robot_of, use, NoJointTorque(error))
+            reason = NoJointTorque(error)
+            return _without_torque(imported, source, robot_of, use, reason)
         raise _other_arm(source, error)
     changed = _changed(look)
     if look.questions or not changed:
-        contradictions = Contradictions.of(cell, cell.model, samples, score, error)
+        contradictions = asked.contradictions(error=error)
         if not changed:
             imported = _of_this_arm(imported, source, contradictions)
         if look.questions:
             raise undecided(source, look.questions[0], contradictions)
     if look.map_text != imported.map_text or look.gravity is not None:
         again = _again(imported, source, robot_of, look, use)
-        if (few := _few_rows(again.archive)) is not None:
-            cell, samples, score = few
+        if (read := _asked(again.archive)) is not None:
             axes = [row.aspect for row in changed if row.aspect in _OF_AXES]
-            contradictions = Contradictions.of(cell, cell.model, samples, score, error, axes)
+            contradictions = read.contradictions(error=error, changed=axes)
             return _of_this_arm(again, source, contradictions)
         return again
     return imported
@@ -156,7 +188,7 @@ class Asking:
         if self.use == "standstill":
             return imported
         try:
-            return concluded(imported, self.source, self.robot_of, self.options, self.use)
+            return concluded(imported, self.source, self.robot_of, self.options, self.use).recording
         except SourceError as error:
             self.refusal = error
             return imported
@@ -171,21 +203,56 @@ def _require_measured(archive: Archive, source: Path) -> None:
         raise SourceError(source, sentence(constant[0]), field="torque", remedy=remedy)
 
 
-def _is_suspect(cell: Cell, samples: Samples, score: Score, source: Path) -> bool:
-    """Return whether a torque does not follow its arm as it is read.
+@dataclass(frozen=True, eq=False)
+class _Asked:
+    """Rows of a recording of which something is asked.
 
-    Raises:
-        SourceError: there is nothing of bodies in it.
+    Attributes:
+        cell: of the arm.
+        samples: of the recording.
+        rows: some of them.
+        score: of these.
     """
-    found = torque_of(cell.model, samples, score)
+
+    cell: Cell
+    samples: Samples
+    rows: Samples
+    score: Score
+
+    def diagnosis(self) -> TorqueDiagnosis:
+        """Return what the torque is as a whole, and the joints where it follows the arm."""
+        model = self.cell.model
+        found = torque_of(model, [self.samples], self.rows, self.score)
+        if self._is_far:
+            return found
+        return with_readings(found, model, self.rows, self.score)
+
+    @property
+    def _is_far(self) -> bool:
+        return self.score.overall > _SUSPECT or bool(np.any(self.score.friction < _DRIVES))
+
+    def is_suspect(self, found: TorqueDiagnosis) -> bool:
+        """Return whether the torque does not follow the arm as it is read."""
+        return self._is_far or any(step.sure for step in found.zeros)
+
+    def contradictions(
+        self,
+        score: Score | None = None,
+        error: float | None = None,
+        changed: Sequence[str] = (),
+    ) -> Contradictions:
+        """Return what contradicts the arm, by default with the score as read and its error."""
+        score = self.score if score is None else score
+        error = score.overall if error is None else error
+        return Contradictions.of(self.cell, self.cell.model, self.rows, score, error, changed)
+
+
+def _require_torque_of_arm(source: Path, found: TorqueDiagnosis) -> None:
+    """Raise SourceError if there is nothing of bodies in a torque, or it is the rate of one."""
     if found.rigid.is_nothing:
-        raise _without_bodies(source, found.rigid)
-    if score.overall > _SUSPECT or np.any(score.friction < _DRIVES):
-        return True
-    return not found.is_weightless and any(
-        step.sure and step.change.meaning == "zero"
-        for step in find_zeros_and_scales(cell.model, samples).steps
-    )
+        raise _not_of_arm(source, without_bodies(found.rigid))
+    if found.is_rate:
+        raise _not_of_arm(source, rate_of_torque())
 
 
 def _unsigned_torques(archive: Archive) -> int:
@@ -231,16 +298,16 @@ def _without_torque(
     return replace(without, concluded=(*others, reason))
 
 
-def _few_rows(archive: Archive) -> tuple[Cell, Samples, Score] | None:
-    """Return the arm, some rows of an archive and their score; None if they cannot be used."""
+def _asked(archive: Archive) -> _Asked | None:
+    """Return the rows of an archive of which something is asked; None if they cannot be used."""
     cell = cell_of(archive)
     try:
         recording = source_of(archive, cell).recording
         samples = prepare(recording, cell.model, options=SETTINGS)
-        few = samples.thinned(max(1, len(samples.torque) // _ROWS))
-        if not few.usable.any():
+        rows = few_rows([samples])
+        if not rows.usable.any():
             return None  # nothing moves
-        return cell, few, score_of(cell.model, few)
+        return _Asked(cell, samples, rows, score_of(cell.model, rows))
     except (IdentificationError, ValueError):
         return None  # the identification says what is wrong
 
@@ -263,7 +330,7 @@ def _explained(archive: Archive) -> _Explained | None:
     try:
         recording = source_of(archive, cell).recording
         unfiltered = prepare(recording, model, options=SETTINGS)
-        least = min(_OTHER_ARM, _EXPLAINS * score_of(model, unfiltered).overall)
+        least = min(UNEXPLAINED, _EXPLAINS * score_of(model, unfiltered).overall)
         low_passes = possible_low_passes(recording, model, options=SETTINGS)
         for how in (*low_passes, SETTINGS):
             samples = unfiltered if how is SETTINGS else prepare(recording, model, options=how)
@@ -358,8 +425,8 @@ def undecided(
     return SourceError(source, problem, field=choices[0].aspect, remedy=remedy)
 
 
-def _without_bodies(source: Path, rigid: RigidTorque) -> SourceError:
-    finding = worded(without_bodies(rigid), Naming())
+def _not_of_arm(source: Path, found: Finding) -> SourceError:
+    finding = worded(found, Naming())
     remedy = (
         f"{finding.next_step}; to identify in spite of that, give the column map (`hil look LOG"
         " --urdf ARM.urdf -o map.toml`, --map map.toml)"
@@ -383,6 +450,6 @@ def _other_arm(source: Path, error: float) -> SourceError:
     problem = (
         "its torque does not follow the arm of the URDF: whatever the masses, "
         f"{percentage(error)} of it stays unexplained, and no other unit, sign or order of the "
-        "joints helps"
+        "joints helps: it is of another arm, or of another run than the positions"
     )
     return SourceError(source, problem, field="--urdf", remedy=_REMEDY)

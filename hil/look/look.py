@@ -37,10 +37,13 @@ from identification.errors import IdentificationError
 from identification.estimators.delay import DelayEstimate, estimate_delay
 from identification.estimators.torque_channel import possible_low_passes
 from identification.hypotheses.changes import Axes
+from identification.hypotheses.diagnosis import few_rows, torque_of
+from identification.hypotheses.inertia_scale import retimed
+from identification.hypotheses.scores import score_of
 from identification.hypotheses.search import EXPLAINED, Readings, find_readings
 from identification.model.robot import RobotModel
 from identification.signals.recording import Recording, RecordingError
-from identification.signals.samples import Preprocessing, prepare
+from identification.signals.samples import Preprocessing, Samples, prepare
 
 SETTINGS: Final = Preprocessing(14.0, exclude_rows="rests")
 """Preparation of a recording whose readings are compared."""
@@ -159,10 +162,15 @@ def look_at_joints(source: Path, imported: ImportedRecording) -> Look:
 def _finding(
     source: Path, imported: ImportedRecording, cell: Cell, recording: Recording
 ) -> physics.TorqueFindings:
-    readings = _readings(cell, recording, imported)
+    samples = prepare(recording, cell.model, options=SETTINGS)
+    rows = few_rows([samples])
+    torque = torque_of(cell.model, [samples], rows, score_of(cell.model, rows))
+    if torque.time is not None:
+        samples = retimed(cell.model, samples, torque.time)
+    readings = _readings(cell, samples, imported)
     axes = Axes.of((step.change for step in readings.steps), cell.model.n_joints)
     return physics.TorqueFindings(
-        cell, recording, readings, axes, imported.map_text, source, imported.files
+        cell, recording, torque, readings, axes, imported.map_text, source, imported.files
     )
 
 
@@ -183,8 +191,7 @@ def _look_of(
     )
 
 
-def _readings(cell: Cell, recording: Recording, imported: ImportedRecording) -> Readings:
-    samples = prepare(recording, cell.model, options=SETTINGS)
+def _readings(cell: Cell, samples: Samples, imported: ImportedRecording) -> Readings:
     stated = any(
         each.kind == "position" and each.unit_basis is not UnitBasis.NUMBERS
         for each in imported.concluded

@@ -38,6 +38,7 @@ from hil.look.readings import (
     DelayInterval,
     DelayProblem,
     DoubtfulArm,
+    DoubtfulTime,
     Either,
     ErrorAsRead,
     ErrorRatio,
@@ -61,6 +62,7 @@ from hil.look.readings import (
     NotSlopes,
     OtherAxes,
     OtherLengths,
+    OtherTimes,
     RigidShare,
     RowsReading,
     Setting,
@@ -123,6 +125,7 @@ _FACTS: Final[Mapping[Fact, str]] = {
     Fact.NO_DELAY_SEEN: "none seen",
     Fact.NO_LOW_PASS: "none in the torque",
     Fact.NO_BODIES: "next to nothing of bodies: a model was subtracted from the torque",
+    Fact.RATE_OF_TORQUE: "the rate of a torque (N·m/s)",
     Fact.NONE_FITS: "no tested explanation fits; the nearest are above",
     Fact.OTHER_ARM: "may not be the arm of the URDF",
 }
@@ -155,6 +158,9 @@ _BASES: Final[Mapping[Basis, str]] = {
     Basis.NO_FILTER_BETTER: "none predicts it better",
     Basis.FREE_PARAMETERS: "with free parameters, before a fit of the friction law",
     Basis.NO_BODIES: "friction torque does not show it",
+    Basis.RATE: "the rate of a torque does not show it",
+    Basis.INTEGRAL: "its integral follows the arm",
+    Basis.INERTIA: "the inertia in the torque is that of other times, the weight as the URDF's",
 }
 _STEPS: Final[Mapping[NextStep, str]] = {
     NextStep.STATE_UNIT_OR_GEARS: "state unit, sign or gears of both",
@@ -171,6 +177,7 @@ _STEPS: Final[Mapping[NextStep, str]] = {
     NextStep.MOVE_ALL_OR_LOCK: "record a motion of all joints, or fix these (--locked NAME)",
     NextStep.MOVE_EACH_JOINT: "move the joints one by one",
     NextStep.REVERSE_THE_ROWS: "reverse the order of the rows, but not the times",
+    NextStep.STATE_RATE: "state the rate of the controller (--sample-rate HZ)",
     NextStep.PUSH_A_JOINT: "push one joint by hand and see its torque",
     NextStep.COMPARE_A_POSTURE: "compare a posture with the URDF's (viewer)",
     NextStep.RECORD_ALL_TORQUE: "record the torque before a model is subtracted from it",
@@ -617,6 +624,11 @@ def _(lengths: OtherLengths) -> str:
 
 
 @_worded.register
+def _(times: OtherTimes) -> str:
+    return f"times that are {times.factor:.3g} times the true ones"
+
+
+@_worded.register
 def _(torque: UnexplainedTorque) -> str:
     return f"{percentage(torque.error)} of the torque stays unexplained, whatever the masses"
 
@@ -723,3 +735,11 @@ def _(arm: DoubtfulArm) -> str:
 def _(changed: ChangedReading) -> str:
     text = row_text(changed.row)
     return f"{changed.row.aspect}: {text.reading}, inferred; {text.reason}"
+
+
+@import_messages.worded.register
+def _(time: DoubtfulTime) -> str:
+    return (
+        f"warning: recorded times are {time.factor:.3g} times the true ones: "
+        f"{_BASES[Basis.INERTIA]}; {_STEPS[NextStep.STATE_RATE]}"
+    )

@@ -1,9 +1,4 @@
-"""What contradicts the arm of a URDF in a recording: range and speed, size, lengths, torque.
-
-Gravity acts on first moments, and the coupling of the joints is that of first moments and lengths.
-A torque whose masses are free says thereby how long the links are, if the motion is fast enough:
-lengths that are s times as long, with masses that fit, are gravity that is s times weaker.
-"""
+"""What contradicts the arm of a URDF in a recording: range and speed, size, lengths, torque."""
 
 from __future__ import annotations
 
@@ -32,8 +27,8 @@ from hil.look.readings import (
     UnexplainedTorque,
 )
 from hil.look.result import Row
-from identification.hypotheses.scores import Comparison, Score, compare, score_of
-from identification.hypotheses.search import EXPLAINED, SEPARATE, SURE
+from identification.hypotheses.inertia_scale import find_inertia_scale
+from identification.hypotheses.scores import Score
 from identification.model.robot import RobotModel
 from identification.signals.samples import Samples
 
@@ -43,10 +38,6 @@ _FAR: Final = np.pi / 4.0  # the same, of one finding that is enough
 _TURNS: Final = 3  # by which the count of an encoder may be off
 _OVER: Final = 3.0  # of a speed or torque; right logs of real arms reach 1.7 of a stated torque
 _UNEXPLAINED: Final = 0.15  # of the torque; right logs of short motions have up to 0.29 as well
-_LENGTHS: Final = (0.5, 0.63, 0.8, 1.25, 1.6, 2.0)  # times those of the URDF
-_NEARER: Final = 1.12  # further factors about the best of them
-# Delay, low-pass and noise take torque from inertia, as if the links were shorter.
-_SHORTER: Final = 0.5  # error ratio that such a channel does not have
 
 
 @dataclass(frozen=True)
@@ -112,8 +103,12 @@ class Contradictions:
             size = BeyondEffort(names[joint], float(effort[joint]))
         elif expected.is_off and factor > 1.0 and not expected.is_thousand:
             size = BeyondMasses(factor, expected.by_masses)
-        lengths = _other_lengths(model, samples, score, expected)
-        is_open = error > _UNEXPLAINED and lengths is None
+        by_masses = factor if expected.by_masses else np.nan
+        inertia = find_inertia_scale(model, samples, score, by_masses)
+        lengths = None
+        if inertia is not None and inertia.time is None:
+            lengths = OtherLengths(inertia.factor, inertia.error, inertia.stated)
+        is_open = error > _UNEXPLAINED and inertia is None
         torque = UnexplainedTorque(error) if is_open else None
         axes = OtherAxes(tuple(changed)) if len(changed) > 1 else None
         is_larger = isinstance(size, BeyondMasses) and size.by_masses
@@ -136,39 +131,6 @@ class Contradictions:
     def is_doubtful(self) -> bool:
         """Whether the arm may be another one, by a finding that is enough or by two."""
         return self.is_far or self.lengths is not None or len(self.found) > 1
-
-
-def _other_lengths(
-    model: RobotModel, samples: Samples, score: Score, size: Size
-) -> OtherLengths | None:
-    """Return the link lengths that fit the torque better than the URDF's.
-
-    Longer links have more weight: that a torque by masses is larger as well is evidence of them.
-    """
-    if not np.any(model.gravity):
-        return None
-    trials = {factor: _with_lengths(model, samples, score, factor) for factor in _LENGTHS}
-    best = min(trials, key=lambda factor: trials[factor][1].ratio)
-    for factor in (best / _NEARER, best * _NEARER):
-        trials[factor] = _with_lengths(model, samples, score, factor)
-    best = min(trials, key=lambda factor: trials[factor][1].ratio)
-    error, against = trials[best]
-    least = 1.0 if best > 1.0 else _SHORTER
-    agrees = size.by_masses and 1.0 < best < (size.factor or 0.0)
-    if error > EXPLAINED or against.sigmas > -(SEPARATE if agrees else SURE):
-        return None
-    if against.ratio > least:
-        return None
-    return OtherLengths(best, error, score.overall)
-
-
-def _with_lengths(
-    model: RobotModel, samples: Samples, score: Score, factor: float
-) -> tuple[float, Comparison]:
-    """Return the error of samples with other lengths of all links, and its comparison."""
-    longer = model.under_gravity((model.gravity / factor).tolist())
-    other = score_of(longer, samples)
-    return other.overall, compare(other, score, longer)
 
 
 def _largest(values: Array) -> Array:

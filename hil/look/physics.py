@@ -41,6 +41,7 @@ from hil.look.readings import (
     Mounting,
     NearestZero,
     NextBest,
+    OtherTimes,
     Reading,
     RigidShare,
     Setting,
@@ -60,7 +61,7 @@ from identification.estimators.delay import DelayEstimate
 from identification.estimators.prior import LEARNED, body_prior, fit_posterior
 from identification.factor.factor import Factor
 from identification.hypotheses.changes import COUPLED, IN_ORDER, Axes, Change, Meaning
-from identification.hypotheses.diagnosis import RigidTorque, rigid_torque
+from identification.hypotheses.diagnosis import RigidTorque, TorqueDiagnosis, rigid_torque
 from identification.hypotheses.scores import is_backwards
 from identification.hypotheses.search import EXPLAINED, SEPARATE, Readings, Step
 from identification.model.link_wrenches import LINK_SYMBOLS
@@ -196,12 +197,14 @@ class TorqueFindings:
     """What the torque says of a recording.
 
     Attributes:
+        torque: what it is as recorded, as a whole.
         map_text: the column map of the import; None for a bag.
         files: the recording, parsed.
     """
 
     cell: Cell
     recording: Recording
+    torque: TorqueDiagnosis
     readings: Readings
     axes: Axes
     map_text: str | None
@@ -242,9 +245,14 @@ class TorqueFindings:
             backwards = (Basis.DRIVING_FRICTION,)
             step = Decide.REVERSE_THE_ROWS
             rows.insert(0, Row("time", Fact.BACKWARDS, Certainty.LIKELY, backwards, step))
-        if self.rigid.is_nothing:
+        if self.torque.time is not None:
+            rows.insert(0, _other_times(self.torque.time))
+        if self.rigid.is_nothing or self.torque.is_rate:
             rest = [row for row in rows if row.aspect != "side"]
-            rows = [self._no_bodies(), *map(_says_nothing, rest)]
+            bodies, basis = _RATE, Basis.RATE
+            if self.rigid.is_nothing:
+                bodies, basis = self._no_bodies(), Basis.NO_BODIES
+            rows = [bodies, *(_says_nothing(row, basis) for row in rest)]
         error = self.readings.score.overall
         adequacy = self.readings.adequacy
         doubted = any(not step.sure for step in self.readings.steps)
@@ -447,7 +455,7 @@ class TorqueFindings:
             shown = first[:_MOST_CHOICES] if len(first) > 1 else pairs[:2]
             choices.append(tuple(self._choice(step, *pair) for pair in shown))
         size = self.size
-        if self.rigid.is_nothing:
+        if self.rigid.is_nothing or self.torque.is_rate:
             return tuple(choices)
         if size.may_be_geared and not size.is_thousand:
             choices.append(self._sides())
@@ -508,11 +516,25 @@ class TorqueFindings:
         return None
 
 
-def _says_nothing(row: Row) -> Row:
+_RATE: Final = Row(
+    "torque",
+    Fact.RATE_OF_TORQUE,
+    Certainty.CERTAIN,
+    (Basis.INTEGRAL,),
+    Decide.RECORD_TORQUE,
+)
+
+
+def _other_times(factor: float) -> Row:
+    """Return the row of recorded times that are not of the motion."""
+    return Row("time", OtherTimes(factor), Certainty.LIKELY, (Basis.INERTIA,), Decide.STATE_RATE)
+
+
+def _says_nothing(row: Row, basis: Basis) -> Row:
     """Return a row that rests on the torque of bodies, of a torque without."""
     if row.aspect == "payload":
         return row
-    return replace(row, certainty=Certainty.UNDETERMINED, evidence=(Basis.NO_BODIES,), decider=None)
+    return replace(row, certainty=Certainty.UNDETERMINED, evidence=(basis,), decider=None)
 
 
 def no_longer_certain(row: Row, error: float) -> Row:

@@ -65,7 +65,15 @@ class Fact(Enum):
     NO_LOW_PASS = auto()
     OTHER_ARM = auto()
     NO_BODIES = auto()
+    RATE_OF_TORQUE = auto()
     NONE_FITS = auto()  #: only the nearest of what was tested
+
+
+@dataclass(frozen=True)
+class OtherTimes:
+    """Recorded times over true ones."""
+
+    factor: float
 
 
 @dataclass(frozen=True)
@@ -231,6 +239,7 @@ Reading = (
     | ErrorAsRead
     | TorqueDelay
     | LowPassedTorque
+    | OtherTimes
 )
 """What a row concludes."""
 
@@ -266,6 +275,9 @@ class Basis(Enum):
     NO_FILTER_BETTER = auto()
     FREE_PARAMETERS = auto()
     NO_BODIES = auto()
+    RATE = auto()
+    INTEGRAL = auto()  #: of the torque follows the arm
+    INERTIA = auto()  #: is that for other times, with the weight of the URDF
 
 
 @dataclass(frozen=True)
@@ -514,6 +526,7 @@ class NextStep(Enum):
     MOVE_EACH_JOINT = auto()
     PUSH_A_JOINT = auto()
     REVERSE_THE_ROWS = auto()
+    STATE_RATE = auto()
     COMPARE_A_POSTURE = auto()
     WEIGH_A_LOAD = auto()
     RECORD_ALL_TORQUE = auto()
@@ -616,3 +629,10 @@ class DoubtfulArm(Conclusion):
     """What contradicts the arm of the URDF."""
 
     found: tuple[Contradiction, ...]
+
+
+@dataclass(frozen=True)
+class DoubtfulTime(Conclusion):
+    """Recorded times that are not of the motion, by this factor."""
+
+    factor: float

@@ -6,6 +6,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
+from types import MappingProxyType
 
 from hil.archive import Archive, place_of
 from hil.base.arrays import Array
@@ -15,6 +16,7 @@ from hil.cell import Cell
 from hil.results.results import Results
 from hil.results.series import ReportSeries
 from identification.estimators.least_squares import RepeatedEstimate
+from identification.hypotheses.diagnosis import TorqueDiagnosis
 from identification.selection.essential import Elimination
 from identification.validation.consistency import ConsistencyCheck
 from identification.validation.verdict import Verdict
@@ -97,6 +99,7 @@ def identify_archives(
     predict: Sequence[Path | Archive] = (),
     name: str = "",
     warnings: Sequence[str] = (),
+    diagnoses: Mapping[Path, TorqueDiagnosis] = MappingProxyType({}),
 ) -> Identification:
     """Identify from archives, files or in memory.
 
@@ -111,6 +114,7 @@ def identify_archives(
         predict: archives that are held out.
         name: of the results.
         warnings: that they begin with.
+        diagnoses: what the torques of archives are, by path, where that was asked.
 
     Raises:
         InputError: the archives cannot be used, not together, or not by the chosen estimator.
@@ -118,7 +122,7 @@ def identify_archives(
     sources = gather_sources(archives, options.split, predict, in_sample=options.in_sample)
     prepared = with_transmitted_load(prepare_sources(sources, options, reporter))
     estimation = estimate_with(prepared, options, reporter)
-    validation = validate(prepared, estimation, options, reporter)
+    validation = validate(prepared, estimation, options, reporter, diagnoses)
     warnings = (*warnings, *payload_warnings(prepared.sources.cell))
     prepared = prepared.warned(*warnings, *estimation.warnings, *validation.warnings)
     paths = tuple(map(place_of, (*archives, *predict)))

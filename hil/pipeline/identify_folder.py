@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
+from types import MappingProxyType
 
 from hil.archive import Archive
 from hil.archive.campaign_archives import RecordedCampaign
@@ -12,6 +13,7 @@ from hil.base.progress import Reporter
 from hil.base.threads import one_thread
 from hil.pipeline.identification import Identification, identify_archives
 from hil.pipeline.options import Options
+from identification.hypotheses.diagnosis import TorqueDiagnosis
 
 
 @one_thread()
@@ -21,6 +23,7 @@ def identify_paths(
     options: Options = Options(),
     *,
     predict: Sequence[Path | Archive] = (),
+    diagnoses: Mapping[Path, TorqueDiagnosis] = MappingProxyType({}),
 ) -> Identification:
     """Identify from a campaign folder, a folder of archives, or archives.
 
@@ -29,13 +32,14 @@ def identify_paths(
         reporter: of progress.
         options: of the identification.
         predict: archives that are held out.
+        diagnoses: what the torques of archives are, by path, where that was asked.
 
     Raises:
         InputError: the folder contains neither, or is not the only path.
     """
     folder = next((path for path in archives if isinstance(path, Path) and path.is_dir()), None)
     if folder is None:
-        return identify_archives(archives, reporter, options, predict=predict)
+        return identify_archives(archives, reporter, options, predict=predict, diagnoses=diagnoses)
     if len(archives) > 1:
         raise InputError(
             folder, "is a folder among files", remedy="give one campaign folder, or files only"

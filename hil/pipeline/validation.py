@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
+from pathlib import Path
 
 from hil.base.progress import Reporter
 from hil.cell.nominal import Nominal, nominal_of
 from identification import Estimate, Factor, IdentificationError
 from identification.hypotheses.column_scores import ScorePrior
+from identification.hypotheses.diagnosis import TorqueDiagnosis
 from identification.purposes.purposes import Application, purposes_of
 from identification.purposes.thresholds import ContactThreshold
 from identification.selection.essential import Elimination, choose_essential
@@ -23,6 +25,7 @@ from .cell_context import cell_context_of, joint_ranges
 from .estimating import Estimation
 from .options import Options
 from .prepared import Prepared
+from .sources import Sources
 
 
 @dataclass(frozen=True, eq=False)
@@ -45,7 +48,11 @@ class Validation:
 
 
 def validate(
-    prepared: Prepared, estimation: Estimation, options: Options, reporter: Reporter
+    prepared: Prepared,
+    estimation: Estimation,
+    options: Options,
+    reporter: Reporter,
+    diagnoses: Mapping[Path, TorqueDiagnosis],
 ) -> Validation:
     """Gather the evidence on an estimate, and judge it.
 
@@ -54,6 +61,7 @@ def validate(
         estimation: of the parameters.
         options: of the identification, with the purposes that decide.
         reporter: of progress.
+        diagnoses: what the torques of archives are, by path, where that was asked.
     """
     sources = prepared.sources
     result = estimation.result
@@ -77,6 +85,7 @@ def validate(
             in_sample=sources.in_sample,
             names=[source.name for source in sources.training],
             unseen=unseen,
+            known=_known(sources, diagnoses),
             prior=ScorePrior(posterior.prior.belief.gaussian, posterior.design_effect),
         )
         possible = None if isinstance(consistency, str) else consistency
@@ -95,6 +104,12 @@ def validate(
     return Validation(
         consistency, essential, calibration, nominal, evidence, verdict, application.thresholds()
     )
+
+
+def _known(sources: Sources, diagnoses: Mapping[Path, TorqueDiagnosis]) -> TorqueDiagnosis | None:
+    """Return what the fitted recording is; None of several, which say more together."""
+    (first, *more) = sources.training
+    return None if more else diagnoses.get(first.path)
 
 
 def _application(

@@ -220,7 +220,7 @@ def rough_size(
 
     None of others; :mod:`~identification.hypotheses.sizes` has the size to be stated.
     """
-    if change.meaning not in ("delay", "payload", "load friction"):
+    if change.meaning not in ("delay", "drift", "payload", "load friction"):
         return None, 0.0
     sizes = score.added[:, MASS if change.meaning == "payload" else 0]
     if change.meaning == "load friction":

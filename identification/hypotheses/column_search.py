@@ -1,10 +1,11 @@
 """Changes of recordings that are linear in columns of torque, and predict parts of them better.
 
-Delay, scale and friction of a joint, friction by the load, a load, and all of these in a part of
-the recordings only. The torque of every fifth block is predicted from the others, as it is and with
-one change after the other. The change that reduces the error most is named if the reduction is
-significant and explains the error of the fit: what is left is near the noise, near the error of the
-other joints, or near that of separate parameters for the part. The search is repeated with it.
+Delay, scale, friction and drift of a joint, friction by the load, a load, and some of these in a
+part of the recordings only. The torque of every fifth block is predicted from the others, as it is
+and with one change after the other. The change that reduces the error most is named if the
+reduction is significant and explains the error of the fit: what is left is near the noise, near the
+error of the other joints, or near that of separate parameters for the part. The search is repeated
+with it.
 """
 
 from __future__ import annotations
@@ -48,7 +49,8 @@ class Explanation(NamedTuple):
     Attributes:
         change: of the recordings, with its joints and part.
         ratio: error of predicted blocks with it over that without, geometric mean over the joints.
-        size: delay [s], factor less one, mass [kg] or share of the load; None without a size.
+        size: delay [s], drift [rad], factor less one, mass [kg] or share of the load; None without
+            a size.
         std: standard deviation of it over the blocks.
         interval_factor: standard deviations in half a 95 % interval.
     """
@@ -176,8 +178,8 @@ class _Search:
         found: list[Explanation] = []
         while len(found) < most and (trial := _best(self.trials())) is not None:
             found.append(self._resized(trial))
-            if trial.explanation.change.meaning == "arm":
-                break  # with separate parameters nothing is left to compare
+            if trial.explanation.change.meaning in ("arm", "drift"):
+                break  # separate parameters leave nothing to compare, a drift what is not linear
             self.known.append(trial.explanation.change)
         return tuple(found)
 
@@ -253,6 +255,8 @@ class _Search:
             yield from (Change("delay"), Change("load friction"))
             for joint in self.moved:
                 yield from (Change("delay", (joint,)), Change("scale", (joint,)))
+                if self.model.chain.revolute[joint]:
+                    yield Change("drift", (joint,))
         for part in self._later_parts():
             yield from (change._replace(part=part) for change in of_parts)
         if not self.seen and len(self.recordings) > 2:

@@ -22,6 +22,7 @@ _MOST_ROWS: Final = 3000  # of all recordings together
 BLOCKS: Final = 10  # of all recordings together
 FOLDS: Final = 5
 _LOAD: Final = len(LINK_SYMBOLS)
+_STEP: Final = 1e-4  # rad, of a derivative
 
 
 @dataclass(frozen=True, eq=False)
@@ -29,7 +30,7 @@ class ColumnSums:
     """Sums of products of columns over the rows of B blocks, joint by joint.
 
     Columns: parameters (p), payload (10), rate of the predicted torque, friction in proportion to
-    the load, torques of all joints (n).
+    the load, drift of each joint's zero by one radian (n), torques of all joints (n).
     """
 
     gram: Array  # (B, n, q, q)
@@ -131,14 +132,36 @@ def _tables(model: RobotModel, samples: Samples, values: Array, some: NDArray[np
         loads = tuple(samples.as_measured(j, block)[some] for j, block in enumerate(loads))
     else:
         blocks, columns = model.regressor(motion)
-    tables = np.zeros((n, len(some), p + _LOAD + 2 + n))
+    tables = np.zeros((n, len(some), p + _LOAD + 2 + 2 * n))
     for j in range(n):
         tables[j][:, columns[j]] = blocks[j]
         tables[j][:, p + payload.columns[j]] = loads[j]
     tables[:, :, p + _LOAD] = _rate(model, samples, values, some).T
     tables[:, :, p + _LOAD + 1] = _load_friction(model, samples, values, part, some).T
+    tables[:, :, p + _LOAD + 2 : -n] = _drift(model, samples, values, some)
     tables[:, :, -n:] = samples.torque[some]
     return tables
+
+
+def _drift(model: RobotModel, samples: Samples, values: Array, some: NDArray[np.intp]) -> Array:
+    """Return what zeros that drift by a radian add to each torque (n, k, n) in some rows.
+
+    From the first to the last row of the recording, in proportion to the time, of joints that turn.
+    """
+    motion = samples.motion.rows(some)
+    if motion.direction is None:
+        motion = replace(motion, direction=model.friction.direction(motion))
+    motion = replace(motion, load=None)
+    time = samples.motion.time
+    passed = (motion.time - time[0]) / max(float(time[-1] - time[0]), 1e-9)
+    usual = model.torque(values, motion)
+    drift = np.zeros((model.n_joints, len(some), model.n_joints))
+    for joint in np.flatnonzero(model.chain.revolute):
+        position = motion.position.copy()
+        position[:, joint] += _STEP
+        moved = model.torque(values, replace(motion, position=position))
+        drift[:, :, joint] = ((moved - usual) / _STEP * passed[:, None]).T
+    return drift
 
 
 def _rate(model: RobotModel, samples: Samples, values: Array, some: NDArray[np.intp]) -> Array:
@@ -201,6 +224,8 @@ def columns_of(tables: ColumnSums, model: RobotModel, values: Array, change: Cha
         columns[joints, p + _LOAD, 0] = -1.0
     elif change.meaning == "load friction":
         columns[joints, p + _LOAD + 1, joints] = 1.0
+    elif change.meaning == "drift":
+        columns[:, p + _LOAD + 2 + joints[0], 0] = 1.0
     elif change.meaning == "payload":
         columns[:, p : p + _LOAD] = np.eye(_LOAD)
     elif change.meaning == "arm":

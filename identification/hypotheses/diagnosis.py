@@ -1,8 +1,9 @@
 """What prepared recordings of one arm are other than stated: the one question of every command.
 
-In this order: whether there are bodies in the torque, and gravity; whether signs, orders, coupled
-angles, zeros and scales of joints are other than stated; then, with a fit whose errors are to be
-explained, delay, friction by the load, load, scale and friction of parts.
+In this order: whether there are bodies and gravity in the torque, and the times are those of the
+motion; whether signs, orders, coupled angles, zeros and scales of joints are other than stated;
+then, with a fit whose errors are to be explained, delay, friction by the load, drift of a joint,
+and load, scale and friction of parts.
 """
 
 from __future__ import annotations
@@ -23,6 +24,7 @@ from identification.hypotheses.column_search import (
     find_columns,
     find_columns_of_unseen,
 )
+from identification.hypotheses.inertia_scale import InertiaScale, find_inertia_scale
 from identification.hypotheses.scores import (
     ROWS_PER_FACT,
     Comparison,
@@ -39,12 +41,16 @@ from identification.hypotheses.search import (
     find_readings,
     find_zeros_and_scales,
 )
+from identification.hypotheses.torque_rate import is_rate
 from identification.model.motion import Motion
 from identification.model.nominal_masses import without_masses
 from identification.model.robot import RobotModel
 from identification.signals.samples import Samples
 
-_ROWS: Final = 700
+UNEXPLAINED: Final = 0.5
+"""Error of the torque, as a share of it, above which no masses of this arm explain it."""
+ROWS: Final = 700
+"""Rows of all recordings in which something other than stated is searched for."""
 _WEIGHTLESS: Final = 0.7  # error ratio of a torque without gravity that chance does not make
 _SURE: Final = 4.5  # standard errors of it
 _FEWEST_ROWS: Final = 100  # that say something of bodies
@@ -100,6 +106,12 @@ class TorqueDiagnosis:
             fits alike first; None where that was not asked.
         begun: changes that begin within unseen recordings.
         is_backwards: whether the rows run backwards in time.
+        inertia: by how much more inertia there is for the weight than described; None where it is
+            as described.
+        is_rate: whether it is the rate of a torque.
+        error: of the torque predicted from other parts, as a share of it, with all that was found.
+        unseen_error: the same of an unseen torque by itself, where a fit does not predict it; None
+            where it does.
     """
 
     weightless: Comparison | None
@@ -108,10 +120,41 @@ class TorqueDiagnosis:
     explanations: tuple[Explanation, ...] | None = None
     begun: tuple[Explanation, ...] = ()
     is_backwards: bool = False
+    inertia: InertiaScale | None = None
+    is_rate: bool = False
+    error: float = 0.0
+    unseen_error: float | None = None
+
+    @property
+    def time(self) -> float | None:
+        """Recorded times over true ones, where that explains the torque; else None."""
+        return None if self.inertia is None else self.inertia.time
+
+    @property
+    def is_otherwise(self) -> bool:
+        """Whether the torque, or its times, are other than stated as a whole."""
+        return self.rigid.is_nothing or self.is_weightless or self.is_rate or self.time is not None
+
+    @property
+    def is_complete(self) -> bool:
+        """Whether all that recordings are throughout was asked."""
+        return self.is_otherwise or self.readings is not None
+
+    @property
+    def is_unexplained(self) -> bool:
+        """Whether no masses, and nothing that was found, explain the torque."""
+        return not self.is_otherwise and self.error > UNEXPLAINED
+
+    @property
+    def is_unseen_unexplained(self) -> bool:
+        """Whether no masses explain an unseen torque, by itself."""
+        return self.unseen_error is not None and self.unseen_error > UNEXPLAINED
 
     @property
     def is_weightless(self) -> bool:
-        """Whether gravity was removed from the torque."""
+        """Whether gravity was removed from the torque; other times may make it as little."""
+        if self.time is not None:
+            return False
         found = self.weightless
         return found is not None and found.ratio < _WEIGHTLESS and found.sigmas < -_SURE
 
@@ -136,28 +179,26 @@ def diagnose(
     recordings: Sequence[Samples],
     fitted: ExplainedFit | None = None,
     unseen: Sequence[Samples] = (),
+    *,
+    known: TorqueDiagnosis | None = None,
 ) -> TorqueDiagnosis:
     """Ask what prepared recordings of one arm are, and what explains the errors of their fit.
-
-    Signs and orders are searched for in some hundred rows where the arm does not predict them, all
-    else in some thousand.
 
     Args:
         model: of the arm.
         recordings: prepared.
         fitted: a fit of them; None asks only for what they are throughout.
         unseen: recordings that it predicts worse, in which something may begin.
+        known: what they are throughout, where that was asked before.
     """
-    samples = _few_rows(recordings)
-    score = score_of(model, samples)
-    found = torque_of(model, samples, score)
-    if found.rigid.is_nothing or found.is_weightless:
-        return found
-    if _is_predicted(score, samples, None if fitted is None else fitted.noise):
-        found = replace(found, readings=find_zeros_and_scales(model, samples))
-    else:
-        found = replace(found, readings=find_readings(model, samples, unit_is_open=False))
-    if fitted is None:
+    found = known
+    if found is None:
+        rows = few_rows(recordings)
+        score = score_of(model, rows)
+        found = torque_of(model, recordings, rows, score)
+        noise = None if fitted is None else fitted.noise
+        found = with_readings(found, model, rows, score, noise)
+    if fitted is None or found.is_otherwise:
         return found
     found = replace(found, explanations=_explained(model, recordings, fitted, found))
     if unseen and not found.explanations:
@@ -166,17 +207,62 @@ def diagnose(
     return found
 
 
-def torque_of(model: RobotModel, samples: Samples, score: Score) -> TorqueDiagnosis:
-    """Return whether bodies and gravity are in the torque of rows with this score; their order."""
+def torque_of(
+    model: RobotModel, recordings: Sequence[Samples], rows: Samples, score: Score
+) -> TorqueDiagnosis:
+    """Return whether bodies and gravity are in a torque, and its times and rows in order.
+
+    Args:
+        model: of the arm.
+        recordings: prepared.
+        rows: some of them.
+        score: of these rows.
+    """
     read = model
     weightless = None
     if np.any(model.gravity):
         without = model.under_gravity((0.0, 0.0, 0.0))
-        weightless = compare(score_of(without, samples), score, model)
+        weightless = compare(score_of(without, rows), score, model)
         if weightless.ratio < 1.0:
             read = without
-    backwards = is_backwards(model, samples, score)
-    return TorqueDiagnosis(weightless, rigid_torque(read, samples), is_backwards=backwards)
+    backwards = is_backwards(model, rows, score)
+    rigid = rigid_torque(read, rows)
+    found = TorqueDiagnosis(weightless, rigid, is_backwards=backwards, error=score.overall)
+    if found.rigid.is_nothing:
+        return found
+    if is_rate(model, recordings[0], score, ROWS):
+        return replace(found, is_rate=True)
+    if score.overall > _SMALL_ERROR:
+        found = replace(found, inertia=find_inertia_scale(model, rows, score, rigid.scale))
+    return found
+
+
+def with_readings(
+    found: TorqueDiagnosis,
+    model: RobotModel,
+    rows: Samples,
+    score: Score,
+    noise: Array | None = None,
+) -> TorqueDiagnosis:
+    """Return what recordings are, with the joints that are other than stated.
+
+    Signs and orders are searched for where the arm does not predict the rows, zeros and scales in
+    any case.
+
+    Args:
+        found: that the torque is of the arm, as a whole.
+        model: of the arm.
+        rows: some of the recordings.
+        score: of these rows.
+        noise: standard deviation of each joint's torque noise (n,); None if unknown.
+    """
+    if found.is_otherwise:
+        return found
+    if _is_predicted(score, rows, noise):
+        readings = find_zeros_and_scales(model, rows)
+    else:
+        readings = find_readings(model, rows, unit_is_open=False)
+    return replace(found, readings=readings, error=readings.score.overall)
 
 
 def _is_predicted(score: Score, samples: Samples, noise: Array | None) -> bool:
@@ -227,10 +313,10 @@ def rigid_torque(model: RobotModel, samples: Samples) -> RigidTorque:
     return RigidTorque(*nominal_ratio(model, factor), over, error)
 
 
-def _few_rows(recordings: Sequence[Samples]) -> Samples:
+def few_rows(recordings: Sequence[Samples]) -> Samples:
     """Return some rows of all recordings, one after the other."""
     rows = sum(len(samples.torque) for samples in recordings)
-    some = [samples.thinned(max(1, rows // _ROWS)) for samples in recordings]
+    some = [samples.thinned(max(1, rows // ROWS)) for samples in recordings]
     if len(some) == 1:
         return some[0]
     return replace(

@@ -30,7 +30,7 @@ from identification.hypotheses.columns import ColumnSums, columns_of
 from identification.model.robot import RobotModel
 
 _SCALING: Final = ("scale", "friction")
-_SIZED: Final = (*_SCALING, "delay", "load friction", "payload")
+_SIZED: Final = (*_SCALING, "delay", "drift", "load friction", "payload")
 _ITERATIONS: Final = 30
 _CONVERGED: Final = 1e-3  # of an unknown and its deviation
 _LEAST_STEP: Final = 0.1  # factor of a factor, in one step
@@ -38,7 +38,7 @@ _LEAST_NOISE: Final = 1e-6  # of the torque
 
 
 class ChangeSize(NamedTuple):
-    """Size of a change: delay [s], factor less one, mass [kg] or share of the load."""
+    """Size of a change: delay [s], drift [rad], factor less one, mass [kg] or share of the load."""
 
     size: float
     std: float  # cluster-robust, with that of the prior
@@ -131,6 +131,7 @@ class _Problem:
         coefficients = {
             "payload": np.array([first + MASS]),
             "delay": np.array([first]),
+            "drift": np.array([first]),
             "load friction": first + np.arange(n),
         }
         return cls(

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Final, NamedTuple
 
 import numpy as np
@@ -19,8 +19,14 @@ from identification.factor.factor import Factor, total_factor
 from identification.hypotheses.carried_load import LOAD, CarriedLoad, find_load
 from identification.hypotheses.column_scores import ScorePrior
 from identification.hypotheses.column_search import ExplainedFit, Explanation
-from identification.hypotheses.diagnosis import TorqueDiagnosis, diagnose
+from identification.hypotheses.diagnosis import (
+    UNEXPLAINED,
+    TorqueDiagnosis,
+    diagnose,
+    few_rows,
+)
 from identification.hypotheses.gravity_direction import GravityDirection, find_gravity
+from identification.hypotheses.scores import score_of
 from identification.hypotheses.unseen_changes import UnseenChange, find_changes
 from identification.model.robot import RobotModel
 from identification.signals.samples import Samples
@@ -222,6 +228,7 @@ def gather(
     names: Sequence[str] = (),
     unseen: Factor | None = None,
     prior: ScorePrior | None = None,
+    known: TorqueDiagnosis | None = None,
 ) -> Evidence:
     """Collect the evidence for a verdict; every recording is read a few times.
 
@@ -237,6 +244,7 @@ def gather(
         names: of the training.
         unseen: sum of the factors of the held-out motions, if known.
         prior: of the arm.
+        known: what the training is throughout, where that was asked before.
     """
     pooled, values = result.pooled, result.pooled.values
     unseen = total_factor(model, held_out) if unseen is None else unseen
@@ -251,6 +259,7 @@ def gather(
     fit = ExplainedFit(values, floor, names, prior, context.scale_std)
     changes = find_changes(model, pooled, training, others, unseen, moved) if others else ()
     is_worse = error.overall > _WORSE * fitted.overall and load.explained < LOAD and not changes
+    diagnosis = diagnose(model, training, fit, others if is_worse else (), known=known)
     return Evidence(
         estimate=pooled,
         held_out=error,
@@ -263,7 +272,7 @@ def gather(
         disagreement=None if noise is None else _disagreement(result),
         changes=changes,
         one_way=_one_way(training),
-        diagnosis=diagnose(model, training, fit, others if is_worse else ()),
+        diagnosis=_with_unseen(diagnosis, model, others, error.overall),
         gravity=gravity,
         load=load,
         nominal=None if nominal is None else _error(model, nominal, held_out),
@@ -278,6 +287,15 @@ def gather(
         prismatic=tuple(np.flatnonzero(~model.chain.revolute).tolist()),
         moved=_total_time_moved(held_out),
     )
+
+
+def _with_unseen(
+    found: TorqueDiagnosis, model: RobotModel, unseen: Sequence[Samples], error: float
+) -> TorqueDiagnosis:
+    """Return a diagnosis with that of unseen recordings by themselves, if a fit is far off."""
+    if not unseen or error < UNEXPLAINED:
+        return found
+    return replace(found, unseen_error=score_of(model, few_rows(unseen)).overall)
 
 
 def _with_friction(

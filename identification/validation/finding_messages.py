@@ -37,6 +37,12 @@ IMPOSSIBLE: Final = "physical signs"
 """Name of the check whether bodies with these parameters can exist."""
 NO_BODIES: Final = "bodies in the torque"
 """Name of the check whether the torque belongs to an arm."""
+OTHER_TIMES: Final = "times"
+"""Name of the check whether inertia and weight have the ratio of the arm."""
+RATE_OF_TORQUE: Final = "rate of the torque"
+"""Name of the check whether it is a torque, and not its rate."""
+TORQUE_AND_MOTION: Final = "torque and motion"
+"""Name of the check whether any masses explain the torque."""
 ARM: Final = "arm of the URDF"
 """Name of the check whether the model describes the arm of the URDF."""
 FORM: Final = "form of friction"
@@ -376,6 +382,21 @@ SENTENCES: Final[Mapping[FindingKey, Sentence]] = {
         "gravity was removed from the torque: without it, the fitted motion is predicted with"
         " {ratio:.2f} times the error",
     ),
+    "rate of a torque": Sentence(
+        RATE_OF_TORQUE,
+        "the recorded torque is the rate of a torque (N·m/s): its integral over time follows the"
+        " arm, and the torque itself does not",
+    ),
+    "other times": Sentence(
+        OTHER_TIMES,
+        "the recorded times are {time:.3g} times the true ones: with these, inertia and weight of"
+        " the torque are of the arm of the URDF",
+    ),
+    "torque of another run": Sentence(
+        TORQUE_AND_MOTION,
+        "whatever the masses, {error:pc0} of the torque of {motion} stays unexplained: it is of"
+        " another run than the positions, of another arm, or its columns are not read as they are",
+    ),
     "rows backwards": Sentence(
         "time",
         "the rows run backwards in time: friction would drive every axis, while gravity and"
@@ -434,6 +455,10 @@ SENTENCES: Final[Mapping[FindingKey, Sentence]] = {
         "delay",
         "the torque of {axes} lags the position by {size:.3g} ± {half_interval:.2g} ms"
         " {difference:more} than assumed",
+    ),
+    "drift of a joint": _fault(
+        "zeros",
+        "the zero of {axes} drifts by about {size:.2g}° over the fitted motion",
     ),
     "torque constant": _fault("torque constant", _CONSTANT),
     "torque constant, as assumed": Sentence(
@@ -736,6 +761,9 @@ REMEDIES: Final[Mapping[RemedyKey, str]] = {
         " (`locked` under [robot] in the cell file, or `hil import log --held JOINT`)"
     ),
     "resolve the torque": "record the torque of {joints} with sufficient resolution",
+    "check the encoder of a joint": (
+        "check encoder, coupling and belt of {joints}, and record again from a calibrated posture"
+    ),
     "check the encoder": (
         "check encoder, coupling and cable of {jumping:6} and record again, or cut the recording"
         " before the jump"
@@ -774,6 +802,10 @@ REMEDIES: Final[Mapping[RemedyKey, str]] = {
     "state that gravity was removed": (
         "state it: `--gravity 0 0 0` where a log is read with its URDF, or gravity of [robot] in"
         " the cell file"
+    ),
+    "record the torque itself": "record the torque itself, or integrate it over time",
+    "record both in one run": (
+        "record torques and positions in one run, and compare the columns of both recordings"
     ),
     "reverse the rows": (
         "reverse the order of the rows but not the times, and check the program that wrote them"

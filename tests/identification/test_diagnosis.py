@@ -7,16 +7,21 @@ import pytest
 from numpy.typing import NDArray
 
 from identification import Recording
+from identification.estimators.prior import body_prior, posterior_values
+from identification.factor.factor import Factor
+from identification.hypotheses.changes import Change
+from identification.hypotheses.column_search import ExplainedFit, find_columns
 from identification.hypotheses.diagnosis import TorqueDiagnosis, diagnose
+from identification.hypotheses.scores import ROWS_PER_FACT
 from identification.hypotheses.search import Adequacy
 from identification.signals.samples import Preprocessing, prepare
-from tests.identification.test_readings import HIP, KNEE, NAMES, TIME, model, motion
+from tests.identification.three_axes import HIP, KNEE, NAMES, TIME, model, motion
 
 Floats = NDArray[np.float64]
 
 
-def diagnosed(position: Floats, torque: Floats) -> TorqueDiagnosis:
-    recording = Recording(TIME, position, NAMES, torque)
+def diagnosed(position: Floats, torque: Floats, time: Floats = TIME) -> TorqueDiagnosis:
+    recording = Recording(time, position, NAMES, torque)
     options = Preprocessing(14.0, exclude_rows="rests")
     return diagnose(model(), [prepare(recording, model(), options=options)])
 
@@ -103,3 +108,76 @@ def test_a_reading_is_judged_joint_by_joint() -> None:
     """A mean over the joints hides one that is ten times worse than a free fit has it."""
     assert Adequacy(1.1, 1.5, agrees=True).is_enough
     assert not Adequacy(1.1, 10.0, agrees=True).is_enough
+
+
+@pytest.mark.parametrize("factor", [0.4, 0.5, 1.6, 2.0])
+def test_times_that_are_too_long_or_short_are_named(factor: float) -> None:
+    """Inertia and weight do not fit together then, and the weight is as described."""
+    q, torque, _ = motion()
+    found = diagnosed(q, torque, factor * TIME)
+    assert found.time == pytest.approx(factor, rel=0.05)
+    assert found.readings is None
+
+
+@pytest.mark.parametrize("factors", [(1.8, 1.8, 1.8), (0.6, 0.6, 0.6), (1.0, 1.5, 2.0)])
+def test_other_masses_are_no_other_times(factors: tuple[float, ...]) -> None:
+    q, torque, _ = motion(factors)
+    assert diagnosed(q, torque).time is None
+
+
+def test_longer_links_are_no_other_times() -> None:
+    """They have more inertia for their weight as well, and more weight."""
+    q, torque, weight = motion()
+    factor = 2.5
+    heavier = factor**2 * (torque - weight) + factor * weight
+    found = diagnosed(q, heavier)
+    assert found.inertia is not None
+    assert found.inertia.factor == pytest.approx(factor, rel=0.2)
+    assert found.time is None
+
+
+def test_the_rate_of_a_torque_is_named() -> None:
+    q, torque, _ = motion()
+    found = diagnosed(q, np.gradient(torque, TIME, axis=0))
+    assert found.is_rate
+    assert not diagnosed(q, torque).is_rate
+
+
+def test_a_torque_of_another_run_is_explained_by_nothing() -> None:
+    q, torque, _ = motion()
+    assert diagnosed(q, np.roll(torque, len(TIME) // 2, axis=0)).is_unexplained
+    assert not diagnosed(q, torque).is_unexplained
+
+
+def test_what_is_known_is_not_searched_again() -> None:
+    q, torque, _ = motion()
+    known = diagnosed(q - 0.3 * HIP, torque)
+    options = Preprocessing(14.0, exclude_rows="rests")
+    samples = prepare(Recording(TIME, q, NAMES, torque), model(), options=options)
+    assert diagnose(model(), [samples], known=known) is known
+
+
+@pytest.mark.parametrize("size", [-0.05, 0.2])
+def test_a_zero_that_drifts_is_named(size: float) -> None:
+    """And no other change of a part, such as of a torque's scale or of the arm."""
+    q, torque, _ = motion()
+    passed = (TIME / TIME[-1])[:, None]
+    recording = Recording(TIME, q - size * passed * KNEE, NAMES, torque)
+    samples = prepare(recording, model(), options=Preprocessing(14.0, exclude_rows="rests"))
+    factor = Factor.of(model(), samples)
+    values, _ = posterior_values(factor, body_prior(model(), factor).gaussian, ROWS_PER_FACT)
+    (found,) = find_columns(model(), [samples], ExplainedFit(values))
+    assert found.change == Change("drift", (1,))
+    assert found.size == pytest.approx(size, rel=0.15)
+
+
+def test_a_log_without_drift_has_none() -> None:
+    q, torque, _ = motion()
+    samples = prepare(
+        Recording(TIME, q, NAMES, torque),
+        model(),
+        options=Preprocessing(14.0, exclude_rows="rests"),
+    )
+    factor = Factor.of(model(), samples)
+    values, _ = posterior_values(factor, body_prior(model(), factor).gaussian, ROWS_PER_FACT)
+    assert not find_columns(model(), [samples], ExplainedFit(values))

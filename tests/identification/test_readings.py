@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from functools import cache
 
 import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from identification import Recording, RobotModel
+from identification import Recording
 from identification.estimators.prior import TorqueSums, body_prior, body_priors
 from identification.factor.columns import every_torque_factor
 from identification.factor.factor import Factor
@@ -20,53 +19,11 @@ from identification.hypotheses.changes import (
     changed_samples,
 )
 from identification.hypotheses.search import Step, find_readings, of_torques
-from identification.model.motion import Motion
 from identification.signals.samples import Preprocessing, prepare
+from tests.identification.three_axes import HIP, KNEE, NAMES, TIME, model, motion
 from tests.tiers import quick_ones
 
 Floats = NDArray[np.float64]
-NAMES = ("hip", "knee", "ankle")
-TIME = np.arange(0.0, 6.0, 0.015)
-
-
-@cache
-def model(gravity: tuple[float, float, float] = (0.0, 0.0, -9.81)) -> RobotModel:
-    """Three parallel axes, whose masses the description has."""
-    bodies = "".join(
-        f"<link name='l{name}'><inertial><mass value='{mass}'/><origin xyz='0 0 0.2'/>"
-        "<inertia ixx='0.1' iyy='0.1' izz='0.1' ixy='0' ixz='0' iyz='0'/></inertial></link>"
-        f"<joint name='{name}' type='revolute'><parent link='{parent}'/><child link='l{name}'/>"
-        "<origin xyz='0 0 0.4'/><axis xyz='0 1 0'/>"
-        "<limit lower='-3' upper='3' effort='99' velocity='9'/></joint>"
-        for name, parent, mass in zip(NAMES, ("base", "lhip", "lknee"), (3, 2, 1), strict=True)
-    )
-    urdf = f"<robot name='three'><link name='base'/>{bodies}</robot>"
-    return RobotModel.from_urdf(urdf, gravity=gravity)
-
-
-@cache
-def motion(factors: tuple[float, ...] = (1.0, 1.0, 1.0)) -> tuple[Floats, Floats, Floats]:
-    """Positions, torque of bodies with friction and noise, and that of gravity.
-
-    The bodies are those of the description times a factor each.
-    """
-    robot = model()
-    rng = np.random.default_rng(0)
-    rate = rng.uniform(2.0, 8.0, (3, 3))
-    angle = rate * TIME[:, None, None] + rng.uniform(0.0, 6.0, rate.shape)
-    q = 0.3 * np.sin(angle).sum(axis=1)
-    v = 0.3 * (rate * np.cos(angle)).sum(axis=1)
-    a = -0.3 * (rate**2 * np.sin(angle)).sum(axis=1)
-    values = np.zeros(robot.n_parameters)
-    bodies = np.repeat(factors, robot.layout.width) * robot.nominal
-    values[: robot.base.rank] = robot.base.grouping @ bodies
-    torque = robot.torque(values, Motion.of_states(q, v, a)) + 0.4 * np.sign(v) + 0.2 * v
-    torque += rng.normal(0.0, 0.02, v.shape)
-    return q, torque, robot.torque(values, Motion.at_rest(q))
-
-
-HIP = np.array([1.0, 0.0, 0.0])
-KNEE = np.array([0.0, 1.0, 0.0])
 ROTATED = [1, 2, 0]
 ANGLE = 0.6  # rad
 OTHER_BODIES = (1.8, 1.8, 1.8)
@@ -138,6 +95,18 @@ def test_it_is_found_and_nothing_else(case: str) -> None:
     assert all(step.sure for step in readings.steps)
     # The hand of the last joint is free: its zero turns with its bodies, which nothing else shows.
     assert 2 in readings.unseen_zeros
+
+
+@pytest.mark.parametrize("joints", [(0, 1), (0, 2), (1, 2)])
+def test_two_torques_without_their_sign_are_found_at_once(joints: tuple[int, ...]) -> None:
+    q, torque, _ = motion()
+    sign = np.where(np.isin(range(3), joints), -1.0, 1.0)
+    recording = Recording(TIME, q, NAMES, torque * sign)
+    samples = prepare(recording, model(), options=Preprocessing(14.0, exclude_rows="rests"))
+    readings = find_readings(model(), samples)
+    axes = Axes.of((step.change for step in readings.steps), 3)
+    assert axes.torque_sign.tolist() == sign.tolist()
+    assert all(step.sure for step in readings.steps)
 
 
 def test_one_joint_whose_friction_alone_speaks_is_not_sure() -> None:

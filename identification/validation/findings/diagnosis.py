@@ -16,12 +16,12 @@ _OTHER_SCALE: Final = 3.0  # of the torque to that of the masses; descriptions i
 
 
 def is_other(evidence: Evidence) -> bool:
-    """Whether a torque is other than stated: without bodies or gravity, backwards, other zeros."""
+    """Whether a torque is other than stated: as a whole, backwards, of other zeros."""
     found = evidence.diagnosis
     if found is None:
         return False
     zeros = any(step.sure for step in found.zeros)
-    return found.rigid.is_nothing or found.is_weightless or found.is_backwards or zeros
+    return found.is_otherwise or found.is_backwards or zeros
 
 
 def other_meanings(evidence: Evidence, _: Thresholds) -> tuple[Finding, ...]:
@@ -30,12 +30,19 @@ def other_meanings(evidence: Evidence, _: Thresholds) -> tuple[Finding, ...]:
 
 
 def of_diagnosis(found: TorqueDiagnosis) -> tuple[Finding, ...]:
-    """Return what a torque is other than stated: of no bodies, backwards, of zeros, open signs."""
+    """Return what a torque is other than stated: as a whole, backwards, of zeros, open signs."""
     findings = [_zeros(found), *(_open(step) for step in found.discrete if not step.sure)]
     if found.rigid.is_nothing:
         findings.insert(0, without_bodies(found.rigid))
     elif found.is_weightless:
         findings.insert(0, _without_gravity(found))
+    elif found.is_rate:
+        findings.insert(0, rate_of_torque())
+    elif found.time is not None:
+        times = {"time": found.time}
+        findings.insert(
+            0, Finding("other times", "wrong", "state the sampling rate", "cause", times)
+        )
     if found.is_backwards:
         findings.insert(0, Finding("rows backwards", "wrong", "reverse the rows", "cause"))
     return tuple(finding for finding in findings if finding is not None)
@@ -45,6 +52,23 @@ def without_bodies(rigid: RigidTorque) -> Finding:
     """Return that there is next to nothing of bodies in a torque."""
     values = {"over_friction": float(rigid.over_friction.max()), "scale": rigid.scale}
     return Finding("no bodies", "wrong", "record all torque", "cause", values)
+
+
+def rate_of_torque() -> Finding:
+    """Return that a torque is the rate of one."""
+    return Finding("rate of a torque", "wrong", "record the torque itself", "cause")
+
+
+def another_run(evidence: Evidence, _: Thresholds) -> Finding | None:
+    """Return that no masses explain a torque."""
+    found = evidence.diagnosis
+    if found is None or not (found.is_unexplained or found.is_unseen_unexplained):
+        return None
+    error, motion = found.error, "the fitted motion"
+    if not found.is_unexplained and found.unseen_error is not None:
+        error, motion = found.unseen_error, "the unseen motion"
+    values: dict[str, Value] = {"error": error, "motion": motion}
+    return Finding("torque of another run", "wrong", "record both in one run", "cause", values)
 
 
 def _without_gravity(found: TorqueDiagnosis) -> Finding:

@@ -24,6 +24,7 @@ from identification.validation.physical_signs import SIGMAS
 
 _THROUGHOUT: Final[Mapping[Meaning, tuple[FindingKey, RemedyKey]]] = {
     "delay": ("delay of the torque", "use the delay found"),
+    "drift": ("drift of a joint", "check the encoder of a joint"),
     "scale": ("torque constant", "check the constant"),
     "load friction": ("load friction", "fit load friction"),
     "torque sign": ("torque sign", "check the sign in the map"),
@@ -190,13 +191,14 @@ def fault_keys(change: Change) -> tuple[FindingKey, RemedyKey]:
 
 
 def fault_values(each: Explanation) -> dict[str, Value]:
-    """Return the figures of a change: its size as it is stated, a delay in ms, a scale as factor.
+    """Return the figures of a change: its size as it is stated.
 
-    `difference` has the sign of the size, `whole` is what the ratio is of.
+    That is ms of a delay, degrees of a drift, the factor of a scale. `difference` has the sign of
+    the size, `whole` is what the ratio is of.
     """
     change_size = each.size or 0.0
     is_factor = each.change.meaning in ("scale", "friction")
-    unit = 1e3 if each.change.meaning == "delay" else 1.0
+    unit = {"delay": 1e3, "drift": np.degrees(1.0)}.get(each.change.meaning, 1.0)
     values: dict[str, Value] = {
         "size": abs(unit * change_size + (1.0 if is_factor else 0.0)),
         "half_interval": unit * each.half_interval,

@@ -6,7 +6,7 @@ from collections.abc import Callable
 from typing import Final
 
 from identification.validation.evidence import Evidence
-from identification.validation.finding import Finding, Thresholds
+from identification.validation.finding import Finding, FindingKey, Thresholds
 
 from . import (
     diagnosis,
@@ -21,6 +21,7 @@ from . import (
     scale,
 )
 
+_UNEXPLAINED: Final[FindingKey] = "torque of another run"
 Check = Callable[[Evidence, Thresholds], "Finding | tuple[Finding, ...] | None"]
 
 CHECKS: Final[tuple[Check, ...]] = (
@@ -46,6 +47,7 @@ CHECKS: Final[tuple[Check, ...]] = (
     sameness.changed_torque_of_large_errors,
     sameness.changed_torque_of_small_errors,
     sameness.friction,
+    diagnosis.another_run,
     scale.physical_signs,
     errors.overall_error,
     errors.axis_error,
@@ -85,7 +87,7 @@ CHECKS: Final[tuple[Check, ...]] = (
 def find(evidence: Evidence, limits: Thresholds) -> list[Finding]:
     """Return all findings, in the order of the verdict's reasons.
 
-    That nothing explains the error is none if a wrong cause does.
+    That nothing explains the error, or the torque, is none if a wrong cause does.
     """
     findings: list[Finding] = []
     for check in CHECKS:
@@ -94,5 +96,8 @@ def find(evidence: Evidence, limits: Thresholds) -> list[Finding]:
             findings.append(found)
         elif found is not None:
             findings += found
-    explained = any(each.role == "cause" and each.level == "wrong" for each in findings)
-    return [each for each in findings if not (explained and each.key == "unexplained error")]
+    causes = [each.key for each in findings if each.role == "cause" and each.level == "wrong"]
+    left_out: list[FindingKey] = ["unexplained error"] if causes else []
+    if causes[:1] != [_UNEXPLAINED]:
+        left_out.append(_UNEXPLAINED)
+    return [each for each in findings if each.key not in left_out]

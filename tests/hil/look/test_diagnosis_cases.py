@@ -19,7 +19,12 @@ from hil.look.readings import Changes, Fact
 from hil.look.result import Row
 from hil.payload.payload_run import find_payload
 from hil.pipeline.identification import identify_archives
-from identification.validation.finding_messages import NO_BODIES
+from identification.validation.finding_messages import (
+    NO_BODIES,
+    OTHER_TIMES,
+    RATE_OF_TORQUE,
+    TORQUE_AND_MOTION,
+)
 from tests.hil.diagnosis_cases import CASES, URDF, identified, needs_the_cases, rigid_error
 
 pytestmark = [pytest.mark.slow, needs_the_cases]
@@ -133,3 +138,60 @@ def test_a_torque_that_was_not_measured_is_refused(
     np.savetxt(damaged, table, delimiter=",", header=header, comments="", fmt="%.10g")
     with pytest.raises(SourceError, match=sentence):
         identified(damaged)
+
+
+PLAIN = CASES / "11-urdf-units" / "log.csv"
+
+
+def damaged_log(folder: Path, damage: Callable[[Any], Any]) -> Path:
+    """The log of an arm as described, with its table changed."""
+    path = folder / "damaged.csv"
+    header = PLAIN.read_text().split("\n", 1)[0]
+    table = damage(np.loadtxt(PLAIN, delimiter=",", skiprows=1))
+    np.savetxt(path, table, delimiter=",", header=header, comments="", fmt="%.10g")
+    return path
+
+
+def twice_as_long(table: Any) -> Any:
+    return np.column_stack([2.0 * table[:, :1], table[:, 1:]])
+
+
+def drifting(table: Any) -> Any:
+    drifts = table.copy()
+    drifts[:, 2] += np.linspace(0.0, 0.2, len(table))
+    return drifts
+
+
+def its_rate(table: Any) -> Any:
+    rate = np.gradient(table[:, 7:], table[:, 0], axis=0)
+    return np.column_stack([table[:, :7], rate])
+
+
+def of_another_run(table: Any) -> Any:
+    return np.column_stack([table[:, :7], np.roll(table[:, 7:], 400, axis=0)])
+
+
+@pytest.mark.parametrize(
+    ("damage", "check", "refusal"),
+    [
+        (twice_as_long, OTHER_TIMES, ""),
+        (drifting, "zeros", ""),
+        (its_rate, RATE_OF_TORQUE, "is the rate of a torque"),
+        (of_another_run, TORQUE_AND_MOTION, "of another run than the positions"),
+    ],
+    ids=["times", "drift", "rate", "another run"],
+)
+def test_a_log_and_its_archive_are_told_the_same(
+    damage: Callable[[Any], Any], check: str, refusal: str, tmp_path: Path
+) -> None:
+    """The verdict names it first, of a log and of an archive of it."""
+    log = damaged_log(tmp_path, damage)
+    verdicts = [identify_archives([archived(log, tmp_path)], Silent()).verdict]
+    if refusal:
+        with pytest.raises(SourceError, match=refusal):
+            identified(log)
+    else:
+        verdicts.append(identified(log).verdict)
+    for verdict in verdicts:
+        assert not verdict.good
+        assert next(each.check for each in verdict.findings if each.level == "wrong") == check

@@ -1,0 +1,156 @@
+r"""Whether inertia and weight in a torque have the ratio that the described arm has.
+
+Recorded times that are k times too long make accelerations and squared speeds :math:`k^2` times too
+small, and links that are s times as long have s times more inertia for their weight. Both are an
+arm under gravity that is weaker by one factor, :math:`s = k^2`:
+
+.. math:: \tau = s\,(M \ddot q + c(q, \dot q) + g(q) / s)
+
+Gravity acts on first moments, and the coupling of the joints is that of first moments and lengths,
+so that a torque whose masses are free says how long the links are, if the motion is fast enough.
+The weight itself tells them apart: other times leave it as described, longer links do not.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+from typing import Final, NamedTuple
+
+import numpy as np
+
+from identification.estimators.prior import nominal_ratio
+from identification.factor.factor import Factor
+from identification.hypotheses.scores import Comparison, Score, compare, score_of
+from identification.hypotheses.search import EXPLAINED, SEPARATE, SURE
+from identification.model.nominal_masses import without_masses
+from identification.model.robot import RobotModel
+from identification.signals.samples import Samples
+
+_TRIED: Final = (0.25, 0.5, 0.8, 1.25, 2.0, 4.0)
+_FURTHER: Final = 2.0  # factor to the next, where the last is the best
+_MOST: Final = 200.0  # times of a rate that is off by 14
+_NARROWER: Final = 5  # steps of the golden section about the best
+_GOLDEN: Final = 0.5 * (np.sqrt(5.0) - 1.0)
+# Delay, low-pass and noise take torque from inertia, as if it were less.
+_LESS: Final = 0.5  # error ratio that such a channel does not have
+_TIME: Final = 0.7  # error ratio of times, of which few are off
+_LEAST_TIME: Final = 1.2  # factor of times beyond what rotors and friction make of inertia
+
+
+class InertiaScale(NamedTuple):
+    """By how much more inertia there is for the weight than described.
+
+    Attributes:
+        factor: of inertia over weight.
+        error: of the torque with it, as a share.
+        stated: without it.
+        against: comparison of both.
+        weight: over that of the described masses; NaN where there are none.
+    """
+
+    factor: float
+    error: float
+    stated: float
+    against: Comparison
+    weight: float
+
+    @property
+    def time(self) -> float | None:
+        """Recorded times over true ones, where these explain it; None where other lengths do.
+
+        The weight is nearer to that described than to that of longer links of the same masses.
+        """
+        far = abs(np.log(self.factor))
+        if not far > 2.0 * np.log(_LEAST_TIME) or not abs(np.log(self.weight)) < 0.5 * far:
+            return None
+        is_certain = self.against.ratio < _TIME and self.against.sigmas < -SURE
+        return float(np.sqrt(self.factor)) if is_certain else None
+
+
+def find_inertia_scale(
+    model: RobotModel, samples: Samples, score: Score, torque_scale: float = np.nan
+) -> InertiaScale | None:
+    """Return the factor that explains a torque much better; None if the described one does.
+
+    Args:
+        model: of the arm.
+        samples: of a recording, as read.
+        score: of these.
+        torque_scale: of the torque to that of the described masses; NaN where it is not known.
+            Longer links have more weight: that the torque is larger as well is evidence of them.
+    """
+    if not np.any(model.gravity):
+        return None
+    errors: dict[float, tuple[float, Comparison]] = {
+        1.0: (score.overall, compare(score, score, model))
+    }
+
+    def ratio(factor: float) -> float:
+        if factor not in errors:
+            lighter = _lighter(model, factor)
+            other = score_of(lighter, samples)
+            errors[factor] = other.overall, compare(other, score, lighter)
+        return errors[factor][1].ratio
+
+    best = min(_TRIED, key=ratio)
+    if ratio(best) >= 1.0:
+        return None
+    best = _narrowed(ratio, best)
+    error, against = errors[best]
+    agrees = 1.0 < best < torque_scale
+    least = 1.0 if best > 1.0 else _LESS
+    if error > EXPLAINED or against.sigmas > -(SEPARATE if agrees else SURE):
+        return None
+    if against.ratio > least:
+        return None
+    return InertiaScale(best, error, score.overall, against, _weight(model, samples, best))
+
+
+def retimed(model: RobotModel, samples: Samples, factor: float) -> Samples:
+    """Return samples whose recorded times are so many times the true ones, with these."""
+    motion = samples.motion
+    start = motion.time[0]
+    motion = replace(
+        motion,
+        time=start + (motion.time - start) / factor,
+        velocity=motion.velocity * factor,
+        acceleration=motion.acceleration * factor**2,
+        direction=None,
+    )
+    return replace(samples, motion=motion).with_friction_direction(model)
+
+
+def _narrowed(ratio: Callable[[float], float], best: float) -> float:
+    """Return the factor of least error beyond or between those that were tried."""
+    step = _FURTHER if best > 1.0 else 1.0 / _FURTHER
+    while best in (_TRIED[0], _TRIED[-1]) or best not in _TRIED:
+        if not 1.0 / _MOST < best * step < _MOST or ratio(best * step) >= ratio(best):
+            break
+        best *= step
+    others = [1.0, *_TRIED, best / _FURTHER, best * _FURTHER]
+    low = float(np.log(max(other for other in others if other < best)))
+    high = float(np.log(min(other for other in others if other > best)))
+    reached = [best]
+    for _ in range(_NARROWER):
+        inner = [high - _GOLDEN * (high - low), low + _GOLDEN * (high - low)]
+        first, second = (float(np.exp(each)) for each in inner)
+        reached += [first, second]
+        if ratio(first) < ratio(second):
+            high = inner[1]
+        else:
+            low = inner[0]
+    return min(reached, key=ratio)
+
+
+def _lighter(model: RobotModel, factor: float) -> RobotModel:
+    return model.under_gravity((model.gravity / factor).tolist())
+
+
+def _weight(model: RobotModel, samples: Samples, factor: float) -> float:
+    """Return the weight in a torque over that of the described masses."""
+    if without_masses(model):
+        return float("nan")
+    lighter = _lighter(model, factor)
+    scale, _ = nominal_ratio(lighter, Factor.of(lighter, samples))
+    return scale / factor if scale > 0.0 else float("nan")
