@@ -103,9 +103,9 @@ def identified_servo(
     identification = identify_servos(
         staging.fitted, reporter, servo, predict=staging.predicted, name=recordings[0].stem
     )
-    fitted_names = identification.results.archives
+    predicted_names = {each.archive for each in identification.results.validation}
     held_out = [
-        staging.sources[place] for place in staging.recordings if place.name not in fitted_names
+        source for place, source in staging.sources.items() if place.name in predicted_names
     ]
     read = recording_results(staging, held_out)
     results = identification.results.model_copy(update={"recordings": read})

@@ -59,9 +59,10 @@ def servo_read_lines(servo: IdentifiedServo) -> list[tuple[str, str]]:
         for text in dict.fromkeys(chain(*unusual.values()))
         if len(unusual) > 1 and all(text in texts for texts in unusual.values())
     ]
+    held_out = {each.archive for each in servo.results.validation}
     lines = []
     for place, recording in staging.recordings.items():
-        use = "fitted" if place.name in servo.results.archives else "predicted"
+        use = "predicted" if place.name in held_out else "fitted"
         own = [text for text in unusual[place] if text not in common]
         lines.append((use, f"{staging.sources[place].name}: {'; '.join([size(recording), *own])}"))
     if (more := len(lines) - _MOST) > 0:

@@ -68,6 +68,7 @@ class ServoPrediction(Frozen):
     joint_errors_mrad: list[float]
     command_error_mrad: float  #: of the commanded position itself
     command_joint_errors_mrad: list[float]
+    motion_mrad: float | None = None  #: root mean square of the motion about its mean
     compared_error_mrad: Known = None  #: of the parameters of the file to compare with
     compared_joint_errors_mrad: list[float] | None = None
     pushed: tuple[ServoPush, ...] = ()  #: joints that something pushed

@@ -270,6 +270,9 @@ def _prediction(series: ServoSeries, engine: Engine | None = None) -> ServoPredi
         joint_errors_mrad=own,
         command_error_mrad=_overall(command, series),
         command_joint_errors_mrad=command,
+        motion_mrad=_overall(
+            [float(_MILLI * each) for each in series.measured.std(axis=0)], series
+        ),
         compared_error_mrad=None if compared is None else _overall(compared, series),
         compared_joint_errors_mrad=compared,
         contacts=series.contacts,

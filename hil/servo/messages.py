@@ -33,6 +33,8 @@ _SHOWN: Final = {
     "dead_band": "dead band",
 }
 """Parameters of the table of joints, as its heads call them; the last ones if there is room."""
+_MISSED: Final = 0.3
+"""Share of the motion, from which on a tenth of its square is missed."""
 _MOSTLY: Final = 0.5  # of a motion, from which on it is judged without what something held
 _MOST_ROWS: Final = 8  # of the table of joints
 _MOST: Final = 3  # recordings, warnings and next steps on a screen
@@ -55,7 +57,8 @@ def verdict_of(results: ServoResults) -> ServoVerdict:
         return ServoVerdict(good=False, line=line, warnings=warnings, next_steps=steps)
     worst = max(results.validation, key=_share)
     share = _share(worst)
-    good = share <= _GOOD
+    missed = [each.archive for each in results.validation if _is_missed(each)]
+    good = share <= _GOOD and not missed
     figures = ", ".join(_figure(each) for each in results.validation)
     line = (
         f"The servo model {'predicts' if good else 'does not predict'} {results.tested_on} from its"
@@ -84,6 +87,11 @@ def verdict_of(results: ServoResults) -> ServoVerdict:
             warnings.append(
                 f"in {each.archive}, {', '.join(poor)} predicted worse than by the command itself"
             )
+    if missed:
+        warnings.append(
+            f"of the motion of {', '.join(missed)} more than a tenth (of its square) is missed:"
+            " its commands may be late by more than 0.2 s, or of other joints"
+        )
     if not good:
         steps.append("look at the report: a joint that touched something cannot be predicted")
         steps.append("fit slow and fast motions over the range that is used")
@@ -109,6 +117,13 @@ def _judged(prediction: ServoPrediction) -> tuple[float, float]:
     if free is not None and free.share >= _MOSTLY:
         return free.position_error_mrad, free.command_error_mrad
     return prediction.position_error_mrad, prediction.command_error_mrad
+
+
+def _is_missed(prediction: ServoPrediction) -> bool:
+    """Return whether much of the motion itself is missed, not only of what friction changes."""
+    own, _ = _judged(prediction)
+    motion = prediction.motion_mrad
+    return motion is not None and own > _MISSED * motion and _share(prediction) > _MISSED**2
 
 
 def _share(prediction: ServoPrediction) -> float:

@@ -89,8 +89,13 @@ def test_an_identification_finds_the_servo(archive: Path, tmp_path: Path) -> Non
         assert gains[joint].lower < planted < gains[joint].upper
 
 
-def test_an_identification_of_a_log_asks_for_the_commands(log: Path) -> None:
-    refused = run("identify", log, "--urdf", log.with_name("robot.urdf"))
+def test_an_identification_of_a_log_asks_for_the_commands(log: Path, tmp_path: Path) -> None:
+    unnamed = tmp_path / "log.csv"
+    head, rows = log.read_text().split("\n", 1)
+    unnamed.write_text(
+        "\n".join([head.replace("command", "channel").replace("target", "channel"), rows])
+    )
+    refused = run("identify", unnamed, "--urdf", log.with_name("robot.urdf"))
     assert "commanded positions (--columns 'commanded_position=NAME{}')" in str(refused.exception)
 
 

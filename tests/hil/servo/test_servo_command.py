@@ -163,6 +163,20 @@ class TestCommand:
         mostly = held.model_copy(update={"free": free.model_copy(update={"share": 0.4})})
         assert not verdict_of(results.model_copy(update={"validation": [mostly]})).good
 
+    def test_a_model_that_misses_much_of_the_motion_is_not_good(
+        self, identified: tuple[Path, str, int]
+    ) -> None:
+        """However bad the commands: such as those of another joint, or late by a second."""
+        folder, _, _ = identified
+        results = ServoResults.load(folder / "results.json")
+        (unseen,) = results.validation
+        assert results.verdict.good
+        update = {"position_error_mrad": 200.0, "command_error_mrad": 560.0, "motion_mrad": 350.0}
+        missed = results.model_copy(update={"validation": [unseen.model_copy(update=update)]})
+        assert not verdict_of(missed).good
+        near = unseen.model_copy(update={**update, "position_error_mrad": 100.0})
+        assert verdict_of(results.model_copy(update={"validation": [near]})).good
+
     def test_a_fitted_motion_that_something_held_is_said(
         self, identified: tuple[Path, str, int]
     ) -> None:
