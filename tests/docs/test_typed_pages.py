@@ -196,11 +196,9 @@ def test_simulators_run_what_was_exported(workplace: Path) -> None:
     assert (names["model"].armature > 0.0).all()  # type: ignore[attr-defined]
 
 
-def masked(text: str) -> set[str]:
-    """Lines without their numbers, whose width and size are those of the day."""
-    return {
-        " ".join(re.sub(r"[\d.]+(e[-+]?\d+)?", "#", line).split()) for line in text.splitlines()
-    }
+def masked(text: str) -> str:
+    """A text in one line without its numbers, whose width and size vary from day to day."""
+    return " ".join(re.sub(r"[\d.]+(e[-+]?\d+)?", "#", text).split())
 
 
 @pytest.mark.slow
@@ -217,14 +215,11 @@ def test_simulators_print_what_the_page_shows(workplace: Path) -> None:
         )
         assert done.returncode == 0, (line, done.stdout, done.stderr)
         printed += done.stdout
-    shown = re.findall(
-        r"^```text\n((?:parameters: |written: 20|\d+ windows).*?)```", text, re.M | re.S
-    )
+    shown = re.findall(r"^((?:parameters: |written: 20|\d+ windows; ).*?)```", text, re.M | re.S)
     assert len(shown) == 3
-    leading = "The identified arm is better than the nominal one"
-    for line in masked("".join(shown)) - masked(printed):
-        assert line.startswith(leading), line  # which joint and effect lead is a matter of numbers
-    assert leading in printed
+    for block in shown:
+        assert masked(block) in masked(printed)
+    assert "The identified arm is better than the nominal one" in printed
 
 
 class TestFirstHour:
