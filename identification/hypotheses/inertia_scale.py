@@ -35,7 +35,9 @@ _GOLDEN: Final = 0.5 * (np.sqrt(5.0) - 1.0)
 # Delay, low-pass and noise take torque from inertia, as if it were less.
 _LESS: Final = 0.5  # error ratio that such a channel does not have
 _TIME: Final = 0.7  # error ratio of times, of which few are off
-_LEAST_TIME: Final = 1.2  # factor of times beyond what rotors and friction make of inertia
+# Factor of times below which links of 0.45 to 2.25 times the length explain it as well: another
+# length need not have another weight.
+_LEAST_TIME: Final = 1.5
 
 
 class InertiaScale(NamedTuple):
