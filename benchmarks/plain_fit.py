@@ -289,8 +289,13 @@ def filtered_motion(measured: Measured, cutoff: float) -> tuple[Array, Array, Ar
 
 
 def low_passed(time: Array, values: Array, cutoff: float) -> Array:
-    """Values (m, n) through a Butterworth filter of order 4, forth and back."""
+    """Values (m, n) through a Butterworth filter of order 4, forth and back.
+
+    Unchanged if the log is too slow to hold anything above the cut-off.
+    """
     rate = 1.0 / np.median(np.diff(time))
+    if cutoff >= 0.5 * rate:
+        return values
     sections = scipy.signal.butter(4, cutoff, fs=rate, output="sos")
     padding = min(len(time) - 1, round(rate / cutoff))
     return np.asarray(scipy.signal.sosfiltfilt(sections, values, axis=0, padlen=padding))
