@@ -72,6 +72,7 @@ NOT_TYPED = {
     "hil move copy.toml": "needs a controller; tests/hil/control/test_move.py types it",
     "hil record": "waits for a controller; tests/hil/control/test_record_command.py runs it",
     "hil new --controller ur": "needs an arm; tests/hil/new/test_ur_values.py asks a simulated one",
+    "hil run runs/weigh": "needs a payload; tests/hil/weighing/test_payload_campaign.py has one",
     "hil torque-constants archives": "needs recordings with a load",
     "hil run campaigns/october --live": "needs a campaign on a real link",
     "hil import rosbag2": "needs a recording; tests/hil/importers/test_rosbag2.py",
@@ -178,7 +179,7 @@ def type_page(page: Path) -> list[str]:
     for command in commands(page, text):
         if reason_not_to(command) is not None:
             continue
-        extra = SHORTER.get(command[1], ())
+        extra = () if "--quick" in command else SHORTER.get(command[1], ())
         result = CliRunner().invoke(app, [*command[1:], *extra], env={"COLUMNS": "120"})
         allowed = (0, 5) if command[1] in NOT_GOOD_EITHER else (0,)
         assert result.exit_code in allowed, (command, result.output, result.exception)
