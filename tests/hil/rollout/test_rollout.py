@@ -322,7 +322,7 @@ def test_annotated_copies_of_single_archives_lie_beside_them(folder: Path, tmp_p
 
 
 def test_a_model_that_must_not_be_relied_on_says_so(tmp_path: Path) -> None:
-    """Torques of the opposite sign: the rollout may be near, the model is not."""
+    """Torques whose map states the opposite sign: the rollout may be near, the model is not."""
     time = np.arange(0.0, 12.0, 0.004)
     motion = four_sines(time, 0.5)
     noise = np.random.default_rng(1).standard_normal((len(time), 4)) * [1e-5, 1e-5, 3.0, 0.2]
@@ -331,7 +331,11 @@ def test_a_model_that_must_not_be_relied_on_says_so(tmp_path: Path) -> None:
     log, urdf, archive = (tmp_path / name for name in ("log.csv", "robot.urdf", "log.mcap"))
     np.savetxt(log, columns, delimiter=",", header="t,q1,q2,tau1,tau2", comments="")
     urdf.write_text(URDF)
-    assert run("import", "log", log, "--urdf", urdf, "-o", archive).exit_code == 0
+    stated = tmp_path / "map.toml"
+    stated.write_text(
+        '[time]\ncolumn = "t"\n[position]\ncolumns = "q{}"\n[torque]\ncolumns = "tau{}"\n'
+    )
+    assert run("import", "log", log, "--urdf", urdf, "--map", stated, "-o", archive).exit_code == 0
     done = run("rollout", archive, "--samples", "3")
     assert done.exit_code == 5, done.exception
     assert messages.ALL_TORQUES_OPPOSITE in done.output
