@@ -14,7 +14,7 @@ from unittest.mock import patch
 import numpy as np
 
 from identification.selection import questions as names
-from identification.selection.averaging import LEAST_ODDS
+from identification.selection.averaging import MIN_ODDS
 from identification.selection.scores import SettingDecision, SettingsTrial
 from identification.selection.settings import Choice, Settings
 
@@ -99,7 +99,7 @@ def taken() -> Iterator[set[str]]:
     def hedged(odds: Callable[..., float]) -> Callable[..., float]:
         def measured(trial: SettingsTrial, *others: Any) -> float:
             weight = odds(trial, *others)
-            if weight > LEAST_ODDS:
+            if weight > MIN_ODDS:
                 found.add("averaging")
             return weight
 

@@ -24,10 +24,10 @@ import pinocchio as pin
 from numpy.typing import NDArray
 from scipy.signal import lfilter
 
-from hil.compare.comparison import LEAST, holm
+from hil.compare.comparison import MIN_RELATIVE_CHANGE, holm
 from hil.fleet.covariates import warmed
 from hil.fleet.series_changes import Course, Series, common_course, courses
-from hil.fleet.trend import FALSE_ALARMS
+from hil.fleet.trend import FALSE_ALARM_RATE
 
 Array = NDArray[np.float64]
 FaultKind = Literal["wear", "lubricant", "replacement", "tool"]
@@ -356,7 +356,7 @@ def watched(plan: FleetPlan, known: Known = "temperature") -> Outcome:
                 found[Place(EVERY, quantity, joint)] = common.course
         adjusted = holm(np.array([each.p_value for each in found.values()]))
         for (place, each), p_value in zip(found.items(), adjusted.tolist(), strict=True):
-            if p_value < FALSE_ALARMS and each.largest >= LEAST:
+            if p_value < FALSE_ALARM_RATE and each.largest >= MIN_RELATIVE_CHANGE:
                 first.setdefault(place, month - 1)
                 last[place] = each
     results = []

@@ -29,24 +29,24 @@ from identification.estimators import prior
 from identification.selection import folds, questions, scores
 
 ALTERNATIVES: Final[Mapping[str, tuple[Any, ...]]] = {
-    "WORTHWHILE": (0.0, 0.03),
-    "TERM_WORTHWHILE": (0.0, 0.05),
-    "REVERSAL_WORTHWHILE": (0.02, 0.10),
+    "MIN_IMPROVEMENT": (0.0, 0.03),
+    "MIN_TERM_IMPROVEMENT": (0.0, 0.05),
+    "MIN_REVERSAL_IMPROVEMENT": (0.02, 0.10),
     "EXCLUDED_ROWS": (("halts", "rests", "slow"),),
     "BANDWIDTHS": ((10.0, 14.0, 7.0, 20.0, 40.0), (20.0, 14.0, 40.0, 10.0, 7.0)),
     "VELOCITIES": (("position", "measured"),),
-    "PRESLIDING": (
+    "PRESLIDING_DISTANCES": (
         (1e-5, 3e-5, 1e-6, 1e-4, 3e-4, 1e-3),
         (1e-4, 3e-5, 3e-4, 1e-5, 1e-3, 1e-6),
         (3e-4, 1e-4, 1e-3, 3e-5, 1e-5, 1e-6),
     ),
-    "STRENGTHS": ((1.0,), (1.0, 4.0), (1.0, 4.0, 16.0), (4.0, 16.0, 64.0, 1e4)),
+    "PRIOR_WEIGHTS": ((1.0,), (1.0, 4.0), (1.0, 4.0, 16.0), (4.0, 16.0, 64.0, 1e4)),
     "FOLDS": (3, 8),
-    "CERTAIN": (1.0, 2.0),
-    "TRANSFER": (0.0, 0.02, 0.1),
-    "ROTORS_WORTHWHILE": (0.0, 0.1, 0.2),
-    "IMPOSSIBLE_WORTHWHILE": (0.02, 0.05, 0.1),
-    "OFFSET_SHARE": (0.2, 0.3, 0.5, 1.0),
+    "MIN_CERTAINTY": (1.0, 2.0),
+    "TRANSFER_STD": (0.0, 0.02, 0.1),
+    "MIN_ROTORS_IMPROVEMENT": (0.0, 0.1, 0.2),
+    "MIN_IMPOSSIBLE_IMPROVEMENT": (0.02, 0.05, 0.1),
+    "OFFSET_STD_SHARE": (0.2, 0.3, 0.5, 1.0),
 }
 """Other values of each default; of a sequence, the first is the one that others have to beat."""
 PRESENT: Final = "present values"

@@ -43,7 +43,7 @@ from hil.base.progress import Silent, Task
 from hil.campaign import Campaign, Stop
 from hil.campaign.errors import RepetitionsRejectedError
 from hil.campaign.plan import CampaignPlan, plan_around, validation_motions
-from hil.campaign.precision_record import IN_A_ROW
+from hil.campaign.precision_record import MIN_CONSECUTIVE_MET
 from hil.campaign.reached_precision import PrecisionMeter
 from hil.cell import Cell
 from hil.control.link import MotionLink
@@ -62,7 +62,7 @@ from hil.payload.payload_run import flange_of
 from hil.precision.forecast import PrecisionDesign, payload_search, short_search
 from hil.precision.requirements import Requirement, requirements_from
 from hil.weighing.payload_campaign import (
-    FEWEST,
+    MIN_PAIRS,
     PayloadCampaign,
     PayloadMounting,
     Weighed,
@@ -125,8 +125,8 @@ def campaigns_of(cell: Cell, required: str, seeds: range, *, effects: bool) -> F
     cell = cell.with_values({"campaign.approach_speed": 1.0, "simulation.friction_drift": drift})
     motions = [motion.trajectory for motion in _validation(cell)]
     promise = PrecisionDesign.of(cell, requirements, motions, (), effects=effects)
-    settings = promise.lengthened(short_search(), IN_A_ROW)
-    problem = problem_of(cell, settings, None, promise.precision(IN_A_ROW))
+    settings = promise.lengthened(short_search(), MIN_CONSECUTIVE_MET)
+    problem = problem_of(cell, settings, None, promise.precision(MIN_CONSECUTIVE_MET))
     excitation = run_search(cell, settings, Silent(), problem=problem).excitation
     plan = plan_around(cell, excitation)
     done = list[_Ended]()
@@ -301,7 +301,7 @@ def stops(count: int) -> dict[str, Any]:
         met = 0
         for repetition in range(1, _MOST + 1):
             met = met + 1 if np.all(_interval(model, factors[:repetition])[1] <= 1.1 * half) else 0
-            if met == IN_A_ROW:
+            if met == MIN_CONSECUTIVE_MET:
                 number = repetition
                 break
         numbers.append(number)
@@ -371,7 +371,7 @@ def weighings(count: int, required: str, most: int, first_seed: int) -> dict[str
         cell, requirements, [motion.trajectory for motion in _validation(cell)], (), assumed
     )
     problem = problem_of(
-        loaded_cell(cell, "load", assumed), settings, None, promise.precision(FEWEST)
+        loaded_cell(cell, "load", assumed), settings, None, promise.precision(MIN_PAIRS)
     )
     plan = plan_around(cell, run_search(cell, settings, Silent(), problem=problem).excitation)
     errors = []
@@ -475,8 +475,8 @@ def main() -> None:
     parser.add_argument("--pairs", type=int, default=_MOST, help="of motions at most to weigh")
     parser.add_argument("--payloads", type=int, default=0)
     options = parser.parse_args()
-    if options.pairs < FEWEST:
-        parser.error(f"--pairs {options.pairs}: at least {FEWEST} pairs weigh a load")
+    if options.pairs < MIN_PAIRS:
+        parser.error(f"--pairs {options.pairs}: at least {MIN_PAIRS} pairs weigh a load")
     figures: dict[str, Any] = {}
     if options.campaigns:
         figures["campaigns"] = campaigns(

@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 
 from benchmarks import parser_of, show, timed
 from identification import Factor, Motion, RobotModel
-from identification.model.kinematics import FROM_PINOCCHIO
+from identification.model.kinematics import PINOCCHIO_ORDER
 from identification.model.link_wrenches import LINK_SYMBOLS
 
 Array = NDArray[np.float64]
@@ -64,7 +64,7 @@ def common_columns(model: RobotModel) -> tuple[list[int], list[int]]:
         joint, symbol = divmod(int(standard), width)
         if symbol < len(LINK_SYMBOLS):
             columns.append(column)
-            foreign.append(10 * joint + FROM_PINOCCHIO[symbol])
+            foreign.append(10 * joint + PINOCCHIO_ORDER[symbol])
     return columns, foreign
 
 

@@ -40,7 +40,7 @@ from hil.base.progress import Silent
 from hil.cell import Cell
 from hil.pipeline.identified_model import IdentifiedModel, model_of
 from hil.pipeline.identify_folder import identify_paths
-from hil.results.rollout_result import JUDGED, RolloutResult
+from hil.results.rollout_result import JUDGED_HORIZON, RolloutResult
 from hil.rollout.torque_rollout import RolloutOptions, nominal_arm, roll_out
 from identification import Samples
 from identification.export.exported_arm import ExportedArm, Ranges
@@ -56,7 +56,7 @@ from identification.rollout.position_errors import (
     recorded_stretches,
     simulate,
 )
-from identification.rollout.windows import STEP, windows_of
+from identification.rollout.windows import STEP_SECONDS, windows_of
 from sim_fixtures.ns16 import CELL_PATH
 
 Array = NDArray[np.float64]
@@ -85,8 +85,10 @@ def recorded(arm: ExportedArm) -> RecordedMotion:
     everything = np.ones(torque.shape, dtype=np.bool_)
     bandwidth = np.full(model.n_joints, np.inf)
     samples = Samples(motion, torque, everything, (slice(0, len(grid)),), 0.0, bandwidth)
-    stretches, owners = recorded_stretches(model, [(samples, None)], STEP)
-    return RecordedMotion(windows_of(stretches, STEP, 1.0, stride).some(WINDOWS), tuple(owners))
+    stretches, owners = recorded_stretches(model, [(samples, None)], STEP_SECONDS)
+    return RecordedMotion(
+        windows_of(stretches, STEP_SECONDS, 1.0, stride).some(WINDOWS), tuple(owners)
+    )
 
 
 def time_of_windows() -> None:
@@ -99,7 +101,7 @@ def time_of_windows() -> None:
     ranges = Ranges(-infinite, infinite, infinite, infinite)
     arm = ExportedArm(cell.urdf, model, standard, cell.nominal_values(), ranges)
     motion = recorded(arm)
-    feedback = light_feedback(arm, STEP, 1.0)
+    feedback = light_feedback(arm, STEP_SECONDS, 1.0)
     begin = time.perf_counter()
     processor = time.process_time()
     for _ in range(ARMS):
@@ -140,7 +142,7 @@ def _print_comparison(name: str, archives: Sequence[Path], iterations: int) -> N
     nominal = nominal_arm(model.cell, arm)
     if nominal is None:
         raise SystemExit(f"{name}: the URDF has no masses to start from")
-    feedback = light_feedback(arm, STEP, 1.0)
+    feedback = light_feedback(arm, STEP_SECONDS, 1.0)
     fitted = _windows_of(model, model.prepared.fitted, HORIZONS[-1])
     held_out = _windows_of(model, model.prepared.held_out, 0.1)
     begin = time.process_time()
@@ -191,9 +193,9 @@ def _windows_of(
 ) -> RecordedMotion:
     """Return windows of one second of samples, which start every `stride` seconds."""
     stretches, owners = recorded_stretches(
-        model.arm.model, [(recording, None) for recording in samples], STEP
+        model.arm.model, [(recording, None) for recording in samples], STEP_SECONDS
     )
-    return RecordedMotion(windows_of(stretches, STEP, HORIZONS[-1], stride), tuple(owners))
+    return RecordedMotion(windows_of(stretches, STEP_SECONDS, HORIZONS[-1], stride), tuple(owners))
 
 
 def arms(names: Sequence[str], data: Path) -> None:
@@ -216,11 +218,11 @@ def arms(names: Sequence[str], data: Path) -> None:
 def _print_arm(name: str, result: RolloutResult) -> list[str]:
     """Print a row, and return the bounds that it misses."""
     missed = []
-    ratio = None if result.ratio is None else result.ratio[JUDGED]
-    at = result.horizons[JUDGED]
+    ratio = None if result.ratio is None else result.ratio[JUDGED_HORIZON]
+    at = result.horizons[JUDGED_HORIZON]
     print(
         f"{name:40} {result.windows:4} windows, {result.identified.unstable:3} unstable;"
-        f" error at {at:g} s {1e3 * result.identified.overall(JUDGED):.3g} mrad,"
+        f" error at {at:g} s {1e3 * result.identified.overall(JUDGED_HORIZON):.3g} mrad,"
         f" {'no nominal' if ratio is None else f'{ratio:.3f} of nominal'};"
         f" in the band {result.band:.1%}",
         flush=True,

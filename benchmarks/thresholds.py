@@ -22,8 +22,8 @@ from hil.pipeline.options import Options
 from identification.arrays import Array
 from identification.purposes.contact import residual_peaks
 from identification.purposes.quiet_torque import once_in, slow_residuals
-from identification.purposes.thresholds import SHOWN
-from identification.signals.block_mean import BLOCK
+from identification.purposes.thresholds import SHOWN_EXCEEDANCES
+from identification.signals.block_mean import BLOCK_SECONDS
 
 WITHIN: Final = 3.0
 """Factor within which the rate of false alarms is to be."""
@@ -68,16 +68,16 @@ def _counted(name: str, split: Split, fitted: Path, predicted: Sequence[Path]) -
     for setting, counted in ((peaks[:middle], peaks[middle:]), (peaks[middle:], peaks[:middle])):
         torque = _shown(setting)
         if torque is None:
-            yield Count(name, str(split), len(peaks) * BLOCK, peaks.shape[1], 0, 0.0)
+            yield Count(name, str(split), len(peaks) * BLOCK_SECONDS, peaks.shape[1], 0, 0.0)
             return
         exceeded += int(np.count_nonzero(counted > torque))
-        promised += SHOWN * len(counted) / len(setting) * peaks.shape[1]
-    seconds = len(peaks) * BLOCK
+        promised += SHOWN_EXCEEDANCES * len(counted) / len(setting) * peaks.shape[1]
+    seconds = len(peaks) * BLOCK_SECONDS
     yield Count(name, str(split), seconds, peaks.shape[1], exceeded, promised)
 
 
 def _shown(peaks: Array) -> Array | None:
-    return once_in(len(peaks) * BLOCK / SHOWN, peaks)
+    return once_in(len(peaks) * BLOCK_SECONDS / SHOWN_EXCEEDANCES, peaks)
 
 
 def main() -> None:

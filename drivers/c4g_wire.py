@@ -48,8 +48,8 @@ from drivers.packets import (
 )
 from drivers.states import (
     CLOSED_MODES,
-    HOLDABLE,
-    INCREMENTAL,
+    HOLDABLE_MODES,
+    INCREMENTAL_MODES,
     KNOWN_MODES,
     OPEN_MODES,
     AxesReport,
@@ -82,8 +82,8 @@ _RETURNED_WORDS: Final[dict[int, tuple[int, ...]]] = {
     Mode.CLOSED: (D1, D2),
     Mode.DRIVING_ON: (D1, D2),
     Mode.CLOSED_MIRRORED: (D1, D2, D3, D4, D5),
-    **dict.fromkeys(HOLDABLE, (D1,)),
-    **dict.fromkeys(INCREMENTAL, ()),
+    **dict.fromkeys(HOLDABLE_MODES, (D1,)),
+    **dict.fromkeys(INCREMENTAL_MODES, ()),
 }
 
 
@@ -119,13 +119,13 @@ def safe_reply(status: bytes, modes: Words, arms: Sequence[int] | None) -> SafeR
     held_slots = []
     for slot in range(n):
         mode = int(modes[slot])
-        if not on[arms[slot] - 1] and mode not in INCREMENTAL:
+        if not on[arms[slot] - 1] and mode not in INCREMENTAL_MODES:
             replied[slot] = mode
             mask[slot, D1:] = _ALL_BITS
         elif mode in _RETURNED_WORDS:
             replied[slot] = mode
             mask[slot, list(_RETURNED_WORDS[mode])] = _ALL_BITS
-            if mode in HOLDABLE:
+            if mode in HOLDABLE_MODES:
                 held_slots.append(slot)
     reply_status = bytes(
         status[arm - 1] if arm in arms and not on[arm - 1] else 0 for arm in range(1, N_ARMS + 1)
@@ -294,7 +294,7 @@ class PacketClassifier:
             status=status[self._arm - 1],
             modes=wanted,
             ready=ready,
-            held_joints=np.isin(wanted, list(HOLDABLE)),
+            held_joints=np.isin(wanted, list(HOLDABLE_MODES)),
             powered=drive_on and bool(is_open.any()),
             any_open=bool(is_open.any()),
             unwanted=int(unwanted[0]) if unwanted.size else None,

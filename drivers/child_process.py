@@ -13,7 +13,7 @@ from typing import Final
 
 from drivers.cycle_records import create_memory
 
-_LONGEST_TEXT: Final = 1 << 20  # bytes of output that are read
+_MAX_OUTPUT_BYTES: Final = 1 << 20  # bytes of output that are read
 
 
 class _Text:
@@ -27,7 +27,7 @@ class _Text:
         """Return it up to now; after `close`, up to then."""
         if self._final is not None:
             return self._final
-        size = min(os.fstat(self.descriptor).st_size, _LONGEST_TEXT)
+        size = min(os.fstat(self.descriptor).st_size, _MAX_OUTPUT_BYTES)
         return os.pread(self.descriptor, size, 0).decode(errors="replace")
 
     def close(self) -> None:

@@ -123,12 +123,12 @@ _HEADER_BYTES: Final = 4096
 _STATE_AT: Final = 256
 """Where in the header the layout of the arm's state is, as JSON; the words are before it."""
 # Indices of 8-byte words, those of different writers on different cache lines.
-_KIND = 0
-_JOINTS = 1
-_CAPACITY = 2
+_KIND_WORD = 0
+_JOINTS_WORD = 1
+_CAPACITY_WORD = 2
 _STATE_LENGTH = 3
-_WRITTEN = 8
-_READ = 16
+_WRITTEN_WORD = 8
+_READ_WORD = 16
 
 
 class RingReader:
@@ -156,30 +156,30 @@ class RingReader:
     def _map(self, memory: memoryview, n_joints: int) -> None:
         whole = memory.cast("B")
         self._words = words = whole[:_STATE_AT].cast("q")
-        if len(whole) < _HEADER_BYTES or words[_KIND] != _TAG:
+        if len(whole) < _HEADER_BYTES or words[_KIND_WORD] != _TAG:
             raise ValueError("this memory is not a ring of cycle records")
-        if words[_JOINTS] != n_joints:
-            raise ValueError(f"this ring is for {words[_JOINTS]} joints, not {n_joints}")
+        if words[_JOINTS_WORD] != n_joints:
+            raise ValueError(f"this ring is for {words[_JOINTS_WORD]} joints, not {n_joints}")
         self.n_joints = n_joints
-        self.capacity = int(words[_CAPACITY])
+        self.capacity = int(words[_CAPACITY_WORD])
         description = bytes(whole[_STATE_AT : _STATE_AT + words[_STATE_LENGTH]])
         dtype = cycle_dtype(n_joints, _layout_of(description))
         self.rows: NDArray[np.void] = np.frombuffer(whole[_HEADER_BYTES:], dtype, self.capacity)
         self.missed = 0
 
     def _oldest(self) -> int:
-        return max(0, self._words[_WRITTEN] - self._readable)
+        return max(0, self._words[_WRITTEN_WORD] - self._readable)
 
     def drain(self) -> NDArray[np.void]:
         """Return a copy of the rows not read yet, (k,), oldest first."""
-        end = self._words[_WRITTEN]
+        end = self._words[_WRITTEN_WORD]
         begin = max(self._read, self._oldest())
         rows = self.rows.take(np.arange(begin, end), mode="wrap")
         overwritten = min(max(0, self._oldest() - begin), len(rows))
         self.missed += begin - self._read + overwritten
         self._read = end
         if self._acknowledge:
-            self._words[_READ] = end
+            self._words[_READ_WORD] = end
         return rows[overwritten:]
 
 
@@ -214,7 +214,7 @@ class CycleRing(RingReader):
         else:
             super().__init__(fd, n_joints)
         self.fd = -1 if fd is None else fd
-        self.written = self._words[_WRITTEN]
+        self.written = self._words[_WRITTEN_WORD]
         self.overflow = 0
         # Column views: assigning through them costs a third of assigning to a record's field.
         self.cycle = self.rows["cycle"]
@@ -245,9 +245,9 @@ class CycleRing(RingReader):
         """Add the row filled last to the ring."""
         words = self._words
         written = self.written
-        if words[_READ] <= written - self.capacity:
+        if words[_READ_WORD] <= written - self.capacity:
             self.overflow += 1
-        self.written = words[_WRITTEN] = written + 1
+        self.written = words[_WRITTEN_WORD] = written + 1
 
     def _block(self, names: tuple[str, ...]) -> Array:
         """Return consecutive joint fields of all rows as one array (capacity, count, n)."""
@@ -286,7 +286,7 @@ def _describe(
     description = b"" if state is None else json.dumps(state.descr).encode()
     words[_STATE_LENGTH] = len(description)
     whole[_STATE_AT : _STATE_AT + len(description)] = description
-    words[_JOINTS], words[_CAPACITY], words[_KIND] = n_joints, capacity, _TAG
+    words[_JOINTS_WORD], words[_CAPACITY_WORD], words[_KIND_WORD] = n_joints, capacity, _TAG
 
 
 def _layout_of(description: bytes) -> np.dtype[np.void] | None:

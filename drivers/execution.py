@@ -21,7 +21,7 @@ from drivers.guard import RANK
 from drivers.motion_source import BoundsName, MotionSource, has_members
 from drivers.states import Outcome
 
-_AT_REST: Final = 1e-9
+_REST_TOLERANCE: Final = 1e-9
 """Rounding of standstill, rad per cycle and rad/s."""
 _MEMBERS: Final = ("begin", "advance", "finished", "stop", "bounds")
 _HOLD: Final = ("hold", "resume")
@@ -174,7 +174,7 @@ class Execution:
             raise _failed("failed", error, cycle) from error
         if self._rest_by is not None:
             moved = np.abs(first - self.position).max()
-            if max(moved, np.abs(second).max()) <= _AT_REST:
+            if max(moved, np.abs(second).max()) <= _REST_TOLERANCE:
                 self.mark_at_rest()
             self._require_rest(cycle)
         # The source may reuse its arrays.

@@ -96,10 +96,10 @@ at 2 ms this is some 0.5 % of a drive's full speed.
 """
 
 RANK: Final[Mapping[BoundsName, int]] = {"plan": 0, "override": 1, "stop": 2}
-EXTRAPOLATED: Final = 3
+EXTRAPOLATED_RANK: Final = 3
 """Rank of the bounds of a stop without one on jerk: the steps that a controller extrapolates have
 no acceleration, so that returning to the motion is a jump of acceleration."""
-MEMORY: Final = 2
+MEMORY_CYCLES: Final = 2
 """Cycles for which wider bounds stay active: a third difference spans three cycles."""
 
 
@@ -185,7 +185,7 @@ class ActiveBounds:
         self._age = 0
 
     def reset(self, rank: int = 0, cycles: int = 0) -> None:
-        """Activate a set for `cycles` more than `MEMORY`."""
+        """Activate a set for `cycles` more than `MEMORY_CYCLES`."""
         self.rank = rank
         self._age = -cycles
 
@@ -195,7 +195,7 @@ class ActiveBounds:
         if rank >= self.rank:
             self.rank = rank
             self._age = 0
-        elif self._age < MEMORY:
+        elif self._age < MEMORY_CYCLES:
             self._age += 1
         else:
             self.rank = rank
@@ -203,10 +203,10 @@ class ActiveBounds:
 
 
 RELATIVE_TOLERANCE: Final = 1e-6
-FIRST_FRACTION: Final = 0.1
+FIRST_SET_POINT_FRACTION: Final = 0.1
 """Share of the following-error threshold allowed between target and arm at the first set-point,
 and later between the target and the set-points sent last."""
-LAG: Final = 0.05
+SERVO_LAG_SECONDS: Final = 0.05
 """Lag of the arm's velocity behind that of its set-points, s: position loops of robots have a gain
 of 20 to 50 /s."""
 
@@ -245,7 +245,7 @@ class Guard:
         n = limits.n_joints
         self._middle = 0.5 * (limits.lower + limits.upper)
         self._every = np.ones(n, dtype=np.bool_)
-        self._sets = {rank: self._bounds(rank) for rank in range(EXTRAPOLATED + 1)}
+        self._sets = {rank: self._bounds(rank) for rank in range(EXTRAPOLATED_RANK + 1)}
         self._active = ActiveBounds()
         # Three sent set-points (oldest first), the next one, and its stated velocity.
         self._history = np.zeros((5, n))
@@ -321,7 +321,7 @@ class Guard:
 
         Jerk is unbounded for this number of cycles.
         """
-        self._active.reset(EXTRAPOLATED, cycles)
+        self._active.reset(EXTRAPOLATED_RANK, cycles)
         self._history[:4] = q - np.arange(3.0, -1.0, -1.0)[:, None] * (self.period * qd)
 
     def check_start(self, target: Array, actual: Array, step: Array, cycle: int) -> None:
@@ -338,7 +338,7 @@ class Guard:
         """
         every = self._every
         require_finite(target, every, cycle)
-        bound = FIRST_FRACTION * self.following_error
+        bound = FIRST_SET_POINT_FRACTION * self.following_error
         require(every, np.abs(target - actual), bound, Check.FIRST_SET_POINT, cycle)
         standstill = np.full(len(target), self.limits.standstill)
         for velocity in step:
@@ -398,7 +398,7 @@ class Guard:
             cycle: for the error.
             where: which joints.
         """
-        bound = FIRST_FRACTION * self.following_error
+        bound = FIRST_SET_POINT_FRACTION * self.following_error
         require(where, np.abs(target - commanded), bound, Check.ACCEPTED, cycle)
         standstill = self.limits.standstill
         bound = np.maximum(0.5 * np.abs(step), standstill)
@@ -409,11 +409,12 @@ class Guard:
     def check_after_pause(self, velocity: Array, cycle: int, where: Joints) -> None:
         """Check after a late packet that the velocity (n,) rad/s agrees with the sent set-points.
 
-        The servo may lag behind by what it gains in `LAG` at the allowed acceleration.
+        The servo may lag behind by what it gains in `SERVO_LAG_SECONDS` at the allowed
+        acceleration.
         """
         sent = (self._history[3] - self._history[2]) / self.period
         factor, _ = self.limits.factors(self._active.rank)
-        bound = LAG * factor * self.limits.acceleration
+        bound = SERVO_LAG_SECONDS * factor * self.limits.acceleration
         require(where, np.abs(velocity - sent), bound, Check.PAUSE_VELOCITY, cycle)
 
     def check_set_point(self, q: Array, qd: Array, bounds: BoundsName, cycle: int) -> None:

@@ -14,17 +14,17 @@ from drivers.errors import PacketError
 from drivers.events import InitReceived
 from drivers.packets import InitPacket
 
-_RELATIVE: Final = 1e-6
+_RELATIVE_TOLERANCE: Final = 1e-6
 """Relative tolerance: float32 rounds by 6e-8 at most; a cell file has six digits or more."""
-_WRITTEN: Final = 1e-5
+_LIMIT_TOLERANCE: Final = 1e-5
 """Relative tolerance of a limit: twice the rounding of six digits."""
-_FLOOR: Final = float(np.spacing(np.float32(1.0)))
+_ABSOLUTE_TOLERANCE: Final = float(np.spacing(np.float32(1.0)))
 """Resolution of float32 within one motor revolution, far below an encoder's increment."""
 
 
 def is_narrower(theirs: Array, ours: Array) -> NDArray[np.bool_]:
     """Return where a limit (n,) of the controller is below the cell's by more than rounding."""
-    return np.asarray(theirs < ours * (1.0 - _WRITTEN))
+    return np.asarray(theirs < ours * (1.0 - _LIMIT_TOLERANCE))
 
 
 def float32_text(value: float) -> str:
@@ -89,7 +89,12 @@ def _values(drive_train: DriveTrain, init: InitPacket, arm: int) -> tuple[str, .
         for axis, ratio in enumerate(drive_train.gear_ratio)
     ]
     pairs += [
-        (f"calibration of axis {axis + 1}", init.calibration[row, axis], calibration, _FLOOR)
+        (
+            f"calibration of axis {axis + 1}",
+            init.calibration[row, axis],
+            calibration,
+            _ABSOLUTE_TOLERANCE,
+        )
         for axis, calibration in enumerate(drive_train.calibration)
     ]
     ours = (drive_train.k54, drive_train.k64, drive_train.k65)
@@ -101,5 +106,5 @@ def _values(drive_train: DriveTrain, init: InitPacket, arm: int) -> tuple[str, .
         f"{name} is {float(theirs):.9g} in the controller, {float(our):.9g} in the cell"
         for name, theirs, our, floor in pairs
         # Written so that NaN differs.
-        if not abs(float(theirs) - float(our)) <= _RELATIVE * abs(float(our)) + floor
+        if not abs(float(theirs) - float(our)) <= _RELATIVE_TOLERANCE * abs(float(our)) + floor
     )

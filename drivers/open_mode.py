@@ -48,17 +48,17 @@ from drivers.errors import (
     as_refusal,
 )
 from drivers.execution import Execution
-from drivers.guard import FIRST_FRACTION, Guard, Joints, all_true, require
+from drivers.guard import FIRST_SET_POINT_FRACTION, Guard, Joints, all_true, require
 from drivers.packet_losses import LossTracker
 from drivers.states import AxesReport, State
 from drivers.wire import Wire
 
 MAX_TARGET_JUMP: Final = 0.25
 """Share of the following-error threshold allowed between target and set-point sent last."""
-SLOW: Final = 4.0
+SLOW_STEP_FACTOR: Final = 4.0
 """Multiple of the standstill threshold, some 2 % of full speed. Several such steps in one cycle are
 permissible."""
-REPETITIONS: Final = 100
+MAX_RESENDS: Final = 100
 """Times that a set-point is sent again, at most, to a controller that does not accept it."""
 EXIT_RETRY_CYCLES: Final = 100
 """Cycles after which the end of open mode is requested again."""
@@ -148,10 +148,10 @@ class SentSetPoints:
     missed packets a controller that extrapolates reports a target ahead of those sent.
 
     A controller that reports its target a cycle late cannot be distinguished from a lost reply in
-    its first cycle. It is recognised in the first steps of a motion, which are small (`SLOW`):
-    there nothing is sent again, and the lag of the target is not a loss from then on. A link that
-    becomes late at speed is a loss in every second cycle, which soon stops the motion; while
-    stopping it counts as late.
+    its first cycle. It is recognised in the first steps of a motion, which are small
+    (`SLOW_STEP_FACTOR`): there nothing is sent again, and the lag of the target is not a loss from
+    then on. A link that becomes late at speed is a loss in every second cycle, which soon stops the
+    motion; while stopping it counts as late.
 
     To a controller that continues by itself and uses the newest set-point, without `resends`,
     nothing is sent again; it states itself what it did not use.
@@ -231,9 +231,9 @@ class SentSetPoints:
             than standstill do not show.
 
         Raises:
-            GuardError: a target further than `FIRST_FRACTION` of the following-error threshold
-                from all of them, or than `MAX_TARGET_JUMP` from the last, or not the last one after
-                `REPETITIONS` of it.
+            GuardError: a target further than `FIRST_SET_POINT_FRACTION` of the following-error
+                threshold from all of them, or than `MAX_TARGET_JUMP` from the last, or not the last
+                one after `MAX_RESENDS` of it.
         """
         sent = self._sent
         standstill = self._guard.limits.standstill
@@ -253,30 +253,30 @@ class SentSetPoints:
         where = self._every if where is None else where
         nearest = np.minimum(late[: self._depth].min(axis=0), ahead.min(axis=0, initial=np.inf))
         threshold = self._guard.following_error
-        require(where, nearest, FIRST_FRACTION * threshold, Check.ACCEPTED, cycle)
+        require(where, nearest, FIRST_SET_POINT_FRACTION * threshold, Check.ACCEPTED, cycle)
         require(where, late[0], MAX_TARGET_JUMP * threshold, Check.ACCEPTED, cycle)
         behind = where & (late[0] > standstill)
         behind &= late.min(axis=0) <= ahead.min(axis=0, initial=np.inf)
         lag = int(late.argmin(axis=0)[behind].max(initial=0))
         more = max(0, lag - self.target_latency)
         known_late = stopping and self._resent_before
-        slow = np.abs(newest - rows[1]).max() <= SLOW * standstill
+        slow = np.abs(newest - rows[1]).max() <= SLOW_STEP_FACTOR * standstill
         if not more or known_late or slow or not self._resends:
             self.target_latency = lag
             return 0 if known_late else more
         self.resend_needed = True
-        if self._resent >= REPETITIONS:
+        if self._resent >= MAX_RESENDS:
             require(where, late[0], np.full_like(newest, standstill), Check.ACCEPTED, cycle)
         return 1 if self._resent else more
 
 
 # Rows of `MotorSide.raw`.
 TARGET, TARGET_VELOCITY, ACTUAL, ACTUAL_VELOCITY, CURRENT = range(5)
-SPREAD: Final = 2
+RETURN_CYCLES_PER_STEP: Final = 2
 """Cycles, per step that a controller extrapolated, in which the motion returns to its path.
 Where the motion accelerates, each step leaves the velocity of one cycle of that acceleration across
 the path; spread over two cycles this is half of that acceleration, within the bounds of a stop."""
-RETURN: Final = 0.03
+MAX_RETURN_SECONDS: Final = 0.03
 """Longest duration of that return, during which jerk has no bound, s. A path that was left for more
 than half of it has so little curvature, less than 10 rad/s² within 1e-3 rad, that no longer return
 is needed; and the motion does not stay beside its path for as long as a gap may last."""
@@ -481,10 +481,10 @@ class SetPointGenerator:
     def _share_of_arm(self) -> float:
         """Share of the speed sent last at which the joint that slowed down least moves (D4).
 
-        Inf where no joint moves faster than `SLOW`, NaN where a velocity was not sent.
+        Inf where no joint moves faster than `SLOW_STEP_FACTOR`, NaN where a velocity was not sent.
         """
         step = self._step
-        fast = np.abs(step) > SLOW * self._guard.limits.standstill
+        fast = np.abs(step) > SLOW_STEP_FACTOR * self._guard.limits.standstill
         if not fast.any():
             return np.inf
         return max(float((self._raw[ACTUAL_VELOCITY][fast] / step[fast]).max()), 0.0)
@@ -549,7 +549,7 @@ class SetPointGenerator:
         step = velocity[0] if moves else step
         position = self.set_point + self._motors.joint_difference(target - self._sent)
         speed = self._motors.joint_difference(step) / self._guard.period
-        spread = min(SPREAD * steps, round(RETURN / self._guard.period))
+        spread = min(RETURN_CYCLES_PER_STEP * steps, round(MAX_RETURN_SECONDS / self._guard.period))
         execution.resume_from(position, speed, spread, cycle)
         self._guard.resume_from(position, speed, spread)
         self._history.resume_from(target, step)

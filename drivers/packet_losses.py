@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections import deque
 from typing import Final
 
-LOSS_WINDOW: Final = 100
+LOSS_WINDOW_CYCLES: Final = 100
 """Cycles over which rejected replies are added up."""
 PAUSE_CYCLES: Final = 2.0
 """Cycles by which a packet may come later than its number and `max_gap` account for."""
@@ -21,8 +21,8 @@ class LossTracker:
     stale     packets since the last reply with an old number        `max_gap`: the motion stops
     late      cycles by which this packet came later than its        more than `PAUSE_CYCLES`: the
               number and `max_gap` account for                       arm must move as commanded
-    rejected  replies of the last `LOSS_WINDOW` cycles that the      more than `max_gap`: the motion
-              controller did not use                                 stops
+    rejected  replies of the last `LOSS_WINDOW_CYCLES` cycles that the      more than `max_gap`: the
+              motion controller did not use                                 stops
     ========  =====================================================  ===============================
 
     Attributes:
@@ -55,7 +55,7 @@ class LossTracker:
         """Count replies that the controller, according to the packet of `cycle`, did not use."""
         rejections = self._rejections
         rejections.append((cycle, count))
-        while rejections[0][0] <= cycle - LOSS_WINDOW:
+        while rejections[0][0] <= cycle - LOSS_WINDOW_CYCLES:
             rejections.popleft()
         self.rejected = sum(number for _, number in rejections)
 
@@ -80,7 +80,7 @@ class LossTracker:
     def reason_to_stop_after_rejection(self) -> str | None:
         """Why the replies that were not used stop a motion, or None."""
         if self.rejected > self.max_gap:
-            return f"{self.rejected} replies were lost in {LOSS_WINDOW} cycles"
+            return f"{self.rejected} replies were lost in {LOSS_WINDOW_CYCLES} cycles"
         return None
 
     @property

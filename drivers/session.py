@@ -87,8 +87,8 @@ from drivers.open_mode import Exit, OpenCycle, OpenReply, Refuse, Reply, SetPoin
 from drivers.packet_losses import LossTracker
 from drivers.packets import Mode
 from drivers.states import (
-    HAS_SET_POINTS,
     POSITION_MODES,
+    STATES_WITH_SET_POINTS,
     AxesReport,
     Decision,
     Input,
@@ -107,7 +107,7 @@ from drivers.wire import (
     Wire,
 )
 
-FLIGHT_RECORDER: Final = 50
+FLIGHT_RECORDER_CYCLES: Final = 50
 """Records attached to a refusal."""
 STOP_TIMEOUT: Final = 10.0
 """Largest time from the request of a stop to rest, s; then drive-off is requested."""
@@ -451,7 +451,7 @@ class Session:
         ring.commit()
         if refusal is not None:
             self.counters.refused += 1
-            self._events.append(Refused(refusal, ring.last(FLIGHT_RECORDER)))
+            self._events.append(Refused(refusal, ring.last(FLIGHT_RECORDER_CYCLES)))
             self._end("refused", str(refusal))
         return self._finish(self.wire.finish(), now)
 
@@ -513,7 +513,7 @@ class Session:
             wire.fill_refusal(self._offending)
             return None
         wire.fill_safe(self.execution is not None, self.cycle)
-        if state not in HAS_SET_POINTS:
+        if state not in STATES_WITH_SET_POINTS:
             self._hold_without_motion(axes)
             return None
         if self._open_mode is None:
@@ -609,7 +609,7 @@ class Session:
             self._entering = True
             self.in_interval = True
             self.interval += 1
-        if after not in HAS_SET_POINTS:
+        if after not in STATES_WITH_SET_POINTS:
             self.stop_reason = None
         self._offending = None
 

@@ -71,9 +71,9 @@ class Input(IntEnum):
 
 
 OPEN_MODES: Final = frozenset(MODE_FIELDS)
-HOLDABLE: Final = frozenset(mode for mode, d in MODE_FIELDS.items() if d[:2] == (1, 2))
+HOLDABLE_MODES: Final = frozenset(mode for mode, d in MODE_FIELDS.items() if d[:2] == (1, 2))
 """Open modes in which D1 is an absolute position: the target received is the safe reply."""
-INCREMENTAL: Final = OPEN_MODES - HOLDABLE
+INCREMENTAL_MODES: Final = OPEN_MODES - HOLDABLE_MODES
 """Open modes in which zero is the safe reply."""
 POSITION_MODES: Final = frozenset({Mode.POSITION, Mode.POSITION_RELATIVE})
 """Open modes in which the PC generates the targets: those in which a motion can run."""
@@ -156,10 +156,10 @@ TRANSITIONS: Final[Mapping[State, Mapping[Input, State]]] = {
 }
 """`TRANSITIONS[state][input]` is the next state; missing entries cannot occur."""
 
-HAS_SET_POINTS: Final = frozenset({State.OPENING, State.OPEN, State.EXITING})
+STATES_WITH_SET_POINTS: Final = frozenset({State.OPENING, State.OPEN, State.EXITING})
 """States in which open axes are sent set-points."""
 
-_BEFORE_DRIVE_ON: Final = frozenset({State.INIT, State.DRIVE_OFF})
+_STATES_BEFORE_DRIVE_ON: Final = frozenset({State.INIT, State.DRIVE_OFF})
 
 
 def keeps_request(before: State, after: State) -> bool:
@@ -172,11 +172,11 @@ def keeps_request(before: State, after: State) -> bool:
     if after in (State.SYNC, State.INIT):
         return before in (State.SYNC, State.INIT)
     if after is State.DRIVE_OFF:
-        return before in _BEFORE_DRIVE_ON
+        return before in _STATES_BEFORE_DRIVE_ON
     if after is State.DRIVING_ON:
-        return before in _BEFORE_DRIVE_ON or before is State.DRIVING_ON
+        return before in _STATES_BEFORE_DRIVE_ON or before is State.DRIVING_ON
     if after is State.CLOSED:
-        return before not in HAS_SET_POINTS
+        return before not in STATES_WITH_SET_POINTS
     if after is State.FREEZING:
         return before is State.FREEZING
     return after in (State.OPENING, State.OPEN)
@@ -338,7 +338,7 @@ def _ending(
         # After such a silence the request may be outdated, whatever the controller does next.
         if cause is not Input.SILENCE and keeps_request(before, after):
             return None
-    elif after in HAS_SET_POINTS:
+    elif after in STATES_WITH_SET_POINTS:
         return None
     elif motion.leaving:
         return motion.outcome, motion.reason

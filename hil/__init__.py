@@ -71,7 +71,7 @@ if TYPE_CHECKING:
     from hil.results.results import Results
     from hil.study import run_study
 
-_HOME = {
+_MODULE_OF_NAME = {
     **dict.fromkeys(("LineReporter", "Silent", "reporter"), "base.progress"),
     **dict.fromkeys(("Stop", "stop_on_interrupt"), "control.motion_watch"),
     **dict.fromkeys(("plan_move", "send"), "control.move"),
@@ -172,8 +172,8 @@ def identify(
 def __getattr__(name: str) -> Any:
     if name == "__version__":
         return import_module("hil.base.version").software()["hil"]
-    if name in _HOME:
-        return getattr(import_module(f"hil.{_HOME[name]}"), name)
+    if name in _MODULE_OF_NAME:
+        return getattr(import_module(f"hil.{_MODULE_OF_NAME[name]}"), name)
     raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
 
 

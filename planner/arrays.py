@@ -21,7 +21,7 @@ def read_only(values: ArrayLike) -> Array:
 
 # What reading damaged data can raise: a text in place of a table, numbers too large for a float or
 # with too many digits, lists nested too deep.
-DAMAGED = (
+DAMAGED_DATA_ERRORS = (
     TypeError,
     ValueError,
     AttributeError,

@@ -29,7 +29,7 @@ from planner.limits import Allowance, jump_rounding
 from planner.piecewise_cubic import Block, Mask, PiecewiseCubic, Rows, after
 
 # Shorter moves [rad] are rests: their times would underflow.
-_SHORTEST: Final = 1e-200
+_MIN_MOVE: Final = 1e-200
 
 
 class StraightMoves(NamedTuple):
@@ -64,7 +64,7 @@ class StraightMoves(NamedTuple):
         """
         change = ends - starts
         length = np.max(np.abs(change), axis=1)
-        moves = length > _SHORTEST
+        moves = length > _MIN_MOVE
         direction = change / np.where(moves, length, 1.0)[:, None]
         with np.errstate(divide="ignore", over="ignore"):
             along = [
@@ -237,28 +237,28 @@ def _peak(distance: Array, above: Array, rates: tuple[Array, Array], jerk: Array
 
 
 # Margins against crashes were measured for this series of ruckig; corners need it.
-SERIES: Final = "0.19"
-_VERSION = str(getattr(ruckig, "__version__", "unknown"))
+RUCKIG_SERIES: Final = "0.19"
+_RUCKIG_VERSION = str(getattr(ruckig, "__version__", "unknown"))
 
 # Shares of the requested fly that are compared, and those tried one by one if none of them works.
-FIRST_SHARES: Final = (1.0, 0.9999, 0.999, 0.99, 0.97)
-LAST_SHARES: Final = (0.9, 0.5, 0.25, 0.125, 0.0625)
+FIRST_FLY_SHARES: Final = (1.0, 0.9999, 0.999, 0.99, 0.97)
+LAST_FLY_SHARES: Final = (0.9, 0.5, 0.25, 0.125, 0.0625)
 # Smaller shares of the ramps are treated as stops.
-LEAST_SHARE: Final = 1e-4
+MIN_FLY_SHARE: Final = 1e-4
 # A join is preferred to that of the requested share if it saves this much more [s].
-BETTER: Final = 1e-9
+MIN_TIME_SAVED: Final = 1e-9
 # States closer to their limits than this can crash ruckig, and are not passed to it.
-NEAREST_STATE: Final = 0.995
+MAX_STATE_SHARE: Final = 0.995
 # Joins use this share of the limits; `_closed` uses the rest.
-FULL: Final = 0.999
+LIMIT_SHARE: Final = 0.999
 # Errors of ruckig where it finds no motion; one in 200 000 is an unknown error number (ValueError).
-REFUSALS: Final = (ruckig.RuckigError, ValueError)
+SOLVER_ERRORS: Final = (ruckig.RuckigError, ValueError)
 # Jerk limit in the units passed to ruckig.
 SOLVER_JERK: Final = 64.0
 # Largest error of a join's end, as a share of the tolerance on jumps.
-_MISS: Final = 0.1
+_END_ERROR_SHARE: Final = 0.1
 # Pieces of a ruckig profile: two to brake into the limits (of zero length here), seven to move.
-_PIECES: Final = 9
+_PROFILE_PIECES: Final = 9
 
 
 class Passing(NamedTuple):
@@ -268,9 +268,10 @@ class Passing(NamedTuple):
     distance: float
 
 
-_SAMPLES = 65  # to find the minimum: a join has one, sometimes two
-_STEPS = 60  # of Newton's method; mostly four or five are needed, bisection alone takes fifty
-_RESOLUTION = 1e-15  # of the time, as a share of the duration
+_SEARCH_SAMPLES = 65  # to find the minimum: a join has one, sometimes two
+# of Newton's method; mostly four or five are needed, bisection alone takes fifty
+_MAX_NEWTON_STEPS = 60
+_TIME_RESOLUTION = 1e-15  # of the time, as a share of the duration
 
 
 def passing(motion: PiecewiseCubic, point: Array) -> Passing:
@@ -278,17 +279,17 @@ def passing(motion: PiecewiseCubic, point: Array) -> Passing:
 
     The distance is that of a point of the path, hence an upper bound of the true one.
     """
-    times = np.linspace(0.0, motion.duration, _SAMPLES)
+    times = np.linspace(0.0, motion.duration, _SEARCH_SAMPLES)
     apart = motion.sample(times)[0] - point
     square = np.einsum("ij,ij->i", apart, apart)
     index = int(square.argmin())
     time = float(times[index])
     best = float(square[index])
     low = float(times[max(index - 1, 0)])
-    high = float(times[min(index + 1, _SAMPLES - 1)])
+    high = float(times[min(index + 1, _SEARCH_SAMPLES - 1)])
     # At its ends a motion may rest, where the slope is zero.
     t = time if low < time < high else 0.5 * (low + high)
-    for _ in range(_STEPS):
+    for _ in range(_MAX_NEWTON_STEPS):
         q, qd, qdd = motion.sample_one(t)
         gap = q - point
         apart_here = float(gap @ gap)
@@ -301,7 +302,7 @@ def passing(motion: PiecewiseCubic, point: Array) -> Passing:
         closer = t - slope / bend if bend > 0.0 else high
         if not low < closer < high:  # bisect where Newton's step fails
             closer = 0.5 * (low + high)
-        if abs(closer - t) <= _RESOLUTION * motion.duration:
+        if abs(closer - t) <= _TIME_RESOLUTION * motion.duration:
             break
         t = closer
     return Passing(time, float(np.sqrt(best)))
@@ -349,7 +350,7 @@ def round_corners(
     corners = [STOP] * len(before)
     slowing = moves.slowing_down[before]
     speeding = moves.speeding_up[after]
-    requested = np.flatnonzero((slowing > 0.0) & (speeding > 0.0) & (fly >= LEAST_SHARE))
+    requested = np.flatnonzero((slowing > 0.0) & (speeding > 0.0) & (fly >= MIN_FLY_SHARE))
     if len(requested) == 0:  # stops need no solver, of whatever version
         return corners
 
@@ -377,18 +378,18 @@ def round_corners(
     def stopped(rows: Rows) -> Mask:
         return np.array([corners[row].join is None for row in rows.tolist()], dtype=np.bool_)
 
-    shares = np.multiply.outer(FIRST_SHARES, fly[requested]).ravel()
-    rows = np.tile(requested, len(FIRST_SHARES))
+    shares = np.multiply.outer(FIRST_FLY_SHARES, fly[requested]).ravel()
+    rows = np.tile(requested, len(FIRST_FLY_SHARES))
     candidates = solved(rows, shares)
     saving = sum(cuts(rows, shares)) - candidates.durations
-    saving = saving.reshape(len(FIRST_SHARES), -1)
+    saving = saving.reshape(len(FIRST_FLY_SHARES), -1)
     for index in ranked(saving):
         picked = np.flatnonzero(np.take_along_axis(saving, index[None], axis=0)[0] >= 0.0)
         picked = picked[stopped(requested[picked])]
         if len(picked) > 0:
             chosen = index[picked] * len(requested) + picked
             finish(rows[chosen], shares[chosen], candidates.take(chosen))
-    for part in LAST_SHARES:
+    for part in LAST_FLY_SHARES:
         rows = requested[stopped(requested)]
         if len(rows) == 0:
             break
@@ -402,11 +403,11 @@ def round_corners(
 def ranked(savings: Array) -> NDArray[np.intp]:
     """Return the order in which to try the rows of savings (s, ...) [s], best first.
 
-    Rows are those of `FIRST_SHARES`, -inf where there is no corner; the first, which was
-    requested, comes first unless another is better by `BETTER`.
+    Rows are those of `FIRST_FLY_SHARES`, -inf where there is no corner; the first, which was
+    requested, comes first unless another is better by `MIN_TIME_SAVED`.
     """
     preferred = savings.copy()
-    preferred[0] += BETTER
+    preferred[0] += MIN_TIME_SAVED
     return np.argsort(-preferred, axis=0, kind="stable")
 
 
@@ -440,16 +441,17 @@ def solve_many(starts: Array, ends: Array, times: Array, bounds: Allowance) -> S
         bounds: limits (c, n).
 
     Raises:
-        UnsupportedSolver: ruckig is of another series than `SERIES`.
+        UnsupportedSolver: ruckig is of another series than `RUCKIG_SERIES`.
     """
-    if _VERSION.split(".")[:2] != SERIES.split("."):
+    if _RUCKIG_VERSION.split(".")[:2] != RUCKIG_SERIES.split("."):
         raise UnsupportedSolver(
-            f"ruckig {_VERSION} is installed; corners are planned with {SERIES}.x only"
+            f"ruckig {_RUCKIG_VERSION} is installed; corners are planned with"
+            f" {RUCKIG_SERIES}.x only"
         )
     n_joints = starts.shape[1]
     problem = ruckig.InputParameter(n_joints)
     problem.synchronization = ruckig.Synchronization.Time
-    problem.max_jerk = [FULL * SOLVER_JERK] * n_joints
+    problem.max_jerk = [LIMIT_SHARE * SOLVER_JERK] * n_joints
     solver = ruckig.Ruckig(n_joints)
     durations = np.full(len(starts), np.inf)
     results = np.full(len(starts), None, dtype=np.object_)
@@ -467,7 +469,7 @@ def solve_many(starts: Array, ends: Array, times: Array, bounds: Allowance) -> S
         result = ruckig.Trajectory(n_joints)
         try:
             solver.calculate(problem, result)
-        except REFUSALS:
+        except SOLVER_ERRORS:
             continue
         durations[row] = result.duration * time
         results[row] = result
@@ -476,8 +478,8 @@ def solve_many(starts: Array, ends: Array, times: Array, bounds: Allowance) -> S
 
 def _askable(states: Array, bounds: Allowance) -> Mask:
     """Whether states (c, n, 3) are far enough from their limits for ruckig, (c,)."""
-    slow = np.abs(states[..., 1]) < NEAREST_STATE * bounds.velocity
-    gentle = np.abs(states[..., 2]) < NEAREST_STATE * bounds.acceleration
+    slow = np.abs(states[..., 1]) < MAX_STATE_SHARE * bounds.velocity
+    gentle = np.abs(states[..., 2]) < MAX_STATE_SHARE * bounds.acceleration
     askable: Mask = np.all(slow & gentle, axis=-1)
     return askable
 
@@ -495,7 +497,9 @@ def _in_units(starts: Array, ends: Array, times: Array, bounds: Allowance) -> Se
     there = ends / units
     there[..., 0] = (ends[..., 0] - starts[..., 0]) / way
     here[..., 0] = 0.0
-    largest = FULL * (np.stack((bounds.velocity, bounds.acceleration), axis=2) / units[..., 1:])
+    largest = LIMIT_SHARE * (
+        np.stack((bounds.velocity, bounds.acceleration), axis=2) / units[..., 1:]
+    )
     return [each.swapaxes(1, 2).tolist() for each in (here, there, largest)]
 
 
@@ -529,10 +533,10 @@ def _tables(solutions: Solutions, bounds: Allowance) -> Block:
             for result in solutions.trajectories
         ]
     )
-    lengths = profiles[..., :_PIECES] * solutions.times[:, None, None]
-    jerks = profiles[..., _PIECES:] * (bounds.jerk / SOLVER_JERK)[..., None]
+    lengths = profiles[..., :_PROFILE_PIECES] * solutions.times[:, None, None]
+    jerks = profiles[..., _PROFILE_PIECES:] * (bounds.jerk / SOLVER_JERK)[..., None]
     last = solutions.durations[:, None, None]
-    knots = np.zeros((*profiles.shape[:2], _PIECES + 1))
+    knots = np.zeros((*profiles.shape[:2], _PROFILE_PIECES + 1))
     np.minimum(np.cumsum(lengths, axis=-1), last, out=knots[..., 1:])
     knots[..., -1:] = last
     return Block.from_jerks(solutions.starts, knots, jerks)
@@ -566,6 +570,6 @@ def _closed(block: Block, start: Array, end: Array) -> Block:
 
 def _meets(block: Block, end: Array, bounds: Allowance) -> Mask:
     """Whether motions end in the states `end` (c, n, 3) within rounding, (c,)."""
-    rounding = _MISS * jump_rounding(bounds, block.durations)
+    rounding = _END_ERROR_SHARE * jump_rounding(bounds, block.durations)
     met: Mask = np.all(np.abs(end - block.end) <= rounding, axis=(1, 2))
     return met

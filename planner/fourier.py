@@ -17,25 +17,25 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from planner.arrays import DAMAGED, Array, numbers, read_only, strict
+from planner.arrays import DAMAGED_DATA_ERRORS, Array, numbers, read_only, strict
 from planner.errors import InvalidSetting, InvalidTrajectory
 from planner.limits import JointLimits
 from planner.piecewise_cubic import Extrema
 
 # Resolution of extremes, as a share of their bounds from the amplitudes, and the most samples for
 # it; with more, these bounds are the extremes.
-_RESOLUTION = 3e-4
-_MOST_SAMPLES = 20_000
+_EXTREMA_RESOLUTION = 3e-4
+_MAX_SAMPLES = 20_000
 
 # w(u) = 10 u³ - 15 u⁴ + 6 u⁵ and its derivatives in u, highest power first, and the largest
 # magnitude of each on [0, 1].
-_RAMP = (
+_RAMP_POLYNOMIALS = (
     (6.0, -15.0, 10.0, 0.0, 0.0, 0.0),
     (30.0, -60.0, 30.0, 0.0, 0.0),
     (120.0, -180.0, 60.0, 0.0),
     (360.0, -360.0, 60.0),
 )
-_RAMP_LARGEST = (1.0, 15.0 / 8.0, 10.0 / np.sqrt(3.0), 60.0, 360.0, 720.0)
+_RAMP_MAXIMA = (1.0, 15.0 / 8.0, 10.0 / np.sqrt(3.0), 60.0, 360.0, 720.0)
 
 
 class HarmonicBounds(NamedTuple):
@@ -162,8 +162,8 @@ class FourierSeries:
             bounds = [self._bounds(order, stage != 0) for order in range(6)]
             with np.errstate(all="ignore"):
                 curved = np.nan_to_num(np.array(bounds[2:]) / bounds[:4], nan=0.0).max()
-                steps = (stop - start) * np.sqrt(curved / (8.0 * _RESOLUTION))
-                steps = int(np.clip(np.ceil(steps), 1, _MOST_SAMPLES))
+                steps = (stop - start) * np.sqrt(curved / (8.0 * _EXTREMA_RESOLUTION))
+                steps = int(np.clip(np.ceil(steps), 1, _MAX_SAMPLES))
                 t = np.linspace(start, stop, steps + 1)
                 window = self._window(t, 3, np.full(t.shape, stage))
                 sines = self._sines(t, 3)
@@ -215,7 +215,7 @@ class FourierSeries:
             )
         except InvalidTrajectory:
             raise
-        except DAMAGED as error:
+        except DAMAGED_DATA_ERRORS as error:
             raise InvalidTrajectory(f"not a series of sines: {error!r:.200}") from error
 
     def _bounds(self, order: int, ramped: bool) -> Array:
@@ -233,7 +233,7 @@ class FourierSeries:
             if ramped:
                 ramp = np.float64(self.ramp)
                 parts = [
-                    comb(order, k) * _RAMP_LARGEST[k] / ramp**k * sums[order - k]
+                    comb(order, k) * _RAMP_MAXIMA[k] / ramp**k * sums[order - k]
                     for k in range(order + 1)
                 ]
                 bound = np.sum(parts, axis=0)
@@ -254,8 +254,11 @@ class FourierSeries:
             return [np.ones_like(t), *(np.zeros_like(t) for _ in range(order))]
         u = np.clip(np.where(stage > 0, t, self.length - t) / self.ramp, 0.0, 1.0)
         pace = stage / self.ramp
-        grown = np.where(stage == 0, 1.0, _polynomial(_RAMP[0], u))
-        return [grown, *(_polynomial(_RAMP[k], u) * pace**k for k in range(1, order + 1))]
+        grown = np.where(stage == 0, 1.0, _polynomial(_RAMP_POLYNOMIALS[0], u))
+        return [
+            grown,
+            *(_polynomial(_RAMP_POLYNOMIALS[k], u) * pace**k for k in range(1, order + 1)),
+        ]
 
     def _sines(self, t: Array, order: int) -> list[Array]:
         """Return the sum of sines and its derivatives up to `order`, (m, n) each."""

@@ -27,9 +27,9 @@ from planner.motion_queue import MotionQueue
 from planner.moves import Move, Overrides, checked_shares
 
 # Tolerance on motion times [s].
-_ROUNDING: Final = 1e-9
+_TIME_TOLERANCE: Final = 1e-9
 # COMAU's default of FLY_PER.
-_FLY_PERCENT: Final = 100.0
+_DEFAULT_FLY_PERCENT: Final = 100.0
 
 P = ParamSpec("P")
 S = TypeVar("S", bound="MoveSettings")
@@ -85,7 +85,7 @@ class MoveSettings:
         full = np.ones(self._limits.n_joints)
         self._move = Move(full, joint_speed=full, joint_acceleration=full, joint_jerk=full)
         self._flying = False
-        self._fly_percent = _FLY_PERCENT
+        self._fly_percent = _DEFAULT_FLY_PERCENT
         self._motion_time = 0.0
         self._overrides = Overrides()
         self._advance = 1
@@ -163,7 +163,7 @@ class MoveSettings:
 
     def cancel_flyby_criteria(self, criterion: int) -> Status:
         """Reset the value of a criterion."""
-        return self.set_flyby_criteria_parameter(criterion, _FLY_PERCENT)
+        return self.set_flyby_criteria_parameter(criterion, _DEFAULT_FLY_PERCENT)
 
     @service
     def select_point_accuracy(self, accuracy: int) -> None:
@@ -221,7 +221,7 @@ class MoveSettings:
         if least == -seconds:
             valid = "0 s where the target is the point before"
             raise InvalidSetting("motion time", seconds, valid)
-        if least > _ROUNDING:
+        if least > _TIME_TOLERANCE:
             raise _TimeTooShortError(f"the move takes longer than its motion time of {seconds} s")
         slow = 1.0
         while excess(slow) < 0.0:

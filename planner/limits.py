@@ -12,8 +12,8 @@ from planner.arrays import Array, read_only
 from planner.errors import InvalidLimits
 
 # Far beyond what any arm does; with larger numbers ruckig has crashed its process.
-SMALLEST_RATE: Final = 1e-10
-LARGEST_RATE: Final = 1e10
+MIN_RATE: Final = 1e-10
+MAX_RATE: Final = 1e10
 # Tolerances for rounding: of a position beyond its range, relative to its largest magnitude, and of
 # a jump between two pieces, relative to the limit of the quantity.
 POSITION_ROUNDING: Final = 1e-12
@@ -64,8 +64,8 @@ class JointLimits:
             raise InvalidLimits("lower", f"must be below upper; joint {joint}: {ends}")
         for name in ("velocity", "acceleration", "jerk"):
             rates = getattr(self, name)
-            if np.any((rates < SMALLEST_RATE) | (rates > LARGEST_RATE)):
-                reason = f"must lie in {SMALLEST_RATE:g}..{LARGEST_RATE:g}, got {rates.tolist()}"
+            if np.any((rates < MIN_RATE) | (rates > MAX_RATE)):
+                reason = f"must lie in {MIN_RATE:g}..{MAX_RATE:g}, got {rates.tolist()}"
                 raise InvalidLimits(name, reason)
 
     @property

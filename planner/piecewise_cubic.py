@@ -11,7 +11,7 @@ from typing import Any, NamedTuple, Protocol, Self
 import numpy as np
 from numpy.typing import NDArray
 
-from planner.arrays import DAMAGED, Array, numbers
+from planner.arrays import DAMAGED_DATA_ERRORS, Array, numbers
 from planner.errors import InvalidTrajectory, LimitExceeded, NotSmooth
 from planner.limits import Allowance, Bounds, jump_rounding, position_rounding
 
@@ -180,7 +180,7 @@ class PiecewiseCubic:
             _check_table(knots, coefficients)
         except InvalidTrajectory:
             raise
-        except DAMAGED as error:
+        except DAMAGED_DATA_ERRORS as error:
             raise InvalidTrajectory(f"not a table of cubic pieces: {error!r:.200}") from error
         return cls(knots, coefficients)
 

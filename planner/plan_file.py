@@ -15,7 +15,7 @@ from typing import Annotated, Any, Final, Literal
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
-from planner.arrays import DAMAGED, Array, read_only
+from planner.arrays import DAMAGED_DATA_ERRORS, Array, read_only
 from planner.errors import InvalidPlanFile, InvalidSetting, PlannerError
 from planner.limits import JointLimits
 from planner.moves import (
@@ -30,8 +30,8 @@ FORMAT: Final = "joint motion plan"
 VERSION: Final = 1
 # Tolerances between a stored motion and the same one planned on another machine: of positions
 # [rad] and duration [s], and of rates as a share of their limits.
-_SAME = 1e-9
-_SAME_RATES = 1e-6
+_PLAN_TOLERANCE = 1e-9
+_RATE_TOLERANCE = 1e-6
 
 
 class _Data(BaseModel):
@@ -174,7 +174,7 @@ class PlanFile:
             first = error.errors(include_url=False, include_input=False)[0]
             field = ".".join(map(str, first["loc"])) or "top level"
             raise InvalidPlanFile(f"not a plan: {field}: {first['msg']}") from error
-        except (PlannerError, *DAMAGED) as error:
+        except (PlannerError, *DAMAGED_DATA_ERRORS) as error:
             raise InvalidPlanFile(f"not a plan: {error}") from error
 
 
@@ -195,7 +195,7 @@ def _check_motion(stored: PiecewiseCubic, planned: MotionPlan) -> None:
     apart = float(apart.max())
     rates = float(max(np.max(fast / limits.velocity), np.max(steep / limits.acceleration)))
     late = abs(stored.duration - other.duration)
-    if not (apart <= _SAME and late <= _SAME and rates <= _SAME_RATES):
+    if not (apart <= _PLAN_TOLERANCE and late <= _PLAN_TOLERANCE and rates <= _RATE_TOLERANCE):
         raise InvalidPlanFile(
             f"the stored motion of {stored.duration:.6f} s differs from the one planned through "
             f"the moves ({other.duration:.6f} s) by up to {apart:.3g} rad: the moves were edited, "
@@ -205,8 +205,8 @@ def _check_motion(stored: PiecewiseCubic, planned: MotionPlan) -> None:
 
 _QUANTITIES: Final = ("position [rad]", "velocity [rad/s]", "acceleration [rad/s^2]")
 # Shortest last period, as a share of the others.
-_LAST_PERIOD: Final = 1e-9
-_HIGHEST_RATE: Final = 1e5  # Hz
+_MIN_LAST_PERIOD: Final = 1e-9
+_MAX_RATE: Final = 1e5  # Hz
 
 
 def to_csv(trajectory: Trajectory, rate: float, joint_names: Sequence[str]) -> str:
@@ -218,11 +218,11 @@ def to_csv(trajectory: Trajectory, rate: float, joint_names: Sequence[str]) -> s
     Raises:
         InvalidSetting: a rate outside (0, 100 kHz], or a motion of zero duration.
     """
-    if not 0.0 < rate <= _HIGHEST_RATE:
-        raise InvalidSetting("rate", rate, f"above 0 Hz, at most {_HIGHEST_RATE:g} Hz")
+    if not 0.0 < rate <= _MAX_RATE:
+        raise InvalidSetting("rate", rate, f"above 0 Hz, at most {_MAX_RATE:g} Hz")
     if trajectory.duration <= 0.0:
         raise InvalidSetting("duration", trajectory.duration, "a motion of more than 0 s")
-    steps = max(1, ceil(trajectory.duration * rate - _LAST_PERIOD))
+    steps = max(1, ceil(trajectory.duration * rate - _MIN_LAST_PERIOD))
     time = np.minimum(np.arange(steps + 1) / rate, trajectory.duration)
     time[-1] = trajectory.duration
     columns = np.stack(trajectory.sample(time), axis=2).reshape(len(time), -1)

@@ -94,13 +94,13 @@ def _merged(trajectory: PiecewiseCubic) -> tuple[list[float], Array]:
 
 
 # Tolerance on times, as a share of the period.
-_ROUNDING = 1e-9
+_TIME_TOLERANCE = 1e-9
 # Tolerance on the range of a joint for set-points rounded to float32, as a share of half the range.
-_RANGE_ROUNDING = 9e-7
+_FLOAT32_RANGE_ROUNDING = 9e-7
 # Newton steps to the nearest point of the path.
 _NEWTON_STEPS = 8
 # Largest change of motion time in `resume_from` [s].
-_FARTHEST = 1.0
+_MAX_TIME_CHANGE = 1.0
 
 
 class _SetPoints(NamedTuple):
@@ -199,7 +199,7 @@ class TrajectoryPlayer:
 
     def _set_path(self, trajectory: Trajectory) -> None:
         self.duration = trajectory.duration
-        self._end = trajectory.duration - _ROUNDING * self._period
+        self._end = trajectory.duration - _TIME_TOLERANCE * self._period
         self._end_position: Array = trajectory.sample(np.array([trajectory.duration]))[0][0]
         self._path = PathReader(trajectory)
 
@@ -265,7 +265,7 @@ class TrajectoryPlayer:
     def _check_range(self, offset: Array) -> None:
         limits = self._limits
         rounding = position_rounding(self._limits)
-        slack = np.maximum(rounding, 0.5 * _RANGE_ROUNDING * (limits.upper - limits.lower))
+        slack = np.maximum(rounding, 0.5 * _FLOAT32_RANGE_ROUNDING * (limits.upper - limits.lower))
         for reach, bound, sign in (
             (self._lower + offset, limits.lower, -1.0),
             (self._upper + offset, limits.upper, 1.0),
@@ -296,9 +296,9 @@ class TrajectoryPlayer:
         s = self.motion_time
         here = position - self._offset
         # Below this squared speed the path has no usable direction.
-        slowest = float(velocity @ velocity) * _ROUNDING
-        least = max(s - _FARTHEST, 0.0)
-        most = min(s + _FARTHEST, self.duration)
+        slowest = float(velocity @ velocity) * _TIME_TOLERANCE
+        least = max(s - _MAX_TIME_CHANGE, 0.0)
+        most = min(s + _MAX_TIME_CHANGE, self.duration)
         point, speed = self._path.read(s)
         for _ in range(_NEWTON_STEPS):
             square = float(speed @ speed)
@@ -307,7 +307,7 @@ class TrajectoryPlayer:
             before = s
             s = min(max(s + float((here - point) @ speed) / square, least), most)
             point, speed = self._path.read(s)
-            if abs(s - before) <= _ROUNDING * self._period:
+            if abs(s - before) <= _TIME_TOLERANCE * self._period:
                 break
         square = float(speed @ speed) or 1.0
         self._offset_from(point, here, self._tolerance)
@@ -446,7 +446,7 @@ class TrajectoryPlayer:
 
 def _tabulate(trajectory: Trajectory, period: float) -> _SetPoints:
     """Return the set-points of a trajectory at full rate, from one period after its start."""
-    cycles = max(1, ceil(trajectory.duration / period - _ROUNDING))
+    cycles = max(1, ceil(trajectory.duration / period - _TIME_TOLERANCE))
     position, velocity, _ = trajectory.sample(period * np.arange(1, 1 + cycles, dtype=np.float64))
     velocity = np.ascontiguousarray(velocity)
     velocity[-1] = 0.0  # exactly at rest at the end

@@ -150,9 +150,9 @@ class TimeLaw:
 
 # Least peak velocity assumed of a joint, as a share of its limit: the bounds of a path on which no
 # joint moves would be infinite.
-_LEAST_SPEED = 1e-3
+_MIN_SPEED_SHARE = 1e-3
 # Slopes tried, as shares of the largest one possible.
-_SHARES = np.linspace(0.02, 1.0, 99)
+_SLOPE_SHARES = np.linspace(0.02, 1.0, 99)
 
 
 def slowing_bounds(
@@ -183,11 +183,11 @@ def slowing_bounds(
     if extrema is not None:
         spare_acceleration = acceleration * a - np.minimum(extrema.acceleration, a)
         spare_jerk = jerk * j - np.minimum(extrema.jerk, j)
-        v = np.clip(extrema.velocity, _LEAST_SPEED * v, v)
+        v = np.clip(extrema.velocity, _MIN_SPEED_SHARE * v, v)
         a = np.minimum(extrema.acceleration, a)
     with np.errstate(divide="ignore", over="ignore"):
         largest = np.minimum(spare_acceleration / v, spare_jerk / (3.0 * a))
-    slopes = _SHARES * np.min(largest)
+    slopes = _SLOPE_SHARES * np.min(largest)
     changes = np.maximum(np.min((spare_jerk - 3.0 * slopes[:, None] * a) / v, axis=1), 0.0)
     reached = slopes * slopes <= changes  # whether the slope reaches its bound
     with np.errstate(divide="ignore"):

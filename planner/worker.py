@@ -39,7 +39,7 @@ from planner.moves import plan
 from planner.piecewise_cubic import PiecewiseCubic
 
 # Time after the timeout of a call at which the child kills itself [s].
-_GRACE: Final = 1.0
+_KILL_GRACE: Final = 1.0
 # Time for a new interpreter to load numpy on a busy machine [s].
 _START_TIMEOUT: Final = 60.0
 _ONE_THREAD: Final = dict.fromkeys(
@@ -47,7 +47,7 @@ _ONE_THREAD: Final = dict.fromkeys(
 )
 _SERVE: Final = "import sys; from planner.worker import serve; serve(int(sys.argv[1]))"
 # Consecutive starts that may fail, for an external reason such as full memory.
-_RESTARTS: Final = 2
+_MAX_FAILED_STARTS: Final = 2
 
 
 def serve(descriptor: int) -> None:
@@ -82,7 +82,7 @@ def _outcome(message: bytes) -> bytes:
     try:
         timeout, function, args, kwargs = load(message)
         # SIGALRM also ends a solver that hangs in native code.
-        signal.setitimer(signal.ITIMER_REAL, timeout + _GRACE)
+        signal.setitimer(signal.ITIMER_REAL, timeout + _KILL_GRACE)
         try:
             return pack((function(*args, **kwargs), None))
         finally:
@@ -384,7 +384,7 @@ def stream_in_children(
                     not_started = 0
                 except PlannerNotStarted:
                     not_started += 1
-                    if not_started > _RESTARTS:
+                    if not_started > _MAX_FAILED_STARTS:
                         raise
                     again.append(chunk)
                 except (PlannerCrashed, PlanningTimedOut) as error:

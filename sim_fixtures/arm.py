@@ -82,7 +82,7 @@ class Disturbances:
 
 RIPPLES_PER_TURN = 2
 WARM_UP_TIME = 600.0  # time constant of the friction drift [s]
-WARM_SPEED = 0.5  # speed at which the final warmth of a joint is one half [rad/s]
+HALF_WARM_SPEED = 0.5  # speed at which the final warmth of a joint is one half [rad/s]
 
 
 @dataclass(frozen=True)
@@ -141,13 +141,13 @@ class SimulatedDrift:
     def scale(self, velocity: Array, duration: float) -> Array:
         """Return the factor on the friction (n,) after `duration` [s] at a velocity."""
         speed = np.abs(velocity)
-        final = speed / (speed + WARM_SPEED)
+        final = speed / (speed + HALF_WARM_SPEED)
         self._warmth += (duration / WARM_UP_TIME) * (final - self._warmth)
         factor: Array = 1.0 + self._drift * (0.5 - self._warmth)
         return factor
 
 
-_BLOCK = 1024
+_BLOCK_SAMPLES = 1024
 
 
 class NoiseSource:
@@ -165,7 +165,7 @@ class NoiseSource:
         if self._deviation == 0.0:
             return self._zeros
         if not self._block:
-            shape = (_BLOCK, self._n_axes)
+            shape = (_BLOCK_SAMPLES, self._n_axes)
             self._block = (self._rng.standard_normal(shape) * self._deviation).tolist()
         return self._block.pop()
 

@@ -82,12 +82,12 @@ class Phase(IntEnum):
     ENDED = auto()
 
 
-POWERED = frozenset(phase for phase in Phase if Phase.DRIVING_ON <= phase <= Phase.CLOSING)
-UNBRAKED = POWERED - {Phase.DRIVING_ON}
-STILL_OPEN = frozenset({Phase.CLOSING, Phase.TRIPPED})
+POWERED_PHASES = frozenset(phase for phase in Phase if Phase.DRIVING_ON <= phase <= Phase.CLOSING)
+UNBRAKED_PHASES = POWERED_PHASES - {Phase.DRIVING_ON}
+STILL_OPEN_PHASES = frozenset({Phase.CLOSING, Phase.TRIPPED})
 """Phases whose first cycles report the previous modes."""
-HAS_OPEN_AXES = frozenset({Phase.OPENING, Phase.OPEN, Phase.CLOSING})
-LISTENING = frozenset({Phase.OPENING, Phase.OPEN})
+OPEN_AXES_PHASES = frozenset({Phase.OPENING, Phase.OPEN, Phase.CLOSING})
+LISTENING_PHASES = frozenset({Phase.OPENING, Phase.OPEN})
 
 
 _COLD_START = (False,) * 9 + (True, False, False)
@@ -183,12 +183,12 @@ class LoopProgram:
             self.openings_lost = 0
             self._stays_off = True
             self._own_motion_over = self._own_motion_over or self.phase is Phase.MOVING
-            opened = self.phase in HAS_OPEN_AXES
+            opened = self.phase in OPEN_AXES_PHASES
             self._enter(Phase.TRIPPED if opened else Phase.DRIVE_OFF)
 
     def axis_leaves(self, axis: int) -> None:
         """Close one axis (0-based) while the others stay open."""
-        if self.phase in HAS_OPEN_AXES:
+        if self.phase in OPEN_AXES_PHASES:
             self._gone.add(axis)
             self.open_axes[axis] = False
 
@@ -226,15 +226,15 @@ class LoopProgram:
 
     def _enter(self, phase: Phase) -> None:
         self.phase = phase
-        self.powered = phase in POWERED
-        self.braked = phase not in UNBRAKED
-        self.listening = phase in LISTENING
+        self.powered = phase in POWERED_PHASES
+        self.braked = phase not in UNBRAKED_PHASES
+        self.listening = phase in LISTENING_PHASES
         self._age = 0
         if phase is Phase.OPENING:
             self._missed_open = 0
             self._gone.clear()
             self._open_due_axes()
-        elif phase not in STILL_OPEN:
+        elif phase not in STILL_OPEN_PHASES:
             self.open_axes = [phase is Phase.OPEN and wanted for wanted in self.wanted_axes]
 
     def _open_due_axes(self) -> None:
@@ -541,8 +541,8 @@ Numbers = Sequence[float]
 Wanted = Sequence[Sequence[float] | None]
 """D1..D5 of the reply for each axis; None for an axis without a valid one."""
 
-_ADDS_SPEED = (2, 8)
-_ADDS_CURRENT = (1, 2, 9)
+_ADDED_SPEED_MODES = (2, 8)
+_ADDED_CURRENT_MODES = (1, 2, 9)
 
 
 class Targets:
@@ -672,15 +672,15 @@ class Targets:
             if fields is not None:
                 if mode == 7:
                     self._offset[i] = fields[0]
-                if mode in _ADDS_SPEED:
+                if mode in _ADDED_SPEED_MODES:
                     demand.speed[i] = fields[3]
-                if mode in _ADDS_CURRENT:
+                if mode in _ADDED_CURRENT_MODES:
                     demand.current[i] = fields[4]
             demand.target[i] += self._offset[i]
             demand.delta[i] += self._offset[i] - before
 
 
-EARTH = (0.0, 0.0, -9.81)
+EARTH_GRAVITY = (0.0, 0.0, -9.81)
 NO_EFFECTS = UnmodelledEffects()
 
 _COMMON_MODE = {Phase.DRIVING_ON: Mode.DRIVING_ON, Phase.ENDING: Mode.END_OF_SESSION}
@@ -720,7 +720,7 @@ class SimulatedController:
         session: int = 0,
         effects: UnmodelledEffects = NO_EFFECTS,
         initial_position: ArrayLike | None = None,
-        gravity: ArrayLike = EARTH,
+        gravity: ArrayLike = EARTH_GRAVITY,
         stated: SimulatedDrive | None = None,
         entered: Carried | None = None,
         faults: Sequence[InjectedFault] = (),

@@ -33,9 +33,9 @@ push@2000x50:axis=1              a push on the axis that does not trip the drive
 pause@2000x50:502                the controller pauses; :500 for the other kind"""
 
 
-SLIP = 1.5  # encoder error as a multiple of the following-error threshold
-LOAD = 0.9  # load as a share of the largest motor torque
-PUSH = 0.15  # push as a share of the largest motor torque; it does not trip the drive
+SLIP_FACTOR = 1.5  # encoder error as a multiple of the following-error threshold
+LOAD_SHARE = 0.9  # load as a share of the largest motor torque
+PUSH_SHARE = 0.15  # push as a share of the largest motor torque; it does not trip the drive
 
 
 class FaultyProgram(Protocol):
@@ -99,12 +99,12 @@ class InjectedFault:
                 controller.program.axis_leaves(self.axis - 1)
             case "following-error":
                 controller.disturb(
-                    "slip" if self.word == "slip" else "jam", self.axis, SLIP, self.count
+                    "slip" if self.word == "slip" else "jam", self.axis, SLIP_FACTOR, self.count
                 )
             case "pause":
                 controller.program.pause(int(self.word), self.count)
             case _:
-                size = LOAD if self.kind == "saturate" else PUSH
+                size = LOAD_SHARE if self.kind == "saturate" else PUSH_SHARE
                 controller.disturb("load", self.axis, size, self.count)
 
 
@@ -184,8 +184,8 @@ def _parsed(text: str) -> Fault:
     if times is not None and not kind.times:
         raise ValueError(f"{name} takes no count")
     count = max(1, kind.times) if times is None else int(times)
-    if not 1 <= count <= link.MOST_CYCLES or cycle > link.MOST_CYCLES:
-        raise ValueError(f"the cycle is at most {link.MOST_CYCLES}, the count 1 to as many")
+    if not 1 <= count <= link.MAX_CYCLES or cycle > link.MAX_CYCLES:
+        raise ValueError(f"the cycle is at most {link.MAX_CYCLES}, the count 1 to as many")
     matches = _matched(name, kind, options)
     to: link.Direction = "to_controller" if "to_controller" in options else "to_pc"
     match name:

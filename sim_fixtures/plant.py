@@ -88,7 +88,7 @@ class PlantTruth:
 
 
 MAX_SWEEPS = 200
-TOLERANCE = 1e-6  # of friction torques, relative to the Coulomb torque
+FRICTION_TOLERANCE = 1e-6  # of friction torques, relative to the Coulomb torque
 
 
 class DryFriction(NamedTuple):
@@ -124,7 +124,7 @@ def resolve_dry_friction(
             previous = torque[i]
             wanted = max(-limit, min(limit, previous + velocity[i] / rows[i][i]))
             change = wanted - previous
-            if abs(change) > TOLERANCE * limit:
+            if abs(change) > FRICTION_TOLERANCE * limit:
                 torque[i] = wanted
                 velocity = [v - a * change for v, a in zip(velocity, rows[i], strict=True)]
                 converged = False

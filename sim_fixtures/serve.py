@@ -24,7 +24,7 @@ from select import select
 from typing import Final, Protocol
 
 from drivers.errors import PacketError
-from drivers.exchange.control import BINS, bin_of, quantile
+from drivers.exchange.control import LATENCY_BINS, bin_of, quantile
 from drivers.packets import (
     AXIS_LENGTH,
     HEADER_LENGTH,
@@ -37,7 +37,7 @@ from drivers.transports.base import TransportError
 from drivers.transports.simulated import Peer
 from drivers.transports.udp import UdpSpec
 
-LARGEST_DATAGRAM: Final = 65536
+MAX_DATAGRAM_BYTES: Final = 65536
 
 
 class ControllerLink(Protocol):
@@ -90,7 +90,7 @@ class UdpControllerLink:
             if not select([self._socket], [], [], max(0.0, until - time.monotonic()))[0]:
                 return None
             try:
-                packet, sender = self._socket.recvfrom(LARGEST_DATAGRAM)
+                packet, sender = self._socket.recvfrom(MAX_DATAGRAM_BYTES)
             except OSError:  # dropped for a bad checksum, or an ICMP error
                 continue
             if sender == self._pc:
@@ -110,7 +110,7 @@ def open_controller_link(spec: UdpSpec, mode: int | None = None) -> UdpControlle
     return UdpControllerLink(spec.peer_host, spec.port)
 
 
-REMEMBERED: Final = 1000
+REMEMBERED_PACKETS: Final = 1000
 
 
 @dataclass(eq=False)
@@ -118,7 +118,7 @@ class Latencies:
     """Durations in the bins of `drivers.exchange.control`, and the largest one, s."""
 
     largest: float = 0.0
-    counts: list[int] = field(default_factory=lambda: [0] * BINS)
+    counts: list[int] = field(default_factory=lambda: [0] * LATENCY_BINS)
 
     def add(self, seconds: float) -> None:
         """Count one duration."""
@@ -153,8 +153,8 @@ class ServeCounts:
     longest_extension: float = 0.0  # longest extension of a cycle, s
     reply: Latencies = field(default_factory=Latencies)  # times from the packet to its reply
     cost: Latencies = field(default_factory=Latencies)  # computing times of a cycle
-    _without_reply: deque[int] = field(default_factory=lambda: deque(maxlen=REMEMBERED))
-    _replied: deque[int] = field(default_factory=lambda: deque(maxlen=REMEMBERED))
+    _without_reply: deque[int] = field(default_factory=lambda: deque(maxlen=REMEMBERED_PACKETS))
+    _replied: deque[int] = field(default_factory=lambda: deque(maxlen=REMEMBERED_PACKETS))
 
     def count_reply(self, number: int, *, valid: bool) -> None:
         """Count a reply with the right number, valid for the controller or not."""
@@ -194,9 +194,9 @@ class Clock(Protocol):
 
 KNOCK_INTERVAL: Final = 1.0
 """Seconds between two first packets while no PC replies."""
-PATIENCE: Final = 3.0
+STOP_TIMEOUT: Final = 3.0
 """Time for the arm to stop when the session is to end [s]."""
-_MOST_STRAY: Final = 100
+_MAX_STRAY_PACKETS: Final = 100
 """Stray packets read after the end of a cycle, so that a flood cannot delay the next one."""
 
 
@@ -227,7 +227,7 @@ def serve(
     request: Callable[[], Request] = lambda: Request.CONTINUE,
     watch: Callable[[ServeCounts], None] = lambda _: None,
     clock: Clock = time,
-    patience: float = PATIENCE,
+    patience: float = STOP_TIMEOUT,
     cycle_extension: float = 0.0,
 ) -> ServeCounts:
     """Run a controller on a real link until its session has ended; the link stays open.
@@ -380,7 +380,7 @@ class _Server:
         """Return the first reply with the next number; count others."""
         wanted = next_number(packet_number(packet))
         stray = 0
-        while stray < _MOST_STRAY:
+        while stray < _MAX_STRAY_PACKETS:
             reply = self.link.receive(max(0.0, until - self.clock.monotonic()))
             if reply is None:
                 return None

@@ -23,7 +23,7 @@ from drivers.exchange.event_log import (
     ExchangeFailed,
     ExchangeStarted,
 )
-from drivers.exchange.loop import MAX_LATE, exchange
+from drivers.exchange.loop import MAX_LATE_REPLIES, exchange
 from drivers.exchange.process_handle import ExchangeSettings
 from drivers.exchange.serving import CommandHandler, portable
 from drivers.exchange.warm_up import WarmUp, may_poll
@@ -32,9 +32,9 @@ from drivers.session import Session
 from drivers.states import State
 from drivers.transports.base import PollingTransport, Transport, TransportError
 
-LINK_FAILED: Final = 1
-NOT_STARTED: Final = 2
-CRASHED: Final = 70
+EXIT_LINK_FAILED: Final = 1
+EXIT_NOT_STARTED: Final = 2
+EXIT_CRASHED: Final = 70
 
 
 def main(arguments: Sequence[str]) -> int:
@@ -80,13 +80,13 @@ def main(arguments: Sequence[str]) -> int:
     except Exception as error:
         traceback.print_exc()
         channel.send(portable(error))
-        return NOT_STARTED
+        return EXIT_NOT_STARTED
     notes = tuple(getattr(transport, "notes", ()))
     server.log(ExchangeStarted(os.getpid(), report, notes))
     channel.send(pickle.dumps((report, notes)))
     max_late = settings.max_late
     if max_late is None:
-        max_late = settings.session.get("max_gap", MAX_LATE)
+        max_late = settings.session.get("max_gap", MAX_LATE_REPLIES)
     status = _serve(transport, session, server, max_late, warm_up)
     control.finished = int(status == 0)
     return status
@@ -119,7 +119,7 @@ def _serve(
     except Exception:
         traceback.print_exc()
         server.log(ExchangeFailed(traceback.format_exc()))
-        return CRASHED
+        return EXIT_CRASHED
     finally:
         transport.close()
     if session.state is State.ENDED:
@@ -128,7 +128,7 @@ def _serve(
         server.log(ExchangeEnded(server.reason))
     else:
         server.log(ExchangeEnded("the link was closed"))
-        return LINK_FAILED
+        return EXIT_LINK_FAILED
     return 0
 
 

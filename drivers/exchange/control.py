@@ -24,27 +24,33 @@ once by the end of its pipe."""
 
 # Latencies are counted in bins: percentiles for other processes at the cost of a logarithm and a
 # store per packet.
-BINS: Final = 96
-PER_OCTAVE: Final = 4
-SHORTEST: Final = 2e-6
-"""Upper edge of the first bin, s; each next one is 2 ** (1 / `PER_OCTAVE`) times longer. The last
-contains everything above 24 s."""
+LATENCY_BINS: Final = 96
+BINS_PER_OCTAVE: Final = 4
+FIRST_BIN_SECONDS: Final = 2e-6
+"""Upper edge of the first bin, s; each next one is 2 ** (1 / `BINS_PER_OCTAVE`) times longer. The
+last contains everything above 24 s."""
 OUTCOMES: Final[tuple[Outcome, ...]] = ("lost", "completed", "stopped", "refused")
 """Outcome of a motion by its number in the shared state; "lost" before the first."""
 
 
 def bin_of(seconds: float) -> int:
     """Return the index of the bin of a latency."""
-    if not seconds > SHORTEST:
+    if not seconds > FIRST_BIN_SECONDS:
         return 0
     if math.isinf(seconds):
-        return BINS - 1
-    return min(BINS - 1, math.ceil(PER_OCTAVE * math.log2(seconds / SHORTEST)))
+        return LATENCY_BINS - 1
+    return min(
+        LATENCY_BINS - 1, math.ceil(BINS_PER_OCTAVE * math.log2(seconds / FIRST_BIN_SECONDS))
+    )
 
 
 def upper_edge(index: int) -> float:
     """Return the longest latency of a bin, s; infinite for the last."""
-    return math.inf if index >= BINS - 1 else SHORTEST * 2.0 ** (index / PER_OCTAVE)
+    return (
+        math.inf
+        if index >= LATENCY_BINS - 1
+        else FIRST_BIN_SECONDS * 2.0 ** (index / BINS_PER_OCTAVE)
+    )
 
 
 def quantile(counts: Sequence[int], share: float) -> float | None:
@@ -60,7 +66,7 @@ def quantile(counts: Sequence[int], share: float) -> float | None:
         cumulated += count
         if cumulated >= share * total and cumulated > 0:
             return upper_edge(index)
-    return upper_edge(BINS - 1)
+    return upper_edge(LATENCY_BINS - 1)
 
 
 class ArchiveState(IntEnum):
@@ -78,7 +84,7 @@ _KINDS: Final[dict[str, Any]] = {
     "float": ctypes.c_double,
     "int": ctypes.c_int64,
     "Gap": ctypes.c_int64 * 8,
-    "Counts": ctypes.c_int64 * BINS,
+    "Counts": ctypes.c_int64 * LATENCY_BINS,
 }
 
 
@@ -114,7 +120,7 @@ class SharedState(ctypes.Structure):
         finished: 1 when the exchange has ended properly.
         motion_time: elapsed time of the last motion at its planned speed, s; NaN if unknown.
         rate: motion time per time, 1 at planned speed; NaN if unknown.
-        latencies: (`BINS`,) replies by their latency.
+        latencies: (`LATENCY_BINS`,) replies by their latency.
         archive_state: an `ArchiveState`.
 
     Raises:
@@ -184,7 +190,7 @@ def create() -> int:
     return create_memory("hil-control", ctypes.sizeof(SharedState))
 
 
-MAX_INTERVAL: Final = 0.5
+MAX_CALL_INTERVAL: Final = 0.5
 """Longest time between two calls that counts as silence, s; otherwise this process was held up."""
 
 
@@ -196,7 +202,7 @@ class HeartbeatMonitor:
     """
 
     def __init__(
-        self, heartbeat: Callable[[], float], *, max_interval: float = MAX_INTERVAL
+        self, heartbeat: Callable[[], float], *, max_interval: float = MAX_CALL_INTERVAL
     ) -> None:
         self._read = heartbeat
         self._max_interval = max_interval

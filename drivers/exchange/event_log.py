@@ -80,15 +80,15 @@ ExchangeEvent = (
 )
 
 
-CAPACITY: Final = 4 << 20
+CAPACITY_BYTES: Final = 4 << 20
 """Bytes, for some hundred refusals with their flight recorders, or 50 000 small events."""
 _HEADER_BYTES: Final = 256
 _FRAME: Final = struct.Struct("<IIQ")
-_HEAD = 8
-_TAIL = 16
+_HEAD_WORD = 8
+_TAIL_WORD = 16
 
 
-def create(capacity: int = CAPACITY) -> int:
+def create(capacity: int = CAPACITY_BYTES) -> int:
     """Return the descriptor of memory for a log of `capacity` bytes."""
     return create_memory("hil-events", _HEADER_BYTES + capacity)
 
@@ -128,13 +128,13 @@ class EventWriter(_Log):
         while end - self._tail > self._capacity:
             length = _FRAME.unpack(self._get(self._tail, _FRAME.size))[0]
             self._tail += _FRAME.size + length
-        self._words[_TAIL] = self._tail
+        self._words[_TAIL_WORD] = self._tail
         begin = self._head % self._capacity
         first = min(len(frame), self._capacity - begin)
         self._bytes[begin : begin + first] = frame[:first]
         self._bytes[: len(frame) - first] = frame[first:]
         self._head = end
-        self._words[_HEAD] = end
+        self._words[_HEAD_WORD] = end
 
 
 class EventReader(_Log):
@@ -142,17 +142,17 @@ class EventReader(_Log):
 
     def __init__(self, fd: int) -> None:
         super().__init__(fd)
-        self._position: int = self._words[_TAIL]
+        self._position: int = self._words[_TAIL_WORD]
         # Index of the next event; unknown if the first ones are overwritten already.
         self._expected: int | None = None if self._position else 0
         self.lost = 0
 
     def drain(self) -> list[ExchangeEvent]:
         """Return the events not read yet, in order."""
-        head = self._words[_HEAD]
-        begin = max(self._position, self._words[_TAIL])
+        head = self._words[_HEAD_WORD]
+        begin = max(self._position, self._words[_TAIL_WORD])
         copy = self._get(begin, head - begin)
-        valid = self._words[_TAIL]
+        valid = self._words[_TAIL_WORD]
         self._position = head
         events: list[ExchangeEvent] = []
         # If the writer lapped all that was copied, its oldest frame begins beyond the copy.

@@ -8,31 +8,31 @@ from typing import Final, NamedTuple
 
 from drivers.errors import TransportClosed
 from drivers.session import Session
-from drivers.states import HAS_SET_POINTS, State
+from drivers.states import STATES_WITH_SET_POINTS, State
 from drivers.transports.base import Transport
 from drivers.wire import Wire
 
-POLL: Final = 0.1
+POLL_PERIOD: Final = 0.1
 """Longest wait for a packet, s."""
 PEER_TIMEOUT: Final = 1.0
 """Silence of a sender before the init packet after which another may start the session, s."""
-MAX_LATE: Final = 2
+MAX_LATE_REPLIES: Final = 2
 """Consecutive late replies that do not stop a motion in open mode."""
-MAX_KINDS: Final = 64
+MAX_REPLIED_PACKETS: Final = 64
 """Most packets of one backlog that get a reply."""
 _MAX_BACKLOG: Final = 100_000
 """Most packets read in search of the newest, more than any kernel queue holds."""
 _COUNT_EVERY: Final = 100
 """Packets between two readings of the link's counters."""
-_LATE_READ: Final = 1.5
+_LATE_READ_PERIODS: Final = 1.5
 """Cycles between two packets read above which more than one may be queued."""
-_LONG_QUEUED: Final = 0.5
+_LONG_QUEUED_PERIODS: Final = 0.5
 """Cycles that a packet was queued above which the next may be queued too."""
-_BUNCHED: Final = 0.5
+_BUNCHED_PERIODS: Final = 0.5
 """Cycles between two arrivals below which these and others were delayed on their way."""
-_IMMEDIATE: Final = 0.1
+_IMMEDIATE_PERIODS: Final = 0.1
 """Cycles that the reception of a queued packet takes at most."""
-_OLD_BACKLOG: Final = 3.0
+_OLD_BACKLOG_PERIODS: Final = 3.0
 _OLD_BACKLOG_SECONDS: Final = 0.005
 """Age of the newest packet of a backlog, in cycles and at least in s, above which the queue must
 have been full when newer ones arrived."""
@@ -115,7 +115,7 @@ class ReceiveQueue:
         transport = self._transport
         session = self._session
         before = transport.now
-        packet = transport.receive(min(POLL, max(0.0, session.deadline - before)))
+        packet = transport.receive(min(POLL_PERIOD, max(0.0, session.deadline - before)))
         if packet is None:
             return ()
         now = transport.now
@@ -125,12 +125,12 @@ class ReceiveQueue:
         read_at = self._read_at
         self._read_at = now
         earliest = self._earliest_next
-        self._earliest_next = arrived + _BUNCHED * period
+        self._earliest_next = arrived + _BUNCHED_PERIODS * period
         if stamp is None:
-            queued = now - before <= _IMMEDIATE * period
+            queued = now - before <= _IMMEDIATE_PERIODS * period
         else:
-            queued = now - arrived > _LONG_QUEUED * period
-        delayed = queued or now - read_at > _LATE_READ * period or arrived < earliest
+            queued = now - arrived > _LONG_QUEUED_PERIODS * period
+        delayed = queued or now - read_at > _LATE_READ_PERIODS * period or arrived < earliest
         # While any peer is accepted, the queue may hold packets of several.
         if delayed and not _accepts_any_peer(session):
             return self._newest(self._arrival(packet, stamp, now), period)
@@ -170,11 +170,11 @@ class ReceiveQueue:
         if (
             len(arrivals) != 1
             or not arrivals[0].stamped
-            or self._session.state not in HAS_SET_POINTS
+            or self._session.state not in STATES_WITH_SET_POINTS
         ):
             return False
         age = self._transport.now - arrivals[0].arrived
-        return age > max(_OLD_BACKLOG * period, _OLD_BACKLOG_SECONDS)
+        return age > max(_OLD_BACKLOG_PERIODS * period, _OLD_BACKLOG_SECONDS)
 
 
 class _Backlog:
@@ -213,7 +213,7 @@ class _Backlog:
             if ahead(number, self._numbers[place]) <= _NUMBER_WINDOW:
                 self._drop(place)
                 break
-        if len(self.newest) >= MAX_KINDS:
+        if len(self.newest) >= MAX_REPLIED_PACKETS:
             self._drop(0)
         self.newest.append((kind, arrival))
         self._numbers.append(number)
@@ -261,7 +261,7 @@ def exchange(
     session: Session,
     *,
     ends_when: Callable[[], bool],
-    max_late: int = MAX_LATE,
+    max_late: int = MAX_LATE_REPLIES,
     before_packet: Callable[[Transport, Session, float], None] | None = None,
 ) -> None:
     """Reply to packets until the session ends, the link closes, or `ends_when()` is true.

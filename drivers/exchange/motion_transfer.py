@@ -18,7 +18,7 @@ from typing import Final
 from drivers.errors import RequestError
 from drivers.motion_source import MotionSource
 
-SMALLEST_MAPPED: Final = 4096
+MIN_MAPPED_BYTES: Final = 4096
 """Bytes from which on an array is mapped; smaller ones are copied and writeable."""
 _ALIGNMENT: Final = 64
 _SEALS: Final = fcntl.F_SEAL_SHRINK | fcntl.F_SEAL_GROW | fcntl.F_SEAL_WRITE | fcntl.F_SEAL_SEAL
@@ -32,7 +32,7 @@ def pack(source: MotionSource) -> int:
 
     def copied(buffer: pickle.PickleBuffer) -> bool:
         raw = buffer.raw()
-        if raw.nbytes < SMALLEST_MAPPED:
+        if raw.nbytes < MIN_MAPPED_BYTES:
             return True
         arrays.append(raw)
         return False
@@ -80,7 +80,7 @@ def unpack(fd: int) -> MotionSource:
     return source
 
 
-LONGEST_MESSAGE: Final = 1 << 16
+MAX_MESSAGE_BYTES: Final = 1 << 16
 """Bytes."""
 WITHDRAWN: Final = "it was withdrawn"
 """Reason of a refusal at the request of the supervisor."""

@@ -18,7 +18,7 @@ from drivers.errors import DriverError, RequestError
 from drivers.exchange import control, event_log
 from drivers.exchange.control import SharedState
 from drivers.exchange.event_log import EventReader, ExchangeEvent
-from drivers.exchange.motion_transfer import LONGEST_MESSAGE, READ, WITHDRAWN, hand_over
+from drivers.exchange.motion_transfer import MAX_MESSAGE_BYTES, READ, WITHDRAWN, hand_over
 from drivers.exchange.realtime import RealTimeReport, RealTimeSettings
 from drivers.guard import GuardLimits
 from drivers.motion_source import MotionSource
@@ -66,7 +66,7 @@ START_TIMEOUT: Final = 60.0
 """Time until the process has opened its link, s; imports may be slow on a cold disk."""
 ANSWER_TIMEOUT: Final = 5.0
 """Time until a motion has been read, and again until it is accepted or refused, s."""
-_POLL: Final = 0.1
+_POLL_PERIOD: Final = 0.1
 
 
 class ExchangeProcess:
@@ -235,8 +235,8 @@ class ExchangeProcess:
         while True:
             self.send_heartbeat()
             remaining = end - time.monotonic()
-            status = self._process.wait(max(0.0, min(remaining, _POLL)))
-            if status is not None or remaining <= _POLL:
+            status = self._process.wait(max(0.0, min(remaining, _POLL_PERIOD)))
+            if status is not None or remaining <= _POLL_PERIOD:
                 return status
 
     def terminate(self) -> None:
@@ -271,11 +271,11 @@ class ExchangeProcess:
     def _receive(self, timeout: float, poll: Callable[[], None] = lambda: None) -> Any:
         """Receive the next message of the exchange; `poll` is called ten times a second."""
         end = time.monotonic() + timeout
-        self._channel.settimeout(_POLL)
+        self._channel.settimeout(_POLL_PERIOD)
         while True:
             self.send_heartbeat()
             try:
-                message = self._channel.recv(LONGEST_MESSAGE)
+                message = self._channel.recv(MAX_MESSAGE_BYTES)
             except TimeoutError:
                 if time.monotonic() < end:
                     poll()

@@ -18,7 +18,7 @@ _MCL_CURRENT = 1
 _MCL_FUTURE = 2
 _M_TRIM_THRESHOLD = -1
 _M_MMAP_MAX = -4
-_HEAP: Final = 32 << 20
+_HEAP_RESERVE_BYTES: Final = 32 << 20
 """Bytes of heap allocated, and so locked, before the first cycle."""
 _open_files: list[int] = []
 
@@ -111,7 +111,7 @@ def _lock_memory(refused: list[str]) -> Literal["all", "in use", "nothing"]:
     if finite:
         refused.append(f"only memory in use now is locked (the limit is {hard} bytes); {remedy}")
         return "in use"
-    reserve = bytearray(_HEAP)
+    reserve = bytearray(_HEAP_RESERVE_BYTES)
     del reserve
     return "all"
 

@@ -42,7 +42,7 @@ from drivers.exchange.event_log import (
     ExchangeEvent,
     Leaving,
 )
-from drivers.exchange.loop import POLL
+from drivers.exchange.loop import POLL_PERIOD
 from drivers.exchange.motion_transfer import READ, WITHDRAWN, Inbox, unpack
 from drivers.motion_source import MotionSource, progress_of
 from drivers.session import Session
@@ -58,15 +58,15 @@ FINISH_LINGER: Final = 1.0
 assumed to have closed."""
 MAX_LINGER: Final = 10.0
 """Time after the axes closed first from which on axes that open again do not delay the end, s."""
-ARM_MOVED: Final = 5e-4
+MIN_ARM_MOVEMENT: Final = 5e-4
 """Change of a joint position that counts as motion of the arm, rad: more than an encoder's noise,
 less than any motion moves in a second."""
-ARM_RESTS: Final = 1.0
+ARM_REST_SECONDS: Final = 1.0
 """Time without motion after which the arm is at rest, s."""
-_SLOW_EVERY: Final = 32
+_CALLS_PER_SLOW_CHECK: Final = 32
 """Packets between two updates of what need not be updated in each cycle."""
 _POSITION: Final = MEASURED.index("position")
-_MAY_BE_OPEN: Final = frozenset(
+_STATES_MAYBE_OPEN: Final = frozenset(
     {State.OPENING, State.OPEN, State.EXITING, State.FREEZING, State.FAULTED}
 )
 _COUNTERS: Final = ("replied", "missed", "duplicates", "stale", "rejected", "refused")
@@ -160,9 +160,11 @@ class CommandHandler:
         self._replied_at = began = time.monotonic()
         # Time in which the whole computer stood still must not count as silence.
         self._supervisor = HeartbeatMonitor(
-            lambda: control.supervisor_heartbeat or began, max_interval=POLL
+            lambda: control.supervisor_heartbeat or began, max_interval=POLL_PERIOD
         )
-        self._archive = HeartbeatMonitor(lambda: control.archive_heartbeat, max_interval=POLL)
+        self._archive = HeartbeatMonitor(
+            lambda: control.archive_heartbeat, max_interval=POLL_PERIOD
+        )
         self._archive_silence = 0.0
         self._closed_since = math.inf
         self._closed_first = math.inf
@@ -203,7 +205,7 @@ class CommandHandler:
         session = self._session
         self._calls += 1
         self._archive_silence = self._archive.silence()
-        if self._calls % _SLOW_EVERY == 0 and self._inbox.closed():
+        if self._calls % _CALLS_PER_SLOW_CHECK == 0 and self._inbox.closed():
             self._detach("the supervisor closed its end")
         if control.stop_count != self._stops:
             self._stops = control.stop_count
@@ -343,13 +345,13 @@ class CommandHandler:
         control.state = session.state
         control.cycle = int(self._ring.cycle[(self._rows - 1) % self._ring.capacity])
         control.interval = session.interval
-        if self._calls % _SLOW_EVERY == 0 or session.counters.replied == self._replied:
+        if self._calls % _CALLS_PER_SLOW_CHECK == 0 or session.counters.replied == self._replied:
             self._publish_counters()
             self._watch_arm(now)
         if session.counters.replied != self._replied:
             self._replied = session.counters.replied
             self._replied_at = now
-        self._open = session.state in _MAY_BE_OPEN and now - self._replied_at < FINISH_LINGER
+        self._open = session.state in _STATES_MAYBE_OPEN and now - self._replied_at < FINISH_LINGER
         if self._open:
             self._closed_since = math.inf
         else:
@@ -360,7 +362,7 @@ class CommandHandler:
     def _watch_arm(self, now: float) -> None:
         """Record motion of the arm: with closed axes the controller's own program may move it."""
         position = self._ring.measured[(self._rows - 1) % self._ring.capacity, _POSITION]
-        if (np.abs(position - self._arm) > ARM_MOVED).any():
+        if (np.abs(position - self._arm) > MIN_ARM_MOVEMENT).any():
             self._arm_moved_at = now
             np.copyto(self._arm, position)
 
@@ -392,7 +394,7 @@ class CommandHandler:
         Without a supervisor packets get replies as long as the arm moves, without limit: there is
         nothing to react to what the controller does without replies.
         """
-        if self._open or (self._detached and now - self._arm_moved_at < ARM_RESTS):
+        if self._open or (self._detached and now - self._arm_moved_at < ARM_REST_SECONDS):
             return False
         lingered = now - self._closed_since >= self._linger
         return lingered or now - self._closed_first >= MAX_LINGER

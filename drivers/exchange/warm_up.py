@@ -19,13 +19,14 @@ from drivers.states import State
 from drivers.transports.base import PollingTransport, Transport
 from drivers.wire import ControllerProtocol
 
-_CYCLES: Final = 200
+_WARM_UP_CYCLES: Final = 200
 """Cycles before the first packet."""
-LEAD: Final = 3e-4
+LEAD_SECONDS: Final = 3e-4
 """Time before the next packet at which such a cycle begins, s: it takes some 0.15 ms, and the
 packet may come some 0.05 ms early."""
-_MOST_SLOW: Final = 3
-"""Cycles in a row that took longer than `LEAD`: a processor on which they would delay replies."""
+_MAX_SLOW_CYCLES: Final = 3
+"""Cycles in a row that took longer than `LEAD_SECONDS`: a processor on which they would delay
+replies."""
 
 
 def may_poll(scheduling: str, processors: set[int]) -> bool:
@@ -76,7 +77,8 @@ class WarmUp:
     Attributes:
         session: open unless something is wrong.
         reply: the last one.
-        polls: from this cycle to `LEAD` after the packet is due the link is polled. False at first.
+        polls: from this cycle to `LEAD_SECONDS` after the packet is due the link is polled. False
+        at first.
     """
 
     def __init__(
@@ -103,7 +105,7 @@ class WarmUp:
         self.session.reply(self._packets.first(), 0.0)
         self.session.request(_Rest(position))
         self.cycle(opened=False)
-        for _ in range(_CYCLES):
+        for _ in range(_WARM_UP_CYCLES):
             self.cycle()
         self.session.events()
 
@@ -120,20 +122,20 @@ class WarmUp:
         """Run one cycle shortly before the packet that follows one which arrived at this time.
 
         Only in open mode, and where the link can wait for a packet without reading it: one that
-        comes early is delayed by no more than this cycle. None is run any more once `_MOST_SLOW` in
-        a row were not at their end when the packet was due.
+        comes early is delayed by no more than this cycle. None is run any more once
+        `_MAX_SLOW_CYCLES` in a row were not at their end when the packet was due.
         """
-        if self._slow == _MOST_SLOW or session.state is not State.OPEN:
+        if self._slow == _MAX_SLOW_CYCLES or session.state is not State.OPEN:
             return
         if not isinstance(transport, PollingTransport):
             return
         due = arrived + self._period
-        remaining = due - LEAD - transport.now
+        remaining = due - LEAD_SECONDS - transport.now
         if remaining <= 0.0 or transport.wait(remaining):
             return
         begun = transport.now
         with suppress(Exception):  # whatever it may be, the real session goes on
             self.cycle()
-        self._slow = self._slow + 1 if transport.now - begun > LEAD else 0
+        self._slow = self._slow + 1 if transport.now - begun > LEAD_SECONDS else 0
         if self.polls:
-            transport.polls_until = due + LEAD
+            transport.polls_until = due + LEAD_SECONDS

@@ -15,9 +15,9 @@ from drivers.errors import TransportClosed
 
 Direction = Literal["to_pc", "to_controller"]
 
-OVERTAKEN_BY: Final = 1.25
+OVERTAKING_DELAY_CYCLES: Final = 1.25
 """Delay of a packet that is overtaken by the next, in cycles."""
-MOST_CYCLES: Final = 1_000_000_000
+MAX_CYCLES: Final = 1_000_000_000
 """Largest cycle and count of a fault: more than eleven days at 1 ms."""
 
 
@@ -108,7 +108,7 @@ class FaultyLink:
                 case Delay():
                     delay += fault.seconds + fault.cycles * self._period
                 case Reorder():
-                    delay += OVERTAKEN_BY * self._period
+                    delay += OVERTAKING_DELAY_CYCLES * self._period
                 case Duplicate():
                     copies += 1
                 case Corrupt():

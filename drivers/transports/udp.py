@@ -29,13 +29,13 @@ from drivers.transports.base import (
     TransportSpec,
 )
 
-LONGEST: Final = 1500
+MAX_PACKET_BYTES: Final = 1500
 """Bytes of the longest datagram accepted (the buffer of the manufacturer's library)."""
-PRIORITY: Final = 6
+SOCKET_PRIORITY: Final = 6
 """SO_PRIORITY: the highest without privileges."""
 TYPE_OF_SERVICE: Final = 0x28
 """IP_TOS of the manufacturer's library (class AF11)."""
-BUSY_POLL: Final = 50
+BUSY_POLL_US: Final = 50
 """Time that the kernel may poll the network device before it sleeps, µs."""
 # Constants of asm-generic/socket.h that the socket module lacks.
 _SO_TIMESTAMPNS: Final = 35
@@ -45,9 +45,9 @@ _MEMINFO: Final = struct.Struct("=9I")
 _TIMEVAL: Final = struct.Struct("@qq")
 _TIMESPEC: Final = struct.Struct("@qq")
 _CONTROL_SPACE: Final = socket.CMSG_SPACE(_TIMESPEC.size)
-_CLOCK_SET: Final = 1e-3
+_MAX_CLOCK_STEP: Final = 1e-3
 """Change of the difference between wall and monotonic clock that means that one was set, s."""
-MAX_FOREIGN: Final = 1000
+MAX_FOREIGN_PACKETS: Final = 1000
 """Datagrams of other hosts skipped after the time-out, more than a queue usually holds."""
 
 
@@ -141,7 +141,8 @@ class UdpTransport:
     def receive(self, timeout: float) -> bytes | None:
         """Return the next datagram of the peer, or None after `timeout` s without one.
 
-        A queued one is found behind up to `MAX_FOREIGN` of other hosts, also with a time-out of 0.
+        A queued one is found behind up to `MAX_FOREIGN_PACKETS` of other hosts, also with a
+        time-out of 0.
         """
         end = time.monotonic() + timeout
         foreign = 0
@@ -149,7 +150,9 @@ class UdpTransport:
             polls = time.monotonic() < self.polls_until
             flags = socket.MSG_DONTWAIT if polls else self._flags(timeout)
             try:
-                packet, control, _, sender = self._receive(LONGEST + 1, _CONTROL_SPACE, flags)
+                packet, control, _, sender = self._receive(
+                    MAX_PACKET_BYTES + 1, _CONTROL_SPACE, flags
+                )
             except BlockingIOError:
                 if polls:
                     # To threads of the same priority, such as the one that serves the network
@@ -163,14 +166,16 @@ class UdpTransport:
                 continue
             except OSError as error:
                 raise TransportClosed(self._closed_reason(error)) from error
-            if (sender == self._peer and len(packet) <= LONGEST) or self._accepts(packet, sender):
+            if (sender == self._peer and len(packet) <= MAX_PACKET_BYTES) or self._accepts(
+                packet, sender
+            ):
                 self.arrived = self._arrival(control)
                 return packet
             # Foreign datagrams do not extend the wait, but those queued behind them are read.
             timeout = max(0.0, end - time.monotonic())
             if timeout == 0.0:
                 foreign += 1
-                if foreign > MAX_FOREIGN:
+                if foreign > MAX_FOREIGN_PACKETS:
                     return None
 
     def wait(self, timeout: float) -> bool:
@@ -241,13 +246,13 @@ class UdpTransport:
     def _accepts(self, packet: bytes, sender: tuple[str, int]) -> bool:
         if sender != self._peer:
             # A stray short datagram must not select the port.
-            first = self._peer is None and HEADER_LENGTH <= len(packet) <= LONGEST
+            first = self._peer is None and HEADER_LENGTH <= len(packet) <= MAX_PACKET_BYTES
             if sender[0] != self._host or not first:
                 from_controller = self._peer is None and sender[0] == self._host
                 self._count("malformed" if from_controller else "foreign")
                 return False
             self._peer = sender
-        if len(packet) > LONGEST:
+        if len(packet) > MAX_PACKET_BYTES:
             self._count("malformed")
             return False
         return True
@@ -261,7 +266,7 @@ class UdpTransport:
         now = time.monotonic()
         offset = self._offset
         self._offset = wall - now
-        if abs(self._offset - offset) > _CLOCK_SET:
+        if abs(self._offset - offset) > _MAX_CLOCK_STEP:
             arrived = now
         else:
             # The queue is in order: an older stamp means that the clock was set since.
@@ -335,8 +340,8 @@ def _set_options(udp: socket.socket) -> tuple[str, ...]:
     for name, level, option, value in (
         # IP_TOS comes first because it sets a priority of its own.
         ("IP_TOS", socket.IPPROTO_IP, socket.IP_TOS, TYPE_OF_SERVICE),
-        ("SO_PRIORITY", socket.SOL_SOCKET, socket.SO_PRIORITY, PRIORITY),
-        ("SO_BUSY_POLL", socket.SOL_SOCKET, _SO_BUSY_POLL, BUSY_POLL),
+        ("SO_PRIORITY", socket.SOL_SOCKET, socket.SO_PRIORITY, SOCKET_PRIORITY),
+        ("SO_BUSY_POLL", socket.SOL_SOCKET, _SO_BUSY_POLL, BUSY_POLL_US),
         ("SO_TIMESTAMPNS", socket.SOL_SOCKET, _SO_TIMESTAMPNS, 1),
     ):
         try:

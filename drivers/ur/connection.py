@@ -12,12 +12,12 @@ from drivers.errors import TransportClosed
 from drivers.transports.base import TransportError
 from drivers.ur import rtde
 
-TIMEOUT: Final = 5.0
+CONNECT_TIMEOUT: Final = 5.0
 """Longest wait for a connection, and for a reply to a request, s."""
-_FASTEST: Final = {3: 125.0}
+_RATE_OF_MAJOR_VERSION: Final = {3: 125.0}
 """Frames per second by major version of the software (CB3)."""
-_E_SERIES: Final = 500.0
-_PIECE: Final = 1 << 16
+_E_SERIES_RATE: Final = 500.0
+_READ_BYTES: Final = 1 << 16
 
 
 class RtdeAddress(Protocol):
@@ -35,7 +35,7 @@ class RtdeAddress(Protocol):
 def connected(to: RtdeAddress) -> socket.socket:
     """Return a connection to the RTDE port of a controller, or raise TransportError."""
     try:
-        return socket.create_connection((to.host, to.port), TIMEOUT)
+        return socket.create_connection((to.host, to.port), CONNECT_TIMEOUT)
     except (OSError, UnicodeError) as error:
         remedy = (
             "check address and cable, and that RTDE is enabled at the controller (Settings, "
@@ -82,9 +82,9 @@ class RtdeConnection:
         self.splitter = rtde.FrameSplitter()
         self._clock = clock
         self.frames: deque[tuple[float, rtde.RtdeFrame]] = deque()
-        connection.settimeout(TIMEOUT)
+        connection.settimeout(CONNECT_TIMEOUT)
         self._negotiate()
-        self.frequency = _FASTEST.get(self.version.major, _E_SERIES)
+        self.frequency = _RATE_OF_MAJOR_VERSION.get(self.version.major, _E_SERIES_RATE)
 
     def _negotiate(self) -> None:
         self._send(rtde.version_request())
@@ -142,18 +142,18 @@ class RtdeConnection:
 
     def _reply(self, kind: rtde.FrameType) -> bytes:
         """Return the payload of the next frame of a kind; others are stored in `frames`."""
-        deadline = self._clock() + TIMEOUT
+        deadline = self._clock() + CONNECT_TIMEOUT
         while self._clock() < deadline:
             arrived = self._receive()
             replies = [frame for _, frame in arrived if frame.kind == kind]
             self.frames += [(at, frame) for at, frame in arrived if frame.kind != kind]
             if replies:
                 return replies[0].payload
-        raise TransportClosed(f"no reply to the request {chr(kind)!r} within {TIMEOUT:g} s")
+        raise TransportClosed(f"no reply to the request {chr(kind)!r} within {CONNECT_TIMEOUT:g} s")
 
     def _receive(self) -> list[tuple[float, rtde.RtdeFrame]]:
         """Return the frames of the next piece of the stream, with the time of its arrival."""
-        data = self._socket.recv(_PIECE)
+        data = self._socket.recv(_READ_BYTES)
         now = self._clock()
         if not data:
             cut = self.splitter.unfinished

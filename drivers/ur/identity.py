@@ -21,7 +21,7 @@ from drivers.arrays import Array
 
 PRIMARY_PORT: Final = 30001
 DASHBOARD_PORT: Final = 29999
-TIMEOUT: Final = 2.0
+IDENTITY_TIMEOUT: Final = 2.0
 """Longest wait for either of them, s."""
 MODELS: Final[Mapping[int, str]] = {
     1: "UR5", 2: "UR10", 3: "UR3", 4: "UR16", 7: "UR20", 8: "UR30"
@@ -29,12 +29,12 @@ MODELS: Final[Mapping[int, str]] = {
 """Names of arms by their type; those of the e-Series end in e, except UR20 and UR30."""
 _WITHOUT_E: Final = (7, 8)
 _PACKAGE: Final = struct.Struct(">IB")
-_ROBOT_STATE: Final = 16
-_KINEMATICS: Final = 5
-_CONFIGURATION: Final = 6
+_ROBOT_STATE_PACKAGE: Final = 16
+_KINEMATICS_PART: Final = 5
+_CONFIGURATION_PART: Final = 6
 _KINEMATICS_SIZE: Final = 6 * 4 + 4 * 6 * 8
 _CONFIGURATION_SIZE: Final = 4 * 6 * 8 + 5 * 8 + 4 * 6 * 8 + 4 * 4
-_LARGEST: Final = 1 << 20
+_MAX_PACKAGE_BYTES: Final = 1 << 20
 """Bytes of a package; longer ones are not of this interface."""
 
 
@@ -114,7 +114,7 @@ def with_state(identity: ArmIdentity, state: bytes) -> ArmIdentity:
         ValueError: the parts are not those of this interface.
     """
     parts = dict(_parts(state))
-    if (data := parts.get(_CONFIGURATION)) is not None:
+    if (data := parts.get(_CONFIGURATION_PART)) is not None:
         if len(data) < _CONFIGURATION_SIZE:
             raise ValueError(f"a configuration of {len(data)} bytes")
         numbers = _doubles(data, 53)
@@ -126,7 +126,7 @@ def with_state(identity: ArmIdentity, state: bytes) -> ArmIdentity:
             identity, kind=kind, lower=limits[0], upper=limits[1],
             velocity=rates[0], acceleration=rates[1], nominal=DhParameters(theta, a, d, alpha),
         )  # fmt: skip
-    if (data := parts.get(_KINEMATICS)) is not None:
+    if (data := parts.get(_KINEMATICS_PART)) is not None:
         if len(data) < _KINEMATICS_SIZE:
             raise ValueError(f"kinematics of {len(data)} bytes")
         theta, a, d, alpha = _doubles(data[24:], 24).reshape(4, 6)
@@ -181,17 +181,17 @@ def _doubles(data: bytes, count: int) -> Array:
 
 def _read_state(host: str, port: int) -> bytes:
     """Return the first state with a configuration; it comes within a tenth of a second."""
-    deadline = time.monotonic() + TIMEOUT
-    with socket.create_connection((host, port), TIMEOUT) as connection:
-        connection.settimeout(TIMEOUT)
+    deadline = time.monotonic() + IDENTITY_TIMEOUT
+    with socket.create_connection((host, port), IDENTITY_TIMEOUT) as connection:
+        connection.settimeout(IDENTITY_TIMEOUT)
         while time.monotonic() < deadline:
             length, kind = _PACKAGE.unpack(_exactly(connection, _PACKAGE.size))
-            if not _PACKAGE.size <= length <= _LARGEST:
+            if not _PACKAGE.size <= length <= _MAX_PACKAGE_BYTES:
                 raise ValueError(f"a package of {length} bytes")
             payload = _exactly(connection, length - _PACKAGE.size)
-            if kind == _ROBOT_STATE and _CONFIGURATION in dict(_parts(payload)):
+            if kind == _ROBOT_STATE_PACKAGE and _CONFIGURATION_PART in dict(_parts(payload)):
                 return payload
-    raise TimeoutError(f"no configuration within {TIMEOUT:g} s")
+    raise TimeoutError(f"no configuration within {IDENTITY_TIMEOUT:g} s")
 
 
 def _exactly(connection: socket.socket, size: int) -> bytes:
@@ -206,15 +206,17 @@ def _exactly(connection: socket.socket, size: int) -> bytes:
 
 def _ask_dashboard(host: str, port: int) -> dict[str, str]:
     """Return the reply to each request."""
-    with socket.create_connection((host, port), TIMEOUT) as connection:
-        connection.settimeout(TIMEOUT)
+    with socket.create_connection((host, port), IDENTITY_TIMEOUT) as connection:
+        connection.settimeout(IDENTITY_TIMEOUT)
         with connection.makefile("rwb") as stream:
-            stream.readline(_LARGEST)  # the greeting
+            stream.readline(_MAX_PACKAGE_BYTES)  # the greeting
             replies = {}
             for request in REQUESTS:
                 stream.write(f"{request}\n".encode())
                 stream.flush()
-                replies[request] = stream.readline(_LARGEST).decode("utf-8", "replace").strip()
+                replies[request] = (
+                    stream.readline(_MAX_PACKAGE_BYTES).decode("utf-8", "replace").strip()
+                )
             with suppress(OSError):
                 stream.write(b"quit\n")
                 stream.flush()

@@ -11,13 +11,13 @@ from collections.abc import Iterator
 from typing import Final
 
 _PACKAGE: Final = struct.Struct(">IB")
-_MESSAGE: Final = 20
+_MESSAGE_PACKAGE: Final = 20
 _CONTENT: Final = struct.Struct(">QbB")
-_LARGEST: Final = 1 << 20
-_KEY: Final = 7
-_ERROR: Final = 6
-_EXCEPTION: Final = 10
-_REPORTED: Final = 2
+_MAX_PACKAGE_BYTES: Final = 1 << 20
+_KEY_MESSAGE: Final = 7
+_ERROR_MESSAGE: Final = 6
+_EXCEPTION_MESSAGE: Final = 10
+_MIN_REPORTED_LEVEL: Final = 2
 """Levels of an error code from which it is reported: 0 and 1 are information."""
 
 
@@ -30,13 +30,13 @@ class MessageReader:
     def feed(self, data: bytes) -> list[str]:
         """Return the texts that these bytes complete."""
         self._rest += data
-        return [text for kind, content in self._packages() if kind == _MESSAGE
+        return [text for kind, content in self._packages() if kind == _MESSAGE_PACKAGE
                 if (text := message_text(content))]  # fmt: skip
 
     def _packages(self) -> Iterator[tuple[int, bytes]]:
         while len(self._rest) >= _PACKAGE.size:
             length, kind = _PACKAGE.unpack_from(self._rest)
-            if not _PACKAGE.size <= length <= _LARGEST:
+            if not _PACKAGE.size <= length <= _MAX_PACKAGE_BYTES:
                 self._rest.clear()  # no primary interface: what follows means nothing
                 return
             if len(self._rest) < length:
@@ -52,16 +52,16 @@ def message_text(content: bytes) -> str:
         return ""
     _, _, kind = _CONTENT.unpack_from(content)
     body = content[_CONTENT.size :]
-    if kind == _EXCEPTION and len(body) > 8:
+    if kind == _EXCEPTION_MESSAGE and len(body) > 8:
         line, column = struct.unpack_from(">ii", body)
         return f"line {line}, column {column} of the program: {_decoded(body[8:])}"
-    if kind == _ERROR and len(body) >= 20:
+    if kind == _ERROR_MESSAGE and len(body) >= 20:
         code, argument, level = struct.unpack_from(">iii", body)
-        if level < _REPORTED:
+        if level < _MIN_REPORTED_LEVEL:
             return ""
         text = _decoded(body[20:])
         return f"C{code}A{argument}{': ' if text else ''}{text}"
-    if kind == _KEY and len(body) > 9:
+    if kind == _KEY_MESSAGE and len(body) > 9:
         code, argument, title = struct.unpack_from(">iiB", body)
         text = _decoded(body[9 + title :])
         return f"{_decoded(body[9 : 9 + title])}: {text}" if text else ""

@@ -19,12 +19,19 @@ from numpy.typing import NDArray
 
 from drivers.errors import TransportClosed
 from drivers.ur import rtde
-from drivers.ur.connection import TIMEOUT, RtdeAddress, RtdeConnection, connected, no_reply, reason
+from drivers.ur.connection import (
+    CONNECT_TIMEOUT,
+    RtdeAddress,
+    RtdeConnection,
+    connected,
+    no_reply,
+    reason,
+)
 from drivers.ur.outputs import OPTIONAL, REQUIRED
 
-SILENCE: Final = 2.0
+SILENCE_TIMEOUT: Final = 2.0
 """Time without a frame after which the controller is lost, s."""
-_MOST_WAITING: Final = 200_000
+_MAX_WAITING_FRAMES: Final = 200_000
 """Frames that may wait to be fetched, 400 s at 500 Hz."""
 
 
@@ -80,7 +87,7 @@ class RtdeReader(RtdeConnection):
     def start(self) -> None:
         """Start the outputs, and the thread that reads them; see `request_start`."""
         self.request_start()
-        self._socket.settimeout(SILENCE)
+        self._socket.settimeout(SILENCE_TIMEOUT)
         self._thread = threading.Thread(target=self._read, name="rtde", daemon=True)
         self._thread.start()
 
@@ -114,7 +121,7 @@ class RtdeReader(RtdeConnection):
             self._socket.shutdown(socket.SHUT_RDWR)
         self._socket.close()
         if self._thread is not None:
-            self._thread.join(TIMEOUT)
+            self._thread.join(CONNECT_TIMEOUT)
 
     def __enter__(self) -> Self:
         return self
@@ -125,14 +132,14 @@ class RtdeReader(RtdeConnection):
     def _read(self) -> None:
         """Store frames until the connection ends."""
         try:
-            while len(self.frames) < _MOST_WAITING:
+            while len(self.frames) < _MAX_WAITING_FRAMES:
                 frames = self._receive()
                 with self._news:
                     self.frames += frames
                     self._news.notify()
             raise TransportClosed("the frames were not fetched: this PC is too slow")
         except TimeoutError:
-            silent = TransportClosed(f"the controller was silent for {SILENCE:g} s")
+            silent = TransportClosed(f"the controller was silent for {SILENCE_TIMEOUT:g} s")
             self._end(silent)
         except OSError as error:
             self._end(TransportClosed(f"the connection broke ({reason(error)})"))

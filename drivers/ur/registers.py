@@ -11,34 +11,43 @@ from __future__ import annotations
 from enum import IntEnum
 from typing import Final
 
-FIRST: Final = 24
+FIRST_REGISTER: Final = 24
 N_JOINTS: Final = 6
-POSITIONS: Final = tuple(range(FIRST, FIRST + N_JOINTS))
+ANGLE_REGISTERS: Final = tuple(range(FIRST_REGISTER, FIRST_REGISTER + N_JOINTS))
 """Float registers of the set-point, controller angles [rad]; in the output the one used."""
-CHECK: Final = FIRST + N_JOINTS
+CHECK_REGISTER: Final = FIRST_REGISTER + N_JOINTS
 """Float register of the sum of set-point and number, so that no half of a frame is used."""
-NUMBER: Final = FIRST
+NUMBER_REGISTER: Final = FIRST_REGISTER
 """Integer register: number of the set-point; as an output, of the set-point used last."""
-DEMAND: Final = FIRST + 1
+DEMAND_REGISTER: Final = FIRST_REGISTER + 1
 """Input: integer register of a `Demand`."""
-STAGE: Final = FIRST + 1
+STAGE_REGISTER: Final = FIRST_REGISTER + 1
 """Output: integer register of a `Stage`."""
-UNUSED: Final = FIRST + 2
+UNUSED_REGISTER: Final = FIRST_REGISTER + 2
 """Output: cycles without a new set-point since the program began."""
-TOKEN: Final = FIRST + 3
+TOKEN_REGISTER: Final = FIRST_REGISTER + 3
 """Output: number of the program, which differs from that of any other."""
-ENDING: Final = FIRST + 4
+ENDING_REGISTER: Final = FIRST_REGISTER + 4
 """Output: an `Ending`."""
 
 INPUTS: Final = (
-    f"input_int_register_{NUMBER}",
-    f"input_int_register_{DEMAND}",
-    *(f"input_double_register_{register}" for register in (*POSITIONS, CHECK)),
+    f"input_int_register_{NUMBER_REGISTER}",
+    f"input_int_register_{DEMAND_REGISTER}",
+    *(f"input_double_register_{register}" for register in (*ANGLE_REGISTERS, CHECK_REGISTER)),
 )
 """Inputs of one frame, in its order."""
 OUTPUTS: Final = (
-    *(f"output_int_register_{register}" for register in (NUMBER, STAGE, UNUSED, TOKEN, ENDING)),
-    *(f"output_double_register_{register}" for register in POSITIONS),
+    *(
+        f"output_int_register_{register}"
+        for register in (
+            NUMBER_REGISTER,
+            STAGE_REGISTER,
+            UNUSED_REGISTER,
+            TOKEN_REGISTER,
+            ENDING_REGISTER,
+        )
+    ),
+    *(f"output_double_register_{register}" for register in ANGLE_REGISTERS),
 )
 
 

@@ -26,12 +26,12 @@ from drivers.errors import DriverError, PacketError
 PORT: Final = 30004
 VERSION: Final = 2
 """Of the protocol, that has a frequency and numbered recipes."""
-LONGEST_NAMES: Final = 2048
+MAX_NAME_BYTES: Final = 2048
 """Bytes of the list of names in a request."""
-LONGEST_TEXT: Final = 255
+MAX_TEXT_BYTES: Final = 255
 """Bytes of a line of text from the controller."""
 _HEADER: Final = struct.Struct(">HB")
-LONGEST: Final = 0xFFFF
+MAX_FRAME_BYTES: Final = 0xFFFF
 """Bytes of the longest frame, header included."""
 
 
@@ -101,8 +101,8 @@ def frame(kind: FrameType, payload: bytes = b"") -> bytes:
         ValueError: the payload is longer than a frame can be.
     """
     length = _HEADER.size + len(payload)
-    if length > LONGEST:
-        raise ValueError(f"a frame of {length} bytes; at most {LONGEST} are possible")
+    if length > MAX_FRAME_BYTES:
+        raise ValueError(f"a frame of {length} bytes; at most {MAX_FRAME_BYTES} are possible")
     return _HEADER.pack(length, kind) + payload
 
 
@@ -178,8 +178,8 @@ def outputs_request(frequency: float, names: Sequence[str]) -> bytes:
         ValueError: the names are too long together.
     """
     joined = ",".join(names).encode("ascii")
-    if len(joined) > LONGEST_NAMES:
-        raise ValueError(f"{len(joined)} bytes of names; at most {LONGEST_NAMES} are possible")
+    if len(joined) > MAX_NAME_BYTES:
+        raise ValueError(f"{len(joined)} bytes of names; at most {MAX_NAME_BYTES} are possible")
     return frame(FrameType.OUTPUTS, struct.pack(">d", frequency) + joined)
 
 
@@ -270,7 +270,7 @@ class ControllerText:
 
 def text_frame(message: str, source: str, level: int = 3) -> bytes:
     """Return a frame with a line of text, cut to the length that a frame can have."""
-    words = (message.encode()[:LONGEST_TEXT], source.encode()[:LONGEST_TEXT])
+    words = (message.encode()[:MAX_TEXT_BYTES], source.encode()[:MAX_TEXT_BYTES])
     packed = b"".join(bytes([len(word)]) + word for word in words)
     return frame(FrameType.TEXT, packed + bytes([level]))
 

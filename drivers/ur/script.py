@@ -25,39 +25,39 @@ from string import Template
 from typing import Final
 
 from drivers.ur.registers import (
-    CHECK,
-    DEMAND,
-    ENDING,
-    NUMBER,
-    POSITIONS,
-    STAGE,
-    TOKEN,
-    UNUSED,
+    ANGLE_REGISTERS,
+    CHECK_REGISTER,
+    DEMAND_REGISTER,
+    ENDING_REGISTER,
+    NUMBER_REGISTER,
+    STAGE_REGISTER,
+    TOKEN_REGISTER,
+    UNUSED_REGISTER,
     Demand,
     Ending,
     Stage,
 )
 
-STARTING: Final = 500
+STARTING_CYCLES: Final = 500
 """Cycles for which the program waits for the first set-point."""
-CONFIRMED: Final = 100
+MIN_CONFIRMED_SET_POINTS: Final = 100
 """Set-points in a row that it must have received before it says that it streams."""
 START_DISTANCE: Final = 1e-3
 """Largest distance of the first set-point from where the arm rests [rad]."""
-_WHOLE: Final = 1e-7
+_CHECKSUM_TOLERANCE: Final = 1e-7
 """Largest difference of a frame from its sum; single registers differ by more."""
-_STILL: Final = 1e-6
+_REST_TOLERANCE: Final = 1e-6
 """Step of a joint above which the arm is to move [rad]."""
 _TEMPLATE: Final = Template(Path(__file__).with_name("stream.urscript").read_text("ascii"))
 _REGISTERS: Final = {
-    **{f"q{joint}": register for joint, register in enumerate(POSITIONS)},
-    "number": NUMBER,
-    "demand": DEMAND,
-    "check": CHECK,
-    "stage": STAGE,
-    "unused": UNUSED,
-    "token_register": TOKEN,
-    "ending": ENDING,
+    **{f"q{joint}": register for joint, register in enumerate(ANGLE_REGISTERS)},
+    "number": NUMBER_REGISTER,
+    "demand": DEMAND_REGISTER,
+    "check": CHECK_REGISTER,
+    "stage": STAGE_REGISTER,
+    "unused": UNUSED_REGISTER,
+    "token_register": TOKEN_REGISTER,
+    "ending": ENDING_REGISTER,
 }
 _CODES: Final = {
     f"{prefix}_{code.name.lower()}": int(code)
@@ -96,8 +96,8 @@ class StreamProgram:
             "deviation": _list(self.deviation),
             "token": self.token,
             "patience": self.patience,
-            "starting": STARTING,
-            "confirmed": CONFIRMED,
+            "starting": STARTING_CYCLES,
+            "confirmed": MIN_CONFIRMED_SET_POINTS,
             **{name: f"{value:.9g}" for name, value in self._numbers().items()},
         }
         return _TEMPLATE.substitute({**constants, **_REGISTERS, **_CODES})
@@ -109,8 +109,8 @@ class StreamProgram:
             "lookahead": self.lookahead,
             "gain": self.gain,
             "start_distance": START_DISTANCE,
-            "still": _STILL,
-            "whole": _WHOLE,
+            "still": _REST_TOLERANCE,
+            "whole": _CHECKSUM_TOLERANCE,
         }
 
 

@@ -13,12 +13,12 @@ import numpy as np
 
 from drivers.arrays import Array
 
-UNCERTAINTY: Final = 0.1
+RELATIVE_UNCERTAINTY: Final = 0.1
 """Relative standard deviation to state of them until a payload was weighed: other sources have
 constants of the same joints that are 11 to 24 % larger."""
-_LOADED: Final = 0.02
+_MIN_CURRENT: Final = 0.02
 """Current that gravity needs in a joint, at least [A]; below, the joint has no constant."""
-_SPREAD: Final = 0.01
+_MAX_RELATIVE_SPREAD: Final = 0.01
 """Largest relative spread of the ratio over the samples at rest."""
 
 
@@ -31,7 +31,7 @@ def stated_constants(target_moment: Array, target_current: Array, target_velocit
         target_velocity: (k, n) [rad/s].
     """
     resting = (target_velocity == 0.0).all(axis=1)[:, None]
-    loaded = resting & (np.abs(target_current) >= _LOADED)
+    loaded = resting & (np.abs(target_current) >= _MIN_CURRENT)
     ratio = np.where(loaded, target_moment / np.where(loaded, target_current, 1.0), np.nan)
     constants = np.full(ratio.shape[1], np.nan)
     for joint, column in enumerate(ratio.T):
@@ -39,7 +39,7 @@ def stated_constants(target_moment: Array, target_current: Array, target_velocit
         if not values.size:
             continue
         middle = float(np.median(values))
-        if middle > 0.0 and np.ptp(values) <= _SPREAD * middle:
+        if middle > 0.0 and np.ptp(values) <= _MAX_RELATIVE_SPREAD * middle:
             constants[joint] = middle
     return constants
 

@@ -26,16 +26,23 @@ from drivers.transports.base import (
     TransportSpec,
 )
 from drivers.ur import rtde
-from drivers.ur.connection import TIMEOUT, RtdeConnection, connected, link_name, no_reply, reason
+from drivers.ur.connection import (
+    CONNECT_TIMEOUT,
+    RtdeConnection,
+    connected,
+    link_name,
+    no_reply,
+    reason,
+)
 from drivers.ur.description import UrDescription
 from drivers.ur.identity import DASHBOARD_PORT, PRIMARY_PORT, ask_identity
 from drivers.ur.messages import MessageReader
 from drivers.ur.registers import INPUTS
 from drivers.ur.wire import OPTIONAL, REQUIRED
 
-MOST_UNSENT: Final = 1 << 14
+MAX_UNSENT_BYTES: Final = 1 << 14
 """Bytes of replies that may wait for the network; further ones are dropped."""
-_PIECE: Final = 1 << 16
+_READ_BYTES: Final = 1 << 16
 
 
 @dataclass(frozen=True)
@@ -91,7 +98,7 @@ class RtdeSpec(TransportSpec):
 
     def _primary(self) -> socket.socket:
         try:
-            return socket.create_connection((self.host, self.primary_port), TIMEOUT)
+            return socket.create_connection((self.host, self.primary_port), CONNECT_TIMEOUT)
         except OSError as error:
             raise TransportError(
                 f"primary interface of {self.host}:{self.primary_port}",
@@ -194,7 +201,7 @@ class UrTransport:
 
     def _read_frames(self) -> None:
         try:
-            data = self._socket.recv(_PIECE)
+            data = self._socket.recv(_READ_BYTES)
         except BlockingIOError:
             return
         except OSError as error:
@@ -213,7 +220,7 @@ class UrTransport:
         """Read what the primary interface says; without it, motions end as usual."""
         assert self._primary is not None
         try:
-            data = self._primary.recv(_PIECE)
+            data = self._primary.recv(_READ_BYTES)
         except BlockingIOError:
             return
         except OSError:
@@ -254,7 +261,7 @@ class UrTransport:
         if not packet:
             return
         length = struct.unpack_from(">H", packet)[0]
-        if len(self._unsent) > MOST_UNSENT:
+        if len(self._unsent) > MAX_UNSENT_BYTES:
             self._counts["unsent"] = self._counts.get("unsent", 0) + 1
         else:
             self._unsent += packet[:length]
@@ -309,7 +316,7 @@ class _Loopback:
     def receive(self, timeout: float) -> bytes | None:
         if not select.select((self._here,), (), (), timeout)[0]:
             return None
-        return self._here.recv(_PIECE)
+        return self._here.recv(_READ_BYTES)
 
     def send(self, packet: bytes) -> None:
         with suppress(BlockingIOError):

@@ -51,14 +51,14 @@ from drivers.ur.outputs import (
     SAFETY_NORMAL,
 )
 from drivers.ur.registers import (
-    ENDING,
+    ANGLE_REGISTERS,
+    ENDING_REGISTER,
     ENDINGS,
-    NUMBER,
+    NUMBER_REGISTER,
     OUTPUTS,
-    POSITIONS,
-    STAGE,
-    TOKEN,
-    UNUSED,
+    STAGE_REGISTER,
+    TOKEN_REGISTER,
+    UNUSED_REGISTER,
     Demand,
     Ending,
     Stage,
@@ -86,43 +86,43 @@ OPTIONAL: Final = tuple(
     name for name in (*outputs.REQUIRED, *outputs.OPTIONAL) if name not in REQUIRED
 )
 """Further outputs, that are recorded where this version has them."""
-OLDEST: Final = (5, 10)
+OLDEST_VERSION: Final = (5, 10)
 """Oldest software, major and minor, on which motions run."""
 NEWEST_MAJOR: Final = 5
 CB3: Final = 3
 """Newest major version of the software of CB3 controllers."""
-FULL_SPEED: Final = 1e-3
+FULL_SPEED_TOLERANCE: Final = 1e-3
 """Largest distance of speed slider and scaling from 1."""
-MOST_DEVIATION: Final = 0.8
+MAX_DEVIATION: Final = 0.8
 """Largest share of the deviation at which the controller stops the arm itself."""
-START_TIME: Final = 5.0
+START_TIMEOUT: Final = 5.0
 """Time for the program to run once it was sent, s."""
-_PLAYING: Final = 2
-_STOPPED: Final = 1
-_PAUSING: Final = (3, 4, 5)
-_SAFEGUARD: Final = 5
-_HEADER: Final = 3
-_RECIPE: Final = 1
+_RUNTIME_PLAYING: Final = 2
+_RUNTIME_STOPPED: Final = 1
+_RUNTIME_PAUSING: Final = (3, 4, 5)
+_SAFETY_SAFEGUARD: Final = 5
+_HEADER_BYTES: Final = 3
+_RECIPE_BYTES: Final = 1
 _FORMATS: Final = {
     "BOOL": "?", "UINT8": "B", "UINT32": "I", "INT32": "i", "UINT64": "Q", "DOUBLE": "d",
     "VECTOR3D": "3d", "VECTOR6D": "6d", "VECTOR6INT32": "6i", "VECTOR6UINT32": "6I",
 }  # fmt: skip
 _COUNTS: Final = {"VECTOR3D": 3, "VECTOR6D": 6, "VECTOR6INT32": 6, "VECTOR6UINT32": 6}
 _REPLY: Final = struct.Struct(f">HBBii{N_JOINTS + 1}d")
-_NUMBERS: Final = 1 << 24
+_NUMBER_MODULUS: Final = 1 << 24
 """Numbers of set-points; with them the sum of a frame is exact to some 1e-9."""
-_STAMPS: Final = 1 << 30
-_REMEMBERED: Final = 64
+_STAMP_MODULUS: Final = 1 << 30
+_REMEMBERED_TARGETS: Final = 64
 """Set-points that are compared with those that the controller states to have used."""
-_SAME: Final = 1e-9
+_TARGET_TOLERANCE: Final = 1e-9
 """Difference of two angles that are one [rad]."""
 _REMEDY: Final = (
     "look at the arm and at the pendant; when the arm is ready again, run the same command"
 )
-_OFF_GRID: Final = 0.25
+_MAX_GRID_DEVIATION: Final = 0.25
 """Largest distance of a time stamp from a whole number of cycles, in cycles."""
-_RUNNING: Final = np.ones(N_JOINTS, dtype=np.bool_)
-_IDLE: Final = np.zeros(N_JOINTS, dtype=np.bool_)
+_ALL_JOINTS: Final = np.ones(N_JOINTS, dtype=np.bool_)
+_NO_JOINTS: Final = np.zeros(N_JOINTS, dtype=np.bool_)
 
 
 class ArmNotReadyError(RefusalError):
@@ -172,13 +172,13 @@ def reasons_not_to_move(
     """Return why this arm is not moved by this cell, a sentence each."""
     version, identity = description.version, description.identity
     found = [*expected.differences(identity, version.major)]
-    oldest = ".".join(map(str, OLDEST))
+    oldest = ".".join(map(str, OLDEST_VERSION))
     if version.major <= CB3:
         found.append(
             f"it is a CB3 controller (software {version}), which is only recorded: motions "
             f"need an e-Series controller with PolyScope {oldest} or newer"
         )
-    elif (version.major, version.minor) < OLDEST or version.major > NEWEST_MAJOR:
+    elif (version.major, version.minor) < OLDEST_VERSION or version.major > NEWEST_MAJOR:
         found.append(f"its software is {version}; motions need {oldest} or newer of PolyScope 5")
     if abs(description.period - period) > 1e-9:
         ours = f"{1e3 * period:g} ms in the cell"
@@ -194,11 +194,11 @@ class _Layout:
     def __init__(self, recipe: OutputRecipe) -> None:
         self.number = recipe.number
         self.struct = struct.Struct(">" + "".join(_FORMATS[kind] for kind in recipe.types))
-        self.length = _HEADER + _RECIPE + self.struct.size
+        self.length = _HEADER_BYTES + _RECIPE_BYTES + self.struct.size
         at: dict[str, slice] = {}
         offsets: dict[str, int] = {}
         index = 0
-        begin = _HEADER + _RECIPE
+        begin = _HEADER_BYTES + _RECIPE_BYTES
         for name, kind in zip(recipe.names, recipe.types, strict=True):
             count = _COUNTS.get(kind, 1)
             at[name] = slice(index, index + count)
@@ -206,10 +206,15 @@ class _Layout:
             index += count
             begin += struct.calcsize(">" + _FORMATS[kind])
         self.at = at
-        names = ("robot_mode", "safety_mode", "runtime_state", f"output_int_register_{STAGE}")
+        names = (
+            "robot_mode",
+            "safety_mode",
+            "runtime_state",
+            f"output_int_register_{STAGE_REGISTER}",
+        )
         self._codes = [slice(offsets[name], offsets[name] + 4) for name in names]
         self._stamp = offsets["timestamp"]
-        first = f"output_double_register_{POSITIONS[0]}"
+        first = f"output_double_register_{ANGLE_REGISTERS[0]}"
         self.echo = slice(at[first].start, at[first].start + N_JOINTS)
 
     def sort(self, packet: bytes) -> bytes:
@@ -230,7 +235,7 @@ class UrWire:
     def __init__(self, settings: ArmSettings, protocol: UrProtocol) -> None:
         self.description: UrDescription | None = None
         self.motors: MotorSide | None = None
-        self.opened: Joints = _RUNNING
+        self.opened: Joints = _ALL_JOINTS
         self._settings = settings
         self._protocol = protocol
         drive_train = settings.drive_train
@@ -255,7 +260,7 @@ class UrWire:
         self._exits = False
         self._sent_at: int | None = None
         self._upload = b""
-        self._sent = np.full((_REMEMBERED, N_JOINTS), np.nan)
+        self._sent = np.full((_REMEMBERED_TARGETS, N_JOINTS), np.nan)
         self._target = np.zeros(N_JOINTS)
 
     def receive(self, packet: bytes, state: State, losses: LossTracker) -> Received:
@@ -263,10 +268,10 @@ class UrWire:
         del losses
         if packet[:1] == START:
             return self._introduced(packet, state)
-        if len(packet) < _HEADER:
+        if len(packet) < _HEADER_BYTES:
             raise PacketError("length", len(packet), "a frame of RTDE")
         if packet[2] == FrameType.TEXT:
-            text = controller_text(packet[_HEADER:])
+            text = controller_text(packet[_HEADER_BYTES:])
             self._remark = text.message
             return Remark(f"{text.source}: {text.message}")
         if packet[2] != FrameType.DATA:
@@ -299,27 +304,29 @@ class UrWire:
         layout = self._layout
         if len(packet) != layout.length:
             raise PacketError("length", len(packet), f"{layout.length} bytes")
-        if packet[_HEADER] != layout.number:
-            raise PacketError("recipe", packet[_HEADER], f"{layout.number}, the one requested")
+        if packet[_HEADER_BYTES] != layout.number:
+            raise PacketError(
+                "recipe", packet[_HEADER_BYTES], f"{layout.number}, the one requested"
+            )
         if packet == self._last_packet:
             return Repeated()
-        values = layout.struct.unpack_from(packet, _HEADER + _RECIPE)
+        values = layout.struct.unpack_from(packet, _HEADER_BYTES + _RECIPE_BYTES)
         stamp: float = values[layout.at["timestamp"].start]
         period = self._settings.period
         ahead = 1.0 if self._stamp is None else (stamp - self._stamp) / period
-        if self._broken and not ahead >= 1.0 - _OFF_GRID:
+        if self._broken and not ahead >= 1.0 - _MAX_GRID_DEVIATION:
             ahead = 1.0  # started again meanwhile
-        if not ahead >= 1.0 - _OFF_GRID:
+        if not ahead >= 1.0 - _MAX_GRID_DEVIATION:
             return Stale(f"the time stamp {stamp:.3f} s does not follow {self._stamp:.3f} s")
-        steps = round(ahead) if ahead < _STAMPS else 0
-        if steps < 1 or abs(ahead - steps) > _OFF_GRID:
+        steps = round(ahead) if ahead < _STAMP_MODULUS else 0
+        if steps < 1 or abs(ahead - steps) > _MAX_GRID_DEVIATION:
             problem = f"{1e3 * period:g} ms, the controller's cycle, or a multiple"
             raise PacketError("time between two frames", f"{1e3 * ahead * period:.3g} ms", problem)
         self._broken = False
         self._stamp = stamp
         self._steps = steps
         self._cycle += steps
-        self._number = self._cycle % _NUMBERS + 1
+        self._number = self._cycle % _NUMBER_MODULUS + 1
         self._values = values
         self._last_packet = packet
         self._report = report = self._read(values)
@@ -338,11 +345,11 @@ class UrWire:
     def _read(self, values: tuple[float, ...]) -> AxesReport:
         """Return what a frame says of the axes."""
         layout = self._layout
-        playing = self._int("runtime_state") == _PLAYING
-        ours = self._register(TOKEN) == self._program.token
-        stage = self._register(STAGE) if ours else Stage.NONE
+        playing = self._int("runtime_state") == _RUNTIME_PLAYING
+        ours = self._register(TOKEN_REGISTER) == self._program.token
+        stage = self._register(STAGE_REGISTER) if ours else Stage.NONE
         self._ours = playing and stage in (Stage.WAITING, Stage.STREAMING, Stage.STOPPING)
-        unused = self._register(UNUSED) if self._ours else self._unused
+        unused = self._register(UNUSED_REGISTER) if self._ours else self._unused
         self._new_unused = max(0, unused - self._unused) if stage == Stage.STREAMING else 0
         self._unused = unused if self._ours else 0
         cause = self._cause(stage)
@@ -354,8 +361,8 @@ class UrWire:
             input=kind,
             status=DRIVE_ON if self._int("robot_mode") == ROBOT_RUNNING else 0,
             modes=np.array(values[layout.at["joint_mode"]], dtype=np.int32),
-            ready=_RUNNING if kind is Input.OPEN else _IDLE,
-            held_joints=_RUNNING if opened else _IDLE,
+            ready=_ALL_JOINTS if kind is Input.OPEN else _NO_JOINTS,
+            held_joints=_ALL_JOINTS if opened else _NO_JOINTS,
             powered=opened,
             any_open=opened,
             unwanted=None,
@@ -367,8 +374,8 @@ class UrWire:
         robot, safety = self._int("robot_mode"), self._int("safety_mode")
         if robot != ROBOT_RUNNING:
             return Input.DRIVING_ON if robot in POWER_MODES else Input.OFF
-        paused = self._int("runtime_state") in _PAUSING
-        if safety == _SAFEGUARD or (paused and safety == SAFETY_NORMAL):
+        paused = self._int("runtime_state") in _RUNTIME_PAUSING
+        if safety == _SAFETY_SAFEGUARD or (paused and safety == SAFETY_NORMAL):
             return Input.PAUSE
         if safety != SAFETY_NORMAL:
             return Input.UNAVAILABLE
@@ -385,13 +392,13 @@ class UrWire:
             return f"the arm was stopped: {SAFETY_MODES.get(safety, f'safety mode {safety}')}"
         if robot != ROBOT_RUNNING:
             return f"the arm is not running: {ROBOT_MODES.get(robot, f'robot mode {robot}')}"
-        if self._int("runtime_state") in _PAUSING:
+        if self._int("runtime_state") in _RUNTIME_PAUSING:
             return "the program on the controller was paused"
         if stage in (Stage.STOPPING, Stage.ENDED):
-            ending = self._register(ENDING)
+            ending = self._register(ENDING_REGISTER)
             return ENDINGS.get(Ending(ending) if ending in [*Ending] else Ending.NONE, "")
         started = stage in (Stage.WAITING, Stage.STREAMING)
-        if started and self._int("runtime_state") != _PLAYING:
+        if started and self._int("runtime_state") != _RUNTIME_PLAYING:
             said = f" ({self._remark})" if self._remark else ""
             return ENDINGS[Ending.NONE] + said
         return ""
@@ -465,29 +472,33 @@ class UrWire:
 
     def _start(self, cycle: int) -> None:
         """Send the program, once, when the controller is ready for it."""
-        playing = self._int("runtime_state") == _PLAYING
-        if self._sent_at is None and playing and self._register(TOKEN) == self._program.token:
+        playing = self._int("runtime_state") == _RUNTIME_PLAYING
+        if (
+            self._sent_at is None
+            and playing
+            and self._register(TOKEN_REGISTER) == self._program.token
+        ):
             return  # the program of the motion before is about to end
         if self._sent_at is None:
             self._require_startable(cycle)
             self._programs += 1
             stamp = self._stamp or 0.0
-            token = (round(1e3 * stamp) * 16 + self._programs) % _STAMPS + 1
+            token = (round(1e3 * stamp) * 16 + self._programs) % _STAMP_MODULUS + 1
             self._program = replace(self._program, token=token)
             self._upload = self._program.text().encode()
             self._sent_at = cycle
             self._remark = ""
-        elif cycle - self._sent_at > START_TIME / self._settings.period:
+        elif cycle - self._sent_at > START_TIMEOUT / self._settings.period:
             self._sent_at = None
             said = f": {self._remark}" if self._remark else ""
-            problem = f"the program did not run within {START_TIME:g} s{said}"
+            problem = f"the program did not run within {START_TIMEOUT:g} s{said}"
             remedy = (
                 "check that the controller is in remote control, and its primary interface enabled"
             )
             raise ArmNotReadyError(problem, remedy, cycle)
 
     def _require_startable(self, cycle: int) -> None:
-        if self._int("runtime_state") != _STOPPED:
+        if self._int("runtime_state") != _RUNTIME_STOPPED:
             remedy = "stop it at the pendant, or wait for its end"
             raise ArmNotReadyError("another program runs on the controller", remedy, cycle)
         self._require_undisturbed(cycle)
@@ -505,29 +516,32 @@ class UrWire:
             remedy = "release the freedrive button"
             raise ArmNotReadyError("a person moves the arm by hand (freedrive)", remedy, cycle)
         slider = self._float("target_speed_fraction", 1.0)
-        if not abs(slider - 1.0) <= FULL_SPEED:
+        if not abs(slider - 1.0) <= FULL_SPEED_TOLERANCE:
             remedy = "set it to 100 %: set-points are sent at full rate, whatever it is"
             raise ArmNotReadyError(f"the speed slider is at {100.0 * slider:.3g} %", remedy, cycle)
         if not self._ours:
             return
         scaling = self._float("speed_scaling", 1.0)
-        if not abs(scaling - 1.0) <= FULL_SPEED:
+        if not abs(scaling - 1.0) <= FULL_SPEED_TOLERANCE:
             remedy = "look at the pendant for the limit that slows the arm down"
             problem = f"the controller slows the arm down to {100.0 * scaling:.3g} %"
             raise ArmNotReadyError(problem, remedy, cycle)
         deviation = self._float("joint_position_deviation_ratio", 0.0)
-        if not deviation <= MOST_DEVIATION:
+        if not deviation <= MAX_DEVIATION:
             remedy = "check payload and obstacles, then go slower"
             problem = f"the arm is at {100.0 * deviation:.3g} % of the deviation that stops it"
             raise ArmNotReadyError(problem, remedy, cycle)
 
     def _require_same(self, cycle: int) -> None:
         """Require that a set-point that was used is the one that was sent under its number."""
-        number = self._register(NUMBER)
-        if self._new_unused or (self._number - number) % _NUMBERS >= _REMEMBERED:
+        number = self._register(NUMBER_REGISTER)
+        if self._new_unused or (self._number - number) % _NUMBER_MODULUS >= _REMEMBERED_TARGETS:
             return
-        sent = self._sent[number % _REMEMBERED]
-        if not (np.abs(sent - self._target) <= _SAME).all() and not np.isnan(sent).all():
+        sent = self._sent[number % _REMEMBERED_TARGETS]
+        if (
+            not (np.abs(sent - self._target) <= _TARGET_TOLERANCE).all()
+            and not np.isnan(sent).all()
+        ):
             remedy = "have another look at who writes the registers of the controller"
             problem = f"the controller used another set-point than number {number} that was sent"
             raise ArmNotReadyError(problem, remedy, cycle)
@@ -570,7 +584,7 @@ class UrWire:
         """Return the frame of inputs, and behind it the program if it is to be started."""
         assert self.description is not None
         number, q = self._number, self._reply_target
-        self._sent[number % _REMEMBERED] = q
+        self._sent[number % _REMEMBERED_TARGETS] = q
         values = q.tolist()
         check = sum(values) + number
         upload, self._upload = self._upload, b""
@@ -596,7 +610,7 @@ class UrWire:
 
     def ahead(self, later: int, earlier: int) -> int:
         """Return the cycles between two time stamps, modulo the range of numbers."""
-        return (later - earlier) % _STAMPS
+        return (later - earlier) % _STAMP_MODULUS
 
 
 class _OwnPackets:
@@ -615,7 +629,7 @@ class _OwnPackets:
         )
         recipe = OutputRecipe(1, names, types)
         self._description = UrDescription(
-            identity, ControllerVersion(*OLDEST, 0, 0), 1.0 / period, recipe, 1
+            identity, ControllerVersion(*OLDEST_VERSION, 0, 0), 1.0 / period, recipe, 1
         )
         self._layout = _Layout(self._description.recipe)
         angles = drive_train.joint_sign * position + drive_train.joint_offset
@@ -623,7 +637,7 @@ class _OwnPackets:
             "target_q": angles.tolist(), "actual_q": angles.tolist(), "robot_mode": ROBOT_RUNNING,
             "safety_mode": SAFETY_NORMAL, "speed_scaling": 1.0, "target_speed_fraction": 1.0,
             "payload": expected.payload, "payload_cog": list(expected.centre or (0.0, 0.0, 0.0)),
-            **{f"output_double_register_{POSITIONS[j]}": angles[j] for j in range(N_JOINTS)},
+            **{f"output_double_register_{ANGLE_REGISTERS[j]}": angles[j] for j in range(N_JOINTS)},
         }  # fmt: skip
         self._cycle = 0
         self._period = period
@@ -635,14 +649,14 @@ class _OwnPackets:
         self._cycle += 1
         stamp = self._cycle * self._period
         # The session sends its program with the first frame, by whose stamp it is numbered.
-        token = (round(1e3 * self._period) * 16 + 1) % _STAMPS + 1
+        token = (round(1e3 * self._period) * 16 + 1) % _STAMP_MODULUS + 1
         values = {
             **self._rest,
             "timestamp": stamp,
-            "runtime_state": _PLAYING if opened else _STOPPED,
-            f"output_int_register_{TOKEN}": token,
-            f"output_int_register_{STAGE}": Stage.STREAMING if opened else Stage.NONE,
-            f"output_int_register_{NUMBER}": self._cycle,
+            "runtime_state": _RUNTIME_PLAYING if opened else _RUNTIME_STOPPED,
+            f"output_int_register_{TOKEN_REGISTER}": token,
+            f"output_int_register_{STAGE_REGISTER}": Stage.STREAMING if opened else Stage.NONE,
+            f"output_int_register_{NUMBER_REGISTER}": self._cycle,
         }
         flat: list[float] = []
         recipe = self._description.recipe

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 Rows = NDArray[np.void]
 
 ENCAPSULATION = b"\x00\x01\x00\x00"  # CDR without parameter list, little endian
-LARGEST_MESSAGE: Final = 1 << 20
+MAX_MESSAGE_BYTES: Final = 1 << 20
 """Bytes; own messages have at most some 10 000. A layout takes memory in proportion."""
 
 _PRIMITIVES = {
@@ -30,8 +30,8 @@ _PRIMITIVES = {
 _FIELD = re.compile(r"(?P<type>[\w/]+)(<=\d+)?(\[(?P<count>[^\]]*)\])?\s+(?P<name>\w+)$")
 _CONSTANT = re.compile(r"^\s*\w+(\[[^\]]*\])?\s+\w+\s*=")
 _SEPARATOR = re.compile(r"^=+\n", re.MULTILINE)
-_LARGEST = 4096  # elements; what is larger is an image or a cloud of points
-_LONGEST_COUNT = 9  # digits
+_MAX_ELEMENTS = 4096  # elements; what is larger is an image or a cloud of points
+_MAX_COUNT_DIGITS = 9  # digits
 _HEADERS = ("std_msgs/Header", "std_msgs/msg/Header", "Header")
 
 
@@ -116,8 +116,8 @@ class LayoutBuilder:
 
     def _extend(self, alignment: int, size: int) -> int:
         offset = self.next_place(alignment)
-        if offset + size > LARGEST_MESSAGE:
-            raise LayoutError(f"its messages are longer than {LARGEST_MESSAGE} bytes")
+        if offset + size > MAX_MESSAGE_BYTES:
+            raise LayoutError(f"its messages are longer than {MAX_MESSAGE_BYTES} bytes")
         self._template += bytes(offset + size - len(self._template))
         return offset
 
@@ -181,7 +181,7 @@ def fixed_layout(definition: str) -> MessageLayout:
             raise LayoutError(f"{match['name']} is of the type {kind}, no number")
         elif count is None:
             builder.variable(match["name"], kind)
-        elif not count.isdecimal() or len(count) > _LONGEST_COUNT or int(count) > _LARGEST:
+        elif not count.isdecimal() or len(count) > _MAX_COUNT_DIGITS or int(count) > _MAX_ELEMENTS:
             raise LayoutError(f"{match['name']} is not of constant size, or too large")
         elif int(count):
             builder.variable(match["name"], kind, int(count))

@@ -107,7 +107,7 @@ def archive_files(paths: Sequence[Path]) -> list[Path]:
     return files
 
 
-_MOST_EVENTS = 20
+_MAX_SHOWN_EVENTS = 20
 _SHOWN_ELSEWHERE = frozenset(
     (
         "kind", "index", "attempt", "joint_names", "period", "attachments", "outcome", "reason",
@@ -201,7 +201,7 @@ def read_overview(path: str | PathLike[str]) -> Overview:
             if key.removeprefix("outcome.") not in _SHOWN_ELSEWHERE
         },
         events=tuple(
-            (event.time, event.name, event.text) for event in archive.events[:_MOST_EVENTS]
+            (event.time, event.name, event.text) for event in archive.events[:_MAX_SHOWN_EVENTS]
         ),
         damage=archive.damage,
     )

@@ -38,7 +38,7 @@ HEAD = np.dtype(
 _FIXED = struct.Struct("<BQH")  # the part of it that repeats with the pattern
 _STAMP = np.dtype([("sec", "<i4"), ("nanosec", "<u4")])
 _STAMP_AT = slice(HEAD.itemsize + 4, HEAD.itemsize + 4 + _STAMP.itemsize)  # after the encapsulation
-_LONGEST_PATTERN = 16  # messages
+_MAX_PATTERN_MESSAGES = 16  # messages
 
 
 @dataclass(frozen=True, eq=False)
@@ -143,7 +143,7 @@ class ChunkParser:
         `offset` is its place in the file. `Damage` if records are truncated or definitions differ.
         """
         by_channel: dict[int, ChunkMessages] = {}
-        recent: deque[Content] = deque(maxlen=_LONGEST_PATTERN)
+        recent: deque[Content] = deque(maxlen=_MAX_PATTERN_MESSAGES)
         at = 0
         while at < len(chunk):
             rows = self._repeated(chunk, at)

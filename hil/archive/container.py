@@ -35,9 +35,9 @@ from mcap.records import (
 )
 
 MAGIC = b"\x89MCAP0\r\n"
-LARGEST_CHUNK = 1 << 24  # bytes; own chunks have a tenth of a megabyte
-MOST_INFLATION = 1000  # times what is compressed; an arm at rest reaches a tenth
-LARGEST_RECORD = 1 << 28  # bytes; attachments and summaries are far smaller
+MAX_CHUNK_BYTES = 1 << 24  # bytes; own chunks have a tenth of a megabyte
+MAX_COMPRESSION_RATIO = 1000  # times what is compressed; an arm at rest reaches a tenth
+MAX_RECORD_BYTES = 1 << 28  # bytes; attachments and summaries are far smaller
 
 HEADER, FOOTER, SCHEMA, CHANNEL, MESSAGE, CHUNK, MESSAGE_INDEX, CHUNK_INDEX = range(1, 9)
 ATTACHMENT, ATTACHMENT_INDEX, STATISTICS, METADATA, METADATA_INDEX = range(9, 14)
@@ -50,7 +50,8 @@ _CHUNK_HEAD = struct.Struct("<QQQII")  # times, size, checksum, length of the co
 _LENGTH = struct.Struct("<Q")
 _CRC = struct.Struct("<I")
 _NO_CRC = 0
-_UNCOVERED = _CRC.size + len(MAGIC)  # bytes at the end of a file, not covered by the checksum
+# bytes at the end of a file, not covered by the checksum
+_UNCHECKED_TAIL_BYTES = _CRC.size + len(MAGIC)
 _KINDS: dict[int, type[McapRecord]] = {
     HEADER: Header,
     SCHEMA: Schema,
@@ -181,7 +182,7 @@ def read_record(stream: BinaryIO, head: Head) -> Record:
     """Read the record with this head; `Damage` if it is too large, or the file has shrunk."""
     start = head.offset + RECORD.size
     length = head.end - start
-    if length > LARGEST_RECORD:
+    if length > MAX_RECORD_BYTES:
         raise Damage(head.offset, f"claims {length} bytes of content")
     stream.seek(start)
     body = stream.read(length)
@@ -202,9 +203,9 @@ def records(stream: BinaryIO, size: int, *, only: Collection[int] = range(256)) 
 def check_end(stream: BinaryIO, size: int, offset: int) -> None:
     """Check summary and footer, which follow DataEnd at `offset`; else `Damage`."""
     stream.seek(offset)
-    tail = stream.read(min(size - offset, LARGEST_RECORD))
+    tail = stream.read(min(size - offset, MAX_RECORD_BYTES))
     footer = _footer(tail)
-    if footer is None or footer.summary_crc not in (_NO_CRC, crc32(tail[:-_UNCOVERED])):
+    if footer is None or footer.summary_crc not in (_NO_CRC, crc32(tail[:-_UNCHECKED_TAIL_BYTES])):
         raise Damage(offset, "(index and footer) is cut off, or fails its checksum")
 
 
@@ -221,11 +222,11 @@ def read_summary(stream: BinaryIO, size: int, *kinds: int, start: int | None = N
     if footer is None or footer.summary_crc == _NO_CRC:
         return []
     start = footer.summary_start if start is None else start
-    if not len(MAGIC) <= start <= last <= start + LARGEST_RECORD:
+    if not len(MAGIC) <= start <= last <= start + MAX_RECORD_BYTES:
         return []
     stream.seek(start)
     data = stream.read(size - start)
-    if crc32(data[:-_UNCOVERED]) != footer.summary_crc:
+    if crc32(data[:-_UNCHECKED_TAIL_BYTES]) != footer.summary_crc:
         return []
     summary = data[: last - start]
     try:
@@ -303,15 +304,16 @@ def chunk_data(head: Chunk, offset: int) -> bytes:
     return data
 
 
-def decompress(head: Chunk, offset: int, *, largest: int = LARGEST_CHUNK) -> bytes:
+def decompress(head: Chunk, offset: int, *, largest: int = MAX_CHUNK_BYTES) -> bytes:
     """Return the records of a chunk at `offset`, their checksum not verified.
 
     At most one byte more than declared is decompressed: a corrupt frame fills no memory. `Damage`
-    if the size is above `largest` or `MOST_INFLATION`, not as declared, or the data are corrupt.
+    if the size is above `largest` or `MAX_COMPRESSION_RATIO`, not as declared, or the data are
+    corrupt.
     """
     size = head.uncompressed_size
     data = head.data
-    if size > min(largest, MOST_INFLATION * len(data)):
+    if size > min(largest, MAX_COMPRESSION_RATIO * len(data)):
         raise Damage(offset, f"(chunk) claims {size} bytes of content")
     try:
         if head.compression == "zstd":

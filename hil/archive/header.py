@@ -50,9 +50,9 @@ CONTROLLER_PROGRAM = "controller"
 REPLIES_LOST = "AnswersLost"  # Name of the event `drivers.events.RepliesLost`
 EPISODE = "episode"  # Entry of an imported recording: its number, where a file has several
 REJECTED = "rejected"  # Outcome of a motion that completed and failed its quality check
-MOST_JOINTS: Final = 256
+MAX_RECORDED_JOINTS: Final = 256
 
-_DIGITS = 8  # of a checksum
+_CHECKSUM_DIGITS = 8  # of a checksum
 _PATTERN = re.compile(
     r"(?P<kind>[a-z]+)_(?P<index>[0-9]{3,18})_a(?P<attempt>[1-9][0-9]{0,17})\.mcap"
 )
@@ -210,8 +210,8 @@ class ArchiveHeader(BaseModel):
     def _check_joints(cls, names: tuple[str, ...]) -> tuple[str, ...]:
         if "" in names or len(set(names)) != len(names):
             raise ValueError("names are empty or not unique")
-        if len(names) > MOST_JOINTS:
-            raise ValueError(f"{len(names)} joints, at most {MOST_JOINTS} are supported")
+        if len(names) > MAX_RECORDED_JOINTS:
+            raise ValueError(f"{len(names)} joints, at most {MAX_RECORDED_JOINTS} are supported")
         return names
 
     @field_validator("motor_from_joint")

@@ -31,7 +31,7 @@ from hil.archive.schema import (
     profile,
 )
 from hil.base.errors import InputError
-from hil.base.safe_input import LARGEST_PORT
+from hil.base.safe_input import MAX_PORT
 from hil.base.version import install_command
 
 if TYPE_CHECKING:
@@ -40,11 +40,11 @@ if TYPE_CHECKING:
 
 LOOPBACK: Final = "127.0.0.1"
 PORT: Final = 8765  # Of the Foxglove WebSocket protocol
-RATE: Final = 50.0  # Messages per second and channel
-QUEUE: Final = 50  # Batches (of some 20 ms) queued for the thread
-BACKLOG: Final = 512  # Messages queued for one client
-POLL: Final = 0.2  # Time between two checks of the end condition, s
-MAX_DRIFT: Final = 1.0
+MESSAGE_RATE: Final = 50.0  # Messages per second and channel
+MAX_QUEUED_BATCHES: Final = 50  # Batches (of some 20 ms) queued for the thread
+MAX_CLIENT_MESSAGES: Final = 512  # Messages queued for one client
+END_POLL_PERIOD: Final = 0.2  # Time between two checks of the end condition, s
+MAX_CLOCK_DRIFT: Final = 1.0
 """Difference of the controller's and this computer's time at which they are aligned again, s."""
 _ADDRESS: Final = re.compile(r"((?P<host>\[[0-9a-fA-F:.]+\]|[\w.-]+):)?(?P<port>\d{1,5})")
 
@@ -59,13 +59,13 @@ class LiveView:
 
     host: str = LOOPBACK
     port: int = PORT
-    rate: float = RATE
+    rate: float = MESSAGE_RATE
 
     @classmethod
     def parse(cls, text: str) -> Self:
         """Parse HOST:PORT, or PORT for connections from this computer only; else LiveViewError."""
         match = _ADDRESS.fullmatch(text.strip())
-        if match is None or int(match["port"]) > LARGEST_PORT:
+        if match is None or int(match["port"]) > MAX_PORT:
             remedy = f"e.g. {LOOPBACK}:{PORT}"
             raise LiveViewError(None, f"--live {text} is not HOST:PORT", remedy=remedy)
         return cls((match["host"] or LOOPBACK).strip("[]"), int(match["port"]))
@@ -116,7 +116,9 @@ class LivePublisher:
         self._channels = [_channel(channel, self._context) for channel in cycles]
         self._events = _channel(EVENT_CHANNEL, self._context)
         self._offset: int | None = None
-        self._waiting = deque[tuple[Records, tuple[ExchangeEvent, ...], DriveTrain]](maxlen=QUEUE)
+        self._waiting = deque[tuple[Records, tuple[ExchangeEvent, ...], DriveTrain]](
+            maxlen=MAX_QUEUED_BATCHES
+        )
         self._more = threading.Event()
         self._closed = False
         self._thread = threading.Thread(target=self._work, name="live view", daemon=True)
@@ -134,12 +136,12 @@ class LivePublisher:
         """End the server and its connections."""
         self._closed = True
         self._more.set()
-        self._thread.join(2.0 * POLL)
+        self._thread.join(2.0 * END_POLL_PERIOD)
         self._server.stop()
 
     def _work(self) -> None:
         while not self._closed:
-            self._more.wait(POLL)
+            self._more.wait(END_POLL_PERIOD)
             self._more.clear()
             while self._waiting:
                 self._send(*self._waiting.popleft())
@@ -162,10 +164,11 @@ class LivePublisher:
     def _time_of(self, stamp: int) -> int:
         """Return the time of a message, ns since 1970, by its stamp, ns since the session began.
 
-        The times are evenly spaced, as the stamps, until the two clocks differ by `MAX_DRIFT`.
+        The times are evenly spaced, as the stamps, until the two clocks differ by
+        `MAX_CLOCK_DRIFT`.
         """
         now = time.time_ns()
-        if self._offset is None or abs(stamp + self._offset - now) > 1e9 * MAX_DRIFT:
+        if self._offset is None or abs(stamp + self._offset - now) > 1e9 * MAX_CLOCK_DRIFT:
             self._offset = now - stamp
         return stamp + self._offset
 
@@ -183,7 +186,7 @@ def _serve(view: LiveView) -> tuple[WebSocketServer, foxglove.Context]:
             host=view.host,
             port=view.port,
             context=context,
-            message_backlog_size=BACKLOG,
+            message_backlog_size=MAX_CLIENT_MESSAGES,
         )
     except Exception as error:  # the library documents no narrower one
         remedy = "name an address of this computer and a free port"

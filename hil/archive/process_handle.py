@@ -133,7 +133,7 @@ class CommandSocket:
 
 
 END_TIMEOUT = 30.0  # Time for the last flush of a slow disk, s
-HUNG = 5.0
+HUNG_TIMEOUT = 5.0
 """Time without a heartbeat after which the process is killed, s; a slow disk does not stop it."""
 NO_TIME = (
     "it was suspended, or this PC gave it no processor time: end other programs, and check this PC "
@@ -141,7 +141,7 @@ NO_TIME = (
 )
 """Why a process sends no heartbeat, and what to do."""
 EXIT_TIMEOUT = 2.0  # Time to exit for a process that was killed or has closed its socket, s
-POLL = 0.05  # Time between two checks whether the process has ended, s
+EXIT_POLL_PERIOD = 0.05  # Time between two checks whether the process has ended, s
 
 
 class SharedMemory(Protocol):
@@ -194,8 +194,8 @@ class ArchiveProcessHandle:
 
     def failure(self) -> str | None:
         """Return the fault of the process, None if it works; one that hangs is killed."""
-        if self.alive and self.monitor.silence() > HUNG:
-            self.kill(silent_for(HUNG))
+        if self.alive and self.monitor.silence() > HUNG_TIMEOUT:
+            self.kill(silent_for(HUNG_TIMEOUT))
         if self.alive:
             return None
         return f"the archive process {self._ended_for or f'ended ({self.process.last_error})'}"
@@ -240,12 +240,12 @@ class ArchiveProcessHandle:
             self.send(Shutdown())
         deadline = time.monotonic() + END_TIMEOUT
         while self.process.alive and not self._gone:
-            if self.monitor.silence() > HUNG:
-                self.kill(silent_for(HUNG))
+            if self.monitor.silence() > HUNG_TIMEOUT:
+                self.kill(silent_for(HUNG_TIMEOUT))
             elif time.monotonic() > deadline:
                 self.kill(f"did not end within {END_TIMEOUT:g} s and was killed")
             else:
-                self.process.wait(POLL)
+                self.process.wait(EXIT_POLL_PERIOD)
         if not self._ended_for and self.process.status not in (0, None):
             self._ended_for = f"ended ({self.process.last_error})"
         self.channel.close()

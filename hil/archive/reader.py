@@ -20,12 +20,12 @@ from hil.archive.header import (
     ArchiveHeader,
     ArchiveOutcome,
 )
-from hil.archive.scan import ALWAYS, Scan
+from hil.archive.scan import ALL_TIMES, Scan
 from hil.archive.schema import ArchivedEvent
 from hil.base.errors import ArchiveError, ArchiveVersionError, NotAnArchiveError
 from hil.base.safe_input import open_file, parse_json, remedy_for_missing
 
-_MOST_SHOWN = 5  # faults in one message
+_MAX_SHOWN_FAULTS = 5  # faults in one message
 
 
 @dataclass(frozen=True, eq=False)
@@ -159,8 +159,8 @@ def open_archive(
         ArchiveError: the file cannot be read.
     """
     times = (
-        ALWAYS[0] if start is None else round(start * 1e9),
-        ALWAYS[1] if stop is None else round(stop * 1e9),
+        ALL_TIMES[0] if start is None else round(start * 1e9),
+        ALL_TIMES[1] if stop is None else round(stop * 1e9),
     )
     return scan_archive(path, fields=fields, times=times)[0]
 
@@ -199,7 +199,7 @@ def _describe(scan: Scan, read: int) -> str | None:
     faults = scan.faults
     if not faults:
         return None
-    return "; ".join([*faults[:_MOST_SHOWN], f"{read} samples could be read"])
+    return "; ".join([*faults[:_MAX_SHOWN_FAULTS], f"{read} samples could be read"])
 
 
 def scan_file(path: Path, **options: Any) -> Scan:

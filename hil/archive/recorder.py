@@ -40,7 +40,7 @@ from hil.archive.header import REPLIES_LOST
 from hil.archive.schema import Level
 from hil.archive.writer import ArchiveWriter
 
-_TEXTS: Final[Mapping[type, tuple[Level, str]]] = {
+_EVENT_TEXTS: Final[Mapping[type, tuple[Level, str]]] = {
     InitReceived: (Level.INFO, "the controller started a session{details}"),
     StateChanged: (Level.INFO, "{0.before.name} -> {0.after.name} in cycle {0.cycle}"),
     GapSeen: (Level.WARN, "packets missed before cycle {0.cycle}: {0.missed}"),
@@ -85,19 +85,19 @@ def describe(event: ExchangeEvent) -> str:
             details = "".join(f"; {note}" for note in (*event.realtime.refused, *event.notes))
         case ExchangeFailed():
             details = event.trace.strip().splitlines()[-1]
-    return _TEXTS[type(event)][1].format(event, details=details)
+    return _EVENT_TEXTS[type(event)][1].format(event, details=details)
 
 
 def level_of(event: ExchangeEvent) -> Level:
     """Return the severity of an event."""
-    return _TEXTS[type(event)][0]
+    return _EVENT_TEXTS[type(event)][0]
 
 
 Records = NDArray[np.void]
 
 LATE_KINDS = frozenset({"late", "replied to late"})
 """Kinds of `PacketRejected`: dropped for a newer packet, or replied to after its cycle."""
-AFTERMATH = 0.5  # Time recorded after a motion was refused or lost, s
+AFTERMATH_SECONDS = 0.5  # Time recorded after a motion was refused or lost, s
 
 
 @dataclass(frozen=True, eq=False)
@@ -253,7 +253,7 @@ class Recorder:
             self.link_lost |= isinstance(event, LinkLost)
 
     def _archive(self, event: ExchangeEvent) -> None:
-        data = {name: getattr(event, name) for name in _DATA.get(type(event), ())}
+        data = {name: getattr(event, name) for name in _EVENT_FIELDS.get(type(event), ())}
         if isinstance(event, Refused) and isinstance(event.error, GuardError):
             data = {name: getattr(event.error, name) for name in _REFUSAL_DATA}
             data["check"] = event.error.check.quantity
@@ -267,7 +267,7 @@ class Recorder:
         """The last cycle that belongs to the archive."""
         if self.ended is None or _at_rest(self.ended):
             return int(np.iinfo(np.int64).max)
-        return self.ended.cycle + round(AFTERMATH / self.writer.period)
+        return self.ended.cycle + round(AFTERMATH_SECONDS / self.writer.period)
 
     def _write(self, records: Records) -> None:
         """Archive the records up to the end of the session and of the aftermath."""
@@ -283,7 +283,7 @@ class Recorder:
             self.records += len(records)
 
 
-_DATA: Final[Mapping[type, Sequence[str]]] = {
+_EVENT_FIELDS: Final[Mapping[type, Sequence[str]]] = {
     RepliesLost: ("count",),
     OverrideChanged: ("fraction",),
     HoldChanged: ("held",),

@@ -32,21 +32,27 @@ from hil.archive.header import (
 )
 from hil.archive.schema import ArchivedEvent
 
-NUMBERS = (
+NUMERIC_TOPICS = (
     *(schema.CYCLE, schema.MEASURED, schema.COMMANDED),
-    *schema.STATES,
+    *schema.STATE_TOPICS,
     *schema.OTHERS.values(),
 )
 """Channels with one message per sample."""
-ALWAYS: Final = -(1 << 63), 1 << 63  # ns, before and after every stamp
-_BATCH: Final = 1 << 20  # bytes of chunks decoded at once: few calls, and all in the cache
-_SEQUENCES = 1 << 32  # message numbers are modulo this
-_MOST_DAMAGES = 1000  # of one file; what follows is not read
-_LEAST = 8  # bytes of a file for one sample, of an arm at rest
+ALL_TIMES: Final = -(1 << 63), 1 << 63  # ns, before and after every stamp
+_BATCH_BYTES: Final = 1 << 20  # bytes of chunks decoded at once: few calls, and all in the cache
+_SEQUENCE_MODULUS = 1 << 32  # message numbers are modulo this
+_MAX_DAMAGES = 1000  # of one file; what follows is not read
+_MIN_BYTES_PER_SAMPLE = 8  # bytes of a file for one sample, of an arm at rest
 _COLUMN_OF: Final = {"effort": "torque"}  # names of message fields that differ from the column's
-_DEFINITIONS = (container.SCHEMA, container.CHANNEL)
-_CONTENT = frozenset(
-    {container.HEADER, container.CHUNK, container.ATTACHMENT, container.METADATA, *_DEFINITIONS}
+_DEFINITION_OPCODES = (container.SCHEMA, container.CHANNEL)
+_CONTENT_OPCODES = frozenset(
+    {
+        container.HEADER,
+        container.CHUNK,
+        container.ATTACHMENT,
+        container.METADATA,
+        *_DEFINITION_OPCODES,
+    }
 )
 
 
@@ -77,7 +83,7 @@ class Scan:
         stream: BinaryIO,
         *,
         fields: Collection[str] | None = (),
-        times: tuple[int, int] = ALWAYS,
+        times: tuple[int, int] = ALL_TIMES,
         all_channels: bool = False,
     ) -> None:
         self.size = os.fstat(stream.fileno()).st_size
@@ -103,7 +109,7 @@ class Scan:
         self._left_out: set[int] = set()
         self._gap = False  # whether something was left out behind the last chunk
         self._skipped = False  # whether chunks were left out: channels continue at any number
-        self._buffer = memoryview(bytearray(_BATCH))
+        self._buffer = memoryview(bytearray(_BATCH_BYTES))
         self._pending: list[tuple[int, slice]] = []  # offset of each chunk, its place in the buffer
         self._next: dict[str, int] = {}
         self._numbers: set[str] = set()
@@ -118,15 +124,15 @@ class Scan:
                 self._try(self._add_metadata, head)
         stated = self.outcome or ArchiveOutcome()
         self._repaired = stated.repaired
-        expected = min(stated.samples or 0, self.size // _LEAST)
-        self._room = expected if times == ALWAYS and fields != () else 0
+        expected = min(stated.samples or 0, self.size // _MIN_BYTES_PER_SAMPLE)
+        self._room = expected if times == ALL_TIMES and fields != () else 0
         self._read()
 
     @property
     def topics(self) -> Collection[str]:
         """The channels of the samples and the events."""
         recorded = schema.CYCLE in self.parser.topics
-        cycles = (schema.CYCLE, *schema.STATES)
+        cycles = (schema.CYCLE, *schema.STATE_TOPICS)
         samples = cycles if recorded else (schema.MEASURED, *schema.OTHERS.values())
         return (*samples, schema.EVENTS)
 
@@ -145,7 +151,7 @@ class Scan:
     @property
     def samples(self) -> int:
         """Number of valid samples."""
-        return max(self.counts.get(topic, 0) for topic in NUMBERS)
+        return max(self.counts.get(topic, 0) for topic in NUMERIC_TOPICS)
 
     @property
     def faults(self) -> list[str]:
@@ -162,7 +168,7 @@ class Scan:
     def definitions(self) -> list[Schema | Channel]:
         """Schemas and channels of the summary, for chunks that follow a lost one."""
         start = self._data_end
-        return container.read_summary(self._stream, self.size, *_DEFINITIONS, start=start)
+        return container.read_summary(self._stream, self.size, *_DEFINITION_OPCODES, start=start)
 
     def _find_shortfalls(self) -> Iterator[str]:
         """Yield a sentence for what the file states to contain and does not."""
@@ -186,7 +192,7 @@ class Scan:
         stream = self._stream
         heads = self.heads
         try:
-            heads += container.heads(stream, self.size, _CONTENT)
+            heads += container.heads(stream, self.size, _CONTENT_OPCODES)
             self._data_end = heads.pop().end
             container.check_end(stream, self.size, self._data_end)
             return
@@ -241,7 +247,7 @@ class Scan:
                 self._next.clear()
                 continue
             self._try(self._add, head)
-            if len(self.damages) >= _MOST_DAMAGES:
+            if len(self.damages) >= _MAX_DAMAGES:
                 del self.heads[index + 1 :]
                 break
         self._flush()
@@ -285,7 +291,7 @@ class Scan:
             if attachment.name in self.attachments:
                 raise Damage(offset, f"(attachment {attachment.name!r}) is there a second time")
             self.attachments[attachment.name] = attachment.data
-        elif record.opcode in _DEFINITIONS:
+        elif record.opcode in _DEFINITION_OPCODES:
             self.parser.define(record)
 
     def _add_chunk(self, data: bytes, offset: int) -> None:
@@ -342,7 +348,7 @@ class Scan:
                 for number, channel_messages in by_number.items()
             }
             read = [topic for topic in self.topics if topic in by_topic]
-            numbers = by_topic.keys() & set(NUMBERS)
+            numbers = by_topic.keys() & set(NUMERIC_TOPICS)
             new = self._numbers not in (set(), numbers) or numbers.isdisjoint(read)
             if numbers and new:
                 raise Damage(
@@ -376,7 +382,7 @@ class Scan:
         """Return the layouts of messages of numbers; `Damage` if messages of one differ."""
         assert self.header is not None
         layouts = {}
-        for topic in by_topic.keys() & set(NUMBERS):
+        for topic in by_topic.keys() & set(NUMERIC_TOPICS):
             messages = by_topic[topic]
             layout = self._layouts.get(topic)
             if layout is None:
@@ -407,7 +413,7 @@ class Scan:
             return
         stamps = next(iter(by_topic.values())).stamps
         chosen = None
-        if self._times != ALWAYS:
+        if self._times != ALL_TIMES:
             chosen = (stamps >= self._times[0]) & (stamps < self._times[1])
             stamps = stamps[chosen]
         begin = self._count
@@ -450,8 +456,8 @@ class Scan:
                 raise Damage(offset, "(chunk) has messages out of order")
             first = int(sequence[0])
             gap = first - self._next.get(topic, first if self._skipped else 0)
-            gap %= _SEQUENCES
-            if gap > _SEQUENCES // 2:
+            gap %= _SEQUENCE_MODULUS
+            if gap > _SEQUENCE_MODULUS // 2:
                 raise Damage(offset, "(chunk) repeats messages of previous chunks")
             if gap:
                 missing[topic] = gap
@@ -463,9 +469,9 @@ class Scan:
         Returns:
             The newest stamp [ns], -1 without cycles.
         """
-        samples = [topic for topic in by_topic if topic in NUMBERS]
+        samples = [topic for topic in by_topic if topic in NUMERIC_TOPICS]
         # Those of viewers are not read, and need no check.
-        cycles = (schema.CYCLE, *schema.STATES)
+        cycles = (schema.CYCLE, *schema.STATE_TOPICS)
         timed = [t for t in cycles if t in samples] if schema.CYCLE in samples else samples
         if not timed:
             return -1
@@ -511,7 +517,7 @@ def _chunks_by_time(
 
     The first is read anyway: it defines the channels. Both are empty where all times are wanted.
     """
-    if times == ALWAYS:
+    if times == ALL_TIMES:
         return set(), set()
     chunks = container.read_summary(stream, size, container.CHUNK_INDEX)
     first = min((chunk.chunk_start_offset for chunk in chunks), default=0)

@@ -196,7 +196,7 @@ OTHERS: Final[Mapping[str, str]] = {
     "commanded_position": COMMANDED_POSITION,
 }
 """Topics of what an imported recording has beside joint states."""
-STATES: Final = (UR_STATE,)
+STATE_TOPICS: Final = (UR_STATE,)
 """Topics of what a controller sends in each cycle beyond `/hil/cycle`."""
 
 
@@ -221,7 +221,7 @@ def cycle_messages(
         period: of the controller [s].
         records: of the cycles (k,).
         torque: of the joints (k, n) [N·m].
-        states: rows (k,) by topic (`STATES`), with the fields of its messages.
+        states: rows (k,) by topic (`STATE_TOPICS`), with the fields of its messages.
     """
     stamp = _stamp(records, period)
     columns = {name: records[name] for name in records.dtype.names or ()}
@@ -334,7 +334,7 @@ def message_layout(
     layout = fixed_layout(record.data.decode(errors="replace"))
     types: Mapping[str, Any] = layout.dtype.fields or {}
     expected: Mapping[str, Any] = _STAMP_TYPES
-    if topic in (CYCLE, MOTOR_CURRENT, *STATES):
+    if topic in (CYCLE, MOTOR_CURRENT, *STATE_TOPICS):
         expected = fixed_layout(profile(n)[topic].definition).dtype.fields or {}
     for name, (kind, *_) in expected.items():
         if name not in types:

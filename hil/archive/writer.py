@@ -54,8 +54,8 @@ from hil.base.terminal_text import with_joint_names
 
 FLUSH_PERIOD = 0.1  # s of the controller's time in one chunk; a crash loses at most that
 _SAMPLES_PER_CHUNK: Final = 1000
-_MOST_NUMBERS: Final = 1 << 32  # message numbers are counted modulo this
-_NO_LIMIT: Final = 1 << 62  # bytes of a chunk: it ends at `flush` only
+_SEQUENCE_MODULUS: Final = 1 << 32  # message numbers are counted modulo this
+_UNLIMITED_CHUNK_BYTES: Final = 1 << 62  # bytes of a chunk: it ends at `flush` only
 _COMPRESSION: Final = CompressionType.LZ4
 """Of chunks. With Zstandard at the only level of the library files are a fifth smaller, and take
 three times as long to decompress (`python -m benchmarks.archive --sizes`)."""
@@ -74,7 +74,7 @@ def mcap_writer(output: Any) -> Any:
     Chunks end at its `flush` only; one without messages is not written. `output` has the methods
     ``write``, ``tell`` and ``flush`` of a binary file.
     """
-    writer: Any = Writer(output, chunk_size=_NO_LIMIT, compression=_COMPRESSION)
+    writer: Any = Writer(output, chunk_size=_UNLIMITED_CHUNK_BYTES, compression=_COMPRESSION)
     writer.start(PROFILE, LIBRARY)
     return writer
 
@@ -179,7 +179,7 @@ class ArchiveFile:
     def add(self, batch: Batch) -> None:
         """Add messages of several channels to the chunk in progress, one of each at each stamp."""
         topics = [*batch.messages]
-        numbers = (self.counts[topics[0]] + np.arange(len(batch.stamp))) % _MOST_NUMBERS
+        numbers = (self.counts[topics[0]] + np.arange(len(batch.stamp))) % _SEQUENCE_MODULUS
         stamps = batch.stamp.tolist()
         channels = [self._numbers[topic] for topic in topics]
         messages = [rows.view(f"V{rows.itemsize}").tolist() for rows in batch.messages.values()]
@@ -200,7 +200,7 @@ class ArchiveFile:
             self._add_message(EVENTS, event.stamp, event.encode())
 
     def _add_message(self, topic: str, stamp: int, data: bytes) -> None:
-        number = self.counts[topic] % _MOST_NUMBERS
+        number = self.counts[topic] % _SEQUENCE_MODULUS
         self._writer.add_message(self._numbers[topic], stamp, data, stamp, number)
         self.counts[topic] += 1
 
@@ -330,7 +330,7 @@ class ArchiveWriter:
         joint_names: joints in the order of the records' columns.
         period: cycle time of the controller [s].
         metadata: see `ArchiveFile`. Times of day only if a real arm moves.
-        states: topics (`hil.archive.schema.STATES`) of the arm's state in each record.
+        states: topics (`hil.archive.schema.STATE_TOPICS`) of the arm's state in each record.
         attachments: ``cell.toml``, ``robot.urdf``, ``drive_train.json``, ``plan.json`` by name.
         durable: wait at each flush until the data are on the disk.
 

@@ -15,7 +15,7 @@ HilError                   exit status 1
 ├── OperatorStopError         130: stopped by the operator
 ├── OutputError            1: results cannot be written: disk full, no permission
 └── InputError             2: invalid input of the user: file, field, problem, remedy
-                           (1 on the command line for errors of a disk: `DISK_REFUSES`)
+                           (1 on the command line for errors of a disk: `DISK_ERRNOS`)
     ├── ArchiveError       an archive that cannot be read or written
     │   ├── NotAnArchiveError       another format, empty, or truncated in its header
     │   ├── ArchiveVersionError     written by a newer version of the archive profile
@@ -38,7 +38,7 @@ from typing import Any, ClassVar, Final, Self
 
 from hil.base.terminal_text import printable
 
-DISK_REFUSES: Final = frozenset({errno.ENOSPC, errno.EDQUOT, errno.EIO, errno.EROFS, errno.EFBIG})
+DISK_ERRNOS: Final = frozenset({errno.ENOSPC, errno.EDQUOT, errno.EIO, errno.EROFS, errno.EFBIG})
 """Numbers of an OSError that are not caused by input: disk full, over quota, failed."""
 
 

@@ -149,9 +149,9 @@ def _sync(path: Path) -> None:
         sync_folder(path)
 
 
-_FLAGS: Final = os.O_CLOEXEC | os.O_NOFOLLOW | os.O_NONBLOCK
+_OPEN_FLAGS: Final = os.O_CLOEXEC | os.O_NOFOLLOW | os.O_NONBLOCK
 """In untrusted folders, no link is followed and no pipe blocks."""
-_PAUSE: Final = 0.02
+_LOCK_POLL_PERIOD: Final = 0.02
 
 
 def digest(content: str | bytes) -> str:
@@ -181,7 +181,7 @@ def file_lock(
     """
     kind = os.O_RDONLY if path.is_dir() else os.O_RDWR | os.O_CREAT
     try:
-        descriptor = os.open(path, _FLAGS | kind, 0o644)
+        descriptor = os.open(path, _OPEN_FLAGS | kind, 0o644)
     except OSError as error:
         raise refusal(error) from error
     try:
@@ -202,4 +202,4 @@ def _acquire(descriptor: int, kind: int, patience: float) -> None:
         except BlockingIOError:
             if time.monotonic() >= deadline:
                 raise
-            time.sleep(_PAUSE)
+            time.sleep(_LOCK_POLL_PERIOD)

@@ -7,9 +7,9 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Final
 
-LINES: Final = 24
-COLUMNS: Final = 100
-_CUT: Final = " ..."
+SCREEN_LINES: Final = 24
+SCREEN_COLUMNS: Final = 100
+_ELLIPSIS: Final = " ..."
 
 
 @dataclass(frozen=True)
@@ -24,11 +24,11 @@ class Paragraph:
         """Return the text on at most so many lines, cut at the end of a word."""
         return textwrap.wrap(
             " ".join(self.text.split()),
-            COLUMNS,
+            SCREEN_COLUMNS,
             initial_indent=self.label,
             subsequent_indent=" " * len(self.label),
             max_lines=count,
-            placeholder=_CUT,
+            placeholder=_ELLIPSIS,
             break_on_hyphens=False,
         )
 
@@ -42,7 +42,7 @@ Part = str | Paragraph
 """A line as it is, such as the row of a table; or text that may be cut."""
 
 
-def one_screen(parts: Sequence[Part], lines: int = LINES) -> list[str]:
+def one_screen(parts: Sequence[Part], lines: int = SCREEN_LINES) -> list[str]:
     """Return parts on at most so many lines: a line each, the rest of the room to the first ones.
 
     Empty lines are dropped, from the end on, where text needs their room.
@@ -56,7 +56,9 @@ def one_screen(parts: Sequence[Part], lines: int = LINES) -> list[str]:
     shown: list[str] = []
     for part in chosen:
         if isinstance(part, str):
-            shown.append(part[:COLUMNS].rstrip() if len(part) <= COLUMNS else _cut(part))
+            shown.append(
+                part[:SCREEN_COLUMNS].rstrip() if len(part) <= SCREEN_COLUMNS else _cut(part)
+            )
             continue
         more = min(part.whole - 1, max(spare, 0))
         spare -= max(more, 0)
@@ -67,11 +69,11 @@ def one_screen(parts: Sequence[Part], lines: int = LINES) -> list[str]:
 def brief(lines: Sequence[str], last: int = 1) -> list[str]:
     """Return lines on one screen: of too many the first ones, their number, and the last ones."""
     shown: list[str] = list(lines)
-    if (more := len(shown) - LINES) > 0:
-        head = shown[: LINES - last - 1]
+    if (more := len(shown) - SCREEN_LINES) > 0:
+        head = shown[: SCREEN_LINES - last - 1]
         shown = [*head, f"{more + 1} more lines: -v", *shown[len(shown) - last :]]
     return one_screen(
-        [line if len(line) <= COLUMNS else Paragraph(line, _indent(line)) for line in shown]
+        [line if len(line) <= SCREEN_COLUMNS else Paragraph(line, _indent(line)) for line in shown]
     )
 
 
@@ -80,7 +82,7 @@ def _indent(line: str) -> str:
 
 
 def _cut(line: str) -> str:
-    return line[: COLUMNS - len(_CUT)].rstrip() + _CUT
+    return line[: SCREEN_COLUMNS - len(_ELLIPSIS)].rstrip() + _ELLIPSIS
 
 
 def columns(rows: Sequence[Sequence[str]], *, left: int = 1) -> list[str]:

@@ -16,7 +16,7 @@ from hil.base.safe_input import path_exists
 SOURCES: Final = "sources.json"
 """File of an output folder with the digests of the recordings that its results are from."""
 
-_LARGEST: Final = 1 << 20  # bytes
+_MAX_SOURCES_BYTES: Final = 1 << 20  # bytes
 
 
 def sources_text(fitted: Sequence[Path], predicted: Sequence[Path]) -> str:
@@ -69,7 +69,7 @@ def _has(folder: Path, sources: str) -> bool:
     path = folder / SOURCES
     try:
         with path.open("rb") as file:
-            return file.read(_LARGEST) == sources.encode()
+            return file.read(_MAX_SOURCES_BYTES) == sources.encode()
     except OSError:
         return False
 

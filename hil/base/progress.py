@@ -24,7 +24,7 @@ from rich.text import Text
 from hil.base.progress_lines import PROGRESS_LINES, progress_console
 from hil.base.terminal_text import printable
 
-_NARROWEST = 8  # columns of a bar
+_MIN_BAR_COLUMNS = 8  # columns of a bar
 
 
 def put(console: Console, text: str) -> None:
@@ -170,7 +170,7 @@ class Bar:
         whole = Column(no_wrap=True)
         progress = _WithNote(
             TextColumn("{task.description}", table_column=whole),
-            BarColumn(bar_width=None, table_column=Column(ratio=1, min_width=_NARROWEST)),
+            BarColumn(bar_width=None, table_column=Column(ratio=1, min_width=_MIN_BAR_COLUMNS)),
             MofNCompleteColumn(table_column=whole),
             TimeElapsedColumn(table_column=whole),
             TextColumn("left", table_column=whole),

@@ -40,7 +40,7 @@ class _Stage:
         parts = [self.title]
         if share:
             parts[0] += f": {100.0 * min(share, 1.0):.0f} %"
-        if share >= _ESTIMATED and share < 1.0:
+        if share >= _MIN_SHARE_FOR_ESTIMATE and share < 1.0:
             parts.append(f"about {_clock(took / share - took)} left")
         elif self.shown:
             parts.append(f"{_clock(took)} so far")
@@ -52,10 +52,10 @@ def _clock(seconds: float) -> str:
     return f"{minutes}:{seconds:02d} min" if minutes else f"{seconds} s"
 
 
-FIRST_LINE: Final = 1.0  # s after which a stage that is not over is named
+FIRST_LINE_DELAY: Final = 1.0  # s after which a stage that is not over is named
 LINE_PERIOD: Final = 30.0  # s, the longest silence during a stage
-_LOOKED: Final = 0.25  # Period of looking whether a line is due, s
-_ESTIMATED: Final = 0.05  # Share of a task from which the time left is estimated
+_POLL_PERIOD: Final = 0.25  # Period of looking whether a line is due, s
+_MIN_SHARE_FOR_ESTIMATE: Final = 0.05  # Share of a task from which the time left is estimated
 
 
 class ProgressLines:
@@ -100,7 +100,7 @@ class ProgressLines:
         stages = sorted(present, key=lambda stage: stage.began)
         if not stages:
             return
-        begins = not stages[-1].shown and now - stages[-1].began >= FIRST_LINE
+        begins = not stages[-1].shown and now - stages[-1].began >= FIRST_LINE_DELAY
         silence = now - max(self._printed, stages[0].began)
         if not begins and silence < LINE_PERIOD:
             return
@@ -123,7 +123,7 @@ class ProgressLines:
         with suppress(OSError, ValueError):  # standard error is closed
             while self._stages or self._step:
                 self.look(time.monotonic())
-                time.sleep(_LOOKED)
+                time.sleep(_POLL_PERIOD)
         self._looking = False
 
 

@@ -20,12 +20,12 @@ from typing import Any, Final
 
 from hil.base.errors import InputError
 
-_FIRST: Final = datetime(1970, 1, 1, tzinfo=UTC)
-_LAST: Final = datetime(2200, 1, 1, tzinfo=UTC)
-LARGEST_PORT: Final = 65535
-_MOST_DIGITS: Final = 18  # of a number that fits into 64 bits
-LONGEST_TEXT: Final = 1 << 28  # bytes of the longest text that is read
-_DEEPEST: Final = 32  # nesting of tables and lists
+_EARLIEST_TIME: Final = datetime(1970, 1, 1, tzinfo=UTC)
+_LATEST_TIME: Final = datetime(2200, 1, 1, tzinfo=UTC)
+MAX_PORT: Final = 65535
+_MAX_INTEGER_DIGITS: Final = 18  # of a number that fits into 64 bits
+MAX_TEXT_BYTES: Final = 1 << 28  # bytes of the longest text that is read
+_MAX_NESTING_DEPTH: Final = 32  # nesting of tables and lists
 _MARKS: Final = {  # those of UTF-32 begin as those of UTF-16
     codecs.BOM_UTF8: "utf-8-sig",
     codecs.BOM_UTF32_LE: "utf-32",
@@ -35,12 +35,12 @@ _MARKS: Final = {  # those of UTF-32 begin as those of UTF-16
 }
 _DECLARATION: Final = re.compile(r"^(<\?xml[^>]*?encoding\s*=\s*[\"'])([\w.-]+)([\"'])")
 _DECLARED: Final = re.compile(_DECLARATION.pattern.encode())
-_PROBED: Final = 1000  # bytes
-_BLOCK: Final = 1 << 20  # bytes
+_PROBE_BYTES: Final = 1000  # bytes
+_BLOCK_BYTES: Final = 1 << 20  # bytes
 GZIP: Final = b"\x1f\x8b"
 """First bytes of what gzip compressed."""
 _NO_FILE: Final = "it is a pipe or a device, not a file"
-_ABSENT: Final = frozenset(
+_ABSENT_ERRNOS: Final = frozenset(
     {
         *(errno.ENOENT, errno.ENOTDIR, errno.EISDIR, errno.ELOOP, errno.ENAMETOOLONG, errno.ENXIO),
         errno.EINVAL,  # a pipe or a device, or no path
@@ -59,12 +59,12 @@ def parse_time(when: str) -> datetime | None:
         at = (at if at.tzinfo else at.replace(tzinfo=UTC)).astimezone(UTC)
     except (ValueError, OverflowError):
         return None
-    return at if _FIRST <= at < _LAST else None
+    return at if _EARLIEST_TIME <= at < _LATEST_TIME else None
 
 
 def parse_count(text: str | None) -> int | None:
     """Return a number of 0 or more; None where the text is none, or too long."""
-    if text is None or not (text.isascii() and text.isdecimal()) or len(text) > _MOST_DIGITS:
+    if text is None or not (text.isascii() and text.isdecimal()) or len(text) > _MAX_INTEGER_DIGITS:
         return None
     return int(text)
 
@@ -72,7 +72,7 @@ def parse_count(text: str | None) -> int | None:
 def parse_port(text: str) -> int | None:
     """Return the number of a UDP or TCP port, 1 to 65535; None where the text is none."""
     port = parse_count(text)
-    return port if port is not None and 0 < port <= LARGEST_PORT else None
+    return port if port is not None and 0 < port <= MAX_PORT else None
 
 
 def open_file(path: Path) -> BufferedReader:
@@ -95,7 +95,7 @@ def open_file(path: Path) -> BufferedReader:
 
 def read_text(
     path: Path,
-    longest: int = LONGEST_TEXT,
+    longest: int = MAX_TEXT_BYTES,
     *,
     encoding: str | None = None,
     or_latin: bool = False,
@@ -118,7 +118,7 @@ def read_text(
     return _decoded(data, encoding, or_latin=or_latin).replace("\r\n", "\n").replace("\r", "\n")
 
 
-def read_bytes(path: Path, longest: int = LONGEST_TEXT) -> bytes:
+def read_bytes(path: Path, longest: int = MAX_TEXT_BYTES) -> bytes:
     """Return the bytes of a file, without their compression by gzip.
 
     OSError: as `open_file`, more than `longest`, or compressed bytes that are cut off or damaged.
@@ -132,7 +132,7 @@ def read_bytes(path: Path, longest: int = LONGEST_TEXT) -> bytes:
         data = bytearray()
         try:
             with gzip.GzipFile(fileobj=stream) as unpacked:
-                while block := unpacked.read(_BLOCK):
+                while block := unpacked.read(_BLOCK_BYTES):
                     data += block
                     if len(data) > longest:
                         raise too_large
@@ -149,7 +149,7 @@ def _decoded(data: bytes, encoding: str | None, *, or_latin: bool) -> str:
     for mark, name in _MARKS.items():
         if data.startswith(mark):
             return _declared_utf_8(data.decode(name))
-    if or_latin and b"\0" in data[:_PROBED]:  # UTF-16 without its mark
+    if or_latin and b"\0" in data[:_PROBE_BYTES]:  # UTF-16 without its mark
         return data.decode("utf-16-le" if data[1:2] == b"\0" else "utf-16-be")
     declaration = _DECLARED.match(data)
     try:
@@ -170,7 +170,7 @@ def encoding_by_start(start: bytes) -> str:
     for mark, name in _MARKS.items():
         if start.startswith(mark):
             return name
-    if b"\0" in start[:_PROBED]:
+    if b"\0" in start[:_PROBE_BYTES]:
         return "utf-16-le" if start[1:2] == b"\0" else "utf-16-be"
     try:
         codecs.getincrementaldecoder("utf-8")().decode(start)
@@ -186,7 +186,7 @@ def _declared_utf_8(text: str) -> str:
 
 def is_not_a_file(error: OSError) -> bool:
     """Return whether there is no regular file, and not a failure of reading."""
-    return error.errno in _ABSENT
+    return error.errno in _ABSENT_ERRNOS
 
 
 def path_exists(path: Path) -> bool:
@@ -194,7 +194,7 @@ def path_exists(path: Path) -> bool:
     return path.is_symlink() or path.exists()
 
 
-_MOST_SIBLINGS = 10_000
+_MAX_SIBLINGS = 10_000
 
 
 def similar_path(path: Path) -> Path | None:
@@ -211,7 +211,7 @@ def similar_path(path: Path) -> Path | None:
             return None
         return similar / path.name if path_exists(similar / path.name) else similar
     try:
-        names = [entry.name for entry in islice(folder.iterdir(), _MOST_SIBLINGS)]
+        names = [entry.name for entry in islice(folder.iterdir(), _MAX_SIBLINGS)]
     except OSError:
         return None
     matches = get_close_matches(path.name, names)
@@ -264,7 +264,7 @@ def parse_toml(text: str) -> dict[str, Any]:
     except RecursionError as error:
         raise ValueError("it is nested too deep") from error
     level: list[Any] = [document]
-    for _ in range(_DEEPEST):  # the parser does not limit dotted keys
+    for _ in range(_MAX_NESTING_DEPTH):  # the parser does not limit dotted keys
         level = [
             inner
             for table in level

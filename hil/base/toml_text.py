@@ -17,10 +17,10 @@ import tomlkit
 from tomlkit.container import Container
 from tomlkit.items import AoT, Comment, Item, Table, Trivia
 
-_EXACT = Context(prec=60)
+_DECIMAL_CONTEXT = Context(prec=60)
 _PI = Decimal("3.14159265358979323846264338327950288419716939937510")
 _SHORT_DIGITS = 15
-_MOST_DIGITS = 20
+_MAX_DIGITS = 20
 _SUFFIX = "_deg"
 
 
@@ -138,7 +138,7 @@ def radians_of(angle: Decimal | int) -> float:
     angle = Decimal(angle)
     if len(angle.as_tuple().digits) <= _SHORT_DIGITS or not angle.is_finite():
         return float(angle) * (pi / 180.0)
-    with localcontext(_EXACT):
+    with localcontext(_DECIMAL_CONTEXT):
         return float(angle * _PI / 180)
 
 
@@ -147,9 +147,9 @@ def degrees_text(angle: float) -> str:
     rounded = repr(float(f"{degrees(angle):.{_SHORT_DIGITS}g}"))
     if _same(radians_of(Decimal(rounded)), angle):
         return rounded
-    with localcontext(_EXACT):
+    with localcontext(_DECIMAL_CONTEXT):
         exact = Decimal(angle) * 180 / _PI
-    for digits in range(_SHORT_DIGITS + 1, _MOST_DIGITS):
+    for digits in range(_SHORT_DIGITS + 1, _MAX_DIGITS):
         text = f"{exact:.{digits - 1}e}"
         if _same(radians_of(Decimal(text)), angle):
             return f"{Decimal(text):f}" if 1e-4 < abs(exact) < 1e15 else text

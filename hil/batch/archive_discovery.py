@@ -50,7 +50,7 @@ _UNCHECKED: Final = (
     "is not listed in its campaign's manifest.json: its quality was not checked (the run was"
     " killed; the next run adds it)"
 )
-_UNTOUCHED: Final = 2_000_000_000
+_MIN_UNCHANGED_NS: Final = 2_000_000_000
 """Age of time stamps [ns] from which on they show the next change; some have steps of 2 s."""
 JOINT_TEMPERATURE: Final = "joint_temperature"
 _FIELDS: Final = (
@@ -152,7 +152,7 @@ class CellTexts:
     urdf: str
 
 
-_CHUNK: Final = 16
+_PLACES_PER_TASK: Final = 16
 """Archives whose metadata one task reads: a task costs 2.5 ms, as much as the metadata of one."""
 
 
@@ -245,10 +245,10 @@ def _inspected(
 ) -> dict[str, ArchiveRef | SkippedArchive]:
     """Return what workers find in archives; the archives of a failed task are tried one by one."""
     refs: dict[str, ArchiveRef | SkippedArchive] = {}
-    chunks = [places[k : k + _CHUNK] for k in range(0, len(places), _CHUNK)]
+    chunks = [places[k : k + _PLACES_PER_TASK] for k in range(0, len(places), _PLACES_PER_TASK)]
     tasks = [ClusterTask(chunk[0], inspect_archives, (chunk, cache)) for chunk in chunks]
     failed: list[str] = []
-    results = cluster.results(tasks, lambda n: advance(n * _CHUNK), archives=len(places))
+    results = cluster.results(tasks, lambda n: advance(n * _PLACES_PER_TASK), archives=len(places))
     for chunk, result in zip(chunks, results, strict=True):
         if isinstance(result, SkippedArchive):
             failed += chunk
@@ -421,7 +421,7 @@ def inspect_archive(place: str, cache: CacheLocation) -> ArchiveRef:
 
 def is_untouched(stamp: Stamp, begun: int) -> bool:
     """Return whether a stamp will show the next change of a file that was read at `begun` [ns]."""
-    return bool(stamp.text) and begun - stamp.changed > _UNTOUCHED
+    return bool(stamp.text) and begun - stamp.changed > _MIN_UNCHANGED_NS
 
 
 def described_archive(place: str, cache: CacheLocation, source: str = "") -> ArchiveRef:

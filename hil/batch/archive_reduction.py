@@ -19,12 +19,12 @@ from hil.base.files import json_digest
 from hil.pipeline.prepared import known_parameters, reduction_of, versions_of
 from hil.pipeline.sources import Source, known_warnings, source_of
 from identification.estimators.elasticity import ElasticTorque
-from identification.estimators.friction_drift import PIECES
+from identification.estimators.friction_drift import TREND_PIECES
 from identification.estimators.least_squares import fit_least_squares
 from identification.estimators.prior import ScoreScatter, body_prior
 from identification.factor.estimate import Estimate
 from identification.factor.factor import Factor
-from identification.reduction.reduction import ALIKE, Reduction, Unmodelled
+from identification.reduction.reduction import MAX_UNMODELLED_REPETITIONS, Reduction, Unmodelled
 from identification.selection.settings import Settings
 
 from .archive_discovery import JOINT_TEMPERATURE, ArchiveRef, cell_in, errors_of_origin, open_ref
@@ -93,10 +93,10 @@ def to_reduce(refs: Sequence[ArchiveRef]) -> list[ToReduce]:
     shown = set()
     for ref in fitted:
         seen[ref.motion] += 1
-        if seen[ref.motion] <= ALIKE:
+        if seen[ref.motion] <= MAX_UNMODELLED_REPETITIONS:
             shown.add(ref)
     # Some of them may turn out to be unusable.
-    parts = PIECES if len(fitted) < 2 * PIECES else 1
+    parts = TREND_PIECES if len(fitted) < 2 * TREND_PIECES else 1
     return [ToReduce(ref, ref in shown, parts if ref.use == "excitation" else 1) for ref in refs]
 
 

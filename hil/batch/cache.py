@@ -29,14 +29,14 @@ from hil.base.errors import InputError
 from hil.base.files import digest, json_digest, replace_file, user_cache
 from hil.base.safe_input import open_file
 from hil.base.type_adapter import adapter_of
-from planner.arrays import DAMAGED
+from planner.arrays import DAMAGED_DATA_ERRORS
 
 from .places import folder_of, is_url
 
 T = TypeVar("T")
 Arrays = dict[str, NDArray[Any]]
 
-BESIDE: Final = ".hil-cache"  # folder beside the archives
+CACHE_FOLDER: Final = ".hil-cache"  # folder beside the archives
 HEADER: Final = "header"  # array with the JSON text, as bytes
 NUMBERS: Final = "numbers"  # array of all others, one after the other, as bytes
 NPZ: Final = ".npz"  # suffix of entries with arrays
@@ -44,8 +44,8 @@ JSON: Final = ".json"  # suffix of entries without
 
 LIBRARIES: Final = ("numpy", "scipy", "pin")  # that determine the numbers
 
-_UNREADABLE: Final = (
-    *DAMAGED,
+_READ_ERRORS: Final = (
+    *DAMAGED_DATA_ERRORS,
     *(OSError, EOFError, MemoryError),
     # By the `.zip` around the arrays: its directory, compression, encryption or data.
     *(BadZipFile, NotImplementedError, RuntimeError, struct.error, zlib.error),
@@ -71,7 +71,7 @@ class CacheLocation:
         """Return the cache folder of an archive, which need not exist."""
         folder = folder_of(location)
         if self.root is None and not is_url(location):
-            beside = Path(folder) / BESIDE
+            beside = Path(folder) / CACHE_FOLDER
             exists = os.path.lexists(beside)
             usable = beside.is_dir() or not exists
             if usable and os.access(beside if exists else folder, os.W_OK | os.X_OK):
@@ -103,7 +103,7 @@ class CacheLocation:
                 if header["key"] != key:
                     return None
                 return header["content"], _split(entry[NUMBERS], header["arrays"])
-        except _UNREADABLE:
+        except _READ_ERRORS:
             return None
 
     def write(self, location: str, key: str, content: Any, arrays: Arrays) -> None:

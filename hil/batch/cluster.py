@@ -35,7 +35,7 @@ AnyFuture: TypeAlias = "Future | LocalFuture[Any]"
 T = TypeVar("T")
 T_co = TypeVar("T_co", covariant=True)
 
-FEW: Final = 32
+MAX_ARCHIVES_IN_PROCESS: Final = 32
 """Archives that are read in this process: a cluster takes two seconds to start, as do these.
 
 By a thread pool of Python. Dask's own cluster in a thread takes half a second to import, to start
@@ -44,8 +44,8 @@ and to end, as long as a batch of a hundred cached archives; `dask.get`, without
 """
 
 CONNECT_TIMEOUT: Final = 10.0  # s, for a scheduler to answer
-PATIENCE: Final = 60.0  # s, for a worker of a scheduler to be there
-_WATCH: Final = 1.0  # s between looks at the workers while no task ends
+WORKER_TIMEOUT: Final = 60.0  # s, for a worker of a scheduler to be there
+_WORKER_POLL_PERIOD: Final = 1.0  # s between looks at the workers while no task ends
 
 _LOGGERS: Final = ("distributed", "tornado.application")
 """Loggers of what a `Cluster` reports in a sentence, or of heartbeats while a worker ends."""
@@ -156,7 +156,11 @@ class Cluster:
             InputError: no scheduler answers at the address.
             ClusterError: the scheduler has no worker, or one of another version.
         """
-        few = archives <= FEW and self._workers is None and self._scheduler is None
+        few = (
+            archives <= MAX_ARCHIVES_IN_PROCESS
+            and self._workers is None
+            and self._scheduler is None
+        )
         if isinstance(self._client, ThreadPoolExecutor) and not few:
             self._close()
         if self._client is None:
@@ -211,7 +215,7 @@ class Cluster:
             ) from error
         self._open.callback(client.close)
         try:
-            client.wait_for_workers(1, timeout=PATIENCE)
+            client.wait_for_workers(1, timeout=WORKER_TIMEOUT)
         except TimeoutError as error:
             raise self._without_workers() from error
         self._require_same_code(client)
@@ -231,9 +235,9 @@ class Cluster:
 
     def _without_workers(self) -> ClusterError:
         return ClusterError(
-            f"the Dask scheduler {self._scheduler} has no worker since {PATIENCE:.0f} s; start some"
-            f" with `dask worker {self._scheduler}` and run the command again: what was computed"
-            " is in the cache"
+            f"the Dask scheduler {self._scheduler} has no worker since {WORKER_TIMEOUT:.0f} s;"
+            f" start some with `dask worker {self._scheduler}` and run the command again: what was"
+            " computed is in the cache"
         )
 
     # Tasks
@@ -264,7 +268,7 @@ class Cluster:
         since = time.monotonic()
         while count:
             try:
-                future = done.get(timeout=_WATCH)
+                future = done.get(timeout=_WORKER_POLL_PERIOD)
             except Empty:
                 since = self._watch(since)
                 continue
@@ -305,13 +309,13 @@ class Cluster:
         )
 
     def _watch(self, since: float) -> float:
-        """Return since when there is a worker, or raise a `ClusterError` after `PATIENCE`."""
+        """Return since when there is a worker, or raise a `ClusterError` after `WORKER_TIMEOUT`."""
         client = self._client
         if self._scheduler is None or client is None or isinstance(client, ThreadPoolExecutor):
             return time.monotonic()  # processes of this PC are started again
         if client.scheduler_info(n_workers=-1)["workers"]:
             return time.monotonic()
-        if time.monotonic() - since > PATIENCE:
+        if time.monotonic() - since > WORKER_TIMEOUT:
             raise self._without_workers()
         return since
 

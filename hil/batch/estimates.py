@@ -21,7 +21,7 @@ from identification.estimators.covariance import solve_with_prior
 from identification.estimators.least_squares import no_narrower
 from identification.estimators.prior import posterior_method
 from identification.factor.estimate import Estimate
-from identification.factor.factor import QR_CONDITION, Factor, require_rows
+from identification.factor.factor import MAX_GRAM_CONDITION, Factor, require_rows
 from identification.reduction.intervals import delayed, widened
 from identification.reduction.posterior import Posterior
 from identification.reduction.reduction import Reduction
@@ -44,7 +44,7 @@ Level = Literal["repetition", "campaign", "pooled", "siblings"]
 BatchEstimator = Literal["auto", "wls", "consistent"]
 """Estimators that need factors only, and no samples."""
 
-_NAMED: Final = 12  # different warnings that are listed
+_MAX_SHOWN_WARNINGS: Final = 12  # different warnings that are listed
 
 
 @dataclass(frozen=True, eq=False)
@@ -399,7 +399,7 @@ class Estimator:
         refs = group.refs
         estimate = self.of_group(group, posterior, recordings)
         unseen = Factor.zero(self.model) if group.unseen is None else group.unseen
-        is_poor = not estimate.undetermined and estimate.condition > QR_CONDITION
+        is_poor = not estimate.undetermined and estimate.condition > MAX_GRAM_CONDITION
         if self.name != "auto" and is_poor:
             conditioning = (
                 f"the scaled condition number is {estimate.condition:.2g}: the motion separates"
@@ -428,12 +428,14 @@ def warning_lines(warned: Sequence[tuple[ArchiveRef, Sequence[str]]]) -> tuple[s
     counts = Counter(text for _, warnings in warned for text in warnings)
     first = {text: ref for ref, warnings in reversed(warned) for text in warnings}
     lines = []
-    for text, count in counts.most_common(_NAMED):
+    for text, count in counts.most_common(_MAX_SHOWN_WARNINGS):
         name = f"{first[text].campaign.rsplit('/', 1)[-1]}/{first[text].name}"
         some = f"{count} of {len(warned)} archives, such as {name}: {text}"
         lines.append(text if count == len(warned) else some)
-    if len(counts) > _NAMED:
-        lines.append(f"{len(counts) - _NAMED} more warnings are listed with the repetitions")
+    if len(counts) > _MAX_SHOWN_WARNINGS:
+        lines.append(
+            f"{len(counts) - _MAX_SHOWN_WARNINGS} more warnings are listed with the repetitions"
+        )
     return tuple(lines)
 
 

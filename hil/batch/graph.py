@@ -1,8 +1,9 @@
 """The batch: find archives, decide settings, and estimate by one graph of Dask tasks.
 
-archive -> factor (cached) -> sum -> estimate: a task reduces up to `PARTITION` archives of a
-campaign, each of which is cached, and adds their factors; one task adds these sums, which it reads
-itself if all of them are cached, and estimates the campaign; others pool the campaigns of an arm.
+archive -> factor (cached) -> sum -> estimate: a task reduces up to `ARCHIVES_PER_TASK` archives of
+a campaign, each of which is cached, and adds their factors; one task adds these sums, which it
+reads itself if all of them are cached, and estimates the campaign; others pool the campaigns of an
+arm.
 """
 
 from __future__ import annotations
@@ -59,7 +60,7 @@ from .estimates import (
     result_of,
 )
 
-PARTITION: Final = 16
+ARCHIVES_PER_TASK: Final = 16
 """Archives of one task, and campaigns of one sum: Dask takes 2.5 ms for a task, and sums of factors
 are fifty times as large as what else is known of an archive."""
 
@@ -263,8 +264,8 @@ class _ArmWork:
 
 
 def _chunks(things: Sequence[Any]) -> Iterator[list[Any]]:
-    for begin in range(0, len(things), PARTITION):
-        yield list(things[begin : begin + PARTITION])
+    for begin in range(0, len(things), ARCHIVES_PER_TASK):
+        yield list(things[begin : begin + ARCHIVES_PER_TASK])
 
 
 @dataclass(eq=False)

@@ -12,7 +12,7 @@ from hil.archive.header import SUFFIX
 from hil.base.errors import InputError
 from hil.base.safe_input import remedy_for_missing
 
-from .cache import BESIDE
+from .cache import CACHE_FOLDER
 from .cluster import SkippedArchive
 from .places import archives_at, is_url
 
@@ -98,7 +98,7 @@ class _Search:
                 folders.clear()
                 continue
             self._visited.add(folder)
-            folders[:] = [subfolder for subfolder in folders if subfolder != BESIDE]
+            folders[:] = [subfolder for subfolder in folders if subfolder != CACHE_FOLDER]
             if (kinds := self._kinds) is not None:
                 recordings = [each for each in folders if kinds.is_folder_of_one(folder / each)]
                 self.logs.update((folder / each).as_posix() for each in recordings)

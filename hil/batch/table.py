@@ -40,7 +40,7 @@ _NUMBERS: Final = frozenset(
     }
 )
 _COUNTS: Final = frozenset(("archives", "samples"))
-_BLOCK: Final = 1 << 24  # bytes of a table in memory at a time
+_BLOCK_BYTES: Final = 1 << 24  # bytes of a table in memory at a time
 
 
 def write_tables(folder: Path, result: BatchResult) -> list[Path]:
@@ -93,7 +93,7 @@ def _write_parquet(path: Path, columns: Sequence[str], table: Path) -> None:
     schema = pyarrow.schema([(name, kind(name)) for name in columns])
     parts = arrow_csv.open_csv(
         table,
-        read_options=arrow_csv.ReadOptions(use_threads=False, block_size=_BLOCK),
+        read_options=arrow_csv.ReadOptions(use_threads=False, block_size=_BLOCK_BYTES),
         parse_options=arrow_csv.ParseOptions(newlines_in_values=True),
         convert_options=arrow_csv.ConvertOptions(column_types=schema, null_values=[""]),
     )

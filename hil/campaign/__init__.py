@@ -33,7 +33,7 @@ __all__ = [
     "plan_around",
     "stop_on_interrupt",
 ]
-_HOME = {
+_MODULE_OF_NAME = {
     "Campaign": "hil.campaign.campaign",
     "CampaignFolder": "hil.campaign.folder",
     **dict.fromkeys(("MotionFailedError", "MotionRefusedError"), "hil.control.errors"),
@@ -49,9 +49,9 @@ _HOME = {
 if not TYPE_CHECKING:  # which would accept any name
 
     def __getattr__(name: str) -> Any:
-        if name not in _HOME:
+        if name not in _MODULE_OF_NAME:
             raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-        return getattr(import_module(_HOME[name]), name)
+        return getattr(import_module(_MODULE_OF_NAME[name]), name)
 
 
 def __dir__() -> list[str]:

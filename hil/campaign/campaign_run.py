@@ -18,7 +18,7 @@ from hil.control.link import MotionLink
 from hil.control.motion_checks import MotionChecks
 from hil.control.motions import CampaignMotion, CheckedMoves, require_allowed
 
-from .dry_run_record import OVERRIDE, DryRunState
+from .dry_run_record import MAX_DRY_RUN_OVERRIDE, DryRunState
 from .dry_run_stage import DryRunStage
 from .gates import require_as_rehearsed, require_dry_run, require_gates
 from .motion_runner import RunArchives, Runner, RunOptions
@@ -150,7 +150,7 @@ class _CampaignRun:
                     # Later repetitions may show that the first one was disturbed.
                     for kind in ("standstill", "excitation", "excitation", "validation"):
                         self._run_missing(runner, kind)
-                runner.go_back(OVERRIDE if options.dry_run_only else 1.0)
+                runner.go_back(MAX_DRY_RUN_OVERRIDE if options.dry_run_only else 1.0)
         return self._result()
 
     @contextmanager

@@ -26,7 +26,7 @@ DryRunState = Literal["accepted", "to be accepted", "left out"]
 
 SIMULATED: Final = "simulated"
 """Metadata key: whether only a simulated arm can have moved, "yes" or "no", by the link."""
-OVERRIDE: Final = 0.2  # Largest share of the planned speed
+MAX_DRY_RUN_OVERRIDE: Final = 0.2  # Largest share of the planned speed
 FORMAT_VERSION: Final = 2  # 1 had no check of torques
 _FIELDS: Final = (
     *("cycle", "gap", "position", "target_position", "target_current", "torque"),
@@ -37,10 +37,12 @@ _CAUSES: Final = "joint_sign, URDF or torque sign may be wrong"
 _CAUSES_WITH_PAYLOAD: Final = (
     "the assumed centre of mass of the payload (--payload-centre) may be wrong; if it is right, "
 )
-CLEAR: Final = 0.5  # Magnitude of a correlation of torque and gravity that is significant
-_LEAST_SHARE: Final = 0.05  # Gravity as a share of the rms torque below which it is not compared
-_LEAST_SAMPLES: Final = 100
-_STEP: Final = 0.01  # Period of the samples whose torque is compared, s
+# Magnitude of a correlation of torque and gravity that is significant
+MIN_GRAVITY_CORRELATION: Final = 0.5
+# Gravity as a share of the rms torque below which it is not compared
+_MIN_GRAVITY_SHARE: Final = 0.05
+_MIN_SAMPLES: Final = 100
+_SAMPLE_PERIOD: Final = 0.01  # Period of the samples whose torque is compared, s
 
 
 def yes_or_no(only_simulated: bool) -> str:
@@ -75,7 +77,7 @@ def agreement(gravity: Array, torque: Array, velocity: Array, moving: NDArray[np
     correlation = np.full(gravity.shape[1], np.nan)
     for joint in range(len(correlation)):
         rows = moving[:, joint]
-        if rows.sum() < _LEAST_SAMPLES:
+        if rows.sum() < _MIN_SAMPLES:
             continue
         speed = velocity[rows, joint]
         both = np.column_stack([gravity[rows, joint], torque[rows, joint]])
@@ -83,7 +85,7 @@ def agreement(gravity: Array, torque: Array, velocity: Array, moving: NDArray[np
         friction = np.column_stack([np.sign(speed), speed])
         residual = both - friction @ np.linalg.lstsq(friction, both, rcond=None)[0]
         weight, measured = np.linalg.norm(residual, axis=0)
-        if weight > _LEAST_SHARE * rms * np.sqrt(rows.sum()) and measured > 0.0:
+        if weight > _MIN_GRAVITY_SHARE * rms * np.sqrt(rows.sum()) and measured > 0.0:
             correlation[joint] = residual[:, 0] @ residual[:, 1] / (weight * measured)
     return correlation
 
@@ -182,7 +184,7 @@ class DryRunRecord:
         folder = campaign.folder
         cell = campaign.cell
         limit = cell.drive_train.current_limit
-        step = max(1, round(_STEP / cell.period))
+        step = max(1, round(_SAMPLE_PERIOD / cell.period))
         current = np.zeros(len(limit))
         following = np.zeros(len(limit))
         missed = late = cycles = 0
@@ -213,7 +215,7 @@ class DryRunRecord:
         joints = np.array(cell.joint_names)
         return cls(
             plan_hash=plan_hash,
-            override=OVERRIDE,
+            override=MAX_DRY_RUN_OVERRIDE,
             archives=tuple(names),
             duration=cycles * cell.period,
             simulated=simulated,
@@ -222,8 +224,10 @@ class DryRunRecord:
             following_error=tuple(following.tolist()),
             missed=missed,
             late=late,
-            against_gravity=tuple(joints[correlation < -CLEAR].tolist()),
-            gravity_not_seen=tuple(joints[~(np.abs(correlation) >= CLEAR)].tolist()),
+            against_gravity=tuple(joints[correlation < -MIN_GRAVITY_CORRELATION].tolist()),
+            gravity_not_seen=tuple(
+                joints[~(np.abs(correlation) >= MIN_GRAVITY_CORRELATION)].tolist()
+            ),
             assumed_payload=cell.assumes_payload,
         )
 

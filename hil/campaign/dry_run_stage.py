@@ -8,7 +8,7 @@ from dataclasses import replace
 from hil.base.errors import OperatorStopError
 from hil.control.motions import CampaignMotion
 
-from .dry_run_record import OVERRIDE, DryRunRecord, DryRunState, is_from, not_accepted
+from .dry_run_record import MAX_DRY_RUN_OVERRIDE, DryRunRecord, DryRunState, is_from, not_accepted
 from .motion_runner import RunArchives, Runner, RunOptions
 from .operator import RunWatch
 from .state import CampaignState
@@ -63,7 +63,7 @@ class DryRunStage:
         """Run what is missing slowly, and have it accepted; see `accept`."""
         missing = self.missing()
         for slow in missing:
-            name = runner.run_motion(slow, slow.index + 1, len(self.motions), OVERRIDE)
+            name = runner.run_motion(slow, slow.index + 1, len(self.motions), MAX_DRY_RUN_OVERRIDE)
             self._archives.review.enter(slow, name)
         if missing:
             self.accept()

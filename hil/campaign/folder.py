@@ -41,7 +41,7 @@ if TYPE_CHECKING:
 T = TypeVar("T")
 
 LOCK: Final = "campaign.lock"
-LOCK_PATIENCE: Final = 0.5  # s to wait for a lock
+LOCK_TIMEOUT: Final = 0.5  # s to wait for a lock
 MESH: Final = "mesh "  # Prefix of the entry of a mesh, by its name in the URDF
 MISSING: Final = "missing"
 PAYLOADS: Final = "payload"
@@ -177,7 +177,7 @@ class CampaignFolder(RecordedCampaign):
             problem = f"{LOCK} cannot be written ({error.strerror})"
             return CampaignFolderError(self.root, problem, "make it a writable file")
 
-        return file_lock(self.root / LOCK, refusal, patience=LOCK_PATIENCE)
+        return file_lock(self.root / LOCK, refusal, patience=LOCK_TIMEOUT)
 
     def seal(self) -> None:
         """Create the manifest with the checksums of cell, URDF, plan and meshes."""

@@ -32,13 +32,13 @@ DEFAULT_DRIFT: Final = 0.002
 """Change per motion below which a real arm is warm. Thirty repetitions then change friction by some
 per cent at most; with half a minute each and the usual time constant of 20 min the slope falls to
 it from 1 % within about 40 motions."""
-WINDOW: Final = 4  # Motions of which the slope is computed
-COLD_AFTER: Final = 600.0  # s without motion after which the joints are assumed to be cold
+DRIFT_WINDOW_MOTIONS: Final = 4  # Motions of which the slope is computed
+COLD_AFTER_SECONDS: Final = 600.0  # s without motion after which the joints are assumed to be cold
 FORMAT_VERSION: Final = 2  # 1 had no time of the last motion
 _FIELDS: Final = ("torque", "commanded_position", "position")
-_LEAST_SHARE: Final = 0.02
+_MIN_FRICTION_SHARE: Final = 0.02
 """Share of a joint's rms torque below which its friction cannot be measured."""
-_LEAST_WAY: Final = 1e-2  # rad of travel below which the friction of a joint cannot be measured
+_MIN_TRAVEL: Final = 1e-2  # rad of travel below which the friction of a joint cannot be measured
 
 
 def drift_wanted(cell: Cell, *, only_simulated: bool | None = None) -> float:
@@ -100,7 +100,7 @@ class WarmUpRecord:
 
         They have if the last motion has no time, or one in the future (a clock was reset).
         """
-        return self.moved_at is None or not 0.0 <= now - self.moved_at <= COLD_AFTER
+        return self.moved_at is None or not 0.0 <= now - self.moved_at <= COLD_AFTER_SECONDS
 
     @property
     def changes(self) -> list[float]:
@@ -122,7 +122,7 @@ class WarmUpRecord:
         longer = replace(self, motions=(*self.motions, WarmMotion(archive, joint_friction)))
         done = len(longer.motions)
         change = longer.changes[-1]
-        if done >= max(least, WINDOW) and change <= self.threshold:
+        if done >= max(least, DRIFT_WINDOW_MOTIONS) and change <= self.threshold:
             return replace(longer, outcome="warm")
         unknown = done >= least and np.isnan(change)  # and would be after more motions
         return replace(longer, outcome="not warm") if unknown or done >= most else longer
@@ -154,7 +154,7 @@ def change_per_motion(friction: Sequence[Array] | Array) -> float:
 
     NaN for fewer than two motions, or if no joint moves.
     """
-    last = np.asarray(friction, dtype=np.float64)[-WINDOW:]
+    last = np.asarray(friction, dtype=np.float64)[-DRIFT_WINDOW_MOTIONS:]
     moves = np.isfinite(last).all(axis=0) if len(last) else np.zeros(0, bool)
     if len(last) < 2 or not moves.any():
         return float("nan")
@@ -192,5 +192,5 @@ class FrictionMeter:
         with np.errstate(divide="ignore", invalid="ignore"):
             friction = (work - self._rigid_work) / self._way
         rms = np.sqrt(np.mean(torque**2, axis=0))
-        measurable = (self._way > _LEAST_WAY) & (np.abs(friction) > _LEAST_SHARE * rms)
+        measurable = (self._way > _MIN_TRAVEL) & (np.abs(friction) > _MIN_FRICTION_SHARE * rms)
         return np.where(measurable, friction, np.nan)

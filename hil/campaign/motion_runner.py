@@ -25,11 +25,11 @@ from hil.control.link import NOT_STARTED, MotionLink
 from hil.control.motions import REPEATED, CampaignMotion, CheckedMoves, moves_to_dict, player_of
 from hil.control.record import archive_spec, origin_of, with_present_date
 from hil.control.simulated_cell import simulated_provenance
-from hil.control.slips import CHECKED, require_no_slip
+from hil.control.slips import CHECKED_OUTCOMES, require_no_slip
 from hil.precision.requirements import Requirement
 from identification.excitation.excitation import trajectory_from_dict
 
-from .dry_run_record import OVERRIDE, SIMULATED, yes_or_no
+from .dry_run_record import MAX_DRY_RUN_OVERRIDE, SIMULATED, yes_or_no
 from .errors import RepetitionsRejectedError
 from .folder import CampaignFolder
 from .operator import ExpectedMotion, RunWatch
@@ -202,10 +202,10 @@ class Runner:
         watched = slow > 0
         for motion in joined:
             dry_run = slow > 0
-            share = OVERRIDE if dry_run else 1.0
+            share = MAX_DRY_RUN_OVERRIDE if dry_run else 1.0
             if motion.kind == "move":
                 unseen = motion.from_arm if watched else self._unseen(motion)
-                share = self._approach(OVERRIDE) if dry_run or unseen else 1.0
+                share = self._approach(MAX_DRY_RUN_OVERRIDE) if dry_run or unseen else 1.0
             else:
                 slow = max(0, slow - 1)
             expected.append(ExpectedMotion(motion.trajectory.duration, share, dry_run))
@@ -268,10 +268,10 @@ class Runner:
         way = self._straight.between(self._position, target, self._moves)
         if way is not None:
             self._moves += 1
-            slow = self._approach(min(most, OVERRIDE) if self._unseen(way) else most)
+            slow = self._approach(min(most, MAX_DRY_RUN_OVERRIDE) if self._unseen(way) else most)
             name = self._execute(way, way.index + 1, way.index + 1, slow)
             self.campaign.folder.add(name, "completed")
-            if self._seen is not None and most <= OVERRIDE:
+            if self._seen is not None and most <= MAX_DRY_RUN_OVERRIDE:
                 self._seen.append(way.ends)
         self._position = target
 
@@ -300,7 +300,7 @@ class Runner:
         archived = spec.path.name if ended.outcome == "completed" or spec.path.exists() else None
         if archived is not None:  # else it was stopped before
             self._archives.names.append(archived)
-        if archived is not None and ended.outcome in CHECKED:
+        if archived is not None and ended.outcome in CHECKED_OUTCOMES:
             self._require_no_slip(motion, spec.path)
         if ended.outcome != "completed":
             if archived is not None:

@@ -77,8 +77,8 @@ class Operator(Protocol):
         ...
 
 
-BETWEEN: Final = 0.6  # s between two motions, to open and close the axes
-_SLOWEST: Final = 0.01  # override at which the time left is computed, at least
+SECONDS_BETWEEN_MOTIONS: Final = 0.6  # s between two motions, to open and close the axes
+_MIN_OVERRIDE: Final = 0.01  # override at which the time left is computed, at least
 
 
 @dataclass(eq=False)
@@ -176,10 +176,10 @@ class RunWatch:
 
     def _show(self, progress: MotionProgress | None, **changes: Any) -> None:
         done = 0.0 if progress is None or progress.motion_time is None else progress.motion_time
-        override = max(self._request.override, _SLOWEST)
-        after = max(self._override_after, _SLOWEST) if self._in_dry_run else override
+        override = max(self._request.override, _MIN_OVERRIDE)
+        after = max(self._override_after, _MIN_OVERRIDE) if self._in_dry_run else override
         remaining = self._present.time(override) - done / min(self._present.most, override)
-        remaining = max(remaining, 0.0) + BETWEEN * len(self._expected)
+        remaining = max(remaining, 0.0) + SECONDS_BETWEEN_MOTIONS * len(self._expected)
         remaining += sum(one.time(override if one.dry_run else after) for one in self._expected)
         self.status = replace(self.status, motion=progress, time_left=remaining, **changes)
         if "show" in self._problems:

@@ -16,9 +16,9 @@ from typing import Any, Final, Literal, TextIO
 
 from hil.control.motion_watch import OperatorRequest
 
-STEP: Final = 0.1
+OVERRIDE_STEP: Final = 0.1
 """Step of the override per key, and its least value."""
-_LONGEST_TYPED: Final = 3
+_MAX_TYPED_KEYS: Final = 3
 """Most keys at once from an operator; of more, which are pasted, only stop and hold count.
 
 So of keys together with Esc, as a terminal sends those pressed with Alt.
@@ -32,20 +32,20 @@ ACTIONS: Final[dict[str, Literal["hold", "resume", "stop"]]] = {
 _SEQUENCES: Final = re.compile(r"\x1b\[[0-?]*[ -/]*[@-~]?|\x1bO.?", re.DOTALL)
 """Sequences of arrow and function keys; the last one may be incomplete."""
 _UNFINISHED: Final = re.compile(rb"\x1b(?:\[[0-?]*[ -/]*|O)?\Z")
-_SEQUENCE_WAIT: Final = 0.05
+_ESCAPE_TIMEOUT: Final = 0.05
 """s to wait for the rest of a sequence; without it, it is the key Esc."""
-_CHUNK: Final = 256
-_LOCAL = 3
-_CONTROL = 6
-_INPUT = 0
-POLL: Final = 0.1
+_READ_BYTES: Final = 256
+_LFLAG_INDEX = 3
+_CC_INDEX = 6
+_IFLAG_INDEX = 0
+KEY_POLL_PERIOD: Final = 0.1
 """Period of polling keys and stop requests, s."""
 
 
 def typed(chunk: str) -> str:
     """Return the keys in what a terminal sent, without sequences of arrow and function keys."""
     keys = _SEQUENCES.sub("", chunk)
-    if len(keys) > _LONGEST_TYPED or "\x1b" in keys:
+    if len(keys) > _MAX_TYPED_KEYS or "\x1b" in keys:
         keys = "".join(key for key in keys if ACTIONS.get(key) in ("stop", "hold"))
     return keys
 
@@ -56,10 +56,12 @@ def after(request: OperatorRequest, key: str, override: float) -> OperatorReques
     if action in ("hold", "resume"):
         return replace(request, held=action == "hold")
     if key in "+=-_":
-        tenths = round((override + (STEP if key in "+=" else -STEP)) / STEP)
-        return replace(request, override=min(1.0, max(STEP, tenths * STEP)))
+        tenths = round(
+            (override + (OVERRIDE_STEP if key in "+=" else -OVERRIDE_STEP)) / OVERRIDE_STEP
+        )
+        return replace(request, override=min(1.0, max(OVERRIDE_STEP, tenths * OVERRIDE_STEP)))
     if key.isascii() and key.isdigit():
-        return replace(request, override=(int(key) or 10) * STEP)
+        return replace(request, override=(int(key) or 10) * OVERRIDE_STEP)
     return request
 
 
@@ -81,11 +83,11 @@ def single_keys(fd: int) -> Iterator[None]:
     """
     before = termios.tcgetattr(fd)
     settings: list[Any] = [part[:] if isinstance(part, list) else part for part in before]
-    settings[_LOCAL] &= ~(termios.ICANON | termios.ECHO)
-    settings[_INPUT] &= ~termios.IXON
-    settings[_CONTROL][termios.VMIN] = 1
-    settings[_CONTROL][termios.VTIME] = 0
-    settings[_CONTROL][termios.VSUSP] = os.fpathconf(fd, "PC_VDISABLE").to_bytes(1, "little")
+    settings[_LFLAG_INDEX] &= ~(termios.ICANON | termios.ECHO)
+    settings[_IFLAG_INDEX] &= ~termios.IXON
+    settings[_CC_INDEX][termios.VMIN] = 1
+    settings[_CC_INDEX][termios.VTIME] = 0
+    settings[_CC_INDEX][termios.VSUSP] = os.fpathconf(fd, "PC_VDISABLE").to_bytes(1, "little")
     termios.tcsetattr(fd, termios.TCSADRAIN, settings)
     try:
         yield
@@ -125,7 +127,7 @@ class Keyboard:
         """Pass keys on until `over` is set, or the terminal is gone."""
         try:
             while not self.over.is_set():
-                if select.select([fd], [], [], POLL)[0]:
+                if select.select([fd], [], [], KEY_POLL_PERIOD)[0]:
                     for key in typed(_chunk(fd).decode(errors="replace")):
                         self._take(key)
         except Exception as error:  # the operator is informed that keys have no effect
@@ -135,11 +137,11 @@ class Keyboard:
 
 def _chunk(fd: int) -> bytes:
     """Return what a terminal has sent; raise EOFError if it is gone."""
-    chunk = os.read(fd, _CHUNK)
+    chunk = os.read(fd, _READ_BYTES)
     if not chunk:
         raise EOFError("the terminal is gone")
-    while _UNFINISHED.search(chunk) and select.select([fd], [], [], _SEQUENCE_WAIT)[0]:
-        more = os.read(fd, _CHUNK)
+    while _UNFINISHED.search(chunk) and select.select([fd], [], [], _ESCAPE_TIMEOUT)[0]:
+        more = os.read(fd, _READ_BYTES)
         if not more:
             break
         chunk += more

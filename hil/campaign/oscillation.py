@@ -9,15 +9,16 @@ import numpy as np
 
 from hil.base.arrays import Array
 
-SMOOTHED: Final = 0.05
+SMOOTHING_SECONDS: Final = 0.05
 """Moving mean that is subtracted from the following error, s. It leaves what oscillates within it:
 slower parts are those of the motion."""
-BLOCKS: Final = (1, 4, 16)
+BLOCK_LENGTHS: Final = (1, 4, 16)
 """Half-waves whose rms is compared: noise hides slow growth from one half-wave to the next."""
-SHORTEST: Final = 8  # Fewest blocks of uninterrupted growth
-GROWTH: Final = 10.0  # Least growth of the rms
-REGULAR: Final = 0.25  # Largest deviation of the length of a half-wave from the median
-MOSTLY: Final = 0.75  # Least share of half-waves of regular length
+MIN_GROWING_BLOCKS: Final = 8  # Fewest blocks of uninterrupted growth
+MIN_RMS_GROWTH: Final = 10.0  # Least growth of the rms
+# Largest deviation of the length of a half-wave from the median
+MAX_HALF_WAVE_DEVIATION: Final = 0.25
+MIN_REGULAR_SHARE: Final = 0.75  # Least share of half-waves of regular length
 
 
 @dataclass(frozen=True)
@@ -45,7 +46,7 @@ def growing_oscillation(error: Array, period: float, resolution: Array) -> Oscil
         period: cycle [s].
         resolution: of the measured positions (n,) [rad]; growth below it is none.
     """
-    width = max(1, round(SMOOTHED / period))
+    width = max(1, round(SMOOTHING_SECONDS / period))
     if len(error) < width:
         return None
     window = np.ones(width)
@@ -55,15 +56,15 @@ def growing_oscillation(error: Array, period: float, resolution: Array) -> Oscil
         fast = column - np.convolve(column, window, "same") / rows
         lengths, amplitudes = _half_waves(fast)
         amplitudes = np.maximum(amplitudes, resolution[joint])
-        for block in BLOCKS:
+        for block in BLOCK_LENGTHS:
             growth, first, last = _strongest_growth(amplitudes, block)
-            if growth < GROWTH:
+            if growth < MIN_RMS_GROWTH:
                 continue
             section = lengths[first:last]
             typical = float(np.median(section))
-            regular = np.mean(np.abs(section / typical - 1.0) <= REGULAR)
+            regular = np.mean(np.abs(section / typical - 1.0) <= MAX_HALF_WAVE_DEVIATION)
             frequency = 0.5 / (typical * period)
-            if regular >= MOSTLY and frequency >= 1.0 / SMOOTHED:
+            if regular >= MIN_REGULAR_SHARE and frequency >= 1.0 / SMOOTHING_SECONDS:
                 seconds = float(section.sum()) * period
                 candidates.append(Oscillation(joint, frequency, growth, seconds))
     return max(candidates, key=lambda each: each.growth, default=None)
@@ -81,8 +82,8 @@ def _half_waves(values: Array) -> tuple[Array, Array]:
 def _strongest_growth(amplitudes: Array, block: int) -> tuple[float, int, int]:
     """Return growth, first and last half-wave (exclusive) of the strongest uninterrupted growth.
 
-    The growth is that of the rms of blocks of positive amplitudes; 0 if no section has `SHORTEST`
-    of them.
+    The growth is that of the rms of blocks of positive amplitudes; 0 if no section has
+    `MIN_GROWING_BLOCKS` of them.
     """
     n_blocks = len(amplitudes) // block
     offset = len(amplitudes) - n_blocks * block
@@ -90,7 +91,7 @@ def _strongest_growth(amplitudes: Array, block: int) -> tuple[float, int, int]:
     falls = np.flatnonzero(np.diff(rms) < 0.0)
     best = (0.0, 0, 0)
     for start, end in zip([0, *(falls + 1)], [*falls, n_blocks - 1], strict=True):
-        if end - start + 1 < SHORTEST:
+        if end - start + 1 < MIN_GROWING_BLOCKS:
             continue
         growth = float(rms[end] / rms[start])
         best = max(best, (growth, offset + start * block, offset + (end + 1) * block))

@@ -30,9 +30,10 @@ from identification.excitation import (
 from identification.excitation.excitation import trajectory_from_dict
 from planner import FourierSeries, PiecewiseCubic, PlanFile
 
-LEAST: Final = 4  # Least population of a genetic search
-SLOWEST: Final = 0.5  # Smallest share of a joint's speed in the search: slow motions excite little
-LONGEST: Final = 60.0  # Longest excitation, s
+MIN_POPULATION: Final = 4  # Least population of a genetic search
+# Smallest share of a joint's speed in the search: slow motions excite little
+MIN_SPEED_SHARE: Final = 0.5
+MAX_EXCITATION_SECONDS: Final = 60.0  # Longest excitation, s
 FORMAT_VERSION: Final = 4
 
 
@@ -127,13 +128,18 @@ def quick_settings(cell: Cell) -> DesignSettings:
     It evaluates at most `candidates` motions, at least 4, in a population of about their root.
     """
     campaign = cell.campaign
-    motions = max(LEAST, campaign.candidates)
-    population = max(LEAST, isqrt(4 * motions // 3))
+    motions = max(MIN_POPULATION, campaign.candidates)
+    population = max(MIN_POPULATION, isqrt(4 * motions // 3))
     settings = preset("b").replaced(
         seed=campaign.seed,
         search={"population": population, "generations": motions // population},
-        via_points={"n_via": campaign.n_via, "fly": campaign.fly, "slowest": SLOWEST},
-        constraints={"closed": True, "collision": True, "current": True, "max_duration": LONGEST},
+        via_points={"n_via": campaign.n_via, "fly": campaign.fly, "slowest": MIN_SPEED_SHARE},
+        constraints={
+            "closed": True,
+            "collision": True,
+            "current": True,
+            "max_duration": MAX_EXCITATION_SECONDS,
+        },
     )
     return within_ranges(settings, cell)
 

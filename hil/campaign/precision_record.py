@@ -13,12 +13,12 @@ from hil.precision.requirements import Requirement, requirements_from
 
 from .folder import save_record
 
-IN_A_ROW: Final = 2
+MIN_CONSECUTIVE_MET: Final = 2
 """Repetitions after which a requirement must be met one after the other: one interval alone can be
 narrow by chance, the more often one looks (Simons 1968 adds observations after the first look)."""
-FEWEST: Final = 3
+MIN_REPETITIONS: Final = 3
 """Repetitions before a campaign ends because more of them do not help."""
-OVERDUE: Final = 2
+OVERDUE_FACTOR: Final = 2
 """Times as many repetitions as were predicted, after which more of them count as no help: the
 prediction takes for noise what differs between repetitions in another way, such as friction that
 falls while the arm gets warm."""
@@ -120,8 +120,8 @@ class PrecisionRecord:
         look = replace(look, reached=reached)
         looks = (*earlier, look)
         longer = replace(self, looks=looks)
-        last = looks[-IN_A_ROW:]
-        if len(last) == IN_A_ROW and all(recent.met for recent in last):
+        last = looks[-MIN_CONSECUTIVE_MET:]
+        if len(last) == MIN_CONSECUTIVE_MET and all(recent.met for recent in last):
             return replace(longer, outcome="met")
         if look.repetitions >= limit:
             return replace(longer, outcome="limit")
@@ -131,7 +131,7 @@ class PrecisionRecord:
             for reached in look.reached
         ]
         promising = [reached.ratio > 1.0 for reached in look.reached]
-        if look.repetitions >= FEWEST and any(unreachable) and unreachable == promising:
+        if look.repetitions >= MIN_REPETITIONS and any(unreachable) and unreachable == promising:
             return replace(longer, outcome="out of reach")
         return replace(longer, outcome="going on")
 
@@ -172,13 +172,13 @@ class PrecisionRecord:
 
 
 def _is_overdue(before: Sequence[PrecisionLook], look: PrecisionLook, index: int) -> bool:
-    """Return whether a requirement is unmet `OVERDUE` times as long as was predicted."""
+    """Return whether a requirement is unmet `OVERDUE_FACTOR` times as long as was predicted."""
     if look.reached[index].ratio <= 1.0:
         return False
     for earlier in reversed(before):
         reached = earlier.reached[index]
         if reached.ratio <= 1.0:
             return False
-        if reached.more and look.repetitions - earlier.repetitions >= OVERDUE * reached.more:
+        if reached.more and look.repetitions - earlier.repetitions >= OVERDUE_FACTOR * reached.more:
             return True
     return False

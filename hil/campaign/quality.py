@@ -16,7 +16,7 @@ from typing import Final
 import numpy as np
 
 from drivers.events import MotionStarted
-from drivers.exchange.serving import ARM_MOVED
+from drivers.exchange.serving import MIN_ARM_MOVEMENT
 from hil.archive import Archive, ArchiveHeader, ArchiveName, open_archive
 from hil.archive.header import REJECTED
 from hil.archive.repair import amend_outcome
@@ -25,7 +25,7 @@ from hil.base.errors import ArchiveError
 from hil.cell import Cell
 from hil.control.motions import CampaignMotion
 from hil.control.slips import slip_of
-from identification.signals.noise import STANDSTILL_WINDOW
+from identification.signals.noise import STANDSTILL_WINDOW_SECONDS
 from identification.signals.recording import stuck
 from identification.text import percentage
 from planner import FourierSeries, PiecewiseCubic
@@ -35,22 +35,24 @@ from .folder import CampaignFolder
 _SENT: Final = ("commanded_position", "commanded_velocity")
 FIELDS: Final = ("cycle", "gap", "position", "target_current", *_SENT)
 """Columns of an archive that are checked."""
-MISSED_SHARE: Final = 0.01  # Largest share of missed packets
-OFF_PATH: Final = 1e-4
+MAX_MISSED_SHARE: Final = 0.01  # Largest share of missed packets
+MAX_PATH_DEVIATION: Final = 1e-4
 """Largest distance of set-point and plan, rad; float32 targets are exact to 2e-6."""
-SATURATED: Final = 0.98  # Share of the current limit from which a current is saturated
-SATURATED_CYCLES: Final = 3  # Saturated cycles in a row that are more than noise
-COMPARED: Final = 9  # Earlier repetitions that a new one is compared with
-FEWEST: Final = 4  # Earlier repetitions from which the bounds follow their own scatter
+SATURATION_SHARE: Final = 0.98  # Share of the current limit from which a current is saturated
+MIN_SATURATED_CYCLES: Final = 3  # Saturated cycles in a row that are more than noise
+COMPARED_REPETITIONS: Final = 9  # Earlier repetitions that a new one is compared with
+# Earlier repetitions from which the bounds follow their own scatter
+MIN_REPETITIONS_FOR_SCATTER: Final = 4
 _CHANNELS: Final = (
     ("position", "the following-error threshold", 0.05, 0.005),
     ("current", "its rms current", 0.1, 0.02),
 )
 """Quantity; its scale; share of it by which the first repetitions may differ (rms); and the least
 bound of later ones."""
-_WIDE: Final = 3.0  # Least bound as a multiple of the median difference of the earlier ones
-_OUTLYING: Final = 6.0  # Robust standard deviations above the median difference
-_FEWEST_ALIKE: Final = 2
+# Least bound as a multiple of the median difference of the earlier ones
+_MIN_BOUND_FACTOR: Final = 3.0
+_OUTLIER_SIGMAS: Final = 6.0  # Robust standard deviations above the median difference
+_MIN_ALIKE_REPETITIONS: Final = 2
 """Least number of attempts that agree with each other before the first repetition is rejected."""
 
 Motion = PiecewiseCubic | FourierSeries
@@ -115,12 +117,12 @@ def problem_of(executed: Executed, trajectory: Motion, cell: Cell) -> QualityPro
     if (problem := incomplete_or_slowed(executed, trajectory, cell)) is not None:
         return problem
     cycles = int(np.ceil(trajectory.duration / cell.period - 1e-6))
-    if executed.missed > MISSED_SHARE * cycles:
+    if executed.missed > MAX_MISSED_SHARE * cycles:
         return QualityProblem(
-            f"{executed.missed} of {cycles} packets were missed; {percentage(MISSED_SHARE)} are "
-            "allowed"
+            f"{executed.missed} of {cycles} packets were missed; {percentage(MAX_MISSED_SHARE)} are"
+            " allowed"
         )
-    high = np.abs(executed.current) >= SATURATED * cell.drive_train.current_limit
+    high = np.abs(executed.current) >= SATURATION_SHARE * cell.drive_train.current_limit
     for joint, name in enumerate(cell.joint_names):
         standstill = stuck(executed.position[:, joint], executed.commanded[:, joint])
         if standstill is not None:
@@ -132,7 +134,7 @@ def problem_of(executed: Executed, trajectory: Motion, cell: Cell) -> QualityPro
     for name, column in zip(cell.joint_names, high.T, strict=True):
         edges = np.flatnonzero(np.diff(column.astype(np.int8), prepend=0, append=0))
         longest = int((edges[1::2] - edges[::2]).max(initial=0))
-        if longest >= SATURATED_CYCLES:
+        if longest >= MIN_SATURATED_CYCLES:
             lasted = f"{longest * cell.period * 1e3:.0f} ms"
             return QualityProblem(f"the current of {name} was at its limit for {lasted}")
     return None
@@ -149,9 +151,9 @@ def incomplete_or_slowed(
     times = np.minimum(np.arange(rows) * cell.period, trajectory.duration)
     off = executed.commanded - trajectory.sample(times)[0]
     off = np.abs(off - off[0]).max(axis=1)
-    if off.max() <= OFF_PATH:
+    if off.max() <= MAX_PATH_DEVIATION:
         return None
-    at = int(np.argmax(off > OFF_PATH)) * cell.period
+    at = int(np.argmax(off > MAX_PATH_DEVIATION)) * cell.period
     return QualityProblem(
         f"it was held or slowed about {at:.1f} s after its start, so it is no repetition; leave "
         "the override at 100 %"
@@ -160,10 +162,12 @@ def incomplete_or_slowed(
 
 def moving_arm(executed: Executed, _trajectory: Motion, cell: Cell) -> QualityProblem | None:
     """Return the problem of a recording of the arm at rest, in which it moved; None for none."""
-    rows = min(round(STANDSTILL_WINDOW / cell.period), len(executed.position) - 1)
+    rows = min(round(STANDSTILL_WINDOW_SECONDS / cell.period), len(executed.position) - 1)
     moved = np.abs(executed.position[rows:] - executed.position[:-rows]).max(axis=0)
     speed = moved / (rows * cell.period)
-    allowed = np.maximum(cell.model.friction.standstill, ARM_MOVED / STANDSTILL_WINDOW)
+    allowed = np.maximum(
+        cell.model.friction.standstill, MIN_ARM_MOVEMENT / STANDSTILL_WINDOW_SECONDS
+    )
     joint = int(np.argmax(speed / allowed))
     if speed[joint] <= allowed[joint]:
         return None
@@ -188,12 +192,12 @@ class RepetitionCheck:
     def __init__(self, cell: Cell, trajectory: Motion) -> None:
         self._cell = cell
         self._trajectory = trajectory
-        self._earlier: deque[Executed] = deque(maxlen=COMPARED)
-        self._differences: deque[Array] = deque(maxlen=2 * COMPARED)
+        self._earlier: deque[Executed] = deque(maxlen=COMPARED_REPETITIONS)
+        self._differences: deque[Array] = deque(maxlen=2 * COMPARED_REPETITIONS)
 
     def learn(self, archives: Sequence[Path]) -> None:
         """Accept repetitions that were accepted by an earlier run."""
-        for path in archives[-2 * COMPARED :]:
+        for path in archives[-2 * COMPARED_REPETITIONS :]:
             self.accept(Executed.of(open_archive(path, fields=FIELDS)))
 
     def accept(self, executed: Executed) -> None:
@@ -211,10 +215,10 @@ class RepetitionCheck:
         past = np.array(self._differences)
         for row, (what, scale, first, least) in enumerate(_CHANNELS):
             bound = np.full(len(new[row]), first)
-            if len(past) >= FEWEST - 1:
+            if len(past) >= MIN_REPETITIONS_FOR_SCATTER - 1:
                 middle = np.median(past[:, row], axis=0)
                 scatter = 1.4826 * np.median(np.abs(past[:, row] - middle), axis=0)
-                usual = np.maximum(_WIDE * middle, middle + _OUTLYING * scatter)
+                usual = np.maximum(_MIN_BOUND_FACTOR * middle, middle + _OUTLIER_SIGMAS * scatter)
                 bound = np.maximum(usual, least)
             joint = int(np.argmax(new[row] / bound))
             if new[row, joint] > bound[joint]:
@@ -340,7 +344,7 @@ class ArchiveReview:
         if several and (executed.missed or not all(map(self._has_missed, accepted))):
             return problem
         alike, with_accepted = self._alike(executed, without_missed=several)
-        enough = max(_FEWEST_ALIKE, self._cell.campaign.bad_repetitions, len(accepted))
+        enough = max(_MIN_ALIKE_REPETITIONS, self._cell.campaign.bad_repetitions, len(accepted))
         if len(alike) + 1 < max(enough, with_accepted + 2):
             return problem
         attempts = ", ".join(alike)

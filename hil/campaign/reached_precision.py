@@ -1,9 +1,9 @@
 """Precision of a running campaign: measured after each repetition, and when it is enough.
 
 The estimate is the posterior that `hil identify` computes, with the settings that it would choose
-from the first repetition; the delay is renewed by the first `DELAY_TIME` of them. Its intervals are
-cluster-robust: what the model cannot explain in the same place of every repetition counts as one
-error, however often it is repeated. Only the rest falls with them.
+from the first repetition; the delay is renewed by the first `DELAY_SEARCH_SECONDS` of them. Its
+intervals are cluster-robust: what the model cannot explain in the same place of every repetition
+counts as one error, however often it is repeated. Only the rest falls with them.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ from hil.design.settings import recorded_settings
 from hil.pipeline.estimating import estimate_with, with_loading
 from hil.pipeline.options import Options
 from hil.pipeline.prepared import (
-    DELAY_TIME,
+    DELAY_SEARCH_SECONDS,
     Prepared,
     decide,
     prepared_with,
@@ -44,10 +44,10 @@ from identification.estimators.torque_scale import absolute
 from identification.excitation import midpoints
 from identification.factor.estimate import Estimate, inverse_variance
 from identification.factor.factor import Factor
-from identification.reduction.reduction import ALIKE, Reduction
+from identification.reduction.reduction import MAX_UNMODELLED_REPETITIONS, Reduction
 from identification.signals.samples import Samples
 
-from .precision_record import IN_A_ROW, PrecisionLook, PrecisionRecord, Reached
+from .precision_record import MIN_CONSECUTIVE_MET, PrecisionLook, PrecisionRecord, Reached
 from .state import CampaignState
 
 
@@ -118,7 +118,7 @@ class PrecisionMeter:
         for path in paths:
             if path not in self._repetitions:
                 (source,) = gather_sources([path], self._options.split, in_sample=True).training
-                few = bool(self._earlier) or len(self._repetitions) < ALIKE
+                few = bool(self._earlier) or len(self._repetitions) < MAX_UNMODELLED_REPETITIONS
                 self._repetitions[path] = self._reduced(source, unmodelled=few)
         repetitions = [self._repetitions[path] for path in paths]
         recordings = (*self._earlier, *repetitions)
@@ -186,9 +186,9 @@ class PrecisionMeter:
         return prepared, delay.mean - settings.preprocessing.torque_delay
 
     def _delay_by(self, training: tuple[Source, ...]) -> CombinedDelay:
-        """Return the delay by the first recordings, as many as `DELAY_TIME` needs."""
+        """Return the delay by the first recordings, as many as `DELAY_SEARCH_SECONDS` needs."""
         ends = np.cumsum([np.ptp(source.recording.time) for source in training])
-        some = training[: 1 + int(np.searchsorted(ends, DELAY_TIME))]
+        some = training[: 1 + int(np.searchsorted(ends, DELAY_SEARCH_SECONDS))]
         paths = tuple(source.path for source in some)
         if paths not in self._delays:
             sources = replace(self._sources, training=some)
@@ -301,7 +301,7 @@ class PrecisionStage:
         done = len(self._campaign.folder.completed("excitation"))
         if done == 0 or not self._record.looks or self._record.looks[-1].repetitions != done:
             self._record = replace(self._record, looks=(), outcome="going on")
-            for count in range(max(1, done - IN_A_ROW + 1), done + 1):
+            for count in range(max(1, done - MIN_CONSECUTIVE_MET + 1), done + 1):
                 self._look(count)
         self._record.save(self._path)
 

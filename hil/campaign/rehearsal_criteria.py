@@ -28,13 +28,13 @@ from .oscillation import growing_oscillation
 from .rehearsal_record import EFFECTS, RehearsalCriterion
 from .twin import Twin
 
-MOST_SIGMA: Final = 4.0
+MAX_PARAMETER_SIGMAS: Final = 4.0
 """Largest deviation of an estimate from the simulated value, in standard deviations."""
-MOST_ERROR: Final = 1.2
+MAX_ERROR_RATIO: Final = 1.2
 """Largest error on unseen motion, as a multiple of that of the simulated parameters."""
-MOST_SPEED: Final = 1.05
+MAX_SPEED_SHARE: Final = 1.05
 """Largest measured speed, as a share of the limit that a plan keeps; the rest is control error."""
-SATURATED: Final = 0.99  # Share of the current limit from which a motor is saturated
+SATURATION_SHARE: Final = 0.99  # Share of the current limit from which a motor is saturated
 
 
 def criterion(
@@ -78,7 +78,7 @@ def of_currents(cell: Cell, folder: CampaignFolder, name: str, bound: float) -> 
         shares = np.nan_to_num(np.abs(columns["target_current"])) / limit
         after_loss = columns["gap"] > 0
         after_loss[1:] |= after_loss[:-1].copy()
-        shares[after_loss[:, None] & (shares <= SATURATED)] = 0.0
+        shares[after_loss[:, None] & (shares <= SATURATION_SHARE)] = 0.0
         share = shares.max(axis=0, initial=0.0)
         if share.max() > worst:
             worst = float(share.max())
@@ -126,7 +126,7 @@ def of_motions(cell: Cell, folder: CampaignFolder, name: str, failure: str) -> R
     joint = int(np.argmax(shares[fastest]))
     share = float(shares[fastest][joint])
     where = entries[fastest].name
-    if share <= MOST_SPEED:
+    if share <= MAX_SPEED_SHARE:
         text = f"{name}: every motion was completed, at up to {percentage(share)} of a speed limit"
         return criterion(f"motions ({name})", 0.0, 0.0, text)
     return criterion(
@@ -134,7 +134,7 @@ def of_motions(cell: Cell, folder: CampaignFolder, name: str, failure: str) -> R
         1.0,
         0.0,
         f"{name}: {cell.joint_names[joint]} moved at {percentage(share)} of its speed limit "
-        f"({where}), at most {percentage(MOST_SPEED)} is allowed",
+        f"({where}), at most {percentage(MAX_SPEED_SHARE)} is allowed",
         _motion_remedy(
             cell,
             name,
@@ -197,7 +197,11 @@ def _motion_remedy(cell: Cell, name: str, path: Path, joint: int | None, remedy:
 
 def of_estimate(twin: Twin, folder: CampaignFolder, reporter: Reporter) -> list[RehearsalCriterion]:
     """Judge an identification from the archives: determined, correct, predictive."""
-    bounds = {"excitation": 0.0, "parameters": MOST_SIGMA, "unseen motion": MOST_ERROR}
+    bounds = {
+        "excitation": 0.0,
+        "parameters": MAX_PARAMETER_SIGMAS,
+        "unseen motion": MAX_ERROR_RATIO,
+    }
     kinds = ("excitation", "validation", "standstill")
     paths = [path for kind in kinds for path in folder.completed(kind)]
     try:
@@ -232,17 +236,17 @@ def of_estimate(twin: Twin, folder: CampaignFolder, reporter: Reporter) -> list[
         criterion(
             "parameters",
             float(apart[farthest]),
-            MOST_SIGMA,
+            MAX_PARAMETER_SIGMAS,
             f"the errors of {finite.sum()} parameters are at most {apart[farthest]:.3g} standard "
-            f"deviations ({estimate.names[farthest]}), {MOST_SIGMA:g} are allowed",
+            f"deviations ({estimate.names[farthest]}), {MAX_PARAMETER_SIGMAS:g} are allowed",
             "drive train or model of the cell file do not match the arm",
         ),
         criterion(
             "unseen motion",
             float(ratio[joint]),
-            MOST_ERROR,
+            MAX_ERROR_RATIO,
             f"on unseen motion the torque error is {ratio[joint]:.2f} times what noise leaves "
-            f"({twin.cell.joint_names[joint]}), at most {MOST_ERROR:g} is allowed",
+            f"({twin.cell.joint_names[joint]}), at most {MAX_ERROR_RATIO:g} is allowed",
             "design a better excitation (`hil design`)",
         ),
     ]

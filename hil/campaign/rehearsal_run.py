@@ -12,11 +12,11 @@ from hil.base.files import make_folder
 from hil.base.progress import Reporter, Silent
 from hil.base.version import software
 from hil.campaign.planned_motions import planned_motions, require_runnable
-from hil.campaign.rehearsal_criteria import SATURATED, of_currents, of_estimate, of_motions
+from hil.campaign.rehearsal_criteria import SATURATION_SHARE, of_currents, of_estimate, of_motions
 from hil.campaign.twin import Twin
 from hil.cell import Cell
 from hil.control.errors import MotionFailedError
-from hil.control.motion_checks import PLANNED_CURRENT, collision_checker
+from hil.control.motion_checks import USABLE_CURRENT_SHARE, collision_checker
 from hil.control.motion_watch import Stop, Unattended
 from hil.control.virtual_link import VirtualLink
 from planner.worker import WorkerProcess
@@ -28,7 +28,7 @@ from .folder import CampaignFolder
 from .motion_runner import RunOptions
 from .operator import RunWatch
 from .rehearsal_record import AS_MODELLED, CRITERIA, EFFECTS, Rehearsal, RehearsalCriterion
-from .simulated_sessions import LONGEST, result_of
+from .simulated_sessions import MAX_RUN_SECONDS, result_of
 from .state import CampaignState
 
 REPETITIONS: Final = 3
@@ -87,13 +87,13 @@ def _rehearsed(
     modelled = _created(campaign, twin.cell, "plain")
     # One repetition shows the effects that the model leaves out.
     with_effects = _created(campaign, twin.cell.with_campaign(repetitions=1), "effects")
-    with WorkerProcess(timeout=LONGEST) as child:
+    with WorkerProcess(timeout=MAX_RUN_SECONDS) as child:
         child.begin(run_with_effects, with_effects.folder.root, twin)
         reporter.step(f"rehearsing on a simulated arm, {AS_MODELLED}")
         link = twin.link(_planned(modelled), effects=False)
         failure = _failure(modelled, link, twin, reporter, stop)
         seconds = link.cycles * modelled.cell.period
-        criteria = _of_run(twin, modelled.folder, AS_MODELLED, failure, PLANNED_CURRENT)
+        criteria = _of_run(twin, modelled.folder, AS_MODELLED, failure, USABLE_CURRENT_SHARE)
         if failure:  # the other criteria would fail for the same reason
             child.close()
             shutil.rmtree(with_effects.folder.root)
@@ -102,7 +102,7 @@ def _rehearsed(
             reporter.step(f"rehearsing on a simulated arm, {EFFECTS}")
             failure, cycles = result_of(child, stop, "the rehearsal", "rehearse again")
             seconds += cycles * modelled.cell.period
-            criteria += _of_run(twin, with_effects.folder, EFFECTS, failure, SATURATED)
+            criteria += _of_run(twin, with_effects.folder, EFFECTS, failure, SATURATION_SHARE)
     names = {criterion.name for criterion in criteria}
     return Rehearsal(
         plan_hash=plan_hash,

@@ -32,17 +32,17 @@ from hil.base.progress_lines import LINE_PERIOD, progress_console
 from hil.base.terminal_text import plural, printable
 from hil.campaign.dry_run_record import DryRunRecord
 from hil.campaign.operator import RunStatus
-from hil.campaign.operator_keys import ACTIONS, HELP, POLL, Keyboard, after, can_read
+from hil.campaign.operator_keys import ACTIONS, HELP, KEY_POLL_PERIOD, Keyboard, after, can_read
 from hil.cell import Cell
 from hil.control.motion_watch import REFUSED, MotionProgress, OperatorRequest, Stop
 from identification.text import percentage
 
 # --- the picture
 
-STALE: Final = 1.0
+STALE_AFTER_SECONDS: Final = 1.0
 """Age of a status that is reported, s."""
 SIMULATED: Final = "SIMULATED"
-WARNING: Final = 0.8
+WARNING_SHARE: Final = 0.8
 """Share of a limit from which it is coloured."""
 
 
@@ -110,7 +110,7 @@ def _joint_cells(motion: MotionProgress, joint: int) -> tuple[str | Text, ...]:
 
 
 def _share(share: float) -> Text:
-    colour = "bold red" if share > 1.0 else "yellow" if share > WARNING else "green"
+    colour = "bold red" if share > 1.0 else "yellow" if share > WARNING_SHARE else "green"
     return Text(percentage(share), style=colour)
 
 
@@ -174,7 +174,7 @@ def confirmed(console: Console, question: str, word: str, stop: Stop) -> bool:
         termios.tcflush(sys.stdin.fileno(), termios.TCIFLUSH)
     while not stop.requested:
         with contextlib.suppress(InterruptedError):
-            if select.select([sys.stdin], [], [], POLL)[0]:
+            if select.select([sys.stdin], [], [], KEY_POLL_PERIOD)[0]:
                 return " ".join(sys.stdin.readline().split()).lower() == word.lower()
     return False
 
@@ -182,10 +182,10 @@ def confirmed(console: Console, question: str, word: str, stop: Stop) -> bool:
 # --- the screen
 
 REFRESH_PERIOD: Final = 0.1  # s between two pictures
-LINE_EVERY: Final = 5.0  # s between two lines where there is no terminal
-FAREWELL: Final = 0.5  # s that a terminal may take for the last picture
-NEWEST = 5
-REMEMBERED = 200
+STATUS_LINE_PERIOD: Final = 5.0  # s between two lines where there is no terminal
+LAST_PICTURE_TIMEOUT: Final = 0.5  # s that a terminal may take for the last picture
+SHOWN_MESSAGES = 5
+MAX_STORED_MESSAGES = 200
 """Messages that are shown, and that are printed at the end."""
 
 
@@ -229,7 +229,7 @@ class Screen:
         self._names = tuple(joint_names)
         self._status: RunStatus | None = None
         self._came = time.monotonic()
-        self._messages: deque[str] = deque(maxlen=REMEMBERED)
+        self._messages: deque[str] = deque(maxlen=MAX_STORED_MESSAGES)
         self._news = ""  # said since the last status
         self._undo = contextlib.ExitStack()
         self._stuck = False
@@ -361,7 +361,7 @@ class Screen:
             stopping = self._stop.requested
             word, colour = ("STOPPING", "red") if stopping else ("HELD", "yellow")
             state.append(f" {word} ", style=f"bold {colour} reverse").append("  ")
-        if status is not None and self.age > STALE:
+        if status is not None and self.age > STALE_AFTER_SECONDS:
             # What was shown last is over; a message that came since is why the run waits.
             reason = f": {self._news}" if self._news else ""
             what, style = ("motion", "bold") if motion is None else ("news", "bold red")
@@ -374,7 +374,7 @@ class Screen:
             state.append(f"   {motion.state.name.lower().replace('_', ' ')}", style="dim")
         rows: list[RenderableType] = [top, state]
         rows += [] if motion is None else _motion_rows(self._names, motion)
-        newest = tuple(self._messages)[-NEWEST:]
+        newest = tuple(self._messages)[-SHOWN_MESSAGES:]
         rows.append(Text())
         for line in newest:
             style = "bold red" if line.startswith(REFUSED) else "dim"
@@ -428,7 +428,7 @@ class Screen:
 
         def close() -> None:
             over.set()
-            thread.join(FAREWELL)
+            thread.join(LAST_PICTURE_TIMEOUT)
             self._stuck = thread.is_alive()
 
         self._undo.callback(close)
@@ -443,7 +443,7 @@ class Screen:
         """
         self._print_messages()
         status = self._status
-        period = LINE_PERIOD if self._sparse else LINE_EVERY
+        period = LINE_PERIOD if self._sparse else STATUS_LINE_PERIOD
         if status is None or self.age > period:
             return
         at = (status.phase, status.number)

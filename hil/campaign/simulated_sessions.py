@@ -30,13 +30,13 @@ from .motion_runner import RunOptions
 from .operator import RunWatch
 from .state import CampaignState
 
-SHORTEST: Final = 60.0
+MIN_SPLIT_SECONDS: Final = 60.0
 """Missing motion from which the start of a second process is worthwhile [s]."""
-LONGEST: Final = 24.0 * 3600.0
+MAX_RUN_SECONDS: Final = 24.0 * 3600.0
 """Most that a run on a simulated arm in another process may take [s]."""
 _MOVES_AROUND: Final = 2
 """Moves of a session in addition to one before each motion: back to home, and to its start."""
-_POLL: Final = 0.2  # s between two looks whether the operator stopped it
+_STOP_POLL_PERIOD: Final = 0.2  # s between two looks whether the operator stopped it
 
 
 def run_simulated(campaign: CampaignState, stop: Stop, reporter: Reporter, *, effects: bool) -> int:
@@ -63,7 +63,7 @@ def run_simulated(campaign: CampaignState, stop: Stop, reporter: Reporter, *, ef
     elsewhere = replace(
         options, only=_keys(second), first_move=len(first) + _MOVES_AROUND, say_unchecked=False
     )
-    with WorkerProcess(timeout=LONGEST) as child:
+    with WorkerProcess(timeout=MAX_RUN_SECONDS) as child:
         try:
             child.begin(run_second_session, folder, elsewhere, effects=effects)
             run_motions(campaign, link, watch, reporter, replace(options, only=_keys(first)))
@@ -82,7 +82,7 @@ def halves(
     The second is empty where they are short.
     """
     total = sum(motion.trajectory.duration for motion in motions)
-    if total < SHORTEST:
+    if total < MIN_SPLIT_SECONDS:
         return motions, ()
     past = 0.0
     for count, motion in enumerate(motions, start=1):
@@ -126,7 +126,7 @@ def result_of(child: WorkerProcess, stop: Stop, what: str, remedy: str) -> Any:
         OperatorStopError: it was stopped.
         ExecutionError: the process ended.
     """
-    while not child.wait(_POLL):
+    while not child.wait(_STOP_POLL_PERIOD):
         if stop.requested:
             raise OperatorStopError(f"{what} was stopped; {remedy}")
     try:

@@ -26,12 +26,13 @@ from planner import Trajectory, to_csv
 
 from .plan import CampaignPlan, plan_around
 
-RATE: Final = 500.0  # Rate of the tables, Hz: the cycle of an e-Series controller
+TABLE_RATE: Final = 500.0  # Rate of the tables, Hz: the cycle of an e-Series controller
 ROS_RATE: Final = 100.0  # Rate of the points that a trajectory controller interpolates, Hz
 SCRIPT_RATE: Final = 125.0  # Rate of the set-points of a URScript program, Hz
 UR_JOINTS: Final = 6
-SLOW: Final = 0.2  # Speed of the slow variants, as a share of that of the motion
-SLOWEST: Final = 0.01  # Least speed of a URScript program, as a share of that of the motion
+SLOW_SPEED_SHARE: Final = 0.2  # Speed of the slow variants, as a share of that of the motion
+# Least speed of a URScript program, as a share of that of the motion
+MIN_SCRIPT_SPEED: Final = 0.01
 README: Final = "README.txt"
 WARNING: Final = (
     "The arm will move. Checked by the model only: limits, torques, floor, walls, self-collision.",
@@ -87,11 +88,11 @@ def trajectory_files(cell: Cell, plan: CampaignPlan) -> dict[str, str]:
     files = {}
     described = []
     for name, motion in motions.items():
-        slowed = SlowedMotion(motion, SLOW)
+        slowed = SlowedMotion(motion, SLOW_SPEED_SHARE)
         for variant, moves in ((name, motion), (f"{name}_slow", slowed)):
             header = header_of(cell.name, variant, moves)
             described += [*header, ""]
-            files[f"{variant}.csv"] = to_csv(moves, RATE, cell.joint_names)
+            files[f"{variant}.csv"] = to_csv(moves, TABLE_RATE, cell.joint_names)
             files[f"{variant}.yaml"] = joint_trajectory(moves, cell.joint_names, header)
         if scripted:
             header = header_of(cell.name, name, motion)
@@ -147,7 +148,7 @@ def urscript(motion: Trajectory, name: str, repetitions: int, header: Sequence[s
     rows = [f"[{', '.join(f'{value:.9f}' for value in q)}]" for q in positions]
     between = ", ".join(f"start[{j}] + share * (goal[{j}] - start[{j}])" for j in range(UR_JOINTS))
     at_start = [f"global start = {rows[0]}", "global share = speed"]
-    valid = f"speed is {SLOWEST:g} to 1"
+    valid = f"speed is {MIN_SCRIPT_SPEED:g} to 1"
     seconds = f"{motion.duration:.1f} s at full speed"
     question = f"{name}, {repetitions} times, {seconds}; speed and repetitions are set at the top"
     popup = f'"The arm will move: {question}. Continue?", "{name}", True, False, blocking=True'
@@ -155,9 +156,9 @@ def urscript(motion: Trajectory, name: str, repetitions: int, header: Sequence[s
         *(f"# {line}" for line in (*header, *WARNING)),
         "# speed scales time: 1.0 is the full speed of the motion. Raise it after a slow run.",
         f"def {name}():",
-        f"  global speed = {SLOW:g}",
+        f"  global speed = {SLOW_SPEED_SHARE:g}",
         f"  repetitions = {repetitions}",
-        f"  if speed < {SLOWEST:g} or speed > 1.0:",
+        f"  if speed < {MIN_SCRIPT_SPEED:g} or speed > 1.0:",
         f'    popup("{valid}", "{name}", False, True, blocking=True)',
         "    halt",
         "  end",

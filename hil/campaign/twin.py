@@ -1,7 +1,7 @@
 """The simulated arm of a rehearsal, close to the nominal one, with faults of its link.
 
-Masses, inertias, rotors and friction are varied within `SPREAD` of their nominal values. A cell
-without `[simulation]` gets one from `[nominal]` and the defaults below.
+Masses, inertias, rotors and friction are varied within `PARAMETER_SPREAD` of their nominal values.
+A cell without `[simulation]` gets one from `[nominal]` and the defaults below.
 """
 
 from __future__ import annotations
@@ -31,19 +31,20 @@ from hil.control.virtual_link import VirtualLink
 from identification.text import percentage
 from sim_fixtures import ServoSettings, UnmodelledEffects
 
-SPREAD: Final = 0.1  # Largest relative deviation of the simulated parameters from the nominal ones
-FAULT_EVERY: Final = 3.0  # Mean time between two faults of the link, s
-LOOP_CYCLES: Final = 0.5
+# Largest relative deviation of the simulated parameters from the nominal ones
+PARAMETER_SPREAD: Final = 0.1
+MEAN_FAULT_INTERVAL: Final = 3.0  # Mean time between two faults of the link, s
+LOOP_DELAY_CYCLES: Final = 0.5
 """Mean delay of a target current, cycles: it acts over the cycle before the packet."""
-RESONANCE: Final = 500.0
+MAIN_AXIS_RESONANCE: Final = 500.0
 """Resonance of a main axis, rotor against link, rad/s, where the cell has no elasticity."""
-FASTEST: Final = 800.0
+MAX_RESONANCE: Final = 800.0
 """Highest resonance in any posture, rad/s: the simulated arm has steps of 0.5 ms."""
-POSTURES: Final = 60  # Postures in which the resonances are computed
+RESONANCE_POSTURES: Final = 60  # Postures in which the resonances are computed
 MAIN_AXES: Final = 3
-SLOWEST_LOOP: Final = 0.002
+MAX_CURRENT_LAG: Final = 0.002
 """Slowest current loop, s; a slower one makes the simulated arm oscillate."""
-_HORIZON: Final = 4.0
+_FAULT_HORIZON_FACTOR: Final = 4.0
 """Period of link faults as a multiple of the motions' duration: moves take time, too."""
 
 
@@ -87,10 +88,10 @@ class Twin:
             return self._ur_link(seconds, effects=effects)
         table = self.cell.controller
         # The current loop has the delay of `[controller] current_delay_cycles`.
-        lag = (LOOP_CYCLES - table.current_delay_cycles) * self.cell.period
+        lag = (LOOP_DELAY_CYCLES - table.current_delay_cycles) * self.cell.period
         settings = replace(
             controller_settings(self.cell, effects=effects),
-            servo=ServoSettings(current_lag=float(np.clip(lag, 0.0, SLOWEST_LOOP))),
+            servo=ServoSettings(current_lag=float(np.clip(lag, 0.0, MAX_CURRENT_LAG))),
             # `[controller] max_gap` missed packets in a row end no motion.
             missed_replies=table.max_gap + 1,
             while_silent="continue",
@@ -98,7 +99,7 @@ class Twin:
         controller = simulated_controller(
             self.cell, settings=settings, effects=effects, seed=self.seed
         )
-        faults = link_faults(self.cell, _HORIZON * seconds, self.seed)
+        faults = link_faults(self.cell, _FAULT_HORIZON_FACTOR * seconds, self.seed)
         return VirtualLink.over(
             SimulatedTransport(controller, faults), self.cell, finish=controller.finish
         )
@@ -111,7 +112,7 @@ class Twin:
         truth = arm_truth(self.cell, exact=True)
         robot = simulated_ur(self.cell, seed=self.seed, truth=truth, effects=effects)
         peer = UrPeer(robot)
-        faults = link_faults(self.cell, _HORIZON * seconds, self.seed)
+        faults = link_faults(self.cell, _FAULT_HORIZON_FACTOR * seconds, self.seed)
         return VirtualLink.over(SimulatedTransport(peer, faults), self.cell, finish=peer.finish)
 
     @property
@@ -134,7 +135,7 @@ def link_faults(cell: Cell, seconds: float, seed: int) -> tuple[Fault, ...]:
     """Return single packets doubled, late or, where a motion survives it, lost within `seconds`."""
     rng = np.random.default_rng([seed, 7])
     cycles = round(seconds / cell.period)
-    count = max(1, round(seconds / FAULT_EVERY))
+    count = max(1, round(seconds / MEAN_FAULT_INTERVAL))
     survived = cell.max_gap > 0 and too_far_without_a_packet(cell) is None
     kinds = ["delay", "duplicate", *(["lose"] if survived else [])]
     faults: list[Fault] = []
@@ -180,7 +181,7 @@ def _varied(cell: Cell, rng: np.random.Generator) -> dict[str, list[float]]:
     n = len(cell.joint_names)
 
     def varied(values: list[float]) -> list[float]:
-        factors = 1.0 + SPREAD * rng.uniform(-1.0, 1.0, n)
+        factors = 1.0 + PARAMETER_SPREAD * rng.uniform(-1.0, 1.0, n)
         return (np.array(values) * factors).tolist()  # type: ignore[no-any-return]
 
     return {
@@ -227,8 +228,8 @@ def _simulation(
 def _ordinary_effects(cell: Cell, rotors: Array) -> UnmodelledEffects:
     """Return effects of default sizes, with springs that suit the arm.
 
-    No resonance exceeds `FASTEST` in any of `POSTURES` random postures. Where axes are almost
-    parallel, the effective inertia beyond a spring is much below that of its link.
+    No resonance exceeds `MAX_RESONANCE` in any of `RESONANCE_POSTURES` random postures. Where axes
+    are almost parallel, the effective inertia beyond a spring is much below that of its link.
     """
     n = len(rotors)
     limits = cell.joint_limits
@@ -243,15 +244,15 @@ def _ordinary_effects(cell: Cell, rotors: Array) -> UnmodelledEffects:
     reduced = rotors * links / np.maximum(rotors + links, np.finfo(np.float64).tiny)
     soft = (np.arange(n) < MAIN_AXES) & (reduced > 0.0)
     compliance = np.zeros(n)
-    compliance[soft] = 1.0 / (reduced[soft] * RESONANCE**2)
+    compliance[soft] = 1.0 / (reduced[soft] * MAIN_AXIS_RESONANCE**2)
     root = 1.0 / np.sqrt(compliance[soft])
     fastest = 0.0
-    shares = np.random.default_rng(0).random((POSTURES, n))
+    shares = np.random.default_rng(0).random((RESONANCE_POSTURES, n))
     for posture in [cell.home, *(limits.lower + shares * (limits.upper - limits.lower))]:
         if soft.any():
             whole = inertia(posture) + np.diag(np.where(soft, 0.0, rotors))
             mobility = np.linalg.inv(whole)[np.ix_(soft, soft)] + np.diag(1.0 / rotors[soft])
             frequency = float(np.linalg.eigvalsh(root[:, None] * mobility * root)[-1])
             fastest = max(fastest, frequency)
-    compliance *= max(1.0, float(np.sqrt(fastest)) / FASTEST) ** 2
+    compliance *= max(1.0, float(np.sqrt(fastest)) / MAX_RESONANCE) ** 2
     return replace(UnmodelledEffects.default_sizes(n), elasticity=tuple(compliance.tolist()))

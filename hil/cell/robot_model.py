@@ -40,7 +40,7 @@ from .schema import (
     TorsionSpringTable,
 )
 
-_GEARED: Final = 10.0  # turns of the motor per turn of the joint
+_MIN_GEAR_RATIO: Final = 10.0  # turns of the motor per turn of the joint
 
 
 def robot_model(
@@ -103,7 +103,7 @@ def ripples(
     return [
         TorqueRipple(name, tuple(zip(joints, row, strict=True)), tuple(orders))
         for k, (name, row) in enumerate(zip(joints, motor_from_joint.tolist(), strict=True))
-        if abs(row[k]) >= _GEARED
+        if abs(row[k]) >= _MIN_GEAR_RATIO
     ]
 
 

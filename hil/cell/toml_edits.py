@@ -99,7 +99,7 @@ def _entries(table: Mapping[str, Any], path: str) -> Iterator[tuple[str, str]]:
             yield f"{path}{name}", repr(value)
 
 
-_NO_LIMIT: Final = 1e4  # some URDFs have larger figures for "none"
+_MIN_ABSENT_LIMIT: Final = 1e4  # some URDFs have larger figures for "none"
 
 
 class UrdfLimits(NamedTuple):
@@ -135,4 +135,4 @@ def urdf_limits(urdf: str, joint_names: Sequence[str]) -> UrdfLimits:
 
 def _stated(figure: float) -> float:
     """Return a limit of speed or effort, infinite if the figure is none."""
-    return figure if 0.0 < figure < _NO_LIMIT else math.inf
+    return figure if 0.0 < figure < _MIN_ABSENT_LIMIT else math.inf

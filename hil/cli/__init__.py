@@ -25,16 +25,16 @@ from rich.console import Console
 from rich.text import Text
 from typer.core import TyperCommand, TyperGroup, TyperOption
 
-from hil.base.errors import DISK_REFUSES, HilError, InputError, OperatorStopError
+from hil.base.errors import DISK_ERRNOS, HilError, InputError, OperatorStopError
 from hil.base.interrupt import leave_if_interrupted
 from hil.base.progress_lines import command_lines
 from hil.base.terminal_text import printable
 from hil.base.version import software
 from hil.cli.suggestions import OTHER_COMMANDS, improve, with_present_names
 
-INTERNAL = 1
+EXIT_INTERNAL = 1
 """Exit status of an internal error, or of a disk that cannot be written."""
-USAGE = 2
+EXIT_USAGE = 2
 """Exit status of bad input."""
 
 
@@ -48,11 +48,11 @@ def exit_code_of(error: BaseException) -> int:
     """Return the exit status of an error."""
     cause: BaseException | None = error
     while cause is not None:
-        if isinstance(cause, OSError) and cause.errno in DISK_REFUSES:
-            return INTERNAL
+        if isinstance(cause, OSError) and cause.errno in DISK_ERRNOS:
+            return EXIT_INTERNAL
         cause = cause.__cause__
     if _comes_from_below(error):
-        return USAGE
+        return EXIT_USAGE
     code = getattr(error, "exit_code", 1)  # of HilError and of click
     return code if isinstance(code, int) else 1
 
@@ -305,10 +305,10 @@ def main() -> None:
     try:
         app(standalone_mode=True)
     except OSError as error:
-        if error.errno not in DISK_REFUSES:
+        if error.errno not in DISK_ERRNOS:
             raise
         file = f"{error.filename}: " if error.filename else ""
-        _fail(f"{file}cannot be written ({error.strerror}); make room", INTERNAL)
+        _fail(f"{file}cannot be written ({error.strerror}); make room", EXIT_INTERNAL)
     except KeyboardInterrupt:
         _fail("interrupted", 130, stopped=True)
     except Exception as error:

@@ -27,10 +27,10 @@ from hil.fleet.logs import LogMap, write_maps
 from hil.fleet.table import write_batch
 from identification.text import percentage
 
-SOME_BROKEN: Final = 5
+EXIT_SOME_BROKEN: Final = 5
 """Exit status if some archives could not be used."""
 
-_MOST_LINES: Final = 20
+_MAX_LINES: Final = 20
 
 
 @with_options(Identifying, "how")
@@ -84,10 +84,10 @@ def batch(
     else:
         _print(result, work.maps, written, quiet=quiet, verbose=verbose)
     if result.broken:
-        raise typer.Exit(SOME_BROKEN)
+        raise typer.Exit(EXIT_SOME_BROKEN)
 
 
-_TAIL: Final = 3  # lines at the end: files, what was skipped, counts
+_TAIL_LINES: Final = 3  # lines at the end: files, what was skipped, counts
 
 
 def _print(
@@ -105,12 +105,12 @@ def _print(
         if written:
             names = ", ".join(path.name for path in written)
             lines.append(f"written to {written[0].parent}: {names}")
-    for line in last(_broken_lines(result.broken), _MOST_LINES, "--output and --json"):
+    for line in last(_broken_lines(result.broken), _MAX_LINES, "--output and --json"):
         typer.echo(printable(line), err=True)
     if result.skipped and not quiet:
         lines.append(skipped_line(result.skipped))
     lines.append(_counts(result))
-    for line in lines if verbose else brief(lines, last=_TAIL):
+    for line in lines if verbose else brief(lines, last=_TAIL_LINES):
         typer.echo(printable(line))
 
 
@@ -137,7 +137,7 @@ def result_lines(result: BatchResult) -> Iterator[str]:
         campaigns = [estimate for estimate in result.campaigns if estimate.arm == digest]
         yield f"{arm.name}: {plural(len(campaigns), 'campaign')}"
         yield from last(
-            [_line(estimate) for estimate in campaigns], _MOST_LINES, "--output and --json"
+            [_line(estimate) for estimate in campaigns], _MAX_LINES, "--output and --json"
         )
         pooled = [estimate for estimate in result.pooled if estimate.arm == digest]
         for warning in dict.fromkeys(text for estimate in pooled for text in estimate.warnings):

@@ -16,7 +16,7 @@ from hil.cli.arguments import JsonOption, QuietOption, VerboseOption, print_json
 from hil.compare import comparison as comparing
 from identification.text import unit_text
 
-CHANGED: Final = 5
+EXIT_CHANGED: Final = 5
 """Exit status with --fail-on-change: something has changed."""
 
 
@@ -56,7 +56,7 @@ def compare(
         for line in lines if verbose else brief(lines):
             typer.echo(printable(line))
     if fail_on_change and comparison.changed:
-        raise typer.Exit(CHANGED)
+        raise typer.Exit(EXIT_CHANGED)
 
 
 def _lines(comparison: comparing.ArmComparison) -> list[str]:

@@ -27,7 +27,7 @@ from hil.cli.arguments import JsonOption, QuietOption, VerboseOption
 from hil.cli.verdict import finish
 from hil.control.errors import stopped
 from hil.design import load_design
-from hil.report.output_files import FILES, REPORT
+from hil.report.output_files import EXPORT_FILES, REPORT
 from hil.results.provenance import RESULTS
 from hil.results.series import SERIES
 from sim_fixtures.ns16 import CELL_PATH
@@ -140,7 +140,7 @@ def _run(campaign: Campaign, reporter: Reporter, *, effects: bool) -> None:
 
 _OURS = {"archives", "cell.toml", "robot.urdf", "plan.json", "manifest.json", "paper"}
 _OURS |= {"rehearsal", "rehearsal.json", "dry_run.json", "warmup.json", "precision.json"}
-_OURS |= {"campaign.lock", "second_session", RESULTS, REPORT, SERIES, *FILES}
+_OURS |= {"campaign.lock", "second_session", RESULTS, REPORT, SERIES, *EXPORT_FILES}
 
 
 def _require_replaceable(output: Path, *, force: bool) -> None:

@@ -12,7 +12,7 @@ from hil.base.one_screen import brief
 from hil.base.progress import reporter, say
 from hil.cell import Cell
 from hil.cli.arguments import JsonOption, VerboseOption, print_json
-from hil.cli.verdict import NOT_GOOD
+from hil.cli.verdict import EXIT_NOT_GOOD
 from hil.doctor.diagnosis import as_json, examine, show, summary
 
 QUICK_SECONDS = 5.0
@@ -58,4 +58,4 @@ def doctor(
         for line in brief([*summary(diagnosis), "all checks, every remedy and the criteria: -v"]):
             say(line)
     if not diagnosis.fit or diagnosis.provisional:
-        raise typer.Exit(NOT_GOOD)
+        raise typer.Exit(EXIT_NOT_GOOD)

@@ -20,7 +20,7 @@ from hil.cli.arguments import (
     with_options,
 )
 from hil.cli.identify_options import FEW, EstimatorOption, Identifying
-from hil.cli.verdict import NOT_GOOD
+from hil.cli.verdict import EXIT_NOT_GOOD
 from hil.export.controller_code import (
     CodeName,
     ExportedCode,
@@ -115,7 +115,7 @@ def export(
         good = arm.good
         print_export(_exported(arm, archives, to, what, precision), json=json, quiet=quiet)
     if not good:
-        raise typer.Exit(NOT_GOOD)
+        raise typer.Exit(EXIT_NOT_GOOD)
 
 
 def _exported(

@@ -17,7 +17,7 @@ from hil.cli.identify_options import EstimatorOption, Identifying
 from hil.cli.imports import RARE, Described, Reading
 from hil.cli.purpose_options import Required
 from hil.cli.servo_verdict import finish_servo
-from hil.cli.verdict import LABEL, finish
+from hil.cli.verdict import LABEL_COLUMNS, finish
 from hil.identified.identified_arm import identify_recordings, write_arm
 from hil.identified.identified_servo import IdentifiedServo, write_servo
 from hil.identified.messages import read_lines, servo_read_lines
@@ -92,7 +92,7 @@ def identify(
         _finish_servo(identified, output, reporter, **show)
         return
     folder, results = write_arm(identified, output, annotate=annotate, reporter=reporter)
-    read = [Paragraph(text, use.ljust(LABEL), 2) for use, text in read_lines(identified)]
+    read = [Paragraph(text, use.ljust(LABEL_COLUMNS), 2) for use, text in read_lines(identified)]
     finish(results, **show, written=(folder, folder / REPORT), read=read)
 
 
@@ -110,5 +110,5 @@ def _finish_servo(
 ) -> None:
     """Write the files of an arm without torque, and print its verdict."""
     folder = write_servo(servo, output, reporter)
-    read = [Paragraph(text, use.ljust(LABEL), 2) for use, text in servo_read_lines(servo)]
+    read = [Paragraph(text, use.ljust(LABEL_COLUMNS), 2) for use, text in servo_read_lines(servo)]
     finish_servo(servo.results, **show, written=(folder, folder / REPORT), read=read)

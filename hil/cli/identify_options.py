@@ -16,7 +16,7 @@ from hil.pipeline.estimators import ESTIMATORS, Estimator
 from hil.pipeline.options import Options, friction_from
 from identification.rollout.servo_by_torque import PositionServo
 
-LONGEST_DELAY: Final = 0.5
+MAX_STATED_DELAY: Final = 0.5
 """Largest delay accepted, s."""
 
 EstimatorOption = Annotated[
@@ -107,8 +107,10 @@ def delay_from(text: str | None) -> float | Literal["auto", "stated"] | None:
     if text is None or text in ("auto", "stated"):
         return cast('Literal["auto", "stated"] | None', text)
     value = number_of(text)
-    if not abs(value) <= LONGEST_DELAY:
-        remedy = f"give seconds between {-LONGEST_DELAY:g} and {LONGEST_DELAY:g}, stated or auto"
+    if not abs(value) <= MAX_STATED_DELAY:
+        remedy = (
+            f"give seconds between {-MAX_STATED_DELAY:g} and {MAX_STATED_DELAY:g}, stated or auto"
+        )
         raise InputError(None, f"{text!r} is not a delay", field="--delay", remedy=remedy)
     return value
 
@@ -121,8 +123,8 @@ def servo_from(text: str | None) -> PositionServo | str | None:
     if len(figures) != 3 or not (figures[0] > 0.0 and figures[1] >= 0.0):
         remedy = "give kp,kd,delay such as 2000,50,0.004, or the word identified"
         raise InputError(None, f"{text!r} is not a servo", field="--servo", remedy=remedy)
-    if not 0.0 <= figures[2] <= LONGEST_DELAY:
-        remedy = f"give a delay of 0 to {LONGEST_DELAY:g} s"
+    if not 0.0 <= figures[2] <= MAX_STATED_DELAY:
+        remedy = f"give a delay of 0 to {MAX_STATED_DELAY:g} s"
         raise InputError(None, f"{text!r} is not a servo", field="--servo", remedy=remedy)
     return PositionServo(np.array(figures[0]), np.array(figures[1]), figures[2])
 

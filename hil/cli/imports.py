@@ -45,7 +45,7 @@ from hil.importers.rosbag2 import CommandStamps, Effort
 from hil.look.before_identification import Asking
 from hil.pipeline.options import friction_from
 from identification import FrictionLaw
-from identification.model.kinematics import MOST_JOINTS
+from identification.model.kinematics import MAX_MOVING_JOINTS
 from identification.model.robot import STANDARD_GRAVITY
 
 app = typer.Typer(
@@ -483,7 +483,7 @@ def _names(renamed: list[str]) -> dict[str, str]:
             problem = f"{text!r} is not a pair"
             remedy = "give RECORDED=URDF, or a {} for the number in both: fer_joint{}=panda_joint{}"
             raise InputError(None, problem, field="--rename", remedy=remedy)
-        numbers = range(MOST_JOINTS + 1) if "{}" in recorded else (0,)
+        numbers = range(MAX_MOVING_JOINTS + 1) if "{}" in recorded else (0,)
         names |= {_numbered(recorded, k): _numbered(name, k) for k in numbers}
     return names
 

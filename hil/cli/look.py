@@ -11,7 +11,7 @@ from typing import Annotated, Final
 import typer
 
 from hil.base.files import write_output
-from hil.base.one_screen import COLUMNS, LINES, Paragraph, Part, one_screen
+from hil.base.one_screen import SCREEN_COLUMNS, SCREEN_LINES, Paragraph, Part, one_screen
 from hil.base.progress import say
 from hil.base.terminal_text import printable
 from hil.cli.arguments import JsonOption, VerboseOption, print_json, with_options
@@ -30,7 +30,7 @@ from hil.look.messages import (
 from hil.look.readings import Fact
 from identification.text import joined, percentage
 
-IN_DOUBT = 2
+EXIT_IN_DOUBT = 2
 """Exit status of a recording that two explanations fit equally well."""
 
 
@@ -80,7 +80,7 @@ def look(
         if not json:
             say(f"wrote {output}{', without what is undetermined: add a line' if is_open else ''}")
     if is_open:
-        raise typer.Exit(IN_DOUBT)
+        raise typer.Exit(EXIT_IN_DOUBT)
 
 
 def whole(result: Look) -> list[str]:
@@ -105,9 +105,9 @@ def screen(result: Look) -> list[str]:
     ]
     questions = [part for choices in result.questions for part in question(choices)]
     parts += ["", *questions, *_options(result), "reasons, and all rows: -v"]
-    lines_left = LINES - len([part for part in parts if part])
+    lines_left = SCREEN_LINES - len([part for part in parts if part])
     if not questions:
-        parts[-1:-1] = steps[: max(1, min(_STEPS, lines_left))]
+        parts[-1:-1] = steps[: max(1, min(_MAX_STEPS, lines_left))]
     return one_screen(parts)
 
 
@@ -139,23 +139,23 @@ def _ask(choices: Sequence[TiedReading]) -> TiedReading | None:
 def table(rows: Sequence[Row]) -> list[str]:
     """Return the rows as lines, and below each what would decide it."""
     width = max((len(row.aspect) for row in rows), default=0)
-    indent = " " * (width + _CERTAINTY + 4)
+    indent = " " * (width + _CERTAINTY_COLUMNS + 4)
     lines = []
     for row in rows:
         text = row_text(row)
-        lines.append(f"{row.aspect:{width}}  {row.certainty:{_CERTAINTY}}  {text.reading}")
+        lines.append(f"{row.aspect:{width}}  {row.certainty:{_CERTAINTY_COLUMNS}}  {text.reading}")
         lines.append(f"{indent}{text.reason}")
         if text.decide and row.certainty is not Certainty.CERTAIN:
             lines.append(f"{indent}to decide: {text.decide}")
     return lines
 
 
-_CERTAINTY: Final = max(map(len, Certainty))
-_MEANING: Final = 42  # columns
-_WORDS: Final = 6  # of the evidence
-_STEPS: Final = 3
-_NAMES: Final = 4  # of joints
-_AS_DESCRIBED: Final = frozenset(
+_CERTAINTY_COLUMNS: Final = max(map(len, Certainty))
+_MEANING_COLUMNS: Final = 42  # columns
+_EVIDENCE_WORDS: Final = 6  # of the evidence
+_MAX_STEPS: Final = 3
+_MAX_JOINT_NAMES: Final = 4  # of joints
+_EXPECTED_FACTS: Final = frozenset(
     {
         Fact.EVERY_JOINT_MOVES,
         Fact.CONTINUOUS,
@@ -177,16 +177,22 @@ _AS_DESCRIBED: Final = frozenset(
 
 def summary(rows: Sequence[Row]) -> list[str]:
     """Return a line for each row, and one for all rows that agree with the URDF."""
-    usual = [row for row in rows if isinstance(row.reading, Fact) and row.reading in _AS_DESCRIBED]
+    usual = [
+        row for row in rows if isinstance(row.reading, Fact) and row.reading in _EXPECTED_FACTS
+    ]
     width = max(len("channel"), *(len(row.aspect) for row in rows))
-    lines = [f"{'channel':{width}}  {'meaning':{_MEANING}}  {'certainty':{_CERTAINTY}}  evidence"]
+    lines = [
+        f"{'channel':{width}}  {'meaning':{_MEANING_COLUMNS}}  "
+        f"{'certainty':{_CERTAINTY_COLUMNS}}  evidence"
+    ]
     for row in rows:
         if row not in usual:
             text = row_text(row)
-            meaning = shorten(text.reading, _MEANING, placeholder=" ...")
-            first = f"{row.aspect:{width}}  {meaning:{_MEANING}}  {row.certainty:{_CERTAINTY}}  "
-            words = " ".join(text.reason.split()[:_WORDS]).rstrip(":;,")
-            lines.append(first + shorten(words, COLUMNS - len(first), placeholder=" ..."))
+            meaning = shorten(text.reading, _MEANING_COLUMNS, placeholder=" ...")
+            certainty_cell = f"{row.certainty:{_CERTAINTY_COLUMNS}}"
+            first = f"{row.aspect:{width}}  {meaning:{_MEANING_COLUMNS}}  {certainty_cell}  "
+            words = " ".join(text.reason.split()[:_EVIDENCE_WORDS]).rstrip(":;,")
+            lines.append(first + shorten(words, SCREEN_COLUMNS - len(first), placeholder=" ..."))
     for certainty in Certainty:
         names = ", ".join(row.aspect for row in usual if row.certainty is certainty)
         if names:
@@ -208,7 +214,7 @@ def determined(groups: Sequence[ParameterGroup]) -> list[str]:
             alike = [k for k, group in enumerate(groups) if group.quantity == quantity]
             total = sum(column[k] for column in numbers.values() for k in alike)
             names = [groups[k].body for k in alike if counts[k]]
-            joints = "all joints" if len(names) == len(alike) else joined(names, _NAMES)
+            joints = "all joints" if len(names) == len(alike) else joined(names, _MAX_JOINT_NAMES)
             if names:
                 parts.append(f"{name} {sum(counts[k] for k in alike)} of {total} ({joints})")
         lines.append(f"  {title:6}  {'; '.join(parts) or 'nothing'}")

@@ -32,7 +32,7 @@ from hil.control.connection import active_checks, narrower_limits
 from hil.control.errors import SlippedError
 from hil.control.motion_watch import MotionProgress, OperatorRequest
 from hil.control.move import (
-    THERE,
+    POSTURE_TOLERANCE,
     CheckedMove,
     axis_alone,
     joint_index,
@@ -109,7 +109,7 @@ def move(
         with stop_on_interrupt() as stop:
             here = link.connect(stop)
         target = turned(cell, here, joint or "", by or 0.0) if wanted is None else wanted
-        if np.max(np.abs(target - here)) <= THERE:
+        if np.max(np.abs(target - here)) <= POSTURE_TOLERANCE:
             link.close()
             _print(
                 "the arm is at the target; nothing was sent",

@@ -21,7 +21,7 @@ from hil.plots import check_format, draw_plan, save
 from planner.moves import MotionPlan, Move, plan_moves
 from planner.worker import in_child
 
-ROUNDING = 1e-9
+ANGLE_TOLERANCE = 1e-9
 """Degrees by which an angle may pass a limit that was converted to radians and back."""
 
 
@@ -50,7 +50,7 @@ def read_via_points(path: Path, cell: Cell) -> Array:
             remedy = f"write one finite angle in degrees for each of the {frame.sign.size} joints"
             raise InputError(path, problem, field=f"line {number}", remedy=remedy)
         for angle, (name, (lower, upper)) in zip(point, bounds, strict=True):
-            if not lower - ROUNDING <= angle <= upper + ROUNDING:
+            if not lower - ANGLE_TOLERANCE <= angle <= upper + ANGLE_TOLERANCE:
                 problem = f"{name} = {angle:g}° is outside [limits] of {cell.path}"
                 remedy = f"write an angle from {lower:g}° to {upper:g}°"
                 raise InputError(path, problem, field=f"line {number}", remedy=remedy)

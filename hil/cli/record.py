@@ -31,7 +31,7 @@ from hil.control.ur_recording import ConstantsFound, listening, record_arm
 from identification.text import percentage
 
 Kind = Annotated[Literal["excitation", "validation", "standstill"], typer.Option(metavar="USE")]
-LINE_EVERY = 5.0
+STATUS_LINE_PERIOD = 5.0
 """Time between two lines, s."""
 
 
@@ -259,7 +259,7 @@ class View:
         self._replies = replies
         console = progress_console()
         self._progress = None if quiet else console or Console(stderr=True)
-        self._period = LINE_EVERY if console is not None else LINE_PERIOD
+        self._period = STATUS_LINE_PERIOD if console is not None else LINE_PERIOD
         self._over = ""
         self._next = 0.0
 

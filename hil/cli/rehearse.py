@@ -12,7 +12,7 @@ from hil.base.progress import say
 from hil.campaign import Campaign, stop_on_interrupt
 from hil.campaign.rehearsal_record import Rehearsal
 from hil.cli.arguments import CampaignArgument, JsonOption, QuietOption, VerboseOption
-from hil.cli.verdict import NOT_GOOD
+from hil.cli.verdict import EXIT_NOT_GOOD
 
 
 def rehearse(
@@ -51,7 +51,7 @@ def rehearse(
         for line in [*lines, rehearsal.line] if verbose else brief([rehearsal.line, *lines]):
             say(line)
     if not rehearsal.passed:
-        raise typer.Exit(NOT_GOOD)
+        raise typer.Exit(EXIT_NOT_GOOD)
 
 
 def _lines(rehearsal: Rehearsal, *, verbose: bool) -> list[str]:

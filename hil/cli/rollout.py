@@ -10,7 +10,7 @@ import typer
 
 from hil.base.errors import InputError
 from hil.base.files import make_folder
-from hil.base.one_screen import LINES, Paragraph, Part, columns, one_screen
+from hil.base.one_screen import SCREEN_LINES, Paragraph, Part, columns, one_screen
 from hil.base.progress import Reporter, say
 from hil.base.progress import reporter as make_reporter
 from hil.cli.arguments import (
@@ -22,7 +22,7 @@ from hil.cli.arguments import (
     with_options,
 )
 from hil.cli.identify_options import EstimatorOption, Identifying, servo_from
-from hil.cli.verdict import MOST_JOINTS, NOT_GOOD
+from hil.cli.verdict import EXIT_NOT_GOOD, MAX_JOINT_ROWS
 from hil.pipeline.options import Options
 from hil.pipeline.stored_identification import read_or_identify
 from hil.plots.plan_picture import save
@@ -112,7 +112,7 @@ def rollout(
         for line in [simulated.result.message] if quiet else lines:
             say(line)
     if not good:
-        raise typer.Exit(NOT_GOOD)
+        raise typer.Exit(EXIT_NOT_GOOD)
 
 
 def screen(result: RolloutResult) -> list[str]:
@@ -121,7 +121,7 @@ def screen(result: RolloutResult) -> list[str]:
     if result.polish is not None:
         arms[1:] = [("polished", result.polish.errors)]
     shown = [(name, arm) for name, arm in arms if arm is not None]
-    joints = range(min(MOST_JOINTS, len(result.joint_names)))
+    joints = range(min(MAX_JOINT_ROWS, len(result.joint_names)))
     more = len(result.joint_names) - len(joints)
     lines = columns(
         [
@@ -142,7 +142,7 @@ def screen(result: RolloutResult) -> list[str]:
     servo = [] if result.servo is None else result.servo.lines(result.joint_names)
     warning = f"warning: {result.band_message}" if result.band_message else ""
     remarks = [*servo, *result.stability(), warning, *result.notes]
-    parts += [Paragraph(text, most=2) for text in remarks if text][: LINES - len(parts) - 1]
+    parts += [Paragraph(text, most=2) for text in remarks if text][: SCREEN_LINES - len(parts) - 1]
     return one_screen([*parts, "drawn arms and what drives the arm: -v"])
 
 

@@ -29,7 +29,7 @@ from hil.cli.arguments import (
     print_json,
     with_options,
 )
-from hil.cli.verdict import NOT_GOOD, as_json, finish
+from hil.cli.verdict import EXIT_NOT_GOOD, as_json, finish
 from hil.cli.weigh import WeighingOptions, weigh
 from hil.control.cell_link import require_real_time
 from hil.control.errors import stopped
@@ -185,7 +185,7 @@ def _identify(
     verdict = json_format.loads(as_json(identification.results))
     print_json({**result.to_dict(), "verdict": verdict})
     if not identification.verdict.good:
-        raise typer.Exit(NOT_GOOD)
+        raise typer.Exit(EXIT_NOT_GOOD)
 
 
 def _print(result: RunResult, *, verbose: bool, json: bool) -> None:

@@ -19,7 +19,7 @@ from hil.cli.arguments import JsonOption, print_json
 from hil.cli.record import with_rtde
 from hil.control.move import joint_index
 from hil.control.simulated_cell import (
-    OWN_SPEED,
+    OWN_SPEED_SHARE,
     controller_settings,
     own_postures,
     simulated_controller,
@@ -35,7 +35,7 @@ from hil.control.simulator_on_link import (
 from hil.control.ur_simulation import served_arm
 from sim_fixtures import ControllerSettings, Phase, SimulatedController
 from sim_fixtures.faults import parse_fault, split_faults
-from sim_fixtures.serve import PATIENCE, Latencies, Request, ServeCounts
+from sim_fixtures.serve import STOP_TIMEOUT, Latencies, Request, ServeCounts
 
 WORDS: Final = {
     Phase.START: "starting: sync and init packets",
@@ -84,9 +84,9 @@ class PhasePrinter:
         self._cycles = counts.cycles
 
     def _report(self, text: str) -> None:
-        """Print a line, or count it if the same one was printed `SHOWN` times already."""
+        """Print a line, or count it if the same one was printed `MAX_SAME_LINES` times already."""
         self._printed[text] += 1
-        if self._printed[text] > SHOWN:
+        if self._printed[text] > MAX_SAME_LINES:
             if self._hidden == 0:
                 self.say(f"{self._elapsed()}  ... and so on; repeated lines are not printed")
             self._hidden += 1
@@ -106,13 +106,13 @@ class PhasePrinter:
         return f"{time.monotonic() - self._began:8.3f} s"
 
 
-SHOWN: Final = 3
+MAX_SAME_LINES: Final = 3
 """Times that a line of a session is printed: openings may repeat every second."""
-OWN_MOVE: Final = 30.0
+OWN_MOTION_TIMEOUT: Final = 30.0
 """Longest time for a motion of the controller's own program to end, s."""
 LOST_OPENINGS: Final = 20
 """Consecutive losses of open mode by missing replies after which the session ends."""
-REOPENING: Final = 1.0
+REOPENING_SECONDS: Final = 1.0
 """Shortest time before the axes open again after such a loss, s."""
 
 
@@ -133,7 +133,7 @@ def simulate(
     warm_start: bool = False,
     intervals: Annotated[int | None, typer.Option(min=1)] = None,
     own_motion: bool = False,
-    own_speed: Annotated[float, typer.Option(min=0.01, max=1.0)] = OWN_SPEED,
+    own_speed: Annotated[float, typer.Option(min=0.01, max=1.0)] = OWN_SPEED_SHARE,
     effects: bool = False,
     fault: Annotated[list[str] | None, typer.Option(metavar="SPEC")] = None,
     seed: Annotated[int | None, typer.Option(min=0)] = None,
@@ -221,7 +221,7 @@ def simulate(
         only_axis=only_axis,
         missed_replies=missed,
         lost_openings=LOST_OPENINGS,
-        reopening_time=REOPENING,
+        reopening_time=REOPENING_SECONDS,
         while_silent="drive_off" if while_silent == "drive-off" else while_silent,
         cold_start=not warm_start,
         open_intervals=intervals,
@@ -263,7 +263,7 @@ def simulate(
                     end,
                     pressed,
                     # The controller's own program stops at the next posture only.
-                    patience=OWN_MOVE if own_motion else PATIENCE,
+                    patience=OWN_MOTION_TIMEOUT if own_motion else STOP_TIMEOUT,
                     cycle_extension=patience,
                     watch=status.watch,
                 )

@@ -8,7 +8,7 @@ from typing import Annotated
 
 import typer
 
-from hil.base.interrupt import REQUESTS, leave_on
+from hil.base.interrupt import STOP_SIGNALS, leave_on
 from hil.base.progress import reporter as make_reporter
 from hil.cell import Cell
 from hil.cli.arguments import JsonOption, QuietOption, print_json
@@ -61,7 +61,7 @@ def study(
         effects=effects,
     )
     arm = None if cell is None else Cell.load(cell)
-    with leave_on(REQUESTS, f"stopped: the same command resumes the study in {output}"):
+    with leave_on(STOP_SIGNALS, f"stopped: the same command resumes the study in {output}"):
         result = run_study(output, settings, reporter, workers=count, cell=arm)
     if json:
         print_json(result.summary)

@@ -73,7 +73,7 @@ them are refused by `hil.design.settings`, whose list is the same; it is slow to
 _METHOD_OPTIONS: Final = ("--method", "--show-settings")  # of `hil design`
 _EXAMPLES: Final = re.compile(r"\*\*Examples?:?\*\*(.*?)(?:\n\n(?!- )|\Z)", re.DOTALL)
 _COMMAND: Final = re.compile(r"`(hil [^`]+)`")
-_MOST: Final = 2  # examples of one error
+_MAX_EXAMPLES: Final = 2  # examples of one error
 
 
 def with_present_names(arguments: Sequence[str]) -> tuple[list[str], list[str]]:
@@ -115,7 +115,7 @@ def improve(error: BaseException) -> None:
     if type(error).__name__ == "MissingParameter" and parameter is not None:
         described = (getattr(parameter, "help", None) or "").rstrip(".")
         lines = [f"It takes: {described}."] if described else []
-        lines += [f"Example: {example}" for example in examples(context.command)[:_MOST]]
+        lines += [f"Example: {example}" for example in examples(context.command)[:_MAX_EXAMPLES]]
         refusal.message = "\n".join(lines)
 
 

@@ -15,7 +15,7 @@ from hil.base.progress import say
 from hil.base.toml_text import comment_lines, inline
 from hil.cli.arguments import JsonOption, QuietOption, numbers, print_json
 from hil.cli.identify_options import delay_from
-from hil.cli.verdict import NOT_GOOD
+from hil.cli.verdict import EXIT_NOT_GOOD
 from hil.pipeline.sources import archives_in
 from hil.pipeline.torque_constants import GainsFound, find_gains
 from identification.model.known_payload import Payload
@@ -72,7 +72,7 @@ def torque_constants(
         for warning in result.warnings:
             say(f"warning: {warning}", err=True)
     if not result.gains.determined.all():
-        raise typer.Exit(NOT_GOOD)
+        raise typer.Exit(EXIT_NOT_GOOD)
 
 
 def _refusal(field: str, problem: str, remedy: str) -> InputError:

@@ -27,10 +27,10 @@ from hil.fleet.trend import FleetTrend, fleet_trend
 from hil.fleet.trend_limits import TrendLimit
 from hil.fleet.trend_page import trend_page
 
-CHANGED: Final = 5
+EXIT_CHANGED: Final = 5
 """Exit status with --fail-on-change: something has changed."""
-_MOST_BROKEN: Final = 8
-_TAIL: Final = 3  # lines at the end: files, what was skipped, counts
+_MAX_BROKEN_LINES: Final = 8
+_TAIL_LINES: Final = 3  # lines at the end: files, what was skipped, counts
 
 
 @with_options(Identifying, "how")
@@ -96,7 +96,7 @@ def trend(
     else:
         _print(result, maps, written, quiet=quiet, verbose=verbose)
     if fail_on_change and result.changed:
-        raise typer.Exit(CHANGED)
+        raise typer.Exit(EXIT_CHANGED)
 
 
 def _print(
@@ -110,14 +110,14 @@ def _print(
     """Print the verdict, the robots and what was written; the rest goes to standard error."""
     lines = [] if quiet else [*map_lines(maps, verbose=verbose), *_lines(result)]
     broken = [f"{each.path} could not be used: {each.message}" for each in result.broken]
-    for line in last(broken, _MOST_BROKEN, "--json"):
+    for line in last(broken, _MAX_BROKEN_LINES, "--json"):
         typer.echo(printable(line), err=True)
     if written and not quiet:
         lines.append(f"written: {', '.join(map(str, written))}")
     if result.skipped and not quiet:
         lines.append(skipped_line(result.skipped))
     lines = [f"{verdict(result)}.", *lines, _counts(result)]
-    for line in lines if verbose else brief(lines, last=_TAIL):
+    for line in lines if verbose else brief(lines, last=_TAIL_LINES):
         typer.echo(printable(line))
 
 

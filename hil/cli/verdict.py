@@ -18,15 +18,15 @@ from identification.text import number, percentage
 from identification.validation.purpose_messages import TITLES, figure, requirement
 from identification.validation.verdict import fault_of
 
-NOT_GOOD = 5
+EXIT_NOT_GOOD = 5
 """Exit status of a command whose model is not good."""
 
-MOST: Final = 3
+MAX_SHOWN: Final = 3
 """Findings, and next steps, on one screen."""
-MOST_JOINTS: Final = 8  # rows on one screen
+MAX_JOINT_ROWS: Final = 8  # rows on one screen
 _MISSING: Final = "-"
 _LEVELS: Final = {"wrong": "wrong", "doubtful": "doubtful", "information": "info", "good": "ok"}
-LABEL: Final = 10
+LABEL_COLUMNS: Final = 10
 """Columns before a finding."""
 _LEGEND: Final = (
     ("RMS error", "root mean square of measured minus predicted torque, on unseen motion"),
@@ -72,7 +72,7 @@ def finish(
         for line in screen(results, written, read):
             typer.echo(printable(line))
     if not results.verdict.good:
-        raise typer.Exit(NOT_GOOD)
+        raise typer.Exit(EXIT_NOT_GOOD)
 
 
 def as_json(results: Results, written: tuple[Path, Path] | None = None) -> str:
@@ -103,17 +103,17 @@ def screen(
         for finding in judgement.worst_first
         if finding.level in ("wrong", "doubtful") and finding != named
     ]
-    shown = open_findings[:MOST]
-    steps = judgement.next_steps[:MOST]
+    shown = open_findings[:MAX_SHOWN]
+    steps = judgement.next_steps[:MAX_SHOWN]
     mentioned = {*shown, named}
     remarks = len([f for f in judgement.findings if f.level != "good" and f not in mentioned])
     remarks += len(results.remarks) + len(judgement.next_steps) - len(steps)
     table_lines = table(results)
     parts: list[Part] = [Paragraph(results.verdict.line), *read, ""]
-    parts += table_lines if len(table_lines) <= MOST_JOINTS + 2 else _some_joints(results)
+    parts += table_lines if len(table_lines) <= MAX_JOINT_ROWS + 2 else _some_joints(results)
     parts.append("")
-    parts += [Paragraph(f.words, _LEVELS[f.level].ljust(LABEL), 3) for f in shown]
-    parts += [Paragraph(step, "next".ljust(LABEL), 3) for step in steps]
+    parts += [Paragraph(f.words, _LEVELS[f.level].ljust(LABEL_COLUMNS), 3) for f in shown]
+    parts += [Paragraph(step, "next".ljust(LABEL_COLUMNS), 3) for step in steps]
     parts += _files(results, written)
     if remarks:
         report = "" if written is None else f", or {written[1]}"
@@ -183,7 +183,7 @@ _OF_ALL: Final = {"joint": "all", "RMS error": "", "of limit": ""}
 def _some_joints(results: Results) -> list[str]:
     """Return the table of the joints with the largest errors of an arm of many joints."""
     judgement = results.judgement
-    worst = sorted(judgement.joints, key=lambda joint: -(joint.relative or 0.0))[:MOST_JOINTS]
+    worst = sorted(judgement.joints, key=lambda joint: -(joint.relative or 0.0))[:MAX_JOINT_ROWS]
     shown = [joint for joint in judgement.joints if joint in worst]
     rows: list[JointJudgement | OverallJudgement] = [*shown]
     if judgement.all_joints is not None:

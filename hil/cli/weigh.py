@@ -18,10 +18,10 @@ from hil.campaign.campaign_run import RunResult
 from hil.campaign.operator_keys import can_read
 from hil.campaign.screen import confirmed
 from hil.cli.arguments import PAYLOAD, numbers, print_json
-from hil.cli.verdict import NOT_GOOD
+from hil.cli.verdict import EXIT_NOT_GOOD
 from hil.precision.requirements import Requirement
 from hil.weighing.payload_campaign import (
-    CENTRE,
+    DEFAULT_CENTRE,
     Execute,
     PayloadCampaign,
     PayloadMounting,
@@ -60,7 +60,7 @@ class WeighingOptions:
         typer.Option(
             metavar="X,Y,Z",
             help="Its expected centre of mass, m in the frame of the flange. Default: "
-            f"{','.join(f'{part:g}' for part in CENTRE)}.",
+            f"{','.join(f'{part:g}' for part in DEFAULT_CENTRE)}.",
             rich_help_panel=PAYLOAD,
         ),
     ] = None
@@ -99,9 +99,9 @@ class WeighingOptions:
 
 
 def centre_from(text: str | None) -> tuple[float, float, float]:
-    """Return the centre of a payload from `--payload-centre`, by default `CENTRE` (InputError)."""
+    """Return a payload's centre from `--payload-centre`, else `DEFAULT_CENTRE` (InputError)."""
     if text is None:
-        return CENTRE
+        return DEFAULT_CENTRE
     x, y, z = numbers(text, 3, "--payload-centre")
     return x, y, z
 
@@ -151,5 +151,5 @@ def weigh(
     else:
         typer.echo("\n".join(result.lines if verbose else brief(result.summary)))
     if result.payload.mounting is not None:
-        raise typer.Exit(NOT_GOOD)
+        raise typer.Exit(EXIT_NOT_GOOD)
     return None

@@ -3,12 +3,21 @@
 from __future__ import annotations
 
 from hil.base.version import software
-from hil.compare.comparison import FALSE_ALARMS, LEAST, MIN_REPETITIONS, ArmComparison
+from hil.compare.comparison import (
+    FALSE_ALARM_RATE,
+    MIN_RELATIVE_CHANGE,
+    MIN_REPETITIONS,
+    ArmComparison,
+)
 from hil.report.rendering import environment, page_bytes
 
 
 def comparison_page(comparison: ArmComparison) -> bytes:
     """Return the comparison as one HTML file; the same input gives the same bytes."""
-    rules = {"alarms": FALSE_ALARMS, "least": LEAST, "repetitions": MIN_REPETITIONS}
+    rules = {
+        "alarms": FALSE_ALARM_RATE,
+        "least": MIN_RELATIVE_CHANGE,
+        "repetitions": MIN_REPETITIONS,
+    }
     template = environment().get_template("changes.html.j2")
     return page_bytes(template.render(found=comparison, rules=rules, software=software()))

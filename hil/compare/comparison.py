@@ -34,11 +34,11 @@ MIN_REPETITIONS: Final = 15
 """Repetitions needed to estimate their correlation. With fewer the effective number is 1, as all
 may have been recorded while the arm warmed up."""
 CONFIDENCE: Final = 0.95  #: Of each interval
-FALSE_ALARMS: Final = 0.01  #: Probability of any change of an arm that has none
-LEAST: Final = 0.05  #: Smallest relevant change, as a share of the first value
-SPEEDS: Final = np.geomspace(0.02, 5.0, 40)  # rad/s or m/s
+FALSE_ALARM_RATE: Final = 0.01  #: Probability of any change of an arm that has none
+MIN_RELATIVE_CHANGE: Final = 0.05  #: Smallest relevant change, as a share of the first value
+FRICTION_SPEEDS: Final = np.geomspace(0.02, 5.0, 40)  # rad/s or m/s
 _MAX_CORRELATION: Final = 0.95
-_NORMAL: Final = float(student_limit(0.025, 1e6))
+_NORMAL_95: Final = float(student_limit(0.025, 1e6))
 _TWO: Final = "give two or more campaigns of one arm"
 _CAVEAT: Final = (
     "the normal variation from day to day is not known from a few campaigns: friction of a cold arm"
@@ -80,7 +80,9 @@ class QuantityChange:
     change: float
     half: float  #: half width of the 95 % interval of the change
     p_value: float  #: of no change, adjusted for all quantities and campaigns
-    changed: bool  #: whether the change is significant and at least `LEAST` of the first value
+    changed: (
+        bool  #: whether it is significant and at least `MIN_RELATIVE_CHANGE` of the first value
+    )
 
 
 @dataclass(frozen=True, eq=False)
@@ -233,7 +235,8 @@ def compare_campaigns(
             half=float(half[c, k]),
             p_value=float(p_value[c, k]),
             changed=bool(
-                p_value[c, k] < FALSE_ALARMS and abs(change[c, k]) >= LEAST * abs(value[0, k])
+                p_value[c, k] < FALSE_ALARM_RATE
+                and abs(change[c, k]) >= MIN_RELATIVE_CHANGE * abs(value[0, k])
             ),
         )
         for c in range(1, len(campaigns))
@@ -271,7 +274,7 @@ def quantities(model: RobotModel, first: BatchEstimate) -> list[ComparedQuantity
         ComparedQuantity(names[k], axes.get(names[k], ""), "inertia", units[k], single[k])
         for k in rows
     ]
-    table = friction_weights(model, SPEEDS)
+    table = friction_weights(model, FRICTION_SPEEDS)
     for j, (joint, turns) in enumerate(zip(joints, model.chain.revolute, strict=True)):
         if not table[:, j].any():
             continue
@@ -279,7 +282,7 @@ def quantities(model: RobotModel, first: BatchEstimate) -> list[ComparedQuantity
         with np.errstate(divide="ignore", invalid="ignore"):
             best = int(np.argmax(np.nan_to_num(np.abs(value) / np.sqrt(variance))))
         unit, speed = ("N·m", "rad/s") if turns else ("N", "m/s")
-        name = f"friction of {joint} at {SPEEDS[best]:.2g} {speed}"
+        name = f"friction of {joint} at {FRICTION_SPEEDS[best]:.2g} {speed}"
         compared.append(ComparedQuantity(name, joint, "friction", unit, table[best, j]))
     return compared
 
@@ -364,7 +367,7 @@ def _warnings(
 def freedom_of(level: BatchEstimate) -> float:
     """Return the degrees of freedom of the covariance, from the Student factor of its intervals."""
     factor = level.estimate.interval_factor
-    if factor <= _NORMAL:
+    if factor <= _NORMAL_95:
         return 1e6
     return float(
         scipy.optimize.brentq(lambda freedom: student_limit(0.025, freedom) - factor, 0.5, 1.1e6)

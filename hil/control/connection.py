@@ -33,10 +33,10 @@ from hil.control.motion_watch import REFUSED
 
 START_TIMEOUT: Final = 60.0  # s within which an accepted motion must have started
 OFF_TIMEOUT: Final = 2.0  # s with the drive off after which an accepted motion is dropped
-READY: Final = frozenset((State.CLOSED, State.OPENING, State.OPEN))
+READY_STATES: Final = frozenset((State.CLOSED, State.OPENING, State.OPEN))
 """States with the drive on. A controller may open its axes at once: they are held where they are
 until a motion is requested."""
-_WITHOUT_DRIVE: Final = (State.SYNC, State.INIT, State.DRIVE_OFF, State.FAULTED, State.ENDED)
+_STATES_WITHOUT_DRIVE: Final = (State.SYNC, State.INIT, State.DRIVE_OFF, State.FAULTED, State.ENDED)
 
 
 @dataclass(eq=False)
@@ -81,7 +81,7 @@ class Connection:
                 self.unusable = event.unusable
                 self.differences = event.differences
                 self.inits += 1
-            case StateChanged() if event.after in READY:
+            case StateChanged() if event.after in READY_STATES:
                 self.switched_off = None
             case Refused():
                 self.refused = event
@@ -138,7 +138,7 @@ class StartTimeout:
 
     def no_start(self, state: State, now: float) -> str | None:
         """Return why a motion that has not started will not start; None while it may."""
-        if state not in _WITHOUT_DRIVE:
+        if state not in _STATES_WITHOUT_DRIVE:
             self._drive_on = now
         if now - self._drive_on > OFF_TIMEOUT:
             event = "a refusal came" if state is State.FAULTED else "the drive went off"

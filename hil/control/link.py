@@ -21,9 +21,9 @@ from drivers.events import MotionEnded, Refused
 from drivers.exchange.control import HEARTBEAT_TIMEOUT, HeartbeatMonitor
 from drivers.exchange.event_log import NO_ARCHIVE
 from drivers.exchange.process_handle import WithdrawnError
-from drivers.exchange.serving import ARM_MOVED
+from drivers.exchange.serving import MIN_ARM_MOVEMENT
 from drivers.motion_source import MotionSource
-from drivers.states import HAS_SET_POINTS, Outcome, State
+from drivers.states import STATES_WITH_SET_POINTS, Outcome, State
 from hil.archive import ArchiveSpec
 from hil.archive.live import LiveView
 from hil.archive.process_handle import NO_TIME
@@ -37,7 +37,7 @@ from hil.control.motion_watch import MotionWatch, Stop, unwatched_motion
 
 from .connection import (
     C4G_WORDS,
-    READY,
+    READY_STATES,
     UR_WORDS,
     Connection,
     ControllerWords,
@@ -51,11 +51,11 @@ from .port import ControllerPort
 REST_TIMEOUT: Final = 30.0
 """s for an arm to come to rest, and for the archive of a motion that has ended."""
 CLOSE_TIMEOUT: Final = 1.0  # s for the axes to close after the motion of a failed archive
-SLOW_DISK: Final = 1.0  # Duration of one flush that is reported as a fault of the disk, s
+SLOW_FLUSH_SECONDS: Final = 1.0  # Duration of one flush that is reported as a fault of the disk, s
 NOT_STARTED: Final = "it had not begun"
 """Reason of a motion that was stopped before it was requested."""
 STOPPED: Final = "stopped by the operator"
-WAIT_REPORTED: Final = 2.0  # s after which a controller that is not ready is reported
+WAIT_REPORT_DELAY: Final = 2.0  # s after which a controller that is not ready is reported
 
 
 @dataclass(frozen=True, eq=False)
@@ -145,9 +145,9 @@ class MotionLink:
             if len(records := port.new_records()):
                 target = records["target_position"][-1].copy()
             state = port.status().state
-            ready = target is not None and state in READY
+            ready = target is not None and state in READY_STATES
             waited = port.now - began
-            if not ready and waited > WAIT_REPORTED:
+            if not ready and waited > WAIT_REPORT_DELAY:
                 self._report_waiting(state, timeout)
             return ready or stop.requested or waited > timeout
 
@@ -156,7 +156,7 @@ class MotionLink:
         self.connection.require_usable()
         if stop.requested:
             raise ControllerError("ended by the operator before anything moved")
-        if target is None or port.status().state not in READY:
+        if target is None or port.status().state not in READY_STATES:
             waited, why_off = port.now - began, self.connection.why_off
             raise self._words.not_ready(port.status().state, waited, why_off)
         self._inits = self.connection.inits
@@ -312,7 +312,7 @@ class MotionLink:
             if not self.motion_ended:
                 return port.now > deadline
             closed_by = min(closed_by, port.now + CLOSE_TIMEOUT)
-            return state().state not in HAS_SET_POINTS or port.now > closed_by
+            return state().state not in STATES_WITH_SET_POINTS or port.now > closed_by
 
         self.exchange(finished)
         return self.motion_ended
@@ -429,7 +429,7 @@ class MotionLink:
         still = Standstill(self.cell.period)
         drive_on = port.now
         received = 1
-        monitor = HeartbeatMonitor(lambda: received, max_interval=MAX_INTERVAL)
+        monitor = HeartbeatMonitor(lambda: received, max_interval=MAX_LOOK_INTERVAL)
         port.prepare(stop)
         port.new_records()
 
@@ -441,12 +441,12 @@ class MotionLink:
             now = port.now
             if state is not State.DRIVE_OFF:
                 drive_on = now
-            if state in NO_SESSION or now - drive_on > OFF:
+            if state in STATES_WITHOUT_SESSION or now - drive_on > DRIVE_OFF_SECONDS:
                 return True
             self._poll()
             records = port.new_records()
             received += len(records) > 0
-            if still.add(records) or monitor.silence() > SILENCE:
+            if still.add(records) or monitor.silence() > SILENCE_TIMEOUT:
                 return True
             self._show_recording(watch, over=reason, records=records)
             return False
@@ -625,7 +625,7 @@ def archive_silence(disk_waited: float) -> str:
 
     `disk_waited` is the longest time that it waited for its disk [s].
     """
-    if disk_waited > SLOW_DISK:
+    if disk_waited > SLOW_FLUSH_SECONDS:
         cause = f"it waited for its disk for {disk_waited:.1f} s: check that disk"
     else:
         cause = NO_TIME
@@ -664,12 +664,15 @@ def recording_end(
     return ("refused", str(refused.error)) if end is not None and refused is not None else end
 
 
-SILENCE: Final = 1.0  # s without a packet after which the controller is assumed to have gone
-MAX_INTERVAL: Final = 0.1  # Longest time between two looks that counts as such a silence, s
-NO_SESSION: Final = frozenset((State.SYNC, State.INIT, State.ENDED))  # States without a session
-TARGET_MOVED: Final = 1e-5  # rad; a target at rest does not change, but its rounding may
-REST: Final = 1.0  # s of the controller's time without motion after which the arm is at rest
-OFF: Final = 1.0
+# s without a packet after which the controller is assumed to have gone
+SILENCE_TIMEOUT: Final = 1.0
+MAX_LOOK_INTERVAL: Final = 0.1  # Longest time between two looks that counts as such a silence, s
+# States without a session
+STATES_WITHOUT_SESSION: Final = frozenset((State.SYNC, State.INIT, State.ENDED))
+MIN_TARGET_CHANGE: Final = 1e-5  # rad; a target at rest does not change, but its rounding may
+# s of the controller's time without motion after which the arm is at rest
+REST_SECONDS: Final = 1.0
+DRIVE_OFF_SECONDS: Final = 1.0
 """s with the drive off after which replies end; a session that is being ended has ended by then."""
 
 
@@ -677,18 +680,18 @@ class Standstill:
     """Detects rest of target and arm, with `period` s; unknown positions count as moving."""
 
     def __init__(self, period: float) -> None:
-        self._cycles = round(REST / period)
+        self._cycles = round(REST_SECONDS / period)
         self._still: NDArray[np.void] | None = None
 
     def add(self, records: NDArray[np.void]) -> bool:
-        """Return whether the arm has been at rest for `REST` at the end of these records (k,)."""
+        """Return whether the arm has been at rest for `REST_SECONDS` at the end of records (k,)."""
         for record in records:
             last = self._still
             if (
                 last is None
                 or not record["cycle"] > last["cycle"]
-                or not _close(record, last, "target_position", TARGET_MOVED)
-                or not _close(record, last, "position", ARM_MOVED)
+                or not _close(record, last, "target_position", MIN_TARGET_CHANGE)
+                or not _close(record, last, "position", MIN_ARM_MOVEMENT)
             ):
                 self._still = record.copy()
         if self._still is None or not len(records):

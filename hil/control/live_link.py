@@ -60,27 +60,27 @@ from .port import PortStatus
 T = TypeVar("T")
 
 HEARTBEAT_PERIOD: Final = 0.05  # s; the exchange stops the arm after 0.5 s without a heartbeat
-STALL: Final = 1.0  # Longest time between two turns of the loop that supervises a motion, s
-HUNG: Final = 5.0
+STALL_TIMEOUT: Final = 1.0  # Longest time between two turns of the loop that supervises a motion, s
+HUNG_TIMEOUT: Final = 5.0
 """s without a heartbeat after which an exchange process is killed: the controller, without replies
 for so long, has acted by its own watchdog."""
-EARLIER_EXCHANGE: Final = 30.0
+EARLIER_EXCHANGE_TIMEOUT: Final = 30.0
 """s to wait for the exchange of an earlier run: longer than one without a supervisor needs to bring
 the arm to rest and to end."""
-POLL: Final = 0.02  # Period of the supervising loop, s
+SUPERVISION_PERIOD: Final = 0.02  # Period of the supervising loop, s
 OPEN_TIMEOUT = 10.0  # s within which a file must have been created, or completed
 END_TIMEOUT: Final = 30.0  # s within which a session must end after that was requested
 _M_MMAP_THRESHOLD: Final = -3
-LARGE: Final = 128 * 1024  # Bytes; glibc's own value, before it adapts
+MMAP_THRESHOLD_BYTES: Final = 128 * 1024  # Bytes; glibc's own value, before it adapts
 
 
 def return_large_arrays() -> None:
-    """Have arrays of `LARGE` bytes and more returned to the system when they are freed.
+    """Have arrays of `MMAP_THRESHOLD_BYTES` and more returned to the system when they are freed.
 
     Otherwise glibc takes them from its heap once one was freed, and the heap grows over hours.
     """
     with suppress(OSError, AttributeError, TypeError):  # another C library
-        ctypes.CDLL(None).mallopt(_M_MMAP_THRESHOLD, LARGE)
+        ctypes.CDLL(None).mallopt(_M_MMAP_THRESHOLD, MMAP_THRESHOLD_BYTES)
 
 
 class Heartbeat:
@@ -109,7 +109,7 @@ class Heartbeat:
         self._ended = True
 
     def turn(self) -> None:
-        """The supervising loop turned; it must again within `STALL` s, until `rest`."""
+        """The supervising loop turned; it must again within `STALL_TIMEOUT` s, until `rest`."""
         self._turned = self._clock()
 
     def rest(self) -> None:
@@ -125,7 +125,7 @@ class Heartbeat:
         """Beat, unless the supervising loop stalls."""
         now = self._clock()
         turned = self._turned
-        if turned is None or now - turned <= STALL:
+        if turned is None or now - turned <= STALL_TIMEOUT:
             self._beat()
 
 
@@ -161,9 +161,9 @@ class ExchangeMonitor:
 
     def failure(self) -> str | None:
         """Return why the process no longer replies, None while it does; kill one that hangs."""
-        if self.exchange.alive and self._monitor.silence() > HUNG:
+        if self.exchange.alive and self._monitor.silence() > HUNG_TIMEOUT:
             self.exchange.kill()
-            self.ended_for = silent_for(HUNG)
+            self.ended_for = silent_for(HUNG_TIMEOUT)
         if self.exchange.alive:
             return None
         self._read()
@@ -254,7 +254,7 @@ class LivePort:
         """See `ControllerPort.prepare`: an archive opened too late is closed, and its name free."""
         deadline = time.monotonic() + OPEN_TIMEOUT
         while self._late_path and not stop.requested:
-            answer = self.archive.answer(POLL, self.job)
+            answer = self.archive.answer(SUPERVISION_PERIOD, self.job)
             if isinstance(answer, Closed | Failed):
                 self._late_path = ""
             elif (failure := self.archive.failure()) is not None:
@@ -280,9 +280,9 @@ class LivePort:
             if self.failure() is not None:
                 return False
             if self.open_path and self._answer is None:
-                self._answer = self.archive.answer(POLL, self.job)
+                self._answer = self.archive.answer(SUPERVISION_PERIOD, self.job)
             else:
-                time.sleep(POLL)
+                time.sleep(SUPERVISION_PERIOD)
         return True
 
     def due(self) -> bool:
@@ -354,7 +354,7 @@ class LivePort:
             deadline = time.monotonic() + END_TIMEOUT
             while self.failure() is None and time.monotonic() < deadline:
                 self.exchange.send_heartbeat()
-                time.sleep(POLL)
+                time.sleep(SUPERVISION_PERIOD)
             if self._monitor.ended_for:
                 problem = f"the exchange process {self._monitor.ended_for}"
             if self.exchange.alive:
@@ -430,7 +430,7 @@ class LivePort:
         self.archive.send(command)
         deadline = time.monotonic() + OPEN_TIMEOUT
         while time.monotonic() < deadline:
-            message = self._answer or self.archive.answer(POLL, self.job)
+            message = self._answer or self.archive.answer(SUPERVISION_PERIOD, self.job)
             self._answer = None
             if isinstance(message, answer):
                 return message
@@ -557,7 +557,7 @@ def _started(
         ControllerError: it cannot be started, another run still has the link, or a stop was
             requested.
     """
-    until = time.monotonic() + EARLIER_EXCHANGE
+    until = time.monotonic() + EARLIER_EXCHANGE_TIMEOUT
     reported = 0
     while True:
         try:
@@ -576,18 +576,18 @@ def _started(
             reported = holder
             report(
                 f"{whose}: if that run was killed, it replies to the controller until the arm has "
-                f"rested, and then ends; waiting for that, up to {EARLIER_EXCHANGE:g} s"
+                f"rested, and then ends; waiting for that, up to {EARLIER_EXCHANGE_TIMEOUT:g} s"
             )
         while is_exchange(holder):
             if stop.requested:
                 raise ControllerError("ended by the operator before anything moved")
             if time.monotonic() > until:
                 raise ControllerError(
-                    f"{whose} and was not released within {EARLIER_EXCHANGE:g} s; wait for the end "
-                    "of that run, or stop it by Ctrl-C in its terminal, and run again. Do not kill "
-                    "the exchange: it replies to the controller"
+                    f"{whose} and was not released within {EARLIER_EXCHANGE_TIMEOUT:g} s; wait for "
+                    "the end of that run, or stop it by Ctrl-C in its terminal, and run again. Do "
+                    "not kill the exchange: it replies to the controller"
                 )
-            time.sleep(POLL)
+            time.sleep(SUPERVISION_PERIOD)
 
 
 def write_error(failed: Failed) -> ArchiveWriteError:

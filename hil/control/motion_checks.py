@@ -29,7 +29,7 @@ _UNITS: Final = {
     "acceleration": " deg/s²",
     "jerk": " deg/s³",
 }
-_UNCHANGED: Final = 0.01
+_MIN_DISTANCE_CHANGE: Final = 0.01
 """Change of a distance below which no motion changes it, m."""
 
 
@@ -61,7 +61,7 @@ def always_so(violation: Violation, checker: CollisionChecker) -> str | None:
     if not pairs:
         return None
     nearest, farthest = checker.spread(*pairs[0])
-    if farthest - nearest > _UNCHANGED:
+    if farthest - nearest > _MIN_DISTANCE_CHANGE:
         return None
     message = f"{violation.subject} are {nearest:.3f} to {farthest:.3f} m apart in any posture"
     if nearest >= violation.bound:
@@ -71,11 +71,11 @@ def always_so(violation: Violation, checker: CollisionChecker) -> str | None:
     return f"{message}: they overlap; correct their collision shapes in the URDF"
 
 
-LONGEST: Final = 600.0
+MAX_MOTION_SECONDS: Final = 600.0
 """Longest motion, s: checks take time and memory in proportion, and a failed motion is repeated."""
-MOST_SINES: Final = 20
+MAX_SINES: Final = 20
 """Most sines per joint, as in a design."""
-PLANNED_CURRENT: Final = 0.8
+USABLE_CURRENT_SHARE: Final = 0.8
 """Share of a motor's current limit in planning and rehearsal. The rest is for noise and the control
 error of the servo. Before a motion is sent, the full limit counts."""
 
@@ -221,20 +221,20 @@ def current_model(cell: Cell) -> CurrentModel:
 
 def planned(currents: CurrentModel) -> CurrentModel:
     """Return the currents with the share of their limits for planning."""
-    return replace(currents, usable=PLANNED_CURRENT)
+    return replace(currents, usable=USABLE_CURRENT_SHARE)
 
 
 def _unsupported(trajectory: PiecewiseCubic | FourierSeries) -> str | None:
     """Return why a motion cannot be checked, or None."""
-    if not trajectory.duration <= LONGEST:
-        return f"it lasts {trajectory.duration:.6g} s; at most {LONGEST:g} s are allowed"
+    if not trajectory.duration <= MAX_MOTION_SECONDS:
+        return f"it lasts {trajectory.duration:.6g} s; at most {MAX_MOTION_SECONDS:g} s are allowed"
     if not isinstance(trajectory, FourierSeries):
         return None
     if trajectory.ramp == 0.0:
         return "its sines begin and end at full speed; give them a ramp"
     sines = trajectory.amplitude.shape[1]
-    if sines > MOST_SINES:
-        return f"it has {sines} sines for each joint; at most {MOST_SINES} are allowed"
+    if sines > MAX_SINES:
+        return f"it has {sines} sines for each joint; at most {MAX_SINES} are allowed"
     for quantity, order in (("velocity", 1), ("acceleration", 2), ("jerk", 3)):
         endless = np.flatnonzero(~np.isfinite(trajectory.derivative_bound(order)))
         if len(endless):

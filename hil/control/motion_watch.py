@@ -12,7 +12,7 @@ from typing import Final, Protocol
 from drivers.states import State
 from hil.base.arrays import Array
 
-REQUESTS: Final = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
+STOP_SIGNALS: Final = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 """Ctrl-C, the usual request to end, and the end of the terminal."""
 
 
@@ -47,7 +47,7 @@ def stop_on_interrupt(*, twice: bool = False) -> Iterator[Stop]:
         stop.requested = True
 
     with ExitStack() as undo:
-        for signum in REQUESTS:
+        for signum in STOP_SIGNALS:
             previous = signal.getsignal(signum)
             if signum is signal.SIGHUP and previous is signal.SIG_IGN:
                 continue

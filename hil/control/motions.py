@@ -25,10 +25,10 @@ from planner import (
     plan_moves,
 )
 
-_ROUNDED: Final = 9e-7
+_FLOAT32_RANGE_ROUNDING: Final = 9e-7
 """Rounding of a position at its limit in packets, as a share of half a joint's range; guard and
 player allow as much."""
-AT_REST_TOLERANCE: Final = 1e-6  # rad; a shorter move is left out
+MIN_MOVE: Final = 1e-6  # rad; a shorter move is left out
 START_TOLERANCE: Final = 1e-3  # Largest distance of the arm from the start of a motion, rad
 REPEATED: Final = ("excitation", "warmup")  # Kinds of motion that run the excitation
 
@@ -62,7 +62,7 @@ class CampaignMotion:
         """Return whether it leads from `start` to `end` (n,) [rad]."""
         first, last = self.ends
         apart = max(np.max(np.abs(first - start)), np.max(np.abs(last - end)))
-        return bool(apart <= AT_REST_TOLERANCE)
+        return bool(apart <= MIN_MOVE)
 
     def endpoints(self, home: Array) -> tuple[Array, Array]:
         """Return the position of the arm before and after it (n,) [rad]: home, or its own ends."""
@@ -75,7 +75,7 @@ class CampaignMotion:
 def at_limit(posture: Array, limits: JointLimits) -> Array:
     """Return a posture (n,) [rad], moved back to limits that are exceeded by rounding only."""
     within = np.clip(posture, limits.lower, limits.upper)
-    rounding = 0.5 * _ROUNDED * (limits.upper - limits.lower)
+    rounding = 0.5 * _FLOAT32_RANGE_ROUNDING * (limits.upper - limits.lower)
     return np.where(np.abs(posture - within) <= rounding, within, posture)
 
 
@@ -114,7 +114,7 @@ class CheckedMoves:
             index: of the move.
             from_arm: whether it begins where the arm is.
         """
-        if np.max(np.abs(end - start)) <= AT_REST_TOLERANCE:
+        if np.max(np.abs(end - start)) <= MIN_MOVE:
             return None
         motion = next((earlier for earlier in self._known if earlier.connects(start, end)), None)
         if motion is None:

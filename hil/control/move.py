@@ -19,12 +19,12 @@ from hil.control.motion_checks import MotionChecks
 from hil.control.motion_watch import MotionWatch, Stop, unwatched_motion
 from hil.control.motions import CampaignMotion, moves_to_dict, player_of, straight_move
 from hil.control.record import archive_spec, kind_entry, origin_of
-from hil.control.slips import CHECKED, require_no_slip
+from hil.control.slips import CHECKED_OUTCOMES, require_no_slip
 from planner import FourierSeries, PiecewiseCubic
 
-_ROUND: Final = 0.1
+_VIA_POINT_RESOLUTION: Final = 0.1
 """Resolution of random via points, deg."""
-THERE = 1e-4
+POSTURE_TOLERANCE = 1e-4
 """Distance below which an arm is at a posture, rad."""
 
 
@@ -57,7 +57,7 @@ def random_via_points(cell: Cell, frame: AngleFrame, count: int, seed: int) -> A
     ends = np.sort([frame.shown(limits.lower), frame.shown(limits.upper)], axis=0)
     shares = np.random.default_rng(seed).random((count, limits.n_joints))
     shown = ends[0] + shares * (ends[1] - ends[0])
-    shown = np.clip(np.round(shown / _ROUND) * _ROUND, *ends)
+    shown = np.clip(np.round(shown / _VIA_POINT_RESOLUTION) * _VIA_POINT_RESOLUTION, *ends)
     home = cell.home if cell.file.campaign is not None else (limits.lower + limits.upper) / 2.0
     return np.vstack((home, frame.urdf(shown)))
 
@@ -205,7 +205,7 @@ def send(
         durable=durable,
     )
     ended = link.run(player_of(cell, planned.motion.trajectory), spec, stop, watch=watch)
-    if ended.outcome in CHECKED and path.exists():
+    if ended.outcome in CHECKED_OUTCOMES and path.exists():
         require_no_slip("the motion", path)
     return ended
 

@@ -30,13 +30,13 @@ from sim_fixtures.servo import loops_per_cycle
 
 NOISE_SHARE: Final = 0.005  # Noise of the current, rms, as a share of the weakest motor's limit
 RESOLUTION_SHARE: Final = 0.001  # Resolution of the target current, as a share of the same limit
-STEP = 0.0005
+SUBSTEP_SECONDS = 0.0005
 """Step of a simulated arm with effects that the model leaves out, s."""
-OWN_SPEED = 0.3
+OWN_SPEED_SHARE = 0.3
 """Speed of the controller's own motion, as a share of the velocity limits."""
-_CHECKED = 100
+_CHECKED_POSTURES = 100
 """Postures checked on each path of the controller's own motion."""
-_POSTURES = 12
+_OWN_MOTION_POSTURES = 12
 """Postures of that motion before home."""
 
 
@@ -123,7 +123,7 @@ def simulated_controller(
     seed: int | None = None,
     session: int = 0,
     faults: Sequence[InjectedFault] = (),
-    own_speed: float = OWN_SPEED,
+    own_speed: float = OWN_SPEED_SHARE,
 ) -> SimulatedController:
     """Return controller and arm of a cell with any link.
 
@@ -166,7 +166,9 @@ def controller_settings(cell: Cell, *, effects: bool = False) -> ControllerSetti
         open_mode=cell.controller.mode,
         # Elastic gears and a delay of 0.5 ms need steps of 0.5 ms; rigid gears are integrated to
         # second order under a constant current.
-        substeps=round(cell.period / loops_per_cycle(cell.period) / STEP) if effects else 1,
+        substeps=round(cell.period / loops_per_cycle(cell.period) / SUBSTEP_SECONDS)
+        if effects
+        else 1,
         current_noise=cell.simulation.current_noise,
         current_resolution=cell.simulation.current_resolution,
     )
@@ -185,16 +187,16 @@ def own_postures(cell: Cell) -> tuple[tuple[float, ...], ...]:
     checker = collision_checker(cell)
 
     def clear(start: Array, end: Array) -> bool:
-        share = np.linspace(0.0, 1.0, _CHECKED)[:, np.newaxis]
+        share = np.linspace(0.0, 1.0, _CHECKED_POSTURES)[:, np.newaxis]
         return bool(checker.clear(start + share * (end - start)).all())
 
     here = cell.initial
     postures: list[Array] = []
-    for _ in range(10 * _POSTURES):
+    for _ in range(10 * _OWN_MOTION_POSTURES):
         there = np.clip(
             home + reach * rng.uniform(-1.0, 1.0, len(home)), limits.lower, limits.upper
         )
-        if len(postures) < _POSTURES and clear(here, there):
+        if len(postures) < _OWN_MOTION_POSTURES and clear(here, there):
             postures.append(there)
             here = there
     if clear(here, home):

@@ -153,7 +153,7 @@ def serve_session(
     link: serve.ControllerLink,
     pressed: Buttons,
     *,
-    patience: float = serve.PATIENCE,
+    patience: float = serve.STOP_TIMEOUT,
     cycle_extension: float = 0.0,
     watch: Callable[[SimulatedController, serve.ServeCounts], None] = lambda *_: None,
 ) -> Served:

@@ -12,8 +12,8 @@ from typing import Any
 from drivers.child_process import ChildProcess
 
 LOOPBACK = "127.0.0.1"
-_SIMULATE = ("-m", "hil", "simulate")
-SIMULATE = (sys.executable, *_SIMULATE)
+_SIMULATE_ARGUMENTS = ("-m", "hil", "simulate")
+SIMULATE_COMMAND = (sys.executable, *_SIMULATE_ARGUMENTS)
 END_TIMEOUT = 20.0
 """Time limit for a simulated controller to end its session, s."""
 
@@ -27,7 +27,7 @@ class SimulatorProcess:
     @classmethod
     def start(cls, cell: Path, *options: str) -> SimulatorProcess:
         """Start a controller for a cell file."""
-        return cls(ChildProcess((*_SIMULATE, str(cell), "--json", *options)))
+        return cls(ChildProcess((*_SIMULATE_ARGUMENTS, str(cell), "--json", *options)))
 
     @property
     def running(self) -> bool:

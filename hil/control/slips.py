@@ -24,10 +24,10 @@ from identification.validation.position_jumps import PositionJump, position_jump
 
 from .errors import SlippedError
 
-CHECKED: Final = ("completed", "stopped")
+CHECKED_OUTCOMES: Final = ("completed", "stopped")
 """Outcomes of motions whose measured positions are checked; the others are failures already."""
-NEAR: Final = 0.2  # s around a lost packet or reply in which a jump is no slip
-AROUND: Final = 3  # cycles on either side of a jump whose velocities may explain it
+LOSS_MARGIN_SECONDS: Final = 0.2  # s around a lost packet or reply in which a jump is no slip
+NEIGHBOUR_CYCLES: Final = 3  # cycles on either side of a jump whose velocities may explain it
 _FIELDS: Final = ("cycle", "gap", "position", "velocity")
 
 
@@ -54,7 +54,9 @@ def slip_of(path: Path) -> str:
         found += [jump for jump in jumps if not _frozen(recording.time, position, names, jump)]
         found = [jump for jump in found if not _within_velocities(recording, velocity, jump)]
     disturbed = _disturbed(archive, recording)
-    found = [jump for jump in found if not (np.abs(disturbed - jump.time) < NEAR).any()]
+    found = [
+        jump for jump in found if not (np.abs(disturbed - jump.time) < LOSS_MARGIN_SECONDS).any()
+    ]
     if not found:
         return ""
     largest = max(found, key=lambda jump: abs(jump.size))
@@ -106,7 +108,7 @@ def _within_velocities(recording: Recording, velocity: Array, jump: PositionJump
     """
     row = int(np.searchsorted(recording.time, recording.time[0] + jump.time))
     joint = recording.joint_names.index(jump.joint)
-    rows = slice(max(row - 1 - AROUND, 0), row + 1 + AROUND)
+    rows = slice(max(row - 1 - NEIGHBOUR_CYCLES, 0), row + 1 + NEIGHBOUR_CYCLES)
     position = recording.position[rows, joint]
     ends = np.stack([velocity[rows, joint][:-1], velocity[rows, joint][1:]])
     steps = ends * np.diff(recording.time[rows])

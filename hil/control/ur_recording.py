@@ -32,7 +32,7 @@ from drivers.ur.outputs import (
     SAFETY_NORMAL,
 )
 from drivers.ur.reader import OutputFrames, RtdeReader
-from drivers.ur.torque_constants import UNCERTAINTY, by_size, stated_constants
+from drivers.ur.torque_constants import RELATIVE_UNCERTAINTY, by_size, stated_constants
 from drivers.ur.transport import RtdeSpec
 from hil.archive import CONTROLLER_PROGRAM, open_archive
 from hil.archive.recorder import Recorded
@@ -45,13 +45,13 @@ from hil.control.link import Progress, Watch, recording_end
 from hil.control.motion_watch import Stop
 from hil.control.record import archive_spec, kind_entry, origin_of
 
-_LOOK: Final = 0.1
+_LOOK_PERIOD: Final = 0.1
 """Time between two looks at what arrived, s."""
-_FIRST: Final = 5.0
+_FIRST_FRAME_TIMEOUT: Final = 5.0
 """Longest wait for the first frame, s."""
-_RETRY: Final = 0.5
+_RETRY_PERIOD: Final = 0.5
 """Time between two attempts to connect, s."""
-_SAME: Final = 0.01
+_RELATIVE_TOLERANCE: Final = 0.01
 """Relative difference of torque constants that is not reported."""
 
 
@@ -136,7 +136,7 @@ def record_arm(
     """
     try:
         arm.reader.start()
-        first = arm.reader.fetch(_FIRST)
+        first = arm.reader.fetch(_FIRST_FRAME_TIMEOUT)
     except (DriverError, OSError) as error:
         raise ControllerError(f"{error}: nothing was recorded") from error
     metadata = {
@@ -173,7 +173,7 @@ class _Recording:
         watch: Watch,
     ) -> Recorded:
         limit = None if duration is None else max(1, round(duration / self._cell.period))
-        some = round(_LOOK / self._cell.period)
+        some = round(_LOOK_PERIOD / self._cell.period)
         ending: tuple[str, str] | None = None
         try:
             while ending is None:
@@ -188,7 +188,7 @@ class _Recording:
                     limited=duration is not None,
                     refused=None,
                 )
-                frames = reader.fetch(2.0 * _LOOK, some) if ending is None else frames
+                frames = reader.fetch(2.0 * _LOOK_PERIOD, some) if ending is None else frames
         except DriverError as error:  # all frames before it are archived
             ending = "lost", str(error)
         return self._closed(*ending)
@@ -275,19 +275,19 @@ class ConstantsFound:
         return cls(
             stated if limit is None else by_size(stated, limit.tolist()),
             drives.torque_constant * np.abs(np.diag(drives.motor_from_joint)),
-            float(np.max(UNCERTAINTY if uncertainty is None else uncertainty)),
+            float(np.max(RELATIVE_UNCERTAINTY if uncertainty is None else uncertainty)),
         )
 
     @property
     def differ(self) -> bool:
         """Whether the cell's constants differ from what the arm states."""
-        off = np.abs(self.stated - self.in_cell) > _SAME * self.in_cell
+        off = np.abs(self.stated - self.in_cell) > _RELATIVE_TOLERANCE * self.in_cell
         return bool((np.isfinite(self.stated) & off).any())
 
     @property
     def are_doubtful(self) -> bool:
         """Whether nothing better than the arm's own statement is known of them."""
-        return self.uncertainty >= UNCERTAINTY
+        return self.uncertainty >= RELATIVE_UNCERTAINTY
 
 
 def _changes(before: np.void | None, now: np.void) -> Iterator[tuple[str, str, Level]]:
@@ -349,7 +349,7 @@ def _connected(
             if not reported:
                 report(f"waiting for the controller: {error}")
             reported = True
-            time.sleep(_RETRY)
+            time.sleep(_RETRY_PERIOD)
     with reader:
         yield reader
 

@@ -31,8 +31,8 @@ from sim_fixtures.ur import (
 from sim_fixtures.ur.controller import UrPayload, parse_ur_fault
 from sim_fixtures.ur.server import PRIMARY_PORT, REALTIME_PORT, dashboard_reply, state_of
 
-_CB3 = (3, 15, 8, 0)
-_WITHIN = 0.9
+_CB3_VERSION = (3, 15, 8, 0)
+_USED_RANGE_SHARE = 0.9
 """Share of the distance to the limits that the program's motion uses."""
 
 
@@ -197,7 +197,7 @@ def _settings(cell: Cell) -> UrSettings:
     kind = next((number for number, name in MODELS.items() if name == base), 1)
     default = UrSettings()
     return UrSettings(
-        version=_CB3 if cell.controller.cycle_ms == round(1e3 / 125) else default.version,
+        version=_CB3_VERSION if cell.controller.cycle_ms == round(1e3 / 125) else default.version,
         serial_number=cell.file.cell.serial_number or default.serial_number,
         model=base or default.model,
         kind=kind,
@@ -237,5 +237,5 @@ def _program(cell: Cell, own_speed: float | None) -> UrProgram | None:
     reach = np.abs(pattern.amplitude).sum(axis=1)
     speed = np.abs(pattern.amplitude) @ (2.0 * np.pi / pattern.period * order)
     room = np.minimum(limits.upper - cell.initial, cell.initial - limits.lower)
-    factor = np.minimum(own_speed * limits.velocity / speed, _WITHIN * room / reach)
+    factor = np.minimum(own_speed * limits.velocity / speed, _USED_RANGE_SHARE * room / reach)
     return UrProgram(cell.initial, pattern.amplitude * np.clip(factor, 0.0, None)[:, None])

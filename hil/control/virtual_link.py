@@ -15,7 +15,7 @@ from drivers.exchange.loop import exchange
 from drivers.guard import Guard
 from drivers.motion_source import MotionSource, progress_of
 from drivers.session import Session
-from drivers.states import HAS_SET_POINTS
+from drivers.states import STATES_WITH_SET_POINTS
 from drivers.transports.base import Transport
 from drivers.transports.simulated import SimulatedTransport
 from drivers.wire import state_of
@@ -225,7 +225,7 @@ class VirtualPort:
             return self.now > deadline
 
         self.exchange_until(finished)
-        if self.session.state in HAS_SET_POINTS:
+        if self.session.state in STATES_WITH_SET_POINTS:
             raise ControllerError(
                 f"an axis is still open {END_TIMEOUT:g} s after the controller was asked to end"
             )
@@ -240,7 +240,7 @@ class VirtualPort:
 
         A motion stopped while its axes opened has not started; they have to close.
         """
-        closed = self.session.state not in HAS_SET_POINTS
+        closed = self.session.state not in STATES_WITH_SET_POINTS
         return (archiving.recorder.complete and closed) or archiving.patience < 0
 
 

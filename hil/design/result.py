@@ -25,7 +25,7 @@ from identification.excitation import (
     coupling_index_max,
 )
 from planner import FourierSeries, PiecewiseCubic, PlanFile, PlannerError, in_child
-from planner.arrays import DAMAGED, Whole, numbers, strict
+from planner.arrays import DAMAGED_DATA_ERRORS, Whole, numbers, strict
 
 from .settings import RESULT_FORMAT, DesignSettings, settings_of, with_present_fields
 
@@ -35,10 +35,10 @@ DECISIVE: Final = ("urdf", "robot", "limits")
 """Parts of a cell that determine a motion and its criteria. The others (walls, motors, home) are
 checked before the motion is sent."""
 
-_DIGITS: Final = 16
+_DIGEST_DIGITS: Final = 16
 # Largest difference of a motion planned on another computer [rad], and number of compared instants.
-_SAME: Final = 1e-9
-_INSTANTS: Final = 9
+_PLAN_TOLERANCE: Final = 1e-9
+_COMPARED_INSTANTS: Final = 9
 _LIMITS: Final = ("lower", "upper", "velocity", "acceleration", "jerk")
 _REMEDY: Final = "design it again (`hil design`)"
 _HEAD: Final = """\
@@ -86,7 +86,7 @@ def fingerprint(cell: Cell) -> dict[str, str]:
         parts[name] = (
             None if table is None else table.model_dump(mode="json", exclude={"torque_uncertainty"})
         )
-    return {name: json_digest(part)[:_DIGITS] for name, part in parts.items()}
+    return {name: json_digest(part)[:_DIGEST_DIGITS] for name, part in parts.items()}
 
 
 @dataclass(frozen=True, eq=False)
@@ -196,11 +196,13 @@ class DesignResult:
                     path, "was changed after it was written", remedy=f"restore it, or {_REMEDY}"
                 )
             result = cls._from_data(data, path)
-        except (PlannerError, *DAMAGED) as error:
+        except (PlannerError, *DAMAGED_DATA_ERRORS) as error:
             problem = f"is not a designed excitation ({' '.join(str(error).split()):.200})"
             raise InputError(path, problem, remedy=_REMEDY) from error
         planned = _positions(result.excitation.trajectory)
-        if positions.shape != planned.shape or np.any(np.abs(planned - positions) > _SAME):
+        if positions.shape != planned.shape or np.any(
+            np.abs(planned - positions) > _PLAN_TOLERANCE
+        ):
             raise InputError(
                 path,
                 "its moves do not plan to the motion that was designed",
@@ -294,7 +296,7 @@ def load_design(path: Path, cell: Cell | None = None) -> Excitation:
 
 def _positions(trajectory: PiecewiseCubic | FourierSeries) -> Array:
     """Return the positions at some instants from start to end (9, n) [rad]."""
-    return trajectory.sample(np.linspace(0.0, trajectory.duration, _INSTANTS))[0]
+    return trajectory.sample(np.linspace(0.0, trajectory.duration, _COMPARED_INSTANTS))[0]
 
 
 def _seal(text: str) -> str:

@@ -29,9 +29,9 @@ FORMER_METHODS: Final = ("balanced", "front")
 """Methods of version 0.1, which the gradient replaced."""
 RESULT_FORMAT: Final = "designed excitation"
 """Key `format` of a result file, which has a table of the settings."""
-MOST_VIA_POINTS: Final = 60
+MAX_VIA_POINTS: Final = 60
 """Most via points of a motion."""
-SHORTEST_RAMP: Final = 0.05
+MIN_RAMP_SECONDS: Final = 0.05
 """Shortest ramp of sines, s; a shorter one is a jerk whose contacts cannot be determined."""
 
 
@@ -81,7 +81,7 @@ class ViaPointTable(Table):
     """`[via_points]`: a motion through via points, as the controller's interpolator runs it."""
 
     n_via: Whole = field(
-        f"a number of via points to search, 2 to {MOST_VIA_POINTS}", ge=2, le=MOST_VIA_POINTS
+        f"a number of via points to search, 2 to {MAX_VIA_POINTS}", ge=2, le=MAX_VIA_POINTS
     )
     fly: Share = field("a fly-by fraction, 0 (stop at every via point) to 1")
     slowest: Fraction = field("the smallest fraction of a joint's speed limit, above 0, at most 1")
@@ -113,9 +113,9 @@ class SineTable(Table):
 
     @model_validator(mode="after")
     def _ramps_fit(self) -> SineTable:
-        if 0.0 < self.ramp < SHORTEST_RAMP:
+        if 0.0 < self.ramp < MIN_RAMP_SECONDS:
             problem = f"a ramp of {self.ramp:g} s is too short"
-            raise FieldError(problem, f"make it {SHORTEST_RAMP:g} s or longer, or 0 for none")
+            raise FieldError(problem, f"make it {MIN_RAMP_SECONDS:g} s or longer, or 0 for none")
         if 2.0 * self.ramp > self.length:
             problem = f"two ramps of {self.ramp:g} s are longer than the motion, {self.length:g} s"
             raise FieldError(problem, "make the ramp shorter, or the motion longer")

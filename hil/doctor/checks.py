@@ -27,7 +27,7 @@ from drivers.transports.base import (
     TransportSpec,
 )
 from drivers.ur.connection import RtdeConnection, connected
-from drivers.ur.wire import NEWEST_MAJOR, OLDEST
+from drivers.ur.wire import NEWEST_MAJOR, OLDEST_VERSION
 from hil.archive.process import STALL_LIMIT
 
 
@@ -191,8 +191,8 @@ def computer_checks(given: RealTimeReport | None, system: System) -> list[Doctor
 
 BYTES_PER_CYCLE = 600
 """Upper bound of the archived bytes per cycle of six axes; 534 by `benchmarks.archive`."""
-_SLOW = 0.1 * STALL_LIMIT
-_TOO_SLOW = 0.5 * STALL_LIMIT
+_SLOW_WRITE_SECONDS = 0.1 * STALL_LIMIT
+_MAX_WRITE_SECONDS = 0.5 * STALL_LIMIT
 """Limits of the time of one write, s; a motion is stopped if a write takes several seconds."""
 _MOVE = "# or put the campaign folder on another, local disk"
 
@@ -227,13 +227,16 @@ def disk_checks(folder: Path, trial: DiskTrial | None) -> list[DoctorCheck]:
     middle = sorted(trial.seconds)[len(trial.seconds) // 2]
     status = (
         CheckStatus.OK
-        if worst < _SLOW
+        if worst < _SLOW_WRITE_SECONDS
         else CheckStatus.WARN
-        if worst < _TOO_SLOW
+        if worst < _MAX_WRITE_SECONDS
         else CheckStatus.BAD
     )
     message = f"64 KiB written in {1e3 * middle:.1f} ms, at most {1e3 * worst:.1f} ms"
-    return [space, DoctorCheck("disk write", status, message, () if worst < _SLOW else (_MOVE,))]
+    return [
+        space,
+        DoctorCheck("disk write", status, message, () if worst < _SLOW_WRITE_SECONDS else (_MOVE,)),
+    ]
 
 
 _ARPHRD_CAN = "280"
@@ -388,8 +391,8 @@ def rtde_check(server: RtdeServer) -> DoctorCheck:
         remedy = "# make sure that this is the RTDE port (30004)"
         return DoctorCheck("RTDE", CheckStatus.BAD, f"{where}: {error}", (remedy,))
     facts = f"{where} replies: software {version}"
-    if (version.major, version.minor) < OLDEST or version.major > NEWEST_MAJOR:
-        oldest = ".".join(map(str, OLDEST))
+    if (version.major, version.minor) < OLDEST_VERSION or version.major > NEWEST_MAJOR:
+        oldest = ".".join(map(str, OLDEST_VERSION))
         note = f"recorded only; motions need {oldest} or newer of PolyScope 5"
         return DoctorCheck("RTDE", CheckStatus.WARN, f"{facts} ({note})")
     return DoctorCheck("RTDE", CheckStatus.OK, facts)

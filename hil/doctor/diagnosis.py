@@ -35,7 +35,7 @@ from .checks import (
 if TYPE_CHECKING:
     from drivers.transports.base import TransportSpec
 
-RESERVE: Final = 100e-6
+REPLY_RESERVE_SECONDS: Final = 100e-6
 """Part of a cycle for session and guard (20 µs, at most 40), transmission both ways (25 µs each at
 100 Mbit/s) and the interrupt of the network card, s."""
 
@@ -54,7 +54,7 @@ class Latency:
 
     def late_cycles(self, period: float) -> int:
         """Return the number of cycles of `period` s without a reply in time."""
-        return int(np.floor((self.samples + RESERVE) / period).sum())
+        return int(np.floor((self.samples + REPLY_RESERVE_SECONDS) / period).sum())
 
     def summary(self) -> dict[str, float | int]:
         """Return percentiles, µs, and late cycles."""
@@ -62,16 +62,20 @@ class Latency:
         return {
             **{name: round(1e6 * self.percentile(p), 1) for name, p in percentiles.items()},
             "samples": len(self.samples),
-            **{f"late_cycles_{cycle}ms": self.late_cycles(cycle / 1000) for cycle in CYCLES_MS},
+            **{
+                f"late_cycles_{cycle}ms": self.late_cycles(cycle / 1000)
+                for cycle in JUDGED_CYCLES_MS
+            },
         }
 
 
-CYCLES_MS: Final = (1, 2)
+JUDGED_CYCLES_MS: Final = (1, 2)
 CRITERIA: Final = (
-    f"a cycle is fit if no cycle of the measurement was late, with {1e6 * RESERVE:.0f} µs "
-    "reserved for packet work and wire, and 99.9 % of the latencies used at most half of this time"
+    "a cycle is fit if no cycle of the measurement was late, with"
+    f" {1e6 * REPLY_RESERVE_SECONDS:.0f} µs reserved for packet work and wire, and 99.9 % of the"
+    " latencies used at most half of this time"
 )
-ENOUGH_SECONDS: Final = 60.0
+MIN_MEASURED_SECONDS: Final = 60.0
 """Time of measurement below which a verdict is provisional, s."""
 _CONFIDENCE: Final = 0.95
 
@@ -100,7 +104,7 @@ def judge(latencies: Sequence[Latency], cycle_ms: int) -> Fitness:
     worst = max(latencies, key=lambda each: (each.late_cycles(period), each.percentile(100)))
     slow = max(latencies, key=lambda each: each.percentile(99.9))
     late = worst.late_cycles(period)
-    used = (slow.percentile(99.9) + RESERVE) / period
+    used = (slow.percentile(99.9) + REPLY_RESERVE_SECONDS) / period
     hours = worst.seconds / 3600.0
     # The mean at which a Poisson distribution gives `late` or fewer with 5 % probability.
     bound = float(gammaincinv(late + 1, _CONFIDENCE)) / hours
@@ -122,7 +126,7 @@ def judge(latencies: Sequence[Latency], cycle_ms: int) -> Fitness:
 
 TURNAROUND_PERIOD = 1e-3
 """Time between two packets, s."""
-_GRACE = 15.0
+_PROBE_GRACE = 15.0
 """Time limit of a probe beyond its measurement (start-up on a slow disk), s."""
 
 
@@ -165,7 +169,10 @@ def run_probe(
     began = time.monotonic()
     shown = 0.0
     try:
-        while probe.wait(0.2) is None and (passed := time.monotonic() - began) < seconds + _GRACE:
+        while (
+            probe.wait(0.2) is None
+            and (passed := time.monotonic() - began) < seconds + _PROBE_GRACE
+        ):
             advance(min(passed, seconds) - shown)
             shown = min(passed, seconds)
         advance(seconds - shown)
@@ -204,7 +211,7 @@ class Diagnosis:
     @property
     def provisional(self) -> bool:
         """Whether the measurement was too short for a reliable verdict."""
-        return self.seconds < ENOUGH_SECONDS
+        return self.seconds < MIN_MEASURED_SECONDS
 
     @property
     def line(self) -> str:
@@ -256,7 +263,7 @@ def examine(
         if latency is None
     ]
     latencies = tuple(latency for latency in measured.values() if latency is not None)
-    cycles = tuple(judge(latencies, cycle) for cycle in sorted({*CYCLES_MS, cycle_ms}))
+    cycles = tuple(judge(latencies, cycle) for cycle in sorted({*JUDGED_CYCLES_MS, cycle_ms}))
     return Diagnosis(tuple(checks), latencies, cycles, cycle_ms, seconds)
 
 
@@ -306,7 +313,7 @@ def show(diagnosis: Diagnosis, console: Console) -> None:
 
 def summary(diagnosis: Diagnosis) -> list[str]:
     """Return the verdict, the checks that are not passed with their first remedy, and latencies."""
-    worst_first = sorted(diagnosis.checks, key=lambda check: _ORDER.index(check.status))
+    worst_first = sorted(diagnosis.checks, key=lambda check: _STATUS_ORDER.index(check.status))
     failed = [check for check in worst_first if check.status is not CheckStatus.OK]
     lines = [diagnosis.line]
     for check in failed:
@@ -326,7 +333,7 @@ def summary(diagnosis: Diagnosis) -> list[str]:
     return [*lines, *([f"ok: {', '.join(passed)}"] if passed else [])]
 
 
-_ORDER: Final = (CheckStatus.BAD, CheckStatus.WARN, CheckStatus.UNKNOWN, CheckStatus.OK)
+_STATUS_ORDER: Final = (CheckStatus.BAD, CheckStatus.WARN, CheckStatus.UNKNOWN, CheckStatus.OK)
 
 
 def remedies(checks: Sequence[DoctorCheck]) -> Iterator[str]:

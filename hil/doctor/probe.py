@@ -22,12 +22,12 @@ from numpy.typing import NDArray
 from drivers.child_process import ChildProcess
 from drivers.exchange.realtime import RealTimeSettings, enter
 
-PACKET = 228
+PACKET_BYTES = 228
 """Bytes of a cyclic packet of six axes."""
-TIMEOUT = 0.5
+REPLY_TIMEOUT = 0.5
 """Time after which a packet counts as lost, s."""
-_BLOCK = 64 * 1024
-_WRITES = 20
+_BLOCK_BYTES = 64 * 1024
+_TIMED_WRITES = 20
 
 
 def wake_ups(period: float, seconds: float) -> NDArray[np.float32]:
@@ -47,20 +47,20 @@ def wake_ups(period: float, seconds: float) -> NDArray[np.float32]:
 
 
 def round_trips(port: int, period: float, seconds: float) -> NDArray[np.float32]:
-    """Return the times from packet to reply, s; `TIMEOUT` for a lost one, others waited for."""
+    """Return the times from packet to reply, s; `REPLY_TIMEOUT` for a lost one, others awaited."""
     took = np.empty(max(round(seconds / period), 1), dtype=np.float32)
     count = 0
     clock = time.perf_counter
     sleep = time.sleep
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as link:
         link.connect(("127.0.0.1", port))
-        link.settimeout(TIMEOUT)
+        link.settimeout(REPLY_TIMEOUT)
         deadline = clock() + period
         end = deadline + seconds
         while deadline < end and count < len(took):
             sleep(max(deadline - clock(), 0.0))
             sent = clock()
-            link.send(count.to_bytes(4, "little") + bytes(PACKET - 4))
+            link.send(count.to_bytes(4, "little") + bytes(PACKET_BYTES - 4))
             took[count] = _wait_for_reply(link, count, sent)
             count += 1
             deadline += period * (1 + int(max(clock() - deadline, 0.0) / period))
@@ -69,13 +69,13 @@ def round_trips(port: int, period: float, seconds: float) -> NDArray[np.float32]
 
 
 def _wait_for_reply(link: socket.socket, number: int, sent: float) -> float:
-    while time.perf_counter() - sent < TIMEOUT:
+    while time.perf_counter() - sent < REPLY_TIMEOUT:
         try:
-            if int.from_bytes(link.recv(PACKET)[:4], "little") == number:
+            if int.from_bytes(link.recv(PACKET_BYTES)[:4], "little") == number:
                 return time.perf_counter() - sent
         except OSError:  # a time-out, or the other process has ended
             break
-    return TIMEOUT
+    return REPLY_TIMEOUT
 
 
 def echo() -> None:
@@ -87,7 +87,7 @@ def echo() -> None:
         _print_json({"port": link.getsockname()[1]})
         while True:
             try:
-                packet, peer = link.recvfrom(PACKET)
+                packet, peer = link.recvfrom(PACKET_BYTES)
             except TimeoutError:
                 return
             if packet == b"end":
@@ -116,8 +116,8 @@ def disk(place: Path) -> dict[str, object]:
     took: list[float] = []
     try:
         with tempfile.TemporaryFile(dir=folder) as file:
-            for _ in range(_WRITES):
-                file.write(os.urandom(_BLOCK))
+            for _ in range(_TIMED_WRITES):
+                file.write(os.urandom(_BLOCK_BYTES))
                 file.flush()
                 began = time.perf_counter()
                 os.fdatasync(file.fileno())

@@ -23,7 +23,7 @@ from identification.export.controller.reference import reference_torque
 from identification.export.controller.structured_text import structured_text
 from identification.export.controller.tables import control_tables
 from identification.export.exported_arm import ExportedArm
-from identification.export.simulators import STATES, random_states
+from identification.export.simulators import RANDOM_STATES, random_states
 from identification.export.urdf import WriteBackError
 
 CodeName = Literal["c", "st"]
@@ -35,7 +35,7 @@ _COMPILERS: Final = ("cc", "gcc", "clang")
 STRICT: Final = ("-std=c99", "-O2", "-Wall", "-Wextra", "-Wconversion", "-pedantic", "-Werror")
 """Flags of a compiler that lets no warning pass."""
 _IDENTIFIER: Final = re.compile(r"[a-z][a-z0-9_]*\Z")
-_MOST_SECONDS: Final = 60.0  # for a compiler
+_COMPILER_TIMEOUT: Final = 60.0  # for a compiler
 _TIMED_CALLS: Final = 100_000
 _TIMER: Final = """
 #include <time.h>
@@ -81,7 +81,7 @@ class ExportedCode:
         else:
             lines.append(
                 f"compiled by {self.check.compiler}: torque within {self.check.difference:.1e} of"
-                f" pinocchio's at {STATES} random states; one call takes"
+                f" pinocchio's at {RANDOM_STATES} random states; one call takes"
                 f" {1e6 * self.check.seconds:.2f} us on this computer"
             )
         return [*lines, self.verdict]
@@ -276,7 +276,12 @@ def _compile(compiler: str, arguments: Sequence[str], folder: Path) -> None:
     command = [compiler, *arguments]
     try:
         done = subprocess.run(
-            command, cwd=folder, capture_output=True, text=True, timeout=_MOST_SECONDS, check=False
+            command,
+            cwd=folder,
+            capture_output=True,
+            text=True,
+            timeout=_COMPILER_TIMEOUT,
+            check=False,
         )
     except (OSError, subprocess.TimeoutExpired) as error:
         raise WriteBackError(f"{compiler} cannot be run: {error}") from error

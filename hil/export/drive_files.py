@@ -44,8 +44,8 @@ _FIELDS: Final[Mapping[str, Mapping[str, Quantity]]] = {
 }
 OWN_FILE: Final = "give an MJCF or URDF with the joints of the arm by name"
 """Remedy for a file that cannot be changed."""
-_DRAWS: Final = 100  # arms of which ranges are estimated
-_LEARNT: Final = 0.5  # of the prior's deviation, above which the motion says little
+_MIN_SAMPLED_ARMS: Final = 100  # arms of which ranges are estimated
+_DETERMINED_STD_RATIO: Final = 0.5  # of the prior's deviation, above which the motion says little
 
 
 @dataclass(frozen=True)
@@ -189,7 +189,7 @@ def drives_of(model: IdentifiedModel, count: int, seed: int) -> Actuators:
         InputError: the estimator has no posterior.
     """
     arm = model.arm
-    draws = _sampled_drives(model, max(count, _DRAWS), seed)
+    draws = _sampled_drives(model, max(count, _MIN_SAMPLED_ARMS), seed)
     known = _prior_deviations(model)
     reach = model.estimate.interval_factor
     fields: dict[Quantity, FieldRange] = {}
@@ -197,7 +197,7 @@ def drives_of(model: IdentifiedModel, count: int, seed: int) -> Actuators:
         deviation = draws[name].std(axis=0)
         low = np.maximum(value - reach * deviation, 0.0)
         fields[name] = FieldRange(
-            value, low, value + reach * deviation, deviation <= _LEARNT * known[name]
+            value, low, value + reach * deviation, deviation <= _DETERMINED_STD_RATIO * known[name]
         )
     fields["limit"] = FieldRange.exact(np.asarray(arm.ranges.effort))
     turning = np.asarray(arm.model.chain.revolute, np.bool_)

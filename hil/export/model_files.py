@@ -15,11 +15,11 @@ from hil.base.files import make_folder, write_files
 from hil.pipeline.identification import Identification
 from hil.pipeline.identified_model import IdentifiedModel, ensemble_of, model_of, remarks_of
 from identification import Samples
-from identification.estimators.ensemble import FEWEST, Ensemble
+from identification.estimators.ensemble import MIN_ARMS, Ensemble
 from identification.export.simulators import (
     FORMATS,
-    MISSING,
-    STATES,
+    MISSING_SIMULATOR_ERRORS,
+    RANDOM_STATES,
     ModelFormat,
     SimulatorComparison,
     compare,
@@ -32,7 +32,7 @@ FormatName = Literal["mjcf", "urdf", "sdf", "pinocchio"]
 _SPREAD_TOLERANCE: Final = 0.05  # of drawn arms, from that of the stated intervals
 _ENSEMBLE_STATES: Final = 50  # random states at which each drawn arm is read back
 _LEAST: Final = 1e-3  # of the torque of a joint, below which a part is not listed
-_MOST_ROWS: Final = 2000  # of the recorded motion, enough for root mean squares
+_MAX_ROWS: Final = 2000  # of the recorded motion, enough for root mean squares
 
 
 @dataclass(frozen=True, eq=False)
@@ -64,7 +64,7 @@ class Exported:
         else:
             lines += [
                 f"read back: torque error at most {self.comparison.difference:.1e} of the joint's"
-                f" largest torque, at {STATES} random states",
+                f" largest torque, at {RANDOM_STATES} random states",
                 *(
                     f"left out: {k}: {row(v, self.comparison.torque)}"
                     for k, v in self.comparison.left_out.items()
@@ -107,7 +107,7 @@ def export_model(
         comparison: SimulatorComparison | str = compare(
             text, form, arm, _motion(model.prepared.held_out)
         )
-    except MISSING as error:
+    except MISSING_SIMULATOR_ERRORS as error:
         comparison = str(error)
     write_files(output.parent, {output.name: text})
     units = tuple("N·m" if turns else "N" for turns in arm.model.chain.revolute)
@@ -139,9 +139,9 @@ class ExportedEnsemble:
         ]
         if abs(pooled - 1.0) > _SPREAD_TOLERANCE:
             lines.append(
-                f"the spread of fewer than {FEWEST} arms is mostly chance: draw more, such as"
+                f"the spread of fewer than {MIN_ARMS} arms is mostly chance: draw more, such as"
                 " --ensemble 20"
-                if len(arms) < FEWEST
+                if len(arms) < MIN_ARMS
                 else "warning: the nearest arms that can be built do not vary as the intervals say:"
                 " do not randomise between them"
             )
@@ -231,7 +231,7 @@ def _ensemble_texts(
         if not missing:
             try:
                 difference = max(difference, read_back(text, form, arm, _ENSEMBLE_STATES))
-            except MISSING as error:
+            except MISSING_SIMULATOR_ERRORS as error:
                 missing = str(error)
     return texts, missing or difference
 
@@ -247,6 +247,6 @@ def default_output(sources: Sequence[Path], to: FormatName, *, ensemble: bool = 
 def _motion(held_out: Sequence[Samples]) -> Motion:
     """Return some rows of the predicted motion, from all its recordings."""
     parts = [samples.motion for samples in held_out]
-    step = -(-sum(motion.n_samples for motion in parts) // _MOST_ROWS)
+    step = -(-sum(motion.n_samples for motion in parts) // _MAX_ROWS)
     some = [motion.rows(slice(None, None, step)) for motion in parts]
     return Motion.joined(some).without_load()

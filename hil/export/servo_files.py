@@ -33,7 +33,7 @@ from identification.export.python_files import (
 )
 from identification.export.simulators import (
     FORMATS,
-    MISSING,
+    MISSING_SIMULATOR_ERRORS,
     MissingMujocoError,
     mjcf,
     read_back,
@@ -64,7 +64,7 @@ _TERMS: Final[Mapping[Quantity, str]] = {
     "delay": "delay",
     "offset": "offset",
 }
-_DRAWS: Final = 2000  # for the interval of a sum
+_MIN_INTERVAL_DRAWS: Final = 2000  # for the interval of a sum
 _MILLI: Final = 1e3
 
 
@@ -215,7 +215,7 @@ def actuators_of(
         np.array(posterior.present),
         np.array(posterior.covariance),
         max(1, windows - 1),
-        max(count, _DRAWS),
+        max(count, _MIN_INTERVAL_DRAWS),
         seed,
     )
     delays = posterior_samples[:, :, PLACE["delay"]]
@@ -292,7 +292,7 @@ def _description(
         text = form.write(arm, cell.name, remarks)
     try:
         difference = read_back(text, form, arm)
-    except MISSING as error:
+    except MISSING_SIMULATOR_ERRORS as error:
         return text, f"warning: not read back: {error}"
     said = "torque of bodies, armature and damping differs by"
     return text, f"read back: {said} {difference:.1e} of the largest at most"

@@ -18,9 +18,10 @@ _SINCE_START: Final = re.compile(
     r"|up[ _-]?time|warm(ed|ing)?[ _-]?up|(minutes|hours)[ _-]?(on|running)(?![a-z])",
     re.IGNORECASE,
 )
-_MOST_COMMON: Final = 2  # covariates that concern all joints
-_CONSTANTS: Final = 2.0 ** np.arange(-5.0, 3.0)  # of a warm-up, of the longest time since a start
-_NEW: Final = 1e-6  # of a covariate, that others leave of it
+_MAX_COMMON_COVARIATES: Final = 2  # covariates that concern all joints
+# of a warm-up, of the longest time since a start
+_TIME_CONSTANT_SHARES: Final = 2.0 ** np.arange(-5.0, 3.0)
+_MIN_INDEPENDENT_SHARE: Final = 1e-6  # of a covariate, that others leave of it
 
 
 def is_heat(name: str) -> bool:
@@ -73,7 +74,7 @@ def chosen(
     )
     varying = [names[k] for k in independent]
     of_joint = [name for name in varying if name in own]
-    return [*of_joint, *[name for name in varying if name not in own][:_MOST_COMMON]]
+    return [*of_joint, *[name for name in varying if name not in own][:_MAX_COMMON_COVARIATES]]
 
 
 def _independent(columns: Sequence[Array]) -> list[int]:
@@ -86,7 +87,7 @@ def _independent(columns: Sequence[Array]) -> list[int]:
     for k, column in enumerate(every.T):
         others = every[:, independent]
         rest = column - others @ np.linalg.lstsq(others, column, rcond=None)[0]
-        if np.linalg.norm(rest) > _NEW * sizes[k]:
+        if np.linalg.norm(rest) > _MIN_INDEPENDENT_SHARE * sizes[k]:
             independent.append(k)
     return independent
 
@@ -129,7 +130,9 @@ def warmed(family: Sequence[Series], names: Sequence[str]) -> list[Series]:
         times = np.concatenate([np.zeros(1), *(each.covariates[:, k] for each in found)])
         longest = float(np.nanmax(times))
         if is_since_start(name) and longest > 0.0:
-            tried = [[_warmed(each, k, longest * c) for each in found] for c in _CONSTANTS]
+            tried = [
+                [_warmed(each, k, longest * c) for each in found] for c in _TIME_CONSTANT_SHARES
+            ]
             found = min(tried, key=unexplained)
     return found
 

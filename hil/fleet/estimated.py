@@ -30,7 +30,7 @@ from hil.pipeline.options import Options
 from identification import RobotModel
 from identification.selection.settings import Settings
 
-_CHUNK: Final = 16  # recordings of one task
+_RECORDINGS_PER_TASK: Final = 16  # recordings of one task
 
 
 @dataclass(frozen=True, eq=False)
@@ -155,13 +155,17 @@ class _TypeFits:
             return None
         unusable = {each.path for each in broken}
         refs = [ref for ref in refs if ref.origin not in unusable]
-        chunks = [refs[k : k + _CHUNK] for k in range(0, len(refs), _CHUNK)]
+        chunks = [
+            refs[k : k + _RECORDINGS_PER_TASK] for k in range(0, len(refs), _RECORDINGS_PER_TASK)
+        ]
         tasks = [
             ClusterTask(chunk[0].origin, summarise, (chunk, settings, cache)) for chunk in chunks
         ]
         new = sum(not has_summary(ref, settings, cache) for ref in refs)
         with reporter.task("estimating recordings", len(refs)) as progress:
-            results = cluster.results(tasks, lambda _: progress.advance(_CHUNK), archives=new)
+            results = cluster.results(
+                tasks, lambda _: progress.advance(_RECORDINGS_PER_TASK), archives=new
+            )
         summaries: list[Summary] = []
         for result in results:
             for each in [result] if isinstance(result, SkippedArchive) else result:

@@ -22,7 +22,7 @@ from hil.importers.log_files import LogFiles
 from hil.importers.mcap_messages import Topic
 from hil.importers.text_table import TextTable
 
-_MOST_COLUMNS: Final = 64
+_MAX_COLUMNS: Final = 64
 _JOINTS: Final = ("name", "joint_names")  # fields of a message that name joints
 _NO_FACTS: Final = (*_JOINTS, "header", "layout", "variance")
 
@@ -119,7 +119,7 @@ def _numbers(value: object) -> Array:
         numbers = np.atleast_1d(np.asarray(value, dtype=np.float64))
     except (TypeError, ValueError):
         return np.empty(0)
-    return numbers if numbers.ndim == 1 and len(numbers) <= _MOST_COLUMNS else np.empty(0)
+    return numbers if numbers.ndim == 1 and len(numbers) <= _MAX_COLUMNS else np.empty(0)
 
 
 def _means(table: TextTable | ArrayFile, name: str) -> Iterator[tuple[str, float]]:
@@ -131,7 +131,7 @@ def _means(table: TextTable | ArrayFile, name: str) -> Iterator[tuple[str, float
             values = table.matrix(name, "facts")
     except SourceError:
         return
-    for number, column in enumerate(values.T[:_MOST_COLUMNS], 1):
+    for number, column in enumerate(values.T[:_MAX_COLUMNS], 1):
         finite = column[np.isfinite(column)]
         if len(finite):
             yield (name if values.shape[1] == 1 else f"{name}{number}"), float(finite.mean())

@@ -51,7 +51,7 @@ _ARCHIVE: Final = ".recording"
 _LOG_SUFFIXES: Final = frozenset((*TEXTS, *READERS, *BAGS)) - {SUFFIX, ".json"}  # else settings
 _PACKED: Final = (".zst", ".zstd")
 _TABLES: Final = ("parameters", "axes", "not_used", "quantities")  # that a batch writes
-_TRIED: Final = 3
+_MAX_REFUSED_LOGS: Final = 3
 """Logs with the same channels from which a map is tried to be concluded, before all are refused."""
 
 
@@ -442,7 +442,7 @@ class LogsOfBatch:
             for channels, (leader, *others) in unread.items():
                 tried[channels] += 1
                 refusal = leading[leader]
-                if isinstance(refusal, SkippedArchive) and tried[channels] >= _TRIED:
+                if isinstance(refusal, SkippedArchive) and tried[channels] >= _MAX_REFUSED_LOGS:
                     done |= {log: refusal._replace(path=log) for log in others}
                 else:
                     remaining += others

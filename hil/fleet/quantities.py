@@ -10,7 +10,7 @@ import numpy as np
 
 from hil.base.arrays import Array
 from hil.batch.archive_reduction import Summary
-from hil.compare.comparison import SPEEDS, friction_weights, projected
+from hil.compare.comparison import FRICTION_SPEEDS, friction_weights, projected
 from identification import RobotModel
 from identification.factor.estimate import Estimate
 from identification.model.motion import Motion
@@ -22,11 +22,11 @@ QUANTITIES: Final[tuple[QuantityName, ...]] = get_args(QuantityName)
 CAUSES: Final[Mapping[QuantityName, int]] = {"friction": 0, "gravity load": 0, "torque scale": 1}
 """Quantities that say what changed, in their order: a load also changes the scale of torque. The
 others are parts of friction, and an error."""
-_STATES: Final = 200  # postures of gravity, and states of the scale of torque
-_SPEED: Final = 1.0  # rad/s or m/s, root mean square of these states
-_ACCELERATION: Final = 3.0  # rad/s² or m/s²
-_SHOWN: Final = 40  # recordings that choose the speed of friction
-_LEAST_LOAD: Final = 0.02  # of the largest joint's gravity, below which a joint carries none
+_RANDOM_STATES: Final = 200  # postures of gravity, and states of the scale of torque
+_RMS_SPEED: Final = 1.0  # rad/s or m/s, root mean square of these states
+_RMS_ACCELERATION: Final = 3.0  # rad/s² or m/s²
+_SAMPLED_RECORDINGS: Final = 40  # recordings that choose the speed of friction
+_MIN_GRAVITY_SHARE: Final = 0.02  # of the largest joint's gravity, below which a joint carries none
 
 
 class FollowedQuantity(NamedTuple):
@@ -102,7 +102,7 @@ def tracked_quantities(
     and torque scale are the projections of gravity torques over postures, and of torques of motions
     without friction, on those of the reference.
     """
-    friction = friction_weights(model, SPEEDS)
+    friction = friction_weights(model, FRICTION_SPEEDS)
     at_rest = friction_weights(model, np.zeros(1))[0]
     gravity, motion = _rigid_weights(model, reference)
     loads = np.array([float(np.sqrt(weights @ reference)) for weights in gravity.values()])
@@ -110,7 +110,7 @@ def tracked_quantities(
         unit, speed_unit = ("N·m", "rad/s") if turns else ("N", "m/s")
         if friction[:, j].any():
             best = _best_speed(fits, friction[:, j])
-            speed = float(SPEEDS[best])
+            speed = float(FRICTION_SPEEDS[best])
             weights = friction[best, j]
             yield TrackedQuantity(FollowedQuantity(joint, "friction", unit, speed), j, weights)
             if at_rest[j].any():
@@ -119,7 +119,7 @@ def tracked_quantities(
             if slope.any():
                 viscous = FollowedQuantity(joint, "viscous", f"{unit} / ({speed_unit})")
                 yield TrackedQuantity(viscous, j, slope)
-        if loads[j] > _LEAST_LOAD * loads.max():
+        if loads[j] > _MIN_GRAVITY_SHARE * loads.max():
             weights = gravity[j] / loads[j]
             yield TrackedQuantity(FollowedQuantity(joint, "gravity load", unit), j, weights)
         size = float(motion[j] @ reference)
@@ -141,7 +141,7 @@ def mean_parameters(fits: Sequence[Estimate]) -> Array:
 
 def _best_speed(fits: Sequence[Estimate], weights: Array) -> int:
     """Return the speed at which friction is largest relative to its standard deviation."""
-    step = max(1, len(fits) // _SHOWN)
+    step = max(1, len(fits) // _SAMPLED_RECORDINGS)
     ratios = []
     for fit in fits[::step]:
         value, variance = projected(fit, weights)
@@ -159,9 +159,9 @@ def _rigid_weights(
     """
     random = np.random.default_rng(0)
     n = model.n_joints
-    position = random.uniform(-np.pi, np.pi, (_STATES, n))
-    velocity = _SPEED * random.standard_normal((_STATES, n))
-    acceleration = _ACCELERATION * random.standard_normal((_STATES, n))
+    position = random.uniform(-np.pi, np.pi, (_RANDOM_STATES, n))
+    velocity = _RMS_SPEED * random.standard_normal((_RANDOM_STATES, n))
+    acceleration = _RMS_ACCELERATION * random.standard_normal((_RANDOM_STATES, n))
     rank = model.base.rank
     frictional = slice(rank, rank + len(model.friction.terms))
     weights = []
@@ -172,6 +172,6 @@ def _rigid_weights(
         rows = model.regressor(motion).dense(model.n_parameters)
         rows[:, :, frictional] = 0.0
         torque = rows @ reference
-        means = np.einsum("mjp,mj->jp", rows, torque) / _STATES
+        means = np.einsum("mjp,mj->jp", rows, torque) / _RANDOM_STATES
         weights.append(dict(enumerate(means)))
     return weights[0], weights[1]

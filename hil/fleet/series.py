@@ -12,13 +12,13 @@ import numpy as np
 from hil.base.arrays import Array
 from hil.fleet import covariates
 from hil.fleet.quantities import FollowedQuantity
-from hil.fleet.series_changes import FEWEST, Series, mean_of_known
+from hil.fleet.series_changes import MIN_RECORDINGS, Series, mean_of_known
 
-REFERENCE: Final = 3.0
+REFERENCE_MONTHS: Final = 3.0
 """First months of a robot, against which it has changed."""
 MONTH: Final = timedelta(days=365.25 / 12.0)
-_FIRST: Final = 3  # recordings that these have at least
-_DETERMINED: Final = 4.0  # standard deviations that a value exceeds
+_MIN_REFERENCE_RECORDINGS: Final = 3  # recordings that these have at least
+_DETERMINED_SIGMAS: Final = 4.0  # standard deviations that a value exceeds
 
 
 @dataclass(frozen=True, eq=False)
@@ -82,8 +82,8 @@ class TypeSeries:
 def first_of(recordings: Sequence[DatedRecording]) -> int:
     """Return how many recordings are of the first months."""
     start = recordings[0].moment
-    within = sum(each.moment - start < REFERENCE * MONTH for each in recordings)
-    return max(min(_FIRST, len(recordings)), within)
+    within = sum(each.moment - start < REFERENCE_MONTHS * MONTH for each in recordings)
+    return max(min(_MIN_REFERENCE_RECORDINGS, len(recordings)), within)
 
 
 class RelativeSeries(NamedTuple):
@@ -115,7 +115,7 @@ class RelativeSeries(NamedTuple):
             origin: of its time.
         """
         known = np.flatnonzero(np.isfinite(values) & np.isfinite(variances))
-        if len(known) < FEWEST:
+        if len(known) < MIN_RECORDINGS:
             return None
         recordings = [recordings[k] for k in known.tolist()]
         values = values[known]
@@ -123,7 +123,7 @@ class RelativeSeries(NamedTuple):
         first = first_of(recordings)
         reference = float(np.mean(values[:first]))
         error = float(np.sqrt(np.mean(variances[:first]) / first))
-        if not abs(reference) > _DETERMINED * error:
+        if not abs(reference) > _DETERMINED_SIGMAS * error:
             return None
         times = np.array([(each.moment - origin) / MONTH for each in recordings])
         columns = np.array(

@@ -24,25 +24,29 @@ from identification.distributions import fisher_tail, student_limit, student_tai
 
 Kind = Literal["step", "slope"]
 
-FEWEST: Final = 4
+MIN_RECORDINGS: Final = 4
 """Recordings below which a series has no model."""
-AFTER: Final = 2
+MIN_ON_EACH_SIDE: Final = 2
 """Recordings on either side of a change, and between two: one alone may be an outlier."""
-SIBLINGS: Final = 4
+MIN_SIBLINGS: Final = 4
 """Other robots from which on their common course is subtracted."""
-_MOST_CHANGES: Final = 3
-_ROUNDS: Final = 3  # of models and noise
-_FINE: Final = 0.25  # of a month, between begins of a slope that are tried
-_OUTLIER: Final = 4.0  # times the median deviation
+_MAX_CHANGES: Final = 3
+_NOISE_ROUNDS: Final = 3  # of models and noise
+_BEGIN_STEP_MONTHS: Final = 0.25  # of a month, between begins of a slope that are tried
+_OUTLIER_SIGMAS: Final = 4.0  # times the median deviation
 _NORMAL_MAD: Final = 0.6745
-_OWN: Final = 10.0  # recordings that the noise of the type counts as beside that of a robot
-_MOST_CORRELATION: Final = 0.9
-_LIKELY: Final = 3.84  # twice the log-likelihood within which a begin is in its 95 % interval
-_LEAST_EFFECT: Final = 0.1  # of all friction, that heat and season leave
-_YEAR: Final = 12.0  # months
-_LASTING: Final = 0.8  # of the whole time, that a robot was there for what all have in common
-_ENTRY: Final = 1e-3  # p value of one series from which on a change enters its model
-_ENTRY_WITHOUT_ONE: Final = 0.01  # likewise without any one recording, which may be an outlier
+# recordings that the noise of the type counts as beside that of a robot
+_TYPE_NOISE_RECORDINGS: Final = 10.0
+_MAX_CORRELATION: Final = 0.9
+# twice the log-likelihood within which a begin is in its 95 % interval
+_CHI_SQUARE_95: Final = 3.84
+_MIN_FRICTION_SHARE: Final = 0.1  # of all friction, that heat and season leave
+_YEAR_MONTHS: Final = 12.0  # months
+# of the whole time, that a robot was there for what all have in common
+_MIN_PRESENT_SHARE: Final = 0.8
+_MAX_ENTRY_P_VALUE: Final = 1e-3  # p value of one series from which on a change enters its model
+# likewise without any one recording, which may be an outlier
+_MAX_P_VALUE_WITHOUT_ONE: Final = 0.01
 
 
 @dataclass(frozen=True, eq=False)
@@ -190,15 +194,16 @@ def common_course(family: Sequence[Series]) -> CommonCourse | None:
     lasting = [
         each
         for each in without
-        if each.time[-1] - each.time[0] >= _LASTING * (end - begin) and len(each.time) >= FEWEST
+        if each.time[-1] - each.time[0] >= _MIN_PRESENT_SHARE * (end - begin)
+        and len(each.time) >= MIN_RECORDINGS
     ]
-    if len(lasting) <= SIBLINGS or end - begin < _YEAR:
+    if len(lasting) <= MIN_SIBLINGS or end - begin < _YEAR_MONTHS:
         return None
     time = max(lasting, key=lambda each: len(each.time)).time
     value, variance, count = _median_of([(each, each.value) for each in lasting], time)
     measured = float(np.mean(np.concatenate([each.variance for each in lasting])))
-    enough = count > SIBLINGS
-    angle = 2.0 * np.pi * time[enough] / _YEAR
+    enough = count > MIN_SIBLINGS
+    angle = 2.0 * np.pi * time[enough] / _YEAR_MONTHS
     season = np.column_stack([np.cos(angle), np.sin(angle)])
     variance = variance[enough] + 0.5 * np.pi * measured / count[enough]
     series = Series(time[enough], value[enough], variance, season)
@@ -236,7 +241,7 @@ def mean_of_known(columns: Array) -> Array:
 
 def _divided(value: Array, effect: Array) -> Array:
     """Return relative values (m,) without an effect by which they were multiplied."""
-    return (1.0 + value) / np.maximum(1.0 + effect, _LEAST_EFFECT) - 1.0
+    return (1.0 + value) / np.maximum(1.0 + effect, _MIN_FRICTION_SHARE) - 1.0
 
 
 def _fitted(
@@ -244,12 +249,12 @@ def _fitted(
 ) -> tuple[list[Course | None], _Noise]:
     """Fit all series with one noise, which is estimated from what their models leave."""
     noise = _noise_of_steps(family)
-    long = [len(series.time) >= FEWEST for series in family]
+    long = [len(series.time) >= MIN_RECORDINGS for series in family]
     pairs = [(s, prior) for s, prior, use in zip(family, priors, long, strict=True) if use]
     models: list[_Model] = []
-    for number in range(_ROUNDS):
+    for number in range(_NOISE_ROUNDS):
         models = [_model(series, prior, noise) for series, prior in pairs]
-        if number < _ROUNDS - 1:
+        if number < _NOISE_ROUNDS - 1:
             noise = _noise_of_residuals(pairs, models, noise)
     found = iter(
         [_described(*pair, model, noise) for pair, model in zip(pairs, models, strict=True)]
@@ -314,14 +319,14 @@ def _common_effect(value: Array, columns: Array) -> tuple[Array, NDArray[np.bool
     for _ in range(5 if len(value) else 0):
         effect = np.asarray(np.linalg.lstsq(columns[within], value[within], rcond=None)[0])
         residual = np.abs(value - columns @ effect)
-        within = residual <= _OUTLIER * np.median(residual) / _NORMAL_MAD
+        within = residual <= _OUTLIER_SIGMAS * np.median(residual) / _NORMAL_MAD
     return effect, within
 
 
 def _steps(series: Series) -> tuple[Array, Array]:
     """Return steps of the logarithm of values (m - 1,) and of covariates, where all are known."""
     known = np.isfinite(series.covariates).all(axis=1)
-    value = np.log(np.maximum(1.0 + series.value[known], _LEAST_EFFECT))
+    value = np.log(np.maximum(1.0 + series.value[known], _MIN_FRICTION_SHARE))
     return np.diff(value), np.diff(series.covariates[known], axis=0)
 
 
@@ -345,7 +350,7 @@ def _spread(information: Array, products: Array, effect: Array, variance: float)
 
 def _without_common(family: Sequence[Series]) -> list[Series]:
     """Divide each series by the median course of its siblings, and add its variance."""
-    if len(family) <= SIBLINGS:
+    if len(family) <= MIN_SIBLINGS:
         return list(family)
     rest = [_divided(each.value, np.full(1, np.median(each.value))) for each in family]
     subtracted = []
@@ -353,16 +358,17 @@ def _without_common(family: Sequence[Series]) -> list[Series]:
         others = [
             (other, rest[k])
             for k, other in enumerate(family)
-            if k != number and len(other.time) >= FEWEST
+            if k != number and len(other.time) >= MIN_RECORDINGS
         ]
         common, variance, count = _median_of(others, each.time)
-        common = np.where(count >= SIBLINGS, common, 0.0)
-        variance = np.where(count >= SIBLINGS, variance, 0.0)
+        common = np.where(count >= MIN_SIBLINGS, common, 0.0)
+        variance = np.where(count >= MIN_SIBLINGS, variance, 0.0)
         subtracted.append(
             replace(
                 each,
                 value=_divided(each.value, common),
-                variance=each.variance / np.maximum(1.0 + common, _LEAST_EFFECT) ** 2 + variance,
+                variance=each.variance / np.maximum(1.0 + common, _MIN_FRICTION_SHARE) ** 2
+                + variance,
             )
         )
     return subtracted
@@ -398,7 +404,7 @@ def scattered(family: Sequence[Series]) -> list[Series]:
     As errors of torque do. The share is that of all of them, by the second differences of their
     logarithms.
     """
-    logs = [np.log(np.maximum(1.0 + each.value, _LEAST_EFFECT)) for each in family]
+    logs = [np.log(np.maximum(1.0 + each.value, _MIN_FRICTION_SHARE)) for each in family]
     every = np.concatenate([*(np.diff(each, n=2) for each in logs), np.empty(0)])
     share = float(np.median(np.abs(every))) / _NORMAL_MAD / math.sqrt(6.0) if len(every) else 0.0
     return [
@@ -434,7 +440,7 @@ def _noise_of_residuals(
     if not residuals:
         return before
     every = np.concatenate([rest for _, rest, _ in residuals])
-    limit = _OUTLIER * float(np.median(np.abs(every))) / _NORMAL_MAD
+    limit = _OUTLIER_SIGMAS * float(np.median(np.abs(every))) / _NORMAL_MAD
     for series, rest, changes in residuals:
         clipped = np.clip(rest, -limit, limit) if limit > 0.0 else rest
         squares += float(clipped @ clipped)
@@ -450,7 +456,7 @@ def _noise_of_residuals(
     # A fitted level leaves residuals with a correlation of -1 / m.
     raw = products / squares if squares > 0.0 else 0.0
     correlation = raw + pieces / count * (1.0 + max(raw, 0.0))
-    correlation = min(max(correlation, 0.0), _MOST_CORRELATION)
+    correlation = min(max(correlation, 0.0), _MAX_CORRELATION)
     if correlation < 2.0 / np.sqrt(count):
         correlation = 0.0
     return _Noise(day, correlation, freedom)
@@ -479,7 +485,7 @@ def _model(series: Series, prior: _Prior, noise: _Noise) -> _Model:
     weights = 1.0 / (variance * inflation)
     chosen: list[ShapeOfChange] = []
     p_value = 1.0
-    while len(chosen) < _MOST_CHANGES:
+    while len(chosen) < _MAX_CHANGES:
         apart = _apart(series.time, candidates, chosen)
         best, statistic = _likeliest(series, prior, weights, chosen, apart)
         if best is None:
@@ -490,13 +496,13 @@ def _model(series: Series, prior: _Prior, noise: _Noise) -> _Model:
         if not chosen:
             # Wear until a repair is two changes, of which neither explains much alone.
             pair, p_of_pair = _likeliest_pair(series, prior, weights, candidates, noise.freedom)
-            if p_of_pair < p and p > _ENTRY:
+            if p_of_pair < p and p > _MAX_ENTRY_P_VALUE:
                 added = pair
             p_value = p = min(1.0, 2.0 * min(p, p_of_pair))
-        if p > _ENTRY:
+        if p > _MAX_ENTRY_P_VALUE:
             break
         without = _p_without_one(series, prior, weights, chosen, added, noise.freedom)
-        if without > _ENTRY_WITHOUT_ONE:
+        if without > _MAX_P_VALUE_WITHOUT_ONE:
             p_value = p_value if chosen else max(p_value, without)
             break
         chosen = _refined(series, prior, weights, [*chosen, *added], candidates)
@@ -513,12 +519,14 @@ def _largest(series: Series, model: _Model) -> float:
 def _candidates(time: Array) -> list[ShapeOfChange]:
     """Return the candidate changes: steps between recordings, slopes also inside the intervals."""
     distinct = np.unique(time)
-    if len(distinct) < 2 * AFTER:
+    if len(distinct) < 2 * MIN_ON_EACH_SIDE:
         return []
     middles = 0.5 * (distinct[:-1] + distinct[1:])
-    steps = middles[AFTER - 1 : len(middles) - AFTER + 1]
-    last = distinct[-AFTER - 1]
-    begins = np.arange(distinct[0], last + 1e-9, max(_FINE, (last - distinct[0]) / 200.0))
+    steps = middles[MIN_ON_EACH_SIDE - 1 : len(middles) - MIN_ON_EACH_SIDE + 1]
+    last = distinct[-MIN_ON_EACH_SIDE - 1]
+    begins = np.arange(
+        distinct[0], last + 1e-9, max(_BEGIN_STEP_MONTHS, (last - distinct[0]) / 200.0)
+    )
     slopes = [ShapeOfChange("slope", float(begin)) for begin in begins]
     return [*(ShapeOfChange("step", float(begin)) for begin in steps), *slopes]
 
@@ -541,7 +549,7 @@ def _p_without_one(
 def _apart(
     time: Array, candidates: Sequence[ShapeOfChange], chosen: Sequence[ShapeOfChange]
 ) -> list[ShapeOfChange]:
-    """Return the changes at least `AFTER` recordings away from the chosen ones."""
+    """Return the changes at least `MIN_ON_EACH_SIDE` recordings away from the chosen ones."""
     if not chosen:
         return list(candidates)
     near = np.any(_near(time, candidates, chosen), axis=1)
@@ -551,14 +559,14 @@ def _apart(
 def _near(
     time: Array, shapes: Sequence[ShapeOfChange], others: Sequence[ShapeOfChange]
 ) -> NDArray[np.bool_]:
-    """Return whether there are fewer than `AFTER` recordings between changes and others (s, o).
+    """Return whether fewer than `MIN_ON_EACH_SIDE` recordings separate changes and others (s, o).
 
     Two so near together can be as large as one outlier asks for.
     """
     distinct = np.unique(time)
     first = np.searchsorted(distinct, [shape.begin for shape in shapes], side="right")
     second = np.searchsorted(distinct, [shape.begin for shape in others], side="right")
-    return np.asarray(np.abs(first[:, None] - second[None, :]) < AFTER)
+    return np.asarray(np.abs(first[:, None] - second[None, :]) < MIN_ON_EACH_SIDE)
 
 
 def _design(series: Series, chosen: Sequence[ShapeOfChange]) -> Array:
@@ -701,7 +709,7 @@ def _own_scale(
     pair, _ = _likeliest_pair(series, prior, weights, candidates, 1.0)
     freedom = max(1.0, len(series.time) - 1.0 - 2.0 * len(pair))
     ratio = float(_misfits(series, prior, weights, _design(series, pair))) / freedom
-    return max(1.0, (_OWN + freedom * ratio) / (_OWN + freedom))
+    return max(1.0, (_TYPE_NOISE_RECORDINGS + freedom * ratio) / (_TYPE_NOISE_RECORDINGS + freedom))
 
 
 def _described(series: Series, prior: _Prior, model: _Model, noise: _Noise) -> Course:
@@ -765,7 +773,7 @@ def _begin_interval(
     design = _design(series, others)
     known = np.broadcast_to(design, (len(begins), *design.shape))
     best, *misfits = _misfits(series, prior, weights, np.concatenate([known, begins], axis=2))
-    likely = np.array([each.begin for each in alike])[np.array(misfits) <= best + _LIKELY]
+    likely = np.array([each.begin for each in alike])[np.array(misfits) <= best + _CHI_SQUARE_95]
     earliest, latest = float(likely.min()), float(likely.max())
     if shape.kind == "step":  # anywhere between two recordings
         earliest = float(series.time[series.time < earliest].max())

@@ -15,7 +15,7 @@ import numpy as np
 
 from hil.base.arrays import Array
 from hil.batch.cluster import SkippedArchive
-from hil.compare.comparison import LEAST, holm
+from hil.compare.comparison import MIN_RELATIVE_CHANGE, holm
 from hil.fleet.covariates import warmed
 from hil.fleet.quantities import CAUSES, FollowedQuantity, QuantityName
 from hil.fleet.series import (
@@ -25,12 +25,12 @@ from hil.fleet.series import (
     RelativeSeries,
     TypeSeries,
 )
-from hil.fleet.series_changes import SIBLINGS, Course, common_course, courses, scattered
+from hil.fleet.series_changes import MIN_SIBLINGS, Course, common_course, courses, scattered
 from hil.fleet.trend_limits import TrendLimit
 
-FALSE_ALARMS: Final = 0.01
+FALSE_ALARM_RATE: Final = 0.01
 """Probability of any change in a fleet that has none, at one time of asking."""
-_LONGEST: Final = 240.0  # months within which a limit is foreseen
+_FORECAST_MONTHS: Final = 240.0  # months within which a limit is foreseen
 _SEASON: Final = ("cosine of a year", "sine of a year")
 
 
@@ -230,7 +230,7 @@ def fleet_trend(
         robots=_ranked(robots),
         together=_ranked([each for each in together if each.trends]),
         covariates=tuple(sorted(names)),
-        seasonal=any(len(series.recordings) > SIBLINGS for series in types),
+        seasonal=any(len(series.recordings) > MIN_SIBLINGS for series in types),
         unknown=tuple(name for name in covariates if name not in known),
     )
 
@@ -270,8 +270,8 @@ def _judged(found: Sequence[_FoundTrend]) -> list[QuantityTrend]:
     for each, p_value, raw_p in zip(found, adjusted.tolist(), raw.tolist(), strict=True):
         trend = each.trend
         largest = float(np.max(np.abs(trend.fitted)))
-        changed = p_value < FALSE_ALARMS and largest >= LEAST
-        would_be = raw_p < FALSE_ALARMS and each.raw_change >= LEAST
+        changed = p_value < FALSE_ALARM_RATE and largest >= MIN_RELATIVE_CHANGE
+        would_be = raw_p < FALSE_ALARM_RATE and each.raw_change >= MIN_RELATIVE_CHANGE
         trend = replace(trend, p_value=p_value, changed=changed, explained=would_be and not changed)
         judged.append(trend if changed else replace(trend, changes=(), limits=()))
     return judged
@@ -394,7 +394,7 @@ def _reached(
     size = abs(limit.share)
     now = sign * course.change * scale
     half = course.half * scale
-    months = np.arange(0.0, _LONGEST, 0.05)
+    months = np.arange(0.0, _FORECAST_MONTHS, 0.05)
 
     def when(level: float, rate: float) -> str | None:
         ahead = level + rate * months

@@ -9,7 +9,7 @@ import numpy as np
 
 from hil.base.arrays import Array
 from hil.base.version import software
-from hil.compare.comparison import LEAST
+from hil.compare.comparison import MIN_RELATIVE_CHANGE
 from hil.fleet.messages import (
     month,
     name_of,
@@ -18,15 +18,15 @@ from hil.fleet.messages import (
     robot_sentence,
     verdict,
 )
-from hil.fleet.series import REFERENCE
-from hil.fleet.trend import FALSE_ALARMS, FleetTrend, QuantityTrend, RobotTrend
+from hil.fleet.series import REFERENCE_MONTHS
+from hil.fleet.trend import FALSE_ALARM_RATE, FleetTrend, QuantityTrend, RobotTrend
 from hil.report.chart import Caption, Chart, Legend, Plot
 from hil.report.panels import Panel, chart_panel
 from hil.report.rendering import environment, page_bytes
 from identification.text import percentage
 
-_MONTH: Final = 365.25 / 12.0 * 86400.0  # s
-_HEIGHT: Final = 96.0  # px of a chart
+_MONTH_SECONDS: Final = 365.25 / 12.0 * 86400.0  # s
+_CHART_HEIGHT: Final = 96.0  # px of a chart
 _VALUE: Final = Legend("value", "value without temperature and season", "--wide", 6.0)
 _RAW: Final = Legend("raw", "value as estimated", "--muted", 4.0)
 _MODEL: Final = Legend("model", "model", "--second", 1.8)
@@ -35,7 +35,11 @@ _MODEL: Final = Legend("model", "model", "--second", 1.8)
 def trend_page(fleet: FleetTrend) -> bytes:
     """Return the trend of a fleet as one HTML file; the same input gives the same bytes."""
     template = environment().get_template("trend.html.j2")
-    rules = {"alarms": FALSE_ALARMS, "least": LEAST, "reference": REFERENCE}
+    rules = {
+        "alarms": FALSE_ALARM_RATE,
+        "least": MIN_RELATIVE_CHANGE,
+        "reference": REFERENCE_MONTHS,
+    }
     shown = [each for each in fleet.together if each.changed]
     robots = [_robot(number, each, fleet) for number, each in enumerate((*shown, *fleet.robots))]
     text = template.render(
@@ -91,7 +95,7 @@ def _panel(key: str, trend: QuantityTrend) -> Panel:
     caption = Caption(
         key, f"{trend.joint}: {name_of(trend)}", end if trend.changed else "", "change over time"
     )
-    plot = Plot(_HEIGHT, "change [%]", traces, shaded=shaded)
+    plot = Plot(_CHART_HEIGHT, "change [%]", traces, shaded=shaded)
     return chart_panel(
         Chart(caption, months, [plot], foot=f"months since {month(first)}", ticks=_ticks(months))
     )
@@ -106,7 +110,9 @@ def _dots(legend: Legend, values: Array, months: Array) -> Any:
 
 def _months(date: str, first: str) -> float:
     """Return the months from one date to another."""
-    return (datetime.fromisoformat(date) - datetime.fromisoformat(first)).total_seconds() / _MONTH
+    return (
+        datetime.fromisoformat(date) - datetime.fromisoformat(first)
+    ).total_seconds() / _MONTH_SECONDS
 
 
 def _ticks(months: Array) -> list[float]:

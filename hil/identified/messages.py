@@ -17,7 +17,7 @@ from hil.look.result import ChangedReading
 from hil.pipeline.sources import Source
 from identification.text import duration_text
 
-_MOST: Final = 3
+_MAX_RECORDING_LINES: Final = 3
 
 
 def read_lines(arm: IdentifiedArm) -> list[tuple[str, str]]:
@@ -32,9 +32,12 @@ def read_lines(arm: IdentifiedArm) -> list[tuple[str, str]]:
         if not (use == "predicted" and sources.in_sample)
     ]
     lines += [(use, _archives(group)) for use, group in of_archives if group and not _same(arm)]
-    if (more := len(lines) - _MOST) > 0:
-        lines = [*lines[: _MOST - 1], ("", f"and {plural(more + 1, 'recording')} more")]
-    return [*decisive[:_MOST], *lines]
+    if (more := len(lines) - _MAX_RECORDING_LINES) > 0:
+        lines = [
+            *lines[: _MAX_RECORDING_LINES - 1],
+            ("", f"and {plural(more + 1, 'recording')} more"),
+        ]
+    return [*decisive[:_MAX_RECORDING_LINES], *lines]
 
 
 def _decisive(arm: IdentifiedArm) -> Iterator[tuple[str, str]]:
@@ -65,8 +68,11 @@ def servo_read_lines(servo: IdentifiedServo) -> list[tuple[str, str]]:
         use = "predicted" if place.name in held_out else "fitted"
         own = [text for text in unusual[place] if text not in common]
         lines.append((use, f"{staging.sources[place].name}: {'; '.join([size(recording), *own])}"))
-    if (more := len(lines) - _MOST) > 0:
-        lines = [*lines[: _MOST - 1], ("", f"and {plural(more + 1, 'recording')} more")]
+    if (more := len(lines) - _MAX_RECORDING_LINES) > 0:
+        lines = [
+            *lines[: _MAX_RECORDING_LINES - 1],
+            ("", f"and {plural(more + 1, 'recording')} more"),
+        ]
     return [*lines, *(("of all", text) for text in common)]
 
 

@@ -33,7 +33,7 @@ from hil.results.results import RecordingResult
 from identification.signals.messages import clock_lines
 from identification.text import duration_text, number
 
-_USUAL: Final = (
+_ROUTINE_CONCLUSIONS: Final = (
     ChannelMeaning,
     ConcludedUnit,
     JointOrder,
@@ -109,5 +109,5 @@ def _unusual(recording: ImportedRecording) -> list[Conclusion]:
     found = (*recording.concluded, *recording.examined.found)
     return [
         *recording.examined.warnings,
-        *(conclusion for conclusion in found if not isinstance(conclusion, _USUAL)),
+        *(conclusion for conclusion in found if not isinstance(conclusion, _ROUTINE_CONCLUSIONS)),
     ]

@@ -15,7 +15,7 @@ from hil.archive import Archive, write_archive
 from hil.base.errors import InputError, SourceError
 from hil.base.files import convert_write_errors, replace_file, write_output
 from hil.base.progress import Reporter
-from hil.importers.excerpt import LONGEST
+from hil.importers.excerpt import MAX_EXCERPT_ROWS
 from hil.importers.lerobot import is_data_set
 from hil.importers.log_files import LogFiles
 from hil.importers.messages import sentence
@@ -163,7 +163,7 @@ def _read(
 def _read_one(
     path: Path, robot_of: RobotOf, options: ImportOptions, place: Path, use: Use
 ) -> ImportedRecording:
-    files = LogFiles(longest=LONGEST)
+    files = LogFiles(longest=MAX_EXCERPT_ROWS)
     return read_recording(path, robot_of, options, place=place, use=use, files=files)
 
 

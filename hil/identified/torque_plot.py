@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-_DOTS: Final = 100  # per inch, of a picture in a notebook
+_DOTS_PER_INCH: Final = 100  # per inch, of a picture in a notebook
 
 
 @dataclass(frozen=True, eq=False)
@@ -48,7 +48,7 @@ class TorquePlot:
     def png(self) -> bytes:
         """Return the picture as a PNG."""
         content = BytesIO()
-        self.figure.savefig(content, format="png", dpi=_DOTS)
+        self.figure.savefig(content, format="png", dpi=_DOTS_PER_INCH)
         return content.getvalue()
 
     def _repr_png_(self) -> bytes:

@@ -23,14 +23,20 @@ from hil.importers.conclusions import LeftOut, Omitted
 from hil.importers.document_messages import ENCODINGS, columns_of_trees, trees
 from hil.importers.json_samples import SUFFIXES as JSON
 from hil.importers.json_samples import read_json
-from hil.importers.matlab import NUMBERS, lost_bytes, mat_array, mat_shapes, script_matrices
+from hil.importers.matlab import (
+    NUMERIC_DTYPE_KINDS,
+    lost_bytes,
+    mat_array,
+    mat_shapes,
+    script_matrices,
+)
 from hil.importers.ros_messages import MessageError, columns_of, decoded, typestore_of
 from hil.importers.stated_units import without_unit
 
-MOST_NUMBERS: Final = 2**28
+MAX_ELEMENTS: Final = 2**28
 """Elements of one array: 2 GiB of doubles, hours of an arm at 5 kHz."""
 
-_MOST_NAMED: Final = 30
+_MAX_NAMED_ARRAYS: Final = 30
 
 
 class Stored(NamedTuple):
@@ -194,18 +200,18 @@ class ArrayFile:
         if name is None or name not in self._stored:
             problem = f"there is no array {name!r}" if name else "the name of the array is missing"
             shapes = [f"{key} {array.shape}" for key, array in self._stored.items()]
-            remedy = f"its arrays are {', '.join(shapes[:_MOST_NAMED])}"
+            remedy = f"its arrays are {', '.join(shapes[:_MAX_NAMED_ARRAYS])}"
             raise SourceError(self.path, problem, field=field, remedy=remedy)
         if name not in self._loaded:
             stored = self._stored[name]
-            if math.prod(stored.shape) > MOST_NUMBERS:
+            if math.prod(stored.shape) > MAX_ELEMENTS:
                 problem = (
                     f"array {name!r} of shape {stored.shape} is too large to be read in one piece"
                 )
                 raise SourceError(self.path, problem, remedy="save the log in parts")
             with _readable(self.path):
                 array = stored.load()
-            if array.dtype.kind not in NUMBERS or array.shape != stored.shape:
+            if array.dtype.kind not in NUMERIC_DTYPE_KINDS or array.shape != stored.shape:
                 raise SourceError(self.path, f"array {name!r} does not hold real numbers")
             self._loaded[name] = array
         return self._loaded[name]
@@ -234,7 +240,7 @@ def _npz(path: Path) -> Contents:
     stored = {
         name.removesuffix(".npy"): Stored(head[0], partial(_member, path, name))
         for name, head in heads.items()
-        if head is not None and head[1].kind in NUMBERS
+        if head is not None and head[1].kind in NUMERIC_DTYPE_KINDS
     }
     return Contents(stored)
 
@@ -396,7 +402,7 @@ def _in_memory(arrays: Mapping[str, NDArray[Any]]) -> Contents:
     stored = {
         name: Stored(array.shape, partial(np.asarray, array))
         for name, array in arrays.items()
-        if array.dtype.kind in NUMBERS
+        if array.dtype.kind in NUMERIC_DTYPE_KINDS
     }
     return Contents(stored)
 

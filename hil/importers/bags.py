@@ -17,7 +17,7 @@ import zstandard
 from rosbags.interfaces import MessageDefinitionFormat
 from rosbags.typesys import Stores, get_typestore
 
-from hil.archive.container import MOST_INFLATION
+from hil.archive.container import MAX_COMPRESSION_RATIO
 from hil.base.errors import SourceError
 from hil.base.safe_input import open_file, read_text
 from hil.base.terminal_text import typed
@@ -30,12 +30,12 @@ if TYPE_CHECKING:
 
 SUFFIXES: Final = (".db3", ".mcap", ".bag")
 _PACKED: Final = (".zstd", ".zst")
-_LONGEST_MESSAGE: Final = 1 << 24  # bytes
-_LONGEST_ROW: Final = 1 << 28  # bytes
-_SLACK: Final = 1 << 20  # bytes
-_SQLITE: Final = b"SQLite format 3\0"
-_ROS_1: Final = b"#ROSBAG V2.0\n"
-_ZSTD: Final = b"\x28\xb5\x2f\xfd"  # begins no CDR message
+_MAX_MESSAGE_BYTES: Final = 1 << 24  # bytes
+_MAX_ROW_BYTES: Final = 1 << 28  # bytes
+_BLOCK_BYTES: Final = 1 << 20  # bytes
+_SQLITE_MAGIC: Final = b"SQLite format 3\0"
+_ROS_1_MAGIC: Final = b"#ROSBAG V2.0\n"
+_ZSTD_MAGIC: Final = b"\x28\xb5\x2f\xfd"  # begins no CDR message
 
 
 def bag_files(source: Path) -> list[Path]:
@@ -246,7 +246,7 @@ def _reader_part(file: Path, path: Path) -> Iterator[_ReaderPart]:
         for part in reader.readers:
             database = getattr(getattr(part, "storage", None), "dbconn", None)
             if database is not None:  # a row can be larger than the file
-                database.limit(sqlite3.SQLITE_LIMIT_LENGTH, _LONGEST_ROW)
+                database.limit(sqlite3.SQLITE_LIMIT_LENGTH, _MAX_ROW_BYTES)
     except Exception as error:  # of apsw, YAML, struct and others on a damaged file
         raise _not_a_bag(file, error) from error
     try:
@@ -262,13 +262,13 @@ def _not_a_bag(file: Path, error: Exception) -> SourceError:
     remedy = "name the .db3, .mcap or .bag file, or the bag's folder"
     if _is_database(file):
         remedy = "copy it again, together with the file that ends in -wal, if there is one"
-    elif _starts_with(file, _ROS_1):
+    elif _starts_with(file, _ROS_1_MAGIC):
         remedy = f"copy it again; or, if its recorder was killed: rosbag reindex {typed(file.name)}"
     return SourceError(file, problem, remedy=remedy)
 
 
 def _is_database(file: Path) -> bool:
-    return _starts_with(file, _SQLITE)
+    return _starts_with(file, _SQLITE_MAGIC)
 
 
 def _starts_with(file: Path, signature: bytes) -> bool:
@@ -314,12 +314,14 @@ def _provide(file: Path, target: Path) -> None:
 
 def _unpack(file: Path, target: Path) -> None:
     try:
-        most = _SLACK + MOST_INFLATION * file.stat().st_size
+        most = _BLOCK_BYTES + MAX_COMPRESSION_RATIO * file.stat().st_size
         with file.open("rb") as packed, target.open("wb") as output:
             for block in _unpacked_blocks(packed, file):
                 output.write(block)
                 if output.tell() > most:
-                    raise SourceError(file, f"becomes more than {MOST_INFLATION} times as large")
+                    raise SourceError(
+                        file, f"becomes more than {MAX_COMPRESSION_RATIO} times as large"
+                    )
     except (OSError, zstandard.ZstdError) as error:
         raise SourceError(file, f"cannot be decompressed ({error})") from error
 
@@ -327,7 +329,7 @@ def _unpack(file: Path, target: Path) -> None:
 def _unpacked_blocks(packed: IO[bytes], file: Path) -> Iterator[bytes]:
     """Yield blocks of a compressed file; SourceError if its end is missing."""
     frame = None
-    while data := packed.read(_SLACK):
+    while data := packed.read(_BLOCK_BYTES):
         while data:
             frame = frame or zstandard.ZstdDecompressor().decompressobj()
             yield frame.decompress(data)
@@ -341,13 +343,13 @@ def _unpacked_blocks(packed: IO[bytes], file: Path) -> Iterator[bytes]:
 
 def _decompressed(data: bytes, file: Path) -> bytes:
     """Return a message, decompressed if it was compressed by itself."""
-    if not data.startswith(_ZSTD):
+    if not data.startswith(_ZSTD_MAGIC):
         return data
     try:
         size = zstandard.frame_content_size(data)
-        if size > _LONGEST_MESSAGE:
+        if size > _MAX_MESSAGE_BYTES:
             raise SourceError(file, f"has a message of {size} bytes")
-        return zstandard.ZstdDecompressor().decompress(data, max_output_size=_LONGEST_MESSAGE)
+        return zstandard.ZstdDecompressor().decompress(data, max_output_size=_MAX_MESSAGE_BYTES)
     except zstandard.ZstdError as error:
         raise SourceError(file, f"has a message that cannot be decompressed ({error})") from error
 

@@ -16,7 +16,7 @@ from hil.importers.conclusions import CopiedCommands
 from hil.importers.name_words import kinds_said
 from hil.importers.text_table import TextTable
 
-_ALIKE: Final = 0.999  # of the rows
+_MIN_EQUAL_ROWS_SHARE: Final = 0.999  # of the rows
 
 
 def copied_commands(
@@ -48,7 +48,7 @@ def copied_commands(
         values = _numbers(file, group)
         if values is None or values.shape != position.shape:
             continue
-        if np.mean((values == position).all(axis=1)) >= _ALIKE:
+        if np.mean((values == position).all(axis=1)) >= _MIN_EQUAL_ROWS_SHARE:
             measured = [
                 other.pattern
                 for other in others

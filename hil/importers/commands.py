@@ -37,7 +37,8 @@ COMMANDED: Final = re.compile(r"target|cmd|command|desired|_des\b|setpoint|ref(e
 _DEGREES_OF_FREEDOM: Final = "control_msgs/msg/MultiDOFStateStamped"
 _TRAJECTORY: Final = "trajectory_msgs/msg/JointTrajectory"
 _ARRAY: Final = "std_msgs/msg/Float64MultiArray"
-_ALIKE: Final = 1e-3  # rad or m between the commands of two topics that are the same
+# rad or m between the commands of two topics that are the same
+_MAX_COMMAND_DIFFERENCE: Final = 1e-3
 
 
 class CommandStamps(NamedTuple):
@@ -172,7 +173,7 @@ def _only(commands: Sequence[Commands], concluded: Sequence[Conclusion]) -> Comm
     most = max(commands, key=lambda command: np.isfinite(_array(command)).sum())
     for other in commands:
         apart = np.abs(_array(other) - _array(most))
-        if np.nanmax(apart, initial=0.0) > _ALIKE:
+        if np.nanmax(apart, initial=0.0) > _MAX_COMMAND_DIFFERENCE:
             different = DifferentCommands((most.topic, other.topic))
             return Commands(None, concluded=(*concluded, different))
     return most._replace(concluded=(*concluded, *most.concluded))
@@ -204,8 +205,8 @@ def _commands_of(bag: Bag, topic: str, measured: Measured) -> Commands:
     position = measured.position[known]
     wrong = np.sqrt(np.mean((values[known] - position) ** 2, axis=0))
     deviation = position.std(axis=0)
-    if (wrong > np.maximum(deviation, _ALIKE)).any():
-        joint = int(np.argmax(wrong / np.maximum(deviation, _ALIKE)))
+    if (wrong > np.maximum(deviation, _MAX_COMMAND_DIFFERENCE)).any():
+        joint = int(np.argmax(wrong / np.maximum(deviation, _MAX_COMMAND_DIFFERENCE)))
         raise _NotCommandsError(
             f"it does not follow the positions of {measured.joints[joint]} ({wrong[joint]:.3g} rad"
             f" or m apart, which move by {deviation[joint]:.3g})"

@@ -12,7 +12,7 @@ _LOCAL: Final = re.compile(r"(\d{1,2})([./-])(\d{1,2})\2(\d{4}|\d{2})(?=\D|$)[\s
 _TIME_OF_DAY: Final = re.compile(r"\d{1,2}:\d{2}(:\d{2}([.,]\d+)?)?")
 _COMMA: Final = re.compile(r"(:\d{2}),(?=\d)")  # 08:00:01,004
 _MILLISECONDS: Final = re.compile(r"(:\d{2}):(\d{3})(?=\D|$)")  # 08:00:01:004
-_MOST_MONTHS: Final = 12
+_MONTHS_PER_YEAR: Final = 12
 
 
 def nanoseconds_of_dates(texts: Sequence[str]) -> list[int | None]:
@@ -49,8 +49,8 @@ def _in_iso_order(texts: Sequence[str], dates: Sequence[re.Match[str] | None]) -
     matches = [match for match in dates if match]
     firsts = {int(match[1]) for match in matches}
     seconds = {int(match[3]) for match in matches}
-    day_first = matches[0][2] != "/" or max(firsts) > _MOST_MONTHS
-    if matches[0][2] == "/" and max(firsts | seconds) <= _MOST_MONTHS:
+    day_first = matches[0][2] != "/" or max(firsts) > _MONTHS_PER_YEAR
+    if matches[0][2] == "/" and max(firsts | seconds) <= _MONTHS_PER_YEAR:
         day_first = len(firsts) >= len(seconds)  # the day changes at midnight, the month hardly
     ordered = []
     for text, match in zip(texts, dates, strict=True):

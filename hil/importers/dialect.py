@@ -12,7 +12,7 @@ from typing import Final, NamedTuple
 from hil.importers.column_map import Format
 
 # Tried in this order; the last is that of numbers in quotation marks.
-_WRITTEN = (
+_DIALECTS = (
     (",", "."), (";", "."), ("\t", "."), ("|", "."), (None, "."),
     (";", ","), ("\t", ","), ("|", ","), (None, ","), (",", ","),
 )  # fmt: skip
@@ -56,7 +56,7 @@ def dialect_of(lines: Sequence[str], form: Format) -> Dialect:
     marks = [form.decimal] if form.decimal else [".", ","]
     tried = [
         Dialect(delimiter, mark, form.thousands)
-        for delimiter, mark in _WRITTEN
+        for delimiter, mark in _DIALECTS
         if mark in marks and form.delimiter in (None, delimiter)
     ]
     if form.delimiter is not None and not tried:

@@ -20,7 +20,7 @@ Number = int | float
 _SECONDS: Final = ("sec", "secs", "seconds")
 _NANOSECONDS: Final = ("nanosec", "nsec", "nsecs", "nanos")
 _STAMPS: Final = ("stamp", "timestamp", "time")
-_LONGEST: Final = 4096  # numbers in one list
+_MAX_LIST_NUMBERS: Final = 4096  # numbers in one list
 
 
 def trees(
@@ -119,7 +119,7 @@ def numbers_of(
             yield name, value
         elif isinstance(value, dict):
             yield from numbers_of(value, f"{name}.", times=times)
-        elif isinstance(value, list) and 0 < len(value) <= _LONGEST and are_numbers(value):
+        elif isinstance(value, list) and 0 < len(value) <= _MAX_LIST_NUMBERS and are_numbers(value):
             if len(labels) == len(value):
                 yield from ((f"{name}/{label}", x) for label, x in zip(labels, value, strict=True))
             else:

@@ -16,18 +16,18 @@ from numpy.typing import NDArray
 
 from hil.base.arrays import Array
 
-LONGEST: Final = 480_000
+MAX_EXCERPT_ROWS: Final = 480_000
 """Rows that are read of one recording."""
-DURATION: Final = 800.0
+MAX_EXCERPT_SECONDS: Final = 800.0
 """Time that is used of one recording [s]: memory follows blocks of time."""
-_PAUSE: Final = 10**9  # ns
-STRETCH: Final = 8_192
+_PAUSE_NS: Final = 10**9  # ns
+STRETCH_ROWS: Final = 8_192
 """Rows that are read together."""
-PROBED: Final = 64
+PROBE_STRIDE: Final = 64
 """One row of so many shows whether anything moves in a stretch."""
-_STILL: Final = 0.25  # of the activity of lively stretches
-_LIVELY: Final = 0.9  # quantile of the stretches
-_GOLDEN: Final = 0.5 * (5.0**0.5 - 1.0)
+_MIN_ACTIVITY_SHARE: Final = 0.25  # of the activity of lively stretches
+_LIVELY_QUANTILE: Final = 0.9  # quantile of the stretches
+_GOLDEN_RATIO: Final = 0.5 * (5.0**0.5 - 1.0)
 
 
 def activity(probes: Sequence[Array]) -> Array:
@@ -56,12 +56,12 @@ def chosen_stretches(moved: Array, most: int) -> NDArray[np.intp]:
         most: stretches that are read.
     """
     known = moved[np.isfinite(moved)]
-    least = _STILL * float(np.quantile(known, _LIVELY)) if known.size else 0.0
+    least = _MIN_ACTIVITY_SHARE * float(np.quantile(known, _LIVELY_QUANTILE)) if known.size else 0.0
     moving = np.flatnonzero(~(moved < least))
     if len(moving) <= most:
         return moving
     edges = np.arange(most + 1) * len(moving) / most
-    within = (np.arange(most) * _GOLDEN) % 1.0
+    within = (np.arange(most) * _GOLDEN_RATIO) % 1.0
     return np.asarray(moving[(edges[:-1] + within * np.diff(edges)).astype(np.intp)])
 
 
@@ -71,22 +71,22 @@ def excerpt_of(stamp: NDArray[np.int64], position: Array, longest: int) -> Stret
     Args:
         stamp: (m,) [ns].
         position: (m, n), any unit.
-        longest: rows of a fast recording; of others `DURATION`.
+        longest: rows of a fast recording; of others `MAX_EXCERPT_SECONDS`.
     """
     steps = np.diff(stamp)
     usual = float(np.median(steps)) if steps.size else 0.0
     rate = 1e9 / usual if usual > 0.0 else np.inf
-    most = int(min(longest, DURATION * rate))
+    most = int(min(longest, MAX_EXCERPT_SECONDS * rate))
     if len(stamp) <= most:
         return None
-    parts = [0, *(np.flatnonzero(steps > _PAUSE) + 1).tolist(), len(stamp)]
+    parts = [0, *(np.flatnonzero(steps > _PAUSE_NS) + 1).tolist(), len(stamp)]
     stretches = [
-        slice(start, min(start + STRETCH, b))
+        slice(start, min(start + STRETCH_ROWS, b))
         for a, b in pairwise(parts)
-        for start in range(a, b, STRETCH)
+        for start in range(a, b, STRETCH_ROWS)
     ]
-    moved = activity([position[stretch][::PROBED] for stretch in stretches])
-    chosen = chosen_stretches(moved, most // STRETCH)
+    moved = activity([position[stretch][::PROBE_STRIDE] for stretch in stretches])
+    chosen = chosen_stretches(moved, most // STRETCH_ROWS)
     rows = np.concatenate([np.arange(len(stamp))[stretches[k]] for k in chosen])
     return Stretches(rows, len(chosen))
 

@@ -24,9 +24,9 @@ from hil.importers.document_messages import (
 from hil.importers.ros_messages import MessageError
 
 SUFFIXES: Final = (".json", ".jsonl", ".ndjson")
-_LONGEST: Final = 1 << 30  # bytes
+_MAX_BYTES: Final = 1 << 30  # bytes
 _NAMELESS: Final = "array"
-_LARGEST_INTEGER: Final = 2**63
+_INT64_LIMIT: Final = 2**63
 
 
 class JsonSamples(NamedTuple):
@@ -43,7 +43,7 @@ def read_json(path: Path) -> JsonSamples:
         OSError: it cannot be read.
         ValueError: it is not JSON, or its samples have no constant shape.
     """
-    text = read_text(path, _LONGEST, or_latin=True).strip("\0 \t\r\n")
+    text = read_text(path, _MAX_BYTES, or_latin=True).strip("\0 \t\r\n")
     try:
         document = parse_json(text)
     except ValueError as error:
@@ -155,5 +155,5 @@ def _array(values: Sequence[Any]) -> NDArray[Any] | None:
 def _typed(values: Sequence[Number | Sequence[Number]]) -> NDArray[Any]:
     """Return whole numbers as such, as a stamp in nanoseconds has too many digits for a double."""
     flat = values if not isinstance(values[0], list) else [x for row in values for x in row]  # type: ignore[union-attr]
-    is_whole = all(isinstance(x, int) and abs(x) < _LARGEST_INTEGER for x in flat)
+    is_whole = all(isinstance(x, int) and abs(x) < _INT64_LIMIT for x in flat)
     return np.array(values, np.int64 if is_whole else np.float64)

@@ -40,10 +40,11 @@ ACTION: Final = "action"
 _TIME: Final = "timestamp"
 _EPISODE: Final = "episode_index"
 _GRIPPER: Final = ("gripper", "jaw")
-_FULL: Final = 100.0
-_ROUNDED: Final = 0.5  # beyond 100 that is still a rounded value of the range
-_STEPS: Final = 4095  # of a turn, as LeRobot converts steps of a servo to degrees
-_BEYOND: Final = math.radians(10.0)  # outside the URDF's limits that no calibration explains
+_FULL_RANGE: Final = 100.0
+_RANGE_ROUNDING: Final = 0.5  # beyond 100 that is still a rounded value of the range
+_STEPS_PER_TURN: Final = 4095  # of a turn, as LeRobot converts steps of a servo to degrees
+# outside the URDF's limits that no calibration explains
+_MAX_LIMIT_EXCESS: Final = math.radians(10.0)
 _SUFFIXES: Final = re.compile(r"\.(?:pos|position|angle)\Z|_(?:pos|position|joint)\Z")
 _PREFIXES: Final = re.compile(r"\A(?:main|follower|robot)_")
 
@@ -137,11 +138,11 @@ class DataSet:
                 _require_like(calibration, name, ranges[j], span)
                 span = ranges[j]
             if _is_gripper(name):  # closed is the lower end
-                scale[j] = span / _FULL
+                scale[j] = span / _FULL_RANGE
                 offset[j] = limits.lower[j] / scale[j]
             elif units.unit == "range":
                 middle = 0.0 if ranges is not None else 0.5 * (limits.lower[j] + limits.upper[j])
-                scale[j] = 0.5 * span / _FULL
+                scale[j] = 0.5 * span / _FULL_RANGE
                 offset[j] = middle / scale[j]
         if not (np.isfinite(scale).all() and np.isfinite(offset).all()):
             j = int(np.argmin(np.isfinite(scale) & np.isfinite(offset)))
@@ -177,11 +178,11 @@ class DataSet:
             return EpisodeUnits(stated, UnitsFrom.OPTION)
         arm = np.array([not _is_gripper(name) for name in self.joints], np.bool_)
         largest = float(np.max(self.largest, where=arm, initial=0.0))
-        if largest > _FULL + _ROUNDED:
+        if largest > _FULL_RANGE + _RANGE_ROUNDING:
             return EpisodeUnits("deg", UnitsFrom.BEYOND_RANGE)
         if ranges is not None:
             return EpisodeUnits("range", UnitsFrom.CALIBRATION)
-        reach = np.maximum(np.abs(lower), np.abs(upper)) + _BEYOND
+        reach = np.maximum(np.abs(lower), np.abs(upper)) + _MAX_LIMIT_EXCESS
         if (arm & (np.radians(self.largest) > reach)).any():
             return EpisodeUnits("range", UnitsFrom.BEYOND_LIMITS)
         problem = "its joints may be in degrees, or -100 to 100 of their calibrated range"
@@ -290,7 +291,7 @@ def _calibrated(path: Path, joints: Sequence[str]) -> Array:
         joint = joints[int(np.argmin(spans))]
         remedy = "calibrate the arm again, or give another file"
         raise SourceError(path, "has an empty range", field=f"{joint}.range_max", remedy=remedy)
-    return np.asarray(2.0 * np.pi / _STEPS * np.array(spans))
+    return np.asarray(2.0 * np.pi / _STEPS_PER_TURN * np.array(spans))
 
 
 def _require_like(path: Path, joint: str, calibrated: float, described: float) -> None:

@@ -16,7 +16,7 @@ from hil.base.errors import SourceError
 from hil.importers.column_map import HOLE
 
 _CELL: Final = re.compile(r"""(?:^|[,;\t|])\s*"?[\[(]\s*[-+.\d][^\])"]*[\])]"?\s*(?=[,;\t|\n]|$)""")
-_PROBED: Final = 1 << 16  # characters, in which the second line of a table of lists ends
+_PROBE_CHARACTERS: Final = 1 << 16  # characters, in which the second line of a table of lists ends
 _LIST: Final = re.compile(r"[\[(]\s*(.*?)\s*,?\s*[\])]", re.DOTALL)
 _BETWEEN: Final = re.compile(r"\s*,\s*|\s+")
 _DELIMITERS: Final = ",;\t|"
@@ -31,7 +31,7 @@ def spread_lists(path: Path, text: str, *, drop: bool) -> str:
     Raises:
         SourceError: a list has another length.
     """
-    head, _, below = text[:_PROBED].partition("\n")
+    head, _, below = text[:_PROBE_CHARACTERS].partition("\n")
     if not _CELL.search(below):
         return text
     delimiter = next((mark for mark in _DELIMITERS if mark in head), ",")

@@ -52,7 +52,7 @@ from hil.importers.servo_numbers import (
     signed,
 )
 from hil.importers.stamps import (
-    YEAR,
+    YEAR_NS,
     concluded_unit,
     is_row_counter,
     sorted_neighbours,
@@ -63,10 +63,10 @@ from hil.importers.stated_units import other_unit
 from hil.importers.text_table import TextTable
 from hil.importers.units import RATED, TIMES, UNITS, factor_of, kind_named, unit_of
 
-_MORE: Final = 64  # columns or files beyond the joints that are tried
+_EXTRA_COLUMNS: Final = 64  # columns or files beyond the joints that are tried
 _ALIKE: Final = 1.5  # factor between the travels of a joint and of its command
-_LATEST: Final = 2**31 * 10**9  # ns, largest stamp of an archive
-_FARTHEST: Final = 2**62  # ns between two times, 146 years
+_MAX_STAMP_NS: Final = 2**31 * 10**9  # ns, largest stamp of an archive
+_MAX_SPAN_NS: Final = 2**62  # ns between two times, 146 years
 
 
 def import_log(
@@ -450,7 +450,7 @@ class _Log:
     ) -> _Clock:
         """Return times [ns] as stamps that an archive can hold, wraps continued."""
         zeros = next((row for row, time in enumerate(times) if time), 0)
-        if zeros and abs(times[zeros] or 0) > YEAR:
+        if zeros and abs(times[zeros] or 0) > YEAR_NS:
             self.concluded.append(LeftOut(Omitted.ZERO_TIMES, zeros))
             valid = valid & (np.arange(len(times)) >= zeros)
         base = times[int(np.argmax(valid))] or 0
@@ -459,7 +459,7 @@ class _Log:
             time - base if time is not None and row else 0
             for time, row in zip(times, valid, strict=True)
         ]
-        if max(map(abs, shifted)) >= _FARTHEST:
+        if max(map(abs, shifted)) >= _MAX_SPAN_NS:
             self._raise_span(max(map(abs, shifted)), path)
         stamp = np.array(shifted, np.int64)
         continued = without_wraps(stamp[valid])
@@ -467,8 +467,8 @@ class _Log:
             self.concluded.append(continued.wrapped)
         low = base + int(continued.stamp.min())
         high = base + int(continued.stamp.max())
-        origin = 0 if low >= 0 and high < _LATEST else low
-        if high - origin >= _LATEST:
+        origin = 0 if low >= 0 and high < _MAX_STAMP_NS else low
+        if high - origin >= _MAX_STAMP_NS:
             self._raise_span(high - low, path)
         stamp[valid] = continued.stamp + (base - origin)
         return _Clock(stamp, valid, origin, path)
@@ -675,7 +675,7 @@ class _Log:
         self, names: str | Sequence[str], field: str
     ) -> list[TextTable | ArrayFile]:
         if isinstance(names, str):
-            numbers = range(len(self.joints) + _MORE)
+            numbers = range(len(self.joints) + _EXTRA_COLUMNS)
             possible = [names.replace("{}", str(number)) for number in [*numbers, *self.joints]]
             file_names = [name for name in possible if (self._folder / name).is_file()]
             names = self._numbered(names, file_names, "files", field, file_names.__contains__)
@@ -695,7 +695,7 @@ class _Log:
         if all(map(has, by_joint)):
             return by_joint
         count = len(self.joints)
-        names = [pattern.replace("{}", str(number)) for number in range(count + _MORE)]
+        names = [pattern.replace("{}", str(number)) for number in range(count + _EXTRA_COLUMNS)]
         first = 0 if has(names[0]) and not has(names[count]) else 1
         chosen = names[first : first + count]
         missing = [name for name in chosen if not has(name)]

@@ -25,12 +25,12 @@ from hil.importers.spreadsheet import is_spreadsheet, text_of_sheet
 COMMENTS: Final = ("#", "%", "//")
 """Starts of lines that are no rows."""
 _ROSTOPIC = "%time,"  # of `rostopic echo -p`
-_LONGEST: Final = 1 << 31  # bytes; several times as many in memory
+_MAX_BYTES: Final = 1 << 31  # bytes; several times as many in memory
 # Cells in apostrophes, or as spreadsheets protect text: ="0.5".
 _OTHER_QUOTES: Final = re.compile(r"""(?<![^\s,;|])(?:'([^'"\n]*)'|="([^"\n]*)")(?![^\s,;|])""")
-_LONGEST_MARK: Final = 100  # bytes that are read for a mark
+_MARK_BYTES: Final = 100  # bytes that are read for a mark
 _OF_PANDAS: Final = "save its table with pandas: {}(FILE).to_parquet('log.parquet')"
-_BINARY: Final = {
+_BINARY_MAGICS: Final = {
     b"PK\x03\x04": (
         "a zip file",
         "unpack it: unzip FILE; if it is a spreadsheet, it is cut off: copy it again",
@@ -75,11 +75,11 @@ def _not_a_table(path: Path, text: str) -> SourceError:
 def _head_of(path: Path) -> bytes:
     """Return the first bytes of a file, without its compression by gzip."""
     with open_file(path) as stream:
-        start = stream.read(_LONGEST_MARK)
+        start = stream.read(_MARK_BYTES)
         if not start.startswith(GZIP):
             return start
     try:
-        return zlib.decompressobj(wbits=31).decompress(start, _LONGEST_MARK)
+        return zlib.decompressobj(wbits=31).decompress(start, _MARK_BYTES)
     except zlib.error as error:
         problem = f"its compressed bytes are cut off or damaged: {error}"
         raise CompressionError(errno.EIO, problem, str(path)) from error
@@ -87,7 +87,7 @@ def _head_of(path: Path) -> bytes:
 
 def _refuse_binary(path: Path, start: bytes) -> None:
     """Raise SourceError for a file of a format that is no text, whatever its suffix."""
-    for mark, (kind, remedy) in _BINARY.items():
+    for mark, (kind, remedy) in _BINARY_MAGICS.items():
         if start.startswith(mark):
             remedy = remedy.replace("FILE", typed(path.name))
             raise SourceError(path, f"is {kind}, not text", remedy=remedy)
@@ -100,7 +100,7 @@ def is_readable_text(path: Path) -> bool:
         OSError: it cannot be read.
     """
     start = _head_of(path)
-    return not (is_spreadsheet(path, start) or any(map(start.startswith, _BINARY)))
+    return not (is_spreadsheet(path, start) or any(map(start.startswith, _BINARY_MAGICS)))
 
 
 def text_of(path: Path, form: Format) -> str:
@@ -114,7 +114,7 @@ def text_of(path: Path, form: Format) -> str:
         if is_spreadsheet(path, start):
             return text_of_sheet(path, form)
         _refuse_binary(path, start)
-        text = read_text(path, _LONGEST, encoding=form.encoding, or_latin=True)
+        text = read_text(path, _MAX_BYTES, encoding=form.encoding, or_latin=True)
     except SourceError:
         raise
     except (OSError, ValueError, LookupError, zipfile.BadZipFile) as error:

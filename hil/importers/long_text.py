@@ -19,14 +19,15 @@ from hil.base.safe_input import GZIP, encoding_by_start, open_file
 from hil.importers.column_map import Format
 from hil.importers.conclusions import Excerpt
 from hil.importers.dialect import Dialect, dialect_of, number_of
-from hil.importers.excerpt import PROBED, STRETCH, activity, chosen_stretches
+from hil.importers.excerpt import PROBE_STRIDE, STRETCH_ROWS, activity, chosen_stretches
 from hil.importers.log_text import COMMENTS, is_readable_text
 
-_START: Final = 1 << 16  # bytes that show encoding and length of lines
-_SHORTEST: Final = 0.5  # of the usual length, a line in a count by the size of the file
-_COMPRESSED: Final = 4  # bytes, a line of a log that is compressed
+_PROBE_BYTES: Final = 1 << 16  # bytes that show encoding and length of lines
+# of the usual length, a line in a count by the size of the file
+_MIN_LINE_LENGTH_SHARE: Final = 0.5
+_COMPRESSED_LINE_BYTES: Final = 4  # bytes, a line of a log that is compressed
 _DIALECT_LINES: Final = 100
-_MOST_TEXT: Final = 1 << 26  # characters that are read; lines of many columns are fewer
+_MAX_CHARACTERS: Final = 1 << 26  # characters that are read; lines of many columns are fewer
 
 
 class LongText(NamedTuple):
@@ -60,32 +61,34 @@ def _excerpt(path: Path, form: Format, longest: int) -> LongText | None:
         total += len(lines)
         size += sum(map(len, lines))
         dialect = dialect or _dialect(lines, form)
-        probes.append(_probe(lines[len(lines) % PROBED :: PROBED] or lines[-1:], dialect))
+        probes.append(
+            _probe(lines[len(lines) % PROBE_STRIDE :: PROBE_STRIDE] or lines[-1:], dialect)
+        )
     if total <= longest or dialect is None:
         return None
     moved = activity(_of_one_width(probes))
-    most = int(min(longest, _MOST_TEXT * total / size) / STRETCH)
+    most = int(min(longest, _MAX_CHARACTERS * total / size) / STRETCH_ROWS)
     chosen = {0, *chosen_stretches(moved[1:], max(1, most - 1)) + 1}
     numbers: list[int] = []
     read: list[str] = []
     for index, lines in enumerate(_stretches(path, form)):
         if index in chosen:
-            numbers += range(index * STRETCH + 1, index * STRETCH + 1 + len(lines))
+            numbers += range(index * STRETCH_ROWS + 1, index * STRETCH_ROWS + 1 + len(lines))
             read += lines
     follow = next(k for k in range(len(chosen) + 1) if k not in chosen)
     excerpt = Excerpt(len(read), total, len(chosen))
-    return LongText(numbers, "\n".join(read) + "\n", follow * STRETCH, excerpt)
+    return LongText(numbers, "\n".join(read) + "\n", follow * STRETCH_ROWS, excerpt)
 
 
 def _may_be_longer(path: Path, longest: int) -> bool:
     """Return whether a file may have more lines, by its size and the length of its first ones."""
     with open_file(path) as stream:
-        start = stream.read(_START)
+        start = stream.read(_PROBE_BYTES)
         size = os.fstat(stream.fileno()).st_size
     if start.startswith(GZIP):
-        return size > longest * _COMPRESSED
+        return size > longest * _COMPRESSED_LINE_BYTES
     lines = start.count(b"\n") or start.count(b"\r")
-    return lines > 0 and size > longest * _SHORTEST * len(start) / lines
+    return lines > 0 and size > longest * _MIN_LINE_LENGTH_SHARE * len(start) / lines
 
 
 @contextmanager
@@ -93,7 +96,7 @@ def _opened(path: Path, form: Format) -> Iterator[io.TextIOWrapper]:
     with open_file(path) as stream:
         is_packed = stream.peek(len(GZIP)).startswith(GZIP)
         content = gzip.GzipFile(fileobj=stream) if is_packed else stream
-        encoding = form.encoding or encoding_by_start(content.read(_START))
+        encoding = form.encoding or encoding_by_start(content.read(_PROBE_BYTES))
         content.seek(0)
         with io.TextIOWrapper(content, encoding, errors="replace") as text:
             yield text
@@ -102,7 +105,7 @@ def _opened(path: Path, form: Format) -> Iterator[io.TextIOWrapper]:
 def _stretches(path: Path, form: Format) -> Iterator[list[str]]:
     """Yield the lines of a file, without their ends, in stretches of equal number."""
     with _opened(path, form) as stream:
-        while lines := [line.rstrip("\n") for line in islice(stream, STRETCH)]:
+        while lines := [line.rstrip("\n") for line in islice(stream, STRETCH_ROWS)]:
             yield lines
 
 

@@ -24,15 +24,16 @@ from planner.worker import WorkerProcess
 P = ParamSpec("P")
 T = TypeVar("T")
 
-NUMBERS: Final = "fiubmM"
+NUMERIC_DTYPE_KINDS: Final = "fiubmM"
 """Kinds of numpy's types that hold real numbers or times."""
 _ASSIGNED: Final = re.compile(r"\b([A-Za-z]\w*)\s*=\s*\[([^\[\]]*)\]")
 _COMMENT: Final = re.compile(r"[%#].*")
-_MEMORY: Final = 8 * 2**30  # bytes of the process that reads a .mat: the largest array and its copy
+# bytes of the process that reads a .mat: the largest array and its copy
+_MAX_MEMORY_BYTES: Final = 8 * 2**30
 _TIMEOUT: Final = 120.0  # s
-_HDF5: Final = b"\x89HDF\r\n\x1a\n"
-_HDF5_AT: Final = 512  # behind MATLAB's own header
-_CHUNK: Final = 1 << 16
+_HDF5_MAGIC: Final = b"\x89HDF\r\n\x1a\n"
+_HDF5_OFFSET: Final = 512  # behind MATLAB's own header
+_CHUNK_BYTES: Final = 1 << 16
 
 
 def mat_shapes(path: Path) -> dict[str, tuple[int, ...]]:
@@ -47,10 +48,10 @@ def mat_shapes(path: Path) -> dict[str, tuple[int, ...]]:
 def lost_bytes(path: Path) -> int:
     """Return how many zeros follow the signature of HDF5 in a .mat; 0 where anything else does."""
     with path.open("rb") as file:
-        if not file.read(_HDF5_AT + len(_HDF5)).endswith(_HDF5):
+        if not file.read(_HDF5_OFFSET + len(_HDF5_MAGIC)).endswith(_HDF5_MAGIC):
             return 0
         size = 0
-        while chunk := file.read(_CHUNK):
+        while chunk := file.read(_CHUNK_BYTES):
             if any(chunk):
                 return 0
             size += len(chunk)
@@ -121,7 +122,7 @@ def _numbers_in(value: object, place: str) -> Iterator[tuple[str, NDArray[Any]]]
     those are found as ``s(2).q`` as well as ``s.q(2)``.
     """
     if isinstance(value, np.ndarray):
-        if value.dtype.kind in NUMBERS:
+        if value.dtype.kind in NUMERIC_DTYPE_KINDS:
             yield place, np.squeeze(value)
     elif isinstance(value, dict):
         lengths = {len(field) if isinstance(field, list) else -1 for field in value.values()}
@@ -151,7 +152,7 @@ def _in_child(function: Callable[P, T], *args: P.args, **kwargs: P.kwargs) -> T:
 
 def _within_memory(read: Callable[[], T]) -> T:
     """Read with limited memory: sizes in a file are not trusted."""
-    resource.setrlimit(resource.RLIMIT_AS, (_MEMORY, _MEMORY))
+    resource.setrlimit(resource.RLIMIT_AS, (_MAX_MEMORY_BYTES, _MAX_MEMORY_BYTES))
     return read()
 
 

@@ -19,11 +19,11 @@ from hil.archive.container import Damage
 from hil.base.errors import SourceError
 from hil.base.safe_input import open_file
 
-LARGEST_CHUNK: Final = 1 << 28
+MAX_FOREIGN_CHUNK_BYTES: Final = 1 << 28
 """Bytes of records in one chunk; usually one to sixteen million."""
-MOST_BYTES: Final = 4 << 30
+MAX_TOTAL_BYTES: Final = 4 << 30
 """Bytes of messages that are read, all topics together."""
-_LATEST: Final = 2**63 - 1  # ns; later ones are wrong, and no signed number
+_MAX_STAMP_NS: Final = 2**63 - 1  # ns; later ones are wrong, and no signed number
 
 
 @dataclass(frozen=True)
@@ -76,10 +76,12 @@ def read(
             elif isinstance(record, Message):
                 name = names[record.channel_id]
                 if wanted(name, topics[name]):
-                    messages.append((name, min(record.log_time, _LATEST), record.data))
+                    messages.append((name, min(record.log_time, _MAX_STAMP_NS), record.data))
                     size += len(record.data)
-            if size > MOST_BYTES:
-                problem = f"has more than {MOST_BYTES} bytes of numbers: too large for one reading"
+            if size > MAX_TOTAL_BYTES:
+                problem = (
+                    f"has more than {MAX_TOTAL_BYTES} bytes of numbers: too large for one reading"
+                )
                 remedy = "cut it, or leave out topics (`mcap filter`)"
                 raise SourceError(path, problem, remedy=remedy)
     return topics, sorted(messages, key=lambda message: message[1])
@@ -91,11 +93,11 @@ def _records(stream: BinaryIO) -> Iterator[McapRecord]:
     Chunks are decompressed in limited memory, which the library does not do.
     """
     reader = StreamReader(
-        stream, emit_chunks=True, validate_crcs=True, record_size_limit=LARGEST_CHUNK
+        stream, emit_chunks=True, validate_crcs=True, record_size_limit=MAX_FOREIGN_CHUNK_BYTES
     )
     for record in reader.records:
         if isinstance(record, Chunk):
-            data = container.decompress(record, stream.tell(), largest=LARGEST_CHUNK)
+            data = container.decompress(record, stream.tell(), largest=MAX_FOREIGN_CHUNK_BYTES)
             yield from breakup_chunk(replace(record, compression="", data=data), validate_crc=True)
         else:
             yield record

@@ -43,25 +43,25 @@ from hil.importers.conclusions import (
     ZeroTorque,
 )
 from hil.importers.messages import problem_of, remedy_of
-from hil.importers.publishers import APART, alternating_samples
-from hil.importers.stamps import FASTEST, SLOWEST
+from hil.importers.publishers import MIN_SAMPLE_DISTANCE, alternating_samples
+from hil.importers.stamps import MAX_SAMPLING_RATE, MIN_SAMPLING_RATE
 from identification.model.motion import Motion
 from identification.model.urdf_text import urdf_tree
 from identification.signals.clock import time_base
-from identification.signals.recording import STUCK_MOVEMENT, unwrap
+from identification.signals.recording import MIN_MOVEMENT, unwrap
 
-_TOLERANCE: Final = 0.05  # rad or m beyond a limit, for calibration and overshoot
-_LEAST_TRAVEL: Final = 0.1  # rad or m
+_LIMIT_TOLERANCE: Final = 0.05  # rad or m beyond a limit, for calibration and overshoot
+_MIN_TRAVEL: Final = 0.1  # rad or m
 _SCALE_TOLERANCE: Final = 0.1  # of velocity over slope of the position, for filters
-_CORRELATED: Final = 0.7
-_TOO_FAST: Final = 3.0  # times the URDF's limit, of speed and of torque
-_OTHER_UNIT: Final = 30.0  # between the errors of a nominal torque and a factor of 1000
+_MIN_CORRELATION: Final = 0.7
+_MAX_LIMIT_RATIO: Final = 3.0  # times the URDF's limit, of speed and of torque
+_OTHER_UNIT_RATIO: Final = 30.0  # between the errors of a nominal torque and a factor of 1000
 _THOUSAND: Final = 1000.0
-_BLOCK: Final = 0.05  # s, over which signals are averaged before they are differentiated
-_MOST_BLOCKS: Final = 2000
-_STANDS: Final = 0.1  # of the samples, at the end: a joint that stands for good
-_FEWEST_BLOCKS: Final = 8  # in which a speed shows
-_SIGNIFICANT: Final = 0.01  # of the largest nominal torque
+_BLOCK_SECONDS: Final = 0.05  # s, over which signals are averaged before they are differentiated
+_MAX_BLOCKS: Final = 2000
+_MIN_FINAL_REST_SHARE: Final = 0.1  # of the samples, at the end: a joint that stands for good
+_MIN_BLOCKS: Final = 8  # in which a speed shows
+_MIN_TORQUE_SHARE: Final = 0.01  # of the largest nominal torque
 
 NominalTorque = Callable[[Motion], Array]
 """Torque (m, n) of the nominal inertias along a motion."""
@@ -96,7 +96,7 @@ def examine(
     base = time_base(time)
     ranges = map(_range, joint_names, position.T, turning, limits.lower, limits.upper)
     warnings: list[Conclusion] = []
-    if not SLOWEST <= base.rate <= FASTEST:
+    if not MIN_SAMPLING_RATE <= base.rate <= MAX_SAMPLING_RATE:
         warnings += [UnusualRate(base.rate)]
     several = _of_one_stamp(time, position) or alternating_samples(position)
     warnings += [several] if several else []
@@ -115,7 +115,7 @@ def examine(
 def _constant(position: Array, names: Sequence[str], held: Collection[str]) -> Iterator[Conclusion]:
     """Yield a warning if joints have one reading throughout while others move."""
     ranges = np.ptp(position, axis=0)
-    if np.all(ranges <= STUCK_MOVEMENT):
+    if np.all(ranges <= MIN_MOVEMENT):
         return
     constant = [name for name, size in zip(names, ranges, strict=True) if size == 0.0]
     constant = [name for name in constant if name not in held]
@@ -132,11 +132,11 @@ def _stopped(
     for name, places, commands in zip(names, position.T, commanded.T, strict=True):
         changes = np.flatnonzero(np.diff(places))
         first = int(changes[-1]) + 1 if len(changes) else len(places)
-        if len(places) - first < _STANDS * len(places):
+        if len(places) - first < _MIN_FINAL_REST_SHARE * len(places):
             continue
         known = commands[first:][np.isfinite(commands[first:])]
         travel = float(np.ptp(known)) if len(known) else 0.0
-        if travel > STUCK_MOVEMENT:
+        if travel > MIN_MOVEMENT:
             yield StoppedJoint(name, float(time[first]), travel)
 
 
@@ -154,8 +154,8 @@ def _range(name: str, position: Array, turns: bool, lower: float, upper: float) 
 
 def _fits(position: Array, limits: UrdfLimits) -> NDArray[np.bool_]:
     """Return whether each column of positions fits the limits of each joint (joints, columns)."""
-    above = limits.lower[:, None] - _TOLERANCE <= position.min(axis=0)
-    return np.asarray(above & (position.max(axis=0) <= limits.upper[:, None] + _TOLERANCE))
+    above = limits.lower[:, None] - _LIMIT_TOLERANCE <= position.min(axis=0)
+    return np.asarray(above & (position.max(axis=0) <= limits.upper[:, None] + _LIMIT_TOLERANCE))
 
 
 def limit_excess(low: Array, high: Array, limits: UrdfLimits) -> Array:
@@ -178,7 +178,7 @@ def whole_turns(
     counts = np.array(sorted(range(-most, most + 1), key=abs))
     turns = 2.0 * np.pi * counts[:, None] * turning
     excess = limit_excess(low + turns, high + turns, limits)
-    nearest = np.maximum(excess - _TOLERANCE, 0.0).argmin(axis=0)
+    nearest = np.maximum(excess - _LIMIT_TOLERANCE, 0.0).argmin(axis=0)
     return np.asarray(turns[nearest, np.arange(len(low))])
 
 
@@ -188,15 +188,15 @@ def in_turns(position: Array, limits: UrdfLimits, turning: NDArray[np.bool_]) ->
     Angles of 0 to 360 degrees and of +-180 are two conventions of one posture; others keep their
     turn, and so does a joint that none brings within its limits.
     """
-    low = position.min(axis=0) + _TOLERANCE
-    high = position.max(axis=0) - _TOLERANCE
+    low = position.min(axis=0) + _LIMIT_TOLERANCE
+    high = position.max(axis=0) - _LIMIT_TOLERANCE
     usual = ((low > 0.0) & (high < 2.0 * np.pi)) | ((low > -np.pi) & (high < np.pi))
     continued = position.copy()
     continued[:, turning] = unwrap(position[:, turning])
     low = continued.min(axis=0)
     high = continued.max(axis=0)
     turns = whole_turns(low, high, limits, turning, 1)
-    fits = limit_excess(low + turns, high + turns, limits) <= _TOLERANCE
+    fits = limit_excess(low + turns, high + turns, limits) <= _LIMIT_TOLERANCE
     return np.where(fits & usual, continued + turns, continued)
 
 
@@ -214,7 +214,9 @@ def _outside(
     low = position.min(axis=0)
     high = position.max(axis=0)
     ranges = {names[j]: (float(low[j]), float(high[j])) for j in beyond}
-    outside = (position < limits.lower - _TOLERANCE) | (position > limits.upper + _TOLERANCE)
+    outside = (position < limits.lower - _LIMIT_TOLERANCE) | (
+        position > limits.upper + _LIMIT_TOLERANCE
+    )
     fraction = float(outside.any(axis=1).mean())
     farthest = 3.0 * np.maximum(-limits.lower, limits.upper)
     far = (np.maximum(-low, high) > farthest)[beyond].any()
@@ -269,19 +271,21 @@ def are_degrees(position: Array, converted: Array, names: Sequence[str], urdf: s
     if not finite or not (far & beyond).any():
         return False
     fits = np.diag(_fits(in_turns(converted, limits, turning), limits))
-    moves = np.ptp(converted, axis=0).max() >= _LEAST_TRAVEL
+    moves = np.ptp(converted, axis=0).max() >= _MIN_TRAVEL
     return bool(fits.all() and moves)
 
 
 def has_degrees_per_second(time: Array, position: Array, velocity: Array) -> bool:
     """Return whether velocities (m, n) are the slopes of positions [rad] in degrees per second."""
-    moving = np.ptp(position, axis=0) >= _LEAST_TRAVEL
+    moving = np.ptp(position, axis=0) >= _MIN_TRAVEL
     if not moving.any():
         return False
     factor, correlation = against_position(time, position[:, moving], velocity[:, moving])
     per_degree = math.radians(1.0) * factor
     itself = np.diag(correlation)
-    return bool((itself >= _CORRELATED).all() and (abs(per_degree - 1.0) < _SCALE_TOLERANCE).all())
+    return bool(
+        (itself >= _MIN_CORRELATION).all() and (abs(per_degree - 1.0) < _SCALE_TOLERANCE).all()
+    )
 
 
 def command_size(position: Array, commanded: Array) -> float | None:
@@ -318,11 +322,11 @@ def _positions(
     low = position.min(axis=0)
     high = position.max(axis=0)
     travel = float((high - low).max())
-    if travel < _LEAST_TRAVEL:
+    if travel < _MIN_TRAVEL:
         yield LittleMotion(travel)
     # Longer steps, in which noise and late stamps are negligible.
-    block = min(_BLOCK * len(time) / float(time[-1] - time[0]), len(time) / _FEWEST_BLOCKS)
-    stride = max(1, len(time) // _MOST_BLOCKS, round(block))
+    block = min(_BLOCK_SECONDS * len(time) / float(time[-1] - time[0]), len(time) / _MIN_BLOCKS)
+    stride = max(1, len(time) // _MAX_BLOCKS, round(block))
     steps = np.diff(time[::stride])[:, None]
     whole = steps[:, 0] > 0.5 * np.median(steps)
     moved = np.abs(np.diff(position[::stride], axis=0))[whole]
@@ -330,7 +334,7 @@ def _positions(
         return
     usual = np.quantile(moved / steps[whole], 0.9, axis=0)
     for name, speed, limit in zip(names, usual, limits.velocity, strict=True):
-        if speed > _TOO_FAST * limit:
+        if speed > _MAX_LIMIT_RATIO * limit:
             yield FastJoint(name, float(speed), float(limit))
 
 
@@ -340,7 +344,7 @@ def _of_one_stamp(time: Array, position: Array) -> SameStamp | None:
     highest = np.maximum.reduceat(position, starts)
     lowest = np.minimum.reduceat(position, starts)
     apart = (highest - lowest).max(axis=1)
-    count = np.count_nonzero(apart > APART)
+    count = np.count_nonzero(apart > MIN_SAMPLE_DISTANCE)
     return SameStamp(float(apart.max()), int(count)) if count else None
 
 
@@ -348,15 +352,15 @@ def _velocities(
     time: Array, position: Array, velocity: Array, names: Sequence[str]
 ) -> Iterator[Conclusion]:
     """Yield warnings where velocities are not the slopes of the positions."""
-    moving = [joint for joint in range(len(names)) if np.ptp(position[:, joint]) >= _LEAST_TRAVEL]
+    moving = [joint for joint in range(len(names)) if np.ptp(position[:, joint]) >= _MIN_TRAVEL]
     if not moving:
         return
     factor, correlation = against_position(time, position[:, moving], velocity[:, moving])
     itself = np.diag(correlation)
-    if itself.min() < _CORRELATED:
+    if itself.min() < _MIN_CORRELATION:
         columns = scipy.optimize.linear_sum_assignment(-correlation)[1]
         best = correlation[np.arange(len(moving)), columns]
-        if best.min() >= _CORRELATED:
+        if best.min() >= _MIN_CORRELATION:
             order = list(names)
             for joint, column in zip(moving, columns, strict=True):
                 order[moving[column]] = names[joint]
@@ -364,7 +368,7 @@ def _velocities(
             return
     off = {}
     for k, joint in enumerate(moving):
-        if itself[k] < _CORRELATED:
+        if itself[k] < _MIN_CORRELATION:
             yield UnrelatedVelocity(names[joint], float(itself[k]))
         elif abs(factor[k] - 1.0) > _SCALE_TOLERANCE:
             off[names[joint]] = float(factor[k])
@@ -407,7 +411,7 @@ def _torques(samples: ImportedSamples, names: Sequence[str], limits: Array) -> I
     for name, largest, limit in zip(names, np.abs(samples.torque).max(axis=0), limits, strict=True):
         if largest == 0.0:
             yield ZeroTorque(name)
-        elif largest > _TOO_FAST * limit:
+        elif largest > _MAX_LIMIT_RATIO * limit:
             yield LargeTorque(name, float(largest), float(limit))
     yield from constant_torques(samples.position, samples.torque, names)
 
@@ -416,7 +420,7 @@ def constant_torques(
     position: Array, torque: Array, names: Sequence[str]
 ) -> tuple[ConstantTorque, ...]:
     """Return the joints that moved (m, n) under one torque (m, n) that is not zero."""
-    moved = np.ptp(position, axis=0) > STUCK_MOVEMENT
+    moved = np.ptp(position, axis=0) > MIN_MOVEMENT
     is_constant = moved & (np.ptp(torque, axis=0) == 0.0) & (torque[0] != 0.0)
     return tuple(
         ConstantTorque(names[joint], float(torque[0, joint]))
@@ -437,20 +441,20 @@ def _torque_size(
     expected = None if nominal is None else _nominal_rms(samples, nominal)
     by_masses = expected is not None and bool(expected.any())
     if expected is not None and by_masses:
-        compared = expected >= _SIGNIFICANT * expected.max()
+        compared = expected >= _MIN_TORQUE_SHARE * expected.max()
         rms = np.sqrt(np.mean(np.square(samples.torque), axis=0))
         ratio = rms[compared] / expected[compared]
-        lowest = _OTHER_UNIT
+        lowest = _OTHER_UNIT_RATIO
     else:
         compared = np.isfinite(limits)
         if not compared.any():
             return
         ratio = np.abs(samples.torque).max(axis=0)[compared] / limits[compared]
-        lowest = _THOUSAND / _TOO_FAST
+        lowest = _THOUSAND / _MAX_LIMIT_RATIO
     ratios = dict(zip(_those(names, compared), ratio.tolist(), strict=True))
     if ratio.max() < 1.0 / lowest:
         yield TorqueSize(ratios, by_masses, too_large=False)
-    elif ratio.min() > _OTHER_UNIT:
+    elif ratio.min() > _OTHER_UNIT_RATIO:
         yield TorqueSize(ratios, by_masses, too_large=True)
 
 
@@ -463,7 +467,7 @@ def _nominal_rms(samples: ImportedSamples, nominal: NominalTorque) -> Array | No
 
     Positions are averaged over blocks first, in which the noise of differences is small.
     """
-    block = ((samples.stamp - samples.stamp[0]) // round(1e9 * _BLOCK)).astype(np.int64)
+    block = ((samples.stamp - samples.stamp[0]) // round(1e9 * _BLOCK_SECONDS)).astype(np.int64)
     _, index, count = np.unique(block, return_inverse=True, return_counts=True)
     mean = np.zeros((len(count), samples.position.shape[1]))
     np.add.at(mean, index, samples.position)
@@ -479,5 +483,5 @@ def _nominal_rms(samples: ImportedSamples, nominal: NominalTorque) -> Array | No
     velocity = (slopes[:-1] * after + slopes[1:] * before) / (before + after)
     acceleration = 2.0 * np.diff(slopes, axis=0) / (before + after)
     motion = Motion(time[1:-1], mean[1:-1], velocity, acceleration)
-    torque = nominal(motion.rows(slice(None, None, -(-len(velocity) // _MOST_BLOCKS))))
+    torque = nominal(motion.rows(slice(None, None, -(-len(velocity) // _MAX_BLOCKS))))
     return np.asarray(np.sqrt(np.mean(np.square(torque), axis=0)))

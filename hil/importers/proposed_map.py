@@ -43,10 +43,11 @@ from hil.importers.text_table import TextTable
 from hil.importers.units import JOINT_KINDS, UNITS, Kind, kind_named, unit_of
 from hil.importers.unnamed_columns import ColumnBlocks, blocks_of, roughness
 
-_MOST_NAMED: Final = 30
+_MAX_NAMED: Final = 30
 _ERRORS: Final = frozenset({"error", "errors", "err"})
 """Words of the deviations of a controller, which are no quantity of a joint."""
-_CLEARLY: Final = 1.5  # ratio of roughness of times that do not fit the motion to those that do
+# ratio of roughness of times that do not fit the motion to those that do
+_MIN_ROUGHNESS_RATIO: Final = 1.5
 _NANO: Final = frozenset({"nano", "nanosec", "nanosecs", "nanoseconds", "nsec", "nsecs"})
 """Words of the nanoseconds of a time whose seconds are in another column."""
 _Columns = str | Sequence[str | int]
@@ -220,7 +221,7 @@ class _Search:
             self._refuse_missing(missing)
         others = [group.label for group in self._groups if not self._is_used(group)]
         if others and not self._nameless:
-            self._concluded.append(UnusedChannels(tuple(others[:_MOST_NAMED])))
+            self._concluded.append(UnusedChannels(tuple(others[:_MAX_NAMED])))
         table: dict[str, object] = {kind: {"columns": names} for kind, names in columns.items()}
         if (
             "torque" in columns
@@ -385,7 +386,7 @@ class _Search:
             if best is not None:
                 patterns = [best, *(name for name in patterns if name != best)]
                 problem += f"; {best} fits the motion: at its times the positions are smooth"
-        options = " or ".join(f"--columns '{kind}={pattern}'" for pattern in patterns[:_MOST_NAMED])
+        options = " or ".join(f"--columns '{kind}={pattern}'" for pattern in patterns[:_MAX_NAMED])
         raise SourceError(self._log, problem, field=kind, remedy=f"choose one: {options}")
 
     def _smoothest(self, names: Sequence[str]) -> str | None:
@@ -403,7 +404,7 @@ class _Search:
         except SourceError:  # of dates, or of a cell that is no number
             return None
         known = sorted((value, name) for name, value in found.items() if value is not None)
-        if not known or (len(known) > 1 and known[1][0] < _CLEARLY * known[0][0]):
+        if not known or (len(known) > 1 and known[1][0] < _MIN_ROUGHNESS_RATIO * known[0][0]):
             return None
         return known[0][1]
 
@@ -476,7 +477,7 @@ class _Search:
             for group in self._groups
             if not self._is_used(group) and group.size == len(self._joints) and len(group.names) > 1
         ]
-        listing = ", ".join(group.label for group in self._groups[:_MOST_NAMED])
+        listing = ", ".join(group.label for group in self._groups[:_MAX_NAMED])
         examples = [
             f"{kind} ({', '.join(CHANNEL_NAMES[kind_named(kind)][:3])}, ...)" for kind in missing
         ]

@@ -10,12 +10,12 @@ from numpy.typing import NDArray
 from hil.base.arrays import Array
 from hil.importers.conclusions import Alternation, Sample, SecondPublisher
 
-APART: Final = 0.1
+MIN_SAMPLE_DISTANCE: Final = 0.1
 """rad or m between samples of one stamp, 20 ms at 5 rad/s."""
-STALLED: Final = 3
+MAX_MESSAGES_PER_STAMP: Final = 3
 """Messages with one stamp, of one publisher."""
-_RETURNS: Final = 0.25  # of a step to another sequence, which the step back leaves
-_LEAST_SHARE: Final = 0.02  # of the samples, beyond single spikes
+_MAX_RETURN_ERROR_SHARE: Final = 0.25  # of a step to another sequence, which the step back leaves
+_MIN_ALTERNATING_SHARE: Final = 0.02  # of the samples, beyond single spikes
 
 
 class FrozenSamples(NamedTuple):
@@ -38,20 +38,24 @@ def second_publisher(position: Array, sample: Sample) -> FrozenSamples:
 
 def _of_one_pose(position: Array) -> NDArray[np.bool_]:
     none = np.zeros(len(position), np.bool_)
-    jumps = np.abs(np.diff(position, axis=0)).max(axis=1) > APART
-    if np.count_nonzero(jumps) <= 2 * STALLED:
+    jumps = np.abs(np.diff(position, axis=0)).max(axis=1) > MIN_SAMPLE_DISTANCE
+    if np.count_nonzero(jumps) <= 2 * MAX_MESSAGES_PER_STAMP:
         return none
     poses, counts = np.unique(position, axis=0, return_counts=True)
     pose = poses[np.argmax(counts)]
     silent = (position == pose).all(axis=1)
     others = position[~silent]
-    alternating = np.count_nonzero(np.diff(silent.astype(np.int8))) > 2 * STALLED
+    alternating = np.count_nonzero(np.diff(silent.astype(np.int8))) > 2 * MAX_MESSAGES_PER_STAMP
     if not alternating or not len(others):
         return none
     moved = np.diff(others, axis=0).any(axis=1)
     if pose.any() and 2 * np.count_nonzero(moved) < len(moved):
         return none  # an arm that goes to and fro between two poses
-    return none if np.abs(others - pose).max(axis=1).min() < APART else np.asarray(silent)
+    return (
+        none
+        if np.abs(others - pose).max(axis=1).min() < MIN_SAMPLE_DISTANCE
+        else np.asarray(silent)
+    )
 
 
 def alternating_samples(position: Array) -> Alternation | None:
@@ -61,8 +65,10 @@ def alternating_samples(position: Array) -> Alternation | None:
         return None
     there_and_back = np.minimum(steps[:-1], steps[1:])
     left = np.abs(position[2:] - position[:-2]).max(axis=1)
-    alternate = (there_and_back > APART) & (left < _RETURNS * there_and_back)
+    alternate = (there_and_back > MIN_SAMPLE_DISTANCE) & (
+        left < _MAX_RETURN_ERROR_SHARE * there_and_back
+    )
     count = np.count_nonzero(alternate)
-    if count <= max(2 * STALLED, _LEAST_SHARE * len(position)):
+    if count <= max(2 * MAX_MESSAGES_PER_STAMP, _MIN_ALTERNATING_SHARE * len(position)):
         return None
     return Alternation(float(there_and_back[alternate].max()), int(count))

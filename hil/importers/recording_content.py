@@ -28,7 +28,7 @@ from hil.importers.stamps import check_clock
 
 Use = Literal["excitation", "validation", "standstill"]
 
-_MOST: Final = 1e12
+_MAX_MAGNITUDE: Final = 1e12
 """Largest value of any quantity, in any unit; sums of its squares do not overflow."""
 
 
@@ -227,7 +227,7 @@ def _check(samples: ImportedSamples, source: Path, joints: Sequence[str]) -> Non
     for name, values in quantities.items():
         if values is None:
             continue
-        wrong = ~(np.abs(values) <= _MOST)
+        wrong = ~(np.abs(values) <= _MAX_MAGNITUDE)
         if values is samples.commanded_position:
             wrong &= ~np.isnan(values)  # where nothing was commanded
         rows, columns = np.nonzero(wrong)
@@ -239,7 +239,9 @@ def _check(samples: ImportedSamples, source: Path, joints: Sequence[str]) -> Non
                 f"{name} of joint {joints[column]} is {values[row, column]} in sample {row} "
                 f"({elapsed:.6g} s; {rows.size} such values)"
             )
-            remedy = f"cut the recording there, or leave out the quantity (largest: {_MOST:g})"
+            remedy = (
+                f"cut the recording there, or leave out the quantity (largest: {_MAX_MAGNITUDE:g})"
+            )
             if not np.isfinite(values[row, column]):
                 remedy += ', or of a log such rows: --drop-missing, or [format] missing = "drop"'
             raise SourceError(source, problem, remedy=remedy)

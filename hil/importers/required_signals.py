@@ -12,7 +12,7 @@ from hil.base.errors import SourceError
 from hil.importers.plausibility import command_size
 from identification.text import duration_text
 
-_SHORTEST: Final = 1.0  # s
+_MIN_RECORDING_SECONDS: Final = 1.0  # s
 _COPIED: Final = 0.999  # of the rows
 _FARTHEST: Final = 10.0  # factor between the travels of joints and of their commands
 
@@ -26,7 +26,7 @@ def require_motion(archive: Archive, recording: Path) -> None:
     columns = archive.columns
     stamp = columns["stamp"]
     duration = float(stamp[-1] - stamp[0]) * 1e-9
-    if duration < _SHORTEST:
+    if duration < _MIN_RECORDING_SECONDS:
         samples = f"{len(stamp)} {'sample' if len(stamp) == 1 else 'samples'}"
         problem = f"has {samples} in {duration_text(duration)}, too few to identify from"
         remedy = "record a motion of all joints, of 10 s or more"

@@ -24,7 +24,7 @@ Stamps = NDArray[np.int64]
 _MEASURED: Final = ("position", "torque", "motor_current")
 """Quantities of which one gives the stamps; the others may be fewer."""
 _SMOOTH: Final = ("position", "velocity")
-_FEWEST: Final = 4  # samples of a cubic
+_MIN_CUBIC_SAMPLES: Final = 4  # samples of a cubic
 
 
 class Timed(NamedTuple):
@@ -63,7 +63,7 @@ def at_stamps(
         return np.full((len(stamp), values.shape[1]), np.nan)
     time = 1e-9 * (known - known[0])
     at = 1e-9 * (stamp - known[0])
-    if smooth and len(known) >= _FEWEST:
+    if smooth and len(known) >= _MIN_CUBIC_SAMPLES:
         from scipy.interpolate import CubicSpline  # only for quantities at times of their own
 
         result = CubicSpline(time, values)(at)
@@ -114,7 +114,7 @@ def are_interleaved(finite: Sequence[NDArray[np.bool_]]) -> bool:
     """
     together = np.count_nonzero(np.all(finite, axis=0))
     fewest = min(np.count_nonzero(each) for each in finite)
-    return bool(fewest >= _FEWEST and together < 0.5 * fewest)
+    return bool(fewest >= _MIN_CUBIC_SAMPLES and together < 0.5 * fewest)
 
 
 def _columns(part: Timed) -> list[tuple[Stamps, Array]]:

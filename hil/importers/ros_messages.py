@@ -29,8 +29,9 @@ _CONTROLLER_STATES: Final = (
     (("desired", "actual", "error"), ()),
 )
 """Points of joints, and of joints with several axes, in the states of trajectory controllers."""
-_LONGEST: Final = 1 << 16  # elements of a sequence in a message
-_LARGEST: Final = 4096  # elements of a column; what is larger is an image or a cloud of points
+_MAX_SEQUENCE_ELEMENTS: Final = 1 << 16  # elements of a sequence in a message
+# elements of a column; what is larger is an image or a cloud of points
+_MAX_COLUMN_ELEMENTS: Final = 4096
 _ROS1_HEADER: Final = "seq"
 
 
@@ -56,7 +57,7 @@ def typestore_of(kind: str, definition: str, encoding: str) -> Typestore:
             for _, node in described:
                 _check_size(node)
         # Names of the definition go before those of ROS 2, which may be of another version.
-        store = Typestore(max_sequence_length=_LONGEST)
+        store = Typestore(max_sequence_length=_MAX_SEQUENCE_ELEMENTS)
         store.register({**ros2_store.fielddefs, **read})
     except Exception as error:  # rosbags does not document what it raises
         raise MessageError(
@@ -95,7 +96,7 @@ def _with_msg(kind: str) -> str:
 def _check_size(node: tuple[Any, Any]) -> None:
     """Refuse fixed arrays if one message would fill the memory."""
     kind, content = node
-    if kind == Nodetype.ARRAY and content[1] > _LONGEST:
+    if kind == Nodetype.ARRAY and content[1] > _MAX_SEQUENCE_ELEMENTS:
         raise MessageError(f"it has an array of {content[1]} elements")
 
 
@@ -153,7 +154,7 @@ _Read = Callable[[Any], Any]
 def _fields_of(value: Any, path: str, read: _Read) -> Iterator[tuple[str, _Read]]:
     """Yield paths of the numbers, arrays and lists in a message, and how each is read from one."""
     if isinstance(value, np.ndarray):
-        if value.size > _LARGEST:
+        if value.size > _MAX_COLUMN_ELEMENTS:
             raise MessageError(f"{path} has {value.size} elements")
         yield path, read
     elif is_dataclass(value):

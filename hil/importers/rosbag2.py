@@ -32,7 +32,7 @@ from hil.importers.conclusions import (
 )
 from hil.importers.imported_robot import NOT_RECORDED, Robot
 from hil.importers.mcap_messages import Topic
-from hil.importers.publishers import APART, STALLED, second_publisher
+from hil.importers.publishers import MAX_MESSAGES_PER_STAMP, MIN_SAMPLE_DISTANCE, second_publisher
 from hil.importers.recording_content import RecordingContent, Use
 from hil.importers.resampling import at_stamps
 from hil.importers.ros_messages import CONTROLLER_STATE, JOINT_STATE
@@ -42,8 +42,8 @@ Effort = Literal["torque", "motor_current", "ignore"]
 CommandStamps = Literal["auto", "header", "bag"]
 
 _QUANTITIES: Final = ("position", "velocity", "effort")
-_MOST_APART: Final = 2.0  # periods between a sample and the one that it is interpolated to
-_STATIC: Final = 1e-3  # rad or m; a joint that moves less is at rest
+_MAX_GAP_PERIODS: Final = 2.0  # periods between a sample and the one that it is interpolated to
+_MIN_TRAVEL: Final = 1e-3  # rad or m; a joint that moves less is at rest
 _AT_REST: Final = "lock joints that did not move: --locked NAME=POSITION"
 _BAG_CLOCK: Final = "use the time at which the bag received the messages: --clock bag"
 
@@ -412,13 +412,13 @@ class _States:
         highest = np.maximum.reduceat(position, starts)
         lowest = np.minimum.reduceat(position, starts)
         apart = (highest - lowest).max(axis=1)
-        worst = np.flatnonzero(apart > APART)
+        worst = np.flatnonzero(apart > MIN_SAMPLE_DISTANCE)
         if not worst.size:
             return
         first = int(starts[worst[0]])
         run = np.flatnonzero(stamp == stamp[first])
         steps = np.abs(np.diff(position[run], axis=0)).max()
-        if len(run) >= STALLED and steps < 0.5 * apart[worst[0]]:
+        if len(run) >= MAX_MESSAGES_PER_STAMP and steps < 0.5 * apart[worst[0]]:
             elapsed = 1e-9 * float(received[run[-1]] - received[run[0]])
             problem = (
                 f"{len(run)} messages from message {numbers[first]} have the same stamp, and were "
@@ -488,11 +488,11 @@ class _States:
             return ""
         period = float(np.median(np.diff(stamp)))
         for part, samples in zip(parts, joined, strict=True):
-            if np.ptp(samples.values["position"], axis=0).max() < _STATIC:
+            if np.ptp(samples.values["position"], axis=0).max() < _MIN_TRAVEL:
                 continue
             after = np.clip(np.searchsorted(samples.stamp, stamp), 1, len(samples.stamp) - 1)
             gap = samples.stamp[after] - samples.stamp[after - 1]
-            if (gap > _MOST_APART * period).any():
+            if (gap > _MAX_GAP_PERIODS * period).any():
                 return (
                     f"for ({', '.join(part.joints)}) up to {1e-6 * gap.max():.3g} ms apart, "
                     f"where {parts[0].joints[0]} comes every {1e-6 * period:.3g} ms"

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Final, NamedTuple
 
-_BEFORE_NAMES: Final = 3  # columns of a joint state: seconds, nanoseconds, frame
+_HEADER_COLUMNS: Final = 3  # columns of a joint state: seconds, nanoseconds, frame
 
 
 class RowNames(NamedTuple):
@@ -20,7 +20,7 @@ class RowNames(NamedTuple):
         They are seconds, nanoseconds, frame, then names, positions, velocities and efforts.
         """
         count = len(self.joints)
-        if self.place != _BEFORE_NAMES or width != self.place + 4 * count:
+        if self.place != _HEADER_COLUMNS or width != self.place + 4 * count:
             return {}
         columns = {"time": "0"}
         for number, kind in enumerate(("position", "velocity", "torque"), 1):

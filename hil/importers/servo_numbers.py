@@ -13,14 +13,14 @@ from hil.importers.name_words import words_of
 
 _SIGN_BITS: Final = (10, 15)
 """Of loads and of speeds, of servos of Dynamixel and Feetech."""
-_LONGEST_STEP: Final = 0.5  # of the largest magnitude, between samples of one joint
+_MAX_STEP_SHARE: Final = 0.5  # of the largest magnitude, between samples of one joint
 _TORQUE_OBJECT: Final = re.compile(r"6077|6078", re.IGNORECASE)
 _ACTUAL: Final = (
     frozenset({"torque", "actual", "value"}),
     frozenset({"current", "actual", "value"}),
 )
 """Words of the names that the standard gives these objects."""
-_LARGEST_PART: Final = 10_000.0  # per mille
+_MAX_PER_MILLE: Final = 10_000.0  # per mille
 
 
 class Encoder(NamedTuple):
@@ -65,7 +65,7 @@ def sign_bit_of(values: Array) -> int | None:
         read = signed(values, bit)
         steps = np.abs(np.diff(read, axis=0))
         both = np.any(values >= limit, axis=0) & np.any((values > 0.0) & (values < limit), axis=0)
-        longest = _LONGEST_STEP * np.nanmax(np.abs(read))
+        longest = _MAX_STEP_SHARE * np.nanmax(np.abs(read))
         if both.any() and np.nanmax(steps) < longest:
             return bit
     return None
@@ -80,7 +80,9 @@ def are_per_mille(names: Sequence[str], values: Array) -> bool:
         _TORQUE_OBJECT.search(name) or any(words <= {*words_of(name)} for words in _ACTUAL)
         for name in names
     )
-    return bool(names) and named and are_whole(values) and np.nanmax(np.abs(values)) < _LARGEST_PART
+    return (
+        bool(names) and named and are_whole(values) and np.nanmax(np.abs(values)) < _MAX_PER_MILLE
+    )
 
 
 def encoder_of(values: Array) -> Encoder | None:

@@ -13,12 +13,12 @@ from typing import Final
 from hil.base.errors import SourceError
 from hil.importers.column_map import Format
 
-_ZIP: Final = b"PK\x03\x04"
-_OLD: Final = b"\xd0\xcf\x11\xe0"
+_ZIP_MAGIC: Final = b"PK\x03\x04"
+_OLE_MAGIC: Final = b"\xd0\xcf\x11\xe0"
 _PARTS: Final = ("xl/workbook.", "content.xml")
 """Begin the names of parts that only spreadsheets have, of Office and of the open format."""
-_LARGEST: Final = 1 << 31  # bytes of an unpacked workbook
-_MUCH_SMALLER: Final = 2.0  # cells of the largest sheet over another that is no rival of it
+_MAX_WORKBOOK_BYTES: Final = 1 << 31  # bytes of an unpacked workbook
+_MIN_SIZE_RATIO: Final = 2.0  # cells of the largest sheet over another that is no rival of it
 _Cell = (
     int | float | str | bool | datetime.time | datetime.date | datetime.datetime
     | datetime.timedelta
@@ -30,8 +30,8 @@ def is_spreadsheet(path: Path, start: bytes) -> bool:
 
     Text that a logger calls ``.xls`` is none.
     """
-    if not start.startswith(_ZIP):
-        return start.startswith(_OLD)
+    if not start.startswith(_ZIP_MAGIC):
+        return start.startswith(_OLE_MAGIC)
     if not zipfile.is_zipfile(path):
         return False
     with zipfile.ZipFile(path) as packed:
@@ -54,7 +54,7 @@ def text_of_sheet(path: Path, form: Format) -> str:
     if chosen not in sheets:
         remedy = f"its sheets are {', '.join(sheets)}"
         raise SourceError(path, f"has no sheet {chosen!r}", field="format.sheet", remedy=remedy)
-    rivals = [name for name, size in sizes.items() if size * _MUCH_SMALLER > sizes[chosen]]
+    rivals = [name for name, size in sizes.items() if size * _MIN_SIZE_RATIO > sizes[chosen]]
     if form.sheet is None and len(rivals) > 1:
         options = " or ".join(f'[format] sheet = "{name}"' for name in rivals)
         problem = f"has {len(rivals)} sheets of about the same size: {', '.join(rivals)}"
@@ -74,7 +74,7 @@ def _sheets_of(path: Path) -> dict[str, Sequence[Sequence[_Cell]]]:
     if zipfile.is_zipfile(path):
         with zipfile.ZipFile(path) as packed:
             size = sum(member.file_size for member in packed.infolist())
-        if size > _LARGEST:
+        if size > _MAX_WORKBOOK_BYTES:
             raise ValueError(f"its parts have {size} bytes")
     with CalamineWorkbook.from_path(path) as workbook:
         return {name: workbook.get_sheet_by_name(name).to_python() for name in workbook.sheet_names}

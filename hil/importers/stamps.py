@@ -18,17 +18,17 @@ from identification.text import number
 
 Stamps = NDArray[np.int64]
 
-SLOWEST: Final = 20.0  # Hz; a robot's dynamics need faster sampling
-FASTEST: Final = 20_000.0  # Hz
-_LARGEST: Final = 10**40  # ns; more is no time in any unit
-_NO_MOTION: Final = 10.0  # Hz; 5 kHz in ms, read as s, are 5 Hz
-_MOST_STEPS: Final = 10  # median steps that a counter may pass where it wraps
-_SHORTEST_PART: Final = 10**9  # ns of a motion that was recorded after another one
-_PAUSE: Final = 10**9  # ns between them
-_FEWEST_ROWS: Final = 20  # rows
-_SWAPPED: Final = 0.02  # share of the samples of a recording that may have changed places
-_EVEN: Final = 0.9  # of the steps of a clock are usual ones
-YEAR: Final = 365 * 86_400 * 10**9
+MIN_SAMPLING_RATE: Final = 20.0  # Hz; a robot's dynamics need faster sampling
+MAX_SAMPLING_RATE: Final = 20_000.0  # Hz
+_MAX_TIME_NS: Final = 10**40  # ns; more is no time in any unit
+_MIN_PLAUSIBLE_RATE: Final = 10.0  # Hz; 5 kHz in ms, read as s, are 5 Hz
+_MAX_WRAP_STEPS: Final = 10  # median steps that a counter may pass where it wraps
+_MIN_PART_NS: Final = 10**9  # ns of a motion that was recorded after another one
+_PAUSE_NS: Final = 10**9  # ns between them
+_MIN_ROWS: Final = 20  # rows
+_MAX_SWAPPED_SHARE: Final = 0.02  # share of the samples of a recording that may have changed places
+_MIN_USUAL_STEP_SHARE: Final = 0.9  # of the steps of a clock are usual ones
+YEAR_NS: Final = 365 * 86_400 * 10**9
 """[ns]"""
 _WRAPS: Final[dict[str, int]] = {
     **{
@@ -47,14 +47,16 @@ def concluded_unit(times: Sequence[int | None]) -> str:
     It is the longest that gives a rate of sampling at which robots are recorded: in seconds where
     none does, and for a column that only counts the samples.
     """
-    stamps = np.array([time / 1e9 for time in times if time is not None and abs(time) < _LARGEST])
+    stamps = np.array(
+        [time / 1e9 for time in times if time is not None and abs(time) < _MAX_TIME_NS]
+    )
     steps = np.diff(stamps)
     steps = steps[steps > 0.0]
     if not steps.size or (bool(np.all(np.abs(steps - 1.0) < 1e-9)) and stamps[0] in (0.0, 1.0)):
         return "s"
     step = float(np.median(steps))
     for unit, places in TIMES.items():
-        if _NO_MOTION <= 10.0**places / step <= FASTEST:
+        if _MIN_PLAUSIBLE_RATE <= 10.0**places / step <= MAX_SAMPLING_RATE:
             return unit
     return "s"
 
@@ -80,9 +82,9 @@ def without_wraps(stamp: Stamps) -> Continued:
     for name, wrap in _WRAPS.items():
         continued = steps[backward] + wrap
         # A counter with a range of a few samples looks like a clock that was set back.
-        if wrap < 4 * _MOST_STEPS * usual:
+        if wrap < 4 * _MAX_WRAP_STEPS * usual:
             continue
-        if ((continued > 0) & (continued <= _MOST_STEPS * usual)).all():
+        if ((continued > 0) & (continued <= _MAX_WRAP_STEPS * usual)).all():
             passed = np.concatenate([[0], np.cumsum(np.where(backward, wrap, 0))])
             return Continued(stamp + passed, CounterContinued(name, int(backward.sum())))
     return Continued(stamp, None)
@@ -91,7 +93,7 @@ def without_wraps(stamp: Stamps) -> Continued:
 def leading_zeros(stamp: Stamps) -> int:
     """Return how many of the first stamps are 0, before a clock of the epoch was there."""
     zeros = int(np.argmax(stamp != 0)) if stamp.any() else 0
-    return zeros if zeros and abs(int(stamp[zeros])) > YEAR else 0
+    return zeros if zeros and abs(int(stamp[zeros])) > YEAR_NS else 0
 
 
 class Sorted(NamedTuple):
@@ -113,7 +115,7 @@ def sorted_neighbours(stamp: Stamps, sample: Sample) -> Sorted:
         return Sorted(unchanged, None)
     order = np.argsort(stamp, kind="stable")
     farthest = int(np.abs(order - unchanged).max())
-    if farthest > 2 or backward > max(1.0, _SWAPPED * len(stamp)):
+    if farthest > 2 or backward > max(1.0, _MAX_SWAPPED_SHARE * len(stamp)):
         return Sorted(unchanged, None)
     return Sorted(order, SortedSamples(backward, sample))
 
@@ -133,18 +135,18 @@ def without_restarts(stamp: Stamps) -> Restarted:
     edges = [0, *(np.flatnonzero(np.diff(stamp) < 0) + 1).tolist(), len(stamp)]
     parts = [stamp[a:b] for a, b in pairwise(edges)]
     shortest = min(int(part[-1] - part[0]) if len(part) else 0 for part in parts)
-    if len(parts) == 1 or shortest < _SHORTEST_PART:
+    if len(parts) == 1 or shortest < _MIN_PART_NS:
         return Restarted(stamp, None)
     joined = [parts[0]]
     for part in parts[1:]:
-        joined.append(part - part[0] + joined[-1][-1] + _PAUSE)
+        joined.append(part - part[0] + joined[-1][-1] + _PAUSE_NS)
     return Restarted(np.concatenate(joined), ClockRestarted(len(parts)))
 
 
 def is_row_counter(times: Sequence[int | None]) -> bool:
     """Return whether times that are read as seconds [ns] count the rows, from 0 or 1."""
-    known = [time for time in times if time is not None and abs(time) < _LARGEST]
-    if len(known) < _FEWEST_ROWS or known[0] not in (0, 10**9):
+    known = [time for time in times if time is not None and abs(time) < _MAX_TIME_NS]
+    if len(known) < _MIN_ROWS or known[0] not in (0, 10**9):
         return False
     return all(after - before == 10**9 for before, after in pairwise(known))
 
@@ -155,7 +157,7 @@ def is_clock(values: Array) -> bool:
     if len(steps) < 2 or not np.all(steps > 0.0):
         return False
     usual = np.median(steps)
-    return bool(np.mean(np.abs(steps - usual) <= 0.5 * usual) >= _EVEN)
+    return bool(np.mean(np.abs(steps - usual) <= 0.5 * usual) >= _MIN_USUAL_STEP_SHARE)
 
 
 def check_clock(stamp: Stamps, path: Path, remedy: str | None = None) -> None:
@@ -182,10 +184,11 @@ def check_clock(stamp: Stamps, path: Path, remedy: str | None = None) -> None:
         other = remedy or "name the column of the time, or give sample_rate instead"
         raise SourceError(path, problem, field="time", remedy=other)
     rate = 1e9 / float(np.median(steps[steps > 0])) if steps.size else np.inf
-    if rate < _NO_MOTION:
+    if rate < _MIN_PLAUSIBLE_RATE:
         problem = f"has {number(rate, 2)} samples per second, too few for a motion"
         other = remedy or (
             "check its unit ([time] unit, or sample_rate in Hz): milliseconds read as seconds "
-            f"would give {1e3 * rate:.0f} samples per second; at least {SLOWEST:g} are needed"
+            f"would give {1e3 * rate:.0f} samples per second; at least {MIN_SAMPLING_RATE:g} are"
+            " needed"
         )
         raise SourceError(path, problem, field="time", remedy=other)

@@ -43,8 +43,8 @@ if TYPE_CHECKING:
 
 
 _EMPTY: Final = "record again, or name the file that has the samples"
-_PROBED: Final = 100  # lines
-_LONGEST_TIME: Final = 30  # digits before the point, more than of nanoseconds since 1970
+_PROBE_LINES: Final = 100  # lines
+_MAX_TIME_DIGITS: Final = 30  # digits before the point, more than of nanoseconds since 1970
 _QUOTES: Final = "\"'"
 _BRACKETS: Final = "[]() "
 # Of columns, as PLCs and programs write them below the names.
@@ -98,7 +98,7 @@ class TextTable:
         filled = [line for _, line in numbered if line.strip()]
         if not filled:
             raise SourceError(path, "has no row of numbers", remedy=_EMPTY)
-        dialect = dialect_of(filled[-_PROBED:], form)  # notes are above the rows
+        dialect = dialect_of(filled[-_PROBE_LINES:], form)  # notes are above the rows
         if form.transposed:
             numbered = _transposed([entry for entry in numbered if entry[1].strip()], dialect, path)
         names, units, rows, repeated, empty = _layout(numbered, dialect, path, form)
@@ -162,7 +162,7 @@ class TextTable:
     @property
     def lacks_numbers(self) -> bool:
         """Whether cells at the start are empty."""
-        return any("" in self.dialect.cells(line) for line in self.lines[:_PROBED])
+        return any("" in self.dialect.cells(line) for line in self.lines[:_PROBE_LINES])
 
     @property
     def texts(self) -> list[str | None]:
@@ -434,7 +434,7 @@ def _is_cut(rows: Sequence[tuple[int, str]], dialect: Dialect, width: int, text:
         return len(dialect.cells(rows[-2][1])) >= width
     if text.endswith("\n"):
         return False
-    others = min(len(dialect.cells(line)[-1]) for _, line in rows[-_PROBED:-1])
+    others = min(len(dialect.cells(line)[-1]) for _, line in rows[-_PROBE_LINES:-1])
     return len(last[-1]) < others
 
 
@@ -461,7 +461,7 @@ def _first_row(lines: Sequence[tuple[int, str]], dialect: Dialect) -> int:
 
     A line above it without any number is a name, a unit or a note.
     """
-    probed = [dialect.cells(line) for _, line in lines[: 5 * _PROBED]]
+    probed = [dialect.cells(line) for _, line in lines[: 5 * _PROBE_LINES]]
     numeric = [any(is_written(cell, dialect) and cell for cell in row) for row in probed]
     lengths = [len(row) for row, some in zip(probed, numeric, strict=True) if some]
     if not lengths:
@@ -519,7 +519,7 @@ def _nanoseconds(text: str, decimals: int) -> int | None:
     """Return a time exactly; None where it is no number, or no time."""
     try:
         time = Decimal(text)
-        if time and time.adjusted() > _LONGEST_TIME:
+        if time and time.adjusted() > _MAX_TIME_DIGITS:
             return None
         return int(time.scaleb(9 - decimals).to_integral())
     except (ArithmeticError, ValueError):

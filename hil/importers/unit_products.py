@@ -12,14 +12,15 @@ from collections.abc import Mapping
 from functools import lru_cache
 from typing import Final, NamedTuple
 
-_POUND: Final = 4.4482216152605  # N
-_KILOGRAM: Final = 9.80665  # N, its weight
+_POUND_FORCE: Final = 4.4482216152605  # N
+_KILOGRAM_FORCE: Final = 9.80665  # N, its weight
 _FORCES: Final = {
-    "n": 1.0, "kn": 1e3, "mn": 1e-3, "dyn": 1e-5, "kgf": _KILOGRAM, "kp": _KILOGRAM,
-    "gf": 1e-3 * _KILOGRAM, "lbf": _POUND, "ozf": _POUND / 16.0,
+    "n": 1.0, "kn": 1e3, "mn": 1e-3, "dyn": 1e-5, "kgf": _KILOGRAM_FORCE, "kp": _KILOGRAM_FORCE,
+    "gf": 1e-3 * _KILOGRAM_FORCE, "lbf": _POUND_FORCE, "ozf": _POUND_FORCE / 16.0,
 }  # fmt: skip
 _WEIGHTS: Final = {
-    "kg": _KILOGRAM, "g": 1e-3 * _KILOGRAM, "lb": _POUND, "lbs": _POUND, "oz": _POUND / 16.0,
+    "kg": _KILOGRAM_FORCE, "g": 1e-3 * _KILOGRAM_FORCE, "lb": _POUND_FORCE, "lbs": _POUND_FORCE,
+    "oz": _POUND_FORCE / 16.0,
 }  # fmt: skip
 """Masses that stand for their weights where a length follows, as in the torque of servos."""
 _LENGTHS: Final = {
@@ -58,7 +59,7 @@ _SUPERSCRIPTS: Final = str.maketrans("⁻¹²³−⋅∙", "-123-··")
 _SLASH: Final = re.compile(r"/|\bper\b")
 _BETWEEN: Final = re.compile(r"[\s·*.×_]+|(?<=[^\d^])-(?=\D)")
 _POWER: Final = re.compile(r"(?P<name>[^\d^-]+)(?:\^?(?P<power>-?\d))?")
-_LONGEST: Final = 24  # characters
+_MAX_UNIT_CHARACTERS: Final = 24  # characters
 
 
 class UnitProduct(NamedTuple):
@@ -75,7 +76,7 @@ def product_of(text: str) -> UnitProduct | None:
     Kilograms, grams, pounds and ounces are their weights, and only with a length.
     """
     text = text.strip().lower().translate(_SUPERSCRIPTS)
-    if not text or len(text) > _LONGEST:
+    if not text or len(text) > _MAX_UNIT_CHARACTERS:
         return None
     powers: Counter[str] = Counter()
     names = []

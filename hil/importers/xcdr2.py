@@ -21,8 +21,8 @@ _SIZES: Final = {
     **dict.fromkeys(("int32", "uint32", "float32"), 4),
     **dict.fromkeys(("int64", "uint64", "float64"), 8),
 }
-_MOST_ALIGNED: Final = 4  # bytes
-_HEAD: Final = 4  # bytes of the encapsulation
+_MAX_ALIGNMENT: Final = 4  # bytes
+_HEADER_BYTES: Final = 4  # bytes of the encapsulation
 
 
 def is_version_2(data: bytes) -> bool:
@@ -48,7 +48,7 @@ class _Rewritten:
     """A message that is read in version 2 and written in version 1."""
 
     def __init__(self, data: bytes, store: Typestore) -> None:
-        self._source = data[_HEAD:]
+        self._source = data[_HEADER_BYTES:]
         self._store = store
         self._at = 0
         self._is_delimited = data[:2] in _DELIMITED
@@ -117,7 +117,7 @@ class _Rewritten:
         self._written += self._length.pack(length)
 
     def _align(self, size: int) -> None:
-        self._at += -self._at % min(size, _MOST_ALIGNED)
+        self._at += -self._at % min(size, _MAX_ALIGNMENT)
 
     def _next(self, count: int) -> bytes:
         end = self._at + count

@@ -44,22 +44,26 @@ from identification.hypotheses.diagnosis import (
     with_readings,
 )
 from identification.hypotheses.scores import Score, compare, score_of
-from identification.hypotheses.search import SURE
-from identification.signals.recording import STUCK_MOVEMENT
+from identification.hypotheses.search import SURE_SIGMAS
+from identification.signals.recording import MIN_MOVEMENT
 from identification.signals.samples import Samples, prepare
 from identification.text import percentage
 from identification.validation.finding import Finding
 from identification.validation.finding_messages import Naming, worded
 from identification.validation.findings.diagnosis import rate_of_torque, without_bodies
 
-_SUSPECT: Final = 0.15
+_SUSPECT_ERROR: Final = 0.15
 """Error of the torque, predicted from other parts, above which a log is looked at closely. Right
 logs of four real arms have 0.04 to 0.11, with URDFs of other arms 0.09 to 1.1."""
-_MUCH_BETTER: Final = 0.85  # error ratio of another mounting that chance alone does not make
-_EXPLAINS: Final = 0.5  # of the error, that a low-pass or heavy rotors leave where they are there
-_DRIVES: Final = -4.0  # standard errors of a friction that drives a joint
-_UNSIGNED: Final = 2  # joints whose torque may be positive throughout, by the weight they hold
-_WARNED: Final = 2  # contradictions: a wrong limit of a right URDF explains one, more are refused
+# error ratio of another mounting that chance alone does not make
+_MAX_MOUNTING_ERROR_RATIO: Final = 0.85
+# of the error, that a low-pass or heavy rotors leave where they are there
+_EXPLAINED_ERROR_RATIO: Final = 0.5
+_DRIVING_FRICTION_SIGMAS: Final = -4.0  # standard errors of a friction that drives a joint
+# joints whose torque may be positive throughout, by the weight they hold
+_MAX_UNSIGNED_JOINTS: Final = 2
+# contradictions: a wrong limit of a right URDF explains one, more are refused
+_MAX_WARNED_CONTRADICTIONS: Final = 2
 _OF_AXES: Final = ("order", "signs", "zero", "coupling")
 _REMEDY: Final = (
     "give the URDF of this arm; to identify in spite of that, give the column map "
@@ -107,7 +111,9 @@ def concluded(
     if unsigned := _unsigned_torques(imported.archive):
         if may_be_load:
             return Concluded(_without_torque(imported, source, robot_of, use, NoJointTorque()))
-        if unsigned > _UNSIGNED and (asked is None or asked.score.overall > _SUSPECT):
+        if unsigned > _MAX_UNSIGNED_JOINTS and (
+            asked is None or asked.score.overall > _SUSPECT_ERROR
+        ):
             raise _without_sign(source, unsigned)
     if may_be_load and _is_named_load(imported):
         size = None if asked is None else Size.of(asked.cell, asked.cell.model, asked.rows)
@@ -126,7 +132,7 @@ def concluded(
     if is_bag or not (suspect or _hangs_otherwise(asked.cell, asked.rows, asked.score)):
         imported = _of_this_arm(imported, source, asked.contradictions())
         return Concluded(imported, found if found.is_complete else None)
-    if asked.score.overall > _SUSPECT and (explained := _explained(imported.archive)):
+    if asked.score.overall > _SUSPECT_ERROR and (explained := _explained(imported.archive)):
         imported = replace(imported, concluded=(*imported.concluded, explained.how))
         return Concluded(_of_this_arm(imported, source, asked.contradictions(explained.score)))
     return Concluded(_as_a_look_says(imported, source, robot_of, use, asked, may_be_load))
@@ -229,7 +235,9 @@ class _Asked:
 
     @property
     def _is_far(self) -> bool:
-        return self.score.overall > _SUSPECT or bool(np.any(self.score.friction < _DRIVES))
+        return self.score.overall > _SUSPECT_ERROR or bool(
+            np.any(self.score.friction < _DRIVING_FRICTION_SIGMAS)
+        )
 
     def is_suspect(self, found: TorqueDiagnosis) -> bool:
         """Return whether the torque does not follow the arm as it is read."""
@@ -258,7 +266,7 @@ def _require_torque_of_arm(source: Path, found: TorqueDiagnosis) -> None:
 def _unsigned_torques(archive: Archive) -> int:
     """Return the number of joints that move, if no torque is ever negative; else, or of one, 0."""
     torque = np.asarray(archive.columns["torque"])
-    moving = np.ptp(np.asarray(archive.columns["position"]), axis=0) > STUCK_MOVEMENT
+    moving = np.ptp(np.asarray(archive.columns["position"]), axis=0) > MIN_MOVEMENT
     count = int(np.count_nonzero(moving))
     return count if count > 1 and (torque >= 0.0).all() and torque.any() else 0
 
@@ -330,7 +338,7 @@ def _explained(archive: Archive) -> _Explained | None:
     try:
         recording = source_of(archive, cell).recording
         unfiltered = prepare(recording, model, options=SETTINGS)
-        least = min(UNEXPLAINED, _EXPLAINS * score_of(model, unfiltered).overall)
+        least = min(UNEXPLAINED, _EXPLAINED_ERROR_RATIO * score_of(model, unfiltered).overall)
         low_passes = possible_low_passes(recording, model, options=SETTINGS)
         for how in (*low_passes, SETTINGS):
             samples = unfiltered if how is SETTINGS else prepare(recording, model, options=how)
@@ -350,7 +358,7 @@ def _hangs_otherwise(cell: Cell, samples: Samples, score: Score) -> bool:
         if np.array_equal(model.gravity, np.zeros(3)):
             continue  # less torque to explain
         against = compare(score_of(model, samples), score, cell.model)
-        if against.ratio < _MUCH_BETTER and against.sigmas < -SURE:
+        if against.ratio < _MAX_MOUNTING_ERROR_RATIO and against.sigmas < -SURE_SIGMAS:
             return True
     return False
 
@@ -366,7 +374,7 @@ def _of_this_arm(
     found = contradictions.found
     if not contradictions.is_doubtful:
         return imported
-    if len(found) > _WARNED:
+    if len(found) > _MAX_WARNED_CONTRADICTIONS:
         problem = f"is not of the arm of the URDF: {sentences(found)}"
         raise SourceError(source, problem, field="--urdf", remedy=_REMEDY)
     return replace(imported, concluded=(*imported.concluded, DoubtfulArm(found)))

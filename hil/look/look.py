@@ -21,7 +21,7 @@ from hil.importers.conclusions import (
     NameBasis,
     UnitBasis,
 )
-from hil.importers.excerpt import LONGEST
+from hil.importers.excerpt import MAX_EXCERPT_ROWS
 from hil.importers.log_files import LogFiles
 from hil.importers.recording_import import ImportedRecording, ImportOptions, RobotOf, read_recording
 from hil.importers.required_signals import require_motion
@@ -40,7 +40,7 @@ from identification.hypotheses.changes import Axes
 from identification.hypotheses.diagnosis import few_rows, torque_of
 from identification.hypotheses.inertia_scale import retimed
 from identification.hypotheses.scores import score_of
-from identification.hypotheses.search import EXPLAINED, Readings, find_readings
+from identification.hypotheses.search import EXPLAINED_ERROR, Readings, find_readings
 from identification.model.robot import RobotModel
 from identification.signals.recording import Recording, RecordingError
 from identification.signals.samples import Preprocessing, Samples, prepare
@@ -67,7 +67,7 @@ def look_at(source: Path, robot_of: RobotOf | None, options: ImportOptions) -> L
     imported = None if robot_of is not None else _archived(source)
     described = robot_of is not None or imported is not None
     if imported is None:
-        files = LogFiles(longest=LONGEST)
+        files = LogFiles(longest=MAX_EXCERPT_ROWS)
         robot = robot_of or (lambda _: undescribed_robot(source, options, files))
         lenient = replace(options, outside_limits=True)
         imported = read_recording(source, robot, lenient, files=files)
@@ -135,7 +135,7 @@ def _with_torque(
     channel = physics.channel_rows(delay, low_pass)
     groups = physics.determined(finding.readings)
     score = finding.readings.score
-    if score.overall > EXPLAINED:
+    if score.overall > EXPLAINED_ERROR:
         rows = [_no_longer_certain_unit(row, score.overall) for row in rows]
     rows = [*rows, *finding.rows(groups), *channel]
     contradictions = Contradictions.of(

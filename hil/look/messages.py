@@ -84,7 +84,7 @@ from hil.look.readings import (
     Wrapped,
 )
 from hil.look.result import ChangedReading, Look, Row, TiedReading
-from identification.hypotheses.changes import COUPLED, IN_ORDER, Meaning
+from identification.hypotheses.changes import COUPLED, ORDERS, Meaning
 from identification.signals.messages import clock_lines, fault_words, time_lines
 from identification.text import number, percentage
 
@@ -296,7 +296,7 @@ def described(change: ArmChange) -> str:
     if meaning in COUPLED:
         joint, other = _names(change)
         return f"the angle of {joint} is recorded {text} the angle of {other}"
-    if meaning in IN_ORDER:
+    if meaning in ORDERS:
         return f"{text} {_exchanged(change)}"
     if not change.change.joints:
         return text

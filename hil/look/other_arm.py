@@ -32,12 +32,14 @@ from identification.hypotheses.scores import Score
 from identification.model.robot import RobotModel
 from identification.signals.samples import Samples
 
-_MOST: Final = 0.99  # quantile of the rows, so that single spikes are no evidence
-_BEYOND: Final = 0.17  # rad or m beyond a range; zeros of the same arm differ by less
-_FAR: Final = np.pi / 4.0  # the same, of one finding that is enough
-_TURNS: Final = 3  # by which the count of an encoder may be off
-_OVER: Final = 3.0  # of a speed or torque; right logs of real arms reach 1.7 of a stated torque
-_UNEXPLAINED: Final = 0.15  # of the torque; right logs of short motions have up to 0.29 as well
+_RANGE_QUANTILE: Final = 0.99  # quantile of the rows, so that single spikes are no evidence
+_MAX_RANGE_EXCESS: Final = 0.17  # rad or m beyond a range; zeros of the same arm differ by less
+_FAR_RANGE_EXCESS: Final = np.pi / 4.0  # the same, of one finding that is enough
+_MAX_TURNS_OFF: Final = 3  # by which the count of an encoder may be off
+# of a speed or torque; right logs of real arms reach 1.7 of a stated torque
+_MAX_LIMIT_RATIO: Final = 3.0
+# of the torque; right logs of short motions have up to 0.29 as well
+_UNEXPLAINED_ERROR: Final = 0.15
 
 
 @dataclass(frozen=True)
@@ -81,24 +83,24 @@ class Contradictions:
         limits = urdf_limits(cell.urdf, cell.joint_names)
         names = cell.joint_names
         position = samples.motion.position
-        low, high = np.quantile(position, (1.0 - _MOST, _MOST), axis=0)
+        low, high = np.quantile(position, (1.0 - _RANGE_QUANTILE, _RANGE_QUANTILE), axis=0)
         turns = model.chain.revolute
-        turns_aside = whole_turns(low, high, limits, turns, _TURNS)
+        turns_aside = whole_turns(low, high, limits, turns, _MAX_TURNS_OFF)
         excess = limit_excess(low + turns_aside, high + turns_aside, limits)
         speed = _largest(samples.motion.velocity) / limits.velocity
         effort = _largest(samples.torque) / limits.effort
         motion: BeyondRange | BeyondSpeed | None = None
         size: BeyondEffort | BeyondMasses | None = None
-        if excess.max() > _BEYOND:
+        if excess.max() > _MAX_RANGE_EXCESS:
             joint = int(excess.argmax())
             motion = BeyondRange(names[joint], float(excess[joint]), turns=bool(turns[joint]))
-        elif speed.max() > _OVER:
+        elif speed.max() > _MAX_LIMIT_RATIO:
             joint = int(speed.argmax())
             motion = BeyondSpeed(names[joint], float(speed[joint]))
         expected = Size.of(cell, model, samples)
         factor = expected.factor or 1.0
         # A factor of 1000 is another unit, which a look names.
-        if effort.max() > _OVER and not expected.is_thousand:
+        if effort.max() > _MAX_LIMIT_RATIO and not expected.is_thousand:
             joint = int(effort.argmax())
             size = BeyondEffort(names[joint], float(effort[joint]))
         elif expected.is_off and factor > 1.0 and not expected.is_thousand:
@@ -108,11 +110,11 @@ class Contradictions:
         lengths = None
         if inertia is not None and inertia.time is None:
             lengths = OtherLengths(inertia.factor, inertia.error, inertia.stated)
-        is_open = error > _UNEXPLAINED and inertia is None
+        is_open = error > _UNEXPLAINED_ERROR and inertia is None
         torque = UnexplainedTorque(error) if is_open else None
         axes = OtherAxes(tuple(changed)) if len(changed) > 1 else None
         is_larger = isinstance(size, BeyondMasses) and size.by_masses
-        is_far = is_larger or bool(np.any(excess > np.where(turns, _FAR, np.inf)))
+        is_far = is_larger or bool(np.any(excess > np.where(turns, _FAR_RANGE_EXCESS, np.inf)))
         return cls(motion, size, lengths, torque, axes, is_far=is_far)
 
     @property
@@ -134,4 +136,4 @@ class Contradictions:
 
 
 def _largest(values: Array) -> Array:
-    return np.asarray(np.quantile(np.abs(values), _MOST, axis=0))
+    return np.asarray(np.quantile(np.abs(values), _RANGE_QUANTILE, axis=0))

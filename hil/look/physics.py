@@ -58,12 +58,12 @@ from hil.look.readings import (
 from hil.look.readings import NextStep as Decide
 from hil.look.result import Aspect, ParameterGroup, Row, TiedReading
 from identification.estimators.delay import DelayEstimate
-from identification.estimators.prior import LEARNED, body_prior, fit_posterior
+from identification.estimators.prior import DETERMINED_STD_RATIO, body_prior, fit_posterior
 from identification.factor.factor import Factor
-from identification.hypotheses.changes import COUPLED, IN_ORDER, Axes, Change, Meaning
+from identification.hypotheses.changes import COUPLED, ORDERS, Axes, Change, Meaning
 from identification.hypotheses.diagnosis import RigidTorque, TorqueDiagnosis, rigid_torque
 from identification.hypotheses.scores import is_backwards
-from identification.hypotheses.search import EXPLAINED, SEPARATE, Readings, Step
+from identification.hypotheses.search import EXPLAINED_ERROR, SEPARATE_SIGMAS, Readings, Step
 from identification.model.link_wrenches import LINK_SYMBOLS
 from identification.model.motion import Motion
 from identification.model.robot import RobotModel
@@ -98,18 +98,20 @@ _ASPECTS: Final[Mapping[Meaning, Aspect]] = {
     "mounting": "mounting",
 }
 """The row of the table that a change belongs to."""
-_HALF: Final = 0.5
-_MOST_CHOICES: Final = 3
-_ALIKE: Final = 1.02  # error ratio of readings of which the recording does not choose one
-_OTHER_UNIT: Final = 3.0  # factor beyond which the masses of a URDF do not explain a torque
+_OPEN_SIGMAS_SHARE: Final = 0.5
+_MAX_CHOICES: Final = 3
+# error ratio of readings of which the recording does not choose one
+_ALIKE_ERROR_RATIO: Final = 1.02
+_OTHER_UNIT_FACTOR: Final = 3.0  # factor beyond which the masses of a URDF do not explain a torque
 _THOUSAND: Final = 1000.0
-_MOST_GEARED: Final = 1000.0  # motor turns per joint turn; built are 1 to some 300
-_ALIKE_GEARS: Final = 10.0  # factor between the ratios of a joint and of the arm
-_WEAK: Final = 0.9  # posterior over prior deviation of a parameter that the recording hardly moves
+_MAX_GEAR_RATIO: Final = 1000.0  # motor turns per joint turn; built are 1 to some 300
+_MAX_GEAR_RATIO_SPREAD: Final = 10.0  # factor between the ratios of a joint and of the arm
+# posterior over prior deviation of a parameter that the recording hardly moves
+_WEAK_STD_RATIO: Final = 0.9
 # Masses of arms over the cube of their reach, kg/m³: 11 (Gen3) to 216 (TX40).
-_DENSITY: Final = 45.0
+_ARM_DENSITY: Final = 45.0
 _DENSITY_SPREAD: Final = 3.0  # factor of one standard deviation
-_GRAVITY: Final = 9.81
+_STANDARD_GRAVITY: Final = 9.81
 
 
 @dataclass(frozen=True)
@@ -143,7 +145,7 @@ class Size:
             return cls(None, by_masses=True)
         factor = float(np.median(np.abs(scale[known])))
         known &= np.abs(np.log(np.abs(scale, where=known, out=np.ones(len(scale))) / factor)) < (
-            np.log(_ALIKE_GEARS)
+            np.log(_MAX_GEAR_RATIO_SPREAD)
         )
         of_joints = tuple(
             float(each) if is_known else None for each, is_known in zip(scale, known, strict=True)
@@ -155,13 +157,13 @@ class Size:
         """Whether the torque has another order of magnitude than the arm needs."""
         if self.factor is None:
             return False
-        limit = _OTHER_UNIT if self.by_masses else _DENSITY_SPREAD**3
+        limit = _OTHER_UNIT_FACTOR if self.by_masses else _DENSITY_SPREAD**3
         return not 1.0 / limit < self.factor < limit
 
     @property
     def may_be_geared(self) -> bool:
         """Whether gears between motors and joints may be what makes it too small."""
-        return self.is_off and 1.0 / _MOST_GEARED < (self.factor or 1.0) < 1.0
+        return self.is_off and 1.0 / _MAX_GEAR_RATIO < (self.factor or 1.0) < 1.0
 
     @property
     def is_thousand(self) -> bool:
@@ -188,8 +190,8 @@ def _by_reach(model: RobotModel, samples: Samples) -> float | None:
     reach = float(np.linalg.norm(model.chain.translation[1:], axis=1).sum())
     if not weight > 0.0 or not reach > 0.0:
         return None
-    mass = _DENSITY * reach**3
-    return float(weight / (0.3 * mass * _GRAVITY * reach))
+    mass = _ARM_DENSITY * reach**3
+    return float(weight / (0.3 * mass * _STANDARD_GRAVITY * reach))
 
 
 @dataclass(frozen=True, eq=False)
@@ -259,7 +261,7 @@ class TorqueFindings:
         if doubted and not adequacy.is_enough:
             beside = FreeFit(adequacy.ratio)
             rows.append(Row("explanation", Fact.NONE_FITS, Certainty.UNDETERMINED, (beside,)))
-        if error > EXPLAINED:
+        if error > EXPLAINED_ERROR:
             rows = [no_longer_certain(row, error) for row in rows]
         as_read = ErrorAsRead(error)
         rows.append(Row("as read", as_read, Certainty.CERTAIN, (Basis.FREE_PARAMETERS,)))
@@ -286,7 +288,7 @@ class TorqueFindings:
             certainty = Certainty.CERTAIN
         nearest = self.readings.nearest
         rivals = [nearest[step.change.meaning] for step in steps if step.change.meaning in nearest]
-        if any(rival[1].sigmas < SEPARATE and _repeats(rival[0], steps) for rival in rivals):
+        if any(rival[1].sigmas < SEPARATE_SIGMAS and _repeats(rival[0], steps) for rival in rivals):
             certainty = Certainty.UNDETERMINED
         evidence: Evidence = ErrorRatio(ratio, sigmas)
         if all(step.by_friction for step in steps):
@@ -303,18 +305,21 @@ class TorqueFindings:
             return Row(aspect, reading, Certainty.LIKELY, (Basis.NOT_EXAMINED,), decider)
         change, against = min(rivals, key=lambda rival: rival[1].sigmas)
         next_best = NextBest(self._of_arm(change), against.ratio)
-        if against.sigmas > SEPARATE:
+        if against.sigmas > SEPARATE_SIGMAS:
             return Row(aspect, reading, Certainty.CERTAIN, (next_best,))
-        if against.sigmas < _HALF * SEPARATE or against.ratio < _ALIKE:
+        if (
+            against.sigmas < _OPEN_SIGMAS_SHARE * SEPARATE_SIGMAS
+            or against.ratio < _ALIKE_ERROR_RATIO
+        ):
             both = Either(reading, next_best.change)
             return Row(aspect, both, Certainty.UNDETERMINED, (next_best,), decider)
         return Row(aspect, reading, Certainty.LIKELY, (next_best,), decider)
 
     def _order(self) -> Row:
-        steps = self.steps(*IN_ORDER)
+        steps = self.steps(*ORDERS)
         if not steps:
             decider = Decide.MOVE_EACH_JOINT
-            return self._unchanged("order", Fact.ORDER_OF_URDF, *IN_ORDER, decider=decider)
+            return self._unchanged("order", Fact.ORDER_OF_URDF, *ORDERS, decider=decider)
         kinds = {step.change.meaning for step in steps}
         names = np.array(self.cell.joint_names)
         torque = position = None
@@ -335,7 +340,7 @@ class TorqueFindings:
             return Row("signs", Fact.SIGNS_OF_URDF, undetermined, backwards, decider)
         friction = self.readings.score.friction
         share = self.readings.score.share
-        dissipates = (friction > SEPARATE) & (share > 0.0)
+        dissipates = (friction > SEPARATE_SIGMAS) & (share > 0.0)
         reading = Fact.SIGNS_OF_URDF
         if dissipates.all():
             return Row("signs", reading, Certainty.CERTAIN, (Basis.DISSIPATION,))
@@ -443,7 +448,7 @@ class TorqueFindings:
     def questions(self) -> tuple[tuple[TiedReading, ...], ...]:
         """Return the readings that fit alike, the best of each meaning."""
         choices: list[tuple[TiedReading, ...]] = []
-        if self.readings.score.overall > EXPLAINED:
+        if self.readings.score.overall > EXPLAINED_ERROR:
             return ()  # none of them is right
         for step in self.readings.steps:
             if not step.alike:
@@ -452,7 +457,7 @@ class TorqueFindings:
             # A joint turned to the other side is another reading.
             meanings = [(change.meaning, change.size > 0.0) for change, _ in pairs]
             first = [pair for k, pair in enumerate(pairs) if meanings[k] not in meanings[:k]]
-            shown = first[:_MOST_CHOICES] if len(first) > 1 else pairs[:2]
+            shown = first[:_MAX_CHOICES] if len(first) > 1 else pairs[:2]
             choices.append(tuple(self._choice(step, *pair) for pair in shown))
         size = self.size
         if self.rigid.is_nothing or self.torque.is_rate:
@@ -547,7 +552,7 @@ def no_longer_certain(row: Row, error: float) -> Row:
 
 def _repeats(change: Change, steps: list[Step]) -> bool:
     """Whether a change concerns the joints of steps that are orders."""
-    return change.meaning in IN_ORDER and any(
+    return change.meaning in ORDERS and any(
         set(change.joints) & set(step.change.joints) for step in steps
     )
 
@@ -614,8 +619,8 @@ def determined(readings: Readings) -> tuple[ParameterGroup, ...]:
                 if owner == joint and kind == quantity
             ]
             if ratios:
-                good = sum(value < LEARNED for value in ratios)
-                weak = sum(LEARNED <= value < _WEAK for value in ratios)
+                good = sum(value < DETERMINED_STD_RATIO for value in ratios)
+                weak = sum(DETERMINED_STD_RATIO <= value < _WEAK_STD_RATIO for value in ratios)
                 groups.append(ParameterGroup(name, quantity, good, weak, len(ratios) - good - weak))
     return tuple(groups)
 

@@ -49,14 +49,14 @@ from hil.look.result import Aspect, Row
 from hil.pipeline.sources import Source
 from identification.signals.clock import time_base
 from identification.signals.noise import noiseless_above
-from identification.signals.recording import STUCK_MOVEMENT, UNWRAPPED, Recording
+from identification.signals.recording import MIN_MOVEMENT, UNWRAPPED, Recording
 
-_FOLLOWS: Final = 0.7  # correlation of a velocity with the slope of its position
-_CLOSE: Final = 0.1  # relative deviation of their ratio
-_LONGEST_LAG: Final = 0.1  # s
-_CLEAR_LAG: Final = 1.5  # sampling steps
-_HIGHEST_CORRELATION: Final = 0.95
-_UNITS: Final = (ConcludedUnit, StatedUnit)
+_MIN_CORRELATION: Final = 0.7  # correlation of a velocity with the slope of its position
+_MAX_RATIO_DEVIATION: Final = 0.1  # relative deviation of their ratio
+_MAX_LAG_SECONDS: Final = 0.1  # s
+_MIN_LAG_STEPS: Final = 1.5  # sampling steps
+_MIN_LAG_CORRELATION: Final = 0.95
+_UNIT_CONCLUSIONS: Final = (ConcludedUnit, StatedUnit)
 _Unit = ConcludedUnit | StatedUnit
 _ASPECTS: Final[Mapping[Kind, Aspect]] = {
     "position": "position",
@@ -78,7 +78,7 @@ def rows(source: Source, imported: ImportedRecording, arm: Cell | None) -> list[
     """Return the rows; `arm` is the recorded arm, None without a description."""
     recording = source.recording
     concluded = imported.concluded
-    units = [each for each in imported.examined.found if isinstance(each, _UNITS)]
+    units = [each for each in imported.examined.found if isinstance(each, _UNIT_CONCLUSIONS)]
     table = [_time(recording, concluded, units)]
     if source.faults or source.retimed:
         found = RowsReading(source.faults, source.times if source.retimed else None)
@@ -140,7 +140,7 @@ def _concluded(conclusion: Conclusion, units: Sequence[_Unit]) -> Row | None:
 def _velocity(recording: Recording) -> Row:
     """Return what the velocity is of the slope of the position."""
     assert recording.velocity is not None
-    moving = np.flatnonzero(np.ptp(recording.position, axis=0) > STUCK_MOVEMENT)
+    moving = np.flatnonzero(np.ptp(recording.position, axis=0) > MIN_MOVEMENT)
     if not moving.size:
         open_ = Certainty.UNDETERMINED
         return Row("velocity", Fact.NOT_EXAMINED, open_, (Basis.NO_MOTION,))
@@ -149,16 +149,18 @@ def _velocity(recording: Recording) -> Row:
     )
     itself = np.diag(correlation)
     names = [recording.joint_names[joint] for joint in moving]
-    if itself.min() < _FOLLOWS:
-        bad = tuple(name for name, r in zip(names, itself, strict=True) if r < _FOLLOWS)
+    if itself.min() < _MIN_CORRELATION:
+        bad = tuple(name for name, r in zip(names, itself, strict=True) if r < _MIN_CORRELATION)
         evidence = Correlation(float(itself.min()))
         decider = NextStep.CHECK_COLUMNS
         return Row("velocity", NotSlopes(bad), Certainty.CERTAIN, (evidence,), decider)
-    if np.all(np.abs(factor - 1.0) < _CLOSE):
+    if np.all(np.abs(factor - 1.0) < _MAX_RATIO_DEVIATION):
         ratio = SlopeRatio(float(1.0 / np.mean(factor)))
         return Row("velocity", Fact.SLOPE, Certainty.CERTAIN, (ratio,))
     explanations = [
-        fact for size, fact in _SLOPES.items() if np.all(np.abs(factor / size - 1.0) < _CLOSE)
+        fact
+        for size, fact in _SLOPES.items()
+        if np.all(np.abs(factor / size - 1.0) < _MAX_RATIO_DEVIATION)
     ]
     factors = SlopeFactors(dict(zip(names, factor.tolist(), strict=True)))
     reading = explanations[0] if explanations else Fact.SCALED_SLOPE
@@ -171,12 +173,12 @@ def _rests(recording: Recording) -> Row:
     rests = [
         name
         for name, size in zip(recording.joint_names, travel, strict=True)
-        if size <= STUCK_MOVEMENT
+        if size <= MIN_MOVEMENT
     ]
     if not rests:
         moved = Travel(float(travel.min()), at_least=True)
         return Row("motion", Fact.EVERY_JOINT_MOVES, Certainty.CERTAIN, (moved,))
-    evidence = Travel(STUCK_MOVEMENT, at_least=False)
+    evidence = Travel(MIN_MOVEMENT, at_least=False)
     still = StillJoints(tuple(rests))
     return Row("motion", still, Certainty.CERTAIN, (evidence,), NextStep.MOVE_ALL_OR_LOCK)
 
@@ -233,12 +235,12 @@ def velocity_lag(recording: Recording) -> float | None:
         return None
     step = float(np.median(np.diff(recording.time)))
     even = np.arange(recording.time[0], recording.time[-1], step)
-    most = max(2, round(_LONGEST_LAG / step))
+    most = max(2, round(_MAX_LAG_SECONDS / step))
     if len(even) <= 4 * most or not step > 0.0:
         return None
     lags = []
     for position, velocity in zip(recording.position.T, recording.velocity.T, strict=True):
-        if np.ptp(position) <= STUCK_MOVEMENT:
+        if np.ptp(position) <= MIN_MOVEMENT:
             continue
         q = np.interp(even, recording.time, position)
         moved = np.cumsum(np.interp(even, recording.time, velocity)) * step
@@ -248,7 +250,7 @@ def velocity_lag(recording: Recording) -> float | None:
         return None
     lag = float(np.median(delays))
     alike = np.abs(delays - lag) <= max(step, 0.25 * abs(lag))
-    clear = abs(lag) > _CLEAR_LAG * step and np.mean(alike) > 0.5
+    clear = abs(lag) > _MIN_LAG_STEPS * step and np.mean(alike) > 0.5
     return lag if clear else None
 
 
@@ -263,7 +265,7 @@ def _lag(first: Array, second: Array, most: int) -> float | None:
         size = np.linalg.norm(reference) * np.linalg.norm(moved)
         scores.append(float(reference @ moved / size) if size > 0.0 else 0.0)
     best = int(np.argmax(scores))
-    if scores[best] < _HIGHEST_CORRELATION or best in (0, 2 * most):
+    if scores[best] < _MIN_LAG_CORRELATION or best in (0, 2 * most):
         return None
     left, middle, right = scores[best - 1 : best + 2]
     bend = left - 2.0 * middle + right

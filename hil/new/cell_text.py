@@ -31,7 +31,12 @@ from hil.cell.schema import CellFile
 from hil.cell.toml_edits import urdf_limits
 from hil.importers.dh import Convention, urdf_of_dh, urdf_of_parameters
 from identification.errors import ModelError
-from identification.model.kinematics import MOST_JOINTS, Chain, chain_from_urdf, pinocchio_model
+from identification.model.kinematics import (
+    MAX_MOVING_JOINTS,
+    Chain,
+    chain_from_urdf,
+    pinocchio_model,
+)
 from identification.model.urdf_text import urdf_tree
 
 from .cell_values import ASSUMED, CellValues, assumed_for_design, clear_home, from_urdf
@@ -131,7 +136,7 @@ revolutions.
 """
 _OF_RECORDINGS: Final = ("cell", "robot")
 """Tables of a cell whose arm is identified from recordings, not moved."""
-_ALONG: Final = 0.99  # cosine of the angle between an axis and gravity
+_MIN_ALIGNMENT_COSINE: Final = 0.99  # cosine of the angle between an axis and gravity
 _ASSUMED: Final = ("nominal.uncertainty", "controller.current_delay_cycles")
 """Fields whose default is written as an assumption."""
 _MESH: Final = re.compile(r"""filename\s*=\s*["'](package://[^"']+)["']""")
@@ -353,8 +358,10 @@ def cell_of_urdf(
     names = _moving_joints(path, text)
     links = Links(base=base, tip=tip)
     if not links:
-        if len(names) > MOST_JOINTS:
-            problem = f"has {len(names)} moving joints; at most {MOST_JOINTS} can be identified"
+        if len(names) > MAX_MOVING_JOINTS:
+            problem = (
+                f"has {len(names)} moving joints; at most {MAX_MOVING_JOINTS} can be identified"
+            )
             remedy = "choose one arm with --base LINK --tip LINK"
             raise InputError(path, problem, remedy=remedy)
         return _cell_of(path, text, fixed, moved=moved)
@@ -370,7 +377,7 @@ def cell_of_urdf(
     return replace(made, urdf=made.urdf or arm, values=made.values | CellValues(notes=(note,)))
 
 
-_MOST_NAMES: Final = 12
+_MAX_NAMES: Final = 12
 
 
 def _note_on_gripper(fingers: Sequence[str], chain: Chain, text: str) -> str:
@@ -383,12 +390,12 @@ def _note_on_gripper(fingers: Sequence[str], chain: Chain, text: str) -> str:
         if parents[name] >= 0 and chain.joint_names[parents[name]] not in fingers
     }
     tip = wrists.pop() if len(wrists) == 1 else "LINK"
-    names = ", ".join(fingers[:_MOST_NAMES])
-    if len(fingers) > _MOST_NAMES:
-        names += f" and {len(fingers) - _MOST_NAMES} others"
+    names = ", ".join(fingers[:_MAX_NAMES])
+    if len(fingers) > _MAX_NAMES:
+        names += f" and {len(fingers) - _MAX_NAMES} others"
     looks = "looks like a joint" if len(fingers) == 1 else "look like joints"
     note = f"{names} {looks} of a gripper or hand by name: "
-    if len(fingers) <= _MOST_NAMES:
+    if len(fingers) <= _MAX_NAMES:
         fixing = " ".join(f"--fix {name}" for name in fingers)
         note += f"fix what is not identified ({fixing}), or "
     return f"{note}name the last link of the arm (--tip {tip})"
@@ -407,7 +414,7 @@ def _note_on_branches(text: str, chain: Chain) -> list[str]:
     if len(ends) > 1:
         notes.append(
             f"the joints form {len(ends)} branches, with the last moving links "
-            f"{', '.join(ends[:_MOST_NAMES])}: choose one arm with --base LINK --tip LINK"
+            f"{', '.join(ends[:_MAX_NAMES])}: choose one arm with --base LINK --tip LINK"
         )
     return notes
 
@@ -422,7 +429,7 @@ def _lifting(text: str, chain: Chain) -> list[str]:
         outer = rotations[parent] if parent >= 0 else np.eye(3)
         rotations.append(outer @ chain.rotation[joint])
         vertical = abs((rotations[joint] @ chain.axis[joint])[2])
-        if not chain.revolute[joint] and vertical > _ALONG and name not in gripper:
+        if not chain.revolute[joint] and vertical > _MIN_ALIGNMENT_COSINE and name not in gripper:
             lifting.append(name)
     return lifting
 

@@ -31,13 +31,13 @@ from hil.control.motion_watch import Stop
 from identification.excitation import CollisionModelError, Workspace
 from planner import JointLimits
 
-from .found_shapes import THICKNESS, check_by_found_shapes
+from .found_shapes import MIN_FRAME_HEIGHT, check_by_found_shapes
 
-_MOST_TURNED: Final = 3
+_MAX_TURNED_JOINTS: Final = 3
 """Joints turned to find a clear home posture."""
 _DECIMALS: Final = 3
 """Decimals of degrees; rounding is below the tolerance of URDF limits."""
-_CYCLES: Final = (1, 2)
+_CYCLES_MS: Final = (1, 2)
 ASSUMED: Final = "assumed"
 """Origin of assumed values."""
 
@@ -159,8 +159,8 @@ def clear_home(urdf: str, cell_values: CellValues, mesh_folders: Sequence[str]) 
             if check.links:
                 notes.append(
                     f"the collision shapes of {', '.join(check.links)} were not found: in "
-                    f"campaign.home_deg their frames are {THICKNESS * 100:g} cm off the floor, and "
-                    "nothing else was checked of them"
+                    f"campaign.home_deg their frames are {MIN_FRAME_HEIGHT * 100:g} cm off the "
+                    "floor, and nothing else was checked of them"
                 )
             if floor is None:
                 values["workspace.floor"] = "none"
@@ -171,7 +171,7 @@ def clear_home(urdf: str, cell_values: CellValues, mesh_folders: Sequence[str]) 
 
 def _turned(home: Array, limits: JointLimits) -> Iterator[Array]:
     """Yield the home posture, and postures with joints turned by 90° within the limits."""
-    for n in range(_MOST_TURNED + 1):
+    for n in range(_MAX_TURNED_JOINTS + 1):
         for joints in combinations(range(len(home)), n):
             for turns in product((-0.5 * np.pi, 0.5 * np.pi), repeat=n):
                 posture = home.copy()
@@ -195,7 +195,7 @@ def from_init(init: InitPacket, n_joints: int, arm: int) -> CellValues:
     }
     notes = []
     cycle = init.sample_time
-    if cycle in _CYCLES:
+    if cycle in _CYCLES_MS:
         values["controller.cycle_ms"] = cycle
     else:
         notes.append(f"the cycle of the controller is {cycle} ms; supported are 1 and 2")
@@ -266,7 +266,7 @@ def _wire(values: ArrayLike, *, zero: bool = True, positive: bool = False) -> li
     ]
 
 
-_POLL = 0.05
+_POLL_PERIOD = 0.05
 _PLACEHOLDER_PERIOD = 0.002
 
 
@@ -324,7 +324,7 @@ def _waited_for(exchange: ExchangeProcess, wait: float, stop: Stop) -> InitPacke
             text += "; start this command first, then the controller's Open program"
             text += f" ({status.foreign} packets from other addresses)" if status.foreign else ""
             raise ControllerError(text)
-        time.sleep(_POLL)
+        time.sleep(_POLL_PERIOD)
     return connection.init
 
 

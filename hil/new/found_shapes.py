@@ -21,7 +21,7 @@ from identification.model.kinematics import chain_from_urdf
 from identification.model.urdf_text import urdf_tree
 from planner import JointLimits
 
-THICKNESS: Final = 0.05
+MIN_FRAME_HEIGHT: Final = 0.05
 """Height over a floor [m] of the frames of links, which are thicker at most places."""
 
 
@@ -103,5 +103,5 @@ def _above_floor(urdf: str, postures: Array, workspace: Workspace) -> NDArray[np
         ]
     )
     rises = np.ptp(heights, axis=1) > workspace.margin
-    least = workspace.floor + workspace.margin + THICKNESS
+    least = workspace.floor + workspace.margin + MIN_FRAME_HEIGHT
     return np.asarray((heights[rises] >= least).all(axis=0))

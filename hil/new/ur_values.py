@@ -14,7 +14,7 @@ from drivers.errors import DriverError
 from drivers.ur.identity import ArmIdentity, DhParameters, ask_identity
 from drivers.ur.outputs import GEAR_RATIO, N_JOINTS, TORQUES
 from drivers.ur.reader import RtdeReader
-from drivers.ur.torque_constants import UNCERTAINTY, by_size, stated_constants
+from drivers.ur.torque_constants import RELATIVE_UNCERTAINTY, by_size, stated_constants
 from drivers.ur.transport import RtdeSpec
 from hil.base.arrays import Array
 from hil.base.errors import ControllerError, InputError
@@ -38,7 +38,7 @@ FLANGES: Final = ("tool0", "flange")
 """Links of URDFs that are the frame of the controller's payload: by the maker, and of `hil`."""
 CONVENTION: Final = "of every arm of this maker"
 """Origin of gears, signs and offsets: angles are those of the URDF, torques follow by the ratio."""
-_LISTENED: Final = 1.0
+_LISTENING_SECONDS: Final = 1.0
 """Time for which outputs are read, s."""
 _COULOMB_SHARE: Final = 0.05
 """Assumed Coulomb friction, as a share of the largest torque."""
@@ -50,7 +50,7 @@ users of the maker's client library and ROS 2 driver (issues 86 and 1311), 34 an
 _LAG_MARGIN: Final = 1.5
 """Largest distance from the set-point, as a multiple of what that lag is at full speed."""
 _FULL_SPEED: Final = np.pi  # of a joint whose speed the arm does not state, rad/s
-_COUNTS: Final = 65536
+_ENCODER_COUNTS: Final = 65536
 
 
 @dataclass(frozen=True, eq=False)
@@ -91,11 +91,11 @@ def ask_arm(spec: RtdeSpec, ports: RtdeTable) -> UrArmStatements:
         with RtdeReader.connect(spec) as reader:
             reader.start()
             cycle_ms = round(1000.0 / reader.frequency)
-            count = round(_LISTENED * reader.frequency)
+            count = round(_LISTENING_SECONDS * reader.frequency)
             parts: list[NDArray[np.void]] = []
-            deadline = time.monotonic() + 10.0 * _LISTENED
+            deadline = time.monotonic() + 10.0 * _LISTENING_SECONDS
             while sum(map(len, parts)) < count and time.monotonic() < deadline:
-                parts.append(reader.fetch(_LISTENED).values)
+                parts.append(reader.fetch(_LISTENING_SECONDS).values)
             version = reader.version.major
     except DriverError as error:
         raise ControllerError(str(error)) from error
@@ -234,9 +234,9 @@ def _flange(urdf: str) -> str | None:
 def _assumed(arm: UrArmStatements) -> Iterator[tuple[str, Any]]:
     # They are the arm's own, and doubtful until a payload was weighed.
     yield "drive_train.torque_constant", _known(constants_of(arm) / GEAR_RATIO)
-    yield "drive_train.torque_uncertainty", UNCERTAINTY
+    yield "drive_train.torque_uncertainty", RELATIVE_UNCERTAINTY
     yield "drive_train.following_error", _following_error(arm)
-    yield "drive_train.encoder_counts_per_revolution", _COUNTS
+    yield "drive_train.encoder_counts_per_revolution", _ENCODER_COUNTS
     acceleration, velocity = arm.identity.acceleration, arm.identity.velocity
     if (share := _range_share(arm.identity)) is not None:
         yield "campaign.range_share", share

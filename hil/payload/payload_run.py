@@ -46,9 +46,9 @@ from identification.validation.finding_messages import MOUNTING_STEP
 from .payload_settings import NOT_DETERMINED, ControllerLoad, controller_settings
 
 _FLANGES: Final = ("tool0", "flange")  # flange frames of controllers, by their ROS-Industrial names
-_LEAST_DISTANCE: Final = 0.5  # m, of a hand tool on an arm that is shorter itself
-_FITTED: Final = 0.7  # of each bare recording, when the direction of gravity is tried
-_MOST_RECORDINGS: Final = 3  # enough to determine gravity
+_MIN_CENTRE_LIMIT: Final = 0.5  # m, of a hand tool on an arm that is shorter itself
+_FITTED_SHARE: Final = 0.7  # of each bare recording, when the direction of gravity is tried
+_MAX_BARE_RECORDINGS: Final = 3  # enough to determine gravity
 _UNITS: Final = dict(zip(NAMES, ["kg", *["m"] * 3, *["kg·m²"] * 6], strict=True))
 
 
@@ -452,9 +452,9 @@ def doubtful_mounting(model: RobotModel, bare: Sequence[Samples]) -> str | None:
     """
     first = []
     last = []
-    for samples in bare[:_MOST_RECORDINGS]:
+    for samples in bare[:_MAX_BARE_RECORDINGS]:
         count = len(samples.torque)
-        cut = round(_FITTED * count)
+        cut = round(_FITTED_SHARE * count)
         first.append(samples.between(0, cut))
         last.append(samples.between(cut, count))
     gravity = find_gravity(model, standard_factor(model, first), standard_factor(model, last))
@@ -527,7 +527,7 @@ def _require_within_reach(estimate: PayloadEstimate, length: float, frame: str) 
     no maker's rating allows.
     """
     value, low, high = (part / estimate.parameters[9] for part in estimate.moment)
-    if value <= max(length, _LEAST_DISTANCE):
+    if value <= max(length, _MIN_CENTRE_LIMIT):
         return
     mass = estimate.parameters[9]
     raise InputError(

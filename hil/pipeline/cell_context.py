@@ -17,7 +17,7 @@ from hil.cell import Cell
 from hil.cell.nominal import nominal_of
 from hil.cell.toml_edits import urdf_limits
 from identification.estimators.torque_channel import torque_noiseless_above
-from identification.estimators.torque_scale import DATA_SHEET, described
+from identification.estimators.torque_scale import TORQUE_CONSTANT_STD, described
 from identification.factor.estimate import Estimate
 from identification.model.friction import TERMS, FrictionLaw
 from identification.selection.questions import FRICTION_AT_SPEED, LOAD, LOW_PASS, REVERSAL
@@ -44,7 +44,7 @@ from planner.arrays import numbers
 from .prepared import Prepared
 from .sources import Source, Sources
 
-_POSTURES = 500
+_MAX_POSTURES = 500
 _TIME_TOLERANCE = 1e-6  # s
 
 
@@ -73,7 +73,7 @@ def controller_inertia(
     received = []
     for source in sources:
         recording = source.recording
-        few = slice(None, None, max(1, recording.n_samples // _POSTURES))
+        few = slice(None, None, max(1, recording.n_samples // _MAX_POSTURES))
         inertia = _column_at(source, "diagonal_inertia", recording.time[few])
         if inertia is not None:
             received.append((recording.position[few], inertia))
@@ -102,14 +102,15 @@ def _column_at(source: Source, field: str, time: Array) -> Array | None:
 
 
 # Position changes below this share of a joint's range are floating-point rounding.
-_ROUNDING: Final = 1e-9
+_ROUNDING_SHARE: Final = 1e-9
 _STEP_QUANTILE: Final = 0.01  # of the changes between samples: one step of a coarse encoder
-_GRID: Final = 0.05  # distance from a multiple of the step, in steps
-_MAX_ROUNDING: Final = 0.02  # of accelerations, as a share
-_EXACT: Final = 1e-4  # relative error below the resolution of any sensor
-_FEW: Final = 3  # recordings that show the noise of the torque
-_MOST: Final = 0.5  # of the squared residual
-_FAST: Final = 2.0  # a low-pass above this multiple of the motion's bandwidth has no effect
+_MAX_GRID_DEVIATION: Final = 0.05  # distance from a multiple of the step, in steps
+_MAX_ROUNDING_SHARE: Final = 0.02  # of accelerations, as a share
+_EXACT_ERROR: Final = 1e-4  # relative error below the resolution of any sensor
+_NOISE_RECORDINGS: Final = 3  # recordings that show the noise of the torque
+_MAX_NOISE_SHARE: Final = 0.5  # of the squared residual
+# a low-pass above this multiple of the motion's bandwidth has no effect
+_MAX_BANDWIDTH_RATIO: Final = 2.0
 
 
 def cell_context_of(prepared: Prepared, estimate: Estimate) -> CellContext:
@@ -327,11 +328,11 @@ def _torque_channel(prepared: Prepared) -> Iterator[Finding]:
     if LOW_PASS in chosen and width is not None:
         yield _doubtful("filtered torque", remedy, bandwidth=width, shape=str(how.torque_shape))
         return
-    exact = any(choice.errors[choice.chosen] < _EXACT for choice in prepared.settings.choices)
+    exact = any(choice.errors[choice.chosen] < _EXACT_ERROR for choice in prepared.settings.choices)
     if exact or REVERSAL in chosen:
         return  # computed for this motion, or it would not be predicted to rounding
     above = torque_noiseless_above(prepared.sources.training[0].recording)
-    if above is not None and width is None and above < _FAST * how.rigid_bandwidth:
+    if above is not None and width is None and above < _MAX_BANDWIDTH_RATIO * how.rigid_bandwidth:
         yield _doubtful("filtered or computed torque", remedy, bandwidth=above)
 
 
@@ -356,13 +357,13 @@ def _resolution(prepared: Prepared) -> Iterator[Finding]:
                 continue
             width = min(samples.position_bandwidth[j], 0.5 / interval)
             noise = step**2 / 12.0 * 2.0 * interval * (2.0 * np.pi) ** 4 * width**5 / 5.0
-            if np.sqrt(noise) > _MAX_ROUNDING * samples.motion.acceleration[:, j].std():
+            if np.sqrt(noise) > _MAX_ROUNDING_SHARE * samples.motion.acceleration[:, j].std():
                 coarse[j] = max(step, coarse[j])
             law = model.friction.laws[j]
             if law.coulomb and resting[j] and 0.0 < (law.presliding or 0.0) < step:
                 reversing[j] = max(step, reversing[j])
     if coarse.any():
-        found = _doubtful("coarse positions", "record more digits", limit=_MAX_ROUNDING)
+        found = _doubtful("coarse positions", "record more digits", limit=_MAX_ROUNDING_SHARE)
         yield found.about(coarse > 0.0, step=coarse)
     elif reversing.any():
         presliding = max(law.presliding or 0.0 for law in model.friction.laws)
@@ -376,10 +377,10 @@ def _sampling_rate(prepared: Prepared, estimate: Estimate) -> Iterator[Finding]:
     how = prepared.settings.preprocessing
     if how.torque_bandwidth is not None:
         return
-    few = prepared.training[:_FEW]
+    few = prepared.training[:_NOISE_RECORDINGS]
     model = prepared.sources.cell.model
     noise = folded_noise(model, estimate.values, few, how.rigid_bandwidth)
-    if noise.share > _MOST and noise.error > Thresholds().unexplained:
+    if noise.share > _MAX_NOISE_SHARE and noise.error > Thresholds().unexplained:
         rate = 1.0 / float(np.median(np.diff(few[0].motion.time)))
         yield _doubtful(
             "folded noise",
@@ -393,13 +394,13 @@ def _sampling_rate(prepared: Prepared, estimate: Estimate) -> Iterator[Finding]:
 def grid_step(position: Array) -> float | None:
     """Return the step of the grid that the positions (m,) of a joint lie on, None without one."""
     moves = np.abs(np.diff(position))
-    moves = moves[moves > _ROUNDING * np.ptp(position)]
+    moves = moves[moves > _ROUNDING_SHARE * np.ptp(position)]
     if not moves.size:
         return None
     step = float(np.quantile(moves, _STEP_QUANTILE))
     # Of positions without a grid, a tenth is that near to multiples of any step by chance.
     off = np.abs(moves / step - np.rint(moves / step))
-    return step if np.mean(off < _GRID) > 0.5 else None
+    return step if np.mean(off < _MAX_GRID_DEVIATION) > 0.5 else None
 
 
 def torque_limits(cell: Cell) -> Array | None:
@@ -442,7 +443,7 @@ def torque_scale(cell: Cell, recordings: Sequence[Recording], *, simulated: bool
     (`simulated`: only one can have moved) are exact: its currents are made with the torque
     constants of the cell. A controller's own currents and imported ones have torque constants of a
     data sheet unless something else is stated, and joint torque sensors are no better
-    (`identification.estimators.torque_scale.DATA_SHEET`).
+    (`identification.estimators.torque_scale.TORQUE_CONSTANT_STD`).
     """
     n = len(cell.joint_names)
     drives = cell.file.drive_train
@@ -461,7 +462,7 @@ def torque_scale(cell: Cell, recordings: Sequence[Recording], *, simulated: bool
         base = np.zeros(n)
         source = "a simulated arm"
     else:
-        base = np.full(n, DATA_SHEET)
+        base = np.full(n, TORQUE_CONSTANT_STD)
         source = "of a data sheet, as no torque_uncertainty is stated"
     if any(entry is not None for entry in mapped):
         stds = [base if text is None else numbers(json.loads(text), 1) for text in mapped]

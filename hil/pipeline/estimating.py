@@ -23,11 +23,11 @@ from identification.estimators.instrumental import (
 from identification.estimators.least_squares import RepeatedEstimate, estimate_repetitions
 from identification.estimators.load_friction import LoadFit, fit_with_load
 from identification.estimators.loss_functions import Huber, Loss, Tukey
-from identification.estimators.prior import BODY_SHARE, NOMINAL_SHARE, PosteriorEstimate
+from identification.estimators.prior import BODY_STD_SHARE, NOMINAL_STD_SHARE, PosteriorEstimate
 from identification.estimators.robust import RobustEstimate, robust_estimate
 from identification.factor.columns import instrument_factor
 from identification.factor.estimate import Estimate
-from identification.factor.factor import QR_CONDITION, Factor, no_rows_message, total_factor
+from identification.factor.factor import MAX_GRAM_CONDITION, Factor, no_rows_message, total_factor
 from identification.reduction.intervals import delayed, widened
 from identification.reduction.posterior import Posterior
 from identification.reduction.reduction import Reduction
@@ -200,7 +200,7 @@ def posterior_of(cell: Cell, factor: Factor, name: str, strength: Strength) -> P
     """Return the posterior of an estimator.
 
     The bodies are as uncertain as `[nominal]` states; the estimator "prior" trusts them to
-    `NOMINAL_SHARE` if it states nothing.
+    `NOMINAL_STD_SHARE` if it states nothing.
 
     Args:
         cell: of the arm.
@@ -209,7 +209,7 @@ def posterior_of(cell: Cell, factor: Factor, name: str, strength: Strength) -> P
         strength: of the prior for "auto"; all others have that of the residuals.
     """
     table = cell.file.nominal
-    share = NOMINAL_SHARE if name == "prior" else BODY_SHARE
+    share = NOMINAL_STD_SHARE if name == "prior" else BODY_STD_SHARE
     if table is not None and "uncertainty" in table.model_fields_set:
         share = table.uncertainty or share
     if name != "auto":
@@ -231,7 +231,7 @@ def _without_prior(prepared: Prepared, name: Estimator) -> tuple[RepeatedEstimat
 
 
 def _poorly_separated(estimate: Estimate) -> list[str]:
-    if estimate.undetermined or estimate.condition <= QR_CONDITION:
+    if estimate.undetermined or estimate.condition <= MAX_GRAM_CONDITION:
         return []
     return [
         f"the scaled condition number is {number(estimate.condition, 2)}: the motion separates some"

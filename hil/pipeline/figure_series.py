@@ -22,10 +22,10 @@ FIGURE_SAMPLES: Final = 4000
 """Maximum number of rows of a time series in a figure."""
 FRICTION_POINTS: Final = 600
 """Points per joint in a friction figure."""
-_RECORDINGS: Final = 4  # fitted recordings in a friction figure
-_FRICTION_ROWS: Final = 20 * FRICTION_POINTS  # of each; a joint rests in many of them
+_MAX_FRICTION_RECORDINGS: Final = 4  # fitted recordings in a friction figure
+_MAX_FRICTION_ROWS: Final = 20 * FRICTION_POINTS  # of each; a joint rests in many of them
 _CLOCK_STAMPS: Final = 4000  # whose intervals are in a figure
-_MARGIN: Final = 1.0  # time shown before and after the motion, s
+_MARGIN_SECONDS: Final = 1.0  # time shown before and after the motion, s
 
 
 def report_series(prepared: Prepared, estimate: RepeatedEstimate) -> ReportSeries:
@@ -82,8 +82,8 @@ def _shown(samples: Samples) -> slice:
     time = samples.motion.time
     if moving.start == moving.stop:
         return moving
-    first = int(np.searchsorted(time, time[moving.start] - _MARGIN))
-    last = int(np.searchsorted(time, time[moving.stop - 1] + _MARGIN, side="right"))
+    first = int(np.searchsorted(time, time[moving.start] - _MARGIN_SECONDS))
+    last = int(np.searchsorted(time, time[moving.stop - 1] + _MARGIN_SECONDS, side="right"))
     return slice(first, last, max(1, (last - first) // FIGURE_SAMPLES))
 
 
@@ -91,14 +91,16 @@ def _fewer_rows(samples: Samples) -> Samples:
     """Return some rows of a long recording; all of one whose low-pass needs them."""
     if samples.torque_bandwidth is not None:
         return samples
-    return samples.thinned(max(1, len(samples.torque) // _FRICTION_ROWS))
+    return samples.thinned(max(1, len(samples.torque) // _MAX_FRICTION_ROWS))
 
 
 def _friction_data(
     model: RobotModel, values: Array, fitted: tuple[Samples, ...]
 ) -> tuple[Array, Array]:
     """Speed and friction torque of fitted rows, each (FRICTION_POINTS, n), padded with NaN."""
-    some = [_fewer_rows(samples) for samples in fitted[:: -(-len(fitted) // _RECORDINGS)]]
+    some = [
+        _fewer_rows(samples) for samples in fitted[:: -(-len(fitted) // _MAX_FRICTION_RECORDINGS)]
+    ]
     parts = [
         (samples.motion.velocity, friction_torque(model, values, samples), samples.usable)
         for samples in some

@@ -28,10 +28,10 @@ from identification.estimators.delay import (
 from identification.estimators.torque_channel import possible_low_passes
 from identification.model.elements import TorqueRipple
 from identification.model.robot import RobotModel
-from identification.reduction.reduction import ALIKE, Reduction, reduce
+from identification.reduction.reduction import MAX_UNMODELLED_REPETITIONS, Reduction, reduce
 from identification.selection.questions import (
     DELAY,
-    RATE,
+    SELECTION_RATE,
     Question,
     SuggestedDelay,
     choose_settings,
@@ -39,7 +39,7 @@ from identification.selection.questions import (
 from identification.selection.scores import Known
 from identification.selection.settings import Settings
 from identification.signals.clock import time_base
-from identification.signals.masks import SHORTEST_STRETCH
+from identification.signals.masks import MIN_STRETCH_SAMPLES
 from identification.signals.messages import clock_lines, time_lines
 from identification.signals.recording import Recording, in_succession
 from identification.signals.samples import (
@@ -199,14 +199,15 @@ def _array(figures: tuple[float, ...] | None) -> Array | None:
 MAX_RECORDINGS: Final = 32
 """Recordings that settings are chosen from."""
 _DELAY_RATE: Final = 250.0  # Hz, to which it is averaged; both positions and torques, without bias
-_SAME_DELAY: Final = 0.05  # cycles, by which a delay in use may differ from the stated one unsaid
-_SAME_STEP: Final = 0.1  # of sampling intervals of recordings that are estimated together
-DELAY_TIME: Final = 64.0  # s, in which a delay that nobody asked for is looked for
-RIPPLE: Final = ((1,), (2,), (1, 2))
+# cycles, by which a delay in use may differ from the stated one unsaid
+_DELAY_TOLERANCE_CYCLES: Final = 0.05
+_STEP_TOLERANCE: Final = 0.1  # of sampling intervals of recordings that are estimated together
+DELAY_SEARCH_SECONDS: Final = 64.0  # s, in which a delay that nobody asked for is looked for
+RIPPLE_ORDERS: Final = ((1,), (2,), (1, 2))
 """Periods of a torque ripple per motor turn: rotor eccentricity, wave generator, both."""
 
 
-FRICTION_SHARE: Final = 0.5
+FRICTION_UNCERTAINTY: Final = 0.5
 """Relative standard deviation of nominal friction, which varies by tens of per cent with
 temperature, lubricant and wear (Bittencourt and Gunnarsson 2012)."""
 
@@ -345,7 +346,7 @@ class _DelayChoice:
             return replace(choice, suggested=(SuggestedDelay(combined.mean, determined=True),))
         if filtered or not estimate.excludes(stated):
             return choice
-        if abs(combined.mean - stated) >= _SAME_DELAY * estimate.cycle:
+        if abs(combined.mean - stated) >= _DELAY_TOLERANCE_CYCLES * estimate.cycle:
             beside = f"by this and the stated {stated * 1e3:.3g} ms"
             choice = replace(
                 choice, notes=(described[0], f"{_compensated(combined.mean)}, {beside}")
@@ -477,7 +478,7 @@ def known_parameters(cell: Cell) -> Known:
     if table is None:
         return {}
     model = cell.model
-    share = table.uncertainty or FRICTION_SHARE
+    share = table.uncertainty or FRICTION_UNCERTAINTY
     parameters = {
         f"I{j}m": (value, share * value) for j, value in enumerate(table.rotor_inertia, 1)
     }
@@ -485,7 +486,7 @@ def known_parameters(cell: Cell) -> Known:
         values = getattr(table, term.term.option, None)
         if values and not term.motor:
             value = values[term.owner]
-            parameters[term.name] = value, FRICTION_SHARE * abs(value)
+            parameters[term.name] = value, FRICTION_UNCERTAINTY * abs(value)
     names = {*model.layout.names, *model.friction.names}
     return {name: pair for name, pair in parameters.items() if pair[0] != 0.0 and name in names}
 
@@ -504,7 +505,7 @@ def _chosen(
         return stated
     # One repetition of a motion is enough.
     some = sources.training[:1] if sources.same_motion else sources.training
-    read = [averaged_source(source, RATE) for source in some]
+    read = [averaged_source(source, SELECTION_RATE) for source in some]
     averaged = averaged_noise(stated, some[0], read[0])
     motions: list[dict[Preprocessing, Smoothed]] = [{} for _ in read]
 
@@ -546,7 +547,7 @@ def _ripples(cell: Cell) -> list[list[TorqueRipple]]:
     if cell.file.drive_train is None or cell.file.robot.friction.ripple:
         return []
     motors = cell.drive_train.motor_from_joint
-    return [ripples(cell.joint_names, motors, orders) for orders in RIPPLE]
+    return [ripples(cell.joint_names, motors, orders) for orders in RIPPLE_ORDERS]
 
 
 def _spring_joints(cell: Cell) -> tuple[str, ...]:
@@ -570,7 +571,7 @@ def _delays(
         return None
     wanted = options.delay == "auto"
     in_order = sorted(sources.training, key=lambda source: -source.recording.n_samples)
-    averages = _averaged_for(np.inf if wanted else DELAY_TIME, in_order)
+    averages = _averaged_for(np.inf if wanted else DELAY_SEARCH_SECONDS, in_order)
     longest = in_order[0]
     mean = replace(longest, recording=averages[0], context=None)
     with reporter.task("estimating the delay", 1) as task:
@@ -593,13 +594,13 @@ def _averaged_for(duration: float, sources: Sequence[Source]) -> list[Recording]
     """Return averages of recordings of one sampling rate, the first one's, for a time [s]."""
     averages: list[Recording] = []
     for recording in (source.recording for source in sources):
-        if averages and (duration <= 0.0 or recording.n_samples < SHORTEST_STRETCH):
+        if averages and (duration <= 0.0 or recording.n_samples < MIN_STRETCH_SAMPLES):
             break
         if duration < np.inf:
             recording = recording.between(0, max(2, math.ceil(duration / _step(recording))))
             duration -= recording.n_samples * _step(recording)
         average = recording.averaged(_DELAY_RATE)
-        if not averages or np.isclose(_step(average), _step(averages[0]), rtol=_SAME_STEP):
+        if not averages or np.isclose(_step(average), _step(averages[0]), rtol=_STEP_TOLERANCE):
             averages.append(average)
     return averages
 
@@ -656,7 +657,10 @@ class Prepared:
         sides = (self.fitted, self.hedged) if self.hedged else (self.fitted,)
         return tuple(
             reduction_of(
-                self.sources.cell, self.settings, versions, unmodelled=not same or k < ALIKE
+                self.sources.cell,
+                self.settings,
+                versions,
+                unmodelled=not same or k < MAX_UNMODELLED_REPETITIONS,
             )
             for k, versions in enumerate(zip(*sides, strict=True))
         )

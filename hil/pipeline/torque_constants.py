@@ -14,7 +14,7 @@ from hil.base.arrays import Array
 from hil.base.errors import ArchiveError, InputError
 from hil.base.progress import Reporter
 from hil.cell import Cell
-from identification.estimators.current_gains import MOST_BLOCKS, Gains, identify_gains
+from identification.estimators.current_gains import MAX_BLOCKS, Gains, identify_gains
 from identification.factor.blocks import FINE_BLOCK
 from identification.factor.columns import gain_factor
 from identification.factor.factor import Factor
@@ -138,7 +138,7 @@ def _reduced(
 ) -> list[Factor]:
     """Return the factor of each recording, in equal blocks of time."""
     longest = max(float(np.ptp(each.samples.motion.time)) for each in prepared)
-    block = max(FINE_BLOCK, longest / MOST_BLOCKS)
+    block = max(FINE_BLOCK, longest / MAX_BLOCKS)
     factors: list[Factor] = []
     with reporter.task("reducing recordings", len(prepared)) as task:
         for samples, current, load, name in prepared:

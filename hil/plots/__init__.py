@@ -10,7 +10,7 @@ if TYPE_CHECKING:
     from hil.report.chart_picture import draw_charts, draw_torque
 
 __all__ = ["check_format", "draw_charts", "draw_plan", "draw_torque", "save"]
-_HOME = {
+_MODULE_OF_NAME = {
     **dict.fromkeys(("check_format", "draw_plan", "save"), "hil.plots.plan_picture"),
     **dict.fromkeys(("draw_charts", "draw_torque"), "hil.report.chart_picture"),
 }
@@ -18,9 +18,9 @@ _HOME = {
 if not TYPE_CHECKING:  # which would accept any name
 
     def __getattr__(name: str) -> Any:
-        if name not in _HOME:
+        if name not in _MODULE_OF_NAME:
             raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-        return getattr(import_module(_HOME[name]), name)
+        return getattr(import_module(_MODULE_OF_NAME[name]), name)
 
 
 def __dir__() -> list[str]:

@@ -27,7 +27,7 @@ from identification.model.kinematics import chain_from_urdf
 
 _BINS: Final = 4000
 """Intervals of a picture, each with its minimum and maximum."""
-_LEAP: Final = 10.0  # Missing samples that interrupt a line
+_LINE_BREAK_SAMPLES: Final = 10.0  # Missing samples that interrupt a line
 _GAP: Final = (np.array([np.nan]), np.array([np.nan]))
 _FIELDS: Final = (
     "position", "velocity", "torque", "target_current", "motor_current", "target_position",
@@ -41,7 +41,7 @@ _COLOURS: Final = {
     "torque at the joint": "#5b3a8c",
     "following error": style.INK,
 }
-_MOST_GAPS: Final = 200
+_MAX_SHOWN_GAPS: Final = 200
 
 
 @dataclass(frozen=True, eq=False)
@@ -259,7 +259,7 @@ def _slides(archive: Archive, n: int) -> NDArray[np.bool_]:
 
 def _reduced(time: Array, values: Array) -> tuple[Array, Array]:
     """Return minimum and maximum per interval of samples (m,); NaN where nothing was recorded."""
-    leap = _LEAP * float(np.median(np.diff(time))) if len(time) > 1 else np.inf
+    leap = _LINE_BREAK_SAMPLES * float(np.median(np.diff(time))) if len(time) > 1 else np.inf
     recorded = np.flatnonzero(np.isfinite(values))
     ends = np.flatnonzero((np.diff(recorded) > 1) | (np.diff(time[recorded]) > leap)) + 1
     parts = list[tuple[Array, Array]]()
@@ -286,7 +286,7 @@ def draw_archive(view: ArchiveView) -> Figure:
     height = 1.6 + 1.15 * rows
     marks = [(at, style.LIMIT if warns else style.MUTED) for at, _, _, warns in view.events]
     if view.gaps is not None:
-        marks += [(float(gap), style.MUTED) for gap in view.gaps[:_MOST_GAPS]]
+        marks += [(float(gap), style.MUTED) for gap in view.gaps[:_MAX_SHOWN_GAPS]]
     with style.page():
         figure = Figure(figsize=(width, height))
         grid = figure.add_gridspec(
@@ -303,11 +303,11 @@ def draw_archive(view: ArchiveView) -> Figure:
                 axes.tick_params(labelbottom=j == rows - 1)
                 share = f"{share} % of limit" if (share := _share(trace)) else ""
                 # A fixed height: an exponent of the axis would move it.
-                axes.set_title(share, loc="right", y=1.0, pad=2.0, fontsize=style.SMALL)
+                axes.set_title(share, loc="right", y=1.0, pad=2.0, fontsize=style.SMALL_FONT_SIZE)
                 if j == 0:
                     axes.annotate(
                         quantity.title, (0.0, 1.0), xycoords="axes fraction", xytext=(0.0, 14.0),
-                        textcoords="offset points", fontsize=style.TEXT,
+                        textcoords="offset points", fontsize=style.FONT_SIZE,
                     )  # fmt: skip
                 axes.set_xlabel(_SECONDS if j == rows - 1 else "")
                 axes.set_ylabel("" if k else wrapped(view.joint_names[j]))
@@ -315,8 +315,8 @@ def draw_archive(view: ArchiveView) -> Figure:
         packets = view.missed and f"packets: {view.missed}"
         parts = (simulated, view.frame, packets, facts.lost, facts.damage, "red dashes: limits")
         for text, size, at in (
-            (f"{facts.path.name} · {facts.title} · {facts.outcome}", style.TITLE, 0.3),
-            (" · ".join(filter(None, parts)), style.SMALL, 0.52),
+            (f"{facts.path.name} · {facts.title} · {facts.outcome}", style.TITLE_FONT_SIZE, 0.3),
+            (" · ".join(filter(None, parts)), style.SMALL_FONT_SIZE, 0.52),
         ):
             figure.text(0.95 / width, 1.0 - at / height, text, fontsize=size)
     return figure

@@ -32,16 +32,16 @@ from planner import Trajectory
 
 _WHITE: Final[dict[str, Any]] = {"linestyle": "none", "markerfacecolor": "white"}
 # inch
-_WIDTH = 11.8
-_ROW = 1.05
-_FRONT = 2.9
-_LEGEND_LINE = 0.22
-_CELL = 0.1
-_SMALLEST = 2.6
-_LARGEST = 4.0
-_TITLE_AT = 0.36
-_HEAD_LINE = 0.23
-_HEAD_FOOT = 0.3
+_FIGURE_WIDTH = 11.8
+_ROW_HEIGHT = 1.05
+_FRONT_HEIGHT = 2.9
+_LEGEND_LINE_HEIGHT = 0.22
+_CELL_SIZE = 0.1
+_MIN_MATRIX_SIDE = 2.6
+_MAX_MATRIX_SIDE = 4.0
+_TITLE_OFFSET = 0.36
+_HEAD_LINE_HEIGHT = 0.23
+_HEAD_FOOT_HEIGHT = 0.3
 _LINE_LENGTH: Final = 1300.0  # Characters of a line times its font size in points
 
 
@@ -79,7 +79,7 @@ def draw_front(axes: Axes, design: Design) -> None:
     axes.set_ylabel(f"{over.title} ({over.better})")
     axes.legend(
         loc="lower left", bbox_to_anchor=(0.0, 1.02), frameon=False, borderaxespad=0.0,
-        borderpad=0.0, labelspacing=0.35, fontsize=style.SMALL,
+        borderpad=0.0, labelspacing=0.35, fontsize=style.SMALL_FONT_SIZE,
     )  # fmt: skip
 
 
@@ -124,18 +124,18 @@ def _heading(
     duration = f"{excitation.trajectory.duration:.2f} s"
     parts = (label(cell.name), f"method {excitation.method}", duration, figures)
     for text, size, colour in (
-        (" · ".join(parts), style.TITLE, style.INK),
+        (" · ".join(parts), style.TITLE_FONT_SIZE, style.INK),
         (
             f"NOT CHECKED: {', '.join(unchecked)}; not for a robot" if unchecked else "",
-            style.TEXT + 1.0,
+            style.FONT_SIZE + 1.0,
             style.LIMIT,
         ),
         (
             "" if design.complete else "search interrupted: better motions may exist",
-            style.TEXT + 1.0,
+            style.FONT_SIZE + 1.0,
             style.LIMIT,
         ),
-        ("red dashes: limits", style.SMALL, style.MUTED),
+        ("red dashes: limits", style.SMALL_FONT_SIZE, style.MUTED),
     ):
         for line in textwrap.wrap(text, int(_LINE_LENGTH / size)):
             yield line, size, colour
@@ -146,16 +146,16 @@ def draw_design(design: Design, cell: Cell, unchecked: Sequence[str] = ()) -> Fi
     model = cell.model
     trajectory = design.excitation.trajectory
     lines = list(_heading(design, cell, unchecked))
-    side = float(np.clip(_CELL * model.base.rank, _SMALLEST, _LARGEST))
-    beside = _FRONT + 3 * _LEGEND_LINE
-    head = _TITLE_AT + _HEAD_LINE * (len(lines) - 1) + _HEAD_FOOT
-    upper = max(_ROW * model.n_joints + 0.6, side + 1.0 + beside)
+    side = float(np.clip(_CELL_SIZE * model.base.rank, _MIN_MATRIX_SIDE, _MAX_MATRIX_SIDE))
+    beside = _FRONT_HEIGHT + 3 * _LEGEND_LINE_HEIGHT
+    head = _TITLE_OFFSET + _HEAD_LINE_HEIGHT * (len(lines) - 1) + _HEAD_FOOT_HEIGHT
+    upper = max(_ROW_HEIGHT * model.n_joints + 0.6, side + 1.0 + beside)
     height = head + upper
     with style.page():
-        figure = Figure(figsize=(_WIDTH, height), layout="constrained")
+        figure = Figure(figsize=(_FIGURE_WIDTH, height), layout="constrained")
         parts: Any = figure.subfigures(2, 1, height_ratios=(head, upper))
         top = parts[1]
-        left, right = top.subfigures(1, 2, width_ratios=(_WIDTH - side - 1.7, side + 1.7))
+        left, right = top.subfigures(1, 2, width_ratios=(_FIGURE_WIDTH - side - 1.7, side + 1.7))
         rows = left.subplots(model.n_joints, 2, squeeze=False).tolist()
         frame = AngleFrame.of(cell)
         draw_motion(rows, trajectory, cell.joint_limits, cell.joint_names, frame)
@@ -164,7 +164,7 @@ def draw_design(design: Design, cell: Cell, unchecked: Sequence[str] = ()) -> Fi
         draw_correlation(matrix, trajectory, model)
         draw_front(below, design)
         for k, (text, size, colour) in enumerate(lines):
-            at = 1.0 - (_TITLE_AT + k * _HEAD_LINE) / height
+            at = 1.0 - (_TITLE_OFFSET + k * _HEAD_LINE_HEIGHT) / height
             weight = "bold" if colour == style.LIMIT else "normal"
             figure.text(0.07, at, text, fontsize=size, color=colour, fontweight=weight)
         figure.draw_without_rendering()

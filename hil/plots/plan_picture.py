@@ -22,14 +22,14 @@ from planner import JointLimits, Trajectory
 from planner.moves import MotionPlan
 
 FORMATS = (".png", ".svg", ".pdf")
-_SAMPLES = 4000
+_PLOT_SAMPLES = 4000
 _LINES = {"flown": "-", "reduced": "--", "stopped": ":"}
-_LETTERS = 12  # Characters that fit the height of a row
+_LABEL_LETTERS = 12  # Characters that fit the height of a row
 # inch
-_WIDTH = 11.0
-_ROW = 1.25
-_TOP = 0.95
-_BOTTOM = 0.55
+_FIGURE_WIDTH = 11.0
+_ROW_HEIGHT = 1.25
+_TOP_MARGIN = 0.95
+_BOTTOM_MARGIN = 0.55
 _DOTS_PER_INCH = 110
 
 
@@ -49,7 +49,7 @@ def draw_motion(
         joint_names: of the rows.
         frame: of the angles that are shown.
     """
-    time = np.linspace(0.0, trajectory.duration, _SAMPLES)
+    time = np.linspace(0.0, trajectory.duration, _PLOT_SAMPLES)
     q, *rates = trajectory.sample(time)
     ends = np.sort([frame.shown(limits.lower), frame.shown(limits.upper)], axis=0)
     fastest = np.degrees(limits.velocity)
@@ -75,7 +75,7 @@ def draw_motion(
 
 def wrapped(name: str) -> str:
     """Return a joint's name in lines that fit the height of a row, broken after underscores."""
-    return textwrap.fill(label(name).replace("_", "_ "), _LETTERS).replace("_ ", "_")
+    return textwrap.fill(label(name).replace("_", "_ "), _LABEL_LETTERS).replace("_ ", "_")
 
 
 def _against_limits(axes: Axes, low: float, high: float, values: Array) -> None:
@@ -102,13 +102,14 @@ def draw_plan(
         title: of the figure.
     """
     n = len(joint_names)
-    height = _TOP + n * _ROW + _BOTTOM
+    height = _TOP_MARGIN + n * _ROW_HEIGHT + _BOTTOM_MARGIN
     targets = np.array([frame.shown(move.target) for move in plan.moves])
     times = [target.time for target in plan.targets]
     with style.page():
-        figure = Figure(figsize=(_WIDTH, height))
+        figure = Figure(figsize=(_FIGURE_WIDTH, height))
         grid = figure.add_gridspec(
-            n, 3, left=0.08, right=0.985, top=1.0 - _TOP / height, bottom=_BOTTOM / height,
+            n, 3, left=0.08, right=0.985, top=1.0 - _TOP_MARGIN / height,
+            bottom=_BOTTOM_MARGIN / height,
             hspace=0.16, wspace=0.2,
         )  # fmt: skip
         rows = [[figure.add_subplot(grid[j, k]) for k in range(3)] for j in range(n)]
@@ -128,7 +129,7 @@ def draw_plan(
                 axes.annotate(
                     str(number), (time, 1.0), xycoords=("data", "axes fraction"),
                     xytext=(0.0, 2.0), textcoords="offset points", ha="center",
-                    fontsize=style.SMALL, color=style.INK,
+                    fontsize=style.SMALL_FONT_SIZE, color=style.INK,
                 )  # fmt: skip
         figure.align_ylabels([row[0] for row in rows])
         duration = plan.duration
@@ -146,8 +147,8 @@ def draw_plan(
             "reduced, dotted stop; circles: targets"
         )
         for text, at, size, colour in (
-            (headline, 0.3, style.TITLE, style.INK),
-            (legend, 0.52, style.SMALL + 0.5, style.MUTED),
+            (headline, 0.3, style.TITLE_FONT_SIZE, style.INK),
+            (legend, 0.52, style.SMALL_FONT_SIZE + 0.5, style.MUTED),
         ):
             figure.text(0.08, 1.0 - at / height, text, fontsize=size, color=colour)
     return figure

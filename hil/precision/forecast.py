@@ -19,7 +19,7 @@ from hil.base.arrays import Array
 from hil.base.errors import InputError
 from hil.base.terminal_text import plural
 from hil.cell import Cell
-from hil.design.settings import MOST_VIA_POINTS, DesignSettings, preset
+from hil.design.settings import MAX_VIA_POINTS, DesignSettings, preset
 from hil.pipeline.cell_context import TorqueScale, torque_scale
 from hil.pipeline.estimating import posterior_of
 from hil.pipeline.options import FIXED
@@ -28,7 +28,7 @@ from hil.precision.given_recordings import given_sources
 from hil.precision.required_quantities import ReferenceMotions, RequiredQuantities
 from identification.distributions import NORMAL_95
 from identification.estimators.payload_estimate import parameter_change
-from identification.estimators.payload_problem import DRIFT
+from identification.estimators.payload_problem import FRICTION_DRIFT_STD
 from identification.excitation import Excitation, LoadQuantities, Objective, midpoints
 from identification.excitation.motion_precision import Precision, Quantities
 from identification.factor.estimate import inverse_variance
@@ -43,10 +43,10 @@ from sim_fixtures.servo import loops_per_cycle
 from .predicted_variances import PredictedRows
 from .requirements import Requirement, require_known
 
-ERROR_SHARE: Final = 0.03
+MODEL_ERROR_SHARE: Final = 0.03
 """Torque error of a fitted model, as a share of each joint's torque, where nothing was recorded.
 On the real arms of the board (`docs/board.md`) it is 2 to 17 %, on the simulated NS 16 2 %."""
-ERROR_TIME: Final = 0.015
+ERROR_CORRELATION_TIME: Final = 0.015
 """Its correlation [s]: the simulated NS 16 with unmodelled effects has 14 ms."""
 NOISE_SHARE: Final = 0.01
 """White noise of the torque in one cycle, which repetitions average, as a share of the torque."""
@@ -54,23 +54,23 @@ SIMULATED_SHARE: Final = 0.002
 """Torque error of the fitted model of a simulated arm, likewise, in addition to the noise of its
 currents: its servo, encoders and smoothing. Chosen by what a campaign of the simulated NS 16 left
 (0.3 % promised friction 1.3 times too wide)."""
-_CYCLE: Final = 0.001  # s, of a cell without controller
+_DEFAULT_CYCLE: Final = 0.001  # s, of a cell without controller
 REFERENCE_PERIOD: Final = 0.04
 """Sampling of a motion on which precision is computed [s]."""
-_ARM_TIME: Final = 60.0  # s of motion, from which an arm is assumed to be known
-_RESERVE: Final = 0.85
+_KNOWN_ARM_SECONDS: Final = 60.0  # s of motion, from which an arm is assumed to be known
+_MAX_PREDICTED_RATIO: Final = 0.85
 """Predicted over required interval for which a motion is made long enough. An interval is itself
 estimated, from some sixty blocks of time: to 9 % (1 / sqrt(2 * 60)). It is to be met for sure, not
 by every second motion: two standard deviations."""
-_YEAR: Final = 3.156e7  # s
-_MEASURED: Final = 3  # recordings whose torque error is measured
-_WEIGHING_TIME: Final = 10.0  # s, longest motion for a payload
+_YEAR_SECONDS: Final = 3.156e7  # s
+_MIN_MEASURED_RECORDINGS: Final = 3  # recordings whose torque error is measured
+_MAX_WEIGHING_SECONDS: Final = 10.0  # s, longest motion for a payload
 _WEIGHING_POINTS: Final = (4, 16)  # fewest and most via points of such a motion
 _MOVE_SHARE: Final = 0.7
 """Time at speed of a move to the next via point of a search for a payload, as a share of that in
 which the slowest joint crosses its range."""
-_MOST: Final = 1000  # repetitions that are counted
-_ENDLESS: Final = 1e9  # factor of the information of motions without end
+_MAX_REPETITIONS: Final = 1000  # repetitions that are counted
+_ENDLESS_INFORMATION_FACTOR: Final = 1e9  # factor of the information of motions without end
 
 
 @dataclass(frozen=True)
@@ -206,7 +206,9 @@ class PrecisionDesign:
         if payload is None:
             required = reference.required(requirements, values, information)
         else:
-            information = prior if given else prior + _ARM_TIME * reference.information(error)
+            information = (
+                prior if given else prior + _KNOWN_ARM_SECONDS * reference.information(error)
+            )
             required, subject = _load(cell.model, requirements[0], payload, values, information)
         made = cls(
             cell, required, subject, values, prior, error, noise, reference, scale, source, exact
@@ -223,7 +225,7 @@ class PrecisionDesign:
         """Return settings of a longer motion, if repetitions of one as long as theirs are too few.
 
         That is so if random motions of that length do not meet all requirements with a reserve. Via
-        points are added at equal density, up to `MOST_VIA_POINTS`.
+        points are added at equal density, up to `MAX_VIA_POINTS`.
         """
         points = settings.via_points
         longest = settings.constraints.max_duration
@@ -231,9 +233,9 @@ class PrecisionDesign:
             return settings
         precision = self.precision(repetitions)
         rate = self.reference.information(precision.density)
-        for count in range(points.n_via, MOST_VIA_POINTS + 1):
+        for count in range(points.n_via, MAX_VIA_POINTS + 1):
             seconds = longest * count / points.n_via
-            if precision.ratios(seconds * rate).max() <= _RESERVE:
+            if precision.ratios(seconds * rate).max() <= _MAX_PREDICTED_RATIO:
                 break
         return settings.replaced(
             via_points={"n_via": count}, constraints={"max_duration": round(seconds, 1)}
@@ -242,7 +244,7 @@ class PrecisionDesign:
     def forecasts(self, excitation: Excitation, repetitions: int) -> list[Forecast]:
         """Return what a motion promises for each requirement after so many repetitions."""
         shown = self._shown(midpoints(excitation.trajectory))
-        limits = self._of_scale(shown, repetitions, _ENDLESS)
+        limits = self._of_scale(shown, repetitions, _ENDLESS_INFORMATION_FACTOR)
         forecasts = []
         worst = self.required.worst(self._ratios(shown, repetitions, 1.0))
         for k, (requirement, label, ratio) in enumerate(worst):
@@ -312,7 +314,9 @@ class PrecisionDesign:
         """Raise InputError for a requirement beyond what a year of different motions gives."""
         precision = self.precision(1.0)
         rate = self.reference.information(precision.density, has_offsets=precision.has_offsets)
-        for requirement, worst, ratio in self.required.worst(precision.ratios(_YEAR * rate)):
+        for requirement, worst, ratio in self.required.worst(
+            precision.ratios(_YEAR_SECONDS * rate)
+        ):
             if ratio > 1.0:
                 year = ratio * requirement.value
                 raise InputError(
@@ -344,7 +348,7 @@ def _load(
     The arm is known with the information `arm_information` (p, p); its friction may drift.
     """
     change = parameter_change(model, payload.frame)
-    drift = np.where(model.friction_columns, DRIFT * values, 0.0)
+    drift = np.where(model.friction_columns, FRICTION_DRIFT_STD * values, 0.0)
     scale = 1.0 / np.sqrt(np.diag(arm_information))
     unit = np.linalg.inv(arm_information * scale[:, None] * scale)
     covariance = unit * scale[:, None] * scale + np.diag(drift**2)
@@ -367,12 +371,12 @@ def payload_search(limits: JointLimits) -> DesignSettings:
     """
     crossing = (limits.upper - limits.lower) / limits.velocity
     move = float(np.max(_MOVE_SHARE * crossing + limits.velocity / limits.acceleration))
-    count = round(_WEIGHING_TIME / move) - 1
+    count = round(_MAX_WEIGHING_SECONDS / move) - 1
     few, many = _WEIGHING_POINTS
     # A heavy payload leaves few motions feasible: more of them, and slower ones, are tried.
     return short_search().replaced(
         search={"population": 60, "generations": 8},
-        constraints={"max_duration": _WEIGHING_TIME},
+        constraints={"max_duration": _MAX_WEIGHING_SECONDS},
         via_points={"n_via": min(max(count, few), many), "slowest": 0.2},
     )
 
@@ -386,11 +390,11 @@ def short_search() -> DesignSettings:
 
 
 def _least(meets: Callable[[int], bool]) -> int | None:
-    """Return the least count, up to `_MOST`, at which a condition holds that stays true."""
-    if not meets(_MOST):
+    """Return the least count, up to `_MAX_REPETITIONS`, from which on a condition holds."""
+    if not meets(_MAX_REPETITIONS):
         return None
     low = 0
-    high = _MOST
+    high = _MAX_REPETITIONS
     while high - low > 1:
         middle = (low + high) // 2
         low, high = (low, middle) if meets(middle) else (middle, high)
@@ -405,7 +409,7 @@ def _posterior(cell: Cell, paths: Sequence[Path]) -> tuple[Array, Array, Array]:
     for source in given_sources(cell, paths):
         versions = versions_of(source, cell, settings)
         factors.append(reduction_of(cell, settings, versions, unmodelled=False).factor)
-        if len(errors) < _MEASURED:
+        if len(errors) < _MIN_MEASURED_RECORDINGS:
             step = float(np.median(np.diff(versions[0].motion.time)))
             alone = posterior_of(cell, factors[-1], "auto", Strength())
             noise = alone.free(factors[-1]).estimate.noise_std
@@ -424,8 +428,8 @@ def _assumed_error(cell: Cell, scatter: Array, *, exact: bool) -> tuple[Array, A
 
     `scatter` is that of the torques (n,) [N m]; the model of an `exact` arm leaves out nothing.
     """
-    share = SIMULATED_SHARE if exact else ERROR_SHARE
-    error = (share * scatter) ** 2 * ERROR_TIME
+    share = SIMULATED_SHARE if exact else MODEL_ERROR_SHARE
+    error = (share * scatter) ** 2 * ERROR_CORRELATION_TIME
     if exact:
         source = f"of the simulated arm: its current noise, and {100 * share:g} % of the torque"
         return error, _current_noise(cell), source
@@ -446,4 +450,4 @@ def _current_noise(cell: Cell) -> Array:
 
 
 def _cycle(cell: Cell) -> float:
-    return _CYCLE if cell.file.controller is None else cell.period
+    return _DEFAULT_CYCLE if cell.file.controller is None else cell.period

@@ -17,7 +17,7 @@ from hil.base.arrays import Array
 from hil.cell import Cell
 from hil.pipeline.prepared import stated_delay, with_stated_delay
 from identification.distributions import student_limit
-from identification.estimators.covariance import SHORTEST_BLOCK
+from identification.estimators.covariance import MIN_FINE_BLOCKS
 from identification.estimators.delay import DelayEstimate, predicted_rate
 from identification.estimators.elasticity import (
     elastic_torque,
@@ -29,7 +29,7 @@ from identification.factor.blocks import FINE_BLOCK
 from identification.model.motion import Motion
 from identification.signals.samples import Preprocessing, Samples
 
-_FEWEST_BLOCKS: Final = 2
+_MIN_BLOCKS: Final = 2
 
 
 class Variances(NamedTuple):
@@ -125,8 +125,8 @@ class PredictedRows:
 
     def interval_factor(self, motions: float = 1.0) -> float:
         """Return the standard deviations in half a 95 % interval, by the blocks of time."""
-        count = motions * self.duration / (SHORTEST_BLOCK * FINE_BLOCK)
-        return float(student_limit(0.025, max(_FEWEST_BLOCKS, count) - 1.0))
+        count = motions * self.duration / (MIN_FINE_BLOCKS * FINE_BLOCK)
+        return float(student_limit(0.025, max(_MIN_BLOCKS, count) - 1.0))
 
     def _delay_variance(self, std: float) -> float:
         """Return the variance of the delay [s²], estimated with a standard deviation [s]."""

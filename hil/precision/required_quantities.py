@@ -16,10 +16,10 @@ from identification.model.robot import RobotModel
 
 from .requirements import Requirement
 
-MOVED: Final = 0.1
+MIN_TORQUE_SHARE: Final = 0.1
 """Share of a joint's torque below which a parameter counts by that share, not by its value."""
-_SPEEDS: Final = (0.25, 0.5, 1.0)  # of each joint's largest one, at which friction is wanted
-_INSTANTS: Final = 25  # per joint, with the widest bands of torque
+_SPEED_SHARES: Final = (0.25, 0.5, 1.0)  # of each joint's largest one, at which friction is wanted
+_INSTANTS_PER_JOINT: Final = 25  # per joint, with the widest bands of torque
 _Row = tuple[str, Array, float]  # label, direction (p,), wanted half of the interval
 
 
@@ -127,29 +127,29 @@ class ReferenceMotions:
             else:
                 rows = self.rows[joint]
                 variance = np.einsum("mp,pm->m", rows, np.linalg.solve(information, rows.T))
-                for instant in np.argsort(-variance)[:_INSTANTS].tolist():
+                for instant in np.argsort(-variance)[:_INSTANTS_PER_JOINT].tolist():
                     yield label, rows[instant], requirement.value
 
     def parameter_sizes(self, values: Array) -> Array:
         """Return the size (p,) of each parameter, to which per cents refer.
 
-        That is its value, or if that makes less than `MOVED` of the torque of the joint that it
-        moves most, what would make as much.
+        That is its value, or if that makes less than `MIN_TORQUE_SHARE` of the torque of the joint
+        that it moves most, what would make as much.
         """
         scatter = np.maximum(self.scatter(values), np.finfo(np.float64).tiny)
         effect = np.sqrt(np.mean(self.rows**2, axis=1)) / scatter[:, None]
         largest = effect.max(axis=0)
-        moved = MOVED / np.where(largest > 0.0, largest, 1.0)
+        moved = MIN_TORQUE_SHARE / np.where(largest > 0.0, largest, 1.0)
         return np.asarray(np.maximum(np.abs(values), moved))
 
     def _friction(self, joint: int, label: str, share: float, values: Array) -> Iterator[_Row]:
         model = self.model
         speed = float(np.abs(self.motion.velocity[:, joint]).max())
-        still = Motion.at_rest(np.zeros((2 * len(_SPEEDS), model.n_joints)))
+        still = Motion.at_rest(np.zeros((2 * len(_SPEED_SHARES), model.n_joints)))
         some = model.friction_columns
         turning = np.zeros_like(still.position)
-        turning[:, joint] = np.concatenate((_SPEEDS, np.negative(_SPEEDS))) * speed
-        least = MOVED * float(self.scatter(values)[joint])
+        turning[:, joint] = np.concatenate((_SPEED_SHARES, np.negative(_SPEED_SHARES))) * speed
+        least = MIN_TORQUE_SHARE * float(self.scatter(values)[joint])
         rows = np.zeros((len(turning), len(values)))
         ((_, blocks),) = model.chunks(replace(still, velocity=turning))
         rows[:, model.plan.columns[joint]] = blocks[joint].T

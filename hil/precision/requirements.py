@@ -36,7 +36,7 @@ _FIGURE: Final = re.compile(
 _ABSOLUTE: Final = {"torque": ("N·m", "Nm", "N m", "N"), "mass": ("kg",)}
 _OF_JOINT: Final = re.compile(r"(friction|torque)(?:\s+of\s+(.+))?")
 _FIELD: Final = "--precision"
-_SIMILAR: Final = 0.7  # of difflib; 1 are equal names
+_SIMILARITY_CUTOFF: Final = 0.7  # of difflib; 1 are equal names
 
 
 @dataclass(frozen=True)
@@ -140,7 +140,7 @@ def _known() -> str:
 def _names(name: str, known: Sequence[str], what: str) -> str:
     """Return which joints or parameters there are, only similar ones if there are such."""
     spelling = {each.lower(): each for each in known}
-    similar = get_close_matches(name.lower(), spelling, n=4, cutoff=_SIMILAR)
+    similar = get_close_matches(name.lower(), spelling, n=4, cutoff=_SIMILARITY_CUTOFF)
     if similar:
         return f"similar are {', '.join(spelling[each] for each in similar)}"
     forms = f"{_known()}; " if what == "parameter" else ""

@@ -20,8 +20,8 @@ INK, MUTED, BAND, FIRST, SECOND, WIDE = (
 )
 """Variables of the style sheet (light, dark, print); `WIDE` is a light colour for a broad line
 below another one."""
-_MARGIN: Final = 0.05  # free on both sides of the values, as a share of their range
-_LABEL_LENGTH: Final = 28
+_MARGIN_SHARE: Final = 0.05  # free on both sides of the values, as a share of their range
+_MAX_LABEL_LENGTH: Final = 28
 
 
 class Caption(NamedTuple):
@@ -36,7 +36,7 @@ class Caption(NamedTuple):
 def label(text: str) -> str:
     """Shorten a name to one printable line."""
     line = one_line(text)
-    return line if len(line) <= _LABEL_LENGTH else line[: _LABEL_LENGTH - 1] + "…"
+    return line if len(line) <= _MAX_LABEL_LENGTH else line[: _MAX_LABEL_LENGTH - 1] + "…"
 
 
 def thinned(time: Array, values: Array, bins: int = 500) -> tuple[Array, Array]:
@@ -66,7 +66,7 @@ def padded(values: Array) -> tuple[float, float]:
     if not high - low > 1e-9 * max(abs(low), abs(high)):
         margin = 0.05 * abs(low) or 1.0
         return low - margin, high + margin
-    margin = _MARGIN * (high - low)
+    margin = _MARGIN_SHARE * (high - low)
     return low - margin, high + margin
 
 

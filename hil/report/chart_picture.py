@@ -16,10 +16,10 @@ from matplotlib.ticker import NullFormatter, NullLocator, StrMethodFormatter
 from hil.report import picture_style as style
 from hil.report.chart import Chart, Legend, Plot, thinned
 
-_WIDTH: Final = 9.0  # inch
-_PIXELS: Final = 110.0  # of a page, per inch of height
-_FRAME: Final = 34.0  # above and below a plot, pixels of a page
-_POINTS: Final = 0.75  # per pixel
+_FIGURE_WIDTH: Final = 9.0  # inch
+_PIXELS_PER_INCH: Final = 110.0  # of a page, per inch of height
+_FRAME_PIXELS: Final = 34.0  # above and below a plot, pixels of a page
+_POINTS_PER_PIXEL: Final = 0.75  # per pixel
 
 
 def draw_charts(
@@ -41,9 +41,11 @@ def draw_charts(
     """
     heights = [[plot.height for chart in column for plot in chart.plots] for column in columns]
     rows = max(map(len, heights))
-    height = (enlarged * max(map(sum, heights)) + rows * _FRAME + _FRAME) / _PIXELS
+    height = (
+        enlarged * max(map(sum, heights)) + rows * _FRAME_PIXELS + _FRAME_PIXELS
+    ) / _PIXELS_PER_INCH
     with style.page():
-        figure = Figure(size or (_WIDTH, height), layout="constrained")
+        figure = Figure(size or (_FIGURE_WIDTH, height), layout="constrained")
         grid = figure.add_gridspec(1, len(columns))
         for k, (column, ratios) in enumerate(zip(columns, heights, strict=True)):
             cells = grid[k].subgridspec(len(ratios), 1, height_ratios=ratios)
@@ -52,13 +54,13 @@ def draw_charts(
                 axes = [figure.add_subplot(cells[next(places)]) for _ in chart.plots]
                 _draw(chart, axes, is_last=chart is column[-1])
                 if len(columns) > 1:
-                    axes[0].legend(*_entries([chart], legends), fontsize=style.SMALL)
+                    axes[0].legend(*_entries([chart], legends), fontsize=style.SMALL_FONT_SIZE)
         if len(columns) == 1:
             figure.legend(
                 *_entries(columns[0], legends),
                 loc="outside upper center",
                 ncols=5,
-                fontsize=style.SMALL,
+                fontsize=style.SMALL_FONT_SIZE,
             )
     return figure
 
@@ -66,7 +68,7 @@ def draw_charts(
 def draw_torque(axes: Axes, chart: Chart, legends: Sequence[Legend]) -> None:
     """Draw the first plot of a chart into axes of somebody's own figure."""
     plot = chart.plots[0]
-    draw_plot(axes, plot, chart, _POINTS)
+    draw_plot(axes, plot, chart, _POINTS_PER_PIXEL)
     axes.set_title(chart.caption.title)
     axes.set_xlabel(chart.foot)
     axes.set_ylabel(plot.heading)
@@ -83,7 +85,7 @@ def _entries(charts: Sequence[Chart], legends: Sequence[Legend]) -> tuple[list[A
             [],
             [],
             color=style.colour(legend.colour),
-            linewidth=legend.width * _POINTS,
+            linewidth=legend.width * _POINTS_PER_PIXEL,
             linestyle="--" if legend.dashed else "-",
         )
         for legend in shown
@@ -98,10 +100,12 @@ def _entries(charts: Sequence[Chart], legends: Sequence[Legend]) -> tuple[list[A
 def _draw(chart: Chart, rows: Sequence[Axes], *, is_last: bool) -> None:
     """Draw the plots of a chart one above the other; the last of a column has the ticks of x."""
     rows[0].set_title(chart.caption.title)
-    rows[0].set_title(chart.caption.note, loc="right", fontsize=style.SMALL, color=style.MUTED)
+    rows[0].set_title(
+        chart.caption.note, loc="right", fontsize=style.SMALL_FONT_SIZE, color=style.MUTED
+    )
     for axes, plot in zip(rows, chart.plots, strict=True):
-        draw_plot(axes, plot, chart, _POINTS)
-        axes.set_title(plot.heading, loc="left", fontsize=style.SMALL, color=style.MUTED)
+        draw_plot(axes, plot, chart, _POINTS_PER_PIXEL)
+        axes.set_title(plot.heading, loc="left", fontsize=style.SMALL_FONT_SIZE, color=style.MUTED)
         axes.tick_params(labelbottom=is_last and axes is rows[-1])
     if is_last:
         rows[-1].set_xlabel(chart.foot)

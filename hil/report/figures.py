@@ -27,10 +27,10 @@ from hil.report.numbers import MISSING, fixed, percent, significant
 from hil.results.results import FittedResult, Results, ValidationResult, by_id
 from hil.results.series import ReportSeries
 
-_INTERVAL: Final = 1.96  # Half a 95 % interval, in standard errors
+_NORMAL_95: Final = 1.96  # Half a 95 % interval, in standard errors
 # Percentiles of the torque inside the axes; outliers may lie outside.
-_SHOWN: Final = (0.5, 99.5)
-_MOST_REPETITIONS: Final = 6  # with a tick each
+_SHOWN_PERCENTILES: Final = (0.5, 99.5)
+_MAX_REPETITION_TICKS: Final = 6  # with a tick each
 
 
 class Joint(NamedTuple):
@@ -230,7 +230,7 @@ def friction_charts(series: ReportSeries, joints: Sequence[Joint]) -> list[Chart
         torque = series.friction_torque[there, j]
         ends = " to ".join(significant(float(end)) for end in law[[0, -1]])
         caption = Caption(f"k{j}", name, f"{ends} {unit}", "friction over velocity")
-        shown = np.percentile(torque, _SHOWN) if torque.size else np.empty(0)
+        shown = np.percentile(torque, _SHOWN_PERCENTILES) if torque.size else np.empty(0)
         values = np.concatenate([shown, law, [0.0]])
         margin = 0.08 * float(np.ptp(values)) or 1.0
         dots = replace(
@@ -263,7 +263,7 @@ def residual_charts(results: Results) -> dict[str, list[Chart]]:
             note = f"RMS error {significant(joint.rms)} {joint.unit}"
             caption = Caption(f"{what[0]}{j}", joint.joint, note, f"mean residual over {what}")
             centre = np.array(profile.centre, np.float64)
-            reach = np.where(np.isfinite(std), _INTERVAL * std, 0.0)
+            reach = np.where(np.isfinite(std), _NORMAL_95 * std, 0.0)
             ends = np.stack([mean - reach, mean + reach], axis=1)
             x_range = padded(centre[np.isfinite(mean)])
             traces = [
@@ -301,7 +301,7 @@ def precision_charts(results: Results) -> list[Chart]:
             shown.append(requirement.promised)
         traces += [Trace(ratio, FIRST, 1.2, name="ratio"), Trace(ratio, FIRST, 4.5, dots=True)]
         limits = padded(np.array(shown))
-        step = max(1, -(-int(count.max()) // _MOST_REPETITIONS))
+        step = max(1, -(-int(count.max()) // _MAX_REPETITION_TICKS))
         charts.append(
             Chart(
                 Caption(f"q{k}", requirement.requirement, note, what), count,

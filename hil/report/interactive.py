@@ -23,11 +23,11 @@ from hil.base.terminal_text import one_line
 from hil.report.chart import Chart, Trace
 
 _LIBRARY: Final = ("bokeh.min.js", "bokeh-api.min.js")
-_VALUES: Final = 180_000
+_MAX_CHART_VALUES: Final = 180_000
 """Values of all lines of a page, 480 kB."""
-_FEWEST = 400  # points of a line
-_MOST = 4000
-_UNKNOWN: Final = -32768
+_MIN_LINE_POINTS = 400  # points of a line
+_MAX_LINE_POINTS = 4000
+_NAN_CODE: Final = -32768
 """Code of a value that is not finite."""
 
 
@@ -51,7 +51,7 @@ def library() -> tuple[Markup, ...]:
 def chart_data(groups: Mapping[str, Sequence[Chart]], joints: Sequence[str]) -> Markup:
     """Return charts by group as JSON for a script element; `joints` are their names."""
     lines = [t for group in groups.values() for c in group for p in c.plots for t in p.traces]
-    most = min(max(_VALUES // max(len(lines), 1), _FEWEST), _MOST)
+    most = min(max(_MAX_CHART_VALUES // max(len(lines), 1), _MIN_LINE_POINTS), _MAX_LINE_POINTS)
     document = {
         "joints": [one_line(name) for name in joints],
         "groups": {
@@ -145,7 +145,7 @@ def encoded(values: Array) -> dict[str, Any]:
     high = float(values[finite].max()) if finite.any() else 0.0
     middle = 0.5 * (low + high)
     step = (high - low) / 65534.0 or 1.0
-    codes = np.full(len(values), _UNKNOWN, "<i2")
+    codes = np.full(len(values), _NAN_CODE, "<i2")
     codes[finite] = np.clip(np.rint((values[finite] - middle) / step), -32767, 32767)
     return {
         "codes": base64.b64encode(codes.tobytes()).decode("ascii"),

@@ -11,7 +11,7 @@ import re
 MISSING = "–"
 _SMALLEST_DECIMAL = 1e-4
 _LARGEST_DECIMAL = 1e6
-_MOST_DECIMALS = 6
+_MAX_DECIMALS = 6
 _MOMENT = re.compile(r"(\d{4}-\d\d-\d\d)T(\d\d:\d\d)(?::[\d.]+)?(Z|[+-]\d\d:\d\d|)")
 
 
@@ -45,7 +45,7 @@ def beside(value: float | None, std: float) -> str:
     exponent = int(f"{std:.1e}".split("e")[1]) - 1
     if exponent > 0:
         return fixed(value, 0)
-    if -exponent <= _MOST_DECIMALS:
+    if -exponent <= _MAX_DECIMALS:
         return fixed(value, -exponent)
     digits = max(1, math.floor(math.log10(abs(value))) - exponent)
     return _short_exponent(f"{value:.{digits}e}")

@@ -82,7 +82,7 @@ def copy_outcome(folder: Path, place: Path, archives: Collection[Path]) -> None:
     """
     if folder.resolve() == place.resolve():
         return
-    names = (RESULTS, SERIES, REPORT, *FILES, SOURCES, "map.toml")
+    names = (RESULTS, SERIES, REPORT, *EXPORT_FILES, SOURCES, "map.toml")
     paths = [folder / name for name in names]
     write_files(place, {path.name: path.read_bytes() for path in paths if path_exists(path)})
     with convert_write_errors(place):
@@ -160,7 +160,7 @@ def rewrite_report(folder: Path) -> Results:
 URDF = "identified.urdf"
 PARAMETERS_CSV = "parameters.csv"
 COVARIANCE_CSV = "parameters_covariance.csv"
-FILES = (PARAMETERS_JSON, PARAMETERS_CSV, COVARIANCE_CSV, URDF)
+EXPORT_FILES = (PARAMETERS_JSON, PARAMETERS_CSV, COVARIANCE_CSV, URDF)
 """Exports of an identification."""
 
 

@@ -28,13 +28,13 @@ from identification.validation.verdict import fault_of
 if TYPE_CHECKING:
     pass
 
-_MOST_CANDIDATES: Final = 6
+_MAX_CANDIDATES: Final = 6
 """Candidates shown of one choice: the first, and the best of the others."""
 
-_BINS: Final = 1500
+_TOTAL_BINS: Final = 1500
 """Intervals of all pictured lines of one kind, with two points in each."""
-_FEWEST_BINS = 80  # of one line
-_MOST_BINS = 300
+_MIN_BINS = 80  # of one line
+_MAX_BINS = 300
 
 _OFFSET: Final = re.compile(r"fo_\d+")  # constant part of a torque, which may be a sensor's
 _USES: Final = {
@@ -60,7 +60,7 @@ def report_bytes(
     series = series.checked_for(len(results.joint_names))
     joints = figures.joints_of(results)
     runs = results.validation
-    bins = min(_MOST_BINS, max(_FEWEST_BINS, _BINS // len(joints)))
+    bins = min(_MAX_BINS, max(_MIN_BINS, _TOTAL_BINS // len(joints)))
     draw = partial(report.chart_panel, bins=bins)
     charts = {
         "torques": figures.torque_charts(series, joints),
@@ -180,8 +180,8 @@ def every_row_errors(results: Results) -> list[float]:
 def shown_candidates(choice: Choice) -> list[int]:
     """Return the indices of the candidates to show, the first one first."""
     shown = list(range(len(choice.errors)))
-    if len(shown) <= _MOST_CANDIDATES:
+    if len(shown) <= _MAX_CANDIDATES:
         return shown
     # The first is the default, with which the others were compared.
     best = sorted(shown[1:], key=lambda k: (k != choice.chosen, choice.errors[k]))
-    return [0, *best[: _MOST_CANDIDATES - 1]]
+    return [0, *best[: _MAX_CANDIDATES - 1]]

@@ -34,22 +34,22 @@ from hil.report.chart_picture import draw_plot
 
 TICK_SIZE: Final = 10.5  # px, as all lengths here: a picture has 72 of them per inch
 TEXT_SIZE: Final = 11.0
-BINS: Final = 300  # of a line over time, which has up to two points in each, some one per px
-_WIDTH: Final = 370.0
-_LEFT: Final = 46.0
-_RIGHT: Final = 10.0
-_TOP: Final = 20.0
-_BOTTOM: Final = 40.0
-_GAP: Final = 24.0  # between plots above each other
-_FEWEST_TICKS: Final = 3  # of y: a printed chart has no pointer that reads it
-_FEWEST_FOR_A_BOX: Final = 5  # values
+LINE_BINS: Final = 300  # of a line over time, which has up to two points in each, some one per px
+_PANEL_WIDTH: Final = 370.0
+_LEFT_MARGIN: Final = 46.0
+_RIGHT_MARGIN: Final = 10.0
+_TOP_MARGIN: Final = 20.0
+_BOTTOM_MARGIN: Final = 40.0
+_PLOT_GAP: Final = 24.0  # between plots above each other
+_MIN_TICKS: Final = 3  # of y: a printed chart has no pointer that reads it
+_MIN_BOX_VALUES: Final = 5  # values
 _BOX_HEIGHT: Final = 206.0
-_LABELS: Final = 84.0
-_SIDE: Final = 560.0
-_SMALLEST_CELL: Final = 11.0
-_LARGEST_CELL: Final = 26.0
+_LABEL_WIDTH: Final = 84.0
+_MATRIX_SIDE: Final = 560.0
+_MIN_CELL_SIDE: Final = 11.0
+_MAX_CELL_SIDE: Final = 26.0
 _POINTS_PER_INCH: Final = 72.0
-_GOLDEN: Final = 0.6180339887498949
+_GOLDEN_RATIO: Final = 0.6180339887498949
 _DECIMALS: Final = re.compile(r"(\.\d)\d+")
 _SVG: Final = "{http://www.w3.org/2000/svg}"
 _LINK: Final = "{http://www.w3.org/1999/xlink}href"
@@ -68,7 +68,7 @@ class Panel:
 
 
 def chart_panel(
-    chart: Chart, bins: int = BINS, width: float = _WIDTH, left: float = _LEFT
+    chart: Chart, bins: int = LINE_BINS, width: float = _PANEL_WIDTH, left: float = _LEFT_MARGIN
 ) -> Panel:
     """Draw a chart; a line has at most two points in each of the `bins` of its x.
 
@@ -79,7 +79,7 @@ def chart_panel(
         left: of this, for the texts of the vertical axis [px].
     """
     heights = tuple(plot.height for plot in chart.plots)
-    height = _TOP + sum(heights) + _GAP * (len(heights) - 1) + _BOTTOM
+    height = _TOP_MARGIN + sum(heights) + _PLOT_GAP * (len(heights) - 1) + _BOTTOM_MARGIN
     has_names = bool(chart.ticks) or any(plot.names for plot in chart.plots)
     with _page(chart.caption.key):
         sheet = _new_sheet if has_names else _sheet
@@ -99,15 +99,15 @@ def _new_sheet(
     """Return a figure with axes of these heights, one above the other."""
     figure = _figure(width, height)
     rows: list[Axes] = []
-    top = _TOP
+    top = _TOP_MARGIN
     for each in heights:
-        axes = _axes(figure, left, top, width - left - _RIGHT, each)
+        axes = _axes(figure, left, top, width - left - _RIGHT_MARGIN, each)
         if not is_log:
             axes.xaxis.set_major_locator(_round_ticks(6))
-            axes.yaxis.set_major_locator(_round_ticks(4, _FEWEST_TICKS))
+            axes.yaxis.set_major_locator(_round_ticks(4, _MIN_TICKS))
         axes.tick_params(labelbottom=len(rows) == len(heights) - 1)
         rows.append(axes)
-        top += each + _GAP
+        top += each + _PLOT_GAP
     return figure, rows
 
 
@@ -127,13 +127,19 @@ def box_panel(boxes: Boxes) -> Panel:
     high = max(float(every.max()), 1.1 * middle)
     with _page(boxes.caption.key):
         figure = _figure(width, _BOX_HEIGHT + bottom)
-        axes = _axes(figure, _LEFT, _TOP, width - _LEFT - _RIGHT, _BOX_HEIGHT - _TOP)
+        axes = _axes(
+            figure,
+            _LEFT_MARGIN,
+            _TOP_MARGIN,
+            width - _LEFT_MARGIN - _RIGHT_MARGIN,
+            _BOX_HEIGHT - _TOP_MARGIN,
+        )
         for k, (values, colour) in enumerate(zip(boxes.columns, boxes.colours, strict=True), 1):
-            if values.size >= _FEWEST_FOR_A_BOX:
+            if values.size >= _MIN_BOX_VALUES:
                 _box(axes, k, values)
             # Horizontal offsets by the golden ratio separate neighbouring values.
             rank = np.argsort(np.argsort(values, kind="stable"), kind="stable")
-            side = k + 0.34 * ((rank * _GOLDEN) % 1.0 - 0.5)
+            side = k + 0.34 * ((rank * _GOLDEN_RATIO) % 1.0 - 0.5)
             axes.plot(
                 side, values, "o", color=style.colour(colour), markersize=4.0, markeredgewidth=0.0
             )
@@ -141,7 +147,7 @@ def box_panel(boxes: Boxes) -> Panel:
         axes.set_xticks(range(1, len(names) + 1), names)
         axes.xaxis.grid(visible=False)
         axes.set_ylim(max(0.0, low - 0.06 * (high - low)), high + 0.06 * (high - low) or 1.0)
-        axes.yaxis.set_major_locator(_round_ticks(5, _FEWEST_TICKS))
+        axes.yaxis.set_major_locator(_round_ticks(5, _MIN_TICKS))
         _head(axes, boxes.heading)
         return _panel(figure, boxes.caption, width, _BOX_HEIGHT + bottom)
 
@@ -164,12 +170,12 @@ def _box(axes: Axes, row: int, values: Array) -> None:
 def matrix_panel(matrix: Matrix) -> Panel:
     """Draw a matrix of correlations with its names."""
     names = [label(name) for name in matrix.names]
-    cell = min(max(_SIDE / len(names), _SMALLEST_CELL), _LARGEST_CELL)
+    cell = min(max(_MATRIX_SIDE / len(names), _MIN_CELL_SIDE), _MAX_CELL_SIDE)
     side = cell * len(names)
-    whole = _LABELS + side + 6.0
+    whole = _LABEL_WIDTH + side + 6.0
     with _page(matrix.caption.key):
         figure = _figure(whole, whole)
-        axes = _axes(figure, _LABELS, _LABELS, side, side)
+        axes = _axes(figure, _LABEL_WIDTH, _LABEL_WIDTH, side, side)
         axes.imshow(
             np.nan_to_num(matrix.values), cmap="gist_yarg", vmin=0.0, vmax=1.0, interpolation="none"
         )

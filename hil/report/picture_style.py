@@ -22,11 +22,11 @@ POSITION = "#0072b2"
 VELOCITY = "#00795a"
 ACCELERATION = "#b0530b"
 """Colours of what only pictures have; charts have those of the pages, see :func:`colour`."""
-SMALL = 7.5
-TEXT = 9.0
-TITLE = 12.0
+SMALL_FONT_SIZE = 7.5
+FONT_SIZE = 9.0
+TITLE_FONT_SIZE = 12.0
 _STYLE = {
-    "font.size": TEXT,
+    "font.size": FONT_SIZE,
     "axes.axisbelow": True,
     "axes.edgecolor": MUTED,
     "axes.grid": True,
@@ -34,13 +34,13 @@ _STYLE = {
     "axes.labelcolor": INK,
     "axes.spines.right": False,
     "axes.spines.top": False,
-    "axes.titlesize": TEXT,
+    "axes.titlesize": FONT_SIZE,
     "grid.color": RULE,
     "grid.linewidth": 0.5,
     "xtick.color": MUTED,
     "ytick.color": MUTED,
-    "xtick.labelsize": SMALL,
-    "ytick.labelsize": SMALL,
+    "xtick.labelsize": SMALL_FONT_SIZE,
+    "ytick.labelsize": SMALL_FONT_SIZE,
 }
 
 

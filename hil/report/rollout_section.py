@@ -12,11 +12,11 @@ import numpy as np
 from hil.base.arrays import Array
 from hil.report.chart import Caption, Chart, Legend, Plot, Trace, label
 from hil.report.figures import NOMINAL, PREDICTED
-from hil.results.rollout_result import WANTED, ArmErrors, RolloutResult
+from hil.results.rollout_result import WANTED_COVERAGE, ArmErrors, RolloutResult
 from identification.text import percentage
 
-_HEIGHT: Final = 190.0  # px
-_FLOOR: Final = 1e-3  # mrad or mm, of logarithmic axes
+_PLOT_HEIGHT: Final = 190.0  # px
+_MIN_SHOWN_ERROR: Final = 1e-3  # mrad or mm, of logarithmic axes
 
 SAMPLES: Final = Legend("samples", "arms drawn from the posterior", "--wide", 1.0)
 POLISHED: Final = Legend("polished", "polished model", "--second", 1.4)
@@ -29,9 +29,9 @@ ROLLOUT_LEGENDS: Final[Mapping[str, Legend]] = {
 """Lines of the figure by name."""
 
 EXPECTED: Final = Legend(
-    "expected", " to ".join(map(percentage, WANTED)), "--muted", 1.0, dashed=True
+    "expected", " to ".join(map(percentage, WANTED_COVERAGE)), "--muted", 1.0, dashed=True
 )
-_DOT: Final = 6.0  # px
+_DOT_SIZE: Final = 6.0  # px
 _JOINT_COLOURS: Final = (
     "--first", "--second", "--good", "--route-3", "--outside-3", "--wide", "--warn-line", "--muted",
 )  # fmt: skip
@@ -61,7 +61,7 @@ def _chart(result: RolloutResult, errors: Errors, number: int, title: str, headi
     """Return position errors over the horizon."""
 
     def shown(arm: ArmErrors) -> Array:
-        return np.maximum(1e3 * errors(arm), _FLOOR)
+        return np.maximum(1e3 * errors(arm), _MIN_SHOWN_ERROR)
 
     horizons = np.array(result.horizons)
     legends = ROLLOUT_LEGENDS
@@ -81,7 +81,7 @@ def _chart(result: RolloutResult, errors: Errors, number: int, title: str, headi
     return Chart(
         Caption(f"rollout-{number}", title, "", what),
         horizons,
-        [Plot(_HEIGHT, heading, traces, limits=_limits(traces))],
+        [Plot(_PLOT_HEIGHT, heading, traces, limits=_limits(traces))],
         foot="horizon [s]",
         joint=number,
         log=True,
@@ -101,12 +101,14 @@ def overview_charts(result: RolloutResult) -> list[Chart]:
     if not result.inside:
         return [errors]
     horizons = np.array(result.horizons)
-    traces = [EXPECTED.trace(np.full(len(horizons), 100.0 * end)) for end in WANTED]
+    traces = [EXPECTED.trace(np.full(len(horizons), 100.0 * end)) for end in WANTED_COVERAGE]
     for legend, shares in zip(_band_legends(result), zip(*result.inside, strict=True), strict=True):
         line = legend.trace(100.0 * np.array(shares))
-        traces += [line, replace(line, dots=True, width=_DOT)]
+        traces += [line, replace(line, dots=True, width=_DOT_SIZE)]
     what = "share of measured positions in the 95 % band of the drawn arms over the horizon"
-    plot = Plot(_HEIGHT, "measured positions in the 95 % band [%]", traces, limits=(0.0, 102.0))
+    plot = Plot(
+        _PLOT_HEIGHT, "measured positions in the 95 % band [%]", traces, limits=(0.0, 102.0)
+    )
     band = Chart(
         Caption("rollout-band", "", "", what),
         horizons,
@@ -136,5 +138,5 @@ def _limits(traces: Sequence[Trace]) -> tuple[float, float]:
     values = np.concatenate([trace.values for trace in traces])
     finite = values[np.isfinite(values)]
     if not finite.size:
-        return _FLOOR, 1.0
+        return _MIN_SHOWN_ERROR, 1.0
     return 0.8 * float(finite.min()), 1.25 * float(finite.max())

@@ -37,13 +37,15 @@ MEANINGS: Final = {
 }
 HELD: Final = "something held the arm"
 _MOTIONS: Final = 4  # on a page
-_JOINTS: Final = 3  # of the picture
-_HEIGHT: Final = 170.0  # px
-_BINS: Final = 400
+_PICTURE_JOINTS: Final = 3  # of the picture
+_PLOT_HEIGHT: Final = 170.0  # px
+_LINE_BINS: Final = 400
 _MILLI: Final = 1e3
 
 
-def motion_charts(results: ServoResults, series: ServoSeries, most: int = _JOINTS) -> list[Chart]:
+def motion_charts(
+    results: ServoResults, series: ServoSeries, most: int = _PICTURE_JOINTS
+) -> list[Chart]:
     """Return charts of the joints with the largest errors of the command, in their order."""
     errors = np.sqrt(np.mean((series.commanded - series.measured) ** 2, axis=0))
     chosen = np.sort(np.argsort(-errors)[:most])
@@ -71,7 +73,7 @@ def _chart(results: ServoResults, series: ServoSeries, joint: int) -> Chart:
             "position over time",
         ),
         series.time,
-        [Plot(_HEIGHT, f"position [{unit}]", traces, shaded=held, shade=HELD)],
+        [Plot(_PLOT_HEIGHT, f"position [{unit}]", traces, shaded=held, shade=HELD)],
         joint=joint,
     )
 
@@ -96,7 +98,7 @@ def servo_page_bytes(results: ServoResults, series: Sequence[ServoSeries]) -> by
             if any(value.name == name and value.present for value in results.servo)
         },
         "motions": [
-            (name, each.archive, [report.chart_panel(chart, _BINS) for chart in charts], held)
+            (name, each.archive, [report.chart_panel(chart, _LINE_BINS) for chart in charts], held)
             for (name, charts), each in zip(figures.items(), series, strict=False)
             for held in [bool(each.contacts)]
         ],

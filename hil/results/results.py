@@ -19,7 +19,7 @@ from hil.base.errors import InputError
 from hil.base.safe_input import parse_json, read_text
 from hil.base.type_adapter import adapter_of
 from identification.excitation.criteria import Criteria
-from identification.factor.estimate import KNOWN
+from identification.factor.estimate import KNOWN_STD_SHARES
 from identification.purposes.thresholds import ContactThreshold
 from identification.selection.essential import EliminationStep
 from identification.selection.settings import Choice, Settings
@@ -358,7 +358,7 @@ class ParameterResult(Frozen):
         """Accuracy: 10 % or better, 50 % or better, worse, or undetermined."""
         if self.undetermined or not math.isfinite(self.std):
             return "undetermined"
-        well, roughly = (self.std <= share * abs(self.estimate) for share in KNOWN)
+        well, roughly = (self.std <= share * abs(self.estimate) for share in KNOWN_STD_SHARES)
         return "within 10 %" if well else "within 50 %" if roughly else "not identified"
 
     def deviation_of(self, estimate: float, std: float) -> float | None:

@@ -15,10 +15,10 @@ from hil.results.results import Frozen, Known
 from identification.text import number, percentage
 
 ROLLOUT: Final = "rollout.json"
-JUDGED: Final = 2
+JUDGED_HORIZON: Final = 2
 """Index of the horizon at which joint and effect are named: 0.5 s."""
-_BAND: Final = 1  # index of the horizon of the band: 0.2 s
-WANTED: Final = (0.88, 0.99)  # share of measured positions in a 95 % band
+_BAND_HORIZON: Final = 1  # index of the horizon of the band: 0.2 s
+WANTED_COVERAGE: Final = (0.88, 0.99)  # share of measured positions in a 95 % band
 
 
 class ArmErrors(Frozen):
@@ -149,12 +149,12 @@ class RolloutResult(Frozen):
     @property
     def band(self) -> float:
         """Share of measured positions in the 95 % band at 0.2 s."""
-        return float(np.mean(self.inside[_BAND]))
+        return float(np.mean(self.inside[_BAND_HORIZON]))
 
     @property
     def band_holds(self) -> bool:
         """Whether that share is near 95 %."""
-        return WANTED[0] <= self.band <= WANTED[1]
+        return WANTED_COVERAGE[0] <= self.band <= WANTED_COVERAGE[1]
 
     @property
     def message(self) -> str:
@@ -189,8 +189,8 @@ class RolloutResult(Frozen):
             return f"From {worse[0]:g} s on the identified arm is no better than the nominal one."
         return (
             f"The identified arm is better than the nominal one up to {self.horizons[-1]:g} s:"
-            f" {percentage(self.ratio[JUDGED], 1)} of its position error at"
-            f" {self.horizons[JUDGED]:g} s."
+            f" {percentage(self.ratio[JUDGED_HORIZON], 1)} of its position error at"
+            f" {self.horizons[JUDGED_HORIZON]:g} s."
         )
 
     @property
@@ -211,8 +211,9 @@ class RolloutResult(Frozen):
         if not self.sample_errors or self.band_holds:
             return ""
         return (
-            f"{percentage(self.band, 1)} at {self.horizons[_BAND]:g} s is not"
-            f" {percentage(WANTED[0])} to {percentage(WANTED[1])}: do not rely on this band"
+            f"{percentage(self.band, 1)} at {self.horizons[_BAND_HORIZON]:g} s is not"
+            f" {percentage(WANTED_COVERAGE[0])} to {percentage(WANTED_COVERAGE[1])}:"
+            " do not rely on this band"
         )
 
     def stability(self) -> list[str]:

@@ -21,15 +21,15 @@ from identification.validation.prediction import for_figure
 
 SERIES: Final = "report_series.npz"
 """File of the series in a folder of results."""
-_LARGEST: Final = 1 << 30
+_MAX_BYTES: Final = 1 << 30
 """Most bytes of the series in a file, a hundred times those of a campaign of 30 repetitions."""
-_TOO_LARGE: Final = 1e100
-_ROWS: Final = 30_000
+_MAX_MAGNITUDE: Final = 1e100
+_MAX_ROWS: Final = 30_000
 """Most rows of the example that a file holds."""
-_RATE: Final = 125.0
+_SHOWN_RATE: Final = 125.0
 """Rows per second of torques that are low-passed at 30 Hz for a figure, at least."""
 _SPECTRUM_TIME: Final = 4.0  # of one periodogram, s
-_FREQUENCIES: Final = 160  # of a spectrum
+_SPECTRUM_BINS: Final = 160  # of a spectrum
 
 
 class SeriesError(ValueError):
@@ -88,7 +88,7 @@ class ReportSeries:
             length = lengths[name.partition("_")[0]]
             alone = name.endswith(("_time", "_frequency"))
             shape = (length,) if alone else (length, n)
-            numbers = array.dtype == np.float64 and not np.any(np.abs(array) >= _TOO_LARGE)
+            numbers = array.dtype == np.float64 and not np.any(np.abs(array) >= _MAX_MAGNITUDE)
             if array.shape != shape or not numbers:
                 raise SeriesError(
                     f"{name} has shape {array.shape} (expected {shape}), or values that cannot be"
@@ -139,7 +139,7 @@ def load_series(folder: Path, n_joints: int) -> ReportSeries:
         with open_file(path) as stream:
             with zipfile.ZipFile(stream) as members:
                 size = sum(member.file_size for member in members.infolist())
-            if size > _LARGEST:
+            if size > _MAX_BYTES:
                 raise ValueError(f"it would take {size} bytes")
             stream.seek(0)
             with np.load(stream, allow_pickle=False) as archive:
@@ -200,7 +200,7 @@ def _step(samples: Samples) -> int:
     m = len(samples.torque)
     if m < 2 or samples.torque_bandwidth is not None:
         return 1
-    step = max(1, int((m - 1) / max(float(time[-1] - time[0]), 1e-9) / (2.0 * _RATE)))
+    step = max(1, int((m - 1) / max(float(time[-1] - time[0]), 1e-9) / (2.0 * _SHOWN_RATE)))
     return step - 1 + step % 2
 
 
@@ -253,14 +253,14 @@ def _with_motion(samples: Samples, *, velocity: bool, acceleration: bool) -> Sam
 
 
 def _rows_within(time: Array, shown: Array) -> slice:
-    """Return rows of times (m,) within the shown ones, some `_RATE` a second, at most `_ROWS`."""
+    """Return rows of the shown times (m,), some `_SHOWN_RATE` a second, at most `_MAX_ROWS`."""
     if not shown.size:
         return slice(0, 0)
     start = int(np.searchsorted(time, shown[0] - 1e-9))
     stop = int(np.searchsorted(time, shown[-1] + 1e-9, side="right"))
     rows = stop - start
     duration = max(float(shown[-1] - shown[0]), 1e-9)
-    return slice(start, stop, max(int(rows / duration / _RATE), -(-rows // _ROWS), 1))
+    return slice(start, stop, max(int(rows / duration / _SHOWN_RATE), -(-rows // _MAX_ROWS), 1))
 
 
 def _spectra(samples: Samples, error: Array) -> dict[str, Array]:
@@ -285,8 +285,8 @@ def _spectra(samples: Samples, error: Array) -> dict[str, Array]:
 
 def _by_ratio(frequency: Array, power: Array) -> tuple[Array, Array]:
     """Return the mean power (f, c) in bins of equal ratio of frequency (f,), empty ones omitted."""
-    edges = np.geomspace(frequency[0], frequency[-1] * (1.0 + 1e-9), _FREQUENCIES + 1)
-    bins = np.clip(np.searchsorted(edges, frequency, side="right") - 1, 0, _FREQUENCIES - 1)
+    edges = np.geomspace(frequency[0], frequency[-1] * (1.0 + 1e-9), _SPECTRUM_BINS + 1)
+    bins = np.clip(np.searchsorted(edges, frequency, side="right") - 1, 0, _SPECTRUM_BINS - 1)
     starts = np.flatnonzero(np.diff(bins, prepend=-1))
     counts = np.diff(np.append(starts, len(frequency)))
     mean_frequency = np.add.reduceat(frequency, starts) / counts

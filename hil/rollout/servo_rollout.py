@@ -16,12 +16,18 @@ from hil.pipeline.identified_model import arm_with
 from hil.pipeline.options import Options, friction_from
 from hil.pipeline.prepared import samples_of, stated_settings
 from hil.pipeline.sources import Source, Sources, archives_in, gather_sources
-from hil.results.rollout_result import JUDGED, ArmErrors, RolloutResult, ServoParameter, ServoResult
+from hil.results.rollout_result import (
+    JUDGED_HORIZON,
+    ArmErrors,
+    RolloutResult,
+    ServoParameter,
+    ServoResult,
+)
 from hil.rollout.polishing import polish
 from hil.rollout.torque_rollout import (
-    MOST_WINDOWS,
+    MAX_WINDOWS,
     POLISHED_WINDOWS,
-    STRIDE,
+    WINDOW_STRIDE,
     Rollout,
     leading_effect,
     nominal_arm,
@@ -46,7 +52,7 @@ from identification.rollout.position_errors import (
 )
 from identification.rollout.servo_by_positions import NAMES, EncoderFit, fit_servo
 from identification.rollout.servo_by_torque import lead_of
-from identification.rollout.windows import STEP, windows_of
+from identification.rollout.windows import STEP_SECONDS, windows_of
 
 _FRICTION = "coulomb,viscous"
 _UNITS = ("N·m/rad", "N·m·s/rad", "kg·m²", "N·m", "N·m·s/rad")
@@ -93,10 +99,12 @@ def roll_out_servo(
             paths[0], "has no torque, and the URDF no masses", field="torque", remedy=remedy
         )
     try:
-        stretches, _ = recorded_stretches(cell.model, with_commands(sources.training, fitted), STEP)
-        fit = fit_servo(bodies, stretches, STEP)
+        stretches, _ = recorded_stretches(
+            cell.model, with_commands(sources.training, fitted), STEP_SECONDS
+        )
+        fit = fit_servo(bodies, stretches, STEP_SECONDS)
         training = _driven(fit, sources.training, fitted, POLISHED_WINDOWS)
-        unseen = _driven(fit, sources.held_out, held_out, MOST_WINDOWS)
+        unseen = _driven(fit, sources.held_out, held_out, MAX_WINDOWS)
     except IdentificationError as error:
         remedy = "record the torque, or a longer motion with the commanded positions"
         raise InputError(paths[0], str(error), field="servo", remedy=remedy) from error
@@ -127,8 +135,10 @@ def _driven(
         replace(recording, torque=recording.predicted_torque(model, fit.arm.values))
         for recording in samples
     ]
-    stretches, owners = recorded_stretches(model, with_commands(sources, with_torque), STEP)
-    windows = windows_of(stretches, STEP, HORIZONS[-1], STRIDE, lead_of(fit.servo)).some(most)
+    stretches, owners = recorded_stretches(model, with_commands(sources, with_torque), STEP_SECONDS)
+    windows = windows_of(
+        stretches, STEP_SECONDS, HORIZONS[-1], WINDOW_STRIDE, lead_of(fit.servo)
+    ).some(most)
     motion = RecordedMotion(windows, tuple(owners), fit.servo)
     return Driven(fit.arm, motion, Feedback(fit.servo.kp, fit.servo.kd))
 
@@ -149,7 +159,7 @@ def _result(
     measured = windows.reached[:, horizon_rows(windows)]
     chain = arm.model.chain
     positions = driven.positions()
-    joint = leading_joint(positions[:, JUDGED], measured[:, JUDGED], chain)
+    joint = leading_joint(positions[:, JUDGED_HORIZON], measured[:, JUDGED_HORIZON], chain)
     alone = simulate(bodies, motion, driven.feedback)
     names = list(arm.model.joint_names)
     return RolloutResult(

@@ -24,14 +24,20 @@ from hil.pipeline.identified_model import (
 from hil.pipeline.prepared import Prepared
 from hil.pipeline.sources import Source
 from hil.report.output_files import REPORT, is_of_report, rewrite_report
-from hil.results.rollout_result import JUDGED, ROLLOUT, ArmErrors, PolishResult, RolloutResult
+from hil.results.rollout_result import (
+    JUDGED_HORIZON,
+    ROLLOUT,
+    ArmErrors,
+    PolishResult,
+    RolloutResult,
+)
 from hil.rollout.polishing import polish
 from identification import IdentificationError, Samples
 from identification.estimators.ensemble import Ensemble
 from identification.export.exported_arm import ExportedArm
 from identification.export.simulators import FORMATS, read_back
 from identification.model.flange import flange_name
-from identification.rollout.mujoco_simulation import LARGEST_ERROR, Feedback
+from identification.rollout.mujoco_simulation import MAX_POSITION_ERROR, Feedback
 from identification.rollout.polish import Driven
 from identification.rollout.position_errors import (
     HORIZONS,
@@ -54,17 +60,18 @@ from identification.rollout.servo_by_torque import (
     identify_servo,
     lead_of,
 )
-from identification.rollout.windows import STEP, Stretch, windows_of
+from identification.rollout.windows import STEP_SECONDS, Stretch, windows_of
 from identification.text import number
 
 PICTURE = "rollout.png"
 POLISHED = "polished.xml"
-MOST_WINDOWS: Final = 1000
+MAX_WINDOWS: Final = 1000
 """Windows that are simulated at most."""
 _FEW_WINDOWS: Final = 200  # of which the error of each sample is computed
-STRIDE: Final = 0.1  # s between the starts of windows
+WINDOW_STRIDE: Final = 0.1  # s between the starts of windows
 POLISHED_WINDOWS: Final = 60  # of the fitted motion
-_LEADS: Final = 0.1  # share of the mean square error that mending an effect has to remove
+# share of the mean square error that mending an effect has to remove
+_MIN_ERROR_REDUCTION: Final = 0.1
 
 
 @dataclass(frozen=True)
@@ -106,7 +113,7 @@ def roll_out(model: IdentifiedModel, options: RolloutOptions, reporter: Reporter
     few = windows.some(_FEW_WINDOWS)
     measured_few = few.reached[:, horizon_rows(few)]
     identified = errors_of(positions, measured, chain)
-    joint = leading_joint(positions[:, JUDGED], measured[:, JUDGED], chain)
+    joint = leading_joint(positions[:, JUDGED_HORIZON], measured[:, JUDGED_HORIZON], chain)
     if 2 * identified.unstable_joints.max() > len(windows):
         joint = int(np.argmax(identified.unstable_joints))
     polished = None
@@ -158,15 +165,15 @@ def _motion_of(
         stretches, owners = _stretches(model, sources.held_out, prepared.held_out, servo)
         if servo is not None and any(stretch.commanded is None for stretch in stretches):
             raise NoServoError("the held-out recordings have no commanded positions")
-        windows = windows_of(stretches, STEP, HORIZONS[-1], STRIDE, lead_of(servo))
-        windows = windows.some(MOST_WINDOWS)
+        windows = windows_of(stretches, STEP_SECONDS, HORIZONS[-1], WINDOW_STRIDE, lead_of(servo))
+        windows = windows.some(MAX_WINDOWS)
     except NoServoError as error:
         remedy = "omit --servo: the recorded torque drives the arm then"
         raise InputError(model.paths[0], str(error), field="--servo", remedy=remedy) from error
     except IdentificationError as error:
         remedy = f"hold out a longer recording (--predict), or fit less; {HORIZONS[-1]:g} s"
         raise InputError(model.paths[-1], str(error), remedy=f"{remedy} are needed") from error
-    feedback = light_feedback(arm, STEP, options.feedback)
+    feedback = light_feedback(arm, STEP_SECONDS, options.feedback)
     if servo is not None:
         feedback = Feedback(servo.kp, servo.kd)
     else:
@@ -187,8 +194,8 @@ def _servo_of(model: IdentifiedModel, options: RolloutOptions) -> tuple[Position
         )
         return servo, f"a servo as stated, delay {number(1e3 * servo.delay)} ms"
     fitted = with_commands(prepared.sources.training, prepared.fitted)
-    stretches, _ = recorded_stretches(arm.model, fitted, STEP)
-    servo = identify_servo(stretches, STEP, arm.model.joint_names)
+    stretches, _ = recorded_stretches(arm.model, fitted, STEP_SECONDS)
+    servo = identify_servo(stretches, STEP_SECONDS, arm.model.joint_names)
     gains = "; ".join(
         f"{joint} {number(kp)} {'N·m/rad' if turns else 'N/m'}"
         for joint, kp, turns in zip(
@@ -211,7 +218,7 @@ def _stretches(
     recordings: list[tuple[Samples, Array | None]] = [(part, None) for part in samples]
     if servo is not None:
         recordings = with_commands(sources, samples)
-    return recorded_stretches(model.arm.model, recordings, STEP)
+    return recorded_stretches(model.arm.model, recordings, STEP_SECONDS)
 
 
 def root_mean_squares(errors: Array) -> list[float]:
@@ -303,7 +310,7 @@ def _polish(
     servo = driven.motion.servo
     fitted = model.prepared.fitted
     stretches, owners = _stretches(model, sources.training, fitted, servo)
-    windows = windows_of(stretches, STEP, HORIZONS[-1], STRIDE, lead_of(servo))
+    windows = windows_of(stretches, STEP_SECONDS, HORIZONS[-1], WINDOW_STRIDE, lead_of(servo))
     windows = windows.some(POLISHED_WINDOWS)
     motion = replace(driven.motion, windows=windows, samples=tuple(owners))
     return polish(
@@ -331,13 +338,15 @@ def leading_effect(
     """
 
     def square(positions: Array) -> float:
-        at = positions[:, JUDGED, joint]
-        error = np.where(np.isfinite(at), at - measured[:, JUDGED, joint], LARGEST_ERROR)
+        at = positions[:, JUDGED_HORIZON, joint]
+        error = np.where(
+            np.isfinite(at), at - measured[:, JUDGED_HORIZON, joint], MAX_POSITION_ERROR
+        )
         return float(np.mean(error**2))
 
     before = square(positions)
     effect = ""
-    least = (1.0 - _LEADS) * before
+    least = (1.0 - _MIN_ERROR_REDUCTION) * before
     for name, change in variants(joint):
         after = square(simulate(*change(arm, motion), feedback))
         if after < least:

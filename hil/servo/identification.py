@@ -42,10 +42,10 @@ from identification.servo.parameters import TERMS, in_units
 from identification.servo.prediction import predicted
 from identification.servo.pushes import pushes_of
 from identification.servo.recorded_motion import Grid, ServoMotion, motions_of
-from identification.servo.simulator_terms import ENGINES, ITERATIONS, Engine, fits_in_simulators
-from identification.signals.recording import STUCK_MOVEMENT
+from identification.servo.simulator_terms import ENGINES, FIT_ITERATIONS, Engine, fits_in_simulators
+from identification.signals.recording import MIN_MOVEMENT
 
-_FINEST: Final = 1e-5  # rad or m, least resolution of positions
+_MIN_RESOLUTION: Final = 1e-5  # rad or m, least resolution of positions
 _MILLI: Final = 1e3
 
 
@@ -124,7 +124,7 @@ def identify_servos(
         raise InputError(first, problem, field="commanded_position", remedy=remedy)
     resolution = _resolution(sources)
     started = time.process_time()
-    with reporter.task("servos", steps_of_a_fit() + len(ENGINES) * ITERATIONS) as task:
+    with reporter.task("servos", steps_of_a_fit() + len(ENGINES) * FIT_ITERATIONS) as task:
         fit = fit_servos(motions_on, grid, resolution, done=lambda: task.advance(1))
         simulators = fits_in_simulators(
             [motion for _, motion in fitted], fit, resolution, done=lambda: task.advance(1)
@@ -191,7 +191,9 @@ def _resolution(sources: Sources) -> Array:
         columns = source.recording.position.T
         steps.append([np.diff(np.unique(column)).min(initial=np.inf) for column in columns])
     least = np.min(steps, axis=0)
-    return np.asarray(np.maximum(np.where(np.isfinite(least), least, 0.0) / np.sqrt(12.0), _FINEST))
+    return np.asarray(
+        np.maximum(np.where(np.isfinite(least), least, 0.0) / np.sqrt(12.0), _MIN_RESOLUTION)
+    )
 
 
 def _stuck(sources: Sources, resolution: Array) -> NDArray[np.bool_]:
@@ -206,7 +208,7 @@ def _stuck(sources: Sources, resolution: Array) -> NDArray[np.bool_]:
         stuck &= np.ptp(recording.position, axis=0) <= 1.5 * np.sqrt(12.0) * resolution
         commands = recording.commanded_position
         if commands is not None and (known := np.isfinite(commands).all(axis=1)).any():
-            commanded |= np.ptp(commands[known], axis=0) > STUCK_MOVEMENT
+            commanded |= np.ptp(commands[known], axis=0) > MIN_MOVEMENT
     return stuck & commanded
 
 

@@ -7,7 +7,7 @@ from typing import Final
 
 import numpy as np
 
-from hil.base.one_screen import COLUMNS, Paragraph, Part, columns
+from hil.base.one_screen import SCREEN_COLUMNS, Paragraph, Part, columns
 from hil.results.servo_result import (
     ServoContact,
     ServoPrediction,
@@ -17,7 +17,7 @@ from hil.results.servo_result import (
 )
 from identification.text import interval_text
 
-_GOOD: Final = 0.5
+_MAX_GOOD_ERROR_SHARE: Final = 0.5
 """Share of the command's own error, up to which a simulated motion is of use: a quarter of what the
 servo does otherwise than commanded is then left in the square."""
 _SHOWN: Final = {
@@ -36,8 +36,8 @@ _SHOWN: Final = {
 _MISSED: Final = 0.3
 """Share of the motion, from which on a tenth of its square is missed."""
 _MOSTLY: Final = 0.5  # of a motion, from which on it is judged without what something held
-_MOST_ROWS: Final = 8  # of the table of joints
-_MOST: Final = 3  # recordings, warnings and next steps on a screen
+_MAX_JOINT_ROWS: Final = 8  # of the table of joints
+_MAX_LINES: Final = 3  # recordings, warnings and next steps on a screen
 
 
 def unit_of(results: ServoResults) -> str:
@@ -58,7 +58,7 @@ def verdict_of(results: ServoResults) -> ServoVerdict:
     worst = max(results.validation, key=_share)
     share = _share(worst)
     missed = [each.archive for each in results.validation if _is_missed(each)]
-    good = share <= _GOOD and not missed
+    good = share <= _MAX_GOOD_ERROR_SHARE and not missed
     figures = ", ".join(_figure(each) for each in results.validation)
     line = (
         f"The servo model {'predicts' if good else 'does not predict'} {results.tested_on} from its"
@@ -183,13 +183,13 @@ def screen(results: ServoResults, read: Sequence[Part] = ()) -> list[Part]:
     """Return the parts of one screen: verdict, recordings, errors, parameters, warnings."""
     verdict = results.verdict
     parts: list[Part] = [Paragraph(verdict.line), *read, ""]
-    parts += columns(_errors(results, results.validation[:_MOST]))
-    parts += ["", *columns(_parameters(results, [*results.joint_names][:_MOST_ROWS])), ""]
+    parts += columns(_errors(results, results.validation[:_MAX_LINES]))
+    parts += ["", *columns(_parameters(results, [*results.joint_names][:_MAX_JOINT_ROWS])), ""]
     parts.append(
         f"delay of commands {1e3 * results.delay:.0f} ms; ? = not determined by the motion"
     )
-    parts += [Paragraph(text, "doubtful  ", 2) for text in verdict.warnings[:_MOST]]
-    parts += [Paragraph(text, "next      ", 2) for text in verdict.next_steps[:_MOST]]
+    parts += [Paragraph(text, "doubtful  ", 2) for text in verdict.warnings[:_MAX_LINES]]
+    parts += [Paragraph(text, "next      ", 2) for text in verdict.next_steps[:_MAX_LINES]]
     return parts
 
 
@@ -278,7 +278,7 @@ def _parameters(results: ServoResults, joints: Sequence[str]) -> list[list[str]]
             for joint, values in by_joint.items()
         ),
     ]
-    while max(map(len, columns(rows))) > COLUMNS:
+    while max(map(len, columns(rows))) > SCREEN_COLUMNS:
         rows = [row[:-1] for row in rows]
     return rows
 

@@ -27,7 +27,7 @@ from .settings import StudyFolder, StudySettings
 
 FLY_BY: Final = "fly-by"
 SINES: Final = "sines"
-CLASSES: Final = (FLY_BY, SINES)
+MOTION_CLASSES: Final = (FLY_BY, SINES)
 """Classes of held-out motions: that of method B, and that of method A."""
 _CAMPAIGN: Final = {
     "campaign.approach_speed": 1.0,
@@ -38,8 +38,9 @@ _CAMPAIGN: Final = {
 _VIA_POINTS: Final = {"campaign.n_via": 6, "campaign.fly": 0.5}  # of the print's held-out motions
 _HELD_OUT_SHARE: Final = 0.5  # duration of held-out sines over that of the excitations
 _RAMP_SHARE: Final = 0.1  # of that duration
-_HELD_OUT: Final = 3  # first number of a random stream that no search and no fly-by motion uses
-_TRIES: Final = 100
+# first number of a random stream that no search and no fly-by motion uses
+_HELD_OUT_STREAM: Final = 3
+_MAX_ATTEMPTS: Final = 100
 
 
 @dataclass(frozen=True, eq=False)
@@ -123,8 +124,8 @@ def sines(cell: Cell, settings: StudySettings) -> tuple[PlannedMotion, ...]:
             ramp=_RAMP_SHARE * length,
             offset=cell.home if number % 2 else None,
         )
-        for attempt in range(_TRIES):
-            random = np.random.default_rng([_HELD_OUT, settings.seed, number, attempt])
+        for attempt in range(_MAX_ATTEMPTS):
+            random = np.random.default_rng([_HELD_OUT_STREAM, settings.seed, number, attempt])
             (motion,) = genome.motions(genome.sample(random, 1))
             if not isinstance(motion, Exception) and checks.refusal(motion) is None:
                 motions.append(PlannedMotion(motion))
@@ -132,7 +133,7 @@ def sines(cell: Cell, settings: StudySettings) -> tuple[PlannedMotion, ...]:
         else:
             raise NoExcitationError(
                 f"no sum of sines of {length:g} s to test the result with satisfies all"
-                f" constraints in {_TRIES} attempts"
+                f" constraints in {_MAX_ATTEMPTS} attempts"
             )
     return tuple(motions)
 

@@ -16,7 +16,7 @@ from .model_errors import NONE, Condition
 from .results import Criterion, DesignPoint, Quantity, Relation
 from .searches import Search
 
-_DRAWS: Final = 2000
+_BOOTSTRAP_DRAWS: Final = 2000
 _SEED: Final = 20140902
 
 
@@ -117,7 +117,8 @@ def _draws(groups: Sequence[NDArray[np.intp]]) -> NDArray[np.intp]:
     """Return designs that are resampled within their methods, (draws, d)."""
     random = np.random.default_rng(_SEED)
     return np.concatenate(
-        [group[random.integers(0, len(group), (_DRAWS, len(group)))] for group in groups], axis=1
+        [group[random.integers(0, len(group), (_BOOTSTRAP_DRAWS, len(group)))] for group in groups],
+        axis=1,
     )
 
 

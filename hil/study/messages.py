@@ -10,15 +10,15 @@ from hil.report.numbers import capitalised, fixed, significant
 from identification.excitation import Method
 from identification.text import percentage
 
-from .campaigns import CLASSES
+from .campaigns import MOTION_CLASSES
 from .model_errors import (
     ALL,
-    CONSTANT_ERROR,
     LENGTH_ERROR,
-    LOAD_FRICTION,
+    LOAD_FRICTION_SHARE,
     NONE,
-    STRIBECK,
-    STRIBECK_SPEED,
+    STRIBECK_SHARE,
+    STRIBECK_SPEED_SHARE,
+    TORQUE_CONSTANT_ERROR,
 )
 from .results import ConditionResult, Criterion, Quantity, StudyResults
 
@@ -58,14 +58,14 @@ def effect_words(cell: Cell) -> list[str]:
         (max(simulation.elasticity, default=0.0), f"elastic gears {elastic} rad/(N·m)"),
         (simulation.delay, f"current {1e3 * simulation.delay:g} ms late"),
     ]
-    slow = percentage(STRIBECK_SPEED)
+    slow = percentage(STRIBECK_SPEED_SHARE)
     return [
         *(words for size, words in described if size > 0.0),
-        f"Stribeck friction {percentage(STRIBECK)} of the Coulomb torque, e-fold at {slow} of the"
-        " speed limit",
-        f"dry friction {percentage(LOAD_FRICTION)} of the load of a gear",
+        f"Stribeck friction {percentage(STRIBECK_SHARE)} of the Coulomb torque, e-fold at {slow} of"
+        " the speed limit",
+        f"dry friction {percentage(LOAD_FRICTION_SHARE)} of the load of a gear",
         f"lengths ± {percentage(LENGTH_ERROR, 1)}",
-        f"torque constants ± {percentage(CONSTANT_ERROR)}",
+        f"torque constants ± {percentage(TORQUE_CONSTANT_ERROR)}",
     ]
 
 
@@ -91,7 +91,7 @@ def conclusion_of(results: StudyResults) -> list[str]:
 
 def _b_over_a(condition: ConditionResult, *, printed_sizes: bool = False, decimals: int = 2) -> str:
     texts = []
-    for motions in CLASSES:
+    for motions in MOTION_CLASSES:
         row = condition.comparison("a", "b", motions, printed_sizes=printed_sizes)
         interval = "too few searches"
         if row.low is not None:
@@ -106,7 +106,7 @@ def _by_error(conditions: Sequence[ConditionResult]) -> str:
         condition.comparison("a", "b", motions)
         for condition in conditions
         if condition.error not in ("none", "all")
-        for motions in CLASSES
+        for motions in MOTION_CLASSES
     ]
     b = [1.0 - row.ratio for row in cases if row.verdict in _BETTER]
     a = [1.0 - 1.0 / row.ratio for row in cases if row.verdict in _WORSE]
@@ -124,7 +124,7 @@ def _of_default(condition: ConditionResult) -> str:
     over = {
         label: ", ".join(
             f"{motions} {fixed(condition.comparison(method, 'gradient', motions).ratio, 2)}"
-            for motions in CLASSES
+            for motions in MOTION_CLASSES
         )
         for label, method in _OTHERS.items()
     }
@@ -157,7 +157,7 @@ def _for_design(conditions: Sequence[ConditionResult]) -> str:
         if any(
             condition.comparison("a", "b", motions).verdict in _BETTER
             and condition.comparison("gradient", "b", motions).verdict in _BETTER
-            for motions in CLASSES
+            for motions in MOTION_CLASSES
         )
     ]
     if not helped:

@@ -11,9 +11,10 @@ from hil.base.arrays import Array
 
 from .results import Verdict
 
-SMALL: Final = 0.02  #: A difference of errors below this share exists and does not matter
+#: A difference of errors below this share exists and does not matter
+SMALL_DIFFERENCE: Final = 0.02
 MIN_UNITS: Final = 3  #: Searches needed for their scatter
-_DRAWS: Final = 2000
+_BOOTSTRAP_DRAWS: Final = 2000
 _SEED: Final = 20140901
 
 
@@ -60,7 +61,7 @@ def compared(first: Array, second: Array) -> Ratio:
 
 def _weights(count: int, random: np.random.Generator) -> Array:
     """Return the weights (draws, count) of means over count - 1 units with replacement."""
-    return random.multinomial(count - 1, [1.0 / count] * count, _DRAWS) / (count - 1.0)
+    return random.multinomial(count - 1, [1.0 / count] * count, _BOOTSTRAP_DRAWS) / (count - 1.0)
 
 
 def verdict_of(ratio: float, low: float | None, high: float | None) -> Verdict:
@@ -70,5 +71,5 @@ def verdict_of(ratio: float, low: float | None, high: float | None) -> Verdict:
     if low <= 1.0 <= high:
         return "none"
     if ratio < 1.0:
-        return "slightly better" if 1.0 - ratio < SMALL else "better"
-    return "slightly worse" if ratio - 1.0 < SMALL else "worse"
+        return "slightly better" if 1.0 - ratio < SMALL_DIFFERENCE else "better"
+    return "slightly worse" if ratio - 1.0 < SMALL_DIFFERENCE else "worse"

@@ -26,7 +26,7 @@ from hil.control.planted_arm import planted_truth
 from hil.control.simulated_cell import simulated_drive
 from planner import FourierSeries, PiecewiseCubic
 from sim_fixtures import PlantTruth, SimulatedDrive
-from sim_fixtures.arm import RIPPLES_PER_TURN, WARM_SPEED, WARM_UP_TIME
+from sim_fixtures.arm import HALF_WARM_SPEED, RIPPLES_PER_TURN, WARM_UP_TIME
 from sim_fixtures.plant import DAMPING_RATIO, build_model, carry, joint_inertia
 from sim_fixtures.settings import ServoSettings
 
@@ -41,15 +41,18 @@ ErrorName = Literal[
     "torque constants",
 ]
 
-STRIBECK: Final = 0.2  #: Excess of dry friction at standstill, as a share of the Coulomb torque
-STRIBECK_SPEED: Final = 0.1  #: Speed at which 37 % of it are left, as a share of the speed limit
-LOAD_FRICTION: Final = 0.05  #: Dry friction that load adds, as a share of the torque of the gear
+#: Excess of dry friction at standstill, as a share of the Coulomb torque
+STRIBECK_SHARE: Final = 0.2
+#: Speed at which 37 % of it are left, as a share of the speed limit
+STRIBECK_SPEED_SHARE: Final = 0.1
+#: Dry friction that load adds, as a share of the torque of the gear
+LOAD_FRICTION_SHARE: Final = 0.05
 LENGTH_ERROR: Final = 0.001  #: Relative error of each coordinate of a joint's origin, random sign
-CONSTANT_ERROR: Final = 0.03  #: Relative error of each torque constant, of random sign
-SIZES: Final = (1, 2)
+TORQUE_CONSTANT_ERROR: Final = 0.03  #: Relative error of each torque constant, of random sign
+ERROR_SIZES: Final = (1, 2)
 """Sizes of each error, times those above and in the cell file."""
 _SUBSTEPS: Final = 2  # of a cycle, for the oscillations of elastic gears
-_SIGNS: Final = 4  # first number of the random stream of signs and phases
+_SIGN_STREAM: Final = 4  # first number of the random stream of signs and phases
 
 
 @dataclass(frozen=True)
@@ -87,7 +90,7 @@ def conditions_of(cell: Cell, *, effects: bool) -> tuple[Condition, ...]:
         "delay": simulation.delay,
     }
     names = [name for name in get_args(ErrorName) if sizes.get(name, 1.0) > 0.0]
-    return (NONE, *(Condition(name, size) for name in names for size in SIZES), ALL)
+    return (NONE, *(Condition(name, size) for name in names for size in ERROR_SIZES), ALL)
 
 
 @dataclass(frozen=True, eq=False)
@@ -139,9 +142,11 @@ class ModelErrors:
         if name == "delay":
             return plan.delay(size * simulation.delay)
         if name == "Stribeck friction":
-            return plan.stribeck(size * STRIBECK, STRIBECK_SPEED * self.cell.joint_limits.velocity)
+            return plan.stribeck(
+                size * STRIBECK_SHARE, STRIBECK_SPEED_SHARE * self.cell.joint_limits.velocity
+            )
         if name == "friction with load":
-            return plan.load_friction(size * LOAD_FRICTION)
+            return plan.load_friction(size * LOAD_FRICTION_SHARE)
         return None
 
     def _converted(self, torque: Array, size: int) -> Array:
@@ -149,7 +154,7 @@ class ModelErrors:
         signs = self._random("constants").choice((-1.0, 1.0), torque.shape[1])
         currents = self._drive.currents(list(torque.T))  # elementwise, also of arrays
         wrong = [
-            (1.0 + size * CONSTANT_ERROR * sign) * current
+            (1.0 + size * TORQUE_CONSTANT_ERROR * sign) * current
             for sign, current in zip(signs.tolist(), currents, strict=True)
         ]
         return np.column_stack(self._drive.joint_torques(wrong))
@@ -163,7 +168,7 @@ class ModelErrors:
         return simulated_drive(self.cell)
 
     def _random(self, what: str) -> np.random.Generator:
-        return np.random.default_rng([_SIGNS, self.seed, *what.encode()])
+        return np.random.default_rng([_SIGN_STREAM, self.seed, *what.encode()])
 
 
 def _with_wrong_lengths(urdf: str, error: float, random: np.random.Generator) -> str:
@@ -229,7 +234,7 @@ class PlannedTorque:
     def drift(self, share: float, elapsed: float) -> Array:
         """Return the torque of friction that falls with a joint's warmth (`SimulatedDrift`)."""
         speed = np.abs(self.velocity)
-        final = speed / (speed + WARM_SPEED)
+        final = speed / (speed + HALF_WARM_SPEED)
         start = final.mean(axis=0) * (1.0 - exp(-elapsed / WARM_UP_TIME))
         rate = self.step / WARM_UP_TIME
         warmth, _ = lfilter([rate], [1.0, rate - 1.0], final, axis=0, zi=(1.0 - rate) * start[None])

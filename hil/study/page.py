@@ -26,7 +26,7 @@ from hil.report.panels import Panel, box_panel, chart_panel, matrix_panel
 from hil.report.rendering import environment, page_bytes
 from identification.excitation import Method
 
-from .campaigns import CLASSES
+from .campaigns import MOTION_CLASSES
 from .messages import CRITERION_WORDS, condition_words
 from .model_errors import ALL, NONE
 from .results import Criterion, DesignPoint, Quantity, ShownCondition, StudyResults
@@ -34,13 +34,13 @@ from .searches import LABELS
 
 COLOURS: Final = (FIRST, SECOND, INK)
 _VARIABLES: Final = ("--first", "--second", "--ink")
-_TICKS: Final = (
+_RATIO_TICKS: Final = (
     (0.7, 0.8, 0.9, 1.0, 1.1, 1.2, 1.3),
     (0.5, 0.6, 0.7, 0.8, 0.9, 1.0, 1.1, 1.2, 1.4, 1.6, 2.0, 2.5),
     (0.01, 0.1, 0.2, 0.5, 1.0, 2.0, 5.0, 10.0, 100.0),
 )
 """Of ratios of errors, the first that reach far enough."""
-_NAMES: Final = 150.0  # width of the names of conditions, px
+_NAME_WIDTH: Final = 150.0  # width of the names of conditions, px
 _POINTS_HEIGHT: Final = 180.0  # of a plot, px
 _POSITION_HEIGHT: Final = 110.0
 
@@ -73,9 +73,9 @@ def study_page(results: StudyResults) -> bytes:
             shown.condition: _examples(shown, results.joint_names) for shown in results.shown
         },
         words={condition.key: condition_words(condition) for condition in results.conditions},
-        ratios=[_ratios(results, motions) for motions in CLASSES],
+        ratios=[_ratios(results, motions) for motions in MOTION_CLASSES],
         ratio_legend=[(label, variable) for _, label, variable, _ in _RATIOS],
-        classes=CLASSES,
+        classes=MOTION_CLASSES,
         criteria=[
             (words, [_points(results, criterion, *quantity) for quantity in _quantities(results)])
             for criterion, words in CRITERION_WORDS.items()
@@ -120,15 +120,15 @@ def _ratios(results: StudyResults, motions: str) -> Panel:
         f"error over A's, {motions}", x_range=(low, high),
         ticks=[math.log10(tick) for tick in ticks], tick_names=[f"{tick:g}" for tick in ticks],
     )  # fmt: skip
-    return chart_panel(chart, width=560.0, left=_NAMES)
+    return chart_panel(chart, width=560.0, left=_NAME_WIDTH)
 
 
 def _ticks(low: float, high: float) -> tuple[float, ...]:
     """Return ticks for a range of logarithms."""
-    for ticks in _TICKS:
+    for ticks in _RATIO_TICKS:
         if math.log10(ticks[0]) < low and high < math.log10(ticks[-1]):
             return ticks
-    return _TICKS[-1]
+    return _RATIO_TICKS[-1]
 
 
 def _quantities(results: StudyResults) -> list[tuple[Quantity, str, str]]:

@@ -37,8 +37,8 @@ TABLE1: Final = (
     ("b", 15996, 30.9, 101.2, "K = 6, λ1 = 0.7, λ2 = 0.3; 150 individuals"),
 )
 """The paper's Table 1: method, N, log det (units not stated), I_c, notes."""
-_SHOWN: Final = 1200  # maximum number of rows of a series in a figure
-_MOVING: Final = 1e-3  # speed above which a joint moves, rad/s or m/s
+_MAX_ROWS: Final = 1200  # maximum number of rows of a series in a figure
+_MIN_MOVING_SPEED: Final = 1e-3  # speed above which a joint moves, rad/s or m/s
 
 
 def best_of(searches: Sequence[Search]) -> dict[Method, Search]:
@@ -259,12 +259,12 @@ def _errors(model: RobotModel, table: Array, run: Samples) -> _MotionErrors:
 
 def _motion_rows(run: Samples) -> slice:
     """Return the samples from the first to the last at which a joint moves."""
-    moving = np.flatnonzero((np.abs(run.motion.velocity) > _MOVING).any(axis=1))
+    moving = np.flatnonzero((np.abs(run.motion.velocity) > _MIN_MOVING_SPEED).any(axis=1))
     return slice(int(moving[0]), int(moving[-1]) + 1) if moving.size else slice(0, 0)
 
 
 def _thinned(rows: slice) -> slice:
-    return slice(rows.start, rows.stop, max(1, (rows.stop - rows.start) // _SHOWN))
+    return slice(rows.start, rows.stop, max(1, (rows.stop - rows.start) // _MAX_ROWS))
 
 
 def _rounded(values: Array) -> list[float]:

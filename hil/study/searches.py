@@ -41,7 +41,7 @@ VIA_POINTS: Final = {
     "twelve": ("12 via points", 12),
 }
 """Choices of method B: with the printed six points an arm as fast as this one is slow for 16 s."""
-_SEEDS: Final = 1000  # of each study
+_SEEDS_PER_STUDY: Final = 1000  # of each study
 
 
 @dataclass(frozen=True)
@@ -131,7 +131,7 @@ def _searched(
     method: Method, settings: StudySettings, number: int, effort: Effort
 ) -> DesignSettings:
     return preset(method).replaced(
-        seed=_SEEDS * settings.seed + number, search=dict(effort.model_dump())
+        seed=_SEEDS_PER_STUDY * settings.seed + number, search=dict(effort.model_dump())
     )
 
 

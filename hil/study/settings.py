@@ -53,7 +53,7 @@ class StudySettings(Frozen):
     cell: str = Field(default="", description="digest of the cell, empty for the paper's NS 16")
 
 
-FULL: Final = StudySettings(
+FULL_STUDY: Final = StudySettings(
     seed=1,
     searches=10,
     repetitions=2,
@@ -69,7 +69,7 @@ FULL: Final = StudySettings(
 )
 """Ten searches of each method, 30 held-out motions as in the paper."""
 
-QUICK: Final = FULL.model_copy(
+QUICK_STUDY: Final = FULL_STUDY.model_copy(
     update={
         "searches": 3,
         "motions": 8,
@@ -86,7 +86,7 @@ def study_settings(*, quick: bool = False, effects: bool = True, **given: Any) -
     """Return the settings of the full or quick study, replaced where not None."""
     changes = {name: value for name, value in given.items() if value is not None}
     return StudySettings.model_validate(
-        (QUICK if quick else FULL).model_dump() | {"effects": effects} | changes
+        (QUICK_STUDY if quick else FULL_STUDY).model_dump() | {"effects": effects} | changes
     )
 
 

@@ -21,7 +21,7 @@ from identification.excitation import Method
 from sim_fixtures.ns16 import CELL_PATH
 
 from . import estimates
-from .campaigns import CLASSES, StudyExecution, execute, plan_study
+from .campaigns import MOTION_CLASSES, StudyExecution, execute, plan_study
 from .child_calls import in_children
 from .criteria_relations import design_points, relations_of
 from .estimates import DesignEstimates, HeldOutForms
@@ -38,7 +38,7 @@ from .results import (
     StudyResults,
 )
 from .searches import LABELS, Search, run_searches, search_plans
-from .settings import FULL, StudyFolder, StudySettings
+from .settings import FULL_STUDY, StudyFolder, StudySettings
 
 _PAIRS: Final[tuple[tuple[Method, Method], ...]] = (
     ("a", "b"),
@@ -118,7 +118,7 @@ def _shown(
         method: by_key[search.key]
         for method, search in best_of([execution.search for execution in executions]).items()
     }
-    fly_by = next(execution for execution in executions if execution.held_out == CLASSES[0])
+    fly_by = next(execution for execution in executions if execution.held_out == MOTION_CLASSES[0])
     truth = planted_values(errors.cell)
     calls = [
         (fly_by.root, (condition, errors, best, fly_by, truth))
@@ -181,7 +181,7 @@ def _compared(parts: _Parts) -> list[ConditionResult]:
         )
 
     rows: list[list[StudyComparison]] = [[] for _ in parts.conditions]
-    for of_class in sorted(parts.forms, key=lambda one: CLASSES.index(one.motions)):
+    for of_class in sorted(parts.forms, key=lambda one: MOTION_CLASSES.index(one.motions)):
         whole = {method: errors(of_class, method) for method in LABELS}
         thinned = errors(of_class, "a", few_rows=True)
         pairs = [(first, second, whole[first], whole[second], False) for first, second in _PAIRS]
@@ -208,7 +208,10 @@ def _compared(parts: _Parts) -> list[ConditionResult]:
 
 def _is_quick(settings: StudySettings) -> bool:
     """Return whether less is searched than in the full study."""
-    return settings.searches < FULL.searches or settings.effort_b.tried < FULL.effort_b.tried
+    return (
+        settings.searches < FULL_STUDY.searches
+        or settings.effort_b.tried < FULL_STUDY.effort_b.tried
+    )
 
 
 def _rows(searches: Sequence[Search], shown: Sequence[ShownCondition]) -> list[MotionRow]:

@@ -75,11 +75,11 @@ def faulty_link(
     return VirtualLink.over(SimulatedTransport(controller, of_link), cell, controller.finish)
 
 
-PATIENCE: Final = 0.5
+REPLY_TIMEOUT: Final = 0.5
 """Time that the controller waits for a reply, s; longer than a real one, for slow computers."""
 
 
-LONGEST: Final = 120.0
+SESSION_SECONDS: Final = 120.0
 """Time after which the controller ends its session, s: a test's program moves for seconds."""
 
 
@@ -119,8 +119,8 @@ class UdpController:
     ) -> Iterator[UdpController]:
         """Start a controller with faults.
 
-        Unless the options say otherwise, it ends its session (504) after `LONGEST`: a program that
-        stays until then must not wait for ever.
+        Unless the options say otherwise, it ends its session (504) after `SESSION_SECONDS`: a
+        program that stays until then must not wait for ever.
 
         Args:
             cell: of the controller.
@@ -136,8 +136,8 @@ class UdpController:
         path.write_text(own_cell.text, encoding="utf-8")
         given = [argument for fault in faults for argument in ("--fault", fault)]
         simulator = SimulatorProcess.start(
-            path, "--udp", f"{LOOPBACK}:{port}", "--patience", str(PATIENCE),
-            "--duration", str(LONGEST), *given, *options,
+            path, "--udp", f"{LOOPBACK}:{port}", "--patience", str(REPLY_TIMEOUT),
+            "--duration", str(SESSION_SECONDS), *given, *options,
         )  # fmt: skip
         controller = cls(own_cell, path, LOOPBACK, port, simulator)
         try:

@@ -48,9 +48,9 @@ from identification.estimators.payload_estimate import ball_radius
 from identification.model.known_payload import Payload
 from identification.model.pseudo_inertia import body
 
-CENTRE: Final = (0.0, 0.0, 0.1)
+DEFAULT_CENTRE: Final = (0.0, 0.0, 0.1)
 """Centre of mass of a payload in the frame of the flange [m] where it is not stated."""
-FEWEST: Final = 2  # pairs: bare, loaded, loaded, bare
+MIN_PAIRS: Final = 2  # pairs: bare, loaded, loaded, bare
 _NAME: Final = re.compile(r"[A-Za-z0-9][\w.-]{0,63}")
 
 Execute = Callable[[Campaign, Mapping[str, Any]], RunResult]
@@ -202,7 +202,7 @@ class PayloadCampaign:
             raise InputError(None, problem, field="--payload", remedy=remedy)
         root = campaign.folder.root / PAYLOADS / name
         plan = replace(campaign.plan, validation=())
-        repetitions = max(FEWEST, campaign.cell.campaign.repetitions)
+        repetitions = max(MIN_PAIRS, campaign.cell.campaign.repetitions)
         cell = campaign.cell.with_campaign(repetitions=repetitions)
         places = [root / side for side in SIDES]
         if assumed is not None:
@@ -288,7 +288,7 @@ class PayloadCampaign:
 
         while True:
             for loaded in _order(pairs):
-                recordings = max(pairs + 1, FEWEST) if loaded else pairs + 1
+                recordings = max(pairs + 1, MIN_PAIRS) if loaded else pairs + 1
                 self._record_side(
                     loaded, recordings, executed, mounting, choices, links or _own_link
                 )
@@ -299,7 +299,9 @@ class PayloadCampaign:
                 record = record.with_look(_look(result, pairs, requirements[0]), self.limit)
                 record.save(self._precision)
                 reporter.say(record.message)
-            if pairs >= FEWEST and (record is None or (record.ended and record.measured == pairs)):
+            if pairs >= MIN_PAIRS and (
+                record is None or (record.ended and record.measured == pairs)
+            ):
                 break
         result = result or self._weighed(pairs, reporter)
         sides = ((self.bare.folder.root,), (self.loaded.folder.root,))
@@ -389,7 +391,7 @@ class PayloadCampaign:
         try:
             return self._weighed(pairs, reporter)
         except (NoPayloadError, IdentificationError) as error:
-            if pairs >= FEWEST:
+            if pairs >= MIN_PAIRS:
                 raise
             pair = plural(pairs, "pair")
             reporter.say(f"precision after {pair}: the mass is not determined yet: {error}")
@@ -405,7 +407,7 @@ class PayloadCampaign:
 
 
 def assumed_payload(
-    cell: Cell, mass: float, centre: tuple[float, float, float] = CENTRE
+    cell: Cell, mass: float, centre: tuple[float, float, float] = DEFAULT_CENTRE
 ) -> Payload:
     """Return a payload on the flange as it is assumed before it is weighed: a ball of water.
 
@@ -466,7 +468,7 @@ def _require_allowed(cell: Cell, plan: CampaignPlan, name: str, assumed: Payload
 def payload_options(assumed: Payload) -> str:
     """Return the options of a command that state a payload."""
     options = f"--payload-mass {assumed.mass:g}"
-    if assumed.centre == CENTRE:
+    if assumed.centre == DEFAULT_CENTRE:
         return options
     return f"{options} --payload-centre={','.join(f'{part:g}' for part in assumed.centre)}"
 

@@ -41,14 +41,18 @@ from identification.model.pseudo_inertia import (
 from identification.model.robot import RobotModel
 
 _N_LINK: Final = len(LINK_SYMBOLS)
-_INSIDE: Final = 1e-6  # smallest eigenvalue of a pseudo-inertia relative to the reference's
-_ROTOR_INSIDE: Final = 1e-6  # of the rotors' matrix, relative to its scale
+# smallest eigenvalue of a pseudo-inertia relative to the reference's
+_MIN_EIGENVALUE_RATIO: Final = 1e-6
+_MIN_ROTOR_EIGENVALUE: Final = 1e-6  # of the rotors' matrix, relative to its scale
 _SOLVED: Final = ("Solved", "AlmostSolved")
-_TOLERANCE: Final = 1e-9  # of the conic solver
-_SHORT_STEP: Final = 0.9  # share of the way to the border of a cone, where the usual 0.99 fails
-_REFINEMENTS: Final = 50  # of each linear system then, at most
-_NO_CERTIFICATE: Final = 1e-16  # the constraints have solutions: any bodies of the references
-_DEPENDENT: Final = 1e-15  # distance of a column from those before it, relative to its length
+_SOLVER_TOLERANCE: Final = 1e-9  # of the conic solver
+# share of the way to the border of a cone, where the usual 0.99 fails
+_SHORT_STEP_FRACTION: Final = 0.9
+_MAX_REFINEMENTS: Final = 50  # of each linear system then, at most
+# the constraints have solutions: any bodies of the references
+_INFEASIBILITY_TOLERANCE: Final = 1e-16
+# distance of a column from those before it, relative to its length
+_DEPENDENCE_TOLERANCE: Final = 1e-15
 
 
 class SolverError(IdentificationError):
@@ -92,7 +96,7 @@ class Program:
         for places, frame in zip(links, bodies.frames, strict=True):
             entries = np.einsum("ab,kbc,dc->kad", frame, _SYMMETRIC, frame)
             transform[np.ix_(places, places)] = inertial_from_pseudo(entries).T
-            cones.append(Cone(places, _SYMMETRIC, _INSIDE * np.eye(4)))
+            cones.append(Cone(places, _SYMMETRIC, _MIN_EIGENVALUE_RATIO * np.eye(4)))
         alone = layout.rotors
         if layout.pairs:
             coupled = _coupled_rotors(model, scale)
@@ -129,14 +133,14 @@ class Program:
         )
         settings = clarabel.DefaultSettings()
         settings.verbose = False
-        settings.tol_gap_abs = settings.tol_gap_rel = settings.tol_feas = _TOLERANCE
+        settings.tol_gap_abs = settings.tol_gap_rel = settings.tol_feas = _SOLVER_TOLERANCE
         # Exact data of an arm that cannot be are far from all that can: no certificate by rounding.
-        settings.tol_infeas_abs = settings.tol_infeas_rel = _NO_CERTIFICATE
+        settings.tol_infeas_abs = settings.tol_infeas_rel = _INFEASIBILITY_TOLERANCE
         solution = clarabel.DefaultSolver(*problem, settings).solve()
         if str(solution.status) not in _SOLVED:
             # Rounding ended it; shorter steps stay further from the borders of the cones.
-            settings.max_step_fraction = _SHORT_STEP
-            settings.iterative_refinement_max_iter = _REFINEMENTS
+            settings.max_step_fraction = _SHORT_STEP_FRACTION
+            settings.iterative_refinement_max_iter = _MAX_REFINEMENTS
             solution = clarabel.DefaultSolver(*problem, settings).solve()
         if str(solution.status) not in _SOLVED:
             raise SolverError(
@@ -263,7 +267,7 @@ def _of_full_rank(matrix: Array) -> Array:
     identity = np.eye(matrix.shape[1])
     square = np.concatenate([matrix, np.zeros_like(identity)])
     distance = np.abs(np.diag(np.linalg.qr(square, mode="r")))
-    dependent = distance <= _DEPENDENT * np.linalg.norm(matrix, axis=0)
+    dependent = distance <= _DEPENDENCE_TOLERANCE * np.linalg.norm(matrix, axis=0)
     return np.concatenate([matrix, identity[dependent]])
 
 
@@ -308,7 +312,7 @@ def _coupled_rotors(model: RobotModel, size: Array) -> Cone:
     # In units of the rotors, so that the margin is relative.
     unit = np.sqrt(size[layout.rotors[joints]])
     entries = entries * size[places][:, None, None] / np.outer(unit, unit)
-    return Cone(places, entries, _ROTOR_INSIDE * np.eye(len(joints)))
+    return Cone(places, entries, _MIN_ROTOR_EIGENVALUE * np.eye(len(joints)))
 
 
 @dataclass(frozen=True, eq=False)

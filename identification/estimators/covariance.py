@@ -32,28 +32,33 @@ from identification.estimators.loss_functions import Loss
 from identification.factor.blocks import FINE_BLOCK, block_slices, fine_blocks, merged
 from identification.factor.estimate import Estimate, mark_undetermined
 from identification.factor.factor import Factor
-from identification.factor.normal_equations import PARTICIPATION, NormalEquations, Solution, solve
+from identification.factor.normal_equations import (
+    MAX_UNDETERMINED_SHARE,
+    NormalEquations,
+    Solution,
+    solve,
+)
 from identification.factor.rows import augmented_rows
 from identification.model.robot import RobotModel
 from identification.signals.samples import Samples
 
 # Model errors are correlated over some tenths of a second.
-SHORTEST_BLOCK: Final = 2  # fine blocks
+MIN_FINE_BLOCKS: Final = 2  # fine blocks
 # Correlation of neighbouring scores up to which blocks are lengthened; the rest is corrected in
 # `_sandwich`.
-_CORRELATED: Final = 0.1
-_FEWEST_BLOCKS: Final = 20  # fewer blocks make the covariance itself too uncertain
+_MAX_BLOCK_CORRELATION: Final = 0.1
+_MIN_BLOCKS: Final = 20  # fewer blocks make the covariance itself too uncertain
 # Leverages between which the variance changes from own residual to other blocks. On simulated NS 16
 # data whose joint 6 moves for 0.2 of 16 s the nominal 95 % intervals of its friction covered 3 to
 # 80 % without this.
 _LOW_LEVERAGE: Final = 0.5
 _HIGH_LEVERAGE: Final = 0.9
 # With a prior all directions are determined, up to rounding.
-_WORST_WITH_PRIOR: Final = 1e7
+_MAX_CONDITION_WITH_PRIOR: Final = 1e7
 # With these, (1 - H)^-1/2 is the mean of the (1 - node H)^-1, a midpoint rule for the integral of
 # 1 / (1 - H sin² x) over a quarter turn: within 0.2 % up to the low leverage.
-_NODES: Final = (float(np.sin(np.pi / 8.0) ** 2), float(np.sin(3.0 * np.pi / 8.0) ** 2))
-_AT_ONCE: Final = 8  # blocks whose matrices fit the cache
+_QUADRATURE_NODES: Final = (float(np.sin(np.pi / 8.0) ** 2), float(np.sin(3.0 * np.pi / 8.0) ** 2))
+_BLOCKS_AT_ONCE: Final = 8  # blocks whose matrices fit the cache
 
 
 @dataclass(frozen=True, eq=False)
@@ -117,8 +122,8 @@ def block_covariance(
     root = solution.root
     scores = merged(scores, length)
     shares = np.empty((len(scores), root.shape[1], root.shape[1]))
-    for start in range(0, len(scores), _AT_ONCE):
-        chunk = slice(start, start + _AT_ONCE)
+    for start in range(0, len(scores), _BLOCKS_AT_ONCE):
+        chunk = slice(start, start + _BLOCKS_AT_ONCE)
         information = longer.blocks(chunk).by_block(weights)[:, :-1, :-1]
         shares[chunk] = _shares(information, root, root)
     spread = None if prior is None else design_effect**2 * prior
@@ -127,7 +132,7 @@ def block_covariance(
 
 def solve_with_prior(equations: NormalEquations, precision: Array) -> Solution:
     """Solve with the information (p, p) of a prior of mean zero, by which all is determined."""
-    return solve(equations._replace(A=equations.A + precision), _WORST_WITH_PRIOR)
+    return solve(equations._replace(A=equations.A + precision), _MAX_CONDITION_WITH_PRIOR)
 
 
 def cluster_covariance(
@@ -152,7 +157,7 @@ def cluster_covariance(
     information = information[used]
     scores = scores[used]
     length = block_length(scores)
-    length = max(length, min(stretch * length, len(scores) // _FEWEST_BLOCKS))
+    length = max(length, min(stretch * length, len(scores) // _MIN_BLOCKS))
     shares = _shares(merged(information, length), solution.root, solution.root)
     result = _sandwich(shares, merged(scores, length), solution, length * block)
     if prior is not None:
@@ -216,10 +221,10 @@ def with_block_covariance(
 
 def block_length(scores: Array) -> int:
     """Return the least number of fine blocks per block with uncorrelated scores (B, p)."""
-    longest = max(1, len(scores) // _FEWEST_BLOCKS)
-    shortest = min(SHORTEST_BLOCK, longest)
+    longest = max(1, len(scores) // _MIN_BLOCKS)
+    shortest = min(MIN_FINE_BLOCKS, longest)
     for length in range(shortest, longest):
-        if lag_correlation(merged(scores, length)) < _CORRELATED:
+        if lag_correlation(merged(scores, length)) < _MAX_BLOCK_CORRELATION:
             return length
     return longest
 
@@ -271,7 +276,9 @@ def leverage_corrected(
         left_out: multiply by (1 - H_b)^-1, as by leaving out one block at a time, for decisions
             that a narrow interval would spoil.
     """
-    corrected, dependent = _regular(shares, scores, symmetric, (1.0,) if left_out else _NODES)
+    corrected, dependent = _regular(
+        shares, scores, symmetric, (1.0,) if left_out else _QUADRATURE_NODES
+    )
     power = 1.0 if left_out else 0.5
     regular = np.ones(len(scores), dtype=np.bool_)
     regular[dependent] = False
@@ -350,7 +357,7 @@ def _shares(information: Array, root: Array, left: Array) -> Array:
 
 
 # Curvature relative to the weighted squares below which a direction is undetermined.
-_FLAT: Final = 1e-3
+_MIN_CURVATURE: Final = 1e-3
 
 
 def clustered_covariance(
@@ -391,14 +398,14 @@ def clustered_covariance(
     length = block_length(scores[rows > 0])
     information = merged(information[rows > 0], length)
     curvature, vectors = np.linalg.eigh(information.sum(axis=0))
-    steep = curvature > _FLAT
+    steep = curvature > _MIN_CURVATURE
     # Coordinates in which all blocks together have unit information.
     to_unit = vectors[:, steep] / np.sqrt(curvature[steep])
     scale = np.maximum(np.linalg.norm(solution.root, axis=1), np.finfo(np.float64).tiny)
     flat = np.abs(solution.root @ vectors[:, ~steep]).max(axis=1, initial=0.0)
     steep_solution = solution._replace(
         root=solution.root @ to_unit,
-        determined=solution.determined & (flat < PARTICIPATION * scale),
+        determined=solution.determined & (flat < MAX_UNDETERMINED_SHARE * scale),
     )
     shares = to_unit.T @ information @ to_unit
     return _sandwich(shares, merged(scores[rows > 0], length), steep_solution, length * FINE_BLOCK)

@@ -26,22 +26,26 @@ from numpy.typing import NDArray
 from identification.arrays import Array
 from identification.errors import IdentificationError
 from identification.estimators.covariance import Clustered, cluster_covariance
-from identification.estimators.payload_problem import DRIFT, OFFSET, STRETCH
+from identification.estimators.payload_problem import (
+    BLOCK_STRETCH,
+    FRICTION_DRIFT_STD,
+    OFFSET_STD_SHARE,
+)
 from identification.factor.blocks import FINE_BLOCK, merged
-from identification.factor.factor import SMALLEST_NOISE, Factor
+from identification.factor.factor import MIN_NOISE, Factor
 from identification.factor.normal_equations import NormalEquations, Solution, solve
 from identification.model.robot import RobotModel
 from identification.text import percentage
 
-WORST_RELATIVE_STD: Final = 0.05  # tolerance of a maker's torque constant
-MOST_BLOCKS: Final = 400
+MAX_RELATIVE_STD: Final = 0.05  # tolerance of a maker's torque constant
+MAX_BLOCKS: Final = 400
 """Blocks of time that the longest recording is reduced to."""
-_NO_LOAD: Final = 1e-9  # relative length of the payload's column that is rounding
-_ITERATIONS: Final = 50
-_VANISHING: Final = 1e-100
-_CONVERGED: Final = 1e-9
-_MOST_VALUES: Final = 2e7  # of the information matrices of all blocks
-_FEWEST_BLOCKS: Final = 60
+_MIN_LOAD_RATIO: Final = 1e-9  # relative length of the payload's column that is rounding
+_MAX_ITERATIONS: Final = 50
+_MIN_MAGNITUDE: Final = 1e-100
+_CONVERGENCE_TOLERANCE: Final = 1e-9
+_MAX_MATRIX_VALUES: Final = 2e7  # of the information matrices of all blocks
+_MIN_BLOCKS: Final = 60
 
 
 @dataclass(frozen=True, eq=False)
@@ -132,7 +136,7 @@ class _Layout(NamedTuple):
         prior[self.drifts[0]] = np.divide(
             1.0, offset_variance, out=np.zeros(self.n), where=offset_variance > 0.0
         )
-        prior[self.drifts[1]] = 1.0 / DRIFT**2
+        prior[self.drifts[1]] = 1.0 / FRICTION_DRIFT_STD**2
         return prior
 
 
@@ -143,12 +147,12 @@ def _reasons(
     p = total.shape[1] - 3
     magnitude = np.abs(inverse)
     relative = np.divide(
-        std, magnitude, out=np.full_like(magnitude, np.inf), where=magnitude > _VANISHING
+        std, magnitude, out=np.full_like(magnitude, np.inf), where=magnitude > _MIN_MAGNITUDE
     )
     # Whether the payload's torque on a motor exceeds rounding.
     powers = np.diagonal(total, axis1=1, axis2=2)
-    loaded = powers[:, p] > _NO_LOAD**2 * powers[:, :p].max(axis=1, initial=0.0)
-    good = determined & (inverse > 0.0) & (relative <= WORST_RELATIVE_STD)
+    loaded = powers[:, p] > _MIN_LOAD_RATIO**2 * powers[:, :p].max(axis=1, initial=0.0)
+    good = determined & (inverse > 0.0) & (relative <= MAX_RELATIVE_STD)
     checks = (  # first match
         (rows == 0, "the motor has no usable row"),
         (good, None),
@@ -160,7 +164,7 @@ def _reasons(
         next(
             (reason for holds, reason in checks if holds[m]),
             f"its relative standard deviation is {percentage(relative[m])}, limit "
-            f"{percentage(WORST_RELATIVE_STD)}",
+            f"{percentage(MAX_RELATIVE_STD)}",
         )
         for m in range(len(total))
     )
@@ -178,7 +182,7 @@ def _motor_by_motor(total: Array, rows: NDArray[np.intp]) -> tuple[Array, Array]
         solution = solve(NormalEquations(gram, current))
         squares = total[m][-1, -1] - solution.values @ current
         freedom = max(rows[m] - len(unknown), 1)
-        noise[m] = np.sqrt(max(squares, SMALLEST_NOISE**2 * total[m][-1, -1]) / freedom)
+        noise[m] = np.sqrt(max(squares, MIN_NOISE**2 * total[m][-1, -1]) / freedom)
         if solution.determined[p] and solution.values[p] > 0.0:
             inverses[m] = solution.values[p]
     estimated = np.isfinite(inverses)
@@ -194,7 +198,7 @@ def _offset_variance(
     friction = np.where(layout.friction, unknowns[: layout.p], 0.0)
     gram = totals.sum(axis=0)[:, : layout.p, : layout.p]
     squares = np.einsum("i,mij,j->m", friction, gram, friction)
-    return np.asarray(OFFSET**2 * squares / np.maximum(rows, 1))
+    return np.asarray(OFFSET_STD_SHARE**2 * squares / np.maximum(rows, 1))
 
 
 def _gauss_newton(
@@ -236,7 +240,7 @@ def _gauss_newton(
     cost = np.inf
     best = unknowns
     step = np.zeros_like(unknowns)
-    for _ in range(_ITERATIONS):
+    for _ in range(_MAX_ITERATIONS):
         equations, squares = problem(unknowns)
         if squares > cost * (1.0 + 1e-12):
             damping *= 0.5
@@ -251,7 +255,7 @@ def _gauss_newton(
         cost = squares
         damping = 1.0
         unknowns = best + step
-        if step[free] @ part.A @ step[free] < _CONVERGED:
+        if step[free] @ part.A @ step[free] < _CONVERGENCE_TOLERANCE:
             break
     return best, solve(problem(best)[0])
 
@@ -265,7 +269,7 @@ def _with_covariance(
     offset_variance: Array,
 ) -> tuple[Array, Solution, Clustered]:
     """Return unknowns with drifts, the last problem, and the covariance."""
-    length = -(-max(map(len, runs)) // max(_FEWEST_BLOCKS, int(_MOST_VALUES / layout.size**2)))
+    length = -(-max(map(len, runs)) // max(_MIN_BLOCKS, int(_MAX_MATRIX_VALUES / layout.size**2)))
     blocks = [merged(run, length) for run in runs]
     prior = layout.prior(offset_variance)
     # The prior is not scaled; the data are, by the design effect of coloured noise.
@@ -282,7 +286,7 @@ def _with_covariance(
             scores[: len(run)] += terms[1]
         duration = length * FINE_BLOCK  # for the description only
         clustered = cluster_covariance(
-            information, scores, solution, np.diag(prior), duration, STRETCH
+            information, scores, solution, np.diag(prior), duration, BLOCK_STRETCH
         )
         effect *= max(1.0, clustered.design_effect)
     return unknowns, solution, clustered

@@ -41,31 +41,32 @@ from identification.signals.samples import Preprocessing, Samples, prepare
 
 Rows = NDArray[np.bool_]
 
-LONGEST_DELAY: Final = 0.05  # s, either way
+MAX_ESTIMATED_DELAY: Final = 0.05  # s, either way
 # Encoder noise correlates with the torque through the servo loop. Simulated NS 16, delay 0.2 ms,
 # four seeds: mean 0.18 ms at 10 Hz, 0.155 at 15 and 0.16 at 40 Hz, where wrist axes deviate by 0.3
 # ms.
 DELAY_BANDWIDTH: Final = 10.0  # Hz
 # Of a smoother that leaves nine tenths of an amplitude at the bandwidth above.
-_SMOOTH_MOTION: Final = 14.0  # Hz
+_SMOOTH_MOTION_BANDWIDTH: Final = 14.0  # Hz
 # Half a 95 % interval of a determined delay.
-WIDEST_INTERVAL: Final = 1e-3  # s
+MAX_HALF_INTERVAL: Final = 1e-3  # s
 # Averaging interval of torques, symmetric in time. The model is sampled between: a longer interval
 # displaces steps of friction, which the low-pass spreads.
-_BIN: Final = 0.005  # s
+_BIN_SECONDS: Final = 0.005  # s
 # Minima of the profile are wider.
 _PROFILE_STEP: Final = 0.01  # s
-_ITERATIONS: Final = 12
+_MAX_ITERATIONS: Final = 12
 _FIRST_ITERATIONS: Final = 3  # iterations
 # Half a 95 % interval that less noise of the positions may make that of a determined delay.
-_WITHIN_REACH: Final = 3e-3  # s
-_CONVERGED = 1e-6  # s
-_OF_STD = 0.02  # share of the standard deviation
-_MODEL_ERROR: Final = 0.05  # difference of log variance up to which two minima are equally good
+_REACHABLE_HALF_INTERVAL: Final = 3e-3  # s
+_CONVERGED_SECONDS = 1e-6  # s
+_CONVERGED_STD_SHARE = 0.02  # share of the standard deviation
+# difference of log variance up to which two minima are equally good
+_EQUAL_LOG_VARIANCE: Final = 0.05
 _FOLDS: Final = 5
-_BLOCKS: Final = 80  # blocks of time
+_TIME_BLOCKS: Final = 80  # blocks of time
 _ROWS_AT_ONCE: Final = 8192
-_CHANCE: Final = 0.005  # one-sided probability of a false delay
+_FALSE_DELAY_PROBABILITY: Final = 0.005  # one-sided probability of a false delay
 CLOSED_LOOP_BIAS: Final = 1e-4
 """Standard deviation [s] of an estimate's error in addition to its interval: encoder noise in the
 closed loop, elastic gears, ripple. Simulated NS 16, UR5, Panda and arm of two joints with effects,
@@ -209,11 +210,11 @@ class DelayEstimate:
 
     @property
     def variance(self) -> float:
-        """Variance of the delay [s²], at most of a uniform one within `LONGEST_DELAY`.
+        """Variance of the delay [s²], at most of a uniform one within `MAX_ESTIMATED_DELAY`.
 
         Also the error variance of an assumed delay inside the interval.
         """
-        return float(np.fmin(self.std**2, LONGEST_DELAY**2 / 3.0))
+        return float(np.fmin(self.std**2, MAX_ESTIMATED_DELAY**2 / 3.0))
 
     def excludes(self, delay: float) -> bool:
         """Return whether the 95 % interval does not hold another delay [s]."""
@@ -225,15 +226,16 @@ class DelayEstimate:
         Errors of the stated value are Gaussian, with the variance of uniform ones of up to `bound`
         either way; the estimate, significant or not, has its own and a `bias` (standard deviation).
         A determined estimate may also show the stated value to be wrong: before it, errors of up to
-        `LONGEST_DELAY` are as likely. A minimum at a limit, or next to another, tells nothing.
+        `MAX_ESTIMATED_DELAY` are as likely. A minimum at a limit, or next to another, tells
+        nothing.
         """
         near = bound**2 / 3.0
-        narrow = self.half_interval <= WIDEST_INTERVAL
+        narrow = self.half_interval <= MAX_HALF_INTERVAL
         if not np.isfinite(self.std) or (narrow and not self.determined):
             return CombinedDelay(stated, near)
         variance = self.std**2 + bias**2
         difference = self.delay - stated
-        priors = np.array([near, LONGEST_DELAY**2 / 3.0] if self.determined else [near])
+        priors = np.array([near, MAX_ESTIMATED_DELAY**2 / 3.0] if self.determined else [near])
         spreads = priors + variance
         shares = priors / spreads
         logarithms = -0.5 * (difference**2 / spreads + np.log(spreads))
@@ -266,11 +268,11 @@ def estimate_delay(
     # Reversals are left out below, less widely than beside a smoother of this bandwidth.
     options = replace(_narrow(options), exclude_rows="halts")
     estimate = _estimated(recording, model, noise_variance, options)
-    is_far = not estimate.half_interval < _WITHIN_REACH
-    if estimate.determined or is_far or options.rigid_bandwidth <= _SMOOTH_MOTION:
+    is_far = not estimate.half_interval < _REACHABLE_HALF_INTERVAL
+    if estimate.determined or is_far or options.rigid_bandwidth <= _SMOOTH_MOTION_BANDWIDTH:
         return estimate
     # Noise of positions turns friction at slow motion: a smoother motion may show the delay.
-    smooth = replace(options, rigid_bandwidth=_SMOOTH_MOTION)
+    smooth = replace(options, rigid_bandwidth=_SMOOTH_MOTION_BANDWIDTH)
     return min(
         (estimate, _estimated(recording, model, noise_variance, smooth)),
         key=lambda either: either.std,
@@ -283,10 +285,10 @@ def _estimated(
     p = model.n_parameters
     assumed = options.torque_delay
     samples = prepare(recording, model, noise_variance=noise_variance, options=options)
-    ends = (-LONGEST_DELAY - assumed, LONGEST_DELAY - assumed)
+    ends = (-MAX_ESTIMATED_DELAY - assumed, MAX_ESTIMATED_DELAY - assumed)
     reader, (grid, heights, values) = _profiled(model, samples, ends)
     shift = float(grid[np.argmin(heights)])
-    for iteration in range(_ITERATIONS):
+    for iteration in range(_MAX_ITERATIONS):
         blocks = reader.linearised(shift, values)
         solution = blocks.solution()
         values = np.delete(solution.values, p)
@@ -294,16 +296,18 @@ def _estimated(
         previous = shift
         shift = float(np.clip(shift + step, *ends))
         if abs(shift - previous) <= max(
-            _CONVERGED, _OF_STD * float(np.sqrt(solution.inverse[p, p]))
+            _CONVERGED_SECONDS, _CONVERGED_STD_SHARE * float(np.sqrt(solution.inverse[p, p]))
         ):
             break
         # What is far from determined need not settle, and often does not.
-        if iteration >= _FIRST_ITERATIONS and blocks.delay_std(solution)[0] > WIDEST_INTERVAL:
+        if iteration >= _FIRST_ITERATIONS and blocks.delay_std(solution)[0] > MAX_HALF_INTERVAL:
             break
     height = reader.profile(np.array([shift]), reader.rows_at).heights[0]
     other = _other_minimum(grid, heights, shift, height)
     std, count = blocks.delay_std(solution)
-    factor, by_chance = (float(student_limit(share, count - 1)) for share in (0.025, _CHANCE))
+    factor, by_chance = (
+        float(student_limit(share, count - 1)) for share in (0.025, _FALSE_DELAY_PROBABILITY)
+    )
     at_limit = shift <= ends[0] or shift >= ends[1]
 
     differs = not at_limit and bool(np.isnan(other)) and abs(shift) > by_chance * std
@@ -355,14 +359,14 @@ def _other_minimum(grid: Array, heights: Array, shift: float, height: float) -> 
     padded = np.concatenate([[np.inf], heights, [np.inf]])
     valley = (heights <= padded[:-2]) & (heights <= padded[2:])
     other = np.abs(grid - shift) > grid[1] - grid[0]
-    valleys = np.flatnonzero(valley & other & (heights < height + _MODEL_ERROR))
+    valleys = np.flatnonzero(valley & other & (heights < height + _EQUAL_LOG_VARIANCE))
     return float(grid[valleys[np.argmin(heights[valleys])]]) if valleys.size else float("nan")
 
 
 def _undetermined_reason(half_interval: float, at_limit: bool, other: float) -> str | None:
     if not np.isfinite(half_interval):
         return "the motion does not separate a delay from the other parameters"
-    if half_interval > WIDEST_INTERVAL:
+    if half_interval > MAX_HALF_INTERVAL:
         return (
             f"95 % interval of ± {half_interval * 1e3:.2g} ms: the torques change too slowly, or"
             " are too noisy"
@@ -468,7 +472,7 @@ def _between_joints(delays: Array, variances: Array, freedom: int) -> float:
     weights = 1.0 / variances
     whole = float(weights.sum())
     squares = float(weights @ (delays - weights @ delays / whole) ** 2)
-    if squares <= others * fisher_limit(2.0 * _CHANCE, others, freedom):
+    if squares <= others * fisher_limit(2.0 * _FALSE_DELAY_PROBABILITY, others, freedom):
         return 0.0
     share = float((weights**2).sum()) / whole**2
     return share * (squares - others) / (whole * (1.0 - share))
@@ -510,7 +514,7 @@ class _Reader:
         reach = REVERSAL_PERIODS / np.minimum(samples.position_bandwidth, DELAY_BANDWIDTH)
         clear = model.moving(motion.velocity) & ~near_any_reversal(model, motion, reach)
         cycle = float(np.median(np.diff(motion.time)))
-        size = max(1, round(_BIN / cycle))
+        size = max(1, round(_BIN_SECONDS / cycle))
         parts = []
         start = 0
         for segment in samples.segments:
@@ -595,7 +599,7 @@ class _Reader:
         By whole bins, with one regressor for all, unless a bin is longer than a step.
         """
         if not self.parts or self.bin > _PROFILE_STEP:
-            steps = 1 + 2 * math.ceil(LONGEST_DELAY / _PROFILE_STEP)
+            steps = 1 + 2 * math.ceil(MAX_ESTIMATED_DELAY / _PROFILE_STEP)
             return self.profile(np.linspace(*ends, steps), self.rows_at)
         step = self.bin * round(_PROFILE_STEP / self.bin)
         first, last = math.ceil(ends[0] / step), math.floor(ends[1] / step)
@@ -646,7 +650,7 @@ class _Reader:
             rate = predicted_rate(samples, torque)
             table = np.column_stack([block, -rate, beside.columns[j], samples.torque[:, j]])
             tables.append(np.where(samples.usable[:, j], table.T, 0.0))
-        index = np.arange(len(samples.usable)) * _BLOCKS // max(1, len(samples.usable))
+        index = np.arange(len(samples.usable)) * _TIME_BLOCKS // max(1, len(samples.usable))
         places = tuple(
             np.concatenate([used, [p + joint], p + n + others])
             for joint, (used, others) in enumerate(zip(columns, beside.places, strict=True))

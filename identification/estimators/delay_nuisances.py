@@ -17,27 +17,27 @@ import numpy as np
 from numpy.typing import NDArray
 
 from identification.arrays import Array
-from identification.estimators.prior import LOAD_SHARE
-from identification.estimators.torque_scale import DATA_SHEET
+from identification.estimators.prior import LOAD_FRICTION_STD
+from identification.estimators.torque_scale import TORQUE_CONSTANT_STD
 from identification.model.motion import Motion
 from identification.model.robot import RobotModel
 from identification.signals.samples import Samples
 
-ZERO: Final = 0.03
+JOINT_ZERO_STD: Final = 0.03
 """Standard deviation of the error of an encoder's zero [rad, m]: marks that are aligned by eye, or
 a mechanical stop, are good to a degree or two."""
-DRIFT: Final = 0.2
+FRICTION_DRIFT_STD: Final = 0.2
 """Relative standard deviation of friction over the recording, of its slowest change: that of gears
 falls by some tens of per cent while they warm (Bittencourt and Gunnarsson 2012)."""
-STATIC: Final = 0.5
+STATIC_FRICTION_STD: Final = 0.5
 """Standard deviation of static friction beyond that in motion, over the RMS of friction."""
-CURVATURE: Final = 0.3
+QUADRATIC_FRICTION_STD: Final = 0.3
 """Likewise of a quadratic term at the largest speed."""
-_CHANGES: Final = 4  # half periods in the recording, of changing friction
+_DRIFT_HALF_PERIODS: Final = 4  # half periods in the recording, of changing friction
 # Speeds [rad/s or m/s] at which static friction has fallen to a third: Stribeck speeds of gears are
 # 0.01 to 0.2 rad/s.
 _STATIC_SPEEDS: Final = (0.03, 0.1, 0.3)
-_STEP: Final = 1e-4  # rad or m, of a numerical derivative
+_DERIVATIVE_STEP: Final = 1e-4  # rad or m, of a numerical derivative
 _TINY: Final = np.finfo(np.float64).tiny
 
 
@@ -64,10 +64,10 @@ def nuisances(model: RobotModel, samples: Samples, values: Array) -> Nuisances:
     places = []
     names = [f"zero {name}" for name in model.joint_names]
     for joint, name in enumerate(model.joint_names):
-        own = {"scale": DATA_SHEET * torque[:, joint]}
+        own = {"scale": TORQUE_CONSTANT_STD * torque[:, joint]}
         transmitted = None if load is None else load[:, joint]
         own |= dict(_of_friction(samples.motion, joint, friction[:, joint], transmitted))
-        table = np.column_stack([ZERO * zeros[:, :, joint].T, *own.values()])
+        table = np.column_stack([JOINT_ZERO_STD * zeros[:, :, joint].T, *own.values()])
         columns.append(samples.as_measured(joint, table))
         places.append(np.concatenate([np.arange(n), len(names) + np.arange(len(own))]))
         names += [f"{what} {name}" for what in own]
@@ -80,9 +80,9 @@ def _of_zeros(model: RobotModel, samples: Samples, values: Array, torque: Array)
     derivatives = []
     for joint in range(model.n_joints):
         position = motion.position.copy()
-        position[:, joint] += _STEP
+        position[:, joint] += _DERIVATIVE_STEP
         moved = replace(samples, motion=replace(motion, position=position))
-        derivatives.append((moved.predicted_torque(model, values) - torque) / _STEP)
+        derivatives.append((moved.predicted_torque(model, values) - torque) / _DERIVATIVE_STEP)
     return np.array(derivatives)
 
 
@@ -97,11 +97,14 @@ def _of_friction(
     sign = np.sign(motion.velocity[:, joint])
     rms = float(np.sqrt(np.mean(friction**2)))
     phase = np.pi * (motion.time - motion.time[0]) / max(np.ptp(motion.time), _TINY)
-    for k in range(1, _CHANGES + 1):
-        yield f"change {k} of friction", DRIFT / k * np.cos(k * phase) * friction
+    for k in range(1, _DRIFT_HALF_PERIODS + 1):
+        yield f"change {k} of friction", FRICTION_DRIFT_STD / k * np.cos(k * phase) * friction
     for slow in _STATIC_SPEEDS:
-        yield f"friction below {slow:g}", STATIC * rms * sign * np.exp(-((speed / slow) ** 2))
+        yield (
+            f"friction below {slow:g}",
+            STATIC_FRICTION_STD * rms * sign * np.exp(-((speed / slow) ** 2)),
+        )
     relative = speed / max(float(speed.max(initial=0.0)), _TINY)
-    yield "quadratic friction", CURVATURE * rms * sign * relative**2
+    yield "quadratic friction", QUADRATIC_FRICTION_STD * rms * sign * relative**2
     if load is not None:
-        yield "friction over load", LOAD_SHARE * np.abs(load) * sign
+        yield "friction over load", LOAD_FRICTION_STD * np.abs(load) * sign

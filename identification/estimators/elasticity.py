@@ -7,8 +7,8 @@ gears grows with the square of the frequency, as torques of inertia do at low on
 .. math:: t = W \pi + E c + e, \quad E_j = \partial \tau_l(q - C \tau_l) / \partial c_j
 
 Parameters take most of that up, so that no residual shows their error. Compliances are fitted
-beside them, about zero with the standard deviation of `RESONANCE`, and their mean square is added
-to the covariance of the parameters, which stay as of rigid gears.
+beside them, about zero with the standard deviation of `EXPECTED_RESONANCE`, and their mean square
+is added to the covariance of the parameters, which stay as of rigid gears.
 
 The smoothed motion lacks some of the arm's fast motion, and its torque grows less with the
 frequency than the measured one: as if the gears were elastic. So the torque that smoothing takes
@@ -34,14 +34,15 @@ from identification.model.robot import RobotModel
 from identification.signals.samples import Samples
 from identification.signals.smoothing import LowPassShape, low_passed
 
-RESONANCE: Final = 2.0 * np.pi * 15.0
+EXPECTED_RESONANCE: Final = 2.0 * np.pi * 15.0
 """Resonance of a joint's links on its gear [rad/s] that compliances are expected at: industrial
 arms have their lowest ones at 5 to 25 Hz."""
 _POSTURES: Final = 20  # in which the inertia of the links is averaged
-_RATE: Final = 125.0  # Hz, at which the torque of elastic gears is computed: it has no more than
+# Hz, at which the torque of elastic gears is computed: it has no more than
+_SAMPLE_RATE: Final = 125.0
 # `DELAY_BANDWIDTH`, as its second derivative would have the noise of accelerations
-_TERMS: Final = 3  # of a power series
-_LINEAR: Final = 1e-3  # share of the expected compliances by which it is linearised
+_SERIES_TERMS: Final = 3  # of a power series
+_LINEARISATION_SHARE: Final = 1e-3  # share of the expected compliances by which it is linearised
 
 
 @dataclass(frozen=True, eq=False)
@@ -129,7 +130,7 @@ def lost_torque(model: RobotModel, samples: Samples, values: Array) -> Array:
         for joint, bandwidth in enumerate(samples.position_bandwidth):
             if 2.0 * bandwidth * step < 1.0:
                 term = torque[segment, joint : joint + 1]
-                for _ in range(_TERMS):
+                for _ in range(_SERIES_TERMS):
                     term = term - low_passed(time, term, bandwidth)
                     lost[segment, joint] += term[:, 0]
     return lost
@@ -147,7 +148,10 @@ def expected_compliance(model: RobotModel, samples: Samples, values: Array) -> A
     pushed = replace(Motion.at_rest(postures), acceleration=pushes)
     torque = model.gear_torque(values, pushed).reshape(_POSTURES, n + 1, n)
     inertia = np.einsum("bjj->bj", torque[:, :n] - torque[:, n:]).mean(axis=0)
-    return np.where(inertia > 0.0, 1.0 / np.where(inertia > 0.0, inertia, 1.0), 0.0) / RESONANCE**2
+    return (
+        np.where(inertia > 0.0, 1.0 / np.where(inertia > 0.0, inertia, 1.0), 0.0)
+        / EXPECTED_RESONANCE**2
+    )
 
 
 def elastic_torque(model: RobotModel, samples: Samples, values: Array, compliance: Array) -> Array:
@@ -165,7 +169,7 @@ def elastic_torque(model: RobotModel, samples: Samples, values: Array, complianc
         if segment.stop - segment.start < 2:
             continue
         step = float(np.median(np.diff(time[segment])))
-        rows = np.arange(segment.start, segment.stop, max(1, int(1.0 / (_RATE * step))))
+        rows = np.arange(segment.start, segment.stop, max(1, int(1.0 / (_SAMPLE_RATE * step))))
         at = time[rows]
         motion = samples.motion.rows(rows)
         rigid = model.gear_torque(values, motion)
@@ -174,7 +178,7 @@ def elastic_torque(model: RobotModel, samples: Samples, values: Array, complianc
         if len(rows) <= 3 * (2 * order + 1) or rate <= 2.0 * DELAY_BANDWIDTH:
             continue
         slow = low_passed(at, rigid, DELAY_BANDWIDTH, LowPassShape(order))
-        sag = _LINEAR * compliance * slow
+        sag = _LINEARISATION_SHARE * compliance * slow
         sag_rate = np.gradient(sag, at, axis=0)
         sag_acceleration = np.gradient(sag_rate, at, axis=0)
         for joint in np.flatnonzero(compliance):
@@ -185,7 +189,7 @@ def elastic_torque(model: RobotModel, samples: Samples, values: Array, complianc
                 velocity=motion.velocity - only * sag_rate,
                 acceleration=motion.acceleration - only * sag_acceleration,
             )
-            change = (model.gear_torque(values, moved) - rigid) / _LINEAR
+            change = (model.gear_torque(values, moved) - rigid) / _LINEARISATION_SHARE
             for row in range(model.n_joints):
                 torque[segment, row, joint] = np.interp(time[segment], at, change[:, row])
     return torque

@@ -27,14 +27,15 @@ from identification.factor.factor import Factor
 from identification.factor.normal_equations import or_one
 from identification.model.robot import RobotModel
 
-FEWEST = 10
+MIN_ARMS = 10
 """Arms of which a spread is estimated."""
-_FLAT = 1e3  # deviations of a quantity without prior, in the largest deviation of the others
-_SMALLEST = 1e-14  # eigenvalue of a correlation matrix
-_RANK = 1e-12  # smallest singular value that counts, relative to the largest
-_ROUNDS = 6  # of widening
+# deviations of a quantity without prior, in the largest deviation of the others
+_UNKNOWN_STD_FACTOR = 1e3
+_MIN_EIGENVALUE = 1e-14  # eigenvalue of a correlation matrix
+_RANK_TOLERANCE = 1e-12  # smallest singular value that counts, relative to the largest
+_WIDENING_ROUNDS = 6  # of widening
 _SPREAD_TOLERANCE = 0.01
-_WIDEST = 5.0  # factor of the deviations
+_MAX_WIDENING = 5.0  # factor of the deviations
 
 
 class UndeterminedError(IdentificationError):
@@ -88,11 +89,11 @@ def draw_ensemble(
     draws = _Draws(model, prior, estimate, np.random.default_rng(seed), count)
     scale = 1.0
     ensemble = draws.consistent(factor, 1.0)
-    for _ in range(_ROUNDS):
+    for _ in range(_WIDENING_ROUNDS):
         ratio = float(np.sqrt(np.nanmean(ensemble.spread**2)))
-        if count < FEWEST or abs(ratio - 1.0) < _SPREAD_TOLERANCE:
+        if count < MIN_ARMS or abs(ratio - 1.0) < _SPREAD_TOLERANCE:
             break
-        scale = min(scale / ratio, _WIDEST)
+        scale = min(scale / ratio, _MAX_WIDENING)
         ensemble = draws.consistent(factor, scale)
     return ensemble
 
@@ -122,7 +123,7 @@ class _Draws:
         combinations = self.prior.combinations
         combined = combinations * self._deviations
         length = np.linalg.norm(combined, axis=1)
-        pull = np.linalg.pinv(combined / length[:, None], rcond=_RANK)
+        pull = np.linalg.pinv(combined / length[:, None], rcond=_RANK_TOLERANCE)
         start = self.prior.mean + self._start
         change = self.estimate.values + scale * self._change - start @ combinations.T
         arms = start + (change / length @ pull.T) * self._deviations
@@ -150,26 +151,26 @@ def _spread(factor: Factor, values: Array, covariance: Array) -> Array:
 
 def _balanced(normal: Array) -> Array:
     """Return standard normal draws (N, p) with the mean zero and each variance one."""
-    if len(normal) < FEWEST:
+    if len(normal) < MIN_ARMS:
         return normal
     return np.asarray((normal - normal.mean(axis=0)) / normal.std(axis=0, ddof=1))
 
 
 def _finite_deviations(std: Array) -> Array:
     finite = np.isfinite(std)
-    return np.where(finite, std, _FLAT * np.max(std, initial=1.0, where=finite))
+    return np.where(finite, std, _UNKNOWN_STD_FACTOR * np.max(std, initial=1.0, where=finite))
 
 
 def _roots(covariance: Array) -> tuple[Array, Array]:
     """Return R (p, p) with R R' the covariance, and its inverse."""
     scale = or_one(np.sqrt(np.diag(covariance)))
     values, vectors = np.linalg.eigh(covariance / np.outer(scale, scale))
-    size = np.sqrt(np.maximum(values, _SMALLEST))
+    size = np.sqrt(np.maximum(values, _MIN_EIGENVALUE))
     return scale[:, None] * vectors * size, (vectors / size).T / scale
 
 
 def _not_combined(combined: Array) -> Array:
     """Return an orthonormal basis (k, s) of the directions that no row (p, s) has."""
     _, singular, right = np.linalg.svd(combined)
-    rank = int(np.count_nonzero(singular > _RANK * singular.max()))
+    rank = int(np.count_nonzero(singular > _RANK_TOLERANCE * singular.max()))
     return np.asarray(right[rank:])

@@ -14,10 +14,10 @@ from identification.factor.blocks import part_edges
 from identification.factor.factor import Factor
 from identification.model.robot import RobotModel
 
-PIECES: Final = 12
+TREND_PIECES: Final = 12
 """Parts of all recordings together."""
-_FEWEST_PIECES: Final = 4  # parts for a trend
-_CHANCE: Final = 0.001  # probability of a false trend per joint
+_MIN_PIECES: Final = 4  # parts for a trend
+_FALSE_TREND_PROBABILITY: Final = 0.001  # probability of a false trend per joint
 
 
 class FrictionDrift(NamedTuple):
@@ -31,7 +31,7 @@ class FrictionDrift(NamedTuple):
     @property
     def significant(self) -> NDArray[np.bool_]:
         """Whether the trend is significant (n,)."""
-        limit = student_limit(0.5 * _CHANCE, self.freedom)
+        limit = student_limit(0.5 * _FALSE_TREND_PROBABILITY, self.freedom)
         return np.asarray(np.abs(self.change) > limit * self.change_std)
 
 
@@ -40,7 +40,7 @@ def drift_of_factors(
 ) -> FrictionDrift | None:
     """Return the drift by the factors by time of recordings in order; None with too few blocks."""
     factors = [factor.occupied() for factor in factors]
-    pieces = -(-PIECES // max(1, len(factors)))
+    pieces = -(-TREND_PIECES // max(1, len(factors)))
     if min((len(factor) for factor in factors), default=0) < pieces:
         return None
     augmented = np.append(-values, 1.0)
@@ -60,14 +60,14 @@ def drift_of_factors(
 
 def friction_trend(sums: Sequence[Array]) -> FrictionDrift | None:
     """Fit a trend over all parts in order; None with too few."""
-    if sum(run_sums.shape[1] for run_sums in sums) < _FEWEST_PIECES:
+    if sum(run_sums.shape[1] for run_sums in sums) < _MIN_PIECES:
         return None
     product, power = np.concatenate(sums, axis=1)
     pieces, n = product.shape
     usual = np.median(power, axis=0)
     moving = power > 0.1 * np.where(usual > 0.0, usual, np.inf)
     share = np.where(moving, product / np.where(moving, power, 1.0), np.nan)
-    parts = sums[0].shape[1] if len(sums) >= _FEWEST_PIECES else 1
+    parts = sums[0].shape[1] if len(sums) >= _MIN_PIECES else 1
     freedom = max(pieces - parts - 1, 1)
     weight = np.where(moving, power, 0.0)
 
@@ -82,9 +82,7 @@ def friction_trend(sums: Sequence[Array]) -> FrictionDrift | None:
     at = about_means(np.repeat(np.linspace(-0.5, 0.5, pieces)[:, None], n, axis=1))
     y = about_means(np.where(moving, share, 0.0))
     count = np.count_nonzero(moving, axis=0)
-    spread = np.where(
-        count < _FEWEST_PIECES + parts - 1, np.nan, np.einsum("pn,pn->n", weight, at**2)
-    )
+    spread = np.where(count < _MIN_PIECES + parts - 1, np.nan, np.einsum("pn,pn->n", weight, at**2))
     change = np.einsum("pn,pn,pn->n", weight, at, y) / spread
     residual = np.where(moving, y - change * at, 0.0)
     scale = count / np.maximum(freedom - (pieces - count), 1)

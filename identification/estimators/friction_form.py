@@ -43,23 +43,23 @@ from identification.signals.samples import Samples
 
 # Speeds over which measured Stribeck friction decays, in steps in which terms of neighbours are
 # alike (correlation above 0.9).
-_SPEEDS: Final = (0.02, 0.05, 0.1, 0.2, 0.5)  # rad/s or m/s
+_STRIBECK_SPEEDS: Final = (0.02, 0.05, 0.1, 0.2, 0.5)  # rad/s or m/s
 FORMS: Final[tuple[FrictionTerm, ...]] = (
-    *(replace(STRIBECK, speed=speed) for speed in _SPEEDS),
+    *(replace(STRIBECK, speed=speed) for speed in _STRIBECK_SPEEDS),
     QUADRATIC,
     ASYMMETRIC,
 )
 """Terms that a friction law may lack."""
-_ODDS: Final = 0.1  # of a term that the law lacks, before the data
+_PRIOR_ODDS: Final = 0.1  # of a term that the law lacks, before the data
 # Its standard deviation, over the friction of the joint. Dry friction at rest exceeds that in
 # motion by 10 to 100 % (Armstrong-Helouvry et al. 1994).
-_SHARE: Final = 0.3
+_STATIC_FRICTION_SHARE: Final = 0.3
 # Mean square of a Stribeck column, one at rest, from which on it is no friction at low speed: of a
 # joint that is slower it cannot be told from viscous friction.
-_MOSTLY_SLOW: Final = 0.5
-_INDEPENDENT: Final = 1e-3  # share of a column that is none of the others
-_HIGHEST: Final = 0.9  # leverage of a block whose residual still counts
-UNCERTAIN: Final = 0.99
+_MAX_SLOW_MEAN_SQUARE: Final = 0.5
+_MIN_INDEPENDENT_SHARE: Final = 1e-3  # share of a column that is none of the others
+_MAX_LEVERAGE: Final = 0.9  # leverage of a block whose residual still counts
+UNCERTAIN_PROBABILITY: Final = 0.99
 """Probability of a further term from which on a law is uncertain."""
 
 
@@ -123,7 +123,7 @@ def form_uncertainty(
     log_factor = np.where(trials.possible, log_factor, -np.inf)
     largest = np.maximum(log_factor.max(axis=1, keepdims=True), 0.0)
     count = np.maximum(trials.possible.sum(axis=1, keepdims=True), 1)
-    odds = _ODDS * np.exp(log_factor - largest) / count
+    odds = _PRIOR_ODDS * np.exp(log_factor - largest) / count
     probability = odds / (odds.sum(axis=1, keepdims=True) + np.exp(-largest))
     square = probability * ((known * trials.value) ** 2 + known * trials.std**2)
     shifts = trials.moved * np.sqrt(square)
@@ -168,7 +168,7 @@ def _trials(
     moved = np.where(determined[:, None], times * solve(equations).inverse @ products, 0.0)
     squares = gram.diagonal()[p:-1]
     information = squares - np.einsum("pk,pk->k", products, moved)
-    possible = (squares > 0.0) & (information > _INDEPENDENT * squares)
+    possible = (squares > 0.0) & (information > _MIN_INDEPENDENT_SHARE * squares)
     # What each further term leaves of itself beside the parameters.
     beside = np.concatenate([-moved, np.eye(n * q)])
     scores = forms.scores(weights, np.append(estimate.values, np.zeros(n * q)))
@@ -186,7 +186,7 @@ def _trials(
     left = merged(left, length)
     shares = merged(shares, length)
     leverage = shares / np.where(possible, np.maximum(shares.sum(axis=0), 1e-300), 1.0)
-    left /= np.maximum(1.0 - leverage, 1.0 - _HIGHEST)
+    left /= np.maximum(1.0 - leverage, 1.0 - _MAX_LEVERAGE)
     correlation = np.array([lag_correlation(left[:, [k]]) for k in range(n * q)])
     variance = (left**2).sum(axis=0) * (1.0 + 2.0 * np.maximum(correlation, 0.0))
     std = np.sqrt(variance) / np.where(possible, information, np.inf)
@@ -201,9 +201,9 @@ def _trials(
         value=value.reshape(n, q),
         std=std.reshape(n, q),
         freedom=freedom.reshape(n, q),
-        possible=possible.reshape(n, q) & ~(slow & (rms**2 > _MOSTLY_SLOW)),
+        possible=possible.reshape(n, q) & ~(slow & (rms**2 > _MAX_SLOW_MEAN_SQUARE)),
         moved=moved.reshape(p, n, q),
-        expected=_SHARE * _friction_rms(model, estimate, forms)[:, None] / scale,
+        expected=_STATIC_FRICTION_SHARE * _friction_rms(model, estimate, forms)[:, None] / scale,
     )
 
 

@@ -34,22 +34,22 @@ from identification.factor.estimate import (
     residual_variance,
 )
 from identification.factor.factor import Factor
-from identification.factor.normal_equations import PARTICIPATION, WORST_CONDITION
+from identification.factor.normal_equations import MAX_CONDITION, MAX_UNDETERMINED_SHARE
 from identification.model.motion import Motion
 from identification.model.robot import RobotModel
 from identification.signals.samples import RIGID_BANDWIDTH, Samples
-from identification.signals.smoothing import ORDER, SmoothingSpline, fit_smoothing_spline
+from identification.signals.smoothing import SPLINE_ORDER, SmoothingSpline, fit_smoothing_spline
 
-LONGEST_LAG: Final = 0.5  # s; position loops of industrial arms lag 5 to 100 ms
+MAX_COMMAND_LAG: Final = 0.5  # s; position loops of industrial arms lag 5 to 100 ms
 _LAG_STEP: Final = 0.01  # s
-_ROWS: Final = 4000  # enough for a lag
+_LAG_ROWS: Final = 4000  # enough for a lag
 # Commands have no noise.
 _COMMAND_TOLERANCE: Final = 1e-20  # rad² or m²
 # Tolerance as a share of a joint's range: clocks of repetitions differ by up to a cycle.
-_SAME_PLAN: Final = 0.01
-_STILL: Final = 1e-4  # rad or m
-_OVERLAP: Final = 0.9
-_COMPARED: Final = 400  # instants
+_PLAN_TOLERANCE: Final = 0.01
+_MIN_COMMAND_RANGE: Final = 1e-4  # rad or m
+_MIN_OVERLAP_SHARE: Final = 0.9
+_COMPARED_INSTANTS: Final = 400  # instants
 
 
 class Instruments(NamedTuple):
@@ -75,7 +75,7 @@ def planned_motion(samples: Samples, commanded: Array, *, lag: Array | None = No
     splines = []
     for segment in samples.segments:
         rows = np.flatnonzero(with_command[segment]) + segment.start
-        if len(rows) >= 2 * ORDER:
+        if len(rows) >= 2 * SPLINE_ORDER:
             segment_spline = fit_smoothing_spline(
                 time[rows], commanded[rows], tolerance, widest=RIGID_BANDWIDTH
             )
@@ -115,33 +115,38 @@ def same_plan(first: tuple[Array, Array], second: tuple[Array, Array]) -> bool:
     start = max(time[0], other_time[0])
     stop = min(time[-1], other_time[-1])
     longer = max(time[-1] - time[0], other_time[-1] - other_time[0])
-    if stop - start < _OVERLAP * longer:
+    if stop - start < _MIN_OVERLAP_SHARE * longer:
         return False
-    at = np.linspace(start, stop, _COMPARED)
+    at = np.linspace(start, stop, _COMPARED_INSTANTS)
     # A quantile, since gaps are interpolated.
     apart = [
-        np.quantile(np.abs(np.interp(at, time, a) - np.interp(at, other_time, b)), _OVERLAP)
+        np.quantile(
+            np.abs(np.interp(at, time, a) - np.interp(at, other_time, b)), _MIN_OVERLAP_SHARE
+        )
         for a, b in zip(commanded.T, other.T, strict=True)
     ]
     return bool(
-        np.all(np.array(apart) <= _SAME_PLAN * np.maximum(np.ptp(commanded, axis=0), _STILL))
+        np.all(
+            np.array(apart)
+            <= _PLAN_TOLERANCE * np.maximum(np.ptp(commanded, axis=0), _MIN_COMMAND_RANGE)
+        )
     )
 
 
 def tracking_lag(time: Array, measured: Array, command: SmoothingSpline) -> Array:
     """Return the lag of axes (m, n) behind their command (n,) [s], NaN if not commanded."""
-    thin = slice(None, None, max(1, len(time) // _ROWS))
+    thin = slice(None, None, max(1, len(time) // _LAG_ROWS))
     time = time[thin]
     measured = measured[thin]
-    inside = time >= time[0] + LONGEST_LAG
-    if np.count_nonzero(inside) >= 2 * ORDER:
+    inside = time >= time[0] + MAX_COMMAND_LAG
+    if np.count_nonzero(inside) >= 2 * SPLINE_ORDER:
         time = time[inside]
         measured = measured[inside]
 
     def misfit(lag: float) -> Array:
         return np.asarray(np.var(measured - command(time - lag), axis=0))
 
-    grid = np.arange(-_LAG_STEP, LONGEST_LAG + _LAG_STEP, _LAG_STEP)
+    grid = np.arange(-_LAG_STEP, MAX_COMMAND_LAG + _LAG_STEP, _LAG_STEP)
     table = np.array([misfit(float(lag)) for lag in grid])
     lags = np.full(measured.shape[1], np.nan)
     for joint in np.flatnonzero(np.ptp(command(time), axis=0) > 1e-6):
@@ -157,7 +162,7 @@ def tracking_lag(time: Array, measured: Array, command: SmoothingSpline) -> Arra
 
 # Below, instruments leave more than a tenth of the bias of least squares (Staiger and Stock 1997);
 # each block counts as one sample.
-WEAK: Final = 10.0
+MIN_FIRST_STAGE_F: Final = 10.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -186,7 +191,7 @@ def solve_cross(total: Array) -> CrossSolution:
     left = scale[:p]
     right = scale[p:]
     u, singular, vt = np.linalg.svd(total[:p, p : 2 * p] / np.outer(left, right))
-    large = singular > singular[0] / WORST_CONDITION**2
+    large = singular > singular[0] / MAX_CONDITION**2
     lost = np.abs(vt[~large]).max(axis=0, initial=0.0)
     root = np.sqrt(singular[large])
     own_right = vt[large].T / root / right[:, None]
@@ -196,7 +201,7 @@ def solve_cross(total: Array) -> CrossSolution:
         right=own_right,
         left=own_left,
         condition=float(np.sqrt(singular[0] / singular[-1])) if singular[-1] > 0.0 else np.inf,
-        determined=np.asarray(lost < PARTICIPATION),
+        determined=np.asarray(lost < MAX_UNDETERMINED_SHARE),
     )
 
 
@@ -246,7 +251,9 @@ def estimate_instrumental(
     )
     return InstrumentalEstimate(
         estimate=estimate,
-        weak=tuple(name for name, f in zip(names, first_stage, strict=True) if f < WEAK),
+        weak=tuple(
+            name for name, f in zip(names, first_stage, strict=True) if f < MIN_FIRST_STAGE_F
+        ),
     )
 
 
@@ -262,7 +269,7 @@ def partial_r2(total: Array) -> Array:
     zz = scaled[:p, :p]
     zw = scaled[:p, p:]
     ww = scaled[p:, p:]
-    inverse = partial(np.linalg.pinv, rcond=1.0 / WORST_CONDITION**2, hermitian=True)
+    inverse = partial(np.linalg.pinv, rcond=1.0 / MAX_CONDITION**2, hermitian=True)
     own_inverse = np.diag(inverse(ww))
     by_instruments = np.diag(inverse(zw.T @ inverse(zz) @ zw))
     positive = (own_inverse > 0.0) & (by_instruments > 0.0)

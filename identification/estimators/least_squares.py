@@ -77,7 +77,7 @@ def clustered_fit(
 
 
 # Probability that the scatter of equal repetitions is significant for none of the parameters.
-_CERTAIN: Final = 0.99
+_SCATTER_CONFIDENCE: Final = 0.99
 
 Fit = Callable[[Sequence[Samples], Factor], Estimate]
 """Estimator: recordings and their factor by time to an estimate."""
@@ -133,7 +133,7 @@ def no_narrower(covariance: Array, values: Array) -> Array:
     determined = np.isfinite(std) & (std > 0.0)
     scatter = values.std(axis=0, ddof=1) / np.sqrt(len(values))
     ratio = np.where(determined, scatter / np.where(determined, std, 1.0), 1.0)
-    certain = _CERTAIN ** (1.0 / max(1, int(determined.sum())))
+    certain = _SCATTER_CONFIDENCE ** (1.0 / max(1, int(determined.sum())))
     chance = np.sqrt(chi_squared_limit(1.0 - certain, freedom) / freedom)
     wider = np.where(ratio > chance, ratio, 1.0)
     return np.where(

@@ -19,9 +19,9 @@ from identification.arrays import Array
 from identification.model.robot import RobotModel
 from identification.signals.samples import Samples
 
-CONVERGED: Final = 1e-3
+MAX_TORQUE_CHANGE: Final = 1e-3
 """Change of the predicted torque by a pass below which it is the last, relative to its rms."""
-MOST_PASSES: Final = 4
+MAX_PASSES: Final = 4
 """With a share of 15 % the third fit changes the torque by some 0.3 % of it, the fourth less."""
 
 
@@ -49,8 +49,8 @@ class LoadFit(Generic[Result]):
 
     @property
     def converged(self) -> bool:
-        """Whether the last pass changed the torque by less than `CONVERGED`."""
-        return self.change < CONVERGED
+        """Whether the last pass changed the torque by less than `MAX_TORQUE_CHANGE`."""
+        return self.change < MAX_TORQUE_CHANGE
 
 
 def fit_with_load(
@@ -58,7 +58,7 @@ def fit_with_load(
     recordings: Sequence[Samples],
     fit: Callable[[tuple[Samples, ...]], Result],
     *,
-    most: int = MOST_PASSES,
+    most: int = MAX_PASSES,
 ) -> LoadFit[Result]:
     """Return the fixed point of fits of samples with the load of the fit before.
 
@@ -92,7 +92,7 @@ def fit_with_load(
         predicted = [_predicted(model, result.values, recording) for recording in samples]
         if previous is not None:
             change = _change(previous, predicted)
-        if passes >= most or change < CONVERGED:
+        if passes >= most or change < MAX_TORQUE_CHANGE:
             return LoadFit(result, samples, passes, change)
 
 

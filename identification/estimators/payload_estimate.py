@@ -7,9 +7,9 @@ offset and friction scale of every joint:
 .. math:: \tau = W \pi + [\text{loaded}]\, L \beta + \delta_k + \varphi_k \odot f, \qquad
           f = W_f \hat\pi_f
 
-The friction f is that of the previous iteration, with weak priors (:data:`DRIFT`) on the drifts.
-The covariance is cluster-robust by time of the motion, and contains the uncertainty of the torque
-scale (:mod:`identification.estimators.torque_scale`) if that is given.
+The friction f is that of the previous iteration, with weak priors (:data:`FRICTION_DRIFT_STD`) on
+the drifts. The covariance is cluster-robust by time of the motion, and contains the uncertainty of
+the torque scale (:mod:`identification.estimators.torque_scale`) if that is given.
 """
 
 from __future__ import annotations
@@ -24,8 +24,8 @@ from numpy.typing import NDArray
 from identification.arrays import Array
 from identification.errors import IdentificationError
 from identification.estimators.payload_problem import (
-    N_BODY,
-    ROUNDING,
+    AXIS_ROUNDING,
+    N_BODY_PARAMETERS,
     BodyFit,
     KnownArm,
     Run,
@@ -33,7 +33,7 @@ from identification.estimators.payload_problem import (
     fit_body,
 )
 from identification.estimators.torque_scale import scale_covariance
-from identification.factor.normal_equations import PARTICIPATION
+from identification.factor.normal_equations import MAX_UNDETERMINED_SHARE
 from identification.model.pseudo_inertia import (
     Body,
     body,
@@ -43,17 +43,17 @@ from identification.model.pseudo_inertia import (
 )
 from identification.model.robot import RobotModel
 
-_INERTIA: Final = np.arange(6)
-_DIAGONAL: Final = [4, 7, 9]  # of a tensor, among `NAMES`
-_STATED: Final = 1.959963984540054  # standard deviations in half a 95 % interval
-_DENSITY: Final = 1000.0  # kg/m³; a ball of it is the least inertia worth determining
-_LIGHTEST: Final = 10.0  # kg/m³, of foam: a ball of it contains the centre of what is carried
+_INERTIA_INDICES: Final = np.arange(6)
+_DIAGONAL_INDICES: Final = [4, 7, 9]  # of a tensor, among `NAMES`
+_NORMAL_95: Final = 1.959963984540054  # standard deviations in half a 95 % interval
+_BALL_DENSITY: Final = 1000.0  # kg/m³; a ball of it is the least inertia worth determining
+_MIN_DENSITY: Final = 10.0  # kg/m³, of foam: a ball of it contains the centre of what is carried
 
 CONTRADICTION_SIGMAS: Final = 5.0
-SAME_MASS: Final = 0.1
+MASS_TOLERANCE: Final = 0.1
 """Share of the mass by which two weighings may differ: pairs of recordings of a real arm differ by
-2 %, and friction by `DRIFT`."""
-SAME_CENTRE: Final = 0.2
+2 %, and friction by `FRICTION_DRIFT_STD`."""
+CENTRE_TOLERANCE: Final = 0.2
 """The same of a first moment, as a share of mass times distance, or times the radius of a ball."""
 
 NAMES: Final = ("mass", "cx", "cy", "cz", "Ixx", "Ixy", "Ixz", "Iyy", "Iyz", "Izz")
@@ -93,7 +93,7 @@ class PayloadEstimate:
     def is_beyond_reach(self) -> bool:
         """Whether its centre is farther from the frame than any load of this mass is large."""
         _, high = self.intervals[0]
-        return self.body is not None and self.moment[1] > high * ball_radius(high, _LIGHTEST)
+        return self.body is not None and self.moment[1] > high * ball_radius(high, _MIN_DENSITY)
 
 
 def identify_payload(
@@ -117,7 +117,7 @@ def identify_payload(
     """
     estimate = _body_estimate(model, runs, scale_std, arm)
     mass, low, high = _determined_mass(estimate)
-    intervals = np.tile([-np.inf, np.inf], (N_BODY, 1))
+    intervals = np.tile([-np.inf, np.inf], (N_BODY_PARAMETERS, 1))
     intervals[0] = max(0.0, low), high
     if low <= 0.0:
         undetermined = NAMES[1:]
@@ -127,15 +127,15 @@ def identify_payload(
     intervals[1:4] = estimate.centre_intervals
     open_ended = np.isinf(intervals[:, 1])
     centre = np.where(open_ended[1:4], 0.0, estimate.values[6:9] / mass)
-    to_centre = about_frame(np.eye(3), -centre)[_INERTIA]
+    to_centre = about_frame(np.eye(3), -centre)[_INERTIA_INDICES]
     six = to_centre @ estimate.values
     halves = estimate.halves(to_centre)
     lower, upper = _off_centre(mass, (intervals[1:4, 1] - intervals[1:4, 0]) / 2.0)
     intervals[4:] = np.column_stack([six - halves - lower, six + halves + upper])
-    negative = _impossible(intervals, ROUNDING * mass * (1.0 + float(centre @ centre)))
+    negative = _impossible(intervals, AXIS_ROUNDING * mass * (1.0 + float(centre @ centre)))
     if negative.any():  # nor is a tensor with such an entry that of a body
         intervals[4:] = [-np.inf, np.inf]
-    intervals[_DIAGONAL] = np.maximum(intervals[_DIAGONAL], 0.0)
+    intervals[_DIAGONAL_INDICES] = np.maximum(intervals[_DIAGONAL_INDICES], 0.0)
     radius = ball_radius(mass)
     width = (intervals[4:, 1] - intervals[4:, 0]) / 2.0
     zero = (intervals[4:, 0] <= 0.0) & (intervals[4:, 1] >= 0.0)
@@ -165,7 +165,7 @@ def _determined_mass(estimate: _BodyEstimate) -> tuple[float, float, float]:
             " more axes, with the wrist in many poses"
         )
     if high < 0.0:
-        if estimate.moment[1] > -low * ball_radius(-low, _LIGHTEST):
+        if estimate.moment[1] > -low * ball_radius(-low, _MIN_DENSITY):
             distance = estimate.moment[0] / -mass
             raise PayloadError(
                 f"the loaded recordings are {-mass:.3g} kg lighter than the bare ones, with a"
@@ -181,8 +181,8 @@ def _determined_mass(estimate: _BodyEstimate) -> tuple[float, float, float]:
 
 def _impossible(intervals: Array, rounding: float) -> NDArray[np.bool_]:
     """Return which figures (10,) are moments of inertia that are negative beyond rounding."""
-    negative = np.zeros(N_BODY, dtype=np.bool_)
-    negative[_DIAGONAL] = intervals[_DIAGONAL, 1] < -rounding
+    negative = np.zeros(N_BODY_PARAMETERS, dtype=np.bool_)
+    negative[_DIAGONAL_INDICES] = intervals[_DIAGONAL_INDICES, 1] < -rounding
     return negative
 
 
@@ -206,8 +206,8 @@ def contradiction(
     Each loaded recording is weighed by itself against all bare ones, each bare one against the
     first. Bodies differ if a difference of mass or first moments is above
     `CONTRADICTION_SIGMAS` standard deviations and above the shares of what was weighed that
-    friction and model errors explain (`SAME_MASS`, `SAME_CENTRE`). The torque scale is the same in
-    all recordings.
+    friction and model errors explain (`MASS_TOLERANCE`, `CENTRE_TOLERANCE`). The torque scale is
+    the same in all recordings.
 
     Args:
         model: of the arm.
@@ -218,7 +218,7 @@ def contradiction(
     bare, loaded = ([run for run in runs if run.loaded == kind] for kind in (False, True))
     mass = float(estimate.parameters[9])
     size = max(estimate.moment[0], mass * ball_radius(mass))
-    limits = np.array([SAME_CENTRE * size] * 3 + [SAME_MASS * mass])
+    limits = np.array([CENTRE_TOLERANCE * size] * 3 + [MASS_TOLERANCE * mass])
     if len(loaded) > 1:
         single = [_body_estimate(model, [*bare, run], arm=arm) for run in loaded]
         for other, run in zip(single[1:], loaded[1:], strict=True):
@@ -234,7 +234,7 @@ def contradiction(
 
 def _differs(first: _BodyEstimate | None, second: _BodyEstimate, limits: Array) -> bool:
     """Return whether first moments and mass (4,) differ, beyond chance and limits; None is zero."""
-    rows = np.eye(N_BODY)[6:]
+    rows = np.eye(N_BODY_PARAMETERS)[6:]
     change = rows @ second.values
     variance = second.variances(rows)
     if first is not None:
@@ -246,7 +246,7 @@ def _differs(first: _BodyEstimate | None, second: _BodyEstimate, limits: Array) 
 
 
 def _weighing(name: str, estimate: _BodyEstimate) -> Weighing:
-    determined = estimate.is_determined(np.eye(N_BODY)[6:])
+    determined = estimate.is_determined(np.eye(N_BODY_PARAMETERS)[6:])
     centre = (
         estimate.values[6:9] / estimate.values[9]
         if estimate.values[9] != 0.0
@@ -271,7 +271,7 @@ def reach(model: RobotModel, frame: str | None, travel: Array) -> float:
     return float(lengths.sum() + slides.sum() + np.linalg.norm(translation))
 
 
-def ball_radius(mass: float, density: float = _DENSITY) -> float:
+def ball_radius(mass: float, density: float = _BALL_DENSITY) -> float:
     """Return the radius of a ball [m], by default with the density of water [kg/m³]."""
     return float((3.0 * mass / (4.0 * np.pi * density)) ** (1.0 / 3.0))
 
@@ -319,8 +319,8 @@ class _BodyEstimate(NamedTuple):
     def scale_share_of_mass(self) -> float:
         """Share of the squared interval of the mass that the torque scale makes."""
         mass = np.linalg.pinv(self.determined)[9]
-        by_scale = _STATED**2 * float(mass @ self.by_scale @ mass)
-        return by_scale / float(self.squares(np.eye(N_BODY)[[9]])[0, 0])
+        by_scale = _NORMAL_95**2 * float(mass @ self.by_scale @ mass)
+        return by_scale / float(self.squares(np.eye(N_BODY_PARAMETERS)[[9]])[0, 0])
 
     def squares(self, rows: Array) -> Array:
         """Return the matrix (k, k) whose diagonal are squared halves of 95 % intervals.
@@ -330,7 +330,7 @@ class _BodyEstimate(NamedTuple):
         """
         combinations = rows @ np.linalg.pinv(self.determined)
         scaled = combinations * self.fit.interval_factors(combinations)[:, None]
-        by_scale = _STATED**2 * combinations @ self.by_scale @ combinations.T
+        by_scale = _NORMAL_95**2 * combinations @ self.by_scale @ combinations.T
         return np.asarray(scaled @ self.fit.covariance @ scaled.T + by_scale)
 
     def halves(self, rows: Array) -> Array:
@@ -346,16 +346,16 @@ class _BodyEstimate(NamedTuple):
     def is_determined(self, rows: Array) -> NDArray[np.bool_]:
         """Return whether functions (k, 10) of the parameters are determined."""
         scale = np.linalg.norm(self.determined, axis=0)  # for equal units
-        scale = np.where(scale > ROUNDING * scale.max(initial=0.0), scale, 1.0)
+        scale = np.where(scale > AXIS_ROUNDING * scale.max(initial=0.0), scale, 1.0)
         lost = (rows - rows @ np.linalg.pinv(self.determined) @ self.determined) / scale
         length = np.linalg.norm(rows / scale, axis=1)
-        return np.asarray(np.linalg.norm(lost, axis=1) < PARTICIPATION * length)
+        return np.asarray(np.linalg.norm(lost, axis=1) < MAX_UNDETERMINED_SHARE * length)
 
     @property
     def mass(self) -> tuple[float, float, float]:
         """Mass and its interval [kg], infinite if undetermined."""
         value = float(self.values[9])
-        half = float(self.halves(np.eye(N_BODY)[[9]])[0])
+        half = float(self.halves(np.eye(N_BODY_PARAMETERS)[[9]])[0])
         return value, value - half, value + half
 
     @property
@@ -363,7 +363,7 @@ class _BodyEstimate(NamedTuple):
         """Length of the first moment and its interval [kg m]."""
         first = self.values[6:9]
         length = float(np.linalg.norm(first))
-        row = np.zeros((1, N_BODY))
+        row = np.zeros((1, N_BODY_PARAMETERS))
         row[0, 6:9] = first / length if length > 0.0 else 1.0 / np.sqrt(3.0)
         half = float(self.halves(row)[0])
         return length, max(0.0, length - half), length + half
@@ -371,8 +371,8 @@ class _BodyEstimate(NamedTuple):
     @property
     def centre_intervals(self) -> Array:
         """95 % intervals of the centre (3, 2), a ratio (Fieller 1954)."""
-        determined = self.is_determined(np.eye(N_BODY))
-        covariance = self.squares(np.eye(N_BODY))
+        determined = self.is_determined(np.eye(N_BODY_PARAMETERS))
+        covariance = self.squares(np.eye(N_BODY_PARAMETERS))
         first = self.values[6:9]
         mass = self.values[9]
         a = mass**2 - covariance[9, 9]
@@ -389,10 +389,10 @@ def _body_estimate(
     arm: KnownArm | None = None,
 ) -> _BodyEstimate:
     """Estimate the body of the loaded runs, of least norm where undetermined."""
-    fit = fit_body(model, runs, np.eye(N_BODY), arm)
-    determined = np.eye(N_BODY)
+    fit = fit_body(model, runs, np.eye(N_BODY_PARAMETERS), arm)
+    determined = np.eye(N_BODY_PARAMETERS)
     directions = fit.determined
-    if len(directions) < N_BODY:
+    if len(directions) < N_BODY_PARAMETERS:
         determined = directions
         fit = fit_body(model, runs, np.asarray(np.linalg.pinv(determined)), arm)
     std = np.zeros(model.n_joints) if scale_std is None else scale_std
@@ -411,7 +411,7 @@ def parameter_change(model: RobotModel, frame: str | None) -> Array:
         ModelError: the description has no such frame, or it is fixed to the base.
     """
     joint, rotation, translation = model.chain.frame(frame)
-    change = np.zeros((model.n_parameters, N_BODY))
+    change = np.zeros((model.n_parameters, N_BODY_PARAMETERS))
     links = model.base.grouping[:, model.layout.links[joint]]
     change[: model.base.rank] = links @ about_frame(rotation, translation)
     return change

@@ -18,25 +18,25 @@ from identification.estimators.covariance import Clustered, cluster_covariance
 from identification.estimators.torque_scale import scale_sensitivity
 from identification.factor.blocks import FINE_BLOCK, count_by_block, fine_blocks
 from identification.factor.estimate import Estimate, inverse_variance
-from identification.factor.factor import SMALLEST_NOISE, Factor, no_rows_message
-from identification.factor.normal_equations import PARTICIPATION, NormalEquations, solve
+from identification.factor.factor import MIN_NOISE, Factor, no_rows_message
+from identification.factor.normal_equations import MAX_UNDETERMINED_SHARE, NormalEquations, solve
 from identification.model.link_wrenches import LINK_SYMBOLS
 from identification.model.pseudo_inertia import inertial_from_pseudo, pseudo_inertia_map
 from identification.model.regressor import RegressorPlan
 from identification.model.robot import RobotModel
 from identification.signals.samples import Samples
 
-DRIFT: Final = 0.1
+FRICTION_DRIFT_STD: Final = 0.1
 """Prior standard deviation of the relative change of friction between recordings."""
-OFFSET: Final = 1.0
+OFFSET_STD_SHARE: Final = 1.0
 """Prior standard deviation of offset changes, as a share of the friction."""
-N_BODY: Final = len(LINK_SYMBOLS)
-_ROUNDS: Final = 4  # iterations of weights and friction
-_MOST_BLOCKS: Final = 500
+N_BODY_PARAMETERS: Final = len(LINK_SYMBOLS)
+_WEIGHTING_ROUNDS: Final = 4  # iterations of weights and friction
+_MAX_BLOCKS: Final = 500
 # Longer blocks: with noise correlated over 50 ms nominal 95 % intervals cover 93 and 95 %,
 # otherwise 90 and 93 %.
-STRETCH: Final = 2
-ROUNDING: Final = 1e-9
+BLOCK_STRETCH: Final = 2
+AXIS_ROUNDING: Final = 1e-9
 
 
 @dataclass(frozen=True, eq=False)
@@ -79,7 +79,7 @@ class Run:
             tables.append(np.concatenate(rows, axis=1).T)
             tables[-1][:, ~samples.usable[:, j]] = 0.0
             body_columns = p + np.arange(load.shape[1])
-            places.append(np.concatenate([columns[j], body_columns, [p + N_BODY + j]]))
+            places.append(np.concatenate([columns[j], body_columns, [p + N_BODY_PARAMETERS + j]]))
         names = (
             *model.parameter_names,
             *LINK_SYMBOLS,
@@ -148,8 +148,8 @@ class BodyFit(NamedTuple):
         """Determined combinations (d, r) of the unknowns, in comparable units."""
         scale = np.where(self.scale > 0.0, self.scale, 1.0)
         lost, axes = np.linalg.eigh(np.eye(len(scale)) - self.root @ self.root.T)
-        axes = np.where(np.abs(axes) < ROUNDING, 0.0, axes)
-        return np.asarray(axes[:, lost < PARTICIPATION**2].T * scale)
+        axes = np.where(np.abs(axes) < AXIS_ROUNDING, 0.0, axes)
+        return np.asarray(axes[:, lost < MAX_UNDETERMINED_SHARE**2].T * scale)
 
 
 class _Problem:
@@ -208,7 +208,7 @@ class _Problem:
                 mapping[of_arm, self._drifts[k, 1, joint]] = friction[columns[of_arm]]
                 mapping[c - 1, self._drifts[k, 0, joint]] = 1.0
                 if run.loaded and c - 1 > len(of_arm):
-                    mapping[len(of_arm) : len(of_arm) + N_BODY, self.part] = self._shape
+                    mapping[len(of_arm) : len(of_arm) + N_BODY_PARAMETERS, self.part] = self._shape
                 used = np.flatnonzero(mapping.any(axis=0))
                 small = mapping[:, used]
                 grams.append((joint, small.T @ gram @ small, used))
@@ -222,10 +222,10 @@ class _Problem:
             at = np.flatnonzero(np.isin(places, self._drifts[:, 1, joint]))
             squares[joint] += gram[:, at, at].sum()
         noise = np.divide(1.0, weights, out=np.zeros(n), where=weights > 0.0)
-        level = OFFSET**2 * np.maximum(squares / np.maximum(self.rows, 1), noise)
+        level = OFFSET_STD_SHARE**2 * np.maximum(squares / np.maximum(self.rows, 1), noise)
         prior = np.zeros(self.width)
         prior[self._drifts[:, 0]] = np.divide(1.0, level, out=np.zeros(n), where=level > 0.0)
-        prior[self._drifts[:, 1]] = 1.0 / DRIFT**2
+        prior[self._drifts[:, 1]] = 1.0 / FRICTION_DRIFT_STD**2
         return np.asarray(self._information + np.diag(prior))
 
     def blocks(self, grams: Sequence[_Rows], weights: Array) -> Array:
@@ -261,13 +261,13 @@ def fit_body(
     p = model.n_parameters
     weights = np.ones(model.n_joints)
     friction = np.zeros(p)
-    for _ in range(_ROUNDS):
+    for _ in range(_WEIGHTING_ROUNDS):
         grams = problem.grams(friction)
         total = problem.blocks(grams, weights)[0]
         values = solve(problem.equations(total, problem.prior(grams, weights))).values
         weights = _weights(grams, values, problem.rows)
         friction = np.where(model.friction_columns, values[:p], 0.0)
-    length = max(1, -(-max(len(run.factor) for run in runs) // _MOST_BLOCKS))
+    length = max(1, -(-max(len(run.factor) for run in runs) // _MAX_BLOCKS))
     grams = problem.grams(friction, length)
     # The prior is not scaled; the data are, by the design effect of coloured noise.
     effect = 1.0
@@ -279,7 +279,7 @@ def fit_body(
         solution = solve(equations)
         scores = blocks[:, :-1] @ np.append(-solution.values, 1.0)
         clustered = cluster_covariance(
-            blocks[:, :-1, :-1], scores, solution, prior, length * FINE_BLOCK, STRETCH
+            blocks[:, :-1, :-1], scores, solution, prior, length * FINE_BLOCK, BLOCK_STRETCH
         )
         effect *= max(1.0, clustered.design_effect)
     scale = np.sqrt(np.diag(equations.A))
@@ -311,7 +311,7 @@ def _weights(grams: Sequence[_Rows], values: Array, rows: NDArray[np.intp]) -> A
         run_values = augmented[places]
         squares[joint] += run_values @ total @ run_values
         torque[joint] += total[-1, -1]
-    squares = np.maximum(squares, SMALLEST_NOISE**2 * torque)
+    squares = np.maximum(squares, MIN_NOISE**2 * torque)
     return np.divide(rows, squares, out=np.zeros(len(rows)), where=squares > 0.0)
 
 

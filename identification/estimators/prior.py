@@ -39,35 +39,35 @@ from identification.text import number
 
 # Posterior over prior standard deviation of a parameter that is determined by the data, which then
 # gave three quarters of its information (inverse variance).
-LEARNED: Final = 0.5
-_WORST_CONDITION: Final = 1e13  # A weak prior still determines what the data leave open
+DETERMINED_STD_RATIO: Final = 0.5
+_MAX_CONDITION: Final = 1e13  # A weak prior still determines what the data leave open
 
-BODY_SHARE: Final = 0.3
+BODY_STD_SHARE: Final = 0.3
 """Relative standard deviation of a body's mass, of its first moment in units of mass times length
 and of its inertia in units of mass times length squared. Makers' descriptions leave out motors,
 gears, cables and covers, or smear them over the links; on nine real arms 0.2 to 0.5 predict alike
 (``benchmarks.leave_one_out``)."""
-NOMINAL_SHARE: Final = 0.1
+NOMINAL_STD_SHARE: Final = 0.1
 """Relative standard deviation of the torque of nominal inertias, which errors of single bodies
 partly cancel in. CAD lacks cables, grease and fasteners; assumed."""
 # Smallest length of a body, as a share of the mean distance of joints: a wrist's links have next to
 # no distance, but a size.
-_SMALLEST_BODY: Final = 0.25
+_MIN_BODY_LENGTH_SHARE: Final = 0.25
 # A body that the description does not know, for the ratios between bodies; their common scale is
 # that of the torque.
 _UNKNOWN_MASS: Final = 1.0  # kg
 # Ratio of measured to nominal torque from which on the masses of a description have no relation to
 # the torque.
-_NO_RELATION: Final = 3.0
-_CLEAR: Final = 3.0  # standard deviations of that ratio
-_INDEPENDENT: Final = 0.01  # share of the rows for that deviation
-_SMALLEST_EIGENVALUE: Final = 1e-12  # over the largest one, of its normal equations
-_ROUNDS: Final = 20  # of the noise of the joints
-_SETTLED: Final = 1e-3  # relative change of the noise
+_MAX_TORQUE_RATIO: Final = 3.0
+_CLEAR_SIGMAS: Final = 3.0  # standard deviations of that ratio
+_INDEPENDENT_ROW_SHARE: Final = 0.01  # share of the rows for that deviation
+_MIN_EIGENVALUE_RATIO: Final = 1e-12  # over the largest one, of its normal equations
+_NOISE_ROUNDS: Final = 20  # of the noise of the joints
+_NOISE_TOLERANCE: Final = 1e-3  # relative change of the noise
 # Of the scatter of its torque, that a term of friction alone makes. Coulomb and viscous friction
 # together are the torque of a light wrist, and a fifth of that of a heavy arm.
 _FRICTION_SHARE: Final = 0.5
-OFFSET_SHARE: Final = 0.4
+OFFSET_STD_SHARE: Final = 0.4
 """Deviation of an offset over that of Coulomb friction of a joint that moves one way. Both are one
 column then, and what opposes its motion is friction rather than an offset. In recordings of six
 arms of the board the median ratio of the two is 0.31, which is that of a Gaussian of 0.46; from 0.2
@@ -76,16 +76,16 @@ to 0.5 the errors of these recordings differ by 0.2 % at most, at 1.0 one is 1.4
 # RMS of motions that excite an arm: 0.2 to 4.5 rad/s in the recordings of six arms of the board,
 # half of the joints above 0.45; at a base frequency of 0.1 to 0.2 Hz the acceleration is as large.
 USUAL_SPEED: Final = 0.5  # rad/s or m/s
-_STANDS: Final = 0.02  # share of it below which a joint shows the noise of its velocity
+_MIN_SPEED_SHARE: Final = 0.02  # share of it below which a joint shows the noise of its velocity
 _USUAL_ACCELERATION: Final = 0.5  # rad/s² or m/s²
-_SPEEDS: Final = 20  # up to the usual one
-LOAD_SHARE: Final = 0.1
+_SPEED_SAMPLES: Final = 20  # up to the usual one
+LOAD_FRICTION_STD: Final = 0.1
 """Deviation of the share of the transmitted torque that becomes friction: strain-wave gears lose
 some 2 to 15 % (Bittencourt and Gunnarsson 2012)."""
-_FEWEST_ROWS: Final = 2  # per parameter, to estimate the noise
-_INERTIA = slice(0, 6)
-_MOMENT = slice(6, 9)
-_MASS = 9
+_MIN_ROWS_PER_PARAMETER: Final = 2  # per parameter, to estimate the noise
+_INERTIA_SLICE = slice(0, 6)
+_MOMENT_SLICE = slice(6, 9)
+_MASS_INDEX = 9
 
 
 class TorqueSums(NamedTuple):
@@ -134,7 +134,7 @@ class TorqueSums(NamedTuple):
             variance = np.where(start > 0.0, 1.0 / np.where(start > 0.0, start, 1.0), variance)
         # A torque that is zero throughout was not measured.
         has_rows = (samples > 0) & (gram[:, -1, -1] > 0.0)
-        for _ in range(_ROUNDS):
+        for _ in range(_NOISE_ROUNDS):
             weights = np.where(has_rows, 1.0 / np.maximum(variance, floor), 0.0)
             # One product of flat matrices: a general sum takes several times as long.
             total = (weights @ flat).reshape(gram.shape[1:])
@@ -150,7 +150,7 @@ class TorqueSums(NamedTuple):
             )
             previous = variance
             variance = self.squared_errors(values) / rows
-            if (np.abs(variance - previous) <= _SETTLED * previous).all():
+            if (np.abs(variance - previous) <= _NOISE_TOLERANCE * previous).all():
                 break
         return values, weights
 
@@ -199,7 +199,7 @@ class GaussianPrior:
     def std(self) -> Array:
         """Standard deviations (p,) of what is believed, infinite where it is flat."""
         believed = self.believed or self
-        solution = solve_rows(believed.root, np.zeros(len(believed.root)), _WORST_CONDITION)
+        solution = solve_rows(believed.root, np.zeros(len(believed.root)), _MAX_CONDITION)
         covariance = solution.inverse
         mark_undetermined(covariance, solution.determined)
         return np.sqrt(np.diag(covariance))
@@ -273,8 +273,8 @@ class PosteriorEstimate:
 
     @property
     def learned(self) -> NDArray[np.bool_]:
-        """Whether each parameter is determined by the data (p,): ratio below `LEARNED`."""
-        return np.asarray(self.ratio < LEARNED)
+        """Whether the data determine each parameter (p,): ratio below `DETERMINED_STD_RATIO`."""
+        return np.asarray(self.ratio < DETERMINED_STD_RATIO)
 
     @property
     def normalized_change(self) -> Array:
@@ -335,7 +335,7 @@ def with_prior(
     posterior = solve_rows(
         np.concatenate([data_weight * rows, prior.root]),
         np.concatenate([data_weight * (target - rows @ prior.mean), np.zeros(len(prior.root))]),
-        _WORST_CONDITION,
+        _MAX_CONDITION,
     )
     solution = posterior._replace(
         values=prior.mean + posterior.values,
@@ -488,7 +488,7 @@ def design_effect_of(factor: Factor, prior: GaussianPrior) -> float:
 
 def _weights(factor: Factor) -> Array:
     rows = int(factor.samples.sum())
-    if 0 < rows < _FEWEST_ROWS * factor.n_parameters:
+    if 0 < rows < _MIN_ROWS_PER_PARAMETER * factor.n_parameters:
         raise IdentificationError(
             f"{rows} rows are too few to estimate the torque noise with {factor.n_parameters}"
             " parameters; pass the weights"
@@ -517,7 +517,7 @@ def _null_space(columns: Array) -> Array:
 def body_prior(
     model: RobotModel,
     factor: Factor,
-    share: float = BODY_SHARE,
+    share: float = BODY_STD_SHARE,
     stated: Mapping[str, tuple[float, float]] | None = None,
     *,
     wide_rotors: bool = False,
@@ -528,7 +528,7 @@ def body_prior(
     relation to the torque of the factor: zero with bodies that could make all of the torque.
     Rotors: zero, with the inertia of the links outboard or, if larger, what makes half of the
     torque's scatter. Friction and elements: zero, with a coefficient that makes half of it; offsets
-    less of a joint that moves one way (`OFFSET_SHARE`).
+    less of a joint that moves one way (`OFFSET_STD_SHARE`).
 
     Args:
         model: of the arm.
@@ -570,7 +570,7 @@ class Priors(NamedTuple):
 
 def body_priors(model: RobotModel, sums: TorqueSums) -> Priors:
     """Return the :func:`body_prior` of each of K torques, in much less time than one by one."""
-    mean, std, _ = _mean_and_deviations(model, sums, BODY_SHARE)
+    mean, std, _ = _mean_and_deviations(model, sums, BODY_STD_SHARE)
     combinations = _of_model(model).combinations
     spread = combinations * std[:, None]
     covariance = spread @ spread.transpose(0, 2, 1)
@@ -634,7 +634,7 @@ def _mean_and_deviations(
     std[..., size:] = _friction_deviations(model, sums, whole_torque[..., model.base.rank :])
     length = body_lengths(model)
     if not placeholder.all():
-        masses = model.nominal[links][:, _MASS]
+        masses = model.nominal[links][:, _MASS_INDEX]
         masses = np.where(masses > 0.0, masses, np.median(masses[masses > 0.0]))
         mean[~placeholder, :size] = model.nominal
         std[~placeholder, :size] = _standard_deviations(model, share, masses, length)
@@ -660,10 +660,10 @@ def _standard_deviations(model: RobotModel, share: float, masses: Array, length:
     return std
 
 
-def nominal_deviations(model: RobotModel, share: float = BODY_SHARE) -> Array:
+def nominal_deviations(model: RobotModel, share: float = BODY_STD_SHARE) -> Array:
     """Return deviations of the nominal bodies as inertial parameters (rank, 10 n), one each."""
     links = model.layout.links
-    std = _body_deviations(share * model.nominal[links][:, _MASS], body_lengths(model))
+    std = _body_deviations(share * model.nominal[links][:, _MASS_INDEX], body_lengths(model))
     return np.asarray(model.base.grouping[:, links.ravel()] * std.ravel())
 
 
@@ -673,9 +673,9 @@ def _friction_deviations(model: RobotModel, sums: TorqueSums, whole_torque: Arra
     one_way = _one_way(model, sums)
     for k, term in enumerate(model.friction.terms):
         if term.term.of_load:
-            std[..., k] = LOAD_SHARE
+            std[..., k] = LOAD_FRICTION_STD
         elif term.symbol == "fo":
-            std[..., k] *= 1.0 - (1.0 - OFFSET_SHARE) * one_way[..., term.owner]
+            std[..., k] *= 1.0 - (1.0 - OFFSET_STD_SHARE) * one_way[..., term.owner]
     return std
 
 
@@ -692,7 +692,7 @@ def _one_way(model: RobotModel, sums: TorqueSums) -> Array:
     alike = np.zeros(sums.samples.shape)
     offset = products(parts.offset, parts.offset)
     speed = np.sqrt(products(parts.viscous, parts.viscous) / np.maximum(1.0, offset))
-    moves = speed > _STANDS * USUAL_SPEED
+    moves = speed > _MIN_SPEED_SHARE * USUAL_SPEED
     product = np.sqrt(products(parts.dry, parts.dry) * offset)
     both = np.abs(products(parts.dry, parts.offset))
     alike[..., parts.sliding] = np.where(moves, both / np.where(moves, product, 1.0), 0.0)
@@ -708,14 +708,14 @@ def _body_deviations(mass: Array, length: Array) -> Array:
 def body_lengths(model: RobotModel) -> Array:
     """Return a length of each body (n,) [m]: to its centre, its next joint, or its gyration."""
     inertial = model.nominal[model.layout.links]
-    mass = inertial[:, _MASS]
+    mass = inertial[:, _MASS_INDEX]
     divisor = np.where(mass > 0.0, mass, np.inf)
-    centre = np.linalg.norm(inertial[:, _MOMENT], axis=1) / divisor
+    centre = np.linalg.norm(inertial[:, _MOMENT_SLICE], axis=1) / divisor
     second_moment = 0.5 * inertial[:, [0, 3, 5]].sum(axis=1)
     gyration = np.sqrt(np.maximum(second_moment, 0.0) / divisor)
     distance = np.linalg.norm(model.chain.translation[1:], axis=1)
     usual = float(distance.mean()) if len(distance) else 0.0
-    smallest = _SMALLEST_BODY * usual or _SMALLEST_BODY
+    smallest = _MIN_BODY_LENGTH_SHARE * usual or _MIN_BODY_LENGTH_SHARE
     lengths = [centre, gyration, np.append(distance, 0.0), np.full(model.n_joints, smallest)]
     return np.asarray(np.max(lengths, axis=0))
 
@@ -779,9 +779,9 @@ def _usual_columns(model: RobotModel) -> Array:
     Zero for other parameters.
     """
     usual = np.zeros(model.n_parameters)
-    speeds = np.linspace(0.0, USUAL_SPEED, _SPEEDS)
+    speeds = np.linspace(0.0, USUAL_SPEED, _SPEED_SAMPLES)
     for k, term in enumerate(model.friction.terms, model.base.rank):
-        usual[k] = np.abs(term.term.column(speeds, np.ones(_SPEEDS))).max()
+        usual[k] = np.abs(term.term.column(speeds, np.ones(_SPEED_SAMPLES))).max()
     rotors = np.isin(model.base.pivots, model.layout.rotors)
     usual[: model.base.rank][rotors] = _USUAL_ACCELERATION
     return usual
@@ -825,8 +825,10 @@ def _is_placeholder(model: RobotModel, sums: TorqueSums) -> NDArray[np.bool_]:
     if not _of_model(model).masses:
         return np.ones(sums.samples.shape[:-1], dtype=np.bool_)
     scale, std = _nominal_ratio(model, sums)
-    clear = (std < np.abs(scale) / _CLEAR) | (std < 1.0 / (_CLEAR * _NO_RELATION))
-    return np.asarray(clear & ~((scale > 1.0 / _NO_RELATION) & (scale < _NO_RELATION)))
+    clear = (std < np.abs(scale) / _CLEAR_SIGMAS) | (
+        std < 1.0 / (_CLEAR_SIGMAS * _MAX_TORQUE_RATIO)
+    )
+    return np.asarray(clear & ~((scale > 1.0 / _MAX_TORQUE_RATIO) & (scale < _MAX_TORQUE_RATIO)))
 
 
 def nominal_ratio(model: RobotModel, factor: Factor) -> tuple[float, float]:
@@ -854,12 +856,12 @@ def _nominal_ratio(model: RobotModel, sums: TorqueSums) -> tuple[Array, Array]:
     matrix = total[..., :-1, :-1] / (scale[..., :, None] * scale[..., None, :])
     eigenvalues, vectors = np.linalg.eigh(matrix)
     size = np.abs(eigenvalues)
-    significant = size > _SMALLEST_EIGENVALUE * size.max(axis=-1, keepdims=True)
+    significant = size > _MIN_EIGENVALUE_RATIO * size.max(axis=-1, keepdims=True)
     inverse = np.where(significant, 1.0 / np.where(significant, eigenvalues, 1.0), 0.0)
     first = vectors[..., 0, :]
     right = (vectors * (total[..., :-1, -1] / scale)[..., None]).sum(axis=-2)
     residual = total[..., -1, -1] - (inverse * right**2).sum(axis=-1)
-    rows = _INDEPENDENT * np.maximum(1.0, samples.sum(axis=-1))
+    rows = _INDEPENDENT_ROW_SHARE * np.maximum(1.0, samples.sum(axis=-1))
     ratio = (first * inverse * right).sum(axis=-1) / scale[..., 0]
     variance = np.maximum(residual, 0.0) / rows * (first**2 * inverse).sum(axis=-1)
     std = np.sqrt(np.maximum(variance, 0.0)) / scale[..., 0]

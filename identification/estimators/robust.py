@@ -19,16 +19,17 @@ from identification.factor.rows import augmented_rows
 from identification.model.robot import RobotModel
 from identification.signals.samples import Samples
 
-MOST_ITERATIONS: Final = 60
-TOLERANCE: Final = 1e-4  # final change of the parameters, in standard deviations of white noise
+MAX_ITERATIONS: Final = 60
+# final change of the parameters, in standard deviations of white noise
+FINAL_STEP_TOLERANCE: Final = 1e-4
 # Changes of parameters (likewise) and scales (relative) at which the scales are fixed and the next
 # loss starts.
 _STEP_TOLERANCE: Final = 0.01
 _SCALE_TOLERANCE: Final = 1e-3
-OUTLYING: Final = 4.0  # scales; one Gaussian row in 16 000
-MOST_OUTLYING: Final = 0.1  # share of outlying rows above which the model is wrong
-_MAD: Final = 0.6744897501960817  # median of |x| for a standard Gaussian x
-_SMALLEST_SCALE: Final = 1e-6  # of the torque's RMS
+OUTLIER_SCALES: Final = 4.0  # scales; one Gaussian row in 16 000
+MAX_OUTLIER_SHARE: Final = 0.1  # share of outlying rows above which the model is wrong
+_NORMAL_MAD: Final = 0.6744897501960817  # median of |x| for a standard Gaussian x
+_MIN_SCALE_SHARE: Final = 1e-6  # of the torque's RMS
 
 
 @dataclass(frozen=True, eq=False)
@@ -36,14 +37,14 @@ class RobustEstimate:
     """Robust fit with its outliers."""
 
     estimate: Estimate  #: with cluster-robust covariance; `noise_std` is the robust scale per joint
-    outlying: Array  #: share of rows beyond `OUTLYING` scales (n,), NaN without rows
+    outlying: Array  #: share of rows beyond `OUTLIER_SCALES` scales (n,), NaN without rows
     iterations: int  #: passes over the samples
     converged: bool
 
     @property
     def doubtful(self) -> NDArray[np.bool_]:
         """Joints with so many outlying rows that the model is wrong, not the data (n,)."""
-        return np.asarray(self.outlying > MOST_OUTLYING)
+        return np.asarray(self.outlying > MAX_OUTLIER_SHARE)
 
 
 class _State(NamedTuple):
@@ -64,7 +65,7 @@ def robust_estimate(
     loss: Loss = Huber(),  # noqa: B008 - frozen
     *,
     total: Factor | None = None,
-    most_iterations: int = MOST_ITERATIONS,
+    most_iterations: int = MAX_ITERATIONS,
 ) -> RobustEstimate:
     """Fit recordings with a robust loss; every iteration reads the samples once.
 
@@ -86,7 +87,7 @@ def robust_estimate(
     n = model.n_joints
     state = _State(factor, factor.solve(np.ones(n)), np.full(n, np.inf))
     stages = [(Huber(), _STEP_TOLERANCE)] if isinstance(loss, Tukey) else []
-    for stage_loss, tolerance in [*stages, (loss, TOLERANCE)]:
+    for stage_loss, tolerance in [*stages, (loss, FINAL_STEP_TOLERANCE)]:
         state = state._replace(converged=False)
         for _ in range(most_iterations):
             state = _iterate(model, recordings, state, stage_loss, tolerance)
@@ -109,7 +110,7 @@ def robust_estimate(
     )
     return RobustEstimate(
         estimate=replace(estimate, noise_std=state.scale),
-        outlying=np.count_nonzero(np.abs(scaled) > OUTLYING, axis=0) / rows,
+        outlying=np.count_nonzero(np.abs(scaled) > OUTLIER_SCALES, axis=0) / rows,
         iterations=state.passes,
         converged=state.converged,
     )
@@ -176,7 +177,7 @@ def _scales(recordings: Sequence[Samples], residuals: Sequence[Array], solution:
     scale = np.full(residual.shape[1], np.nan)
     for joint, joint_rows in enumerate(usable.T):
         if joint_rows.any():
-            floor = _SMALLEST_SCALE * np.sqrt(np.mean(torque[joint_rows, joint] ** 2))
-            spread = np.median(np.abs(residual[joint_rows, joint])) / _MAD * wider
+            floor = _MIN_SCALE_SHARE * np.sqrt(np.mean(torque[joint_rows, joint] ** 2))
+            spread = np.median(np.abs(residual[joint_rows, joint])) / _NORMAL_MAD * wider
             scale[joint] = max(spread, floor, np.finfo(np.float64).tiny ** 0.5)
     return scale

@@ -16,11 +16,11 @@ import numpy as np
 from identification.arrays import Array, Indices
 from identification.factor.estimate import Estimate
 
-FEWEST: Final = 3
+MIN_ESTIMATES: Final = 3
 """Arms from which on their spread is estimated."""
-_MOST_ROUNDS: Final = 300
-_CONVERGED: Final = 1e-3  # relative change of the spread
-_LEAST_SPREAD: Final = 1e-4  # as a share of the size of a parameter
+_MAX_ROUNDS: Final = 300
+_SPREAD_TOLERANCE: Final = 1e-3  # relative change of the spread
+_MIN_SPREAD: Final = 1e-4  # as a share of the size of a parameter
 
 
 @dataclass(frozen=True, eq=False)
@@ -40,12 +40,12 @@ class Siblings:
 
 def with_siblings(estimates: Sequence[Estimate]) -> Siblings | None:
     """Return the arms of one type, from the estimate of each by itself; None of too few."""
-    if len(estimates) < FEWEST:
+    if len(estimates) < MIN_ESTIMATES:
         return None
     stds = np.array([each.std for each in estimates])
     values = np.array([each.values for each in estimates])
     determined = np.isfinite(stds) & (stds > 0.0)
-    used = np.flatnonzero(determined.sum(axis=0) >= FEWEST)
+    used = np.flatnonzero(determined.sum(axis=0) >= MIN_ESTIMATES)
     if not len(used):
         return None
     shown = np.where(determined, values, 0.0)[:, used]
@@ -56,13 +56,13 @@ def with_siblings(estimates: Sequence[Estimate]) -> Siblings | None:
     scaled = shown / rms
     centre = scaled.sum(axis=0) / counts
     spread = (np.where(determined[:, used], scaled - centre, 0.0) ** 2).sum(axis=0) / counts
-    spread = np.maximum(spread, _LEAST_SPREAD**2)
-    for _ in range(_MOST_ROUNDS):
+    spread = np.maximum(spread, _MIN_SPREAD**2)
+    for _ in range(_MAX_ROUNDS):
         previous = spread
         mean, of_mean, centred, covariances = _expected(information, scaled, spread)
         squares = (centred - mean) ** 2 + np.diagonal(covariances, axis1=1, axis2=2)
-        spread = np.maximum(squares.mean(axis=0), _LEAST_SPREAD**2)
-        if np.all(np.abs(spread - previous) <= _CONVERGED * previous):
+        spread = np.maximum(squares.mean(axis=0), _MIN_SPREAD**2)
+        if np.all(np.abs(spread - previous) <= _SPREAD_TOLERANCE * previous):
             break
     # The spread of few arms is known poorly, and may have come out too small (Morris 1983).
     doubt = 2.0 / max(1.0, len(estimates) - 3.0)

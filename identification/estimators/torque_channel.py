@@ -18,9 +18,9 @@ from numpy.typing import NDArray
 
 from identification.arrays import Array
 from identification.factor.blocks import EqualRuns, add_grams, equal_runs
-from identification.factor.factor import SMALLEST_NOISE
+from identification.factor.factor import MIN_NOISE
 from identification.model.robot import RobotModel
-from identification.signals.masks import LONGEST_END, edge_rows
+from identification.signals.masks import MAX_END_SECONDS, edge_rows
 from identification.signals.noise import noiseless_above
 from identification.signals.recording import Recording
 from identification.signals.samples import RIGID_BANDWIDTH, Preprocessing, Samples, prepare
@@ -33,33 +33,37 @@ from identification.signals.smoothing import (
 Complex = NDArray[np.complex128]
 
 LOWEST_BANDWIDTH: Final = 0.5  # Hz
-_WORTHWHILE: Final = 0.05  # required relative reduction of the residual, mean over joints
-_COARSE: Final = 4.0  # candidates per decade of bandwidth, before refinement
-_REFINED: Final = 5  # candidates between the neighbours of the best
+_MIN_IMPROVEMENT: Final = 0.05  # required relative reduction of the residual, mean over joints
+_CANDIDATES_PER_DECADE: Final = 4.0  # candidates per decade of bandwidth, before refinement
+_REFINED_CANDIDATES: Final = 5  # candidates between the neighbours of the best
 # Spacings about the vertex of a parabola, of the logarithm: for all shapes, then for the best. With
 # little noise the minimum is narrower than a parabola.
-_CLOSE: Final = (0.07, 0.02)
+_VERTEX_SPACINGS: Final = (0.07, 0.02)
 # Of the bandwidth, in which a low-pass and its absence differ most.
-_OCTAVES: Final = ((1.0, 2.0), (2.0, 4.0))
-_THERE: Final = 0.5  # share of a low-pass from which on the torque is nearer to it than to none
-_RATE: Final = 250.0  # Hz; rows beyond it are averaged
+_BANDWIDTH_OCTAVES: Final = ((1.0, 2.0), (2.0, 4.0))
+# share of a low-pass from which on the torque is nearer to it than to none
+_MIN_LOW_PASS_SHARE: Final = 0.5
+_MAX_RATE: Final = 250.0  # Hz; rows beyond it are averaged
 
 # Half a period of the lowest bandwidth: shorter stretches do not show it, and shorter rests between
 # stretches stay in, as leaving them out costs more rows beside them.
-_SHORTEST: Final = 0.5 / LOWEST_BANDWIDTH  # s
+_MIN_STRETCH_SECONDS: Final = 0.5 / LOWEST_BANDWIDTH  # s
 # Share of a stretch over which its weight rises and falls. Window and filter commute up to the
 # change of the window during the filter's lag; a window without a level part would be the most
 # accurate, but the rows of the middle alone would decide.
-_TAPERED: Final = 0.5
-_UNEVEN: Final = 0.01  # of a step; rows at other times are interpolated
-_PADDING: Final = 1.0 / LOWEST_BANDWIDTH  # s of zeros, against the periodicity of the transform
-_LONGEST: Final = 120.0  # s; longer segments are transformed in parts, whose tables stay small
-_BESIDE: Final = 5  # signals beside the columns: load and torque, and three made of the torque
+_TAPER_SHARE: Final = 0.5
+_MAX_STEP_DEVIATION: Final = 0.01  # of a step; rows at other times are interpolated
+# s of zeros, against the periodicity of the transform
+_PADDING_SECONDS: Final = 1.0 / LOWEST_BANDWIDTH
+# s; longer segments are transformed in parts, whose tables stay small
+_MAX_SEGMENT_SECONDS: Final = 120.0
+# signals beside the columns: load and torque, and three made of the torque
+_EXTRA_SIGNALS: Final = 5
 
 # Gains and phases are constant in a band. A delay of 50 ms turns the phase by 3 mrad in the lowest
 # bands and by 0.15 rad at 30 Hz from its centre, where arms have hardly any torque.
-_BAND: Final = 0.03  # width as a share of the frequency
-_NARROWEST: Final = 0.02  # Hz
+_RELATIVE_BAND_WIDTH: Final = 0.03  # width as a share of the frequency
+_MIN_BAND_WIDTH: Final = 0.02  # Hz
 _RIDGE: Final = 1e-11  # of columns of unit length, as the limit of condition of Gram matrices
 
 
@@ -104,7 +108,7 @@ def possible_low_passes(
         undelayed: delay without a low-pass [s], by default that of the options.
     """
     still = options.torque_delay if undelayed is None else undelayed
-    mean = recording.averaged(_RATE)
+    mean = recording.averaged(_MAX_RATE)
     if noise_variance is not None:
         noise_variance = noise_variance * mean.n_samples / recording.n_samples
     wide = replace(
@@ -117,19 +121,19 @@ def possible_low_passes(
     )
     samples = prepare(mean, model, noise_variance=noise_variance, options=wide)
     # Without the ends, where the smoothed motion is inaccurate.
-    spectra = _Spectra.of(model, samples, ~edge_rows(mean, LONGEST_END), still)
+    spectra = _Spectra.of(model, samples, ~edge_rows(mean, MAX_END_SECONDS), still)
     if not spectra.joints:
         return ()
     delays = tuple(dict.fromkeys((still, options.torque_delay)))
     # A low-pass must be better than a delay alone.
     enough = spectra.misfits([_Filter(delay) for delay in delays]).min()
-    enough += math.log(1.0 - _WORTHWHILE)
+    enough += math.log(1.0 - _MIN_IMPROVEMENT)
     possible = []
     for kind_delays, shapes in ((delays, WITHOUT_PHASE), ((still,), FORWARDS)):
         kinds = [_Filter(delay, shape) for delay, shape in product(kind_delays, shapes)]
         misfit, best = spectra.best(kinds)
         share, std = spectra.attenuation(best)
-        if misfit < enough and share - std > _THERE:
+        if misfit < enough and share - std > _MIN_LOW_PASS_SHARE:
             assert best.shape is not None
             possible.append(
                 replace(
@@ -217,7 +221,7 @@ class _Spectra:
         bands = np.flatnonzero(count)
         total = np.sum([segment.bins * segment.frequency for segment in segments], axis=0)
         columns = model.plan.columns
-        sizes = [len(used) + _BESIDE for used in columns]
+        sizes = [len(used) + _EXTRA_SIGNALS for used in columns]
         grams = [np.zeros((len(count), size, size)) for size in sizes]
         rows = np.zeros(model.n_joints)
         for segment in segments:
@@ -261,7 +265,7 @@ class _Spectra:
         rows = np.array([joint.rows for joint in self.joints])
         power = np.array([joint.power for joint in self.joints])
         variance = np.broadcast_to(power / rows, (len(filters), len(rows)))
-        smallest = np.maximum(SMALLEST_NOISE**2 * power / rows, np.finfo(np.float64).tiny)
+        smallest = np.maximum(MIN_NOISE**2 * power / rows, np.finfo(np.float64).tiny)
         for _ in range(2):  # with weights of the torque, then of the residual
             # A torque that is zero throughout was not measured.
             weights = np.where(power > 0.0, 1.0 / np.maximum(variance, smallest), 0.0)
@@ -299,7 +303,7 @@ class _Spectra:
         phases = (np.ones_like(response), response / size, self.response(without)[0])
         modelled = [joint.modelled(values) for joint in self.joints]
         shares = []
-        for octave in _OCTAVES:
+        for octave in _BANDWIDTH_OCTAVES:
             low, high = (factor * channel.bandwidth for factor in octave)
             inside = (self.frequency >= low) & (self.frequency < high)
             certain = np.zeros(len(self.joints))  # information on the logarithm of the gain
@@ -313,7 +317,7 @@ class _Spectra:
                 if not (product > 0.0 and power > 0.0):
                     continue
                 # At most one, up to the rounding of sums of squares.
-                coherence = min(product**2 / (power * torque), 1.0 - SMALLEST_NOISE)
+                coherence = min(product**2 / (power * torque), 1.0 - MIN_NOISE)
                 count = max(1.0, joint.duration * (high - low))
                 certain[k] = 2.0 * count * coherence / (1.0 - coherence)
                 gains[k] = math.log(product / power)
@@ -347,13 +351,13 @@ class _Spectra:
     def best(self, kinds: Sequence[_Filter]) -> tuple[float, _Filter]:
         """Return the least misfit of shapes and delays over all bandwidths, and its filter."""
         ends = np.log(LOWEST_BANDWIDTH), np.log(max(self.highest, 2.0 * LOWEST_BANDWIDTH))
-        count = max(4, round(_COARSE * (ends[1] - ends[0]) / np.log(10.0)) + 1)
+        count = max(4, round(_CANDIDATES_PER_DECADE * (ends[1] - ends[0]) / np.log(10.0)) + 1)
         grids = np.tile(np.linspace(*ends, count), (len(kinds), 1))
         heights = self._heights(kinds, grids)
         grids = np.array([_around(*pair) for pair in zip(grids, heights, strict=True)])
         heights = self._heights(kinds, grids)
         lowest = np.array([_vertex(*pair) for pair in zip(grids, heights, strict=True)])
-        for step in _CLOSE:
+        for step in _VERTEX_SPACINGS:
             grids = lowest[:, None] + step * np.array([-1.0, 0.0, 1.0])
             heights = self._heights(kinds, grids)
             least = int(np.argmin(heights.min(axis=1)))
@@ -425,7 +429,7 @@ class _Segment:
         """Return a segment, for bands with lower edges (B,) [Hz]."""
         time = time[rows]
         step = float(time[-1] - time[0]) / max(len(time) - 1, 1) or 1.0
-        length = len(time) + round(_PADDING / step)
+        length = len(time) + round(_PADDING_SECONDS / step)
         factor = max(1, 2 ** (length.bit_length() - 5))  # of a length that is quick to transform
         length = -(-length // factor) * factor
         frequency = np.fft.rfftfreq(length, step)
@@ -474,7 +478,7 @@ class _Segment:
         """Interpolate signals (c, m) at even times."""
         even = np.linspace(self.time[0], self.time[-1], len(self.time))
         step = even[1] - even[0]
-        if np.abs(self.time - even).max() <= _UNEVEN * step:
+        if np.abs(self.time - even).max() <= _MAX_STEP_DEVIATION * step:
             return signals
         return np.array([np.interp(even, self.time, signal) for signal in signals])
 
@@ -483,15 +487,15 @@ def _parts(time: Array, segments: Iterable[slice]) -> Iterator[slice]:
     """Yield segments of rows, long ones in parts of equal length."""
     for segment in segments:
         duration = float(time[segment.stop - 1] - time[segment.start])
-        count = max(1, math.ceil(duration / _LONGEST))
+        count = max(1, math.ceil(duration / _MAX_SEGMENT_SECONDS))
         edges = np.linspace(segment.start, segment.stop, count + 1).round().astype(int).tolist()
         yield from (slice(start, stop) for start, stop in pairwise(edges))
 
 
 def _window(length: int) -> Array:
-    """Return a window (length,) from zero to zero, level but for `_TAPERED` of it (Tukey 1967)."""
+    """Return a window (length,) from zero to zero, level but for `_TAPER_SHARE` (Tukey 1967)."""
     phase = np.linspace(0.0, 1.0, length)
-    from_end = np.minimum(phase, 1.0 - phase) / (0.5 * _TAPERED)
+    from_end = np.minimum(phase, 1.0 - phase) / (0.5 * _TAPER_SHARE)
     return np.asarray(0.5 - 0.5 * np.cos(np.pi * np.minimum(from_end, 1.0)))
 
 
@@ -500,27 +504,31 @@ def _stretches(time: Array, usable: NDArray[np.bool_]) -> Iterator[tuple[int, in
     edges = np.flatnonzero(np.diff(usable.astype(np.int8), prepend=0, append=0))
     runs: list[tuple[int, int]] = []
     for start, stop in edges.reshape(-1, 2).tolist():
-        if runs and time[start] - time[runs[-1][1] - 1] < _SHORTEST:
+        if runs and time[start] - time[runs[-1][1] - 1] < _MIN_STRETCH_SECONDS:
             start = runs.pop()[0]
         runs.append((start, stop))
     for start, stop in runs:
-        if time[stop - 1] - time[start] >= _SHORTEST:
+        if time[stop - 1] - time[start] >= _MIN_STRETCH_SECONDS:
             yield start, stop
 
 
 def _band_edges(highest: float) -> Array:
     """Return the lower edges of bands (B,) [Hz] from zero up to a frequency."""
-    turn = _NARROWEST / _BAND
+    turn = _MIN_BAND_WIDTH / _RELATIVE_BAND_WIDTH
     if highest <= turn:
-        return np.arange(0.0, highest, _NARROWEST)
-    wide = np.arange(math.log(turn), math.log(highest), _BAND)
-    return np.concatenate([np.arange(0.0, turn - 0.5 * _NARROWEST, _NARROWEST), np.exp(wide)])
+        return np.arange(0.0, highest, _MIN_BAND_WIDTH)
+    wide = np.arange(math.log(turn), math.log(highest), _RELATIVE_BAND_WIDTH)
+    return np.concatenate(
+        [np.arange(0.0, turn - 0.5 * _MIN_BAND_WIDTH, _MIN_BAND_WIDTH), np.exp(wide)]
+    )
 
 
 def _around(grid: Array, heights: Array) -> Array:
-    """Return `_REFINED` points between the neighbours of the lowest of a grid (w,)."""
+    """Return `_REFINED_CANDIDATES` points between the neighbours of the lowest of a grid (w,)."""
     best = int(np.argmin(heights))
-    return np.linspace(grid[max(best - 1, 0)], grid[min(best + 1, len(grid) - 1)], _REFINED)
+    return np.linspace(
+        grid[max(best - 1, 0)], grid[min(best + 1, len(grid) - 1)], _REFINED_CANDIDATES
+    )
 
 
 def _vertex(grid: Array, heights: Array) -> float:

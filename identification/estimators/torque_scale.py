@@ -27,7 +27,7 @@ from identification.distributions import NORMAL_95
 from identification.factor.estimate import Estimate
 from identification.factor.factor import Factor
 
-DATA_SHEET: Final = 0.03
+TORQUE_CONSTANT_STD: Final = 0.03
 """Relative standard deviation of a torque constant from a data sheet, or of a torque sensor.
 
 Makers of servo motors state tolerances of 5 to 10 % for the constant of one specimen, magnets lose

@@ -31,25 +31,25 @@ from identification.model.workspace import Workspace
 from planner import FourierSeries, JointLimits, PiecewiseCubic
 
 # Another contact may be deeper by this: in given postures, and along a motion [m].
-_DEPTH: Final = 0.005
-_DEPTH_ALONG: Final = 0.02
-_STEP: Final = 0.08  # of the first instants of a motion [s]
-_SAMPLE_STEP: Final = 0.008  # of the last ones, if only instants are checked
-_DIVISIONS: Final = 16  # of an interval; one that is still open counts as a contact
+_DEPTH_TOLERANCE: Final = 0.005
+_MOTION_DEPTH_TOLERANCE: Final = 0.02
+_FIRST_STEP_SECONDS: Final = 0.08  # of the first instants of a motion [s]
+_LAST_STEP_SECONDS: Final = 0.008  # of the last ones, if only instants are checked
+_MAX_DIVISIONS: Final = 16  # of an interval; one that is still open counts as a contact
 # Most open intervals, and distances that are computed; with more, the motion counts as a contact.
-_MOST_OPEN: Final = 20_000
-_MOST_DISTANCES: Final = 30_000
+_MAX_OPEN_INTERVALS: Final = 20_000
+_MAX_DISTANCES: Final = 30_000
 # Pairs closer than this [m] (and than the margin) in all sampled postures are not checked; a wider
 # margin does not exclude more.
-_NEAR: Final = 0.05
+_NEAR_DISTANCE: Final = 0.05
 # Largest variation [m] of the distance of a rotating foot from its obstacle.
-_CONSTANT: Final = 0.002
+_MAX_DISTANCE_VARIATION: Final = 0.002
 # A pair that never or hardly has the margin must have the largest sampled distance less this [m],
 # or less half the margin if that is smaller.
-_SLACK: Final = 0.005
+_DISTANCE_SLACK: Final = 0.005
 _N_POSTURES = 200
 _SEED = 20140901
-_NO_RANGE = 1e-6  # ranges below this [rad, m] are not limits
+_MIN_RANGE = 1e-6  # ranges below this [rad, m] are not limits
 
 
 class Proximity(NamedTuple):
@@ -208,9 +208,9 @@ class CollisionChecker:
         """Remove pairs that are always too close; return the least distances of the others."""
         # Removed: two links at most two joints apart that are too close in all postures, and an
         # obstacle and a shape of the first link at a constant distance below the margin.
-        near = min(self.margin, _NEAR)
+        near = min(self.margin, _NEAR_DISTANCE)
         samples = np.arange(_N_POSTURES)
-        slack = min(_SLACK, near / 2.0)
+        slack = min(_DISTANCE_SLACK, near / 2.0)
         checked: list[tuple[int, int]] = []
         required: list[float] = []
         unchecked = list[ClosePair]()
@@ -228,7 +228,11 @@ class CollisionChecker:
                     least = float(distances.min())
                     most = float(distances.max())
             close = ClosePair(self._bodies[a].shape_name, self._bodies[b].shape_name, least, most)
-            fixed = joints <= 1 and most - least <= _CONSTANT if b >= self._n_links else True
+            fixed = (
+                joints <= 1 and most - least <= _MAX_DISTANCE_VARIATION
+                if b >= self._n_links
+                else True
+            )
             if most < near and fixed:
                 unchecked.append(close)
                 continue
@@ -266,7 +270,7 @@ class CollisionChecker:
 
         Another contact may be deeper by up to 5 mm.
         """
-        nearest = _Nearest(self, _DEPTH)
+        nearest = _Nearest(self, _DEPTH_TOLERANCE)
         pair, sample = np.indices((len(self.separation.first), len(q))).reshape(2, -1)
         nearest.visit(q, np.arange(len(q), dtype=np.float64), pair, sample)
         if nearest.contact is None:
@@ -282,10 +286,14 @@ class CollisionChecker:
         interval that division does not resolve counts as a contact. Another contact may be deeper
         by up to 2 cm.
         """
-        nearest = _Nearest(self, _DEPTH_ALONG)
-        time = np.linspace(0.0, trajectory.duration, 1 + _steps(trajectory.duration, _STEP))
+        nearest = _Nearest(self, _MOTION_DEPTH_TOLERANCE)
+        time = np.linspace(
+            0.0, trajectory.duration, 1 + _steps(trajectory.duration, _FIRST_STEP_SECONDS)
+        )
         q = trajectory.sample(time)[0]
-        beyond = acceleration_bound(trajectory, time[:1], time[-1:])[:, 0] * _STEP**2 / 8.0
+        beyond = (
+            acceleration_bound(trajectory, time[:1], time[-1:])[:, 0] * _FIRST_STEP_SECONDS**2 / 8.0
+        )
         reach = self.reaches(np.abs(q).max(axis=0) + beyond)
         pair, node = np.indices((len(reach), len(time))).reshape(2, -1)
         distances = nearest.visit(q, time, pair, node).reshape(-1, len(time))
@@ -295,10 +303,10 @@ class CollisionChecker:
         pair, node = np.nonzero(~(least >= nearest.limit))
         start, stop, q0, q1 = (end[node] for end in ends)
         gaps = _Gaps(pair, start, stop, q0, q1, distances[pair, node], distances[pair, node + 1])
-        for _ in range(_DIVISIONS):
+        for _ in range(_MAX_DIVISIONS):
             if not between:
-                gaps = gaps.take(gaps.stop - gaps.start > _SAMPLE_STEP)
-            many = len(gaps.pair) > _MOST_OPEN or nearest.distances > _MOST_DISTANCES
+                gaps = gaps.take(gaps.stop - gaps.start > _LAST_STEP_SECONDS)
+            many = len(gaps.pair) > _MAX_OPEN_INTERVALS or nearest.distances > _MAX_DISTANCES
             if many or len(gaps.pair) == 0:
                 break
             time, node = np.unique((gaps.start + gaps.stop) / 2.0, return_inverse=True)
@@ -446,7 +454,7 @@ def random_postures(n: int, limits: JointLimits | None) -> Array:
     lower, upper = np.full((2, n), [[-np.pi], [np.pi]])
     if limits is not None:
         range_ = limits.upper - limits.lower
-        limited = (range_ > _NO_RANGE) & (range_ < 2.0 * np.pi)
+        limited = (range_ > _MIN_RANGE) & (range_ < 2.0 * np.pi)
         lower, upper = np.where(limited, (limits.lower, limits.upper), (lower, upper))
     shares = np.random.default_rng(_SEED).random((_N_POSTURES, n))
     postures: Array = lower + shares * (upper - lower)

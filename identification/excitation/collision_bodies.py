@@ -16,7 +16,7 @@ import pinocchio as pin
 
 from identification.arrays import Array
 from identification.excitation.errors import CollisionModelError, MissingMeshError
-from identification.model.kinematics import FARTHEST
+from identification.model.kinematics import MAX_DISTANCE
 from identification.model.urdf_text import urdf_tree
 from identification.model.workspace import Workspace
 
@@ -101,10 +101,10 @@ def link_bodies(model: pin.Model, urdf: str, mesh_folders: Sequence[str]) -> lis
     for item, link in zip(shapes.geometryObjects, names, strict=True):
         rotation = item.placement.rotation
         translation = item.placement.translation
-        if not np.abs(translation).max() <= FARTHEST:
+        if not np.abs(translation).max() <= MAX_DISTANCE:
             raise CollisionModelError(
                 f"collision shape {item.name!r} of the robot description is more than "
-                f"{FARTHEST:g} m away from its parent"
+                f"{MAX_DISTANCE:g} m away from its parent"
             )
         shape = _convex(item.geometry, link)
         joint = item.parentJoint - 1
@@ -119,19 +119,20 @@ def link_bodies(model: pin.Model, urdf: str, mesh_folders: Sequence[str]) -> lis
 def _convex(shape: coal.CollisionGeometry, link: str) -> coal.CollisionGeometry:
     """Return the shape itself, or the convex hull of a mesh."""
     if isinstance(shape, coal.BVHModelBase):
-        if np.all(np.abs(shape.vertices()) <= FARTHEST):
+        if np.all(np.abs(shape.vertices()) <= MAX_DISTANCE):
             with suppress(ValueError, RuntimeError):
                 shape.buildConvexHull(True, "Qt")
                 return shape.convex
         raise CollisionModelError(
-            f"a collision mesh of link {link!r} has no volume, or vertices beyond {FARTHEST:g} m"
+            f"a collision mesh of link {link!r} has no volume, or vertices beyond"
+            f" {MAX_DISTANCE:g} m"
         )
     sides = [getattr(shape, name, 0.0) for name in ("halfSide", "radius", "halfLength")]
     if min(float(np.min(side)) for side in sides) < 0.0:
         raise CollisionModelError(f"a collision shape of link {link!r} has a negative size")
-    if not max(float(np.max(side)) for side in sides) <= FARTHEST:
+    if not max(float(np.max(side)) for side in sides) <= MAX_DISTANCE:
         raise CollisionModelError(
-            f"a collision shape of link {link!r} is larger than {FARTHEST:g} m"
+            f"a collision shape of link {link!r} is larger than {MAX_DISTANCE:g} m"
         )
     return shape
 

@@ -25,7 +25,7 @@ SAMPLE_PERIOD: Final = 0.008
 """Sample period of checks and criteria, s; the tip of a fast arm moves some 4 cm in it."""
 
 # Relative to a period; a duration of a whole number of periods and less gets no further sample.
-_ROUNDING: Final = 1e-9
+_PERIOD_ROUNDING: Final = 1e-9
 
 
 def sampled(trajectory: Trajectory, period: float = SAMPLE_PERIOD) -> Motion:
@@ -42,7 +42,7 @@ def midpoints(trajectory: Trajectory, period: float = SAMPLE_PERIOD) -> Motion:
 
 
 def _steps(trajectory: Trajectory, period: float) -> int:
-    return max(1, math.ceil(trajectory.duration / period - _ROUNDING))
+    return max(1, math.ceil(trajectory.duration / period - _PERIOD_ROUNDING))
 
 
 _RATES = ("velocity", "acceleration", "jerk")

@@ -9,7 +9,7 @@ from typing import Any, Self
 from identification.arrays import Array
 from identification.excitation.criteria import Criteria
 from planner import FourierSeries, Move, PiecewiseCubic
-from planner.arrays import DAMAGED, Whole, numbers, strict
+from planner.arrays import DAMAGED_DATA_ERRORS, Whole, numbers, strict
 
 
 @dataclass(frozen=True, eq=False)
@@ -93,7 +93,7 @@ class Excitation:
                 rejected=strict(dict[str, Whole], data["rejected"]),
                 **({} if sines else _planned(data, trajectory.n_joints)),
             )
-        except DAMAGED as error:
+        except DAMAGED_DATA_ERRORS as error:
             raise ValueError(f"not an excitation: {error!r:.300}") from error
 
 

@@ -24,15 +24,15 @@ from planner import (
 
 Motion: TypeAlias = PiecewiseCubic | FourierSeries
 
-_TOGETHER: Final = 48
+_POINTS_PER_CHECK: Final = 48
 """Motions planned together: the arrays of more do not fit the processor's caches (294 motions of 50
 legs at once took twice the time)."""
 # Spacing [rad] of the checked postures of a straight path.
 _PATH_SPACING: Final = 0.1
 # Draws of one via point before the last one is used even if it collides.
-_DRAWS: Final = 50
+_MAX_DRAWS: Final = 50
 # Of the postures of a path every so many are looked at for contacts, in turn.
-_STRIDES: Final = (16, 4, 1)
+_POSTURE_STRIDES: Final = (16, 4, 1)
 
 
 def _interpolated(lower: ArrayLike, upper: ArrayLike, genes: Array) -> Array:
@@ -51,7 +51,7 @@ def straight_path(start: Array, end: Array) -> Array:
 def _are_clear(checker: CollisionChecker, paths: Sequence[Array]) -> NDArray[np.bool_]:
     """Return which paths (m, n) are clear; most contacts show in a few of their postures."""
     clear = np.ones(len(paths), dtype=np.bool_)
-    for stride in _STRIDES:
+    for stride in _POSTURE_STRIDES:
         unchecked = np.flatnonzero(clear)
         some = [paths[k][::stride] for k in unchecked.tolist()]
         if some:
@@ -113,8 +113,8 @@ class ViaPointGenome:
     def planned(self, points: Sequence[Array], speed: Array) -> list[PiecewiseCubic | PlannerError]:
         """Plan motions through points (m_k, n) [rad] at speeds (k, n); see :meth:`motions`."""
         motions = list[PiecewiseCubic | PlannerError]()
-        for first in range(0, len(points), _TOGETHER):
-            chunk = slice(first, first + _TOGETHER)
+        for first in range(0, len(points), _POINTS_PER_CHECK):
+            chunk = slice(first, first + _POINTS_PER_CHECK)
             motions += plan_chunk(points[chunk], speed[chunk], self.limits, self.fly)
         return motions
 
@@ -161,7 +161,7 @@ class ViaPointGenome:
     ) -> Array:
         """Redraw points (m, n) in place until the paths before and after them are free."""
         blocked = np.arange(len(coordinates))
-        for draw in range(_DRAWS):
+        for draw in range(_MAX_DRAWS):
             if draw > 0:
                 coordinates[blocked] = random.random((len(blocked), self.limits.n_joints))
             points = self._points(coordinates[blocked])

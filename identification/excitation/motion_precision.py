@@ -15,10 +15,11 @@ import numpy as np
 
 from identification.arrays import Array
 
-INTERVAL: Final = 2.0
+INTERVAL_SIGMAS: Final = 2.0
 """Standard deviations in half a 95 % interval: Student's factor for some sixty blocks of time."""
-_UNDETERMINED: Final = 1e-10  # information, relative, of what no row shows
-_NORM: Final = 16.0  # of the ratios in the criterion: the largest one dominates, and it is smooth
+_MIN_INFORMATION: Final = 1e-10  # information, relative, of what no row shows
+# of the ratios in the criterion: the largest one dominates, and it is smooth
+_NORM_POWER: Final = 16.0
 
 
 class Spread(NamedTuple):
@@ -63,7 +64,7 @@ class Precision:
     def ratios(self, information: Array) -> Array:
         """Return predicted over wanted interval (k,) for the information (p, p) of a motion."""
         variance = self.spread(information).variance
-        return np.asarray(INTERVAL * np.sqrt(variance) / self.quantities.allowed)
+        return np.asarray(INTERVAL_SIGMAS * np.sqrt(variance) / self.quantities.allowed)
 
     def criterion(self, information: Array) -> float:
         """Return a norm of the ratios in which the largest dominates."""
@@ -73,7 +74,7 @@ class Precision:
         """Return the derivative (p, p) of -ln of the criterion by the information."""
         spread = self.spread(information)
         ratios = np.sqrt(spread.variance) / self.quantities.allowed
-        share = (ratios / ratios.max()) ** _NORM
+        share = (ratios / ratios.max()) ** _NORM_POWER
         weights = 0.5 * share / share.sum() / spread.variance
         return np.asarray((spread.slope * weights[:, None]).T @ spread.slope)
 
@@ -109,7 +110,7 @@ class LoadQuantities:
         about = change.T @ left[:, loads:]
         # What the arm's motion does not show has a variance without bound, not zero.
         scale = 1.0 / np.sqrt(np.where(np.diag(about) > 0.0, np.diag(about), 1.0))
-        unit = about * scale[:, None] * scale + _UNDETERMINED * np.eye(loads)
+        unit = about * scale[:, None] * scale + _MIN_INFORMATION * np.eye(loads)
         covariance = np.linalg.inv(unit)
         moved = (self.directions * scale) @ covariance * scale
         slope = moved @ left[:, :loads].T @ self.root.T
@@ -120,4 +121,4 @@ def _norm(ratios: Array) -> float:
     largest = float(ratios.max())
     if not np.isfinite(largest) or largest <= 0.0:
         return np.inf
-    return float(largest * np.sum((ratios / largest) ** _NORM) ** (1.0 / _NORM))
+    return float(largest * np.sum((ratios / largest) ** _NORM_POWER) ** (1.0 / _NORM_POWER))

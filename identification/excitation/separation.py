@@ -17,7 +17,7 @@ from identification.arrays import Array, Indices
 from identification.excitation.collision_bodies import CollisionBody
 from identification.model.kinematics import Chain, skew
 
-_CROSSING = 1e-9  # axes closer than this [m] intersect
+_CROSSING_DISTANCE = 1e-9  # axes closer than this [m] intersect
 
 
 class Frames(NamedTuple):
@@ -158,7 +158,7 @@ class Separation:
             between, axis_a, self._half_length[a], axis_b, self._half_length[b]
         )
         length = _norm(shortest)
-        crossing = length < _CROSSING
+        crossing = length < _CROSSING_DISTANCE
         normal = shortest / np.where(crossing, 1.0, length)
         normal[:, crossing] = np.array([[0.0], [0.0], [1.0]])
         bound = _dot(normal, between)

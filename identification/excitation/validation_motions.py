@@ -25,10 +25,10 @@ from planner import (
 
 _DRAWS_PER_POINT: Final = 50  # of one via point before the path is rejected
 _TRIES_PER_MOTION: Final = 100
-_VALIDATION: Final = 2  # first seed of a random stream that no search uses
-_SPEED: Final = (0.5, 1.0)  # range of the speeds, fraction of the velocity limits
+_VALIDATION_STREAM: Final = 2  # first seed of a random stream that no search uses
+_SPEED_SHARES: Final = (0.5, 1.0)  # range of the speeds, fraction of the velocity limits
 _RANGE_SHARE: Final = 0.98  # central fraction of each joint's range that via points lie in
-_LONGEST: Final = 60.0  # s
+_MAX_DURATION: Final = 60.0  # s
 
 
 def random_validation_motions(
@@ -70,7 +70,7 @@ def random_validation_motions(
     motions = []
     for k in range(count):
         for attempt in range(_TRIES_PER_MOTION):
-            motion = attempts.motion(np.random.default_rng([_VALIDATION, seed, k, attempt]))
+            motion = attempts.motion(np.random.default_rng([_VALIDATION_STREAM, seed, k, attempt]))
             if isinstance(motion, ViaPointMotion):
                 motions.append(motion)
                 break
@@ -120,7 +120,7 @@ class _Attempts:
 
     def motion(self, random: np.random.Generator) -> ViaPointMotion | Sequence[Violation]:
         """Return a feasible motion, or the violations of an infeasible one."""
-        speed = random.uniform(*_SPEED, self._limits.n_joints)
+        speed = random.uniform(*_SPEED_SHARES, self._limits.n_joints)
         points = [self._home]
         while len(points) <= self._n_via:
             point = self._next_point(random, points[-1], last=len(points) == self._n_via)
@@ -133,8 +133,8 @@ class _Attempts:
             trajectory = plan_in_child(via_points, self._limits, speed=speed, fly=self._fly)
         except (PlannerCrashed, PlanningError, PlanningTimedOut) as error:
             return [Violation("planning", f"the motion ({error})", 1.0, 0.0, None)]
-        if trajectory.duration > _LONGEST:
-            return [Violation("duration", "the motion", trajectory.duration, _LONGEST, None)]
+        if trajectory.duration > _MAX_DURATION:
+            return [Violation("duration", "the motion", trajectory.duration, _MAX_DURATION, None)]
         violations = check_motion(
             trajectory, self._limits, checker=self._checker, currents=self._currents
         )

@@ -12,15 +12,15 @@ from identification.model.friction import COULOMB, LOAD
 from identification.model.robot import RobotModel
 from identification.signals.samples import Samples
 
-SPEEDS: Final = 120
+CURVE_SPEEDS: Final = 120
 """Points of a curve in each direction."""
 
 
 class FrictionCurve(NamedTuple):
     """Friction of one joint, with offset, without presliding and coupled motors."""
 
-    speed: Array  # (2 SPEEDS,) [rad/s or m/s], densest around zero
-    torque: Array  # at these speeds (2 SPEEDS,) [N·m or N]
+    speed: Array  # (2 CURVE_SPEEDS,) [rad/s or m/s], densest around zero
+    torque: Array  # at these speeds (2 CURVE_SPEEDS,) [N·m or N]
 
 
 def friction_curve(
@@ -38,7 +38,7 @@ def friction_curve(
     """
     law = model.friction.laws[joint]
     table = model.friction.table(values[model.friction_part])
-    steps = np.linspace(0.0, 1.0, SPEEDS) ** 2
+    steps = np.linspace(0.0, 1.0, CURVE_SPEEDS) ** 2
     steps[0] = 1e-6 * steps[1]  # both sides of the jump at zero
     speed = np.concatenate([low * steps[::-1], high * steps])
     columns = law.columns(speed, law.sign(speed), np.full_like(speed, load))

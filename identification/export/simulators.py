@@ -36,23 +36,23 @@ from identification.model.regressor import RegressorPlan
 
 Node = ElementTree.Element
 
-STATES: Final = 1000
+RANDOM_STATES: Final = 1000
 """Number of random states at which a text is compared with the model."""
-AGREES: Final = 1e-6
+AGREEMENT_TOLERANCE: Final = 1e-6
 """Largest difference of a text that is read back, relative to the largest torque of a joint."""
 _SEED: Final = 20140903
 # Default ranges of random states: rad or m, rad/s or m/s, rad/s² or m/s².
-_ANYWHERE = math.pi
-_SPEED = 2.0
-_ACCELERATION = 10.0
-_DRY: Final = (COULOMB, TANH)
-_DRY_LABELS: Final = tuple(term.label for term in _DRY)
-_OF_SPEED: Final = (QUADRATIC, CUBIC)
+_DEFAULT_POSITION_LIMIT = math.pi
+_DEFAULT_SPEED_LIMIT = 2.0
+_ACCELERATION_LIMIT = 10.0
+_DRY_FRICTION_TERMS: Final = (COULOMB, TANH)
+_DRY_LABELS: Final = tuple(term.label for term in _DRY_FRICTION_TERMS)
+_SPEED_POWER_TERMS: Final = (QUADRATIC, CUBIC)
 _TIMESTEP: Final = 1e-3  # s
 _FRICTION_STEPS: Final = 2.0  # time constant of MuJoCo's dry friction, at least 2 steps
-_STILL: Final = 0.9999  # impedance of MuJoCo's dry friction at which a joint rests
-_THICKNESS: Final = 0.03  # m, radius of the capsules that show the arm
-_SHORTEST: Final = 1e-3  # m, length of a capsule
+_REST_IMPEDANCE: Final = 0.9999  # impedance of MuJoCo's dry friction at which a joint rests
+_CAPSULE_RADIUS: Final = 0.03  # m, radius of the capsules that show the arm
+_MIN_CAPSULE_LENGTH: Final = 1e-3  # m, length of a capsule
 
 
 class MissingMujocoError(IdentificationError):
@@ -91,10 +91,12 @@ def mjcf(
         parent = places[int(model.chain.parents[j])]
         rotation = model.chain.rotation[j]
         translation = model.chain.translation[j]
-        if np.linalg.norm(translation) > _SHORTEST:  # shows the arm, without mass and contact
+        if (
+            np.linalg.norm(translation) > _MIN_CAPSULE_LENGTH
+        ):  # shows the arm, without mass and contact
             line = as_text([0.0, 0.0, 0.0, *translation])
-            _add(parent, "geom", type="capsule", fromto=line, size=as_text(_THICKNESS), mass="0",
-                 contype="0", conaffinity="0")  # fmt: skip
+            _add(parent, "geom", type="capsule", fromto=line, size=as_text(_CAPSULE_RADIUS),
+                 mass="0", contype="0", conaffinity="0")  # fmt: skip
         link = places[j] = _add(parent, "body", name=arm.link(j), **_pose(rotation, translation))
         six = mass.inertia[[0, 1, 2, 0, 0, 1], [0, 1, 2, 1, 2, 2]]
         _add(link, "inertial", pos=as_text(mass.centre), mass=as_text(mass.mass),
@@ -127,7 +129,7 @@ def _joint(
     damping = [  # of v, v |v| and v³
         friction.get("f1", 0.0),
         # A negative one would accelerate a joint that is faster than the recorded motion.
-        *(max(0.0, friction["f2"]) if third == kind else 0.0 for kind in _OF_SPEED),
+        *(max(0.0, friction["f2"]) if third == kind else 0.0 for kind in _SPEED_POWER_TERMS),
     ]
     lower, upper, most = (bound[joint] for bound in (ranges.lower, ranges.upper, ranges.effort))
     limited = math.isfinite(lower) and math.isfinite(upper) and lower < upper
@@ -164,7 +166,10 @@ def still_friction(step: float) -> dict[str, str]:
 
     With the default impedance (0.9 to 0.95) a held joint creeps by milliradians a second.
     """
-    return {**_dry_friction(step), "solimpfriction": as_text([_STILL, _STILL, 0.001, 0.5, 2.0])}
+    return {
+        **_dry_friction(step),
+        "solimpfriction": as_text([_REST_IMPEDANCE, _REST_IMPEDANCE, 0.001, 0.5, 2.0]),
+    }
 
 
 def position_attributes(servos: Actuators, joint: int, step: float) -> dict[str, str]:
@@ -233,8 +238,8 @@ class ModelFormat(NamedTuple):
 class SimulatorComparison(NamedTuple):
     """Comparison of a text with the model."""
 
-    # largest torque difference of the supported parts at `STATES` random states, relative to the
-    # largest torque of the joint
+    # largest torque difference of the supported parts at `RANDOM_STATES` random states, relative to
+    # the largest torque of the joint
     difference: float
     torque: Array  # root mean square of the whole torque over the motion (n,) [N·m or N]
     left_out: Mapping[str, Array]  # that of each unsupported part (n,), by description
@@ -266,7 +271,7 @@ def compare(text: str, form: ModelFormat, arm: ExportedArm, motion: Motion) -> S
     )
 
 
-def read_back(text: str, form: ModelFormat, arm: ExportedArm, count: int = STATES) -> float:
+def read_back(text: str, form: ModelFormat, arm: ExportedArm, count: int = RANDOM_STATES) -> float:
     """Return the largest difference of a text's torque from the arm's, see :class:`Comparison`.
 
     Args:
@@ -285,7 +290,7 @@ def read_back(text: str, form: ModelFormat, arm: ExportedArm, count: int = STATE
     error = np.abs(form.read(text, arm, states) - expected).max(axis=0)
     largest = np.abs(expected).max(axis=0)
     difference = float((error / np.where(largest > 0.0, largest, 1.0)).max())
-    if not difference <= AGREES:
+    if not difference <= AGREEMENT_TOLERANCE:
         joint = arm.model.joint_names[int(np.argmax(error))]
         raise WriteBackError(
             f"read back, the torque of joint {joint!r} differs by {difference:.2g} of its"
@@ -294,23 +299,23 @@ def read_back(text: str, form: ModelFormat, arm: ExportedArm, count: int = STATE
     return difference
 
 
-MISSING: Final = (MissingMujocoError, MissingDrakeError)
+MISSING_SIMULATOR_ERRORS: Final = (MissingMujocoError, MissingDrakeError)
 """Errors of formats whose reader is not installed."""
 
 
-def random_states(arm: ExportedArm, count: int = STATES) -> Motion:
+def random_states(arm: ExportedArm, count: int = RANDOM_STATES) -> Motion:
     """Return random states within the limits of an arm."""
     ranges = arm.ranges
     n = arm.model.n_joints
     random = np.random.default_rng(_SEED)
-    lower = np.maximum(ranges.lower, -_ANYWHERE)
-    upper = np.minimum(ranges.upper, _ANYWHERE)
-    speed = np.where(np.isfinite(ranges.velocity), ranges.velocity, _SPEED)
+    lower = np.maximum(ranges.lower, -_DEFAULT_POSITION_LIMIT)
+    upper = np.minimum(ranges.upper, _DEFAULT_POSITION_LIMIT)
+    speed = np.where(np.isfinite(ranges.velocity), ranges.velocity, _DEFAULT_SPEED_LIMIT)
     return Motion(
         np.arange(count, dtype=np.float64),
         random.uniform(lower, np.maximum(lower, upper), (count, n)),
         random.uniform(-speed, speed, (count, n)),
-        random.uniform(-_ACCELERATION, _ACCELERATION, (count, n)),
+        random.uniform(-_ACCELERATION_LIMIT, _ACCELERATION_LIMIT, (count, n)),
     )
 
 
@@ -318,7 +323,7 @@ _BEYOND: Final = "where it differs from its value at the typical load, which is 
 _ACCELERATES: Final = "where its coefficient is negative and would accelerate a joint"
 _REVERSALS: Final = "dry friction between the two directions (velocity reversals, standstill)"
 _ROUNDED: Final = "effect of rounded angles of the URDF on the base parameters"
-_MOST_ROUNDED: Final = 200  # rows that show whether there is one
+_MAX_COMPARED_ROWS: Final = 200  # rows that show whether there is one
 
 
 Part = tuple[str, Callable[[], Array], bool]
@@ -334,7 +339,7 @@ def _parts(form: ModelFormat, arm: ExportedArm, motion: Motion) -> Iterator[Part
     yield "the links", lambda: rigid_torque(arm, motion), True
     brakes = _brakes(arm)
     for kind in model.friction.kinds:
-        if kind not in _DRY or kind not in form.friction:
+        if kind not in _DRY_FRICTION_TERMS or kind not in form.friction:
             description = f"{kind.description}, {_BEYOND}" if kind.of_load else kind.description
             chosen = np.array([t.term.label == kind.label and not t.motor for t in terms], np.bool_)
             written = kind in form.friction
@@ -368,7 +373,7 @@ def _brakes(arm: ExportedArm) -> NDArray[np.bool_]:
     terms = arm.model.friction.terms
     values = arm.values[arm.model.friction_part]
     of_speed = np.array(
-        [friction_term.term in _OF_SPEED for friction_term in terms], dtype=np.bool_
+        [friction_term.term in _SPEED_POWER_TERMS for friction_term in terms], dtype=np.bool_
     )
     return np.asarray(~(of_speed & (values < 0.0)))
 
@@ -400,9 +405,9 @@ def _left_out(form: ModelFormat, arm: ExportedArm, motion: Motion) -> dict[str, 
     for name, torque, supported in _parts(form, arm, motion):
         if not supported:
             omitted[name] = omitted.get(name, 0.0) + torque()
-    some = motion.rows(slice(None, None, -(-motion.n_samples // _MOST_ROUNDED)))
+    some = motion.rows(slice(None, None, -(-motion.n_samples // _MAX_COMPARED_ROWS)))
     rounded, whole = _rounding(arm, some)
-    if np.abs(rounded).max() > AGREES * np.abs(whole).max():
+    if np.abs(rounded).max() > AGREEMENT_TOLERANCE * np.abs(whole).max():
         omitted[_ROUNDED] = _rounding(arm, motion)[0]
     return omitted
 

@@ -21,7 +21,7 @@ from identification.errors import IdentificationError
 from identification.export.friction_curve import equivalent_coulomb, load_remarks
 from identification.model.friction import TERMS
 from identification.model.kinematics import (
-    FROM_PINOCCHIO,
+    PINOCCHIO_ORDER,
     chain_from_urdf,
     locked_posture,
     pinocchio_model,
@@ -41,9 +41,9 @@ TENSOR: Final = {
     "izz": (2, 2),
 }
 _DYNAMICS: Final = {kind.symbol: kind.urdf for kind in reversed(TERMS) if kind.urdf}
-_STATES: Final = 50
+_RANDOM_STATES: Final = 50
 _SEED: Final = 20140902
-_ROUNDING: Final = 1e-8  # relative to the largest torque of a joint
+_TORQUE_ROUNDING: Final = 1e-8  # relative to the largest torque of a joint
 _PROLOG: Final = re.compile(r"(?:\s+|<!--.*?-->|<\?.*?\?>|<!DOCTYPE[^>\[]*(?:\[.*?\])?\s*>)*", re.S)
 
 
@@ -167,7 +167,7 @@ def _without_locked(urdf: str, model: RobotModel, inertial: Array) -> tuple[Arra
             parent = arm.parents[parent]
         moved = (data.oMi[parent].inverse() * data.oMi[joint]).act(arm.inertias[joint])
         index = model.joint_names.index(arm.names[parent]) if parent > 0 else -1
-        parameters = moved.toDynamicParameters()[list(FROM_PINOCCHIO)]
+        parameters = moved.toDynamicParameters()[list(PINOCCHIO_ORDER)]
         carried.setdefault(index, {})[name] = parameters
     remaining = inertial.copy()
     removed = list(carried.get(-1, {}))
@@ -268,7 +268,7 @@ def _require_consistent(
         if not rotor >= 0.0:
             raise NotConsistentError(f"the rotor of joint {joint!r} is negative")
     smallest, directions = np.linalg.eigh(rotors)
-    if smallest[0] < -_ROUNDING * np.abs(rotors).max(initial=0.0):
+    if smallest[0] < -_TORQUE_ROUNDING * np.abs(rotors).max(initial=0.0):
         joint = model.joint_names[int(np.argmax(np.abs(directions[:, 0])))]
         raise NotConsistentError(
             f"the coupling inertias of joint {joint!r} are too large for its rotors"
@@ -295,20 +295,22 @@ def _compare(text: str, model: RobotModel, inertial: Array) -> None:
     chain = chain_from_urdf(text, model.locked)
     if chain.joint_names != model.joint_names:
         raise WriteBackError("the description has other joints than the model")
-    states = np.random.default_rng(_SEED).uniform(-2.0, 2.0, (3, _STATES, model.n_joints))
+    states = np.random.default_rng(_SEED).uniform(-2.0, 2.0, (3, _RANDOM_STATES, model.n_joints))
     motion = Motion.of_states(*states)
     plan = RegressorPlan.of_bodies(model.chain, model.gravity)
     expected = plan.torque(inertial.reshape(-1), motion)
     arm = pinocchio_model(text, model.locked)
     arm.gravity.linear = model.gravity
     error = np.abs(rnea(arm, motion) - expected).max(axis=0)
-    allowed = _ROUNDING * max(float(np.abs(expected).max()), 1.0)
+    allowed = _TORQUE_ROUNDING * max(float(np.abs(expected).max()), 1.0)
     for joint in np.flatnonzero(~(error <= allowed)):
         raise WriteBackError(
             f"the torque of joint {model.joint_names[joint]!r} differs by {error.max():.3g} in the"
             " written description"
         )
-    if not np.allclose(chain.inertial, inertial, rtol=0.0, atol=_ROUNDING * np.abs(inertial).max()):
+    if not np.allclose(
+        chain.inertial, inertial, rtol=0.0, atol=_TORQUE_ROUNDING * np.abs(inertial).max()
+    ):
         raise WriteBackError("the written description has other inertial parameters")
     _require_consistent_links(model, chain.inertial, "by rounding in the written text")
 

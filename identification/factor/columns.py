@@ -24,7 +24,7 @@ from identification.model.regressor import RegressorPlan
 from identification.model.robot import RobotModel
 from identification.signals.samples import Samples
 
-_MOST_ROWS: Final = 500  # of one recording, in standard parameters
+_ROWS_PER_RECORDING: Final = 500  # of one recording, in standard parameters
 _PARTS: Final = ("W0", "Wx", "Wy", "Wz")
 
 
@@ -205,7 +205,7 @@ def every_torque_factor(model: RobotModel, motions: Sequence[Samples]) -> Factor
 
 
 def standard_factor(model: RobotModel, recordings: Sequence[Samples]) -> Factor:
-    """Reduce some `_MOST_ROWS` usable rows of each recording to [W0 | Wx | Wy | Wz | y].
+    """Reduce some `_ROWS_PER_RECORDING` usable rows of each recording to [W0 | Wx | Wy | Wz | y].
 
     The columns are of s standard parameters, friction, springs and balancers; the regressor is
     affine in gravity: W(g) = W0 + gx Wx + gy Wy + gz Wz, so one pass serves any.
@@ -228,7 +228,7 @@ def standard_factor(model: RobotModel, recordings: Sequence[Samples]) -> Factor:
     gram = np.zeros((n, 4 * s + 1, 4 * s + 1))
     rows = np.zeros(n, dtype=np.intp)
     for samples in recordings:
-        every = max(1, len(samples.torque) // _MOST_ROWS)
+        every = max(1, len(samples.torque) // _ROWS_PER_RECORDING)
         filtered = samples.torque_bandwidth is not None
         part = slice(None, None, 1 if filtered else every)  # filters need all rows
         motion = model.with_gear_load(replace(samples.motion.rows(part), direction=None))

@@ -15,7 +15,7 @@ from identification.factor.normal_equations import Solution
 from identification.model.robot import RobotModel
 
 Known = Literal["yes", "roughly", "no"]
-KNOWN: Final = (0.1, 0.5)
+KNOWN_STD_SHARES: Final = (0.1, 0.5)
 """Standard deviations, as shares of the estimate, up to which a parameter is known, or roughly."""
 
 
@@ -80,8 +80,8 @@ class Estimate:
 
     @property
     def known(self) -> tuple[Known, ...]:
-        """How well each parameter is known (p,), by :data:`KNOWN`."""
-        well, roughly = (self.std <= share * np.abs(self.values) for share in KNOWN)
+        """How well each parameter is known (p,), by :data:`KNOWN_STD_SHARES`."""
+        well, roughly = (self.std <= share * np.abs(self.values) for share in KNOWN_STD_SHARES)
         return tuple(
             "no" if name in self.undetermined or not rough else "yes" if good else "roughly"
             for name, good, rough in zip(self.names, well, roughly, strict=True)

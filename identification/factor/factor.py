@@ -42,11 +42,11 @@ from identification.signals.samples import Samples
 
 Storage = Literal["gram", "qr"]
 
-_COARSEST: Final = 4  # fine blocks in a block of a long recording
+_MAX_FINE_BLOCKS: Final = 4  # fine blocks in a block of a long recording
 _MANY_BLOCKS: Final = 400  # from which on they are longer: a covariance needs some tens
 
-QR_CONDITION: Final = 1e5
-SMALLEST_NOISE: Final = 1e-6
+MAX_GRAM_CONDITION: Final = 1e5
+MIN_NOISE: Final = 1e-6
 """Smallest noise that Gram matrices resolve, as a share of the torque's RMS."""
 
 
@@ -200,7 +200,7 @@ class Factor:
     @property
     def smallest_noise(self) -> float:
         """Smallest noise as a share of the torque's RMS, for joints that fit exactly."""
-        return 1e-12 if self.storage == "qr" else SMALLEST_NOISE
+        return 1e-12 if self.storage == "qr" else MIN_NOISE
 
     @property
     def smallest_variance(self) -> Array:
@@ -428,7 +428,7 @@ def time_blocks(samples: Samples) -> tuple[Indices, float]:
     """Return the block of each sample (m,), and its duration [s]: longer ones if many."""
     index = fine_blocks(samples)
     length = 1
-    while length < _COARSEST and index.max(initial=0) >= length * _MANY_BLOCKS:
+    while length < _MAX_FINE_BLOCKS and index.max(initial=0) >= length * _MANY_BLOCKS:
         length *= 2
     return index // length, length * FINE_BLOCK
 
@@ -490,7 +490,7 @@ def no_rows_message(model: RobotModel) -> str:
 
 
 def reduced(model: RobotModel, recordings: Sequence[Samples], gram: Factor) -> Factor:
-    """Return Gram matrices of recordings, or triangles if the condition exceeds `QR_CONDITION`.
+    """Return Gram matrices of recordings, or triangles above a condition `MAX_GRAM_CONDITION`.
 
     Triangles read the samples once more; without recordings the Gram matrices are returned.
 
@@ -498,7 +498,7 @@ def reduced(model: RobotModel, recordings: Sequence[Samples], gram: Factor) -> F
         IdentificationError: no usable row.
     """
     require_rows(model, gram)
-    if not recordings or gram.solve(np.ones(model.n_joints)).condition <= QR_CONDITION:
+    if not recordings or gram.solve(np.ones(model.n_joints)).condition <= MAX_GRAM_CONDITION:
         return gram
     triangles = (Factor.of(model, samples, "qr") for samples in recordings)
     return sum(triangles, Factor.zero(model, storage="qr"))

@@ -12,15 +12,15 @@ from identification.arrays import Array, Indices
 
 # Condition 1e6 leaves four digits of a Gram matrix, enough for torque measurements; rank deficiency
 # shows as 1e8 and more.
-WORST_CONDITION: Final = 1e6
+MAX_CONDITION: Final = 1e6
 
 # Condition 1e10 leaves six digits of rows; structural dependence shows as 1e14 and more.
-WORST_ROW_CONDITION: Final = 1e10
+MAX_ROW_CONDITION: Final = 1e10
 
-PARTICIPATION: Final = 1e-3
+MAX_UNDETERMINED_SHARE: Final = 1e-3
 """Share in undetermined directions up to which a parameter is determined."""
 
-_NO_COLUMN: Final = 1e-10  # length of a column that is rounding, over that of the longest
+_MIN_COLUMN_RATIO: Final = 1e-10  # length of a column that is rounding, over that of the longest
 
 
 class NormalEquations(NamedTuple):
@@ -64,11 +64,11 @@ def _determined_part(length: Array, size: Array, vectors: Array, worst: float) -
         values=np.zeros(len(length)),
         root=vectors[:, significant] / size[significant] / or_one(length)[:, None],
         condition=float(size.max() / smallest) if smallest > 0.0 else np.inf,
-        determined=np.asarray((length > 0.0) & (lost < PARTICIPATION)),
+        determined=np.asarray((length > 0.0) & (lost < MAX_UNDETERMINED_SHARE)),
     )
 
 
-def solve(equations: NormalEquations, worst: float = WORST_CONDITION) -> Solution:
+def solve(equations: NormalEquations, worst: float = MAX_CONDITION) -> Solution:
     """Solve ``A x = b`` with unit columns; parameters of a condition above `worst` are open."""
     length = np.sqrt(np.diag(equations.A))
     scale = or_one(length)
@@ -84,7 +84,7 @@ def solve_with_ridge(gram: Array, cross: Array, ridge: float) -> Array:
     zero.
     """
     length = np.sqrt(np.maximum(np.diag(gram), 0.0))
-    present = length > _NO_COLUMN * length.max(initial=0.0)
+    present = length > _MIN_COLUMN_RATIO * length.max(initial=0.0)
     scale = np.where(present, length, 1.0)
     normal = gram / np.outer(scale, scale)
     np.fill_diagonal(normal, np.where(present, 1.0 + ridge, 1.0))
@@ -102,7 +102,7 @@ def solve_positive(matrix: Array, right: Array) -> Array:
     return np.asarray(np.linalg.solve(matrix, right) if failed else solution)
 
 
-def solve_rows(rows: Array, target: Array, worst: float = WORST_ROW_CONDITION) -> Solution:
+def solve_rows(rows: Array, target: Array, worst: float = MAX_ROW_CONDITION) -> Solution:
     """Solve ``rows @ x = target`` (k, p), (k,) without squaring the condition.
 
     By a singular value decomposition (Golub and Van Loan 2013, section 5.3); `worst` as for
@@ -122,7 +122,7 @@ def rows_of(equations: NormalEquations) -> tuple[Array, Array]:
     length = np.sqrt(np.maximum(np.diag(equations.A), 0.0))
     scale = or_one(length)
     eigenvalues, vectors = np.linalg.eigh(equations.A / np.outer(scale, scale))
-    significant = eigenvalues > max(eigenvalues[-1], 0.0) / WORST_CONDITION**2
+    significant = eigenvalues > max(eigenvalues[-1], 0.0) / MAX_CONDITION**2
     singular = np.sqrt(eigenvalues[significant])
     basis = vectors[:, significant].T
     # Exactly zero for columns without data.

@@ -9,7 +9,7 @@ import numpy as np
 
 from identification.arrays import Array
 from identification.model.motion import joint_arrays
-from identification.model.regressor import CHUNK
+from identification.model.regressor import SAMPLES_PER_CHUNK
 from identification.model.robot import RobotModel
 from identification.signals.samples import Samples
 
@@ -53,6 +53,6 @@ def _filtered(model: RobotModel, samples: Samples) -> Iterator[tuple[slice, list
         np.concatenate([block.T, torque[None]])
         for block, torque in zip(blocks, samples.torque.T, strict=True)
     ]
-    for start in range(0, len(samples.torque), CHUNK):
-        part = slice(start, min(start + CHUNK, len(samples.torque)))
+    for start in range(0, len(samples.torque), SAMPLES_PER_CHUNK):
+        part = slice(start, min(start + SAMPLES_PER_CHUNK, len(samples.torque)))
         yield part, [table[:, part] for table in tables]

@@ -17,11 +17,11 @@ from identification.model.link_wrenches import LINK_SYMBOLS
 from identification.model.robot import RobotModel
 from identification.signals.samples import Samples
 
-LOAD: Final = 0.8
+MIN_LOAD_EXPLAINED: Final = 0.8
 """Share of the additional error on unseen motion that a body on the last link explains. A real
 body: at least 0.99; other faults: at most 0.7."""
-_FEWEST_ROWS: Final = 50  # of a joint whose usual error is known
-_GROWN: Final = 4.0  # power ratio beyond which a joint's error exceeds that of the fit
+_MIN_ROWS: Final = 50  # of a joint whose usual error is known
+_MIN_POWER_RATIO: Final = 4.0  # power ratio beyond which a joint's error exceeds that of the fit
 
 
 class CarriedLoad(NamedTuple):
@@ -55,7 +55,7 @@ def find_load(
     floor = 1e-12 * unseen.gram[:, -1, -1] + 1e-300
     usual = seen.squared_errors(values) * predicted.samples / np.maximum(fitted.samples, 1.0)
     # What the fitted motion did not move has no usual error.
-    fits = fitted.samples >= _FEWEST_ROWS
+    fits = fitted.samples >= _MIN_ROWS
     weights = np.where(fits, predicted.samples / np.maximum(usual, floor), 0.0)
     before = unseen.squared_errors(values)
     last = model.layout.links[-1]
@@ -70,9 +70,9 @@ def find_load(
     load = CarriedLoad(
         mass=float(body[LINK_SYMBOLS.index("m")]),
         explained=float(weights @ (before - after) / beyond) if beyond > 0.0 else 0.0,
-        axes=int(np.count_nonzero(fits & (before > _GROWN * np.maximum(usual, floor)))),
+        axes=int(np.count_nonzero(fits & (before > _MIN_POWER_RATIO * np.maximum(usual, floor)))),
     )
-    if load.explained <= LOAD:
+    if load.explained <= MIN_LOAD_EXPLAINED:
         return load
     try:
         runs = [

@@ -43,13 +43,13 @@ Meaning = Literal[
 ]
 DEGREE: Final = np.pi / 180.0
 SIGNS: Final[tuple[Meaning, ...]] = ("torque sign", "position sign", "axis sign")
-IN_ORDER: Final[tuple[Meaning, ...]] = ("torque order", "position order", "joint order")
+ORDERS: Final[tuple[Meaning, ...]] = ("torque order", "position order", "joint order")
 SIZED: Final[tuple[Meaning, ...]] = ("zero", "scale")
 UNITS: Final[tuple[Meaning, ...]] = ("degrees", "radians")
 GRAVITIES: Final[tuple[Meaning, ...]] = ("mounting", "no gravity")
 COUPLED: Final[tuple[Meaning, ...]] = ("angle sum", "angle difference")
 """The recorded angle of the first joint contains that of the second, added or taken off."""
-DISCRETE: Final[tuple[Meaning, ...]] = (*SIGNS, *IN_ORDER, *COUPLED)
+DISCRETE_MEANINGS: Final[tuple[Meaning, ...]] = (*SIGNS, *ORDERS, *COUPLED)
 """Changes without a size."""
 # An angle contains that of one of these joints before it: parallel axes are neighbours, or have one
 # across them in between.
@@ -82,7 +82,7 @@ class Change(NamedTuple):
     @property
     def is_discrete(self) -> bool:
         """Whether it has no size, as a sign or an order."""
-        return self.meaning in DISCRETE
+        return self.meaning in DISCRETE_MEANINGS
 
     @property
     def places(self) -> tuple[int, ...]:
@@ -178,7 +178,7 @@ def kind_of(change: Change) -> tuple[Meaning, tuple[int, ...]]:
 
 def alternatives_to(change: Change) -> Iterator[Change]:
     """Yield the changes that may have the same effect as one that was found."""
-    for kinds in (SIGNS[:2], IN_ORDER):
+    for kinds in (SIGNS[:2], ORDERS):
         if change.meaning in kinds:
             yield from (change._replace(meaning=kind) for kind in kinds if kind != change.meaning)
 

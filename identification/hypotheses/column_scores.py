@@ -14,21 +14,22 @@ from identification.hypotheses.changes import Change
 from identification.hypotheses.columns import FOLDS, ColumnSums, folded
 from identification.model.link_wrenches import LINK_SYMBOLS
 
-_SIGMAS: Final = 3.0  # standard errors over the blocks of a significant correction
+_SIGNIFICANT_SIGMAS: Final = 3.0  # standard errors over the blocks of a significant correction
 # Ratio of the fit's error on the affected joints, with the correction over that without: 0.55 is
 # 70 % of the squared error. True faults of simulated and real arms, without noise known: at most
 # 0.5, a payload in half of a recording 0.66; false ones: at least 0.9.
-_EXPLAINS: Final = 0.55
-_STANDS_OUT: Final = 0.7  # the same, if the joint then is as good as the others
-_SAME_PART: Final = 0.85  # the same, if separate parameters for the part do no better
-_NEAR_NOISE: Final = 2.0  # noise floors; those of coloured noise are underestimated by a third
-_NO_TORQUE: Final = 1e-20  # squared torque of an axis that counts, as a share of the largest
-_NEAR_SEPARATE: Final = 1.1  # error ratio to separate parameters
-_FEWEST_ROWS: Final = 10
-FEWEST_BLOCKS: Final = 2
+_EXPLAINED_ERROR_RATIO: Final = 0.55
+_LONE_JOINT_ERROR_RATIO: Final = 0.7  # the same, if the joint then is as good as the others
+_SAME_PART_ERROR_RATIO: Final = 0.85  # the same, if separate parameters for the part do no better
+# noise floors; those of coloured noise are underestimated by a third
+_NEAR_NOISE_FLOORS: Final = 2.0
+_MIN_POWER_SHARE: Final = 1e-20  # squared torque of an axis that counts, as a share of the largest
+_SEPARATE_ERROR_RATIO: Final = 1.1  # error ratio to separate parameters
+_MIN_ROWS: Final = 10
+MIN_BLOCKS: Final = 2
 # Ridge as a share of each column's information, for columns that the motion hardly determines.
 _RIDGE: Final = 1e-6
-MASS: Final = LINK_SYMBOLS.index("m")
+MASS_INDEX: Final = LINK_SYMBOLS.index("m")
 
 
 class ScorePrior(NamedTuple):
@@ -61,7 +62,7 @@ class ColumnScore(NamedTuple):
 
     def shares(self, squares: Array) -> Array:
         """Return squared errors (n,) as shares of the squared torque, zero without torque."""
-        loaded = self.torque > _NO_TORQUE * self.torque.max(initial=0.0)
+        loaded = self.torque > _MIN_POWER_SHARE * self.torque.max(initial=0.0)
         return np.where(loaded, squares / np.where(loaded, self.torque, 1.0), 0.0)
 
     def explains(
@@ -83,24 +84,24 @@ class ColumnScore(NamedTuple):
         if not affected.size:
             return False
         floor = usual.shares(noise)
-        if np.all(after[affected] <= _NEAR_NOISE**2 * floor[affected]):
+        if np.all(after[affected] <= _NEAR_NOISE_FLOORS**2 * floor[affected]):
             return True
         ratio = _geometric_mean(np.sqrt(after[affected] / before[affected]))
-        if ratio <= _EXPLAINS:
+        if ratio <= _EXPLAINED_ERROR_RATIO:
             return True
         others = np.setdiff1d(every, affected)
-        if others.size and ratio <= _STANDS_OUT:
+        if others.size and ratio <= _LONE_JOINT_ERROR_RATIO:
             level = float(np.median(after[others]))
             if np.all(after[affected] <= level) and np.all(before[affected] > level):
                 return True
-        if separate is None or ratio > _SAME_PART:
+        if separate is None or ratio > _SAME_PART_ERROR_RATIO:
             return False
         least = separate.squares.sum(axis=0)[affected]
         mine = self.squares.sum(axis=0)[affected]
         positive = (least > 0.0) & (mine > 0.0)
         return bool(positive.any()) and _geometric_mean(
             np.sqrt(mine[positive] / least[positive])
-        ) <= (_NEAR_SEPARATE)
+        ) <= (_SEPARATE_ERROR_RATIO)
 
     def fit_ratio_to(self, other: ColumnScore) -> float:
         """Return the ratio of the errors of the fits, geometric mean over the joints."""
@@ -121,10 +122,10 @@ class ColumnScore(NamedTuple):
         change[tested] = 0.5 * np.log(self.squares[tested] / other.squares[tested])
         some = tested.any(axis=1)
         blocks = change[some].sum(axis=1) / np.count_nonzero(tested[some], axis=1)
-        if len(blocks) < FEWEST_BLOCKS:
+        if len(blocks) < MIN_BLOCKS:
             return ratio, np.inf
         error = np.std(blocks, ddof=1) / np.sqrt(len(blocks))
-        return ratio, float(np.exp(blocks.mean() + _SIGMAS * error))
+        return ratio, float(np.exp(blocks.mean() + _SIGNIFICANT_SIGMAS * error))
 
 
 def _geometric_mean(ratios: Array) -> float:
@@ -170,7 +171,7 @@ def column_score(
         values = solved(of_folds[k])
         coefficients.append(values)
         squares[fold_blocks] = _Sums(*(part[fold_blocks] for part in sums)).squares(values)
-    squares = np.where(tables.rows >= _FEWEST_ROWS, np.maximum(squares, floor / blocks), 0.0)
+    squares = np.where(tables.rows >= _MIN_ROWS, np.maximum(squares, floor / blocks), 0.0)
     fitted = np.maximum(whole.squares(solved(total)), floor)
     fold_values = np.array(coefficients)
     return ColumnScore(squares, fitted, torque, fold_values[:, :p], fold_values[:, p:])
@@ -222,7 +223,7 @@ def rough_size(
     """
     if change.meaning not in ("delay", "drift", "payload", "load friction"):
         return None, 0.0
-    sizes = score.added[:, MASS if change.meaning == "payload" else 0]
+    sizes = score.added[:, MASS_INDEX if change.meaning == "payload" else 0]
     if change.meaning == "load friction":
         loaded = np.median(score.added[:, : tables.gram.shape[1]], axis=1)
         return float(loaded.mean()), float(np.sqrt((FOLDS - 1) * loaded.var()))

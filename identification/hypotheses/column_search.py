@@ -19,8 +19,8 @@ import numpy as np
 from identification.arrays import Array
 from identification.hypotheses.changes import Change, Meaning, Part
 from identification.hypotheses.column_scores import (
-    FEWEST_BLOCKS,
-    MASS,
+    MASS_INDEX,
+    MIN_BLOCKS,
     ColumnScore,
     ScorePrior,
     column_score,
@@ -29,16 +29,17 @@ from identification.hypotheses.column_scores import (
 from identification.hypotheses.columns import BLOCKS, ColumnSums, columns_of
 from identification.hypotheses.sizes import estimated_size
 from identification.model.robot import RobotModel
-from identification.signals.recording import STUCK_MOVEMENT
+from identification.signals.recording import MIN_MOVEMENT
 from identification.signals.samples import Samples
 
 UNSEEN: Final = "unseen motion"
 """What a model is tested on if it is another motion than the fitted one."""
-_LEAST_GAIN: Final = 0.1  # relative reduction of the error by a significant change
-_ALIKE: Final = 1.05  # error ratio up to which a change with fewer coefficients is preferred
-_CHANGED: Final = 2.0  # standard deviations of a payload that is one
-_MOST: Final = 4  # changes
-_DIVIDED: Final = 4  # parts of a block whose scatter gives the interval of a size
+_MIN_ERROR_REDUCTION: Final = 0.1  # relative reduction of the error by a significant change
+# error ratio up to which a change with fewer coefficients is preferred
+_ALIKE_ERROR_RATIO: Final = 1.05
+_MIN_PAYLOAD_SIGMAS: Final = 2.0  # standard deviations of a payload that is one
+_MAX_CHANGES: Final = 4  # changes
+_PARTS_PER_BLOCK: Final = 4  # parts of a block whose scatter gives the interval of a size
 _OF_ARM: Final[tuple[Meaning, ...]] = ("payload", "arm")  # that may be of a part
 _OF_JOINT: Final[tuple[Meaning, ...]] = ("scale", "friction")
 
@@ -132,14 +133,18 @@ class _Trial(NamedTuple):
     @property
     def is_better(self) -> bool:
         """Whether it reduces the error significantly, and explains it."""
-        return self.explains and self.explanation.ratio < 1.0 - _LEAST_GAIN and self.highest < 1.0
+        return (
+            self.explains
+            and self.explanation.ratio < 1.0 - _MIN_ERROR_REDUCTION
+            and self.highest < 1.0
+        )
 
 
 def _best(trials: Sequence[_Trial]) -> _Trial | None:
     """Return the significant trial of least error, with few coefficients preferred."""
     better = [trial for trial in trials if trial.is_better]
     least = min((trial.explanation.ratio for trial in better), default=0.0)
-    alike = [trial for trial in better if trial.explanation.ratio <= _ALIKE * least]
+    alike = [trial for trial in better if trial.explanation.ratio <= _ALIKE_ERROR_RATIO * least]
     return min(alike, key=lambda trial: (trial.coefficients, trial.explanation.ratio), default=None)
 
 
@@ -169,11 +174,11 @@ class _Search:
         fit = recordings[:seen] or recordings
         travel = np.max([np.ptp(samples.motion.position, axis=0) for samples in fit], axis=0)
         usable = np.any([samples.usable.any(axis=0) for samples in fit], axis=0)
-        moved = np.flatnonzero((travel > STUCK_MOVEMENT) & usable).tolist()
+        moved = np.flatnonzero((travel > MIN_MOVEMENT) & usable).tolist()
         tables = ColumnSums.of(model, recordings, fitted.values, blocks=blocks)
         return cls(model, recordings, fitted, tables, moved, seen, blocks)
 
-    def explanations(self, most: int = _MOST) -> tuple[Explanation, ...]:
+    def explanations(self, most: int = _MAX_CHANGES) -> tuple[Explanation, ...]:
         """Return the changes found, one after the other."""
         found: list[Explanation] = []
         while len(found) < most and (trial := _best(self.trials())) is not None:
@@ -204,7 +209,7 @@ class _Search:
                     columns = np.concatenate([every, before], axis=3)
                     separate[change.part] = column_score(tables, columns, target)
                 # All that may have changed is within separate parameters.
-                if separate[change.part].fit_ratio_to(usual) > 1.0 - _LEAST_GAIN:
+                if separate[change.part].fit_ratio_to(usual) > 1.0 - _MIN_ERROR_REDUCTION:
                     continue
             added = columns_of(tables, model, values, change)
             if not added.any():
@@ -214,7 +219,11 @@ class _Search:
             size, std = rough_size(change, score, tables)
             if change.meaning == "load friction" and (size or 0.0) <= 0.0:
                 continue  # friction dissipates
-            if size is not None and change.meaning == "payload" and abs(size) < _CHANGED * std:
+            if (
+                size is not None
+                and change.meaning == "payload"
+                and abs(size) < _MIN_PAYLOAD_SIGMAS * std
+            ):
                 continue  # the interval of its mass contains zero
             ratio, highest = score.ratio_to(usual)
             found = Explanation(change, ratio, size, std)
@@ -229,7 +238,7 @@ class _Search:
         if explanation.change.meaning == "arm":
             return explanation
         tables = ColumnSums.of(
-            self.model, self.recordings, trial.values, blocks=self.blocks, divided=_DIVIDED
+            self.model, self.recordings, trial.values, blocks=self.blocks, divided=_PARTS_PER_BLOCK
         )
         found = estimated_size(
             explanation.change,
@@ -274,7 +283,7 @@ class _Search:
             columns.append(columns_of(tables, self.model, self.fitted.values, one))
         score = column_score(tables, np.concatenate(columns, axis=3), tables.torques)
         sizes = score.added.mean(axis=0).reshape(len(columns), -1)
-        sizes = np.append(0.0, sizes[:, MASS if alike.meaning == "payload" else 0])
+        sizes = np.append(0.0, sizes[:, MASS_INDEX if alike.meaning == "payload" else 0])
         order = np.argsort(sizes)
         cut = int(np.argmax(np.diff(sizes[order]))) + 1
         those = sorted(min(order[cut:], order[:cut], key=len).tolist())
@@ -286,7 +295,7 @@ class _Search:
         """Yield the blocks from each time on, in recordings that are not known to be without."""
         tables = self.tables
         blocks = len(tables.recording)
-        for first in range(FEWEST_BLOCKS, blocks - FEWEST_BLOCKS + 1):
+        for first in range(MIN_BLOCKS, blocks - MIN_BLOCKS + 1):
             k = int(tables.recording[first])
             if k < self.seen:
                 continue

@@ -34,8 +34,8 @@ from identification.hypotheses.scores import (
     score_of,
 )
 from identification.hypotheses.search import (
-    EXPLAINED,
-    SEPARATE,
+    EXPLAINED_ERROR,
+    SEPARATE_SIGMAS,
     Readings,
     Step,
     find_readings,
@@ -51,14 +51,17 @@ UNEXPLAINED: Final = 0.5
 """Error of the torque, as a share of it, above which no masses of this arm explain it."""
 ROWS: Final = 700
 """Rows of all recordings in which something other than stated is searched for."""
-_WEIGHTLESS: Final = 0.7  # error ratio of a torque without gravity that chance does not make
-_SURE: Final = 4.5  # standard errors of it
-_FEWEST_ROWS: Final = 100  # that say something of bodies
-_NO_ARM: Final = 1.0 / 3.0  # of the nominal torque, below which bodies are not those of the arm
-_NO_BODY: Final = 0.5  # torque of bodies over that of friction where there is none of bodies
+# error ratio of a torque without gravity that chance does not make
+_WEIGHTLESS_ERROR_RATIO: Final = 0.7
+_SURE_SIGMAS: Final = 4.5  # standard errors of it
+_MIN_ROWS: Final = 100  # that say something of bodies
+# of the nominal torque, below which bodies are not those of the arm
+_MIN_NOMINAL_SCALE: Final = 1.0 / 3.0
+# torque of bodies over that of friction where there is none of bodies
+_MIN_BODY_TORQUE_RATIO: Final = 0.5
 # Error of a joint, of its torque, up to which its sign and order are as stated, and noise floors.
-_SMALL_ERROR: Final = 0.02
-_LITTLE_MORE: Final = 1.05
+_SMALL_JOINT_ERROR: Final = 0.02
+_NOISE_FLOOR_FACTOR: Final = 1.05
 
 
 @dataclass(frozen=True, eq=False)
@@ -86,9 +89,9 @@ class RigidTorque:
         if not np.isfinite(self.scale):
             return False
         return bool(
-            self.error < EXPLAINED
-            and abs(self.scale) + SEPARATE * self.std < _NO_ARM
-            and self.over_friction.max(initial=0.0) < _NO_BODY
+            self.error < EXPLAINED_ERROR
+            and abs(self.scale) + SEPARATE_SIGMAS * self.std < _MIN_NOMINAL_SCALE
+            and self.over_friction.max(initial=0.0) < _MIN_BODY_TORQUE_RATIO
         )
 
 
@@ -156,7 +159,11 @@ class TorqueDiagnosis:
         if self.time is not None:
             return False
         found = self.weightless
-        return found is not None and found.ratio < _WEIGHTLESS and found.sigmas < -_SURE
+        return (
+            found is not None
+            and found.ratio < _WEIGHTLESS_ERROR_RATIO
+            and found.sigmas < -_SURE_SIGMAS
+        )
 
     @property
     def steps(self) -> tuple[Step, ...]:
@@ -232,7 +239,7 @@ def torque_of(
         return found
     if is_rate(model, recordings[0], score, ROWS):
         return replace(found, is_rate=True)
-    if score.overall > _SMALL_ERROR:
+    if score.overall > _SMALL_JOINT_ERROR:
         found = replace(found, inertia=find_inertia_scale(model, rows, score, rigid.scale))
     return found
 
@@ -269,7 +276,9 @@ def _is_predicted(score: Score, samples: Samples, noise: Array | None) -> bool:
     """Return whether the arm predicts all joints as well as no wrong sign or order lets it."""
     rows = samples.usable.sum(axis=0)
     floor = np.zeros(len(rows)) if noise is None else np.nan_to_num(noise)
-    small = np.maximum(_LITTLE_MORE * floor * np.sqrt(rows), _SMALL_ERROR * np.sqrt(score.torque))
+    small = np.maximum(
+        _NOISE_FLOOR_FACTOR * floor * np.sqrt(rows), _SMALL_JOINT_ERROR * np.sqrt(score.torque)
+    )
     is_small = np.sqrt(score.squares.sum(axis=0)) <= small
     return bool(is_small.all()) and not score.driven.any()
 
@@ -307,7 +316,7 @@ def rigid_torque(model: RobotModel, samples: Samples) -> RigidTorque:
     over = np.where((other == 0.0) & (rigid > 0.0), np.inf, over)
     power = max(float(factor.gram[:, -1, -1].sum()), np.finfo(np.float64).tiny)
     error = float(np.sqrt(factor.squared_errors(values).sum() / power))
-    is_little = samples.usable.any(axis=1).sum() < _FEWEST_ROWS or not powers[1].any()
+    is_little = samples.usable.any(axis=1).sum() < _MIN_ROWS or not powers[1].any()
     if without_masses(model) or is_little:
         return RigidTorque(np.nan, np.inf, over, error)
     return RigidTorque(*nominal_ratio(model, factor), over, error)

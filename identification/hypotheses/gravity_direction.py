@@ -13,11 +13,11 @@ from identification.factor.factor import Factor
 from identification.factor.normal_equations import solve_with_ridge
 from identification.model.robot import RobotModel
 
-_STANDARD: Final = 9.81  # m/s²
-_PASSES: Final = 2
-_MOST_TURNS: Final = 20
-_SHARES: Final = (1.0, 0.5, 0.1)  # of a Gauss-Newton step that are tried
-_SAME_FIT: Final = 0.1  # difference of twice the log likelihood that is none
+_STANDARD_GRAVITY: Final = 9.81  # m/s²
+_FRICTION_PASSES: Final = 2
+_MAX_TURNS: Final = 20
+_STEP_SHARES: Final = (1.0, 0.5, 0.1)  # of a Gauss-Newton step that are tried
+_SAME_FIT_TOLERANCE: Final = 0.1  # difference of twice the log likelihood that is none
 # Of each column's information: combinations of standard parameters of a condition above 10^4.5
 # count as undetermined.
 _RIDGE: Final = 1e-9
@@ -57,7 +57,7 @@ def find_gravity(model: RobotModel, training: Factor, held_out: Factor) -> Gravi
         errors = factor.gram[:, -1, -1]
         values = np.empty(0)
         floor = 1e-12 * errors + 1e-300
-        for _ in range(_PASSES):
+        for _ in range(_FRICTION_PASSES):
             values = standard_parameters(factor, training.samples / np.maximum(errors, floor))
             errors = factor.squared_errors(values)
         return values, np.maximum(errors, floor)
@@ -71,20 +71,20 @@ def find_gravity(model: RobotModel, training: Factor, held_out: Factor) -> Gravi
         errors = factor.squared_errors(fitted(gravity)[0])
         return np.maximum(np.maximum(errors, 1e-12 * factor.gram[:, -1, -1]), 1e-300)
 
-    size = float(np.linalg.norm(model.gravity)) or _STANDARD
+    size = float(np.linalg.norm(model.gravity)) or _STANDARD_GRAVITY
     starts = [model.gravity, *(size * sign * axis for axis in np.eye(3) for sign in (1.0, -1.0))]
     first = min(starts, key=misfit)
     if not np.any(first):
         return GravityDirection(model.gravity, model.gravity, 1.0)
     best = first
     least = misfit(first)
-    for _ in range(_MOST_TURNS):
+    for _ in range(_MAX_TURNS):
         values, errors = fitted(best)
         turn = _turn(training, best, values, training.samples / errors)
-        for share in _SHARES:
+        for share in _STEP_SHARES:
             turned = _turned(best, share * turn)
             height = misfit(turned)
-            if height < least - _SAME_FIT:
+            if height < least - _SAME_FIT_TOLERANCE:
                 break
         else:
             break

@@ -22,7 +22,7 @@ import numpy as np
 from identification.estimators.prior import nominal_ratio
 from identification.factor.factor import Factor
 from identification.hypotheses.scores import Comparison, Score, compare, score_of
-from identification.hypotheses.search import EXPLAINED, SEPARATE, SURE
+from identification.hypotheses.search import EXPLAINED_ERROR, SEPARATE_SIGMAS, SURE_SIGMAS
 from identification.model.nominal_masses import without_masses
 from identification.model.robot import RobotModel
 from identification.signals.samples import Samples
@@ -66,7 +66,7 @@ class InertiaScale(NamedTuple):
         far = abs(np.log(self.factor))
         if not far > 2.0 * np.log(_LEAST_TIME) or not abs(np.log(self.weight)) < 0.5 * far:
             return None
-        is_certain = self.against.ratio < _TIME and self.against.sigmas < -SURE
+        is_certain = self.against.ratio < _TIME and self.against.sigmas < -SURE_SIGMAS
         return float(np.sqrt(self.factor)) if is_certain else None
 
 
@@ -102,7 +102,7 @@ def find_inertia_scale(
     error, against = errors[best]
     agrees = 1.0 < best < torque_scale
     least = 1.0 if best > 1.0 else _LESS
-    if error > EXPLAINED or against.sigmas > -(SEPARATE if agrees else SURE):
+    if error > EXPLAINED_ERROR or against.sigmas > -(SEPARATE_SIGMAS if agrees else SURE_SIGMAS):
         return None
     if against.ratio > least:
         return None

@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 
 from identification.arrays import Array
 from identification.estimators.prior import GaussianPrior, body_prior
-from identification.factor.factor import SMALLEST_NOISE, Factor
+from identification.factor.factor import MIN_NOISE, Factor
 from identification.factor.normal_equations import solve_positive
 from identification.model.robot import RobotModel
 from identification.signals.samples import Samples
@@ -34,24 +34,26 @@ ZERO_SPREAD: Final = np.radians(45.0)
 """Standard deviation of the zero of a joint that is off [rad]."""
 GAIN_SPREAD: Final = 0.5
 """Standard deviation of the relative error of a torque scale that is off."""
-_SPREADS: Final = (ZERO_SPREAD, GAIN_SPREAD)
-_FREE_SHARE: Final = 1e-2  # of the information on bodies, where a fit is free of their masses
-_COMMON_SPREAD: Final = 3.0  # relative deviation of a scale that all torques have in common
-_SIGNIFICANT: Final = 12.0  # twice the loss of log posterior of what is kept: 3.5 deviations
-LEAST_ZERO: Final = np.radians(1.0)
+_PRIOR_SPREADS: Final = (ZERO_SPREAD, GAIN_SPREAD)
+# of the information on bodies, where a fit is free of their masses
+_FREE_BODY_INFORMATION: Final = 1e-2
+_COMMON_SCALE_SPREAD: Final = 3.0  # relative deviation of a scale that all torques have in common
+# twice the loss of log posterior of what is kept: 3.5 deviations
+_MIN_LIKELIHOOD_LOSS: Final = 12.0
+MIN_ZERO: Final = np.radians(1.0)
 """Zeros up to which an arm is as stated [rad]: those of its assembly."""
-LEAST_GAIN: Final = 0.15
+MIN_GAIN: Final = 0.15
 """Relative errors up to which a torque is as stated: those of torque constants."""
-_STEP: Final = 1e-5  # rad, of a numerical derivative
-_LARGEST_STEP: Final = (0.5, 0.3)  # rad, and share, of one iteration
-_ROUNDS: Final = 12
-_SETTLED: Final = 1e-2  # change of twice the log posterior
-_KNOWN_SCALE: Final = 0.1  # relative deviation of a scale that the motion shows
-_SAME_ZERO: Final = np.radians(3.0)  # difference of two fits that agree
-_SIGMAS: Final = 3.0  # the same, in standard deviations
-_HALVINGS: Final = 4
-_WEIGHINGS: Final = 6
-_SMALLEST_GAIN: Final = -0.95
+_DERIVATIVE_STEP: Final = 1e-5  # rad, of a numerical derivative
+_MAX_STEP: Final = (0.5, 0.3)  # rad, and share, of one iteration
+_MAX_ROUNDS: Final = 12
+_COST_TOLERANCE: Final = 1e-2  # change of twice the log posterior
+_MAX_SCALE_DEVIATION: Final = 0.1  # relative deviation of a scale that the motion shows
+_SAME_ZERO_TOLERANCE: Final = np.radians(3.0)  # difference of two fits that agree
+_SAME_ZERO_SIGMAS: Final = 3.0  # the same, in standard deviations
+_MAX_HALVINGS: Final = 4
+_WEIGHTING_ROUNDS: Final = 6
+_GAIN_LOWER_BOUND: Final = -0.95
 
 
 @dataclass(frozen=True, eq=False)
@@ -83,12 +85,12 @@ class JointFit:
     @property
     def moved(self) -> tuple[int, ...]:
         """The joints whose zero is other than stated."""
-        return tuple(np.flatnonzero(np.abs(self.zero) > LEAST_ZERO).tolist())
+        return tuple(np.flatnonzero(np.abs(self.zero) > MIN_ZERO).tolist())
 
     @property
     def scaled(self) -> tuple[int, ...]:
         """The joints whose torque has another scale."""
-        return tuple(np.flatnonzero(np.abs(self.gain) > LEAST_GAIN).tolist())
+        return tuple(np.flatnonzero(np.abs(self.gain) > MIN_GAIN).tolist())
 
     def fixed(self, free: Mask) -> JointFit:
         """Return it with the zeros and scales as stated that are not `free` (2 n,)."""
@@ -103,7 +105,7 @@ class JointFit:
 
     def is_zero_at(self, joints: Sequence[int]) -> bool:
         """Return whether the zeros of joints are as stated, within their uncertainty."""
-        tolerance = np.maximum(_SAME_ZERO, _SIGMAS * self.zero_std)
+        tolerance = np.maximum(_SAME_ZERO_TOLERANCE, _SAME_ZERO_SIGMAS * self.zero_std)
         return bool((np.abs(self.zero) < tolerance)[list(joints)].all())
 
     def ratio_to(self, other: JointFit) -> float:
@@ -156,7 +158,7 @@ def fit_joints(
         start: from which the iteration starts; the others are fixed at its values.
         free_bodies: hardly believe the masses of the description.
     """
-    problem = _Problem.of(model, samples, _FREE_SHARE if free_bodies else 1.0)
+    problem = _Problem.of(model, samples, _FREE_BODY_INFORMATION if free_bodies else 1.0)
     return _fitted(problem, free, problem.start(start))
 
 
@@ -263,10 +265,10 @@ class _Problem:
             usable = self.samples.usable[:, joint]
             residuals[usable, joint] = self.samples.torque[usable, joint] - table @ values[places]
         squares = np.square(residuals).sum(axis=0)
-        least = SMALLEST_NOISE**2 * self.power + np.finfo(np.float64).tiny
+        least = MIN_NOISE**2 * self.power + np.finfo(np.float64).tiny
         squares = np.maximum(squares, least)
         away = values - self.prior.mean
-        joints = np.concatenate([zero, gain]) / np.repeat(_SPREADS, self.n)
+        joints = np.concatenate([zero, gain]) / np.repeat(_PRIOR_SPREADS, self.n)
         log = float((self.rows * np.log(squares)).sum()) / ROWS_PER_FACT
         cost = log + float(away @ self.information @ away) / ROWS_PER_FACT + float(joints @ joints)
         return _Point(values, zero, gain, residuals, squares, cost)
@@ -283,10 +285,10 @@ class _Problem:
     def settled(self, zero: Array, gain: Array, weights: Array) -> _Point:
         """Return the point with weights from its own residuals."""
         point = self.at(zero, gain, weights)
-        for _ in range(_WEIGHINGS):
+        for _ in range(_WEIGHTING_ROUNDS):
             before = point.cost
             point = self.at(zero, gain, self.weights(point.squares))
-            if before - point.cost < _SETTLED:
+            if before - point.cost < _COST_TOLERANCE:
                 break
         return point
 
@@ -301,7 +303,7 @@ class _Problem:
         weights = self.weights(point.squares)
         matrix = np.zeros((p + 2 * n, p + 2 * n))
         matrix[:p, :p] = self.information
-        own = ROWS_PER_FACT / np.repeat(_SPREADS, n) ** 2
+        own = ROWS_PER_FACT / np.repeat(_PRIOR_SPREADS, n) ** 2
         matrix[range(p, p + 2 * n), range(p, p + 2 * n)] = own
         gradient = np.zeros(p + 2 * n)
         gradient[:p] = -self.information @ (point.values - self.prior.mean)
@@ -327,9 +329,9 @@ class _Problem:
         derivative = np.zeros((self.n, *torque.shape))
         for joint in np.flatnonzero(free[: self.n]):
             position = motion.position + point.zero
-            position[:, joint] += _STEP
+            position[:, joint] += _DERIVATIVE_STEP
             moved = self.model.torque(point.values, replace(motion, position=position))
-            derivative[joint] = (moved - torque) / _STEP
+            derivative[joint] = (moved - torque) / _DERIVATIVE_STEP
         return derivative
 
 
@@ -337,21 +339,21 @@ def _of_any_scale(prior: GaussianPrior) -> Array:
     """Return the information of a prior (p, p) whose bodies have an open common scale."""
     information = prior.information
     along = information @ prior.mean
-    known = 1.0 / _COMMON_SPREAD**2 + float(prior.mean @ along)
+    known = 1.0 / _COMMON_SCALE_SPREAD**2 + float(prior.mean @ along)
     return np.asarray(information - np.outer(along, along) / known)
 
 
 def _fitted(problem: _Problem, free: Mask, point: _Point) -> JointFit:
     p = problem.model.n_parameters
     n = problem.n
-    most = np.repeat(_LARGEST_STEP, n)
+    most = np.repeat(_MAX_STEP, n)
     sums = problem.linearised(point, free)
-    for _ in range(_ROUNDS if free.any() else 0):
+    for _ in range(_MAX_ROUNDS if free.any() else 0):
         step = np.where(free, _solved(sums.matrix, sums.gradient)[p:], 0.0)
         step /= max(1.0, float((np.abs(step) / most).max()))
-        for _ in range(_HALVINGS):
+        for _ in range(_MAX_HALVINGS):
             zero = point.zero + step[:n]
-            gain = np.maximum(point.gain + step[n:], _SMALLEST_GAIN)
+            gain = np.maximum(point.gain + step[n:], _GAIN_LOWER_BOUND)
             moved = problem.at(zero, gain, problem.weights(point.squares))
             if moved.cost < point.cost:
                 break
@@ -361,7 +363,7 @@ def _fitted(problem: _Problem, free: Mask, point: _Point) -> JointFit:
         before = point.cost
         point = moved
         sums = problem.linearised(point, free)
-        if before - point.cost < _SETTLED:
+        if before - point.cost < _COST_TOLERANCE:
             break
     std = np.sqrt(ROWS_PER_FACT * _inverse(sums.matrix).diagonal()[p:])
     power = np.where(problem.power > 0.0, problem.power, np.inf)
@@ -385,7 +387,7 @@ def _tied(problem: _Problem, fit: JointFit) -> tuple[int, ...]:
     for joint in free.tolist():
         column = covariance[joint]
         beside = covariance.diagonal() - column**2 / covariance[joint, joint]
-        known = np.sqrt(np.maximum(beside, 0.0)) < _KNOWN_SCALE * (1.0 + fit.gain)
+        known = np.sqrt(np.maximum(beside, 0.0)) < _MAX_SCALE_DEVIATION * (1.0 + fit.gain)
         tied = tuple(k for k in free.tolist() if known[k] or k == joint)
         best = max(best, tied, key=len)
     return best
@@ -399,7 +401,7 @@ def _common_scale(scales: Array, tied: Sequence[int]) -> float:
     if len(tied) < 2:
         return float(np.median(scales))
     compared = scales[list(tied)]
-    others = (np.abs(compared / compared[:, None] - 1.0) > LEAST_GAIN).sum(axis=1)
+    others = (np.abs(compared / compared[:, None] - 1.0) > MIN_GAIN).sum(axis=1)
     return float(compared[np.lexsort((np.abs(np.log(compared)), others))[0]])
 
 
@@ -414,7 +416,7 @@ def _significant(problem: _Problem, fit: JointFit) -> Mask:
         # What fixing one of them at zero costs, and where the others are then.
         cost = np.where(needed, joints**2 / covariance.diagonal(), np.inf)
         worst = int(cost.argmin())
-        if cost[worst] > _SIGNIFICANT:
+        if cost[worst] > _MIN_LIKELIHOOD_LOSS:
             break
         column = covariance[:, worst].copy()
         pivot = column[worst]

@@ -11,12 +11,12 @@ from identification.arrays import Array
 
 Mask = NDArray[np.bool_]
 
-MINOR: Final = 0.015
+LITTLE_TORQUE_SHARE: Final = 0.015
 """Torque of such an axis as a share of that of all axes: an eighth of the error up to which a model
 is good, so that losing it entirely adds 0.1 points to the error over all axes."""
 
 
-def little_torque(torque: Array, slides: Mask, minor: float = MINOR) -> Mask:
+def little_torque(torque: Array, slides: Mask, minor: float = LITTLE_TORQUE_SHARE) -> Mask:
     """Return the axes whose torque (n,) is too small against the others' to decide alone (n,).
 
     Axes that slide are compared with each other, and those that turn.

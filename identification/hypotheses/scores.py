@@ -16,8 +16,8 @@ from identification.model.motion import Motion
 from identification.model.robot import RobotModel
 from identification.signals.samples import Samples
 
-DISSIPATES: Final = 4.0  # standard errors of a friction that drives a joint
-_LEAST_FRICTION: Final = 0.02  # of the torque of a joint
+DRIVING_FRICTION_SIGMAS: Final = 4.0  # standard errors of a friction that drives a joint
+_MIN_FRICTION_SHARE: Final = 0.02  # of the torque of a joint
 _BLOCKS: Final = 20
 _FOLDS: Final = 5
 # Rows that count as one beside the prior. Where other parts are predicted they are seven in all: a
@@ -26,7 +26,7 @@ _FOLDS: Final = 5
 ROWS_PER_FACT: Final = 10.0
 _ROWS_PER_FACT_LEFT_OUT: Final = 100.0
 _POSTURES: Final = 35  # at which the inertia about each axis is evaluated
-_SPEED: Final = 0.9  # quantile of the speed at which friction is judged
+_SPEED_QUANTILE: Final = 0.9  # quantile of the speed at which friction is judged
 
 
 @dataclass(frozen=True, eq=False)
@@ -61,12 +61,12 @@ class Score:
     @property
     def driven(self) -> NDArray[np.bool_]:
         """Whether friction would drive each joint (n,)."""
-        return (self.friction < -DISSIPATES) & (self.share < -_LEAST_FRICTION)
+        return (self.friction < -DRIVING_FRICTION_SIGMAS) & (self.share < -_MIN_FRICTION_SHARE)
 
     @property
     def is_all_driven(self) -> bool:
         """Whether friction would drive every joint with a clear sign, at least two."""
-        clear = self.friction[np.abs(self.friction) > DISSIPATES]
+        clear = self.friction[np.abs(self.friction) > DRIVING_FRICTION_SIGMAS]
         return len(clear) > 1 and bool(np.all(clear < 0.0))
 
     @property
@@ -174,7 +174,7 @@ def _squares(factor: Factor, values: Array, blocks: slice | NDArray[np.bool_]) -
 
 def _friction_columns(model: RobotModel, samples: Samples) -> Array:
     """Return the friction of each joint at a usual speed as a sum of the parameters (n, p)."""
-    speed = np.quantile(np.abs(samples.motion.velocity), _SPEED, axis=0)
+    speed = np.quantile(np.abs(samples.motion.velocity), _SPEED_QUANTILE, axis=0)
     columns = np.zeros((model.n_joints, model.n_parameters))
     for place, (_, term, joint, motor, _) in enumerate(model.friction.terms, model.base.rank):
         if not motor and term.is_friction and not term.of_load:

@@ -20,12 +20,12 @@ import numpy as np
 from identification.arrays import Array
 from identification.estimators.prior import TorqueSums, body_priors
 from identification.factor.columns import every_torque_factor
-from identification.factor.factor import SMALLEST_NOISE, Factor
+from identification.factor.factor import MIN_NOISE, Factor
 from identification.hypotheses.changes import (
     COUPLED,
     DEGREE,
     GRAVITIES,
-    IN_ORDER,
+    ORDERS,
     SIGNS,
     SIZED,
     UNITS,
@@ -62,38 +62,44 @@ from identification.hypotheses.scores import (
 from identification.model.robot import RobotModel
 from identification.signals.samples import Samples
 
-SURE: Final = 4.5
+SURE_SIGMAS: Final = 4.5
 """Standard errors over the blocks of a reading that is sure, whatever the number tried: with 19
 degrees of freedom one of 4 000 exceeds it by chance."""
-SEPARATE: Final = 3.0
+SEPARATE_SIGMAS: Final = 3.0
 """Standard errors by which the second best reading is worse."""
-EXPLAINED: Final = 0.15
+EXPLAINED_ERROR: Final = 0.15
 """Error of the torque above which no reading is sure: the arm does not explain the torque."""
-_LARGE: Final = 0.15  # relative reduction of the error that chance alone does not make
-_LEAST_GAIN: Final = 0.02  # relative reduction of the error of a reading that is adopted
-_ALIKE: Final = 0.05  # the same, of readings that fit alike
-_HARM: Final = 1.1  # error ratio of a joint beyond which a reading spoils it
-_HALVES: Final = 0.5  # error ratio over all joints from which it may
-_ROWS: Final = 700
-_FEWER_ROWS: Final = 250  # on which all readings are tried first
+_LARGE_REDUCTION: Final = 0.15  # relative reduction of the error that chance alone does not make
+_MIN_ERROR_REDUCTION: Final = 0.02  # relative reduction of the error of a reading that is adopted
+_ALIKE_REDUCTION: Final = 0.05  # the same, of readings that fit alike
+_MAX_JOINT_ERROR_RATIO: Final = 1.1  # error ratio of a joint beyond which a reading spoils it
+_HALVED_ERROR_RATIO: Final = 0.5  # error ratio over all joints from which it may
+_MAX_ROWS: Final = 700
+_FIRST_TRIAL_ROWS: Final = 250  # on which all readings are tried first
 # Of the search for an order: as read, then at random until the best order is reached twice. From a
 # third of the starts the right one is reached: ten miss it in 2 % of the cases.
-_STARTS: Final = 10
-_IMPROVES: Final = 0.98  # error ratio of one exchange from which a whole order is searched for
-_ORDERS: Final = 2  # best orders of each kind that are compared
-_CLOSER: Final = 12  # changes of least error on fewer rows, which are compared
-_MOST_STEPS: Final = 6
-_SAME_SIZE: Final = 0.3  # rad, or of a scale: difference of two fits that are one
-_FAR_WORSE: Final = 0.5  # error ratio to a zero far away, of which no better fit is expected
-_OTHER_SIDE: Final = 60.0 * DEGREE  # between two zeros that are not one
-_FAR_STARTS: Final = 2  # zeros far from what is stated at which a fit starts
-_NEEDED: Final = 2.0  # standard errors of one of several zeros and scales that its fit needs
-_ADEQUATE: Final = 1.2  # error ratio to a free fit, of a reading that explains the rows
-_ADEQUATE_JOINT: Final = 2.0  # the same of each joint: a mean hides one that is not explained
-_FAR: Final = 90.0 * DEGREE  # zeros beyond it are of no assembly: a sign and a near one look alike
-_SIGNED: Final = 3  # signs of least error with zeros and scales beside them, which are compared
-_AT_ONCE: Final = 24  # fits, so that their sums stay in the processor's cache
-_ZEROS: Final = (-135.0, -90.0, -45.0, 45.0, 90.0, 135.0, 180.0)  # deg, near which a fit starts
+_ORDER_STARTS: Final = 10
+# error ratio of one exchange from which a whole order is searched for
+_EXCHANGE_ERROR_RATIO: Final = 0.98
+_COMPARED_ORDERS: Final = 2  # best orders of each kind that are compared
+_COMPARED_CHANGES: Final = 12  # changes of least error on fewer rows, which are compared
+_MAX_STEPS: Final = 6
+_SAME_SIZE_TOLERANCE: Final = 0.3  # rad, or of a scale: difference of two fits that are one
+# error ratio to a zero far away, of which no better fit is expected
+_FAR_ZERO_ERROR_RATIO: Final = 0.5
+_MIN_ZERO_SEPARATION: Final = 60.0 * DEGREE  # between two zeros that are not one
+_FAR_ZERO_STARTS: Final = 2  # zeros far from what is stated at which a fit starts
+_NEEDED_SIGMAS: Final = 2.0  # standard errors of one of several zeros and scales that its fit needs
+_ADEQUATE_ERROR_RATIO: Final = 1.2  # error ratio to a free fit, of a reading that explains the rows
+# the same of each joint: a mean hides one that is not explained
+_ADEQUATE_JOINT_ERROR_RATIO: Final = 2.0
+# zeros beyond it are of no assembly: a sign and a near one look alike
+_FAR_ZERO: Final = 90.0 * DEGREE
+# signs of least error with zeros and scales beside them, which are compared
+_COMPARED_SIGNS: Final = 3
+_FITS_AT_ONCE: Final = 24  # fits, so that their sums stay in the processor's cache
+# deg, near which a fit starts
+_START_ZEROS_DEGREES: Final = (-135.0, -90.0, -45.0, 45.0, 90.0, 135.0, 180.0)
 
 
 @dataclass(frozen=True, eq=False)
@@ -126,18 +132,18 @@ class Step:
     @property
     def is_explained(self) -> bool:
         """Whether the arm explains the torque with it, and certainly worse without."""
-        is_certain = not self.by_friction and self.sigmas < -SURE
-        return self.error < EXPLAINED and self.is_adequate and is_certain
+        is_certain = not self.by_friction and self.sigmas < -SURE_SIGMAS
+        return self.error < EXPLAINED_ERROR and self.is_adequate and is_certain
 
     @property
     def is_far(self) -> bool:
         """Whether it is a zero that no assembly has."""
-        return self.change.meaning == "zero" and abs(self.change.size) > _FAR
+        return self.change.meaning == "zero" and abs(self.change.size) > _FAR_ZERO
 
     @property
     def by_friction(self) -> bool:
         """Whether friction supports it, and the error little or not at all."""
-        return self.ratio > 1.0 - _ALIKE
+        return self.ratio > 1.0 - _ALIKE_REDUCTION
 
     @property
     def sure(self) -> bool:
@@ -146,10 +152,10 @@ class Step:
         Friction, or a slightly smaller error, says it of a whole arm; of one joint a lag of the
         torque looks the same.
         """
-        slight = self.ratio > 1.0 - _LARGE and len(self.change.joints) == 1
+        slight = self.ratio > 1.0 - _LARGE_REDUCTION and len(self.change.joints) == 1
         if self.change.meaning in SIZED:
-            slight = self.sigmas > -SEPARATE
-        return not self.alike and self.error < EXPLAINED and not slight and self.is_adequate
+            slight = self.sigmas > -SEPARATE_SIGMAS
+        return not self.alike and self.error < EXPLAINED_ERROR and not slight and self.is_adequate
 
 
 @dataclass(frozen=True)
@@ -171,7 +177,11 @@ class Adequacy:
     @property
     def is_enough(self) -> bool:
         """Whether the reading explains the rows about as well."""
-        return self.agrees and self.ratio < _ADEQUATE and self.largest < _ADEQUATE_JOINT
+        return (
+            self.agrees
+            and self.ratio < _ADEQUATE_ERROR_RATIO
+            and self.largest < _ADEQUATE_JOINT_ERROR_RATIO
+        )
 
 
 @dataclass(frozen=True, eq=False)
@@ -212,7 +222,7 @@ def find_readings(
         mountings: models with another gravity, by name ("" without gravity).
         unit_is_open: whether nothing states the unit of the positions.
     """
-    few = _thinned(samples, _ROWS)
+    few = _thinned(samples, _MAX_ROWS)
 
     def started(changes: Sequence[Change] = ()) -> _Search:
         search = _Search(model, few, mountings or {}, unit_is_open=unit_is_open)
@@ -222,7 +232,7 @@ def find_readings(
     search, steps = _one_by_one(started)
     adequacy = search.adequacy()
     is_doubted = not adequacy.is_enough or any(not step.sure or step.is_far for step in steps)
-    if is_doubted and (steps or search.score.overall > EXPLAINED):
+    if is_doubted and (steps or search.score.overall > EXPLAINED_ERROR):
         search, steps = _with_a_sign(started, search, steps)
         adequacy = search.adequacy()
     nearest = search.nearest()
@@ -281,9 +291,10 @@ def _with_a_sign(
     change, best, more = min(tried, key=lambda each: each[1].score.overall)
     against = compare(best.score, found.score, found.model)
     is_alike = (
-        against.sigmas < SEPARATE and best.score.overall < (1.0 + _ALIKE) * found.score.overall
+        against.sigmas < SEPARATE_SIGMAS
+        and best.score.overall < (1.0 + _ALIKE_REDUCTION) * found.score.overall
     )
-    is_better = against.ratio < 1.0 - _LARGE and against.sigmas < -SEPARATE
+    is_better = against.ratio < 1.0 - _LARGE_REDUCTION and against.sigmas < -SEPARATE_SIGMAS
     if not is_better and not (is_alike and len(more) + 1 < len(steps)):
         is_other = is_alike and not _contains([step.change for step in more], steps)
         if not is_other or any(step.change == change for step in steps):
@@ -294,8 +305,8 @@ def _with_a_sign(
     alone = compare(best.score, without.score, found.model)
     is_alone = not any(
         other != change
-        and compare(again.score, best.score, found.model).sigmas < SEPARATE
-        and again.score.overall < (1.0 + _ALIKE) * best.score.overall
+        and compare(again.score, best.score, found.model).sigmas < SEPARATE_SIGMAS
+        and again.score.overall < (1.0 + _ALIKE_REDUCTION) * best.score.overall
         for other, again, _ in tried
     )
     sign = Step(
@@ -313,7 +324,8 @@ def _contains(changes: Sequence[Change], steps: Sequence[Step]) -> bool:
     """Return whether all of some steps are among changes, about of the same size."""
     return all(
         any(
-            change[:2] == step.change[:2] and abs(change.size - step.change.size) < _SAME_SIZE
+            change[:2] == step.change[:2]
+            and abs(change.size - step.change.size) < _SAME_SIZE_TOLERANCE
             for change in changes
         )
         for step in steps
@@ -323,8 +335,8 @@ def _contains(changes: Sequence[Change], steps: Sequence[Step]) -> bool:
 def _signed(started: Callable[..., _Search]) -> Iterator[tuple[Change, _Search, list[Step]]]:
     """Yield the signs that fit best with zeros and scales of all joints, and these steps."""
     fewer = started()
-    fewer.samples = _thinned(fewer.samples, _FEWER_ROWS)
-    for change in fewer.signs_by_joint_fit()[:_SIGNED]:
+    fewer.samples = _thinned(fewer.samples, _FIRST_TRIAL_ROWS)
+    for change in fewer.signs_by_joint_fit()[:_COMPARED_SIGNS]:
         again = started([change])
         yield change, again, again.by_joint_fit(())
 
@@ -337,7 +349,7 @@ def _doubted(steps: Sequence[Step], found: _Search, as_recorded: _Search) -> lis
     if not steps:
         return []
     without = as_recorded.free_fit()
-    is_beyond = found.stated_fit().ratio_to(without) < 1.0 - _LARGE
+    is_beyond = found.stated_fit().ratio_to(without) < 1.0 - _LARGE_REDUCTION
     return [
         replace(
             step,
@@ -351,7 +363,7 @@ def _doubted(steps: Sequence[Step], found: _Search, as_recorded: _Search) -> lis
 
 def find_zeros_and_scales(model: RobotModel, samples: Samples) -> Readings:
     """Find zeros and scales of joints that are other than stated, with nothing else changed."""
-    few = _thinned(samples, _ROWS)
+    few = _thinned(samples, _MAX_ROWS)
     search = _Search(model, few, {}, unit_is_open=False)
     steps = search.by_joint_fit(())
     adequacy = search.adequacy() if steps else Adequacy(1.0, 1.0, agrees=True)
@@ -425,7 +437,9 @@ class _Search:
             joints = tuple(range(self.model.n_joints))
         trials = [self._try(Change(kind, joints)) for kind in kinds]
         best = min(trials, key=lambda trial: trial.against.ratio)
-        if not everywhere and (best.against.ratio > 1.0 + _ALIKE or best.against.sigmas > SURE):
+        if not everywhere and (
+            best.against.ratio > 1.0 + _ALIKE_REDUCTION or best.against.sigmas > SURE_SIGMAS
+        ):
             return []
         return [self._adopt(best, trials)]
 
@@ -442,7 +456,8 @@ class _Search:
         ]
         joints = self._best_joints(better)
         if joints is not None and all(
-            compare(joints.score, trial.score, self.model).ratio < 1.0 - _ALIKE for trial in good
+            compare(joints.score, trial.score, self.model).ratio < 1.0 - _ALIKE_REDUCTION
+            for trial in good
         ):
             others = [trial for trial in better if trial.change.meaning not in SIZED]
             others += [*self._singles(joints), *self._other_sides(joints)]
@@ -458,7 +473,7 @@ class _Search:
     def more_steps(self) -> list[Step]:
         """Adopt changes one after the other, as long as they are significant."""
         steps: list[Step] = []
-        while len(steps) < _MOST_STEPS:
+        while len(steps) < _MAX_STEPS:
             found = self.by_prediction() or self.by_friction()
             if not found:
                 break
@@ -484,7 +499,7 @@ class _Search:
             near = [
                 other
                 for other in known
-                if other[:2] == change[:2] and abs(other.size - change.size) < _SAME_SIZE
+                if other[:2] == change[:2] and abs(other.size - change.size) < _SAME_SIZE_TOLERANCE
             ]
             if not more and not near:
                 known.append(change)
@@ -499,8 +514,8 @@ class _Search:
         (change, *more) = joints.changes
         if more or change.meaning != "zero":
             return []
-        angles = [angle * DEGREE for angle in _ZEROS]
-        far = [angle for angle in angles if _apart(angle, change.size) > _OTHER_SIDE]
+        angles = [angle * DEGREE for angle in _START_ZEROS_DEGREES]
+        far = [angle for angle in angles if _apart(angle, change.size) > _MIN_ZERO_SEPARATION]
         trials = [self._try(change._replace(size=angle)) for angle in far]
         best = min(trials, key=lambda trial: trial.score.overall)
         zero = np.zeros(self.model.n_joints)
@@ -508,7 +523,7 @@ class _Search:
         free = np.isin(np.arange(2 * len(zero)), change.joints)
         start = starting_at(self.model, self.samples, zero, np.zeros_like(zero))
         size = float(fit_joints(self.model, self.samples, free, start).zero[change.joints[0]])
-        if _apart(size, change.size) < _OTHER_SIDE:
+        if _apart(size, change.size) < _MIN_ZERO_SEPARATION:
             return [best]
         return [self._try(change._replace(size=size))]
 
@@ -557,9 +572,12 @@ class _Search:
         if best is not None:
             self._fitted.append(best)
         zeros = [trial for trial in trials if trial.change.meaning == "zero"]
-        zeros = [trial for trial in zeros if trial.against.ratio < 1.0 - _LARGE]
-        for far in sorted(zeros, key=lambda trial: trial.against.ratio)[:_FAR_STARTS]:
-            if best is not None and compare(best.score, far.score, self.model).ratio < _FAR_WORSE:
+        zeros = [trial for trial in zeros if trial.against.ratio < 1.0 - _LARGE_REDUCTION]
+        for far in sorted(zeros, key=lambda trial: trial.against.ratio)[:_FAR_ZERO_STARTS]:
+            if (
+                best is not None
+                and compare(best.score, far.score, self.model).ratio < _FAR_ZERO_ERROR_RATIO
+            ):
                 continue  # near what is stated is better
             zero = np.zeros(self.model.n_joints)
             joints = list(far.change.joints)
@@ -586,10 +604,10 @@ class _Search:
                 self._scored([each for each in changes if each != one])[1] for one in changes
             ]
             against = [compare(score, other, self.model) for other in without]
-            is_needed = [each.sigmas < -_NEEDED for each in against]
+            is_needed = [each.sigmas < -_NEEDED_SIGMAS for each in against]
             if all(is_needed):
                 whole = compare(score, self.score, self.model)
-                if whole.ratio > 1.0 - _LEAST_GAIN or whole.sigmas > -SEPARATE:
+                if whole.ratio > 1.0 - _MIN_ERROR_REDUCTION or whole.sigmas > -SEPARATE_SIGMAS:
                     return None
                 return _Joints(fit, changes, samples, score, whole, tuple(against))
             free = np.zeros(2 * n, dtype=np.bool_)
@@ -616,8 +634,8 @@ class _Search:
         alike = tuple(
             (trial.change, trial.score.overall)
             for trial in others
-            if compare(trial.score, joints.score, self.model).sigmas < SEPARATE
-            and trial.score.overall < (1.0 + _ALIKE) * joints.score.overall
+            if compare(trial.score, joints.score, self.model).sigmas < SEPARATE_SIGMAS
+            and trial.score.overall < (1.0 + _ALIKE_REDUCTION) * joints.score.overall
         )
         steps = [
             Step(
@@ -639,8 +657,8 @@ class _Search:
         trials = [
             trial
             for trial in tried
-            if compare(trial.score, score, self.model).sigmas < SEPARATE
-            and trial.score.overall < (1.0 + _ALIKE) * score.overall
+            if compare(trial.score, score, self.model).sigmas < SEPARATE_SIGMAS
+            and trial.score.overall < (1.0 + _ALIKE_REDUCTION) * score.overall
             and trial.score.driven.sum() <= score.driven.sum()
         ]
         if not trials:
@@ -662,28 +680,30 @@ class _Search:
         unseen = []
         for joint in joints:
             trials = [self._try(Change("zero", (joint,), s * 45.0 * DEGREE)) for s in (-1.0, 1.0)]
-            if min(trial.against.sigmas for trial in trials) < SEPARATE:
+            if min(trial.against.sigmas for trial in trials) < SEPARATE_SIGMAS:
                 unseen.append(joint)
         return tuple(unseen)
 
     def _are_alike(self, trial: Trial, best: Trial) -> bool:
         """Whether two changes fit alike, so that the recording does not choose one."""
-        if compare(trial.score, best.score, self.model).sigmas > SEPARATE:
+        if compare(trial.score, best.score, self.model).sigmas > SEPARATE_SIGMAS:
             return False
-        if trial.score.overall < (1.0 + _ALIKE) * best.score.overall:
+        if trial.score.overall < (1.0 + _ALIKE_REDUCTION) * best.score.overall:
             return True
         more = trial.score.squares.sum(axis=1) - best.score.squares.sum(axis=1)
-        return sigmas_of(more) < SEPARATE
+        return sigmas_of(more) < SEPARATE_SIGMAS
 
     def _orders(self, trials: Sequence[Trial], fits: _Fits) -> Iterator[Trial]:
         """Yield whole orders: from several starts, the best exchange while the error falls."""
-        is_poor = self.score.overall > EXPLAINED
-        for kind in IN_ORDER:
+        is_poor = self.score.overall > EXPLAINED_ERROR
+        for kind in ORDERS:
             trials_of_kind = [trial for trial in trials if trial.change.meaning == kind]
-            if not is_poor and not any(trial.against.ratio < _IMPROVES for trial in trials_of_kind):
+            if not is_poor and not any(
+                trial.against.ratio < _EXCHANGE_ERROR_RATIO for trial in trials_of_kind
+            ):
                 continue
             tried = {whole_order(trial.change, self.model.n_joints) for trial in trials_of_kind}
-            for order in _best_orders(fits, kind, _STARTS if is_poor else 1):
+            for order in _best_orders(fits, kind, _ORDER_STARTS if is_poor else 1):
                 change = order_change(kind, order)
                 if change.joints and order not in tried:
                     yield self._try(change)
@@ -694,13 +714,17 @@ class _Search:
         Worse than before, and than with `beside`. With an angle that contains another the posture
         of all that follows is another.
         """
-        if trial.change.meaning in IN_ORDER:
+        if trial.change.meaning in ORDERS:
             return False
         if int(trial.score.driven.sum()) > int(self.score.driven.sum()):
             return True
-        most = _HARM if beside is None else _HARM * np.maximum(1.0, beside.against.joints)
+        most = (
+            _MAX_JOINT_ERROR_RATIO
+            if beside is None
+            else _MAX_JOINT_ERROR_RATIO * np.maximum(1.0, beside.against.joints)
+        )
         # What a second fault leaves may fit a joint worse where the first one is corrected.
-        halves = trial.against.ratio < _HALVES and beside is None
+        halves = trial.against.ratio < _HALVED_ERROR_RATIO and beside is None
         spoils = bool(np.any(trial.against.joints > most)) and not halves
         return spoils and trial.change.meaning not in COUPLED
 
@@ -726,10 +750,10 @@ class _Search:
     def tried(self) -> list[Trial]:
         """Return the changes of least error, tried on all rows."""
         if self._trials is None:
-            fits = _Fits(self.model, _thinned(self.samples, _FEWER_ROWS), self._mountings)
+            fits = _Fits(self.model, _thinned(self.samples, _FIRST_TRIAL_ROWS), self._mountings)
             errors = fits.errors(list(self._to_try()))
             ranked = sorted(errors, key=lambda change: errors[change])
-            closer = ranked[:_CLOSER]
+            closer = ranked[:_COMPARED_CHANGES]
             kinds = {kind_of(change) for change in closer}
             for change in ranked:
                 if kind_of(change) not in kinds:
@@ -752,11 +776,13 @@ class _Search:
             if joint in moved:
                 yield from (Change(kind, (joint,)) for kind in SIGNS)
             if self.model.chain.revolute[joint]:
-                yield from (Change("zero", (joint,), angle * DEGREE) for angle in _ZEROS)
+                yield from (
+                    Change("zero", (joint,), angle * DEGREE) for angle in _START_ZEROS_DEGREES
+                )
         for pair in coupled_pairs(self.model, moved):
             yield from (Change(kind, pair) for kind in COUPLED)
         for pair in combinations(moved, 2):
-            yield from (Change(kind, pair) for kind in IN_ORDER)
+            yield from (Change(kind, pair) for kind in ORDERS)
 
     def _try(self, change: Change) -> Trial:
         if change not in self._tries:
@@ -800,8 +826,8 @@ class _Fits:
             by_gravity.setdefault(gravity, []).append(change)
         for alike in by_gravity.values():
             model = mounted_model(self.model, alike[0], self._mountings)
-            for first in range(0, len(alike), _AT_ONCE):
-                errors.update(self._errors(model, alike[first : first + _AT_ONCE]))
+            for first in range(0, len(alike), _FITS_AT_ONCE):
+                errors.update(self._errors(model, alike[first : first + _FITS_AT_ONCE]))
         return errors
 
     def _errors(self, model: RobotModel, changes: Sequence[Change]) -> dict[Change, float]:
@@ -819,7 +845,7 @@ class _Fits:
         for change, each, read, mean, information in zip(
             changes, sums.each(), axes, *priors, strict=True
         ):
-            values, _ = each.posterior(mean, ROWS_PER_FACT * information, SMALLEST_NOISE)
+            values, _ = each.posterior(mean, ROWS_PER_FACT * information, MIN_NOISE)
             squares = each.squared_errors(values)[self._counts[read.torque_order]]
             errors[change] = float(np.log(np.where(squares > 0.0, squares, 1.0)).sum())
         return errors
@@ -865,7 +891,7 @@ def _best_orders(fits: _Fits, kind: Meaning, starts: int) -> list[tuple[int, ...
         reached.append(order)
         if reached.count(best_of(reached)) > 1:
             break
-    return sorted(errors, key=lambda order: errors[order])[:_ORDERS]
+    return sorted(errors, key=lambda order: errors[order])[:_COMPARED_ORDERS]
 
 
 def _exchanged(order: tuple[int, ...], pair: tuple[int, int]) -> tuple[int, ...]:
@@ -882,13 +908,13 @@ def _apart(angle: float, other: float) -> float:
 
 def _is_better(against: Comparison) -> bool:
     """Whether a change reduces the error by more than chance, of all that are tried."""
-    if against.ratio < 1.0 - _LARGE and against.sigmas < -SEPARATE:
+    if against.ratio < 1.0 - _LARGE_REDUCTION and against.sigmas < -SEPARATE_SIGMAS:
         return True
-    return against.ratio < 1.0 - _LEAST_GAIN and against.sigmas < -SURE
+    return against.ratio < 1.0 - _MIN_ERROR_REDUCTION and against.sigmas < -SURE_SIGMAS
 
 
 def _is_clearly_better(score: Score, other: Score, model: RobotModel) -> bool:
-    return compare(score, other, model).ratio < 1.0 - _ALIKE
+    return compare(score, other, model).ratio < 1.0 - _ALIKE_REDUCTION
 
 
 def _changes_of(fit: JointFit) -> tuple[Change, ...]:

@@ -25,16 +25,16 @@ from identification.arrays import Array
 from identification.estimators.covariance import cluster_covariance, solve_with_prior
 from identification.factor.normal_equations import NormalEquations
 from identification.hypotheses.changes import Change
-from identification.hypotheses.column_scores import MASS, ScorePrior
+from identification.hypotheses.column_scores import MASS_INDEX, ScorePrior
 from identification.hypotheses.columns import ColumnSums, columns_of
 from identification.model.robot import RobotModel
 
 _SCALING: Final = ("scale", "friction")
 _SIZED: Final = (*_SCALING, "delay", "drift", "load friction", "payload")
-_ITERATIONS: Final = 30
-_CONVERGED: Final = 1e-3  # of an unknown and its deviation
-_LEAST_STEP: Final = 0.1  # factor of a factor, in one step
-_LEAST_NOISE: Final = 1e-6  # of the torque
+_MAX_ITERATIONS: Final = 30
+_STEP_TOLERANCE: Final = 1e-3  # of an unknown and its deviation
+_MIN_STEP_FACTOR: Final = 0.1  # factor of a factor, in one step
+_MIN_NOISE_SHARE: Final = 1e-6  # of the torque
 
 
 class ChangeSize(NamedTuple):
@@ -129,7 +129,7 @@ class _Problem:
             mean[:p] = prior.gaussian.mean
         first = p + 1 + n
         coefficients = {
-            "payload": np.array([first + MASS]),
+            "payload": np.array([first + MASS_INDEX]),
             "delay": np.array([first]),
             "drift": np.array([first]),
             "load friction": first + np.arange(n),
@@ -151,8 +151,8 @@ class _Problem:
         unknowns[:p] = values
         torque = self.gram[..., -1, -1].sum(axis=0)
         rows = np.maximum(self.rows, 1)
-        floor = _LEAST_NOISE**2 * torque + np.finfo(np.float64).tiny
-        for _ in range(_ITERATIONS):
+        floor = _MIN_NOISE_SHARE**2 * torque + np.finfo(np.float64).tiny
+        for _ in range(_MAX_ITERATIONS):
             moves, residual = self._linearised(unknowns)
             pulled = (self.gram @ residual[..., None])[..., 0]
             squares = np.einsum("bji,bji->j", pulled, residual)
@@ -165,11 +165,11 @@ class _Problem:
             solution = solve_with_prior(equations, self.information)
             step = solution.values
             # A factor stays above zero.
-            least = float((_LEAST_STEP - 1.0) * (1.0 + unknowns[p]))
+            least = float((_MIN_STEP_FACTOR - 1.0) * (1.0 + unknowns[p]))
             step = step * min(1.0, least / min(float(step[p]), least))
             unknowns = unknowns + step
             deviations = np.sqrt(solution.inverse.diagonal())
-            if np.all(np.abs(step) <= _CONVERGED * (np.abs(unknowns) + deviations)):
+            if np.all(np.abs(step) <= _STEP_TOLERANCE * (np.abs(unknowns) + deviations)):
                 break
         order = self.sizes[np.argsort(unknowns[self.sizes])]
         row = np.zeros_like(unknowns)

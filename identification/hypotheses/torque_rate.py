@@ -9,7 +9,7 @@ import numpy as np
 from scipy.integrate import cumulative_trapezoid
 
 from identification.hypotheses.scores import Score, score_of
-from identification.hypotheses.search import EXPLAINED
+from identification.hypotheses.search import EXPLAINED_ERROR
 from identification.model.robot import RobotModel
 from identification.signals.samples import Samples
 
@@ -26,9 +26,9 @@ def is_rate(model: RobotModel, samples: Samples, score: Score, rows: int) -> boo
         score: of some of them.
         rows: that are used of them.
     """
-    if score.overall < EXPLAINED:
+    if score.overall < EXPLAINED_ERROR:
         return False
-    return _integrated_error(model, samples, rows) < min(EXPLAINED, _BETTER * score.overall)
+    return _integrated_error(model, samples, rows) < min(EXPLAINED_ERROR, _BETTER * score.overall)
 
 
 def _integrated_error(model: RobotModel, samples: Samples, rows: int) -> float:

@@ -27,24 +27,24 @@ from identification.signals.samples import Samples
 ChangeKind = Literal["gain", "friction"]
 
 _KINDS: Final[tuple[ChangeKind, ...]] = ("gain", "friction")
-_SIGMAS: Final = 3.0  # standard deviations of a significant change
+_SIGNIFICANT_SIGMAS: Final = 3.0  # standard deviations of a significant change
 # Smallest change that is named; a torque constant drifts by some per cent with the temperature of
 # its magnets.
-_LEAST: Final = 0.03
+_MIN_CHANGE: Final = 0.03
 # Error on unseen motion over the usual one of a joint that may have changed: half of its square
 # again, so that there is an additional error to explain. A change that other axes contradict is an
 # error of the fit as well, and grows it by little.
-_GROWN: Final = 1.25
+_MIN_ERROR_GROWTH: Final = 1.25
 # Error that remains with the change, of a joint that is then predicted as well as usual: twice that
 # of the fitted motion, or that of published fits.
-_USUAL: Final = (2.0, 0.1)
+_MAX_REMAINING_ERROR: Final = (2.0, 0.1)
 # Share of the additional squared error that the change has to explain: twice what is left. Planted
 # changes: at least 0.72, of a friction that is a twentieth of the torque; another motion that the
 # fitted one does not cover: below 0.6.
-_EXPLAINED: Final = 2.0 / 3.0
+_MIN_EXPLAINED_SHARE: Final = 2.0 / 3.0
 # Ratio of remaining errors up to which the two kinds are alike, as for a joint that has little more
 # than friction: friction varies, a gain is set once.
-_ALIKE: Final = 1.1
+_ALIKE_ERROR_RATIO: Final = 1.1
 
 
 class UnseenChange(NamedTuple):
@@ -144,7 +144,7 @@ def find_changes(
     doubt = _Doubt.of(model, estimate, held_out_factor)
     usual = np.maximum(np.hypot(fitted.relative, doubt.relative), 1e-9)
     changes = []
-    for joint in np.flatnonzero(moved & (unseen.relative > _GROWN * usual)).tolist():
+    for joint in np.flatnonzero(moved & (unseen.relative > _MIN_ERROR_GROWTH * usual)).tolist():
         beyond = unseen.relative[joint] ** 2 - usual[joint] ** 2
         trials = []
         for k, kind in enumerate(_KINDS):
@@ -159,16 +159,20 @@ def find_changes(
             deviation = std / base
             error = unseen.error[joint] - unseen.explained[k, joint]
             left = float(_relative(error, unseen.torque[joint]))
-            explains = unseen.relative[joint] ** 2 - left**2 > _EXPLAINED * beyond
+            explains = unseen.relative[joint] ** 2 - left**2 > _MIN_EXPLAINED_SHARE * beyond
             # A factor near zero removes a prediction that is wrong, and explains nothing.
-            explains &= left < max(_USUAL[0] * usual[joint], _USUAL[1])
+            explains &= left < max(_MAX_REMAINING_ERROR[0] * usual[joint], _MAX_REMAINING_ERROR[1])
             size = abs(ratio - 1.0)
             # A factor below zero is no change of one quantity.
-            if ratio > 0.0 and explains and size > max(_LEAST, _SIGMAS * deviation):
+            if (
+                ratio > 0.0
+                and explains
+                and size > max(_MIN_CHANGE, _SIGNIFICANT_SIGMAS * deviation)
+            ):
                 trials.append(UnseenChange(kind, joint, ratio, deviation, left))
         if trials:
             least = min(trial.relative for trial in trials)
-            alike = [trial for trial in trials if trial.relative <= _ALIKE * least]
+            alike = [trial for trial in trials if trial.relative <= _ALIKE_ERROR_RATIO * least]
             changes.append(alike[-1]._replace(alike=len(alike) > 1))
     return tuple(changes)
 

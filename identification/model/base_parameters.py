@@ -13,10 +13,10 @@ from identification.arrays import Array
 # Smallest residual of a base column after projection on the columns before it, relative to the
 # longest column of its unit. Exact geometry leaves 1e-15 of a dependent column, a URDF with rounded
 # angles (1.5708 for pi/2) up to 4e-6.
-TOLERANCE = 1e-5
+DEPENDENCE_TOLERANCE = 1e-5
 
-_ROUNDING = 1e-13
-_NEGLIGIBLE = 1e-9  # factors below this are left out of texts
+_RELATION_ROUNDING = 1e-13
+_NEGLIGIBLE_FACTOR = 1e-9  # factors below this are left out of texts
 
 
 @dataclass(frozen=True, eq=False)
@@ -43,13 +43,13 @@ class BaseParameters:
     def explanation(self) -> str:
         """Return a message about the rank decision and its margin."""
         s = len(self.standard_names)
-        absent = s - np.count_nonzero(np.any(np.abs(self.grouping) > _NEGLIGIBLE, axis=0))
+        absent = s - np.count_nonzero(np.any(np.abs(self.grouping) > _NEGLIGIBLE_FACTOR, axis=0))
         weakest = self.names[int(np.argmin(self.shares[self.pivots]))]
         return (
             f"{self.rank} of {s} standard parameters are independent, {s - self.rank - absent} are"
             f" grouped with them, {absent} do not affect the torque. The smallest residual of an"
             f" independent column is {self.smallest_pivot:.1e} ({weakest}), the largest of a"
-            f" dependent one {self.largest_dropped:.1e}; the threshold is {TOLERANCE:g}."
+            f" dependent one {self.largest_dropped:.1e}; the threshold is {DEPENDENCE_TOLERANCE:g}."
         )
 
     def expressions(self, digits: int = 6) -> tuple[str, ...]:
@@ -59,7 +59,7 @@ class BaseParameters:
             text = self.standard_names[pivot]
             others = [
                 (row[column], self.standard_names[column])
-                for column in np.flatnonzero(np.abs(row) > _NEGLIGIBLE)
+                for column in np.flatnonzero(np.abs(row) > _NEGLIGIBLE_FACTOR)
                 if column != pivot
             ]
             formulas.append(self.expression(text, others, digits))
@@ -92,7 +92,7 @@ def select_base(regressor: Array, names: Sequence[str], units: Sequence[str]) ->
     pivots, basis, shares = _first_independent(scaled)
     relation = np.linalg.solve(basis.T @ scaled[:, pivots], basis.T @ scaled)
     residual = np.linalg.norm(scaled - scaled[:, pivots] @ relation, axis=0).max(initial=0.0)
-    relation[np.abs(relation) < max(_ROUNDING, 10.0 * float(residual))] = 0.0
+    relation[np.abs(relation) < max(_RELATION_ROUNDING, 10.0 * float(residual))] = 0.0
     grouping = relation * scale / scale[pivots, None]
     grouping[:, pivots] = np.eye(len(pivots))
     return BaseParameters(
@@ -124,7 +124,7 @@ def _first_independent(columns: Array) -> tuple[NDArray[np.intp], Array, Array]:
             earlier = basis[:, : len(pivots)]
             residual -= earlier @ (earlier.T @ residual)
         shares[index] = np.linalg.norm(residual)
-        if shares[index] > TOLERANCE and len(pivots) < basis.shape[1]:
+        if shares[index] > DEPENDENCE_TOLERANCE and len(pivots) < basis.shape[1]:
             basis[:, len(pivots)] = residual / shares[index]
             pivots.append(index)
     return np.array(pivots, dtype=np.intp), basis[:, : len(pivots)], shares

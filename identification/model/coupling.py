@@ -15,7 +15,7 @@ import numpy as np
 from identification.arrays import Array
 from identification.errors import ModelError
 
-_UNCOUPLED = 1e-9  # relative to the largest entry of a row
+_COUPLING_TOLERANCE = 1e-9  # relative to the largest entry of a row
 
 
 @dataclass(frozen=True, eq=False)
@@ -30,8 +30,8 @@ class Coupling:
         matrix = np.array(self.motor_from_joint, dtype=np.float64)
         direct = np.abs(np.diag(matrix))
         most = np.abs(matrix).max(axis=1, initial=0.0)
-        if np.any(direct <= _UNCOUPLED * most):
-            motor = int(np.argmax(direct <= _UNCOUPLED * most)) + 1
+        if np.any(direct <= _COUPLING_TOLERANCE * most):
+            motor = int(np.argmax(direct <= _COUPLING_TOLERANCE * most)) + 1
             raise ModelError(
                 f"motor {motor} of the coupling does not turn with joint {motor}; order the motors"
                 " by the joints that they drive"
@@ -61,4 +61,4 @@ class Coupling:
     @staticmethod
     def _relative(matrix: Array) -> Array:
         speeds = matrix / np.diag(matrix)[:, None]
-        return np.where(np.abs(speeds) < _UNCOUPLED, 0.0, speeds)
+        return np.where(np.abs(speeds) < _COUPLING_TOLERANCE, 0.0, speeds)

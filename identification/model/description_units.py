@@ -60,12 +60,13 @@ class _Range:
 
 _EXTENT: Final = _Range((0.0, 50.0), (0.1, 8.0))  # m
 _MASS: Final = _Range((0.0, 1e6), (0.05, 5000.0))  # kg, of all bodies
-_SPREAD: Final = _Range((0.01, 2000.0), (0.5, 300.0))  # kg/m³, mass over the cube of the extent
+# kg/m³, mass over the cube of the extent
+_MASS_OVER_EXTENT_CUBED: Final = _Range((0.01, 2000.0), (0.5, 300.0))
 _OFFSET: Final = _Range((0.0, 5.0), (0.02, 2.0))  # farthest centre of mass over the longest chain
 _GYRATION: Final = _Range((1e-3, 20.0), (0.02, 1.0))  # over the extent, mean over the mass
 _DENSITY: Final = _Range((0.05, 5e4), (20.0, 15e3))  # kg/m³, of ellipsoids with these inertias
-_ISOTROPIC: Final = 1.0 + 1e-9  # ratio of the moments of inertia of a ball
-_CHANGE: Final = 0.5  # decades that another unit for one more quantity costs
+_ISOTROPIC_RATIO: Final = 1.0 + 1e-9  # ratio of the moments of inertia of a ball
+_UNIT_CHANGE_COST: Final = 0.5  # decades that another unit for one more quantity costs
 
 
 @dataclass(frozen=True)
@@ -110,7 +111,7 @@ class _Description:
 
     def is_possible(self) -> bool:
         """Whether an arm can have these figures in SI units."""
-        return all(limits.is_possible(value) for limits, value in self._figures(_SI))
+        return all(limits.is_possible(value) for limits, value in self._figures(_SI_FACTORS))
 
     def distance(self, factors: Sequence[float]) -> float:
         """Return decades from the usual arm in other units, infinite beyond what is usual."""
@@ -133,9 +134,9 @@ class _Description:
         if not mass.size:
             return
         yield _MASS, float(mass.sum())
-        yield _SPREAD, float(mass.sum()) / extent**3
+        yield _MASS_OVER_EXTENT_CUBED, float(mass.sum()) / extent**3
         inertia = of_inertia * self.inertia
-        bodies = inertia[:, -1] > _ISOTROPIC * inertia[:, 0]  # others are placeholders
+        bodies = inertia[:, -1] > _ISOTROPIC_RATIO * inertia[:, 0]  # others are placeholders
         if mass[bodies].sum() < 0.5 * mass.sum():
             return
         gyration = math.sqrt(float(inertia[bodies, -1].sum() / mass[bodies].sum()))
@@ -145,7 +146,7 @@ class _Description:
             yield _DENSITY, density
 
 
-_SI: Final = (1.0, 1.0, 1.0, 1.0)
+_SI_FACTORS: Final = (1.0, 1.0, 1.0, 1.0)
 
 
 @lru_cache(maxsize=8)
@@ -161,7 +162,7 @@ def wrong_units(urdf: str) -> tuple[WrongUnit, ...]:
 
     def cost(names: Sequence[str]) -> float:
         changed = sum(factor != 1.0 for factor in _factors(names))
-        return description.distance(_factors(names)) + _CHANGE * changed
+        return description.distance(_factors(names)) + _UNIT_CHANGE_COST * changed
 
     best = min(product(*_UNITS.values()), key=cost)
     if not math.isfinite(cost(best)):

@@ -13,7 +13,7 @@ import numpy as np
 from identification.arrays import Array
 from identification.errors import ModelError
 
-_SAME_DISTANCE: Final = 1e-6  # relative; equal distances allow a length of zero
+_DISTANCE_TOLERANCE: Final = 1e-6  # relative; equal distances allow a length of zero
 
 
 class ElementError(ModelError):
@@ -81,7 +81,7 @@ class Anchors:
     angle: float  #: between the two at joint angle zero [rad]
 
     def __post_init__(self) -> None:
-        if abs(self.base - self.link) <= _SAME_DISTANCE * self.base:
+        if abs(self.base - self.link) <= _DISTANCE_TOLERANCE * self.base:
             raise ModelError(
                 f"both anchors are {self.base:g} m from the axis, so that their distance is zero at"
                 " one angle; give the measured distances"

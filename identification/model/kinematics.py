@@ -84,16 +84,16 @@ def closed_chain(text: str) -> str | None:
 
 
 # Indices of `LINK_SYMBOLS` in pinocchio's order m, mcx, mcy, mcz, Ixx, Ixy, Iyy, Ixz, ...
-FROM_PINOCCHIO = (4, 5, 7, 6, 8, 9, 1, 2, 3, 0)
+PINOCCHIO_ORDER = (4, 5, 7, 6, 8, 9, 1, 2, 3, 0)
 
-MOST_JOINTS: Final = 64
+MAX_MOVING_JOINTS: Final = 64
 """Largest number of joints; a model of 100 takes a minute and 1.5 GB."""
 
-FARTHEST: Final = 1e6
+MAX_DISTANCE: Final = 1e6
 """Largest coordinate of joints and shapes, m."""
 
 _LINK = "link "
-_UNIT: Final = 1e-6  # tolerance of the length of a unit axis
+_UNIT_LENGTH_TOLERANCE: Final = 1e-6  # tolerance of the length of a unit axis
 
 
 class LinkFrame(NamedTuple):
@@ -158,9 +158,9 @@ def chain_from_urdf(urdf: str, locked: Mapping[str, float] | None = None) -> Cha
     """Read a chain from URDF text; links of fixed joints are merged with their parents.
 
     Raises:
-        ModelError: the text is not a URDF, has no moving joint or more than `MOST_JOINTS`, a joint
-            of another type than revolute, continuous, prismatic or fixed, or no joint of a name
-            in `locked` (positions [rad or m]).
+        ModelError: the text is not a URDF, has no moving joint or more than `MAX_MOVING_JOINTS`, a
+            joint of another type than revolute, continuous, prismatic or fixed, or no joint of a
+            name in `locked` (positions [rad or m]).
     """
     return _chain(urdf, tuple((locked or {}).items()))
 
@@ -170,10 +170,10 @@ def _chain(urdf: str, locked: tuple[tuple[str, float], ...]) -> Chain:
     model = pinocchio_model(urdf, dict(locked))
     if model.njoints < 2:
         raise ModelError("the robot description has no revolute or prismatic joint")
-    if model.njoints > 1 + MOST_JOINTS:
+    if model.njoints > 1 + MAX_MOVING_JOINTS:
         raise ModelError(
             f"the robot description has {model.njoints - 1} moving joints; at most "
-            f"{MOST_JOINTS} can be identified together; lock the others"
+            f"{MAX_MOVING_JOINTS} can be identified together; lock the others"
         )
     indices = range(1, model.njoints)
     axes, revolute = zip(*(_axis(model, i) for i in indices), strict=True)
@@ -185,7 +185,7 @@ def _chain(urdf: str, locked: tuple[tuple[str, float], ...]) -> Chain:
         axis=np.array(axes),
         revolute=np.array(revolute, dtype=np.bool_),
         inertial=np.array(
-            [model.inertias[i].toDynamicParameters()[list(FROM_PINOCCHIO)] for i in indices]
+            [model.inertias[i].toDynamicParameters()[list(PINOCCHIO_ORDER)] for i in indices]
         ),
         frames={
             frame.name: LinkFrame(
@@ -205,7 +205,7 @@ def pinocchio_model(urdf: str, locked: Mapping[str, float] | None = None) -> pin
     Raises:
         ModelError: the text is not a valid URDF of an open chain
             (:func:`identification.model.urdf_text.refusal`), has an axis of length zero or a
-            coordinate beyond `FARTHEST`, or no joint of a name in `locked`.
+            coordinate beyond `MAX_DISTANCE`, or no joint of a name in `locked`.
     """
     if (refused := refusal(urdf)) is not None:
         raise ModelError(f"the robot description is not a readable URDF: {refused}")
@@ -219,7 +219,7 @@ def pinocchio_model(urdf: str, locked: Mapping[str, float] | None = None) -> pin
         raise ModelError(f"the robot description is not an open chain: {closed}")
     for index in range(1, model.njoints):
         if model.joints[index].nv == 1 and not (
-            abs(float(np.linalg.norm(_subspace(model, index))) - 1.0) < _UNIT
+            abs(float(np.linalg.norm(_subspace(model, index))) - 1.0) < _UNIT_LENGTH_TOLERANCE
         ):
             name = model.names[index]
             raise ModelError(
@@ -291,13 +291,13 @@ def _axis(model: pin.Model, index: int) -> tuple[Array, bool]:
 
 
 def _require_near(model: pin.Model) -> None:
-    """Check that all joints and links are within `FARTHEST` of their parents."""
+    """Check that all joints and links are within `MAX_DISTANCE` of their parents."""
     places = [*zip(model.names, model.jointPlacements, strict=True)]
     places += [(frame.name, frame.placement) for frame in model.frames]
     for name, place in places:
-        if not np.abs(place.translation).max() <= FARTHEST:
+        if not np.abs(place.translation).max() <= MAX_DISTANCE:
             raise ModelError(
-                f"{name!r} of the robot description is more than {FARTHEST:g} m away from its "
+                f"{name!r} of the robot description is more than {MAX_DISTANCE:g} m away from its "
                 "parent"
             )
 

@@ -13,8 +13,8 @@ from identification.model.motion import Motion
 from identification.model.pseudo_inertia import Body, inertial_parameters, tensors
 from identification.model.regressor import RegressorPlan
 
-_ROUNDING = 1e-9  # relative to the largest principal moment
-_MOST = 1e9  # kg, m, kg·m²; products of larger numbers could overflow
+_INERTIA_ROUNDING = 1e-9  # relative to the largest principal moment
+_MAX_MAGNITUDE = 1e9  # kg, m, kg·m²; products of larger numbers could overflow
 
 
 @dataclass(frozen=True)
@@ -33,12 +33,12 @@ class Payload:
     frame: str | None = None
 
     def __post_init__(self) -> None:
-        if not 0.0 <= self.mass <= _MOST:
+        if not 0.0 <= self.mass <= _MAX_MAGNITUDE:
             raise ModelError(f"the payload weighs {self.mass!r} kg; give its mass, zero or more")
-        if not all(abs(value) <= _MOST for value in (*self.centre, *self.inertia)):
+        if not all(abs(value) <= _MAX_MAGNITUDE for value in (*self.centre, *self.inertia)):
             raise ModelError(
                 "the payload's centre or inertia has a number that is not finite or beyond"
-                f" {_MOST:g}"
+                f" {_MAX_MAGNITUDE:g}"
             )
 
     @property
@@ -53,7 +53,10 @@ class Payload:
         Principal moments are not negative, and none exceeds the sum of the others.
         """
         least, middle, most = np.linalg.eigvalsh(self.tensor)
-        return bool(least >= -_ROUNDING * most and most <= (1.0 + _ROUNDING) * (least + middle))
+        return bool(
+            least >= -_INERTIA_ROUNDING * most
+            and most <= (1.0 + _INERTIA_ROUNDING) * (least + middle)
+        )
 
     @property
     def parameters(self) -> Array:

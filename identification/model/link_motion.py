@@ -8,9 +8,9 @@ from identification.arrays import Array
 from identification.model.kinematics import Chain, skew
 from identification.model.motion import Motion
 
-_ROUNDING = 1e-15  # of direction cosines
+_COSINE_ROUNDING = 1e-15  # of direction cosines
 
-_OTHERS = (slice(1, 3), slice(0, 3, 2), slice(0, 2))  # the other two axes of each axis
+_OTHER_AXES = (slice(1, 3), slice(0, 3, 2), slice(0, 2))  # the other two axes of each axis
 
 
 class LinkMotion:
@@ -107,8 +107,8 @@ class _Step:
         if (fixed_axis := _find_fixed_axis(self.blend)) is not None:
             row, column, sign = fixed_axis
             self._fixed_axis = (self._shifted[:, :, column], sign, self._carried[:, :, row])
-            rows = _OTHERS[row]
-            columns = _OTHERS[column]
+            rows = _OTHER_AXES[row]
+            columns = _OTHER_AXES[column]
         self._turn = (
             rotation[rows, columns],
             self._shifted[:, :, columns],
@@ -189,4 +189,4 @@ def _add_cross(out: Array, left: Array, axis: int, size: Array) -> None:
 
 def _clean(values: Array) -> Array:
     """Return `values` with rounding errors of zero removed."""
-    return np.where(np.abs(values) < _ROUNDING, 0.0, values)
+    return np.where(np.abs(values) < _COSINE_ROUNDING, 0.0, values)

@@ -24,23 +24,23 @@ N_INERTIA = 6
 N_PRIMITIVES = 12
 
 # moments of inertia do not need the accelerations, which come first
-_ACCELERATION = 0
-_ALPHA = 3
-_SQUARE = 6
-_PRODUCT = 9
-ROTATIONAL = slice(_ALPHA, N_PRIMITIVES)
-_TENSOR = ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2))
+_ACCELERATION_COLUMN = 0
+_ALPHA_COLUMN = 3
+_SQUARE_COLUMN = 6
+_PRODUCT_COLUMN = 9
+ROTATIONAL_COLUMNS = slice(_ALPHA_COLUMN, N_PRIMITIVES)
+_TENSOR_INDICES = ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2))
 
 
 def wrench_matrix(symbol: int) -> Array:
     """Return the wrench (moment, then force) of a unit parameter of `LINK_SYMBOLS`, (6, 12)."""
     matrix = np.zeros((6, N_PRIMITIVES))
     if symbol < N_INERTIA:
-        _add_inertia(matrix[:3], *_TENSOR[symbol])
+        _add_inertia(matrix[:3], *_TENSOR_INDICES[symbol])
     elif symbol < N_INERTIA + 3:
         _add_first_moment(matrix[:3], matrix[3:], symbol - N_INERTIA)
     else:
-        matrix[3:, _ACCELERATION : _ACCELERATION + 3] = np.eye(3)
+        matrix[3:, _ACCELERATION_COLUMN : _ACCELERATION_COLUMN + 3] = np.eye(3)
     return matrix
 
 
@@ -48,14 +48,14 @@ def write_primitives(motion: Array, out: Array) -> None:
     """Compute primitives (n, 12, k) of all links from velocity and acceleration (n, 2, 2, 3, k)."""
     omega = motion[:, 0, 0]
     speed = motion[:, 0, 1]
-    out[:, _ALPHA : _ALPHA + 3] = motion[:, 1, 0]
-    np.multiply(omega, omega, out=out[:, _SQUARE : _SQUARE + 3])
+    out[:, _ALPHA_COLUMN : _ALPHA_COLUMN + 3] = motion[:, 1, 0]
+    np.multiply(omega, omega, out=out[:, _SQUARE_COLUMN : _SQUARE_COLUMN + 3])
     for c in range(3):
         a = (c + 1) % 3
         b = (c + 2) % 3
-        np.multiply(omega[:, a], omega[:, b], out=out[:, _PRODUCT + c])
+        np.multiply(omega[:, a], omega[:, b], out=out[:, _PRODUCT_COLUMN + c])
         # The origin's acceleration is the spatial one + omega x v.
-        acceleration = out[:, _ACCELERATION + c]
+        acceleration = out[:, _ACCELERATION_COLUMN + c]
         np.multiply(omega[:, a], speed[:, b], out=acceleration)
         acceleration -= omega[:, b] * speed[:, a]
         acceleration += motion[:, 1, 1, c]
@@ -63,7 +63,7 @@ def write_primitives(motion: Array, out: Array) -> None:
 
 def _product(a: int, b: int) -> int:
     """Return the primitive omega_a omega_b."""
-    return _SQUARE + a if a == b else _PRODUCT + 3 - a - b
+    return _SQUARE_COLUMN + a if a == b else _PRODUCT_COLUMN + 3 - a - b
 
 
 def _add_inertia(moment: Array, first: int, second: int) -> None:
@@ -72,7 +72,7 @@ def _add_inertia(moment: Array, first: int, second: int) -> None:
     for row, column in entries:  # I has a one at (row, column)
         a = (row + 1) % 3
         b = (row + 2) % 3
-        moment[row, _ALPHA + column] += 1.0
+        moment[row, _ALPHA_COLUMN + column] += 1.0
         # omega x e_row = omega_b e_a - omega_a e_b, times omega_column
         moment[a, _product(b, column)] += 1.0
         moment[b, _product(a, column)] -= 1.0
@@ -82,9 +82,9 @@ def _add_first_moment(moment: Array, force: Array, c: int) -> None:
     """Add e_c x a to the moment, alpha x e_c + omega omega_c - e_c omega^2 to the force."""
     a = (c + 1) % 3
     b = (c + 2) % 3
-    moment[a, _ACCELERATION + b] = -1.0
-    moment[b, _ACCELERATION + a] = 1.0
-    force[a, [_ALPHA + b, _product(a, c)]] = 1.0
-    force[b, _ALPHA + a] = -1.0
+    moment[a, _ACCELERATION_COLUMN + b] = -1.0
+    moment[b, _ACCELERATION_COLUMN + a] = 1.0
+    force[a, [_ALPHA_COLUMN + b, _product(a, c)]] = 1.0
+    force[b, _ALPHA_COLUMN + a] = -1.0
     force[b, _product(b, c)] = 1.0
-    force[c, [_SQUARE + a, _SQUARE + b]] = -1.0
+    force[c, [_SQUARE_COLUMN + a, _SQUARE_COLUMN + b]] = -1.0

@@ -21,7 +21,7 @@ from identification.errors import IdentificationError
 from identification.model.kinematics import skew
 
 # Rows and columns of a symmetric 3x3 matrix, in the order xx, xy, xz, yy, yz, zz.
-_UPPER = (np.array([0, 0, 0, 1, 1, 2]), np.array([0, 1, 2, 1, 2, 2]))
+_UPPER_TRIANGLE = (np.array([0, 0, 0, 1, 1, 2]), np.array([0, 1, 2, 1, 2, 2]))
 
 
 class NoMassError(IdentificationError, ValueError):
@@ -54,7 +54,7 @@ def inertial_from_pseudo(matrix: Array) -> Array:
     second = matrix[..., :3, :3]
     trace = np.trace(second, axis1=-2, axis2=-1)
     tensor = trace[..., None, None] * np.eye(3) - second
-    rows, columns = _UPPER
+    rows, columns = _UPPER_TRIANGLE
     return np.concatenate(
         [tensor[..., rows, columns], matrix[..., :3, 3], matrix[..., 3, 3][..., None]], axis=-1
     )
@@ -89,12 +89,12 @@ def inertial_parameters(body: Body) -> Array:
     """Return the inertial parameters (10,) of a body about its frame's origin (Steiner)."""
     lever = skew(body.centre)
     tensor = body.inertia - body.mass * lever @ lever
-    return np.concatenate([tensor[_UPPER], body.mass * body.centre, [body.mass]])
+    return np.concatenate([tensor[_UPPER_TRIANGLE], body.mass * body.centre, [body.mass]])
 
 
 def tensors(six: Array) -> Array:
     """Return symmetric matrices (..., 3, 3) of xx, xy, xz, yy, yz, zz (..., 6)."""
-    rows, columns = _UPPER
+    rows, columns = _UPPER_TRIANGLE
     tensor = np.empty((*six.shape[:-1], 3, 3))
     tensor[..., rows, columns] = six
     tensor[..., columns, rows] = six
@@ -107,12 +107,12 @@ ASSUMED: Final = "assumed: the nominal has no mass"
 
 # Smallest ratio of the variances of the mass in two directions; that of a steel tube with a
 # diameter of 1/30 of its length.
-_THINNEST: Final = 1e-3
+_MIN_VARIANCE_RATIO: Final = 1e-3
 # Without nominal parameters: a ball with this fraction of the mean joint distance as its radius.
-_BALL: Final = 0.25
-_SMALLEST_BODY: Final = 0.01  # fraction of that radius; smaller nominal bodies are ignored
-_SMALLEST_SIZE: Final = 0.05  # m
-_SOME_MASS: Final = 1.0  # kg
+_BALL_RADIUS_SHARE: Final = 0.25
+_MIN_BODY_SHARE: Final = 0.01  # fraction of that radius; smaller nominal bodies are ignored
+_MIN_JOINT_DISTANCE: Final = 0.05  # m
+_DEFAULT_MASS: Final = 1.0  # kg
 
 
 class ReferenceBodies(NamedTuple):
@@ -130,10 +130,10 @@ def reference_bodies(nominal: Array, translation: Array) -> ReferenceBodies:
     """
     distances = np.linalg.norm(translation[1:], axis=1)
     distances = distances[distances > 0.0]
-    size = max(float(distances.mean()) if len(distances) else 0.0, _SMALLEST_SIZE)
+    size = max(float(distances.mean()) if len(distances) else 0.0, _MIN_JOINT_DISTANCE)
     masses = nominal[nominal[:, 9] > 0.0, 9]
-    mass = float(np.median(masses)) if len(masses) else _SOME_MASS
-    references = [_reference(link, mass, _BALL * size) for link in nominal]
+    mass = float(np.median(masses)) if len(masses) else _DEFAULT_MASS
+    references = [_reference(link, mass, _BALL_RADIUS_SHARE * size) for link in nominal]
     matrices = np.array([matrix for matrix, _ in references])
     return ReferenceBodies(
         inertial=inertial_from_pseudo(matrices),
@@ -151,10 +151,12 @@ def _reference(inertial: Array, usual_mass: float, radius: float) -> tuple[Array
     centre = matrix[:3, 3] / mass
     spread, axes = np.linalg.eigh(matrix[:3, :3] / mass - np.outer(centre, centre))
     ball = radius**2 / 5.0
-    widest = spread[-1] if spread[-1] > _SMALLEST_BODY**2 * ball else ball
-    if spread[0] >= _THINNEST * widest:
+    widest = spread[-1] if spread[-1] > _MIN_BODY_SHARE**2 * ball else ball
+    if spread[0] >= _MIN_VARIANCE_RATIO * widest:
         return matrix, AS_GIVEN
-    second = (axes * np.maximum(spread, _THINNEST * widest)) @ axes.T + np.outer(centre, centre)
+    second = (axes * np.maximum(spread, _MIN_VARIANCE_RATIO * widest)) @ axes.T + np.outer(
+        centre, centre
+    )
     possible = np.empty((4, 4))
     possible[:3, :3] = mass * second
     possible[:3, 3] = possible[3, :3] = mass * centre

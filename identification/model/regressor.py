@@ -19,7 +19,7 @@ from identification.model.link_wrenches import (
     LINK_SYMBOLS,
     N_INERTIA,
     N_PRIMITIVES,
-    ROTATIONAL,
+    ROTATIONAL_COLUMNS,
     wrench_matrix,
     write_primitives,
 )
@@ -29,12 +29,12 @@ Rows = slice | NDArray[np.intp]
 
 # Samples per block, so that the working arrays stay in the processor's cache. For six joints 1000
 # to 2000 take the same time, 512 a quarter more, 256 two thirds more.
-CHUNK = 1280
+SAMPLES_PER_CHUNK = 1280
 
 # Number and granularity of the sizes of reused working arrays (some 8 kB per sample): allocation
 # costs more than the arithmetic.
-_SPARE = 8
-_GRAIN = 128
+_MAX_SPARE_ARRAYS = 8
+_SIZE_GRANULARITY = 128
 
 
 class Regressor(NamedTuple):
@@ -130,8 +130,8 @@ class RegressorPlan:
     @contextmanager
     def _borrowed(self, m: int) -> Iterator[_Workspace]:
         """Provide working arrays that divide m samples evenly, to one thread at a time."""
-        even = -(-m // max(1, -(-m // CHUNK)))
-        size = min(CHUNK, -(-max(even, 1) // _GRAIN) * _GRAIN)
+        even = -(-m // max(1, -(-m // SAMPLES_PER_CHUNK)))
+        size = min(SAMPLES_PER_CHUNK, -(-max(even, 1) // _SIZE_GRANULARITY) * _SIZE_GRANULARITY)
         with self._lock:
             index = next((i for i, work in enumerate(self._spare) if work.size == size), None)
             work = None if index is None else self._spare.pop(index)
@@ -140,7 +140,7 @@ class RegressorPlan:
             yield work
         finally:
             with self._lock:
-                self._spare = [*self._spare, work][-_SPARE:]
+                self._spare = [*self._spare, work][-_MAX_SPARE_ARRAYS:]
 
     def evaluate(self, motion: Motion) -> Regressor:
         """Return the whole regressor of a motion, see :meth:`chunks`."""
@@ -265,7 +265,7 @@ class _Workspace:
         twists = self._motion.twists[link]
         part = twists[:, 0] if moments_only else twists.reshape(len(twists), 6, size)
         length = part.shape[1]
-        used = ROTATIONAL if moments_only else slice(None)
+        used = ROTATIONAL_COLUMNS if moments_only else slice(None)
         matrix = np.concatenate([wrench_matrix(symbol)[:length, used] for symbol in symbols])
         wrenches = np.empty((len(matrix), size))
         columns = slice(first, first + len(symbols))

@@ -13,7 +13,12 @@ from numpy.typing import NDArray
 
 from identification.arrays import Array, Indices
 from identification.errors import ModelError, ShapeError
-from identification.model.base_parameters import TOLERANCE, BaseParameters, select_base, share_left
+from identification.model.base_parameters import (
+    DEPENDENCE_TOLERANCE,
+    BaseParameters,
+    select_base,
+    share_left,
+)
 from identification.model.coupling import Coupling
 from identification.model.elements import Element, ElementError, JointElements, TorqueRipple
 from identification.model.friction import OFFSET, FrictionLaw, JointFriction
@@ -25,7 +30,7 @@ from identification.model.regressor import Regressor, RegressorPlan
 
 _N_LINK = len(LINK_SYMBOLS)
 _N_SINGLE_DIGITS = 9
-_NO_ROTOR = 1e-7  # of the largest parameter of the link: what a solver leaves of zero
+_NO_ROTOR_RATIO = 1e-7  # of the largest parameter of the link: what a solver leaves of zero
 
 
 @dataclass(frozen=True)
@@ -98,7 +103,7 @@ class StandardLayout:
         if not self.rotor_inertia:
             return np.zeros(self.n_joints, dtype=np.bool_)
         inertia = np.abs(values[self.links]).max(axis=1)
-        return np.asarray(values[self.rotors] <= _NO_ROTOR * inertia)
+        return np.asarray(values[self.rotors] <= _NO_ROTOR_RATIO * inertia)
 
     def rotor_matrix(self, standard: Array) -> Array:
         """Return the inertia matrix of the rotors in joint coordinates (n, n)."""
@@ -143,7 +148,7 @@ def _name(symbol: str, joint: int) -> str:
 
 STANDARD_GRAVITY = (0.0, 0.0, -9.81)
 
-_N_STATES = 300  # random states, enough for any arm
+_RANDOM_STATES = 300  # random states, enough for any arm
 _SEED = 20140901
 _NO_LAWS: Final[Mapping[str, FrictionLaw]] = MappingProxyType({})
 _NOT_LOCKED: Final[Mapping[str, float]] = MappingProxyType({})
@@ -523,7 +528,7 @@ def _base_of_bodies(geometry: _Geometry, layout: StandardLayout) -> _BaseOfBodie
     chain, gravity = geometry.chain, geometry.gravity
     everything = np.arange(layout.size, dtype=np.intp)
     random = np.random.default_rng(_SEED)
-    shape = (_N_STATES, chain.n_joints)
+    shape = (_RANDOM_STATES, chain.n_joints)
     q = random.uniform(-np.pi, np.pi, shape)
     qd = random.uniform(-3.0, 3.0, shape)
     qdd = random.uniform(-10.0, 10.0, shape)
@@ -532,7 +537,7 @@ def _base_of_bodies(geometry: _Geometry, layout: StandardLayout) -> _BaseOfBodie
     rows = plan.evaluate(states).dense(layout.size).reshape(-1, layout.size)
     base = select_base(rows, layout.names, layout.units)
     left = share_left(_offsets(rows, chain.n_joints), rows[:, base.pivots])
-    return _BaseOfBodies(base, rows, q, left <= TOLERANCE)
+    return _BaseOfBodies(base, rows, q, left <= DEPENDENCE_TOLERANCE)
 
 
 def _offsets(rows: Array, joints: int) -> Array:
@@ -563,7 +568,7 @@ def _without_carried_rotors(
     columns = np.column_stack([regressor[:, base.pivots], offsets[:, joints]])
     factors = np.linalg.lstsq(columns, rows[:, rotors], rcond=None)[0]
     lumped: dict[str, list[tuple[float, str]]] = {}
-    for row, column in zip(*np.nonzero(np.abs(factors) > TOLERANCE), strict=True):
+    for row, column in zip(*np.nonzero(np.abs(factors) > DEPENDENCE_TOLERANCE), strict=True):
         term = float(factors[row, column]), layout.names[rotors[column]]
         lumped.setdefault(names[row], []).append(term)
     return replace(base, lumped=lumped)
@@ -585,7 +590,7 @@ def _require_separate_elements(
             torque = np.zeros((m, n))
             torque[:, placed.joint] = values[:, k]
             column = torque.reshape(-1, 1)
-            if share_left(column, columns)[0] <= TOLERANCE:
+            if share_left(column, columns)[0] <= DEPENDENCE_TOLERANCE:
                 raise ElementError(
                     f"the torque of {name} on joint {owner!r} cannot be distinguished from that of"
                     " other parameters, such as a weight; state its values, with"

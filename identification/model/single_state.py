@@ -17,13 +17,13 @@ from identification.arrays import Array
 from identification.errors import ModelError
 from identification.model.elements import TorqueRipple
 from identification.model.friction import FrictionLaw
-from identification.model.kinematics import FROM_PINOCCHIO
+from identification.model.kinematics import PINOCCHIO_ORDER
 from identification.model.link_wrenches import LINK_SYMBOLS
 from identification.model.robot import RobotModel
 
-_MASS: Final = LINK_SYMBOLS.index("m")
-_LEAST_MASS: Final = 1e-3  # kg: pinocchio needs the centre of mass, mc / m
-_ROUNDING: Final = 1e-9  # relative to the largest base parameter
+_MASS_INDEX: Final = LINK_SYMBOLS.index("m")
+_MIN_MASS: Final = 1e-3  # kg: pinocchio needs the centre of mass, mc / m
+_PARAMETER_ROUNDING: Final = 1e-9  # relative to the largest base parameter
 
 
 class SingleStateTorque:
@@ -122,15 +122,17 @@ def _bodies(model: RobotModel, base: Array) -> Array:
     links = model.layout.links
     grouping = model.base.grouping[:, links.ravel()]
     bodies = model.nominal[links]
-    bodies[:, _MASS] = np.where(bodies[:, _MASS] < _LEAST_MASS, 1.0, bodies[:, _MASS])
-    is_mass = np.arange(bodies.size) % len(LINK_SYMBOLS) == _MASS
-    most = _ROUNDING * max(1.0, np.abs(base).max(initial=0.0))
+    bodies[:, _MASS_INDEX] = np.where(
+        bodies[:, _MASS_INDEX] < _MIN_MASS, 1.0, bodies[:, _MASS_INDEX]
+    )
+    is_mass = np.arange(bodies.size) % len(LINK_SYMBOLS) == _MASS_INDEX
+    most = _PARAMETER_ROUNDING * max(1.0, np.abs(base).max(initial=0.0))
     for free in (~is_mass, np.ones_like(is_mass)):
         missing = base - grouping @ bodies.ravel()
         change, *_ = np.linalg.lstsq(grouping[:, free], missing, rcond=None)
         if np.abs(grouping[:, free] @ change - missing).max(initial=0.0) < most:
             bodies.reshape(-1)[free] += change
-            if np.all(bodies[:, _MASS] > _LEAST_MASS):
+            if np.all(bodies[:, _MASS_INDEX] > _MIN_MASS):
                 return bodies
             break
     raise ModelError("no bodies with positive masses have these parameters")
@@ -154,7 +156,7 @@ def _pinocchio_model(model: RobotModel, bodies: Array) -> pin.Model:
         if payload is not None and payload[0] == j:
             parameters = parameters + payload[1]
         ordered = np.empty(len(parameters))
-        ordered[list(FROM_PINOCCHIO)] = parameters
+        ordered[list(PINOCCHIO_ORDER)] = parameters
         made.appendBodyToJoint(
             index, pin.Inertia.FromDynamicParameters(ordered), pin.SE3.Identity()
         )

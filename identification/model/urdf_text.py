@@ -33,13 +33,13 @@ def urdf_tree(urdf: str, *, comments: bool = False) -> Element:
     return root
 
 
-LONGEST: Final = 20_000_000
+MAX_CHARACTERS: Final = 20_000_000
 """Largest number of characters; the description of a cell has some 100 000."""
-MOST_LINKS: Final = 1000
+MAX_LINKS: Final = 1000
 """Largest number of links; a chain of some thousands overflows the reader's stack."""
 XACRO: Final = "it is a xacro file; expand it with: xacro FILE > robot.urdf"
-_DEEPEST: Final = 50  # a description needs seven
-_MOST_ATTRIBUTES: Final = 100  # of one element; the reader's time grows with their square
+_MAX_NESTING_DEPTH: Final = 50  # a description needs seven
+_MAX_ATTRIBUTES: Final = 100  # of one element; the reader's time grows with their square
 
 _NUMBERS: Final[Mapping[str, Mapping[str, int]]] = {
     "origin": {"xyz": 3, "rpy": 3},
@@ -56,8 +56,8 @@ _FORMS: Final = {
 _TAG: Final = re.compile(rb"""<[^"'>]*(?:(?:"[^"]*"|'[^']*')[^"'>]*)*>""")
 _QUOTED: Final = re.compile(rb""""[^"]*"|'[^']*'""")
 _BLANKS: Final = (b"\t", b"\n", b"\r")  # spaces in attributes for XML, but not for the reader
-_USUAL: Final = dict.fromkeys(("ixy", "ixz", "iyz"), "0")
-_UNBOUND: Final = expat.errors.codes[expat.errors.XML_ERROR_UNBOUND_PREFIX]
+_DEFAULT_PRODUCTS: Final = dict.fromkeys(("ixy", "ixz", "iyz"), "0")
+_UNBOUND_PREFIX_MESSAGE: Final = expat.errors.codes[expat.errors.XML_ERROR_UNBOUND_PREFIX]
 
 
 class _RefusedError(Exception):
@@ -70,8 +70,8 @@ def refusal(text: str) -> str | None:
     It must be XML of limited size, depth and number of links, without entities, with printable
     names, and with complete, finite inertias.
     """
-    if len(text) > LONGEST:
-        return f"it has {len(text)} characters; at most {LONGEST} are read"
+    if len(text) > MAX_CHARACTERS:
+        return f"it has {len(text)} characters; at most {MAX_CHARACTERS} are read"
     reading = _Reading()
     try:
         reading.read(text)
@@ -124,7 +124,7 @@ class _Reading:
         try:
             expat.ParserCreate("utf-8", "}").Parse(self._data, True)
         except expat.ExpatError as problem:
-            if problem.code != _UNBOUND:
+            if problem.code != _UNBOUND_PREFIX_MESSAGE:
                 raise
             raise _RefusedError(
                 f"a name in line {problem.lineno} has an undeclared prefix; declare it, as in "
@@ -142,10 +142,10 @@ class _Reading:
 
     def _begin(self, tag: str, attributes: Mapping[str, str]) -> None:
         self._path.append(tag)
-        if len(self._path) > _DEEPEST:
-            raise _RefusedError(f"its elements are nested more than {_DEEPEST} deep")
-        if len(attributes) > _MOST_ATTRIBUTES:
-            raise _RefusedError(f"its <{tag[:40]}> has more than {_MOST_ATTRIBUTES} attributes")
+        if len(self._path) > _MAX_NESTING_DEPTH:
+            raise _RefusedError(f"its elements are nested more than {_MAX_NESTING_DEPTH} deep")
+        if len(attributes) > _MAX_ATTRIBUTES:
+            raise _RefusedError(f"its <{tag[:40]}> has more than {_MAX_ATTRIBUTES} attributes")
         if len(self._path) == 2 and tag in ("link", "joint"):
             self._named(tag, attributes.get("name", ""))
         elif self._path[1:] == ["link", "inertial"]:
@@ -174,14 +174,14 @@ class _Reading:
         if tag == "link":
             self._link = name
             self._links += 1
-            if self._links > MOST_LINKS:
-                raise _RefusedError(f"it has more than {MOST_LINKS} links")
+            if self._links > MAX_LINKS:
+                raise _RefusedError(f"it has more than {MAX_LINKS} links")
 
     def _of_inertia(self, tag: str, attributes: Mapping[str, str]) -> str:
         where = f"in the <{tag}> of its <inertial>"
         needed = [] if tag == "origin" else [key for key in _NUMBERS[tag] if key not in attributes]
         if needed:
-            written = " ".join(f'{key}="{_USUAL.get(key, "...")}"' for key in needed)
+            written = " ".join(f'{key}="{_DEFAULT_PRODUCTS.get(key, "...")}"' for key in needed)
             return f"link {self._link!r} has no {', '.join(needed)} {where}; write {written}"
         for key, count in _NUMBERS[tag].items():
             text = attributes.get(key)

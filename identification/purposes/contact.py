@@ -11,18 +11,23 @@ from identification.arrays import Array
 from identification.model.flange import flange_motion, flange_name
 from identification.model.known_payload import Load, Payload
 from identification.model.robot import RobotModel
-from identification.purposes.quiet_torque import PERIOD, SlowResidual, once_in, whole_blocks
+from identification.purposes.quiet_torque import (
+    FALSE_ALARM_PERIOD,
+    SlowResidual,
+    once_in,
+    whole_blocks,
+)
 
-DIRECTIONS: Final = 100
-SHARE: Final = 0.95
+FORCE_DIRECTIONS: Final = 100
+COVERED_SHARE: Final = 0.95
 """Of directions and postures: the force is seen in so many."""
 _SEED: Final = 20140902
-_ROUNDING: Final = 1e-9  # m, of a lever
-_LEVERAGE: Final = 0.1  # of the median one; with less a mass cannot be told from the residual
+_LEVER_ROUNDING: Final = 1e-9  # m, of a lever
+_MIN_LEVERAGE: Final = 0.1  # of the median one; with less a mass cannot be told from the residual
 
 
 class ContactLevel(NamedTuple):
-    """What motion without contact exceeds once in `PERIOD`, and the force that exceeds it."""
+    """What motion without contact exceeds once in `FALSE_ALARM_PERIOD`, and the force that does."""
 
     torque: Array  # of each joint (n,) [N·m or N]
     force: float  # at the flange [N]; infinite where no joint feels it
@@ -33,7 +38,7 @@ def contact(
 ) -> ContactLevel | None:
     """Return thresholds and force at postures (m, n); None of too little unseen motion."""
     peaks = residual_peaks(residuals)
-    torque = once_in(PERIOD, np.concatenate(peaks)) if peaks else None
+    torque = once_in(FALSE_ALARM_PERIOD, np.concatenate(peaks)) if peaks else None
     if torque is None:
         return None
     return ContactLevel(torque, seen_force(model, torque, postures))
@@ -47,28 +52,28 @@ def residual_peaks(residuals: Sequence[SlowResidual]) -> list[Array]:
 def seen_force(model: RobotModel, torque: Array, postures: Array) -> float:
     """Return the force [N] at the flange that exceeds the torque (n,) of some joint.
 
-    In `SHARE` of directions and postures (m, n), at rest. A joint without residual did not move,
-    and its threshold is not known.
+    In `COVERED_SHARE` of directions and postures (m, n), at rest. A joint without residual did not
+    move, and its threshold is not known.
     """
     known = np.where(torque > 0.0, torque, np.inf)
     if not np.isfinite(known).any():
         return float("inf")
     random = np.random.default_rng(_SEED)
-    direction = random.normal(size=(DIRECTIONS, 3))
+    direction = random.normal(size=(FORCE_DIRECTIONS, 3))
     direction /= np.linalg.norm(direction, axis=1)[:, None]
     jacobian = flange_motion(model.chain, postures).jacobian
     shares = np.abs(direction @ jacobian) / known
     largest = shares.max(axis=2).ravel()
-    weakest = float(np.quantile(largest, 1.0 - SHARE))
-    return 1.0 / weakest if weakest > _ROUNDING / float(torque.max()) else float("inf")
+    weakest = float(np.quantile(largest, 1.0 - COVERED_SHARE))
+    return 1.0 / weakest if weakest > _LEVER_ROUNDING / float(torque.max()) else float("inf")
 
 
 def seen_mass(model: RobotModel, residuals: Sequence[SlowResidual]) -> float | None:
-    """Return the mass [kg] at the flange that is seen in half a second (`BLOCK`).
+    """Return the mass [kg] at the flange that is seen in half a second (`BLOCK_SECONDS`).
 
     The residual of each block is fitted by the torque of a kilogram at the flange, with all joints
-    weighted by their residual; motion without another payload exceeds the mass once in `PERIOD`.
-    None of too little unseen motion, or where gravity does not load a joint.
+    weighted by their residual; motion without another payload exceeds the mass once in
+    `FALSE_ALARM_PERIOD`. None of too little unseen motion, or where gravity does not load a joint.
     """
     if not residuals:
         return None
@@ -83,8 +88,8 @@ def seen_mass(model: RobotModel, residuals: Sequence[SlowResidual]) -> float | N
     median = float(np.median(square)) if len(square) else 0.0
     if median == 0.0:
         return None
-    seen = square > _LEVERAGE * median
-    limit = once_in(PERIOD, np.abs(product[seen] / square[seen]))
+    seen = square > _MIN_LEVERAGE * median
+    limit = once_in(FALSE_ALARM_PERIOD, np.abs(product[seen] / square[seen]))
     return None if limit is None else float(limit)
 
 

@@ -15,9 +15,9 @@ from identification.model.friction import COULOMB, STRIBECK
 from identification.model.motion import Motion
 from identification.model.robot import RobotModel
 
-POSTURES: Final = 500
+RANDOM_POSTURES: Final = 500
 """Postures of a workspace."""
-SHARE: Final = 0.95
+COVERED_SHARE: Final = 0.95
 """Of postures and of arms that the covariance allows: the error is smaller in so many."""
 _SEED: Final = 20140901
 
@@ -25,14 +25,14 @@ _SEED: Final = 20140901
 class GravityError(NamedTuple):
     """Error of the gravity torque of each joint, and what holds the joint."""
 
-    error: Array  # that `SHARE` stay below (n,) [N·m or N]; infinite where undetermined
-    friction: Array  # dry friction of `SHARE` of the postures (n,) [N·m or N]
+    error: Array  # that `COVERED_SHARE` stay below (n,) [N·m or N]; infinite where undetermined
+    friction: Array  # dry friction of `COVERED_SHARE` of the postures (n,) [N·m or N]
 
 
 def workspace(lower: Array, upper: Array) -> Array:
-    """Return postures (`POSTURES`, n) between joint limits (n,) [rad or m]."""
+    """Return postures (`RANDOM_POSTURES`, n) between joint limits (n,) [rad or m]."""
     random = np.random.default_rng(_SEED)
-    return lower + (upper - lower) * random.random((POSTURES, len(lower)))
+    return lower + (upper - lower) * random.random((RANDOM_POSTURES, len(lower)))
 
 
 def gravity_error(model: RobotModel, estimate: Estimate, postures: Array) -> GravityError:
@@ -44,7 +44,7 @@ def gravity_error(model: RobotModel, estimate: Estimate, postures: Array) -> Gra
     std = torque_deviation(model, estimate, postures)
     # Covariances of few data have longer tails.
     std *= estimate.interval_factor / float(normal_limit(0.025))
-    error = np.array([mixture_limit(column, SHARE) for column in std.T])
+    error = np.array([mixture_limit(column, COVERED_SHARE) for column in std.T])
     return GravityError(error, dry_friction(model, estimate.values, postures))
 
 
@@ -79,7 +79,7 @@ def mixture_limit(std: Array, share: float) -> float:
 
 
 def dry_friction(model: RobotModel, values: Array, postures: Array) -> Array:
-    """Return the dry friction (n,) [N·m or N] that `SHARE` of postures (m, n) have at least.
+    """Return the dry friction (n,) [N·m or N] that `COVERED_SHARE` of postures (m, n) reach.
 
     Coulomb friction with that of low speed, with that of the load in a posture, and with that of
     coupled motors, of parameters (p,).
@@ -88,7 +88,7 @@ def dry_friction(model: RobotModel, values: Array, postures: Array) -> Array:
     load = np.zeros(n)
     if model.friction.has_load:
         torque = model.gear_torque(values, Motion.at_rest(postures))
-        load = np.quantile(np.abs(torque), 1.0 - SHARE, axis=0)
+        load = np.quantile(np.abs(torque), 1.0 - COVERED_SHARE, axis=0)
     rows = equivalent_coulomb(model, values[model.friction_part], load)
     dry = np.array([row.get(COULOMB.symbol, 0.0) + row.get(STRIBECK.symbol, 0.0) for row in rows])
     return np.asarray(dry[:n] + np.abs(model.friction.motor_speeds()).T @ dry[n:])

@@ -14,8 +14,8 @@ from identification.factor.estimate import Estimate
 from identification.model.robot import RobotModel
 from identification.purposes.contact import contact, seen_mass
 from identification.purposes.gravity_error import gravity_error, workspace
-from identification.purposes.quiet_torque import PERIOD, SlowResidual, slow_residuals
-from identification.purposes.simulation_error import HORIZON, flange_error
+from identification.purposes.quiet_torque import FALSE_ALARM_PERIOD, SlowResidual, slow_residuals
+from identification.purposes.simulation_error import HORIZON_SECONDS, flange_error
 from identification.purposes.thresholds import ContactThreshold, contact_thresholds
 from identification.signals.samples import Samples
 from identification.validation.evidence import Evidence
@@ -138,7 +138,7 @@ def contact_detection(
         limits.contact,
         "N",
         joints=tuple(found.torque.tolist()),
-        references={"period": PERIOD},
+        references={"period": FALSE_ALARM_PERIOD},
     )
 
 
@@ -152,11 +152,13 @@ def change_of_payload(
     if mass is None:
         return Purpose.unknown("payload", "too short", "kg")
     good = None if limits.payload is None else mass <= limits.payload
-    return Purpose("payload", good, mass, limits.payload, "kg", references={"period": PERIOD})
+    return Purpose(
+        "payload", good, mass, limits.payload, "kg", references={"period": FALSE_ALARM_PERIOD}
+    )
 
 
 def simulation(arm: Application, limits: PurposeLimits) -> Purpose:
-    """Return how far a simulated flange is from its measured path after `HORIZON`."""
+    """Return how far a simulated flange is from its measured path after `HORIZON_SECONDS`."""
     if not arm.held_out:
         return Purpose.unknown("simulation", "nothing held out", "m")
     if arm.consistent is None:
@@ -168,7 +170,9 @@ def simulation(arm: Application, limits: PurposeLimits) -> Purpose:
     if error is None:
         return Purpose.unknown("simulation", "too short", "m")
     good = error <= limits.distance
-    return Purpose("simulation", good, error, limits.distance, "m", references={"horizon": HORIZON})
+    return Purpose(
+        "simulation", good, error, limits.distance, "m", references={"horizon": HORIZON_SECONDS}
+    )
 
 
 def single_parameters(estimate: Estimate) -> Purpose:

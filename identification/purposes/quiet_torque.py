@@ -11,26 +11,26 @@ from identification.arrays import Array, Indices
 from identification.distributions import chi_squared_limit
 from identification.model.motion import Motion
 from identification.model.robot import RobotModel
-from identification.signals.block_mean import BLOCK
+from identification.signals.block_mean import BLOCK_SECONDS
 from identification.signals.masks import EDGE, SATURATED
 from identification.signals.samples import Samples
 from identification.signals.smoothing import low_pass
-from identification.validation.prediction import SLOW, driving_residual
+from identification.validation.prediction import SLOW_BANDWIDTH, driving_residual
 
-PERIOD: Final = 60.0
+FALSE_ALARM_PERIOD: Final = 60.0
 """A threshold is exceeded once in this time of motion without contact [s]."""
-_WHOLE: Final = 0.8  # of a block's time
-_FEWEST: Final = 10  # blocks that show how the largest residuals are distributed
-_TAIL: Final = 0.2  # of the blocks, from which larger ones are inferred
-_MANY: Final = 50  # blocks, of which a share would be more peaks than a tail needs
-_WITHIN: Final = 3.0  # times as many blocks as exceed the threshold, at most
+_MIN_BLOCK_SHARE: Final = 0.8  # of a block's time
+_MIN_BLOCKS: Final = 10  # blocks that show how the largest residuals are distributed
+_TAIL_SHARE: Final = 0.2  # of the blocks, from which larger ones are inferred
+_MANY_BLOCKS: Final = 50  # blocks, of which a share would be more peaks than a tail needs
+_TAIL_FACTOR: Final = 3.0  # times as many blocks as exceed the threshold, at most
 
 
 class SlowResidual(NamedTuple):
     """Part of a recording without gap, and what a monitor of contact forces sees in it."""
 
     motion: Motion  # (m, n)
-    torque: Array  # residual below `SLOW` (m, n) [N·m or N]
+    torque: Array  # residual below `SLOW_BANDWIDTH` (m, n) [N·m or N]
 
 
 def slow_residuals(
@@ -48,18 +48,18 @@ def slow_residuals(
                 error = np.where(samples.mask.reasons[reason], 0.0, error)
         for segment in samples.segments:
             motion = samples.motion.rows(segment)
-            if motion.n_samples > _FEWEST and np.ptp(motion.time) > BLOCK:
-                slow = low_pass(motion.time, error[segment], SLOW)
+            if motion.n_samples > _MIN_BLOCKS and np.ptp(motion.time) > BLOCK_SECONDS:
+                slow = low_pass(motion.time, error[segment], SLOW_BANDWIDTH)
                 parts.append(SlowResidual(motion, slow))
     return parts
 
 
 def whole_blocks(time: Array) -> tuple[Indices, int]:
     """Return the first row of each whole block of times (m,) [s], and the row after the last."""
-    index = np.floor((time - time[0]) / BLOCK + 1e-9).astype(np.intp)
+    index = np.floor((time - time[0]) / BLOCK_SECONDS + 1e-9).astype(np.intp)
     edges = np.flatnonzero(np.diff(index, prepend=-1))
     # A part of a block at the end would have a smaller peak than a whole one.
-    if time[-1] - time[edges[-1]] > _WHOLE * BLOCK:
+    if time[-1] - time[edges[-1]] > _MIN_BLOCK_SHARE * BLOCK_SECONDS:
         return edges, len(time)
     return edges[:-1], int(edges[-1])
 
@@ -76,8 +76,12 @@ class _Tail(NamedTuple):
     def of(cls, period: float, peaks: Array) -> _Tail:
         """Choose the tail of peaks of blocks (B, ...) for what is exceeded once in a time [s]."""
         count = len(peaks)
-        share = min(1.0, BLOCK / period)
-        beyond = int(np.clip(_WITHIN * share * count, _TAIL * min(count, _MANY), 0.5 * count))
+        share = min(1.0, BLOCK_SECONDS / period)
+        beyond = int(
+            np.clip(
+                _TAIL_FACTOR * share * count, _TAIL_SHARE * min(count, _MANY_BLOCKS), 0.5 * count
+            )
+        )
         ordered = np.sort(peaks, axis=0)[::-1]
         threshold = ordered[beyond]
         scale = (ordered[:beyond] - threshold).mean(axis=0)
@@ -91,7 +95,7 @@ def once_in(period: float, peaks: Array) -> Array | None:
     further one beyond x is (1 + x / (k scale))^-k, so that few peaks give a larger threshold. Of
     normal residuals, whose tail is shorter, it errs to the larger side.
     """
-    if len(peaks) < _FEWEST:
+    if len(peaks) < _MIN_BLOCKS:
         return None
     tail = _Tail.of(period, peaks)
     growth = tail.beyond * (tail.chance ** (-1.0 / tail.beyond) - 1.0)

@@ -22,24 +22,24 @@ from identification.model.flange import flange_motion
 from identification.model.friction import VISCOUS
 from identification.model.motion import Motion
 from identification.model.robot import RobotModel
-from identification.rollout.windows import STEP, Windows, stretches_of, windows_of
+from identification.rollout.windows import STEP_SECONDS, Windows, stretches_of, windows_of
 from identification.signals.samples import Samples
 from identification.validation.prediction import driving_residual
 
-HORIZON: Final = 0.2
+HORIZON_SECONDS: Final = 0.2
 """Time of a simulation [s]."""
-FEEDBACK: Final = 1.0
+FEEDBACK_BANDWIDTH: Final = 1.0
 """Natural frequency of the feedback that keeps the arm near its motion [Hz]."""
-STRIDE: Final = 0.1
+WINDOW_STRIDE: Final = 0.1
 """Time between the starts of simulations [s]."""
-_MOST: Final = 200  # simulations
-_ALIKE: Final = 8  # steps of one inertia
+_MAX_SIMULATIONS: Final = 200  # simulations
+_STEPS_PER_INERTIA: Final = 8  # steps of one inertia
 
 
 def flange_error(model: RobotModel, values: Array, recordings: Sequence[Samples]) -> float | None:
     """Return the root mean square distance of the flange from its measured path [m].
 
-    After `HORIZON`, of an arm with parameters (p,); None of too little unseen motion.
+    After `HORIZON_SECONDS`, of an arm with parameters (p,); None of too little unseen motion.
 
     Raises:
         IdentificationError: the inertia of the arm is not that of bodies.
@@ -48,11 +48,13 @@ def flange_error(model: RobotModel, values: Array, recordings: Sequence[Samples]
     errors = []
     for samples in recordings:
         error = driving_residual(model, samples, values)
-        parts = stretches_of(samples, np.zeros_like(samples.torque), STEP)
+        parts = stretches_of(samples, np.zeros_like(samples.torque), STEP_SECONDS)
         stretches += parts
         errors += [stretch.mean_about_instants(error[stretch.part]) for stretch in parts]
     try:
-        windows = windows_of(stretches, STEP, HORIZON, STRIDE).some(_MOST)
+        windows = windows_of(stretches, STEP_SECONDS, HORIZON_SECONDS, WINDOW_STRIDE).some(
+            _MAX_SIMULATIONS
+        )
     except IdentificationError:
         return None
     departure = departures(model, values, windows, windows.cut(errors))
@@ -75,19 +77,19 @@ def departures(model: RobotModel, values: Array, windows: Windows, error: Array)
     """
     count, steps, n = error.shape
     # The inertia of an arm hardly changes in so many steps; of many joints it takes long.
-    postures = windows.position[:, ::_ALIKE]
+    postures = windows.position[:, ::_STEPS_PER_INERTIA]
     inertia = moved_inertia(model, values, postures.reshape(-1, n))
     if np.linalg.eigvalsh(inertia).min() <= 0.0:
         raise IdentificationError("the inertia of the arm is not positive")
     inertia = inertia.reshape(count, -1, n, n)
     alone = np.diagonal(moved_inertia(model, values, np.zeros((1, n)))[0])
-    rate = 2.0 * np.pi * FEEDBACK
+    rate = 2.0 * np.pi * FEEDBACK_BANDWIDTH
     stiffness = rate**2 * alone
     damping = 2.0 * rate * alone + viscous_friction(model, values)
     position, velocity = np.zeros((2, count, n))
     for step in range(steps):
         # Damping acts on the velocity after the step: a light joint of much friction stays stable.
-        at = inertia[:, step // _ALIKE]
+        at = inertia[:, step // _STEPS_PER_INERTIA]
         matrix = at + windows.step * np.diag(damping)
         momentum = np.einsum("wij,wj->wi", at, velocity)
         impulse = windows.step * (error[:, step] - stiffness * position)

@@ -13,13 +13,13 @@ from identification.model.flange import flange_motion
 from identification.model.robot import RobotModel
 from identification.purposes.contact import residual_peaks, seen_force
 from identification.purposes.quiet_torque import SlowResidual, once_in, once_in_interval
-from identification.signals.block_mean import BLOCK
+from identification.signals.block_mean import BLOCK_SECONDS
 
-SHOWN: Final = 3.0
+SHOWN_EXCEEDANCES: Final = 3.0
 """Times that unseen motion exceeds the threshold which it shows itself."""
-PERIODS: Final = (60.0, 600.0, 3600.0)
+FALSE_ALARM_PERIODS: Final = (60.0, 600.0, 3600.0)
 """Times for which a threshold is extrapolated [s]."""
-_KNOWN: Final = 3.0  # upper over lower end of an extrapolated threshold, at most
+_MAX_INTERVAL_RATIO: Final = 3.0  # upper over lower end of an extrapolated threshold, at most
 
 
 @dataclass(frozen=True)
@@ -54,14 +54,14 @@ def contact_thresholds(
     if not residuals:
         return ()
     peaks = np.concatenate(residual_peaks(residuals))
-    shown = len(peaks) * BLOCK / SHOWN
+    shown = len(peaks) * BLOCK_SECONDS / SHOWN_EXCEEDANCES
     found = []
-    for period in (shown, *(longer for longer in PERIODS if longer > shown)):
+    for period in (shown, *(longer for longer in FALSE_ALARM_PERIODS if longer > shown)):
         torque = once_in(period, peaks)
         if torque is None:
             break
         low, high = once_in_interval(period, peaks)
-        if period > shown and not (high <= _KNOWN * low).all():
+        if period > shown and not (high <= _MAX_INTERVAL_RATIO * low).all():
             break
         found.append(
             ContactThreshold(

@@ -22,7 +22,7 @@ from identification.factor.factor import Factor, mean_factor
 from identification.model.robot import RobotModel
 from identification.signals.samples import Samples
 
-ALIKE: Final = 3
+MAX_UNMODELLED_REPETITIONS: Final = 3
 """Repetitions of one motion that are reduced to `Unmodelled` sums, which all of them share."""
 
 

@@ -18,7 +18,7 @@ from identification.errors import IdentificationError
 from identification.export.exported_arm import ExportedArm
 from identification.export.simulators import load_mujoco, mjcf
 
-LARGEST_ERROR: Final = np.pi
+MAX_POSITION_ERROR: Final = np.pi
 """Position error [rad or m] from which on a simulation counts as unstable."""
 
 
@@ -172,7 +172,7 @@ def _without_unstable(position: Array, reference: Array) -> Array:
     Positions of the joint that becomes unstable first are infinite, all others NaN.
     """
     with np.errstate(invalid="ignore", over="ignore"):
-        near = np.abs(position - reference) < LARGEST_ERROR
+        near = np.abs(position - reference) < MAX_POSITION_ERROR
     for window in np.flatnonzero(~np.all(near, axis=(1, 2))):
         first = int(np.argmin(np.all(near[window], axis=1)))
         joint = int(np.argmin(near[window, first]))

@@ -20,24 +20,24 @@ from numpy.typing import NDArray
 from identification.arrays import Array
 from identification.export.exported_arm import ExportedArm
 from identification.export.simulators import load_mujoco
-from identification.rollout.mujoco_simulation import LARGEST_ERROR, Feedback
+from identification.rollout.mujoco_simulation import MAX_POSITION_ERROR, Feedback
 from identification.rollout.position_errors import (
     RecordedMotion,
     horizon_rows,
     joint_inertia,
     simulate,
 )
-from identification.rollout.servo_by_torque import LONGEST_DELAY
+from identification.rollout.servo_by_torque import MAX_SERVO_DELAY
 
-_WEIGHT: Final = 0.03  # lambda: of a change by one unit, beside an error that stays as it is
-_UNIT: Final = 0.3  # of the logarithm of friction and gains
+_CHANGE_WEIGHT: Final = 0.03  # lambda: of a change by one unit, beside an error that stays as it is
+_LOG_UNIT: Final = 0.3  # of the logarithm of friction and gains
 _DELAY_UNIT: Final = 5e-3  # s
 _ROTOR_UNIT: Final = 0.3  # of the logarithm of the inertia that the joint turns, rotor included
-_STEP: Final = 0.02  # of finite differences: dry friction makes the error rough
-_LARGEST: Final = 5.0  # change of a quantity, in its units
-_LARGEST_ROTOR: Final = 10.0  # likewise: twenty times the inertia
-_ITERATIONS: Final = 8
-_SETTLED: Final = 1e-3  # relative change
+_DIFFERENCE_STEP: Final = 0.02  # of finite differences: dry friction makes the error rough
+_MAX_CHANGE: Final = 5.0  # change of a quantity, in its units
+_MAX_ROTOR_CHANGE: Final = 10.0  # likewise: twenty times the inertia
+_MAX_ITERATIONS: Final = 8
+_RELATIVE_TOLERANCE: Final = 1e-3  # relative change
 _DRY = ("f0", "fl")
 _VISCOUS = ("f1", "f2")
 
@@ -62,19 +62,19 @@ class Driven:
         return simulate(self.arm, self.motion, self.feedback)
 
     def residuals(self) -> Array:
-        """Return position errors at the horizons (w, h, n), `LARGEST_ERROR` where unstable."""
+        """Return position errors at the horizons (w, h, n), `MAX_POSITION_ERROR` where unstable."""
         windows = self.motion.windows
         simulated = self.positions()
         measured = windows.reached[:, horizon_rows(windows)]
-        return np.where(np.isfinite(simulated), simulated - measured, LARGEST_ERROR)
+        return np.where(np.isfinite(simulated), simulated - measured, MAX_POSITION_ERROR)
 
 
 class PolishedQuantity(NamedTuple):
     """What a polish changes, by a number in its unit."""
 
     change: Callable[[Driven, float], Driven]
-    lower: float = -_LARGEST
-    upper: float = _LARGEST
+    lower: float = -_MAX_CHANGE
+    upper: float = _MAX_CHANGE
 
 
 def polished(start: Driven) -> Driven:
@@ -95,7 +95,7 @@ def polished(start: Driven) -> Driven:
         columns_of_errors = []
         for changes in np.atleast_2d(columns.T):
             errors = _changed(start, quantities, changes).residuals() / scale
-            columns_of_errors.append(np.concatenate([errors.ravel(), _WEIGHT * changes]))
+            columns_of_errors.append(np.concatenate([errors.ravel(), _CHANGE_WEIGHT * changes]))
         return np.column_stack(columns_of_errors)
 
     best, _ = minimize.least_squares(
@@ -105,9 +105,9 @@ def polished(start: Driven) -> Driven:
             np.array([getattr(quantity, end) for quantity in quantities])
             for end in ("lower", "upper")
         ],
-        eps=_STEP,
-        xtol=_SETTLED,
-        max_iter=_ITERATIONS,
+        eps=_DIFFERENCE_STEP,
+        xtol=_RELATIVE_TOLERANCE,
+        max_iter=_MAX_ITERATIONS,
         verbose=minimize.Verbosity.SILENT,
     )
     return _changed(start, quantities, np.asarray(best).ravel())
@@ -140,21 +140,21 @@ def _quantities(start: Driven) -> list[PolishedQuantity]:
         inertias = joint_inertia(arm, start.motion.windows.step).tolist()
         for joint, (rotor, inertia) in enumerate(zip(rotors, inertias, strict=True)):
             # A rotor of a wrist, seen through its gear, is heavier than what it moves.
-            others = max((inertia - rotor) / inertia, np.exp(-_LARGEST_ROTOR * _ROTOR_UNIT))
+            others = max((inertia - rotor) / inertia, np.exp(-_MAX_ROTOR_CHANGE * _ROTOR_UNIT))
             change = partial(_with_rotor, joint, inertia)
             least = float(np.log(others)) / _ROTOR_UNIT
-            quantities.append(PolishedQuantity(change, least, _LARGEST_ROTOR))
+            quantities.append(PolishedQuantity(change, least, _MAX_ROTOR_CHANGE))
     if servo is None:
         return [*quantities, PolishedQuantity(_with_delay)]
     for joint in range(model.n_joints):
         quantities += [PolishedQuantity(partial(_with_gain, name, joint)) for name in ("kp", "kd")]
-    ends = (np.array([0.0, LONGEST_DELAY]) - servo.delay) / _DELAY_UNIT
+    ends = (np.array([0.0, MAX_SERVO_DELAY]) - servo.delay) / _DELAY_UNIT
     return [*quantities, PolishedQuantity(_with_delay, *ends.tolist())]
 
 
 def _with_friction(rows: NDArray[np.intp], driven: Driven, change: float) -> Driven:
     values = driven.arm.values.copy()
-    values[rows] *= np.exp(_UNIT * change)
+    values[rows] *= np.exp(_LOG_UNIT * change)
     return replace(driven, arm=replace(driven.arm, values=values))
 
 
@@ -174,7 +174,7 @@ def _with_gain(name: str, joint: int, driven: Driven, change: float) -> Driven:
     servo = driven.motion.servo
     assert servo is not None
     gains = getattr(servo, name).copy()
-    gains[joint] *= np.exp(_UNIT * change)
+    gains[joint] *= np.exp(_LOG_UNIT * change)
     servo = servo._replace(**{name: gains})
     motion = replace(driven.motion, servo=servo)
     return replace(driven, motion=motion, feedback=Feedback(servo.kp, servo.kd))

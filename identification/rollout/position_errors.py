@@ -18,7 +18,7 @@ from identification.model.flange import flange_motion
 from identification.model.kinematics import Chain
 from identification.model.regressor import RegressorPlan
 from identification.model.robot import RobotModel
-from identification.rollout.mujoco_simulation import LARGEST_ERROR, Feedback, RolloutArm
+from identification.rollout.mujoco_simulation import MAX_POSITION_ERROR, Feedback, RolloutArm
 from identification.rollout.servo_by_torque import PositionServo, command_of
 from identification.rollout.windows import Stretch, Windows, stretches_of
 from identification.signals.samples import Samples
@@ -174,7 +174,7 @@ def _delayed(stretch: Stretch, delay: float) -> Array:
 class RolloutErrors:
     """Root mean square errors of an arm at the horizons."""
 
-    joints: Array  #: position (h, n) [rad or m]; where unstable, `LARGEST_ERROR`
+    joints: Array  #: position (h, n) [rad or m]; where unstable, `MAX_POSITION_ERROR`
     tool: Array  #: distance of the tool (h,) [m] in stable windows; NaN without any
     unstable: int  #: windows in which it became unstable
     unstable_joints: NDArray[np.intp]  #: of these, by the joint that left first (n,)
@@ -183,7 +183,7 @@ class RolloutErrors:
 def errors_of(positions: Array, measured: Array, chain: Chain) -> RolloutErrors:
     """Return the errors of simulated positions (w, h, n)."""
     stable = np.isfinite(positions)
-    difference = np.where(stable, positions - measured, LARGEST_ERROR)
+    difference = np.where(stable, positions - measured, MAX_POSITION_ERROR)
     whole = np.all(stable, axis=2)
     distances = np.full(len(HORIZONS), np.nan)
     for k in range(len(HORIZONS)):
@@ -218,7 +218,7 @@ def coverage(ensemble: Array, measured: Array) -> Array:
     The band is that of one more arm, from mean and scatter of the stable ones.
     """
     count = np.count_nonzero(np.isfinite(ensemble), axis=0)
-    in_band = count >= _FEWEST
+    in_band = count >= _MIN_ARMS
     filled = np.where(np.isfinite(ensemble), ensemble, 0.0)
     mean = filled.sum(axis=0) / np.maximum(count, 1)
     deviation = np.where(np.isfinite(ensemble), ensemble - mean, 0.0)
@@ -228,7 +228,7 @@ def coverage(ensemble: Array, measured: Array) -> Array:
     return np.asarray(inside.mean(axis=0))
 
 
-_FEWEST: Final = 3  # arms of which a scatter is computed
+_MIN_ARMS: Final = 3  # arms of which a scatter is computed
 
 
 @dataclass(frozen=True, eq=False)

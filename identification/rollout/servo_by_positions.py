@@ -8,8 +8,8 @@ Without a torque the bodies have to be given. Of each joint and for each delay d
 
 is linear in five numbers, none of which is negative. What disturbs a joint is in its position, and
 by the servo in all columns, but not in the command: delayed commands, their directions and the
-torque of the bodies along them are instruments. The constant is one of every `BLOCK`, for the
-integral action of a servo. The delay is that of least error of all joints; as a later command
+torque of the bodies along them are instruments. The constant is one of every `BLOCK_SECONDS`, for
+the integral action of a servo. The delay is that of least error of all joints; as a later command
 resembles more viscous friction, standard deviations are those with an unknown delay of each joint.
 
 Bodies of which all masses are larger by a factor have gains, friction and rotor inertias that are
@@ -32,8 +32,8 @@ from identification.export.exported_arm import ExportedArm
 from identification.export.simulators import rigid_torque
 from identification.model.motion import Motion
 from identification.rollout.servo_by_torque import (
-    BLOCK,
-    LONGEST_DELAY,
+    BLOCK_SECONDS,
+    MAX_SERVO_DELAY,
     NoServoError,
     PositionServo,
     best_delay,
@@ -44,8 +44,8 @@ from identification.rollout.windows import Stretch
 
 NAMES: Final = ("kp", "kd", "Im", "f0", "f1")
 """Parameters of a joint: gains, rotor inertia, dry and viscous friction."""
-_LAGS: Final = (0.0, 0.01, 0.02, 0.03, 0.04)  # s of the commands that are instruments
-_DETERMINED: Final = 2.0  # standard deviations that a determined parameter is larger than
+_INSTRUMENT_LAGS: Final = (0.0, 0.01, 0.02, 0.03, 0.04)  # s of the commands that are instruments
+_DETERMINED_SIGMAS: Final = 2.0  # standard deviations that a determined parameter is larger than
 
 
 class EncoderFit(NamedTuple):
@@ -60,7 +60,7 @@ class EncoderFit(NamedTuple):
     @property
     def determined(self) -> NDArray[np.bool_]:
         """Whether a parameter differs from zero by more than its interval (n, 5)."""
-        return np.asarray(self.values > _DETERMINED * self.deviations)
+        return np.asarray(self.values > _DETERMINED_SIGMAS * self.deviations)
 
 
 def fit_servo(arm: ExportedArm, stretches: Sequence[Stretch], step: float) -> EncoderFit:
@@ -90,7 +90,7 @@ def fit_servo(arm: ExportedArm, stretches: Sequence[Stretch], step: float) -> En
             for joint, fit in zip(joints, fits, strict=True)
         ]
     )
-    stiffness = values[:, 0] - _DETERMINED * deviations[:, 0]
+    stiffness = values[:, 0] - _DETERMINED_SIGMAS * deviations[:, 0]
     if not (stiffness > 0.0).all():
         name = model.joint_names[int(np.argmin(stiffness))]
         raise NoServoError(
@@ -191,10 +191,10 @@ def _lengths(columns: Array) -> Array:
 
 def _joints_of(arm: ExportedArm, stretches: Sequence[Stretch], step: float) -> list[_Joint]:
     """Return the equations of each joint of an arm without rotors."""
-    rows = round(BLOCK / step)
+    rows = round(BLOCK_SECONDS / step)
     count = arm.model.n_joints
     # The same rows for every delay: those whose command is known.
-    with_command = slice(round(LONGEST_DELAY / step) + 1, -1)
+    with_command = slice(round(MAX_SERVO_DELAY / step) + 1, -1)
 
     def stacked(columns_of: Callable[[Stretch], Sequence[Array]]) -> Array:
         """Return columns (m, c, n) in blocks without means."""
@@ -203,7 +203,7 @@ def _joints_of(arm: ExportedArm, stretches: Sequence[Stretch], step: float) -> l
             columns = np.stack(columns_of(stretch), axis=1)[with_command]
             blocks += without_means(columns, rows)
         if not blocks:
-            raise NoServoError(f"no stretch lasts {BLOCK:g} s")
+            raise NoServoError(f"no stretch lasts {BLOCK_SECONDS:g} s")
         return np.concatenate(blocks).reshape(len(blocks) * rows, -1, count)
 
     def servo(delay: float) -> Array:
@@ -218,7 +218,7 @@ def _joints_of(arm: ExportedArm, stretches: Sequence[Stretch], step: float) -> l
 
     def commanded(stretch: Stretch) -> list[Array]:
         columns = []
-        for lag in _LAGS:
+        for lag in _INSTRUMENT_LAGS:
             position, _ = command_of(stretch, lag)
             velocity = np.gradient(position, step, axis=0)
             acceleration = np.gradient(velocity, step, axis=0)

@@ -12,11 +12,11 @@ from identification.arrays import Array
 from identification.errors import IdentificationError
 from identification.rollout.windows import Stretch
 
-BLOCK: Final = 0.5
+BLOCK_SECONDS: Final = 0.5
 """Time over which the sum of gravity, friction and integral action counts as constant [s]."""
-LONGEST_DELAY: Final = 0.04
+MAX_SERVO_DELAY: Final = 0.04
 """Largest delay of the command that is tried [s]."""
-_DELAYS: Final = 1e-3  # s between delays that are compared
+_DELAY_STEP: Final = 1e-3  # s between delays that are compared
 
 
 class NoServoError(IdentificationError):
@@ -33,7 +33,7 @@ class PositionServo(NamedTuple):
 
 def lead_of(servo: PositionServo | None) -> float:
     """Return how long before a window the command of a servo has to be known [s]."""
-    return 0.0 if servo is None else max(servo.delay, LONGEST_DELAY)
+    return 0.0 if servo is None else max(servo.delay, MAX_SERVO_DELAY)
 
 
 def command_of(stretch: Stretch, delay: float) -> tuple[Array, Array]:
@@ -75,12 +75,12 @@ def identify_servo(
 
 
 def best_delay(error: Callable[[float], float]) -> float:
-    """Return the delay [s] of least error up to `LONGEST_DELAY`."""
-    delays = np.arange(0.0, LONGEST_DELAY + 0.5 * _DELAYS, _DELAYS)
+    """Return the delay [s] of least error up to `MAX_SERVO_DELAY`."""
+    delays = np.arange(0.0, MAX_SERVO_DELAY + 0.5 * _DELAY_STEP, _DELAY_STEP)
     coarse = delays[int(np.argmin([error(float(delay)) for delay in delays]))]
-    ends = np.clip([coarse - _DELAYS, coarse + _DELAYS], 0.0, LONGEST_DELAY)
+    ends = np.clip([coarse - _DELAY_STEP, coarse + _DELAY_STEP], 0.0, MAX_SERVO_DELAY)
     fine = scipy.optimize.minimize_scalar(
-        error, bounds=ends, method="bounded", options={"xatol": 0.05 * _DELAYS}
+        error, bounds=ends, method="bounded", options={"xatol": 0.05 * _DELAY_STEP}
     )
     return float(fine.x)
 
@@ -89,7 +89,7 @@ def _gains_at(
     stretches: Sequence[Stretch], delay: float, step: float
 ) -> tuple[float, PositionServo]:
     """Return the share of the torque's variance that is left over, and the gains."""
-    rows = round(BLOCK / step)
+    rows = round(BLOCK_SECONDS / step)
     errors = []
     rates = []
     torques = []
@@ -97,12 +97,12 @@ def _gains_at(
         position, _ = command_of(stretch, delay)
         rate = np.gradient(position, step, axis=0)
         # The same rows for every delay: those whose command is known.
-        with_command = slice(round(LONGEST_DELAY / step) + 1, -1)
+        with_command = slice(round(MAX_SERVO_DELAY / step) + 1, -1)
         errors += without_means((position - stretch.motion.position)[with_command], rows)
         rates += without_means((rate - stretch.motion.velocity)[with_command], rows)
         torques += without_means(stretch.torque[with_command], rows)
     if not errors:
-        raise NoServoError(f"no stretch lasts {BLOCK:g} s")
+        raise NoServoError(f"no stretch lasts {BLOCK_SECONDS:g} s")
     error, rate, torque = (np.concatenate(part) for part in (errors, rates, torques))
     n = error.shape[1]
     left = 0.0

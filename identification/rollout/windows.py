@@ -17,9 +17,9 @@ from identification.model.motion import Motion
 from identification.signals.masks import runs_of
 from identification.signals.samples import Samples
 
-STEP: Final = 5e-3
+STEP_SECONDS: Final = 5e-3
 """Time step of a simulation [s]."""
-_FEWEST_SAMPLES: Final = 4  # of a stretch that is interpolated
+_MIN_SAMPLES: Final = 4  # of a stretch that is interpolated
 
 
 class NoWindowError(IdentificationError):
@@ -132,7 +132,7 @@ def stretches_of(
     for part in parts:
         motion = samples.motion.rows(part)
         time = motion.time
-        if len(time) < _FEWEST_SAMPLES or time[-1] - time[0] < 2.0 * step:
+        if len(time) < _MIN_SAMPLES or time[-1] - time[0] < 2.0 * step:
             continue
         count = int((time[-1] - time[0]) / step - 1.0 + 1e-9) + 1
         grid = time[0] + step * (0.5 + np.arange(count))

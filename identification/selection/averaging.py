@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Final
 
-LEAST_ODDS: Final = 0.05
+MIN_ODDS: Final = 0.05
 """Odds against a choice from which on it is averaged with what it replaced: at two and a half
 standard deviations these are 0.05, and a share of 5 % moves nothing."""
 
@@ -25,4 +25,4 @@ class AveragedBandwidth:
 
 def averaged_bandwidth(usual: float, odds: float) -> AveragedBandwidth | None:
     """Return the `usual` bandwidth [Hz], by its `odds` against the chosen one; None for a few."""
-    return AveragedBandwidth(usual, odds) if odds > LEAST_ODDS else None
+    return AveragedBandwidth(usual, odds) if odds > MIN_ODDS else None

@@ -26,9 +26,9 @@ from identification.factor.normal_equations import Solution, solve
 from identification.model.robot import RobotModel
 from identification.text import percentage
 
-_CHANCE: Final = 0.05
+_SIGNIFICANCE_LEVEL: Final = 0.05
 _TINY: Final = 1e-300
-_MOST_BLOCKS: Final = 150
+_MAX_BLOCKS: Final = 150
 
 
 @dataclass(frozen=True)
@@ -89,7 +89,7 @@ def choose_essential(
         IdentificationError: nothing was fitted, or no row was held out.
     """
     # Blocks are merged to some hundred, enough for significance.
-    longer = max(1, sum(len(factor) for factor in held_out) // _MOST_BLOCKS)
+    longer = max(1, sum(len(factor) for factor in held_out) // _MAX_BLOCKS)
     unseen = joined([factor.merged(longer) for factor in held_out]).occupied()
     return eliminate(model, training, unseen, weights=joint_weights(training))
 
@@ -280,7 +280,7 @@ def _is_significant(difference: Array) -> bool:
 
 @lru_cache
 def _limit(freedom: int) -> float:
-    return float(student_limit(_CHANCE, freedom))
+    return float(student_limit(_SIGNIFICANCE_LEVEL, freedom))
 
 
 def _reason(steps: list[EliminationStep], cut: int, refused: tuple[str, ...], rule: CutRule) -> str:

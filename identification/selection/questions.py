@@ -19,10 +19,10 @@ from identification.model.elements import TorqueRipple
 from identification.model.robot import RobotModel
 from identification.selection.averaging import AveragedBandwidth, averaged_bandwidth
 from identification.selection.scores import (
-    IMPOSSIBLE_WORTHWHILE,
-    MEANINGLESS,
-    TRANSFER,
-    WORTHWHILE,
+    MEANINGLESS_ERROR,
+    MIN_IMPOSSIBLE_IMPROVEMENT,
+    MIN_IMPROVEMENT,
+    TRANSFER_STD,
     Known,
     Ready,
     SettingDecision,
@@ -47,9 +47,9 @@ Question = Literal[
     "estimator",
 ]
 
-RATE: Final = 125.0
+SELECTION_RATE: Final = 125.0
 """Rate [Hz] to which recordings are averaged for choices: three times the widest bandwidth."""
-CERTAIN: Final = 3.0
+MIN_CERTAINTY: Final = 3.0
 ROTORS: Final = "largest inertia of rotors"
 PRESLIDING_DISPLACEMENT: Final = "presliding displacement"
 ROWS: Final = "rows that are left out"
@@ -71,15 +71,15 @@ VELOCITIES: Final[tuple[VelocitySource, ...]] = ("measured", "position")
 # nine tenths of an amplitude there, and half of it at 14 Hz.
 BANDWIDTHS: Final = (14.0, 10.0, 20.0, 7.0, 40.0)  # Hz, by distance from the first
 # The middle of what gears show first. Zero is no candidate: its sign at rest is noise.
-PRESLIDING: Final = (3e-5, 1e-5, 1e-4, 3e-4, 1e-6, 1e-3)  # rad or m
+PRESLIDING_DISTANCES: Final = (3e-5, 1e-5, 1e-4, 3e-4, 1e-6, 1e-3)  # rad or m
 # Rows of a joint that stands while another moves hold its load; but those near a reversal, or at
 # rest by brake or static friction, can mislead.
 EXCLUDED_ROWS: Final[tuple[ExcludedRows, ...]] = ("rests", "halts", "slow")
 # Speeds over which dry friction may reverse smoothly, and factors that refine the best of them.
 REVERSAL_SPEEDS: Final = (0.02, 0.08, 0.3)  # rad/s or m/s
-REVERSAL_STEPS: Final = (1.5, 1.25, 1.12, 1.06, 1.03, 1.015, 1.008)
-NEARBY: Final = (1.0, 0.9, 0.95, 1.05, 1.1)  # factors of the bandwidth of a low-pass
-STRENGTHS: Final = (1.0, 4.0, 16.0, 64.0, 1e4)
+REVERSAL_FACTORS: Final = (1.5, 1.25, 1.12, 1.06, 1.03, 1.015, 1.008)
+NEARBY_FACTORS: Final = (1.0, 0.9, 0.95, 1.05, 1.1)  # factors of the bandwidth of a low-pass
+PRIOR_WEIGHTS: Final = (1.0, 4.0, 16.0, 64.0, 1e4)
 """Weights of the described bodies: deviations of 30, 15, 7.5, 4 and 0.3 % of their masses.
 
 None below one: folds of one motion would favour a weaker prior, which another motion pays for. The
@@ -95,12 +95,12 @@ FRICTION_TERMS: Final[tuple[Mapping[str, Any], ...]] = (
     {"third": "cubic", "stribeck": 0.0},
     {"third": "none", "stribeck": 0.1},
 )
-REVERSAL_WORTHWHILE: Final = 0.05
-ROTORS_WORTHWHILE: Final = 0.05
+MIN_REVERSAL_IMPROVEMENT: Final = 0.05
+MIN_ROTORS_IMPROVEMENT: Final = 0.05
 """Rotors far heavier than the links change the error to a fifth or to less than a tenth more."""
-TERM_WORTHWHILE: Final = 0.02
-SPRING_WORTHWHILE: Final = 0.3  # of the error of its own joint
-_MOST_SWEEPS: Final = 2
+MIN_TERM_IMPROVEMENT: Final = 0.02
+MIN_SPRING_IMPROVEMENT: Final = 0.3  # of the error of its own joint
+_MAX_SWEEPS: Final = 2
 
 LowPasses = Callable[[RobotModel, Preprocessing], Sequence[Preprocessing]]
 """Returns settings with candidate low-passes of the torque."""
@@ -168,7 +168,7 @@ def choose_settings(
         choices = [*choices, decision.choice]
     trial.weigh(now)
     compared, now, decided = _choose_prior(trial, now, requested)
-    if not trial.errors(compared).overall < MEANINGLESS:
+    if not trial.errors(compared).overall < MEANINGLESS_ERROR:
         return start
     choices = [*choices, *decided]
     if "springs" in requested:
@@ -184,7 +184,7 @@ def choose_settings(
 def _usual_bandwidth(trial: SettingsTrial, now: Settings) -> AveragedBandwidth | None:
     """Return the usual bandwidth with the odds that another motion prefers it to the chosen one."""
     usual = now.preprocessed(rigid_bandwidth=BANDWIDTHS[0])
-    odds = 0.0 if usual == now else trial.odds(usual, now, TRANSFER)
+    odds = 0.0 if usual == now else trial.odds(usual, now, TRANSFER_STD)
     return averaged_bandwidth(BANDWIDTHS[0], odds)
 
 
@@ -198,7 +198,7 @@ def _first_candidates(start: Settings, questions: Collection[Question]) -> Setti
     if "excluded rows" in questions:
         settings = settings.preprocessed(exclude_rows=EXCLUDED_ROWS[0])
     if "presliding" in questions:
-        settings = settings.with_friction(presliding=PRESLIDING[0])
+        settings = settings.with_friction(presliding=PRESLIDING_DISTANCES[0])
     return settings
 
 
@@ -211,7 +211,7 @@ def _choose_prior(
     """
     choices: list[Choice] = []
     if "strength" in requested and trial.knows_bodies(now):
-        weights = [replace(now.strength, weight=weight) for weight in STRENGTHS]
+        weights = [replace(now.strength, weight=weight) for weight in PRIOR_WEIGHTS]
         decision = trial.decide_last(STRENGTH, [replace(now, strength=each) for each in weights])
         now = decision.settings
         choices = [decision.choice]
@@ -222,7 +222,7 @@ def _choose_prior(
             decision = trial.decide(
                 CONSISTENT,
                 [possible, now],
-                IMPOSSIBLE_WORTHWHILE,
+                MIN_IMPOSSIBLE_IMPROVEMENT,
                 possible=lambda each: trial.carries_over(each, possible),
             )
             now = decision.settings
@@ -252,7 +252,7 @@ def _friction_terms(trial: SettingsTrial, now: Settings) -> SettingDecision:
             and trial.has_friction(term)
         )
 
-    return trial.decide(FRICTION_AT_SPEED, candidates, TERM_WORTHWHILE, possible=possible)
+    return trial.decide(FRICTION_AT_SPEED, candidates, MIN_TERM_IMPROVEMENT, possible=possible)
 
 
 def _load_friction(trial: SettingsTrial, now: Settings) -> SettingDecision:
@@ -265,7 +265,7 @@ def _load_friction(trial: SettingsTrial, now: Settings) -> SettingDecision:
     return trial.decide(
         LOAD,
         candidates,
-        TERM_WORTHWHILE,
+        MIN_TERM_IMPROVEMENT,
         possible=lambda each: law.load or trial.has_load_shares(each),
     )
 
@@ -288,10 +288,10 @@ def _torsion_springs(
         decision = trial.decide(
             SPRINGS,
             [possible, every],
-            SPRING_WORTHWHILE,
+            MIN_SPRING_IMPROVEMENT,
             joint=joint,
             possible=lambda settings: trial.stiffness(joint, settings) > 0.0,
-            certainty=CERTAIN,
+            certainty=MIN_CERTAINTY,
         )
         return bool(decision.choice.chosen)
 
@@ -324,7 +324,7 @@ def _compare_delays(
         pair = [late, sliding] if delay.determined else [sliding, late]
         # The unknown scale of one torque resembles a delay, but of that joint only. One that was
         # estimated beside friction which the law does not have is not refuted by that law at once.
-        certainty = CERTAIN if delay.determined else 1.0
+        certainty = MIN_CERTAINTY if delay.determined else 1.0
         decision = trial.decide(DELAY, pair, 0.0, by_joint=True, rows="fitted", certainty=certainty)
         compared.append(decision.choice)
         if decision.settings.preprocessing.torque_delay == delay.value:
@@ -354,7 +354,7 @@ def _compare_low_passes(
     # A lag and a low-pass differ beside reversals, where friction is not quite as any law: one that
     # replaces a delay is the best of many.
     delayed = now.preprocessing.torque_delay != now.stated_delay
-    certainty = CERTAIN if delayed else 1.0
+    certainty = MIN_CERTAINTY if delayed else 1.0
 
     def compare(first: Settings, other: Settings) -> SettingDecision:
         # That there is one, its gain has shown (`possible_low_passes`).
@@ -389,13 +389,13 @@ def _compare_low_passes(
 def _smooth_reversal(trial: SettingsTrial, now: Settings, filtered: Settings) -> SettingDecision:
     """Choose friction of ``tanh(v / v_t)`` in place of a low-pass if it predicts clearly better."""
     best = trial.best([_with_tanh(now, speed) for speed in REVERSAL_SPEEDS])
-    for step in REVERSAL_STEPS:
-        if trial.best([best, filtered]) is filtered and step < REVERSAL_STEPS[0]:
+    for step in REVERSAL_FACTORS:
+        if trial.best([best, filtered]) is filtered and step < REVERSAL_FACTORS[0]:
             break
         speed = float(best.friction["tanh"])
         best = trial.best([best, *(_with_tanh(now, speed * part) for part in (1.0 / step, step))])
     return trial.decide(
-        REVERSAL, [filtered, best], REVERSAL_WORTHWHILE, by_joint=True, certainty=CERTAIN
+        REVERSAL, [filtered, best], MIN_REVERSAL_IMPROVEMENT, by_joint=True, certainty=MIN_CERTAINTY
     )
 
 
@@ -409,7 +409,7 @@ def _sweep(
     """Decide interdependent settings in turn until nothing changes."""
     requested = [swept for swept in _SETTINGS_SEARCHED if swept.question in questions]
     choices: list[Choice] = []
-    for _ in range(_MOST_SWEEPS):
+    for _ in range(_MAX_SWEEPS):
         before = now
         choices = []
         for swept in requested:
@@ -443,7 +443,7 @@ def _rows_for_motion(
     the error over all rows. Fitted, they spoil the friction at speed. Any gain above its standard
     error decides: friction that is wrong by its interval changes the prediction by a hundredth.
     """
-    limit = trial.errors(now).overall * (1.0 + WORTHWHILE)
+    limit = trial.errors(now).overall * (1.0 + MIN_IMPROVEMENT)
     others = [each for each in candidates if each != now and trial.errors(each).overall < limit]
     return trial.decide(ROWS_IN_MOTION, [now, *others], 0.0, rows="moving")
 
@@ -467,15 +467,15 @@ _SETTINGS_SEARCHED: Final = (
         lambda now: [
             replace(now, strength=replace(now.strength, wide_rotors=wide)) for wide in (False, True)
         ],
-        share=ROTORS_WORTHWHILE,
-        certainty=CERTAIN,
+        share=MIN_ROTORS_IMPROVEMENT,
+        certainty=MIN_CERTAINTY,
     ),
     _SearchedSetting(
         "presliding",
         PRESLIDING_DISPLACEMENT,
-        lambda now: [now.with_friction(presliding=distance) for distance in PRESLIDING],
+        lambda now: [now.with_friction(presliding=distance) for distance in PRESLIDING_DISTANCES],
         lambda now: float(now.friction["presliding"]),
-        transfer=TRANSFER,
+        transfer=TRANSFER_STD,
     ),
     _SearchedSetting(
         "excluded rows",
@@ -486,21 +486,21 @@ _SETTINGS_SEARCHED: Final = (
         "velocity",
         VELOCITY,
         lambda now: [now.preprocessed(velocity=source) for source in VELOCITIES],
-        transfer=TRANSFER,
+        transfer=TRANSFER_STD,
     ),
     _SearchedSetting(
         "bandwidth",
         BANDWIDTH,
         lambda now: [now.preprocessed(rigid_bandwidth=width) for width in BANDWIDTHS],
         lambda now: now.preprocessing.rigid_bandwidth,
-        transfer=TRANSFER,
+        transfer=TRANSFER_STD,
     ),
 )
 
 
 def _nearby_bandwidths(now: Settings) -> list[Settings]:
     width = now.preprocessing.torque_bandwidth or math.nan
-    return [now.preprocessed(torque_bandwidth=share * width) for share in NEARBY]
+    return [now.preprocessed(torque_bandwidth=share * width) for share in NEARBY_FACTORS]
 
 
 def _nearby_lags(now: Settings, filtered: Settings) -> list[Settings]:
@@ -508,4 +508,6 @@ def _nearby_lags(now: Settings, filtered: Settings) -> list[Settings]:
     how = filtered.preprocessing
     width = filtered.preprocessing.torque_bandwidth or math.inf
     lag = how.torque_shape.lag(width)
-    return [now.preprocessed(torque_delay=how.torque_delay + share * lag) for share in NEARBY]
+    return [
+        now.preprocessed(torque_delay=how.torque_delay + share * lag) for share in NEARBY_FACTORS
+    ]

@@ -36,7 +36,7 @@ from identification.text import number
 
 Rows = NDArray[np.bool_]
 
-TRANSFER: Final = 0.07
+TRANSFER_STD: Final = 0.07
 """By how much the gain of an answer on another motion differs from that on parts of this one.
 
 Relative standard deviation, root mean square over eight real arms (60 splits, candidates within
@@ -44,31 +44,31 @@ Relative standard deviation, root mean square over eight real arms (60 splits, c
 presliding displacements (1 to 12 %). Measured once, at ab6d0d94."""
 
 # Improvement required to replace the first, simpler candidate, beside its standard error.
-WORTHWHILE: Final = 0.01
+MIN_IMPROVEMENT: Final = 0.01
 # Bodies that cannot exist are of no use in a simulator, so they must predict better by more than
 # what is worthwhile elsewhere. 3 % in place of 5 % decides eight splits of three of eight real arms
 # otherwise, and what is held out is then predicted 5 % better on average (-11 to +1 %).
-IMPOSSIBLE_WORTHWHILE: Final = 0.03
+MIN_IMPOSSIBLE_IMPROVEMENT: Final = 0.03
 # An error above the torque itself chooses nothing, nor does one that no sensor resolves.
-MEANINGLESS: Final = 1.0
-_EXACT: Final = 1e-5
-_SAME: Final = 1e-4  # relative difference of errors that is none
+MEANINGLESS_ERROR: Final = 1.0
+_EXACT_ERROR: Final = 1e-5
+_SAME_ERROR_TOLERANCE: Final = 1e-4  # relative difference of errors that is none
 # Speeds above this share of the largest are predicted from slower ones to try friction terms.
-_FAST: Final = 0.85
+_FAST_SPEED_SHARE: Final = 0.85
 # Share of the rows of a joint in motion that are faster than a Stribeck term reaches.
-_FEWEST_FAST: Final = 0.1
+_MIN_FAST_SHARE: Final = 0.1
 # Another motion may be faster by this factor, which a friction law has to bear.
-_FASTER: Final = 2.0
+_SPEED_FACTOR: Final = 2.0
 # Smallest friction within the range of speeds, as a share of Coulomb or static friction.
-_LEAST_FRICTION: Final = 0.5
+_MIN_FRICTION_SHARE: Final = 0.5
 # Share of load that becomes friction in a worm gear; a larger one is another effect.
-_LARGEST_SHARE: Final = 0.5
-_SHOWN: Final = 0.1  # share of the torque's scatter from which on friction is judged
-_SPEEDS: Final = 20  # points of that test
+_MAX_LOAD_FRICTION_SHARE: Final = 0.5
+_MIN_SCATTER_SHARE: Final = 0.1  # share of the torque's scatter from which on friction is judged
+_SPEED_SAMPLES: Final = 20  # points of that test
 _POSTURES: Final = 50  # of a recording in which the inertia of the joints is judged
-_FAR_BETTER: Final = 0.5  # share of an error, of what shows in spite of doubts
+_FAR_BETTER_ERROR_RATIO: Final = 0.5  # share of an error, of what shows in spite of doubts
 # Variance inflation from which on two columns are one (James et al. 2013, section 3.3.3): 5 to 10.
-_COLLINEAR: Final = 5.0
+_MAX_VARIANCE_INFLATION: Final = 5.0
 
 Ready = Callable[[RobotModel, Preprocessing], Sequence[Samples]]
 """Prepares the fitted data for a model, averaged to a common rate."""
@@ -169,17 +169,17 @@ class SettingsTrial:
         Args:
             name: of the setting.
             candidates: settings, the default first.
-            share: by which the error must fall; by default `WORTHWHILE`.
+            share: by which the error must fall; by default `MIN_IMPROVEMENT`.
             by_joint: whether the geometric mean over the joints is compared.
             joint: the only joint whose error counts.
             rows: whose error counts.
             possible: whether a candidate may be chosen.
             certainty: standard errors of the difference over the segments by which it must fall.
-            transfer: relative standard deviation between motions in addition (`TRANSFER`). With it
-                the first candidate wins that is not clearly worse than the best, so the candidates
-                are ordered by their distance from the first.
+            transfer: relative standard deviation between motions in addition (`TRANSFER_STD`). With
+                it the first candidate wins that is not clearly worse than the best, so the
+                candidates are ordered by their distance from the first.
         """
-        share = WORTHWHILE if share is None else share
+        share = MIN_IMPROVEMENT if share is None else share
         scores = [self.errors(each, rows) for each in candidates]
         if joint is not None:
             index = self._model.joint_names.index(joint)
@@ -189,7 +189,7 @@ class SettingsTrial:
         means = [mean_error(part) for part in segments]
         chosen = 0
         for k, mean in enumerate(means):
-            if not (mean < means[chosen] and mean < MEANINGLESS) or means[0] < _EXACT:
+            if not (mean < means[chosen] and mean < MEANINGLESS_ERROR) or means[0] < _EXACT_ERROR:
                 continue
             better = clearly_better(segments[k], segments[0], share, certainty, transfer)
             if better and (possible is None or possible(candidates[k])):
@@ -222,13 +222,13 @@ class SettingsTrial:
         need not be better. None behind one that is worse is tried.
         """
         means = [self.errors(candidates[0]).overall]
-        if _EXACT <= means[0] < MEANINGLESS:
+        if _EXACT_ERROR <= means[0] < MEANINGLESS_ERROR:
             for each in candidates[1:]:
                 means.append(self.errors(each).overall)
-                if not means[-1] <= (1.0 + _SAME) * means[0]:
+                if not means[-1] <= (1.0 + _SAME_ERROR_TOLERANCE) * means[0]:
                     break
         chosen = len(means) - 1
-        if not means[chosen] <= (1.0 + _SAME) * means[0]:
+        if not means[chosen] <= (1.0 + _SAME_ERROR_TOLERANCE) * means[0]:
             chosen -= 1
         return self._decision(name, candidates[: len(means)], means, chosen)
 
@@ -252,7 +252,7 @@ class SettingsTrial:
 
         What they fit better is the most that they can predict better.
         """
-        limit = (1.0 - IMPOSSIBLE_WORTHWHILE) * self.fitted_error(possible)
+        limit = (1.0 - MIN_IMPOSSIBLE_IMPROVEMENT) * self.fitted_error(possible)
         return self.fitted_error(settings) < limit
 
     def stiffness(self, joint: str, settings: Settings) -> float:
@@ -342,7 +342,7 @@ class SettingsTrial:
         """
         samples = self.samples(settings)
         speeds = [np.abs(each.motion.velocity).max(axis=0) for each in samples]
-        fast = _FAST * np.max(speeds, axis=0)
+        fast = _FAST_SPEED_SHARE * np.max(speeds, axis=0)
         folds = Folds.of(self.model(settings), samples, fast)
         if not (folds.fitted.samples.any() and folds.predicted.samples.any()):
             return 0.0
@@ -363,12 +363,12 @@ class SettingsTrial:
         fastest = np.max(
             [np.abs(each.motion.velocity).max(axis=0) for each in self.samples(settings)], axis=0
         )
-        fastest = np.maximum(_FASTER * fastest, USUAL_SPEED)
+        fastest = np.maximum(_SPEED_FACTOR * fastest, USUAL_SPEED)
         scatters = torque_scatter(model, self._folds(settings).fitted)
         for law, coefficients, speed, scatter in zip(
             model.friction.laws, table, fastest, scatters, strict=False
         ):
-            along = np.linspace(0.0, speed, _SPEEDS)
+            along = np.linspace(0.0, speed, _SPEED_SAMPLES)
             columns = law.columns(along, np.ones_like(along))
             forces = [
                 coefficients[symbol] * column
@@ -379,7 +379,10 @@ class SettingsTrial:
             # Stribeck friction at the lowest speed is at most twice that at higher ones.
             dry = max(coefficients.get("f0", 0.0), float(total[0]))
             # Friction that hardly shows in the torque is not worth a judgement.
-            if dry > _SHOWN * scatter and float(total.min()) < _LEAST_FRICTION * dry:
+            if (
+                dry > _MIN_SCATTER_SHARE * scatter
+                and float(total.min()) < _MIN_FRICTION_SHARE * dry
+            ):
                 return False
         return True
 
@@ -391,7 +394,7 @@ class SettingsTrial:
         """
         if self.fast_error(settings) > self.fast_error(possible):
             return False
-        limit = _FAR_BETTER * self.errors(possible).overall
+        limit = _FAR_BETTER_ERROR_RATIO * self.errors(possible).overall
         return self.has_inertia(settings) or self.errors(settings).overall < limit
 
     def has_inertia(self, settings: Settings) -> bool:
@@ -405,7 +408,7 @@ class SettingsTrial:
         values = self._values(settings)
         samples = self.samples(settings)
         moved = [(each.motion.position, each.motion.acceleration) for each in samples]
-        alike = np.flatnonzero(_correlation(moved) ** 2 > 1.0 - 1.0 / _COLLINEAR)
+        alike = np.flatnonzero(_correlation(moved) ** 2 > 1.0 - 1.0 / _MAX_VARIANCE_INFLATION)
         for position, _ in moved:
             some = position[:: max(1, len(position) // _POSTURES)]
             inertia = model.joint_inertia(values, some)[:, alike[:, None], alike]
@@ -427,7 +430,7 @@ class SettingsTrial:
             )
             moving = speeds[speeds > law.standstill]
             # At twice its speed the term has fallen to 2 %.
-            if moving.size and np.mean(moving > 2.0 * law.stribeck) < _FEWEST_FAST:
+            if moving.size and np.mean(moving > 2.0 * law.stribeck) < _MIN_FAST_SHARE:
                 return False
         return True
 
@@ -445,7 +448,7 @@ class SettingsTrial:
             if term.term.of_load
         ]
         share, weight = np.array(shares).T
-        return bool(0.0 < np.average(share, weights=weight) < _LARGEST_SHARE)
+        return bool(0.0 < np.average(share, weights=weight) < _MAX_LOAD_FRICTION_SHARE)
 
     def samples(self, settings: Settings) -> list[Samples]:
         """Return the samples of settings, with direction of friction and transmitted torque.

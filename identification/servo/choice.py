@@ -19,15 +19,15 @@ from identification.servo.parameters import OPTIONAL, PLACE, TERMS
 from identification.servo.recorded_motion import Grid, ServoMotion
 from identification.servo.start import STARTS, prior_of, start_of
 
-ITERATIONS: Final = 12
-_FINE: Final = 5  # iterations on the halved grid
-_ROUGH: Final = 12  # iterations of each start
-_TRIAL: Final = 4  # of each fit of a fold
+FIT_ITERATIONS: Final = 12
+_FINE_ITERATIONS: Final = 5  # iterations on the halved grid
+_ROUGH_ITERATIONS: Final = 12  # iterations of each start
+_TRIAL_ITERATIONS: Final = 4  # of each fit of a fold
 _FOLDS: Final = 2
-_FEWEST_WINDOWS: Final = 4  # of which one half is predicted from the other
-_CHANCE: Final = 1.92  # of a log-likelihood with one parameter more, 95 %
-_DEVIATIONS: Final = 2.0  # of the mean over windows, from which on a term harms
-_LARGEST: Final = 1.0  # rad or m of an error, as of a model that falls over
+_MIN_WINDOWS: Final = 4  # of which one half is predicted from the other
+_LOG_LIKELIHOOD_95: Final = 1.92  # of a log-likelihood with one parameter more, 95 %
+_HARM_SIGMAS: Final = 2.0  # of the mean over windows, from which on a term harms
+_MAX_POSITION_ERROR: Final = 1.0  # rad or m of an error, as of a model that falls over
 
 
 @dataclass(frozen=True)
@@ -70,7 +70,12 @@ class ServoFit:
 
 def steps_of_a_fit() -> int:
     """Return the number of iterations that `fit_servos` reports at most."""
-    return len(STARTS) * _ROUGH + (1 + len(OPTIONAL)) * _FOLDS * _TRIAL + ITERATIONS + _FINE
+    return (
+        len(STARTS) * _ROUGH_ITERATIONS
+        + (1 + len(OPTIONAL)) * _FOLDS * _TRIAL_ITERATIONS
+        + FIT_ITERATIONS
+        + _FINE_ITERATIONS
+    )
 
 
 def fit_servos(
@@ -100,20 +105,20 @@ def fit_servos(
             present,
             start_of(prior, start),
             resolution,
-            iterations=_ROUGH,
+            iterations=_ROUGH_ITERATIONS,
             rough=True,
             done=done,
         )
         for start in STARTS
     ]
     best = min(starts, key=lambda each: float(_errors(windows, each, resolution).sum()))
-    enough = windows.count >= _FEWEST_WINDOWS
+    enough = windows.count >= _MIN_WINDOWS
     choices = _choices(windows, best, resolution, done) if enough else ()
     chosen = present.copy()
     for choice in choices:
         chosen[choice.joint, [PLACE[name] for name in choice.terms]] = choice.present
     final = best
-    for on, iterations in ((grid, ITERATIONS), (grid.halved, _FINE)):
+    for on, iterations in ((grid, FIT_ITERATIONS), (grid.halved, _FINE_ITERATIONS)):
         scales = (final.scatter, final.alike)
         final = fit(
             ServoWindows.of(motions(on)), prior, chosen, final.coordinates, resolution,
@@ -136,7 +141,7 @@ def _errors(windows: ServoWindows, estimate: ServoEstimate, resolution: Array) -
     Errors below the step of the encoder count as that.
     """
     residuals = windows.residuals(estimate.values[None])[:, 0]
-    squares = np.minimum((residuals**2).mean(axis=0), _LARGEST**2)
+    squares = np.minimum((residuals**2).mean(axis=0), _MAX_POSITION_ERROR**2)
     return np.asarray(np.log(squares + 12.0 * resolution**2))
 
 
@@ -160,10 +165,10 @@ def _choices(
         deviation = 0.5 * change.std(axis=0) / np.sqrt(max(1, len(change) - 1))
         likelier = 0.5 * independent * change
         total = likelier.sum(axis=0)
-        harms[k] = np.where(gains[k] < -_DEVIATIONS * deviation, -total, 0.0)
-        shown[k] = (total > _CHANCE) & (total > likelier.max(axis=0))
+        harms[k] = np.where(gains[k] < -_HARM_SIGMAS * deviation, -total, 0.0)
+        shown[k] = (total > _LOG_LIKELIHOOD_95) & (total > likelier.max(axis=0))
     # What others do is known with the worst term alone: without it they may well help.
-    left_out = (harms > _CHANCE) & (harms == harms.max(axis=0))
+    left_out = (harms > _LOG_LIKELIHOOD_95) & (harms == harms.max(axis=0))
     return tuple(
         TermChoice(
             terms,
@@ -191,7 +196,8 @@ def _predicted(
         inside = number % _FOLDS == fold
         fitted = windows.some(np.flatnonzero(~inside))
         estimate = fit(
-            fitted, start.prior, present, start.coordinates, resolution, iterations=_TRIAL,
+            fitted, start.prior, present, start.coordinates, resolution,
+            iterations=_TRIAL_ITERATIONS,
             scales=(start.scatter[~inside], start.alike), fixed=True, bus=start.bus_delay,
             rough=True, done=done,
         )  # fmt: skip

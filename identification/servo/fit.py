@@ -25,16 +25,17 @@ from identification.servo.parameters import (
 from identification.servo.recorded_motion import ServoMotion, side_by_side
 from identification.servo.servo_simulation import JointInputs, simulate
 
-_LONGEST: Final = 10.0  # s of a window
-_SHORTEST: Final = 4.0
-_WINDOWS: Final = 24  # that a short recording is cut to
+_MAX_WINDOW_SECONDS: Final = 10.0  # s of a window
+_MIN_WINDOW_SECONDS: Final = 4.0
+_WINDOW_COUNT: Final = 24  # that a short recording is cut to
 ROBUST: Final = 3.0  # scatters from which on a residual counts less
-_DIFFERENCE: Final = np.where(POSITIVE, 0.03, 3e-4)  # of the coordinates, for derivatives
-_DAMPINGS: Final = (1e-3, 1e-1, 1.0, 1e1, 1e2)  # that are tried in each iteration, times the last
-_LARGEST_STEP: Final = np.where(POSITIVE, 0.7, 0.01)  # of a coordinate in an iteration
-_CONVERGED: Final = 3e-4  # relative decrease of the cost at which a fit ends
-_INITIAL_CORRELATION: Final = 0.5  # s that residuals are correlated over, before a fit says it
-_EXACT: Final = 2  # last iterations with differences to both sides
+_DIFFERENCE_STEPS: Final = np.where(POSITIVE, 0.03, 3e-4)  # of the coordinates, for derivatives
+# that are tried in each iteration, times the last
+_DAMPING_FACTORS: Final = (1e-3, 1e-1, 1.0, 1e1, 1e2)
+_MAX_STEP: Final = np.where(POSITIVE, 0.7, 0.01)  # of a coordinate in an iteration
+_COST_TOLERANCE: Final = 3e-4  # relative decrease of the cost at which a fit ends
+_INITIAL_CORRELATION_TIME: Final = 0.5  # s that residuals are correlated over, before a fit says it
+_CENTRAL_DIFFERENCE_ROUNDS: Final = 2  # last iterations with differences to both sides
 _P: Final = len(TERMS)
 
 Done = Callable[[], None]
@@ -60,7 +61,7 @@ class ServoWindows:
     def of(cls, motions: Sequence[ServoMotion]) -> ServoWindows:
         """Return the windows of motions, which follow each other without overlap."""
         total = sum(motion.duration for motion in motions)
-        duration = float(np.clip(total / _WINDOWS, _SHORTEST, _LONGEST))
+        duration = float(np.clip(total / _WINDOW_COUNT, _MIN_WINDOW_SECONDS, _MAX_WINDOW_SECONDS))
         every = motions[0].every
         longest = min(duration, *(motion.duration for motion in motions))
         steps = every * max(1, int(longest / (every * motions[0].step)))
@@ -196,12 +197,12 @@ class _Fit:
         self._correlate(slopes, here, terms)
         self.normal = normal
         size = np.diag(normal)
-        dampings = self.damping * np.array(_DAMPINGS)
+        dampings = self.damping * np.array(_DAMPING_FACTORS)
         steps_ = np.stack(
             [np.linalg.solve(normal + np.diag(damping * size), gradient) for damping in dampings]
         )
         moves = -steps_[:, :-1].reshape(-1, *x.shape)
-        largest = (np.abs(moves) / _LARGEST_STEP).max(axis=2, keepdims=True)
+        largest = (np.abs(moves) / _MAX_STEP).max(axis=2, keepdims=True)
         moves = moves / np.maximum(largest, 1.0)
         tried = x + np.where(self.present, moves, 0.0)
         delay = PLACE["delay"]
@@ -226,12 +227,12 @@ class _Fit:
         count = len(terms)
         shifted = np.repeat(x[None], 1 + (count if self.rough else 2 * count), axis=0)
         for k, term in enumerate(terms):
-            shifted[1 + k, :, term] += self.sign * _DIFFERENCE[term]
+            shifted[1 + k, :, term] += self.sign * _DIFFERENCE_STEPS[term]
             if not self.rough:
-                shifted[1 + count + k, :, term] -= self.sign * _DIFFERENCE[term]
+                shifted[1 + count + k, :, term] -= self.sign * _DIFFERENCE_STEPS[term]
         residuals = self.windows.residuals(self.values(shifted))
         here = residuals[:, 0].copy()
-        steps = (self.sign * _DIFFERENCE[terms])[:, None, None]
+        steps = (self.sign * _DIFFERENCE_STEPS[terms])[:, None, None]
         ahead = residuals[:, 1 : 1 + count]
         if self.rough:
             self.sign = -self.sign
@@ -356,7 +357,7 @@ def fit(
     error = windows.residuals(without_absent(natural(start), present)[None])[:, 0]
     scatter = np.maximum(np.sqrt((error**2).mean(axis=(0, 1))) * 0.5, resolution)
     scatter = np.tile(scatter, (windows.count, 1))
-    alike = np.full(windows.n_joints, _INITIAL_CORRELATION / step)
+    alike = np.full(windows.n_joints, _INITIAL_CORRELATION_TIME / step)
     if scales is not None:
         scatter, alike = scales
     progress = _Fit(
@@ -365,13 +366,13 @@ def fit(
     )  # fmt: skip
     progress._least = resolution
     calm = 0
-    last = 0 if rough else _EXACT
+    last = 0 if rough else _CENTRAL_DIFFERENCE_ROUNDS
     for k in range(iterations - last):
         decrease = progress.iterate()
         done()
         if not fixed and k % 3 == 2:
             progress.rescale()
-        calm = calm + 1 if decrease < _CONVERGED else 0
+        calm = calm + 1 if decrease < _COST_TOLERANCE else 0
         if calm >= 3 and k > 8:
             break
     progress.rough = False

@@ -23,8 +23,8 @@ from identification.servo.parameters import (
     without_absent,
 )
 
-_LEARNT: Final = 0.5  # of the prior's deviation, above which the motion says little
-_FACTOR: Final = 2.0  # upper end over value, above which a parameter is not determined
+_DETERMINED_STD_RATIO: Final = 0.5  # of the prior's deviation, above which the motion says little
+_MAX_INTERVAL_FACTOR: Final = 2.0  # upper end over value, above which a parameter is not determined
 _VANISHES: Final = np.array([name not in ABSENT for name in NAMES])  # without effect at zero
 _POWER: Final = np.array([term.torque for term in TERMS])
 
@@ -58,10 +58,12 @@ def intervals_of(fit: ServoFit) -> ServoIntervals:
         np.where(POSITIVE, values * np.exp(sign * np.minimum(reach, 700.0)), values + sign * reach)
         for sign in (-1.0, 1.0)
     ]
-    narrow = np.where(POSITIVE, np.exp(np.minimum(reach, 700.0)) <= _FACTOR, True)
+    narrow = np.where(POSITIVE, np.exp(np.minimum(reach, 700.0)) <= _MAX_INTERVAL_FACTOR, True)
     least, most = _changed_by_unseen(fit, covariance)
-    narrow &= (least >= 1.0 / _FACTOR) & (most <= _FACTOR)
-    determined = np.asarray((spread <= _LEARNT * prior) & narrow & estimate.present & fit.shown)
+    narrow &= (least >= 1.0 / _MAX_INTERVAL_FACTOR) & (most <= _MAX_INTERVAL_FACTOR)
+    determined = np.asarray(
+        (spread <= _DETERMINED_STD_RATIO * prior) & narrow & estimate.present & fit.shown
+    )
     absent = without_absent(natural(estimate.coordinates), estimate.present)
     lower, upper = (np.where(estimate.present, end, absent) for end in ends)
     unseen = estimate.present & ~fit.shown

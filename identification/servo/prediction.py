@@ -13,11 +13,16 @@ from identification.arrays import Array
 from identification.model.motion import Motion
 from identification.model.robot import RobotModel
 from identification.servo.parameters import in_errors
-from identification.servo.recorded_motion import SMOOTHED, Bodies, ServoMotion, side_by_side
+from identification.servo.recorded_motion import (
+    SMOOTHING_SECONDS,
+    Bodies,
+    ServoMotion,
+    side_by_side,
+)
 from identification.servo.servo_simulation import simulate
 
-_PASSES: Final = 4
-_AGREES: Final = 1e-4  # rad or m between passes
+_MAX_PASSES: Final = 4
+_PASS_TOLERANCE: Final = 1e-4  # rad or m between passes
 
 
 def predicted(
@@ -38,7 +43,7 @@ def predicted(
     references = [motion.command for _ in parameters]
     still = True
     positions = np.stack(references)
-    for _ in range(_PASSES):
+    for _ in range(_MAX_PASSES):
         inputs = [
             replace(
                 motion.along(_along(model, bodies, reference, motion.step, still=still)),
@@ -52,7 +57,7 @@ def predicted(
         positions = new
         references = list(new)
         still = False
-        if change < _AGREES:
+        if change < _PASS_TOLERANCE:
             break
     return positions
 
@@ -63,7 +68,9 @@ def _along(
     """Return the bodies along a reference (g, n), at rest or as it moves."""
     if still:
         return Bodies.every(model, bodies, Motion.at_rest(reference))
-    smooth = scipy.ndimage.gaussian_filter1d(reference, SMOOTHED / step, axis=0, mode="nearest")
+    smooth = scipy.ndimage.gaussian_filter1d(
+        reference, SMOOTHING_SECONDS / step, axis=0, mode="nearest"
+    )
     velocity = np.gradient(smooth, step, axis=0)
     states = Motion.of_states(reference, velocity, np.gradient(velocity, step, axis=0))
     return Bodies.every(model, bodies, states)

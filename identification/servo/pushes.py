@@ -8,11 +8,11 @@ import numpy as np
 
 from identification.arrays import Array
 
-_OVER: Final = 1.0  # s in which a joint moves
-_BEFORE: Final = 0.5  # s before, from which on its command rests
-_RESTING: Final = 1e-3  # rad or m, range of a command that rests
-_FEWEST: Final = 0.01  # rad or m by which a joint that is pushed moves
-_SHARE: Final = 0.25  # of it, that the model moves at most
+_PUSH_SECONDS: Final = 1.0  # s in which a joint moves
+_REST_SECONDS: Final = 0.5  # s before, from which on its command rests
+_MAX_RESTING_RANGE: Final = 1e-3  # rad or m, range of a command that rests
+_MIN_PUSH: Final = 0.01  # rad or m by which a joint that is pushed moves
+_MAX_MODEL_SHARE: Final = 0.25  # of it, that the model moves at most
 
 
 class Push(NamedTuple):
@@ -38,16 +38,16 @@ def pushes_of(step: float, command: Array, measured: Array, simulated: Array) ->
         measured: positions (m, n).
         simulated: positions from the commands alone (m, n).
     """
-    over, before = (max(1, round(duration / step)) for duration in (_OVER, _BEFORE))
+    over, before = (max(1, round(duration / step)) for duration in (_PUSH_SECONDS, _REST_SECONDS))
     if len(measured) <= over + before:
         return []
     windows = np.lib.stride_tricks.sliding_window_view(command, over + before + 1, axis=0)
-    resting = np.ptp(windows, axis=-1) <= _RESTING
+    resting = np.ptp(windows, axis=-1) <= _MAX_RESTING_RANGE
     moved, expected = (
         positions[over + before :] - positions[before:-over] for positions in (measured, simulated)
     )
     size = np.abs(moved)
-    pushed = resting & (size >= _FEWEST) & (np.abs(expected) <= _SHARE * size)
+    pushed = resting & (size >= _MIN_PUSH) & (np.abs(expected) <= _MAX_MODEL_SHARE * size)
     pushes = []
     for joint in np.flatnonzero(pushed.any(axis=0)).tolist():
         row = int(np.argmax(np.where(pushed[:, joint], size[:, joint], 0.0)))

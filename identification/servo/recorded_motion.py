@@ -15,16 +15,16 @@ from identification.model.robot import RobotModel
 from identification.servo.servo_simulation import JointInputs
 from identification.signals.recording import Recording
 
-STEP: Final = 5e-3
+SIMULATION_STEP: Final = 5e-3
 """Time step of a simulation [s]."""
 
-LEAD: Final = 0.25
+LEAD_SECONDS: Final = 0.25
 """Time before a window of which its commands are known [s]: the largest delay."""
-SMOOTHED: Final = 0.03
+SMOOTHING_SECONDS: Final = 0.03
 """Standard deviation of the filter that smooths measured positions for the bodies' torque [s]."""
-_SLOPE: Final = 1e-3  # rad or m of the difference for a slope
-_FEWEST_SAMPLES: Final = 10
-_EVERY: Final = 4  # steps between instants at which the bodies are computed
+_SLOPE_STEP: Final = 1e-3  # rad or m of the difference for a slope
+_MIN_SAMPLES: Final = 10
+_BODY_STRIDE: Final = 4  # steps between instants at which the bodies are computed
 
 
 @dataclass(frozen=True, eq=False)
@@ -61,10 +61,10 @@ class Bodies:
             accelerated = torque(Motion.of_states(position, still, unit))
             inertia[:, joint] = (accelerated - at_rest)[:, joint]
             ends = [
-                torque(Motion.at_rest(position + sign * _SLOPE * unit))[:, joint]
+                torque(Motion.at_rest(position + sign * _SLOPE_STEP * unit))[:, joint]
                 for sign in (-1.0, 1.0)
             ]
-            slope[:, joint] = (ends[1] - ends[0]) / (2.0 * _SLOPE)
+            slope[:, joint] = (ends[1] - ends[0]) / (2.0 * _SLOPE_STEP)
         bias = torque(motion.kinematics()) - inertia * motion.acceleration
         return cls(bias, inertia, slope, position)
 
@@ -72,7 +72,7 @@ class Bodies:
     def every(cls, model: RobotModel, values: Array, motion: Motion) -> Bodies:
         """Return the bodies along a motion on a fine grid, from some of its instants."""
         count = motion.n_samples
-        rows = np.unique(np.append(np.arange(0, count, _EVERY), count - 1))
+        rows = np.unique(np.append(np.arange(0, count, _BODY_STRIDE), count - 1))
         coarse = cls.along(model, values, motion.rows(rows))
         instants = np.arange(count)
 
@@ -99,9 +99,9 @@ class Grid(NamedTuple):
     def of(cls, recording: Recording) -> Grid:
         """Return the grid of a recording; a fast one is simulated at some of its samples."""
         period = float(np.median(np.diff(recording.time)))
-        if period < STEP:
-            return cls(period * max(1, round(STEP / period)), 1)
-        every = max(1, round(period / STEP))
+        if period < SIMULATION_STEP:
+            return cls(period * max(1, round(SIMULATION_STEP / period)), 1)
+        every = max(1, round(period / SIMULATION_STEP))
         return cls(period / every, every)
 
     @property
@@ -148,7 +148,7 @@ class ServoMotion:
 
     def inputs(self, first: int, count: int) -> JointInputs:
         """Return what acts on the n joints in `count` steps from an instant on."""
-        lead = int(np.ceil(LEAD / self.step)) + 3
+        lead = int(np.ceil(LEAD_SECONDS / self.step)) + 3
         rows = np.clip(np.arange(first - lead, first + count), 0, None)
         part = slice(first, first + count)
         return JointInputs(
@@ -190,12 +190,12 @@ def motions_of(
     motions = []
     for part in recording.segments():
         known = np.isfinite(commanded[part]).all(axis=1)
-        if np.count_nonzero(known) < _FEWEST_SAMPLES:
+        if np.count_nonzero(known) < _MIN_SAMPLES:
             continue
         first = part.start + int(np.argmax(known))
         rows = slice(first, part.stop)
         time = recording.time[rows]
-        if time[-1] - time[0] < LEAD:
+        if time[-1] - time[0] < LEAD_SECONDS:
             continue
         motions.append(
             _motion(time, commanded[rows], recording.position[rows], model, bodies, grid)
@@ -220,7 +220,9 @@ def _motion(
         )
 
     measured = at_grid(position)
-    smooth = scipy.ndimage.gaussian_filter1d(measured, SMOOTHED / step, axis=0, mode="nearest")
+    smooth = scipy.ndimage.gaussian_filter1d(
+        measured, SMOOTHING_SECONDS / step, axis=0, mode="nearest"
+    )
     velocity = np.gradient(smooth, step, axis=0)
     acceleration = np.gradient(velocity, step, axis=0)
     return ServoMotion(

@@ -24,7 +24,7 @@ _SIMULATED: Final = (
     *("kp", "armature", "viscous", "coulomb", "delay", "offset", "load", "static", "speed"),
     *("kd", "limit", "dead_band"),
 )
-_UNLIMITED: Final = 1e6  # rad/s² or m/s²
+_UNLIMITED_ACCELERATION: Final = 1e6  # rad/s² or m/s²
 
 
 @dataclass(frozen=True, eq=False)
@@ -173,7 +173,7 @@ class _SetPoint:
         """Return it at rest; None if no joint has a limit."""
         if np.isinf(acceleration).all():
             return None
-        return cls(step, np.minimum(acceleration, _UNLIMITED))
+        return cls(step, np.minimum(acceleration, _UNLIMITED_ACCELERATION))
 
     def __post_init__(self) -> None:
         self._twice = 2.0 * self.most

@@ -19,10 +19,10 @@ from identification.servo.recorded_motion import ServoMotion
 
 Engine = Literal["mujoco", "physx"]
 ENGINES: Final[tuple[Engine, ...]] = get_args(Engine)
-ITERATIONS: Final = 12
+FIT_ITERATIONS: Final = 12
 
 _COMMON: Final = ("kp", "armature", "viscous", "coulomb", "delay", "offset", "limit")
-HAS: Final[Mapping[Engine, tuple[str, ...]]] = {
+TERMS_OF_ENGINE: Final[Mapping[Engine, tuple[str, ...]]] = {
     "mujoco": _COMMON,
     "physx": (*_COMMON, "static", "speed"),
 }
@@ -49,12 +49,12 @@ def fits_in_simulators(
     best = found.estimate
     fits = dict[Engine, ServoFit]()
     for engine in ENGINES:
-        present = best.present & np.isin(NAMES, HAS[engine])
+        present = best.present & np.isin(NAMES, TERMS_OF_ENGINE[engine])
         if (present == best.present).all():
             fits[engine] = found
             continue
         estimate = fit(
-            windows, best.prior, present, best.coordinates, resolution, iterations=ITERATIONS,
+            windows, best.prior, present, best.coordinates, resolution, iterations=FIT_ITERATIONS,
             bus=best.bus_delay, done=done,
         )  # fmt: skip
         fits[engine] = ServoFit(estimate, (), found.windows, found.shown & present)

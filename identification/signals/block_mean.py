@@ -11,14 +11,14 @@ from identification.arrays import Array, Indices
 from identification.signals.samples import Samples
 
 # Model errors are correlated over tenths of a second.
-BLOCK: Final = 0.5  # s
-FEWEST_BLOCKS: Final = 5  # fewer blocks give no standard error
+BLOCK_SECONDS: Final = 0.5  # s
+MIN_BLOCKS: Final = 5  # fewer blocks give no standard error
 
 
 class BlockMean(NamedTuple):
     """Means over blocks of time; every array has the shape of the averaged values."""
 
-    mean: Array  # NaN with fewer than `FEWEST_BLOCKS` blocks
+    mean: Array  # NaN with fewer than `MIN_BLOCKS` blocks
     std: Array  # standard error, likewise
     rows: Array  # samples
     blocks: Indices  # blocks with at least one sample
@@ -35,7 +35,7 @@ def block_mean(parts: Sequence[Array], repeated: int = 1) -> BlockMean:
     values, weights = np.concatenate([shared, *parts[repeated:]], axis=1)
     total = weights.sum(axis=0)
     blocks = np.count_nonzero(weights, axis=0)
-    enough = blocks >= FEWEST_BLOCKS
+    enough = blocks >= MIN_BLOCKS
     divisor = np.where(enough, total, 1.0)
     mean = values.sum(axis=0) / divisor
     scores = (values - mean * weights) / divisor
@@ -46,4 +46,4 @@ def block_mean(parts: Sequence[Array], repeated: int = 1) -> BlockMean:
 def block_index(samples: Samples) -> Indices:
     """Return the block of each row (m,), numbered from the start of the motion."""
     since = samples.motion.time - samples.origin
-    return np.maximum(np.floor(since / BLOCK + 1e-9).astype(np.intp), 0)
+    return np.maximum(np.floor(since / BLOCK_SECONDS + 1e-9).astype(np.intp), 0)

@@ -16,30 +16,31 @@ import scipy
 from numpy.typing import NDArray
 
 from identification.arrays import Array
-from identification.signals.recording import GAP_STEPS, PAUSE, Recording, RecordingError
+from identification.signals.recording import GAP_STEPS, PAUSE_SECONDS, Recording, RecordingError
 
 Rows = NDArray[np.bool_]
 
 # Largest deviation from a uniform step: 1 % displaces a sine of a tenth of the sampling rate by
 # less than 1 % of its amplitude.
-UNIFORM: Final = 0.01
-_REGULAR: Final = 0.25  # largest deviation from a step between which no sample is missing
-_LAG: Final = 7  # steps for measuring the usual step
-_PHASE: Final = 51  # samples averaged for the phase; slower changes are drift
+MAX_STEP_DEVIATION: Final = 0.01
+# largest deviation from a step between which no sample is missing
+_REGULAR_STEP_TOLERANCE: Final = 0.25
+_STEP_LAG: Final = 7  # steps for measuring the usual step
+_PHASE_SAMPLES: Final = 51  # samples averaged for the phase; slower changes are drift
 _REFINEMENTS: Final = 3  # iterations of step and count of steps
-_DRIFT: Final = 101
-_MARGIN: Final = 3.0  # required significance of the decision, standard deviations
-_OUTLIER: Final = 6.0  # limit of the influence of a row, standard deviations
+_DRIFT_SAMPLES: Final = 101
+_DECISION_SIGMAS: Final = 3.0  # required significance of the decision, standard deviations
+_OUTLIER_SIGMAS: Final = 6.0  # limit of the influence of a row, standard deviations
 _ROWS_AT_ONCE: Final = 20_000
-_SHORTEST: Final = 32  # samples; shorter segments keep their stamps
-_BESIDE: Final = 4  # steps to either side for the speed at one
+_MIN_SAMPLES: Final = 32  # samples; shorter segments keep their stamps
+_NEIGHBOUR_STEPS: Final = 4  # steps to either side for the speed at one
 _SPEED_TIME: Final = 0.025  # s to either side for the speed beside a residual
-_BURSTS: Final = 0.9  # of the pauses of stamps that are late, not of missing rows
-_CLEAR: Final = 8.0  # steps are counted by positions that resolve an eighth of a clock step
-_MOVES: Final = 3.0  # multiples of noise and resolution of a moving joint
+_MIN_BURST_SHARE: Final = 0.9  # of the pauses of stamps that are late, not of missing rows
+_MIN_CLARITY: Final = 8.0  # steps are counted by positions that resolve an eighth of a clock step
+_MOVING_NOISE_RATIO: Final = 3.0  # multiples of noise and resolution of a moving joint
 # Rounding noise of the distance from the cubic: sqrt((1 + 17 / 18) / 12).
-_ROUNDING: Final = 0.4  # steps of the encoder
-_CUBIC: Final = np.array([-2, -1, 1, 2])  # samples beside
+_CUBIC_ROUNDING: Final = 0.4  # steps of the encoder
+_CUBIC_OFFSETS: Final = np.array([-2, -1, 1, 2])  # samples beside
 
 
 @dataclass(frozen=True)
@@ -66,7 +67,7 @@ class TimeBase:
     @property
     def uniform(self) -> bool:
         """Whether segments between gaps are uniformly sampled."""
-        even = self.largest_deviation <= UNIFORM
+        even = self.largest_deviation <= MAX_STEP_DEVIATION
         return even and self.repeated == self.backward == self.dropped == 0
 
 
@@ -106,14 +107,14 @@ def time_base(time: Array, gap_before: NDArray[np.bool_] | None = None) -> TimeB
         backward=int(np.count_nonzero(steps < 0.0)),
         dropped=int(missing.sum()),
         gaps=int(np.count_nonzero(gap)),
-        pauses=int(np.count_nonzero(steps > PAUSE)),
-        longest_pause=float(steps.max(initial=0.0, where=steps > PAUSE)),
+        pauses=int(np.count_nonzero(steps > PAUSE_SECONDS)),
+        longest_pause=float(steps.max(initial=0.0, where=steps > PAUSE_SECONDS)),
     )
 
 
 def _usual_step(time: Array, steps: Array, median: float) -> float:
     """Return the step of the clock [s], with more digits than rounded stamps."""
-    lag = min(_LAG, len(time) - 1)
+    lag = min(_STEP_LAG, len(time) - 1)
     usual = float(np.median(time[lag:] - time[:-lag])) / lag
     if not 0.5 * median < usual < 2.0 * median:
         return median
@@ -124,10 +125,13 @@ def _usual_step(time: Array, steps: Array, median: float) -> float:
 def _steps_by_phase(time: Array, step: float) -> Array:
     """Return steps of an even clock between stamps (m,) [s] with errors below half a step."""
     turns = (time - time[0]) / step
-    if np.abs(np.diff(turns) - 1.0).max(initial=0.0) < _REGULAR:
+    if np.abs(np.diff(turns) - 1.0).max(initial=0.0) < _REGULAR_STEP_TOLERANCE:
         return np.ones(len(turns) - 1)
     phasor = scipy.ndimage.uniform_filter1d(
-        np.exp(2j * np.pi * turns).view(np.float64).reshape(-1, 2), _PHASE, axis=0, mode="nearest"
+        np.exp(2j * np.pi * turns).view(np.float64).reshape(-1, 2),
+        _PHASE_SAMPLES,
+        axis=0,
+        mode="nearest",
     )
     phase = np.unwrap(np.arctan2(phasor[:, 1], phasor[:, 0])) / (2.0 * np.pi)
     ahead = np.rint(turns - phase) - np.arange(len(time))
@@ -164,7 +168,7 @@ class SampleTimes:
     @property
     def certain(self) -> bool:
         """Whether the positions decide: the share is not between the hypotheses."""
-        return bool(abs(self.share - 0.5) > max(_MARGIN * self.deviation, 0.25))
+        return bool(abs(self.share - 0.5) > max(_DECISION_SIGMAS * self.deviation, 0.25))
 
 
 def true_times(recording: Recording) -> tuple[Recording, SampleTimes]:
@@ -189,7 +193,7 @@ def true_times(recording: Recording) -> tuple[Recording, SampleTimes]:
     share = np.nan
     deviation = np.nan
     residuals = (1.0, 1.0)
-    if np.abs(clock.late).max() > UNIFORM:
+    if np.abs(clock.late).max() > MAX_STEP_DEVIATION:
         parts = [_residuals(*part, base.step) for part in clock.evidence]
         share, deviation, residuals = _stamp_share(*map(np.concatenate, zip(*parts, strict=True)))
     rows = ~(clock.repeated | clock.idle)
@@ -198,7 +202,7 @@ def true_times(recording: Recording) -> tuple[Recording, SampleTimes]:
     times = SampleTimes(0, False, clock.missing, base.rate, scatter, share, deviation, residuals)
     is_even = times.certain and share < 0.5 and advances
     out = ~rows if is_even else clock.repeated
-    shown = share if is_even or base.largest_deviation > UNIFORM else np.nan
+    shown = share if is_even or base.largest_deviation > MAX_STEP_DEVIATION else np.nan
     times = replace(times, removed=int(np.count_nonzero(out)), even=is_even, share=shown)
     if not out.any() and not is_even:
         return recording, times
@@ -212,7 +216,7 @@ def _clock_of(recording: Recording, signals: Array) -> tuple[TimeBase, _EvenCloc
     base = time_base(time, gap)
     if not _are_late_in_bursts(time, signals, gap):
         return base, _even_clock(time, signals, recording.segments(), base)
-    reported = np.diff(time, prepend=time[0]) > PAUSE
+    reported = np.diff(time, prepend=time[0]) > PAUSE_SECONDS
     if gap is not None:
         reported |= gap
     numbered = replace(recording, time=np.arange(len(time), dtype=np.float64), gap_before=reported)
@@ -228,24 +232,24 @@ def _are_late_in_bursts(time: Array, signals: Array, reported: Rows | None) -> b
     """
     steps = np.diff(time)
     forward = steps[steps > 0.0]
-    if len(time) < _SHORTEST or not forward.size:
+    if len(time) < _MIN_SAMPLES or not forward.size:
         return False
-    pause = (steps > GAP_STEPS * float(np.median(forward))) & (steps <= PAUSE)
+    pause = (steps > GAP_STEPS * float(np.median(forward))) & (steps <= PAUSE_SECONDS)
     if reported is not None:
         pause &= ~reported[1:]
     if not pause.any():
         return False
     moved = np.diff(signals, axis=0)
     before, after = (_run(signals, side) for side in (-1, 1))
-    each = (before + after) / (2 * _BESIDE)
+    each = (before + after) / (2 * _NEIGHBOUR_STEPS)
     noise = np.maximum(_robust_rms(moved - each), _resolution(signals)[1:])
     unit = each / noise
     clarity = (unit**2).sum(axis=1)
     passed = (unit * moved / noise).sum(axis=1) / np.maximum(clarity, 1.0)
-    clear = pause & (clarity > _CLEAR**2) & _steady(before / noise, after / noise, 0.5)
+    clear = pause & (clarity > _MIN_CLARITY**2) & _steady(before / noise, after / noise, 0.5)
     if not clear.any():
         return False
-    return bool(np.mean(passed[clear] < 1.5) >= _BURSTS)
+    return bool(np.mean(passed[clear] < 1.5) >= _MIN_BURST_SHARE)
 
 
 def _mean_step(time: Array, segments: Sequence[slice]) -> float:
@@ -315,14 +319,14 @@ def _even_clock(
         even[part] += longer
         repeated[part] = _repeated(time[part], signals[part])
         rows = part.start + np.flatnonzero(~repeated[part])
-        if len(rows) < _SHORTEST:
+        if len(rows) < _MIN_SAMPLES:
             continue
         number = _numbers(time[rows], signals[rows], base.step, by_rows=by_rows)
         new = np.diff(number, prepend=-1.0) > 0.0
         idle[rows[~new]] = True
         rows = rows[new]
         number = number[new]
-        if len(rows) < _SHORTEST:
+        if len(rows) < _MIN_SAMPLES:
             continue
         lost = int(number[-1]) + 1 - len(rows)
         if base.uniform:  # row counter: missing samples extend the time
@@ -347,7 +351,7 @@ def _numbers(time: Array, signals: Array, step: float, *, by_rows: bool) -> Arra
     starts = range(0, len(time) - 1, _ROWS_AT_ONCE)
     # Each part begins with the last sample of the one before; a short rest belongs to the last.
     edges = [*starts, len(time) - 1]
-    if len(starts) > 1 and edges[-1] - edges[-2] < _SHORTEST:
+    if len(starts) > 1 and edges[-1] - edges[-2] < _MIN_SAMPLES:
         del edges[-2]
     parts = [slice(start, stop + 1) for start, stop in pairwise(edges)]
     steps = []
@@ -363,7 +367,7 @@ def _steps_by_position(signals: Array, phased: Array) -> Array:
     moved = np.diff(signals, axis=0)
     resolution = _resolution(signals)[1:]
     before, after = (_run(signals, side) for side in (-1, 1))
-    pace = np.add(*(np.abs(_run(signals, side)) for side in (-1, 1))) / (2 * _BESIDE)
+    pace = np.add(*(np.abs(_run(signals, side)) for side in (-1, 1))) / (2 * _NEIGHBOUR_STEPS)
     steps = phased
     for _ in range(2):  # speeds by stamps, then by the improved count
         number = np.concatenate([[0.0], np.cumsum(steps)])[:, None]
@@ -374,11 +378,11 @@ def _steps_by_position(signals: Array, phased: Array) -> Array:
         way = moved / noise
         clarity = (unit**2).sum(axis=1)
         whole_steps = np.rint((unit * way).sum(axis=1) / np.maximum(clarity, 1.0))
-        alike = (np.abs(way - unit * whole_steps[:, None]) < _OUTLIER + 0.5 * pace / noise).all(
-            axis=1
-        )
+        alike = (
+            np.abs(way - unit * whole_steps[:, None]) < _OUTLIER_SIGMAS + 0.5 * pace / noise
+        ).all(axis=1)
         steady = _steady(before / passed[0] / noise, after / passed[1] / noise, 0.25)
-        clear = clarity - (unit**2).max(axis=1) > _CLEAR**2
+        clear = clarity - (unit**2).max(axis=1) > _MIN_CLARITY**2
         clear &= alike & steady & (whole_steps >= 0.0) & (whole_steps <= GAP_STEPS)
         improved = np.where(clear, whole_steps, phased)
         if np.array_equal(improved, steps):
@@ -390,7 +394,7 @@ def _steps_by_position(signals: Array, phased: Array) -> Array:
 def _run(values: Array, side: int) -> Array:
     """Return the change of values (m, k) in steps before (-1) or after (1) each (m - 1, k)."""
     at = np.arange(len(values) - 1) + (side > 0)
-    there = np.clip(at + side * _BESIDE, 0, len(values) - 1)
+    there = np.clip(at + side * _NEIGHBOUR_STEPS, 0, len(values) - 1)
     return np.asarray(side * (values[there] - values[at]))
 
 
@@ -399,8 +403,8 @@ def _even_times(stamps: Array, number: Array) -> Array:
     line = np.polynomial.Polynomial.fit(number, stamps - stamps[0], 1)
     off = stamps - stamps[0] - line(number)
     # Median first: single stamps may be late by many steps.
-    usual = scipy.ndimage.median_filter(off, _odd(_DRIFT / 3, len(off)), mode="nearest")
-    drift = _fitted_lines(usual, _odd(_DRIFT, len(off)))
+    usual = scipy.ndimage.median_filter(off, _odd(_DRIFT_SAMPLES / 3, len(off)), mode="nearest")
+    drift = _fitted_lines(usual, _odd(_DRIFT_SAMPLES, len(off)))
     return np.asarray(stamps[0] + line(number) + drift)
 
 
@@ -433,11 +437,11 @@ def _repeated(time: Array, signals: Array) -> Rows:
     equal = np.concatenate([[False], (np.diff(signals, axis=0) == 0.0).all(axis=1)])
     again = np.diff(time) == 0.0
     samples = signals[~equal]
-    if equal.any() and len(samples) >= _SHORTEST:
+    if equal.any() and len(samples) >= _MIN_SAMPLES:
         noise = _robust_rms(_off_cubic(np.arange(len(samples), dtype=np.float64), samples))
         noise = np.maximum(noise, _resolution(signals)[1:])
-        before, after = (_run(signals, side) / (_BESIDE * noise) for side in (-1, 1))
-        moving = (np.abs(before + after) > 2.0 * _MOVES).any(axis=1)
+        before, after = (_run(signals, side) / (_NEIGHBOUR_STEPS * noise) for side in (-1, 1))
+        moving = (np.abs(before + after) > 2.0 * _MOVING_NOISE_RATIO).any(axis=1)
         again |= moving & _steady(before, after, 0.5)
     return np.asarray(equal & np.concatenate([[False], again]))
 
@@ -455,7 +459,7 @@ def _resolution(signals: Array) -> Array:
     # Differences of decimal numbers are rounded.
     change[change <= 1e-10 * np.abs(signals).max()] = np.inf
     change = np.vstack([change[:1], change, change[-1:]])
-    starts = np.arange(0, len(change), _DRIFT // 2)
+    starts = np.arange(0, len(change), _DRIFT_SAMPLES // 2)
     least = np.minimum.reduceat(change, starts, axis=0)
     beside = np.vstack([least[:1], least, least[-1:]])
     nearby = np.minimum(np.minimum(beside[:-2], beside[1:-1]), beside[2:])
@@ -465,22 +469,24 @@ def _resolution(signals: Array) -> Array:
 def _off_cubic(number: Array, values: Array) -> Array:
     """Return the distance of samples (m, k) from the cubic through two each side (m - 4, k)."""
     at = np.arange(2, len(number) - 2)
-    beside = number[at[:, None] + _CUBIC] - number[at][:, None]
-    self = np.eye(len(_CUBIC), dtype=np.bool_)
+    beside = number[at[:, None] + _CUBIC_OFFSETS] - number[at][:, None]
+    self = np.eye(len(_CUBIC_OFFSETS), dtype=np.bool_)
     above = np.where(self, 1.0, -beside[:, None, :])
     below = np.where(self, 1.0, beside[:, :, None] - beside[:, None, :])
     weights = np.prod(above / below, axis=2)
-    return np.asarray(values[2:-2] - np.einsum("ma,mak->mk", weights, values[at[:, None] + _CUBIC]))
+    return np.asarray(
+        values[2:-2] - np.einsum("ma,mak->mk", weights, values[at[:, None] + _CUBIC_OFFSETS])
+    )
 
 
 def _residuals(
     number: Array, times: Array, signals: Array, late: Array, step: float
 ) -> tuple[Array, Array, Array]:
     """Return the residuals of even signals and of correct stamps, and the resolution."""
-    half = round(float(np.clip(_SPEED_TIME / step, _DRIFT // 10, _DRIFT // 2)))
+    half = round(float(np.clip(_SPEED_TIME / step, _DRIFT_SAMPLES // 10, _DRIFT_SAMPLES // 2)))
     at = np.arange(len(number))
     # From other samples than the residual, for independent noise.
-    ahead = half // 2 + len(_CUBIC)
+    ahead = half // 2 + len(_CUBIC_OFFSETS)
     there = np.minimum(at + ahead, at[-1])
     behind = np.maximum(at - ahead, 0)
 
@@ -498,10 +504,10 @@ def _stamp_share(
 ) -> tuple[float, float, tuple[float, float]]:
     """Return the share of `late` (m, k) in `measured`, its deviation, and both residuals."""
     level = np.minimum(_robust_rms(measured), _robust_rms(measured - late))
-    level = np.maximum(level, _ROUNDING * resolution)
+    level = np.maximum(level, _CUBIC_ROUNDING * resolution)
     measured = measured / level
     late = late / level
-    inlier = np.minimum(np.abs(measured), np.abs(measured - late)) < _OUTLIER
+    inlier = np.minimum(np.abs(measured), np.abs(measured - late)) < _OUTLIER_SIGMAS
     measured = np.where(inlier, measured, 0.0)
     late = np.where(inlier, late, 0.0)
     weight = float((late**2).sum())
@@ -510,7 +516,7 @@ def _stamp_share(
     share = float((measured * late).sum()) / weight
     # Rows are correlated with neighbours, joints by the stamp: blocks of rows are independent.
     score = ((measured - share * late) * late).sum(axis=1)
-    score = np.add.reduceat(score, np.arange(0, len(score), 2 * len(_CUBIC)))
+    score = np.add.reduceat(score, np.arange(0, len(score), 2 * len(_CUBIC_OFFSETS)))
     deviation = float(np.sqrt(max(weight, (score**2).sum()))) / weight
     squares = np.sum((measured - late) ** 2), np.sum(measured**2)
     with_stamps, evenly = np.sqrt(np.array(squares) / np.count_nonzero(inlier))
@@ -522,6 +528,6 @@ def _robust_rms(values: Array) -> Array:
     levels = []
     for column in np.abs(values).T:
         some = column[column > 0.0]
-        most = _OUTLIER * 1.4826 * float(np.median(some)) if some.size else np.inf
+        most = _OUTLIER_SIGMAS * 1.4826 * float(np.median(some)) if some.size else np.inf
         levels.append(np.sqrt(np.mean(np.minimum(some, most) ** 2)) if some.size else np.inf)
     return np.array(levels)

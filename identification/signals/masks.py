@@ -21,36 +21,36 @@ Rows = NDArray[np.bool_]
 # acceleration is normal two periods of the bandwidth from the end. Limited, since a joint that
 # hardly moves has a low bandwidth.
 END_PERIODS: Final = 2.0
-LONGEST_END: Final = 0.25  # s
+MAX_END_SECONDS: Final = 0.25  # s
 # Coulomb friction and acceleration change faster at a reversal than the smoother, whose kernel is a
 # period of its bandwidth wide. On the simulated NS 16 at 40 Hz
 # (``benchmarks.identification_study``) the rms bias over standard deviation of the parameters is
 # 0.38 with half a period on either side (worst 1.1), 0.20 with one (worst 0.6) or two.
 REVERSAL_PERIODS: Final = 1.0
 # Twice the minimum of the smoother.
-SHORTEST_STRETCH: Final = 24  # samples
-AT_LIMIT: Final = 0.995  # share of the limit, for the resolution of drives
-SHORTEST_TOP: Final = 5  # samples
+MIN_STRETCH_SAMPLES: Final = 24  # samples
+SATURATION_SHARE: Final = 0.995  # share of the limit, for the resolution of drives
+MIN_TOP_SAMPLES: Final = 5  # samples
 # A rounded smooth peak has a flat top as well. One top length further a parabola has fallen by at
 # most 8 resolutions, 12 with the worst rounding.
-_FALL: Final = 16.0
+_MIN_FALL_RESOLUTIONS: Final = 16.0
 
 # The torque at rest depends on the servo. Shorter halts are reversals, which show dry friction. On
 # an arm with a balancer fitting long rests doubles the prediction error.
-LONGEST_HALT: Final = 0.25  # s
+MAX_HALT_SECONDS: Final = 0.25  # s
 
 # The time around a reversal in which no row shows dry friction: two rows at the rate to which
-# recordings are averaged for the choice of rows (`questions.RATE`), so that the fit of a
+# recordings are averaged for the choice of rows (`questions.SELECTION_RATE`), so that the fit of a
 # faster recording leaves out as much as was judged.
-TURN: Final = 0.016  # s
+REVERSAL_SECONDS: Final = 0.016  # s
 
 # Torque that stands out alone, as damaged packets leave it: from its neighbours by so many robust
 # standard deviations, and by so much of its range.
-_STANDS_OUT: Final = 15.0
-_OF_RANGE: Final = 0.5
-_UNDISTURBED: Final = 0.1  # of it, that the samples beside it differ
-_TAIL: Final = 0.01  # of the samples at either end, which are no range
-_LONGEST_SPIKE: Final = 2  # samples
+_SPIKE_SIGMAS: Final = 15.0
+_SPIKE_RANGE_SHARE: Final = 0.5
+_MAX_NEIGHBOUR_SHARE: Final = 0.1  # of it, that the samples beside it differ
+_TAIL_QUANTILE: Final = 0.01  # of the samples at either end, which are no range
+_MAX_SPIKE_SAMPLES: Final = 2  # samples
 
 ExcludedRows = Literal["rests", "halts", "slow", "none"]
 
@@ -118,11 +118,11 @@ def mask_rows(
         delay: of the torque [s].
         exclude_rows: slow rows that are excluded:
 
-            - "rests": rows in which no joint moves for more than `LONGEST_HALT` (a joint that
+            - "rests": rows in which no joint moves for more than `MAX_HALT_SECONDS` (a joint that
                 stands while another moves holds its load), and the two rows at each reversal of a
-                joint, or more in `TURN`;
-            - "halts": rows of a joint slower than standstill for more than `LONGEST_HALT`, and the
-                same rows at each change of its velocity's sign;
+                joint, or more in `REVERSAL_SECONDS`;
+            - "halts": rows of a joint slower than standstill for more than `MAX_HALT_SECONDS`, and
+                the same rows at each change of its velocity's sign;
             - "slow": all rows slower than standstill, or near a velocity reversal;
             - "none": no slow rows.
     """
@@ -134,16 +134,18 @@ def mask_rows(
             saturated |= flat_topped(values, ~still)
             spikes |= spiking(values, recording.segments())
     if current_limit is not None and recording.motor_current is not None:
-        saturated |= np.abs(recording.motor_current) >= AT_LIMIT * current_limit
+        saturated |= np.abs(recording.motor_current) >= SATURATION_SHARE * current_limit
     slowest = float(bandwidth[np.ptp(recording.position, axis=0) > 0.0].min(initial=np.inf))
-    edge = edge_rows(recording, min(LONGEST_END, END_PERIODS / slowest), delay)
+    edge = edge_rows(recording, min(MAX_END_SECONDS, END_PERIODS / slowest), delay)
     if torque_bandwidth is not None:
-        edge |= edge_rows(recording, min(LONGEST_END, END_PERIODS / float(torque_bandwidth.min())))
+        edge |= edge_rows(
+            recording, min(MAX_END_SECONDS, END_PERIODS / float(torque_bandwidth.min()))
+        )
     reversal = near_any_reversal(model, motion, REVERSAL_PERIODS / bandwidth)
     reasons = {EDGE: np.broadcast_to(edge[:, None], shape)}
     # Errors of velocity and delay turn dry friction there, always to less of it at low speed.
     # Half a period less, so that it ends between two rows.
-    reach = max(0.0, 0.5 * (TURN - float(np.median(np.diff(recording.time)))))
+    reach = max(0.0, 0.5 * (REVERSAL_SECONDS - float(np.median(np.diff(recording.time)))))
     turning = near_any_reversal(model, motion, np.full(shape[1], reach))
     halts = long_rests(motion.time, still)
     if exclude_rows == "rests":
@@ -160,23 +162,23 @@ def mask_rows(
 
 
 def long_rests(time: Array, still: Rows) -> Rows:
-    """Return rows (m, n) in runs of resting rows (m, n) longer than `LONGEST_HALT`."""
+    """Return rows (m, n) in runs of resting rows (m, n) longer than `MAX_HALT_SECONDS`."""
     resting = np.zeros_like(still)
     for joint, column in enumerate(still.T):
         for start, stop in runs_of(column):
-            resting[start:stop, joint] = time[stop - 1] - time[start] > LONGEST_HALT
+            resting[start:stop, joint] = time[stop - 1] - time[start] > MAX_HALT_SECONDS
     return resting
 
 
 def flat_topped(values: Array, moving: Rows) -> Rows:
     """Return rows (m, n) that are clipped: a moving channel constant at its extreme value.
 
-    At least `SHORTEST_TOP` equal values, left faster than the peak of a smooth signal would be.
+    At least `MIN_TOP_SAMPLES` equal values, left faster than the peak of a smooth signal would be.
     """
     clipped = np.zeros(values.shape, dtype=np.bool_)
     for j, channel in enumerate(np.ascontiguousarray(values.T)):
         tops = [channel == extreme for extreme in (channel.max(), channel.min())]
-        if max(map(np.count_nonzero, tops)) < SHORTEST_TOP:
+        if max(map(np.count_nonzero, tops)) < MIN_TOP_SAMPLES:
             continue
         steps = np.abs(np.diff(channel))
         if not steps.any():
@@ -184,7 +186,9 @@ def flat_topped(values: Array, moving: Rows) -> Rows:
         resolution = float(steps[steps > 0.0].min())
         for top in tops:
             for start, stop in runs_of(top):
-                if stop - start >= SHORTEST_TOP and _leaves_peak(channel, start, stop, resolution):
+                if stop - start >= MIN_TOP_SAMPLES and _leaves_peak(
+                    channel, start, stop, resolution
+                ):
                     clipped[start:stop, j] = True
     return clipped & moving
 
@@ -197,26 +201,26 @@ def spiking(values: Array, segments: Sequence[slice]) -> Rows:
     and a pulse of the arm begins and ends in more than one sample.
     """
     found = np.zeros(values.shape, dtype=np.bool_)
-    side = _LONGEST_SPIKE + 1
+    side = _MAX_SPIKE_SAMPLES + 1
     for segment in segments:
         part = values[segment]
-        if len(part) < SHORTEST_STRETCH:
+        if len(part) < MIN_STRETCH_SAMPLES:
             continue
         padded = np.pad(part, ((side, side), (0, 0)), mode="edge")
         windows = np.lib.stride_tricks.sliding_window_view(padded, 2 * side + 1, axis=0)
         apart = np.abs(part - np.median(windows, axis=-1))
         spread = MAD_TO_STD * np.median(apart, axis=0)
-        low, high = np.quantile(part, [_TAIL, 1.0 - _TAIL], axis=0)
-        least = np.maximum(_STANDS_OUT * spread, _OF_RANGE * (high - low))
-        beyond = np.maximum(part - high, low - part) > 0.5 * _OF_RANGE * (high - low)
+        low, high = np.quantile(part, [_TAIL_QUANTILE, 1.0 - _TAIL_QUANTILE], axis=0)
+        least = np.maximum(_SPIKE_SIGMAS * spread, _SPIKE_RANGE_SHARE * (high - low))
+        beyond = np.maximum(part - high, low - part) > 0.5 * _SPIKE_RANGE_SHARE * (high - low)
         for joint, far in enumerate(((apart > least) & beyond).T):
             for start, stop in runs_of(far):
-                if stop - start > _LONGEST_SPIKE:
+                if stop - start > _MAX_SPIKE_SAMPLES:
                     continue
                 around = np.delete(part[:, joint], slice(start, stop))[
                     max(0, start - 2) : start + 2
                 ]
-                if np.ptp(around) < _UNDISTURBED * apart[start:stop, joint].min():
+                if np.ptp(around) < _MAX_NEIGHBOUR_SHARE * apart[start:stop, joint].min():
                     found[segment.start + start : segment.start + stop, joint] = True
     return found
 
@@ -225,7 +229,7 @@ def near_reversal(time: Array, speed: Array, reach: Array) -> Rows:
     """Return rows (m, k) within a time (k,) [s] of a reversal of each of k speeds (m, k)."""
     near = np.zeros(speed.shape, dtype=np.bool_)
     for column, velocity in enumerate(speed.T):
-        before = min(LONGEST_END, float(reach[column]))
+        before = min(MAX_END_SECONDS, float(reach[column]))
         last = np.flatnonzero(velocity[1:] * velocity[:-1] < 0.0)
         starts = np.searchsorted(time, time[last] - before)
         stops = np.searchsorted(time, time[last + 1] + before, side="right")
@@ -251,7 +255,7 @@ def edge_rows(recording: Recording, end: float, delay: float = 0.0) -> NDArray[n
     edge = np.ones(recording.n_samples, dtype=np.bool_)
     for segment in recording.segments():
         inside = recording.time[segment]
-        if len(inside) >= SHORTEST_STRETCH:
+        if len(inside) >= MIN_STRETCH_SAMPLES:
             at = inside - delay
             edge[segment] = (at < inside[0] + end) | (at > inside[-1] - end)
     return edge
@@ -269,4 +273,4 @@ def _leaves_peak(channel: Array, start: int, stop: int, resolution: float) -> bo
     top = channel[start]
     outside = [channel[max(0, start - length) : start], channel[stop : stop + length]]
     falls = [float(np.abs(side - top).max(initial=0.0)) for side in outside]
-    return max(falls) > _FALL * resolution
+    return max(falls) > _MIN_FALL_RESOLUTIONS * resolution

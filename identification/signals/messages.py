@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from identification.signals.clock import UNIFORM, SampleTimes, TimeBase
+from identification.signals.clock import MAX_STEP_DEVIATION, SampleTimes, TimeBase
 from identification.signals.row_faults import RowFault, RowFaultKind
 from identification.text import duration_text, number, percentage
 
@@ -12,7 +12,7 @@ from identification.text import duration_text, number, percentage
 def clock_lines(clock: TimeBase) -> list[str]:
     """Return lines on the time stamps, at least one."""
     lines = [f"{clock.samples} samples in {clock.duration:.6g} s, {clock.rate:.6g} Hz"]
-    if clock.largest_deviation > UNIFORM:
+    if clock.largest_deviation > MAX_STEP_DEVIATION:
         lines.append(
             f"uneven: steps scatter by {percentage(clock.jitter, 1)} of the usual one, at most"
             f" {percentage(clock.largest_deviation)}"

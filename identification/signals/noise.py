@@ -11,9 +11,9 @@ from identification.arrays import Array
 from identification.signals.recording import RecordingError
 from identification.signals.spectrum import HARRIS, power_density
 
-STANDSTILL_WINDOW: Final = 0.1  # s
-_SHORTEST_WINDOW: Final = 20  # samples
-_HIGHEST_DIFFERENCE: Final = 8
+STANDSTILL_WINDOW_SECONDS: Final = 0.1  # s
+_MIN_WINDOW_SAMPLES: Final = 20  # samples
+_MAX_DIFFERENCE_ORDER: Final = 8
 
 
 def standstill_variance(time: Array, values: Array) -> Array:
@@ -25,11 +25,13 @@ def standstill_variance(time: Array, values: Array) -> Array:
     Raises:
         RecordingError: fewer samples than one window.
     """
-    if len(time) < _SHORTEST_WINDOW:
+    if len(time) < _MIN_WINDOW_SAMPLES:
         raise RecordingError(
-            f"a variance at standstill requires {_SHORTEST_WINDOW} samples, got {len(time)}"
+            f"a variance at standstill requires {_MIN_WINDOW_SAMPLES} samples, got {len(time)}"
         )
-    width = max(_SHORTEST_WINDOW, round(STANDSTILL_WINDOW / float(np.median(np.diff(time)))))
+    width = max(
+        _MIN_WINDOW_SAMPLES, round(STANDSTILL_WINDOW_SECONDS / float(np.median(np.diff(time))))
+    )
     width = min(width, len(time))
     count = len(time) // width
     line = np.linspace(-1.0, 1.0, width)
@@ -53,19 +55,19 @@ def difference_variance(time: Array, values: Array) -> Array:
     Raises:
         RecordingError: fewer samples than the highest order needs.
     """
-    if len(time) < 2 * _HIGHEST_DIFFERENCE:
+    if len(time) < 2 * _MAX_DIFFERENCE_ORDER:
         raise RecordingError(
-            f"a noise variance requires {2 * _HIGHEST_DIFFERENCE} samples, got {len(time)}"
+            f"a noise variance requires {2 * _MAX_DIFFERENCE_ORDER} samples, got {len(time)}"
         )
     variances = [_difference_variance(time, values, 1)]
     settled = np.zeros((0, values.shape[1]), dtype=np.bool_)
-    for order in range(2, _HIGHEST_DIFFERENCE + 1):
+    for order in range(2, _MAX_DIFFERENCE_ORDER + 1):
         variances.append(_difference_variance(time, values, order))
         settled = np.array(variances[1:]) > 0.95 * np.array(variances[:-1])
         if settled.any(axis=0).all():  # higher orders are not needed
             break
     estimates = np.array(variances)
-    first = np.where(settled.any(axis=0), settled.argmax(axis=0), _HIGHEST_DIFFERENCE - 1)
+    first = np.where(settled.any(axis=0), settled.argmax(axis=0), _MAX_DIFFERENCE_ORDER - 1)
     return np.asarray(np.take_along_axis(estimates, first[None, :], axis=0)[0])
 
 
@@ -93,10 +95,11 @@ def _difference_variance(time: Array, values: Array, order: int) -> Array:
 
 
 ROWS_AT_ONCE: Final = 8192  # of a long recording, whose intermediate arrays would be its largest
-_STRETCH: Final = 4.0  # s; resolution 0.25 Hz
-_FEWEST: Final = 32  # samples
-_NO_POWER: Final = 1e-6  # share of a signal's power; noise of 0.1 % of the amplitude
-_LOW_PASSED: Final = 0.75  # share of half the sampling rate; anti-alias filters cut at about 0.8
+_SPECTRUM_SECONDS: Final = 4.0  # s; resolution 0.25 Hz
+_MIN_SAMPLES: Final = 32  # samples
+_SILENT_POWER_SHARE: Final = 1e-6  # share of a signal's power; noise of 0.1 % of the amplitude
+# share of half the sampling rate; anti-alias filters cut at about 0.8
+_MAX_EDGE_SHARE: Final = 0.75
 
 
 def noiseless_above(time: Array, signals: Array, segments: Sequence[slice]) -> float | None:
@@ -106,9 +109,9 @@ def noiseless_above(time: Array, signals: Array, segments: Sequence[slice]) -> f
     if not power.size:
         return None
     above = np.cumsum(power[::-1], axis=0)[::-1]
-    silent = np.all(above < _NO_POWER * above[0], axis=1)
+    silent = np.all(above < _SILENT_POWER_SHARE * above[0], axis=1)
     edge = float(frequency[np.argmax(silent)])
-    return edge if silent.any() and edge < _LOW_PASSED * frequency[-1] else None
+    return edge if silent.any() and edge < _MAX_EDGE_SHARE * frequency[-1] else None
 
 
 def _power(time: Array, signals: Array, segments: Sequence[slice]) -> tuple[Array, Array]:
@@ -118,10 +121,10 @@ def _power(time: Array, signals: Array, segments: Sequence[slice]) -> tuple[Arra
     )
     time = time[longest]
     signals = signals[longest]
-    if time.size < _FEWEST:
+    if time.size < _MIN_SAMPLES:
         return np.empty(0), np.empty((0, signals.shape[1]))
     interval = float(np.median(np.diff(time)))
     even = np.arange(time[0], time[-1], interval)
     resampled = np.column_stack([np.interp(even, time, column) for column in signals.T])
-    length = min(len(even), max(_FEWEST, round(_STRETCH / interval)))
+    length = min(len(even), max(_MIN_SAMPLES, round(_SPECTRUM_SECONDS / interval)))
     return power_density(resampled, 1.0 / interval, length, HARRIS)

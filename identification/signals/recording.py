@@ -15,12 +15,12 @@ from identification.arrays import Array
 from identification.errors import IdentificationError, ShapeError
 
 # Command range beyond which a constant position is an error.
-STUCK_MOVEMENT: Final = 0.02  # rad or m
-LONGEST_PAUSE: Final = 600.0
+MIN_MOVEMENT: Final = 0.02  # rad or m
+MAX_PAUSE_SECONDS: Final = 600.0
 """Longest time without sample, s; empty blocks of time take memory."""
-PAUSE: Final = 10.0
+PAUSE_SECONDS: Final = 10.0
 """Time without sample [s] at which an imported recording is cut."""
-_BETWEEN_PARTS: Final = 1.0  # s, left of a pause; a gap at every rate
+_PART_GAP_SECONDS: Final = 1.0  # s, left of a pause; a gap at every rate
 UNWRAPPED: Final = "unwrapped"
 """Entry of the provenance: joints whose angles wrapped."""
 GAP_STEPS: Final = 5.0  # clock steps of a gap, in usual steps
@@ -198,24 +198,24 @@ class Recording:
                 f"{self.time[sample]:.9g} s ({bad.size} such samples)"
             )
         sample = int(np.argmax(steps)) + 1
-        if steps[sample - 1] > LONGEST_PAUSE:
+        if steps[sample - 1] > MAX_PAUSE_SECONDS:
             raise RecordingError(
                 f"the time step is {steps[sample - 1]:.6g} s at sample {sample}, limit "
-                f"{LONGEST_PAUSE:g} s: cut the recording there"
+                f"{MAX_PAUSE_SECONDS:g} s: cut the recording there"
             )
 
 
 def cut_at_pauses(recording: Recording) -> Recording:
-    """Return the recording with a second between the parts that pauses above `PAUSE` separate.
+    """Return the recording with a second between parts that pauses above `PAUSE_SECONDS` separate.
 
     Blocks of time take memory, empty ones too.
     """
     steps = np.diff(recording.time)
-    pauses = np.flatnonzero(steps > PAUSE) + 1
+    pauses = np.flatnonzero(steps > PAUSE_SECONDS) + 1
     if not pauses.size:
         return recording
     excess = np.zeros(recording.n_samples)
-    excess[pauses] = steps[pauses - 1] - _BETWEEN_PARTS
+    excess[pauses] = steps[pauses - 1] - _PART_GAP_SECONDS
     gap = np.zeros(recording.n_samples, np.bool_)
     if recording.gap_before is not None:
         gap |= recording.gap_before
@@ -279,7 +279,7 @@ def without_repeats(recording: Recording) -> Recording:
 _TURN: Final = 2.0 * np.pi
 # Largest distance of an unwrapped step from the steps beside it [rad]; a glitch to zero or to
 # another joint's angle is no whole turn.
-_SMOOTH: Final = 0.3
+_MAX_UNWRAP_DISTANCE: Final = 0.3
 
 
 def unwrap(position: Array, gap_before: NDArray[np.bool_] | None = None) -> Array:
@@ -295,7 +295,7 @@ def unwrap(position: Array, gap_before: NDArray[np.bool_] | None = None) -> Arra
     remainder = np.nan_to_num(steps) - _TURN * turns
     padded = np.pad(remainder, ((1, 1), (0, 0)), mode="edge")
     usual = 0.5 * (padded[:-2] + padded[2:])
-    turns[np.abs(remainder - usual) > _SMOOTH + np.abs(usual)] = 0.0
+    turns[np.abs(remainder - usual) > _MAX_UNWRAP_DISTANCE + np.abs(usual)] = 0.0
     if gap_before is not None:
         at_gap = turns * gap_before[1:, None]
         wraps = (turns - at_gap).any(axis=0)
@@ -333,16 +333,16 @@ def stuck(position: Array, command: Array) -> tuple[int, float] | None:
     lowest = np.fmin.reduceat(command, starts)
     travel = np.nan_to_num(highest - lowest, nan=0.0)
     worst = int(np.argmax(travel))
-    if travel[worst] <= STUCK_MOVEMENT:
+    if travel[worst] <= MIN_MOVEMENT:
         return None
     return int(starts[worst]), float(travel[worst])
 
 
-_STEP: Final = 0.01  # s
+_OFFSET_STEP: Final = 0.01  # s
 # Largest difference of repetitions as a share of each joint's scatter.
-_MAX_DIFFERENCE: Final = 0.02
-_OVERLAP: Final = 0.8  # required overlap as a share of the longer recording
-_REFINED: Final = 21  # offsets tried within a step
+_MAX_DIFFERENCE_SHARE: Final = 0.02
+_MIN_OVERLAP_SHARE: Final = 0.8  # required overlap as a share of the longer recording
+_REFINED_OFFSETS: Final = 21  # offsets tried within a step
 
 
 def offsets_of_repetitions(recordings: Sequence[Recording]) -> Array | None:
@@ -370,11 +370,11 @@ def _offset(first: Recording, other: Recording) -> float | None:
     lag = _lag(a, b)
     if lag is None:
         return None
-    coarse = other_time[0] - time[0] + lag * _STEP
-    fine = coarse + _STEP * np.linspace(-1.0, 1.0, _REFINED)
+    coarse = other_time[0] - time[0] + lag * _OFFSET_STEP
+    fine = coarse + _OFFSET_STEP * np.linspace(-1.0, 1.0, _REFINED_OFFSETS)
     differences = [_difference(time, a, other_time - offset, b) for offset in fine]
     best = int(np.argmin(differences))
-    return float(fine[best]) if differences[best] < _MAX_DIFFERENCE else None
+    return float(fine[best]) if differences[best] < _MAX_DIFFERENCE_SHARE else None
 
 
 def _lag(a: Array, b: Array) -> int | None:
@@ -383,7 +383,7 @@ def _lag(a: Array, b: Array) -> int | None:
     first = np.maximum(0, -lags)
     last = np.minimum(len(a), len(b) - lags)
     rows = last - first
-    enough = rows >= _OVERLAP * max(len(a), len(b))
+    enough = rows >= _MIN_OVERLAP_SHARE * max(len(a), len(b))
     if not enough.any():
         return None
     # By transforms: `scipy.signal`, which has this, takes a second to import.
@@ -399,7 +399,7 @@ def _lag(a: Array, b: Array) -> int | None:
 def _difference(time: Array, a: Array, other_time: Array, b: Array) -> float:
     """Return the largest RMS difference of a joint; infinite if the overlap is short."""
     inside = (time >= other_time[0]) & (time <= other_time[-1])
-    if np.count_nonzero(inside) < _OVERLAP * max(len(a), len(b)):
+    if np.count_nonzero(inside) < _MIN_OVERLAP_SHARE * max(len(a), len(b)):
         return np.inf
     at = np.column_stack([np.interp(time[inside], other_time, column) for column in b.T])
     return float(np.sqrt(np.mean((a[inside] - at) ** 2, axis=0)).max())
@@ -407,6 +407,6 @@ def _difference(time: Array, a: Array, other_time: Array, b: Array) -> float:
 
 def _resampled(recording: Recording) -> tuple[Array, Array]:
     """Return times and positions (k, n) at even steps."""
-    time = np.arange(recording.time[0], recording.time[-1], _STEP)
+    time = np.arange(recording.time[0], recording.time[-1], _OFFSET_STEP)
     columns = [np.interp(time, recording.time, column) for column in recording.position.T]
     return time, np.column_stack(columns)

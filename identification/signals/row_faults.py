@@ -19,11 +19,11 @@ from identification.signals.recording import GAP_STEPS, Recording
 Rows = NDArray[np.bool_]
 
 # Acceleration within one step of the clock; robots reach a fifth of it.
-FASTEST: Final = 150.0
+MAX_ACCELERATION: Final = 150.0
 """rad/s² or m/s²"""
-_BESIDE: Final = 4  # rows to either side
-_SHORTEST_BLOCK: Final = 10  # rows that are written twice
-_USUAL: Final = 0.9  # quantile of the rows for which a sample is held in a slower channel
+_NEIGHBOUR_ROWS: Final = 4  # rows to either side
+_MIN_REPEATED_ROWS: Final = 10  # rows that are written twice
+_HELD_QUANTILE: Final = 0.9  # quantile of the rows for which a sample is held in a slower channel
 
 
 class RowFaultKind(Enum):
@@ -111,8 +111,8 @@ def _frozen(recording: Recording) -> Iterator[tuple[int, int]]:
     if not len(runs):
         return
     single = recording.n_samples - int(lengths.sum()) - len(runs)  # rows that nothing repeats
-    held = np.quantile(np.concatenate([lengths + 1, np.ones(max(0, single))]), _USUAL)
-    least = FASTEST * recording.usual_step**2
+    held = np.quantile(np.concatenate([lengths + 1, np.ones(max(0, single))]), _HELD_QUANTILE)
+    least = MAX_ACCELERATION * recording.usual_step**2
     for start, stop in runs:
         if stop - start <= GAP_STEPS * held:
             continue
@@ -135,19 +135,21 @@ def _jumps(recording: Recording, gap: Rows) -> Iterator[tuple[int, NDArray[np.in
     changed = np.any(np.diff(recording.position, axis=0) != 0.0, axis=1)
     places = np.concatenate([[0], np.flatnonzero(changed) + 1])  # of a slower channel too
     position = recording.position[places]
-    if len(position) < 2 * _BESIDE + 2:
+    if len(position) < 2 * _NEIGHBOUR_ROWS + 2:
         return
     step = np.diff(position, axis=0)
-    padded = np.pad(np.abs(step), ((_BESIDE, _BESIDE), (0, 0)), mode="edge")
-    windows = np.lib.stride_tricks.sliding_window_view(padded, 2 * _BESIDE + 1, axis=0)
-    before, after = windows[..., :_BESIDE], windows[..., _BESIDE + 1 :]
+    padded = np.pad(np.abs(step), ((_NEIGHBOUR_ROWS, _NEIGHBOUR_ROWS), (0, 0)), mode="edge")
+    windows = np.lib.stride_tricks.sliding_window_view(padded, 2 * _NEIGHBOUR_ROWS + 1, axis=0)
+    before, after = windows[..., :_NEIGHBOUR_ROWS], windows[..., _NEIGHBOUR_ROWS + 1 :]
     usual = np.maximum(np.median(before, axis=-1), np.median(after, axis=-1))
     clock = np.diff(recording.time[places])
     median = recording.usual_step
     if not median:
         return
     passed = np.maximum(clock / median, 1.0)[:, None] + GAP_STEPS
-    possible = passed * usual + FASTEST * (passed * median) ** 2 + 3.0 * _resolution(position)
+    possible = (
+        passed * usual + MAX_ACCELERATION * (passed * median) ** 2 + 3.0 * _resolution(position)
+    )
     beyond = np.abs(step) > possible
     moving = np.count_nonzero(np.ptp(position, axis=0) > 0.0)
     found = np.flatnonzero(np.count_nonzero(beyond, axis=1) >= max(2.0, 0.5 * moving))
@@ -156,8 +158,8 @@ def _jumps(recording: Recording, gap: Rows) -> Iterator[tuple[int, NDArray[np.in
         row = int(places[place])
         if row in breaks or gap[row]:
             continue
-        stays = np.median(position[place : place + _BESIDE], axis=0)
-        stays = stays - np.median(position[max(0, place - _BESIDE) : place], axis=0)
+        stays = np.median(position[place : place + _NEIGHBOUR_ROWS], axis=0)
+        stays = stays - np.median(position[max(0, place - _NEIGHBOUR_ROWS) : place], axis=0)
         joints = np.flatnonzero(beyond[place - 1])
         if (np.abs(stays)[joints] > 0.5 * np.abs(step[place - 1])[joints]).all():
             yield row, joints
@@ -175,7 +177,7 @@ def _written_before(recording: Recording, row: int) -> int:
         same = (rows[row:] == rows[place : len(rows) - lag]).all(axis=1)
         length = len(same) if same.all() else int(np.argmin(same))
         longest = max(longest, min(length, lag))
-    if longest < _SHORTEST_BLOCK:
+    if longest < _MIN_REPEATED_ROWS:
         return 0
     moves = np.ptp(recording.position[row : row + longest], axis=0).any()
     return longest if moves else 0

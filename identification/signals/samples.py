@@ -12,7 +12,7 @@ from identification.arrays import Array
 from identification.model.motion import Motion
 from identification.model.regressor import Regressor
 from identification.model.robot import RobotModel
-from identification.signals.masks import SHORTEST_STRETCH, ExcludedRows, RowMask, mask_rows
+from identification.signals.masks import MIN_STRETCH_SAMPLES, ExcludedRows, RowMask, mask_rows
 from identification.signals.noise import difference_variance
 from identification.signals.recording import Recording, RecordingError
 from identification.signals.smoothing import (
@@ -26,8 +26,8 @@ from identification.signals.smoothing import (
 # Default (see :mod:`identification.selection.questions`). Planned motion is below 10 Hz, the
 # first resonance of large arms at 10 to 30 Hz; on the simulated NS 16 20 to 60 Hz are equal.
 RIGID_BANDWIDTH: Final = 40.0  # Hz
-_MOST_PREDICTIONS: Final = 2  # in memory: those of the result and of the nominal model
-_SHORTEST_SEGMENT: Final = 12  # samples, twice the minimum of a quintic spline
+_MAX_PREDICTIONS: Final = 2  # in memory: those of the result and of the nominal model
+_MIN_SEGMENT_SAMPLES: Final = 12  # samples, twice the minimum of a quintic spline
 
 VelocitySource = Literal["position", "measured"]
 Smoothed = tuple[Motion, Array]
@@ -204,7 +204,7 @@ class Samples:
             torque = self._torque_of(model, values, values)
             torque.flags.writeable = False
             # The tests of a verdict ask for those of few estimates, again and again.
-            if len(self._predictions) >= _MOST_PREDICTIONS:
+            if len(self._predictions) >= _MAX_PREDICTIONS:
                 del self._predictions[next(iter(self._predictions))]
             self._predictions[values.tobytes()] = model, torque
         return torque
@@ -253,7 +253,7 @@ def smooth(
 
     for segment in recording.segments():
         time = recording.time[segment]
-        if len(time) < SHORTEST_STRETCH:
+        if len(time) < MIN_STRETCH_SAMPLES:
             continue
         spline = spline_of(time, position[segment], noise_variance)
         at = time - options.torque_delay
@@ -379,7 +379,7 @@ def _low_passed(
     """Filter columns (m, c) by own low-passes (c,), segment by segment."""
     filtered = np.zeros_like(columns)
     for segment in segments:
-        if segment.stop - segment.start < _SHORTEST_SEGMENT:
+        if segment.stop - segment.start < _MIN_SEGMENT_SAMPLES:
             continue
         widths = np.unique(bandwidth)
         if len(widths) == 1:

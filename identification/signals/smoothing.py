@@ -27,18 +27,18 @@ from identification.signals.noise import ROWS_AT_ONCE
 Complex = NDArray[np.complex128]
 
 
-DEGREE: Final = 5
-ORDER: Final = DEGREE + 1  # non-zero basis functions per knot interval
+SPLINE_DEGREE: Final = 5
+SPLINE_ORDER: Final = SPLINE_DEGREE + 1  # non-zero basis functions per knot interval
 # Limits of the penalty in knot units per sample: resolution of the knots, and rounding of the
 # normal equations.
-_LIGHTEST: Final = 1e-9
-_HEAVIEST: Final = 1e11
-_ROUNDED: Final = 1e4
+_MIN_PENALTY: Final = 1e-9
+_MAX_PENALTY: Final = 1e11
+_MAX_ACCURATE_PENALTY: Final = 1e4
 """Penalty, per samples of a knot, above which the normal equations lose digits: their solution is
 then that of the lightest penalty and a correction."""
-_PENALTY: Final = 1e-2  # of its logarithm; 0.2 % of the bandwidth
-_FLAT: Final = 1e-6  # slope of the residual over the penalty that is none
-_KNOT_OF_CUTOFF: Final = 0.5  # radians of the cutoff frequency per knot
+_LOG_PENALTY_TOLERANCE: Final = 1e-2  # of its logarithm; 0.2 % of the bandwidth
+_MIN_SLOPE: Final = 1e-6  # slope of the residual over the penalty that is none
+_RADIANS_PER_KNOT: Final = 0.5  # radians of the cutoff frequency per knot
 
 
 @dataclass(frozen=True, eq=False)
@@ -52,7 +52,7 @@ class SmoothingSpline:
 
     def __call__(self, time: Array, derivative: int = 0) -> Array:
         """Return value or derivative at times (m,): (m, c), per second to its power."""
-        intervals = len(self.coefficients) - DEGREE
+        intervals = len(self.coefficients) - SPLINE_DEGREE
         values = np.empty((len(time), self.coefficients.shape[1]))
         # The basis functions of a long recording take many times the memory of its values.
         for start in range(0, len(time), ROWS_AT_ONCE):
@@ -78,7 +78,7 @@ def fit_smoothing_spline(
     """
     for samples_per_knot in (4, 2, 1):
         problem = _Problem.of(time, values, samples_per_knot * float(np.median(np.diff(time))))
-        fine = problem.design.spacing <= _KNOT_OF_CUTOFF / (2.0 * np.pi * widest)
+        fine = problem.design.spacing <= _RADIANS_PER_KNOT / (2.0 * np.pi * widest)
         # Without the squares of all samples, which are the largest array of a long recording.
         squares = np.einsum("mc,mc->c", problem.closest_residual, problem.closest_residual)
         if fine or np.all(squares / len(time) <= tolerance):
@@ -98,10 +98,12 @@ def low_pass(time: Array, values: Array, bandwidth: float) -> Array:
     """Filter values (m, c) by the same smoother with a fixed bandwidth [Hz]: linear, zero-phase."""
     step = float(np.median(np.diff(time)))
     times = time.tobytes()
-    spacing = max(step, _KNOT_OF_CUTOFF / (2.0 * np.pi * bandwidth))
+    spacing = max(step, _RADIANS_PER_KNOT / (2.0 * np.pi * bandwidth))
     design = _design(times, spacing)
     penalty, factor = _low_pass_factor(times, spacing, bandwidth)
-    if penalty > _ROUNDED * design.density:  # of few samples, as the knots follow the bandwidth
+    if (
+        penalty > _MAX_ACCURATE_PENALTY * design.density
+    ):  # of few samples, as the knots follow the bandwidth
         problem = _Problem.of(time, values, spacing)
         coefficients = problem.closest + problem.correction(slice(None), penalty)
     else:
@@ -122,7 +124,7 @@ class _Design(NamedTuple):
     def penalty_at(self, bandwidth: float) -> float:
         """Return the penalty of a bandwidth [Hz], within the limits of the knots."""
         cutoff = 2.0 * np.pi * bandwidth * self.spacing  # rad per knot
-        share = np.clip(1.0 / max(cutoff, 1e-3) ** 6, _LIGHTEST, _HEAVIEST)
+        share = np.clip(1.0 / max(cutoff, 1e-3) ** 6, _MIN_PENALTY, _MAX_PENALTY)
         return float(self.density * share)
 
     def factor(self, penalty: float) -> Array:
@@ -164,7 +166,7 @@ class _Problem:
     def of(cls, time: Array, values: Array, spacing: float) -> _Problem:
         """Set up the problem with about this knot spacing [s]."""
         design = _design(time.tobytes(), spacing)
-        light = _LIGHTEST * design.density
+        light = _MIN_PENALTY * design.density
         factor = design.factor(light)
         closest = _banded_solution(factor, design.transposed @ values)
         residual = design.rows @ closest
@@ -182,7 +184,7 @@ class _Problem:
         """Return the factor (6, k) of the normal equations, and the change of coefficients."""
         design = self.design
         factor = design.factor(penalty)
-        change = penalty - _LIGHTEST * design.density
+        change = penalty - _MIN_PENALTY * design.density
         return factor, _banded_solution(factor, -change * roughness)
 
     def penalty_for(self, channel: int, tolerance: float, widest: float) -> float:
@@ -195,7 +197,7 @@ class _Problem:
         roughness = np.ascontiguousarray(self.roughness[:, channel])
         point = low
         high_tried = False
-        while high - low > _PENALTY:
+        while high - low > _LOG_PENALTY_TOLERANCE:
             penalty = float(np.exp(point))
             variance, slope = self._residual_variance(penalty, closest, roughness)
             excess = float(np.log(variance / tolerance))
@@ -204,8 +206,8 @@ class _Problem:
                 high_tried = True
             else:
                 low = point
-            target = point - excess / max(slope, _FLAT)
-            if abs(target - point) < _PENALTY:
+            target = point - excess / max(slope, _MIN_SLOPE)
+            if abs(target - point) < _LOG_PENALTY_TOLERANCE:
                 return float(np.exp(np.clip(target, low, high)))
             if target >= high and not high_tried:
                 target = high
@@ -265,10 +267,10 @@ def _rows(
     start: float, spacing: float, intervals: int, time: Array, derivative: int = 0
 ) -> scipy.sparse.csr_array:
     """Return the basis functions or derivatives at each time, sparse (m, intervals + 5)."""
-    pieces = _pieces(DEGREE, derivative)
+    pieces = _pieces(SPLINE_DEGREE, derivative)
     m = len(time)
-    weights = np.empty((m, ORDER))
-    columns = np.empty((m, ORDER), dtype=np.int32)
+    weights = np.empty((m, SPLINE_ORDER))
+    columns = np.empty((m, SPLINE_ORDER), dtype=np.int32)
     # Powers of all times of a long recording would be its largest arrays.
     for first in range(0, m, ROWS_AT_ONCE):
         part = slice(first, first + ROWS_AT_ONCE)
@@ -276,20 +278,20 @@ def _rows(
         interval = np.clip(np.floor(x).astype(np.int32), 0, intervals - 1)
         powers = np.vander(x - interval, len(pieces), increasing=True)
         weights[part] = powers @ pieces / spacing**derivative
-        columns[part] = interval[:, None] + np.arange(ORDER)
-    ends = np.arange(0, ORDER * m + 1, ORDER, dtype=np.int32)
+        columns[part] = interval[:, None] + np.arange(SPLINE_ORDER)
+    ends = np.arange(0, SPLINE_ORDER * m + 1, SPLINE_ORDER, dtype=np.int32)
     return scipy.sparse.csr_array(
-        (weights.ravel(), columns.ravel(), ends), shape=(m, intervals + DEGREE)
+        (weights.ravel(), columns.ravel(), ends), shape=(m, intervals + SPLINE_DEGREE)
     )
 
 
 def _gram_band(rows: scipy.sparse.csr_array) -> Array:
     """Return the lower band (6, k) of rows' rows, in the order of LAPACK."""
-    columns = rows.indices.reshape(-1, ORDER)
-    weights = rows.data.reshape(-1, ORDER)
-    band = np.zeros((ORDER, rows.shape[1]), order="F")
-    for k in range(ORDER):
-        for offset in range(ORDER - k):
+    columns = rows.indices.reshape(-1, SPLINE_ORDER)
+    weights = rows.data.reshape(-1, SPLINE_ORDER)
+    band = np.zeros((SPLINE_ORDER, rows.shape[1]), order="F")
+    for k in range(SPLINE_ORDER):
+        for offset in range(SPLINE_ORDER - k):
             band[offset] += np.bincount(
                 columns[:, k], weights[:, k] * weights[:, k + offset], minlength=rows.shape[1]
             )
@@ -303,15 +305,15 @@ def _products(pieces: Array) -> Array:
     return np.asarray(values.T @ (values * (weights / 2.0)[:, None]))
 
 
-_THIRD_DERIVATIVES: Final = _products(_pieces(DEGREE, 3))
+_THIRD_DERIVATIVES: Final = _products(_pieces(SPLINE_DEGREE, 3))
 _QUADRATICS: Final = _products(_pieces(2))
 
 
 def _penalty_band(intervals: int) -> Array:
     """Return the lower band (6, k) of integrals of third derivatives, in knot units."""
-    band = np.zeros((ORDER, intervals + DEGREE), order="F")
-    for k in range(ORDER):
-        for offset in range(ORDER - k):
+    band = np.zeros((SPLINE_ORDER, intervals + SPLINE_DEGREE), order="F")
+    for k in range(SPLINE_ORDER):
+        for offset in range(SPLINE_ORDER - k):
             band[offset, k : k + intervals] += _THIRD_DERIVATIVES[k, k + offset]
     return band
 
@@ -338,10 +340,10 @@ def _third_differences(values: Array) -> Array:
     return values
 
 
-_HIGHEST: Final = 0.45  # largest cut-off as a share of the sampling rate
-_UNEVEN: Final = 0.01  # of a step
-_AT_ONCE: Final = 8  # columns; more would leave the processor's cache
-_NEGLIGIBLE: Final = 1e-6  # share of the impulse response that a reflection may lack
+_MAX_CUTOFF_SHARE: Final = 0.45  # largest cut-off as a share of the sampling rate
+_MAX_STEP_DEVIATION: Final = 0.01  # of a step
+_COLUMNS_AT_ONCE: Final = 8  # columns; more would leave the processor's cache
+_NEGLIGIBLE_RESPONSE_SHARE: Final = 1e-6  # share of the impulse response that a reflection may lack
 
 
 @dataclass(frozen=True)
@@ -396,7 +398,7 @@ def low_passed(
     if shape == SMOOTHER:
         return low_pass(time, columns, bandwidth)
     step = float(np.median(np.diff(time)))
-    if np.abs(np.diff(time) - step).max() <= _UNEVEN * step:
+    if np.abs(np.diff(time) - step).max() <= _MAX_STEP_DEVIATION * step:
         return _filtered(columns, bandwidth * step, shape)
     even = np.arange(time[0], time[-1] + step, step)
     filtered = _filtered(_interpolated(even, time, columns), bandwidth * step, shape)
@@ -405,7 +407,7 @@ def low_passed(
 
 def _filtered(columns: Array, cycles: float, shape: LowPassShape) -> Array:
     """Filter columns (m, c) at even times; the cut-off in cycles per sample."""
-    cycles = min(cycles, _HIGHEST)
+    cycles = min(cycles, _MAX_CUTOFF_SHARE)
     if not shape.causal:
         return _filtered_without_phase(columns, cycles, shape.order)
     sections = scipy.signal.butter(shape.order, cycles, fs=1.0, output="sos")
@@ -425,7 +427,7 @@ def _filtered_without_phase(columns: Array, cycles: float, order: int) -> Array:
     if count < 3:
         return columns.copy()
     decay = 2.0 * np.pi * cycles * math.sin(math.pi / (2.0 * order))  # per sample
-    reach = math.log(1.0 / _NEGLIGIBLE) / decay
+    reach = math.log(1.0 / _NEGLIGIBLE_RESPONSE_SHARE) / decay
     length = 2 * (count - 1)
     if count + 2 * reach < length:
         length = min(length, _quick_length(count + 2 * int(reach)))
@@ -435,9 +437,9 @@ def _filtered_without_phase(columns: Array, cycles: float, order: int) -> Array:
     gain = 1.0 / (1.0 + ratio ** (2 * order))
     share = np.linspace(0.0, 1.0, count)
     filtered = np.empty_like(columns)
-    for first in range(0, columns.shape[1], _AT_ONCE):
+    for first in range(0, columns.shape[1], _COLUMNS_AT_ONCE):
         # Transforms of rows take three quarters of the time.
-        part = columns[:, first : first + _AT_ONCE].T
+        part = columns[:, first : first + _COLUMNS_AT_ONCE].T
         line = part[:, :1] + share * (part[:, -1:] - part[:, :1])
         extended = np.empty((len(part), length))
         extended[:, :count] = part - line
@@ -446,7 +448,7 @@ def _filtered_without_phase(columns: Array, cycles: float, order: int) -> Array:
         spectrum = np.fft.rfft(extended, axis=1)
         spectrum *= gain
         line += np.fft.irfft(spectrum, length, axis=1)[:, :count]
-        filtered[:, first : first + _AT_ONCE] = line.T
+        filtered[:, first : first + _COLUMNS_AT_ONCE] = line.T
     return filtered
 
 

@@ -24,7 +24,7 @@ from identification.factor.factor import Factor
 from identification.factor.rows import augmented_rows
 from identification.model.robot import RobotModel
 from identification.selection.folds import FOLDS
-from identification.signals.block_mean import BLOCK, FEWEST_BLOCKS, block_index
+from identification.signals.block_mean import BLOCK_SECONDS, MIN_BLOCKS, block_index
 from identification.signals.masks import EDGE, SATURATED
 from identification.signals.samples import Samples
 
@@ -34,7 +34,7 @@ Refit = Callable[[Factor], Array]
 
 @dataclass(frozen=True, eq=False)
 class TorqueMeans:
-    """Means of [W | y] over B blocks of `BLOCK` seconds, rows at rest included."""
+    """Means of [W | y] over B blocks of `BLOCK_SECONDS` seconds, rows at rest included."""
 
     rows: Array  # (B, n, p + 1), torque last; NaN where less than half of the block is known
     block: NDArray[np.intp]  # index since the origin of the motion (B,)
@@ -71,7 +71,7 @@ class Calibration:
     joint_inside: Array  #: share inside the interval
     half_width: Array  #: median of half the interval [N·m or N]
     joint_white_inside: Array  #: share inside the intervals of white residuals
-    block: float = BLOCK  #: time of a mean [s]
+    block: float = BLOCK_SECONDS  #: time of a mean [s]
 
     @property
     def means(self) -> int:
@@ -108,7 +108,7 @@ def calibrate(
         refit: of a part of the factor.
 
     Raises:
-        IdentificationError: fewer than `FEWEST_BLOCKS` blocks, or a fold cannot be fitted.
+        IdentificationError: fewer than `MIN_BLOCKS` blocks, or a fold cannot be fitted.
     """
     inner = inner_errors(factor, fitted, refit)
     with np.errstate(invalid="ignore"):
@@ -144,11 +144,12 @@ def inner_errors(factor: Factor, means: TorqueMeans, refit: Refit) -> Array:
     Folds have equally many rows and are cut at equal times of all recordings. NaN where a mean is
     unknown, infinite where the other folds have no row of the joint.
     """
-    fine = round(BLOCK / factor.block)
+    fine = round(BLOCK_SECONDS / factor.block)
     rows = merged(factor.counts, fine).sum(axis=1)
-    if np.count_nonzero(rows) < FEWEST_BLOCKS:
+    if np.count_nonzero(rows) < MIN_BLOCKS:
         raise IdentificationError(
-            f"the fitted motion of {BLOCK * len(rows):g} s is too short for inner prediction"
+            f"the fitted motion of {BLOCK_SECONDS * len(rows):g} s is too short for inner"
+            " prediction"
         )
     before = np.cumsum(rows) - 0.5 * rows
     # Blocks at rest after the last row belong to the last fold.

@@ -18,16 +18,16 @@ from identification.hypotheses.little_torque import little_torque
 from identification.model.motion import Motion
 from identification.model.pseudo_inertia import pseudo_inertia, reference_bodies
 from identification.model.robot import RobotModel
-from identification.validation.physical_signs import SIGMAS
+from identification.validation.physical_signs import SIGNIFICANT_SIGMAS
 
 # Smallest second moment of a link relative to the nominal body's at which a bound counts as active.
-_EDGE: Final = 0.01
+_MIN_MOMENT_RATIO: Final = 0.01
 # Rise of the relative held-out torque error over all joints, and of one joint, that is noticeable,
 # or means that no consistent parameters exist. NS 16 campaigns without a fault: below 0.0001 over
 # all joints. With torque or position of one joint negated: at least 0.13 for joints 1 and 2; for
 # wrist joints 0.004 to 0.02, but more than 0.5 of their own torque.
-_COSTLY: Final = (0.001, 0.005)
-_IMPOSSIBLE: Final = (0.02, 0.1)
+_COSTLY_ERROR_RISE: Final = (0.001, 0.005)
+_IMPOSSIBLE_ERROR_RISE: Final = (0.02, 0.1)
 Quantity = Literal["rotor inertia", "Coulomb friction", "viscous friction", "body"]
 
 _NEGATIVE: Final[Mapping[str, Quantity]] = {
@@ -37,7 +37,7 @@ _NEGATIVE: Final[Mapping[str, Quantity]] = {
 }
 # Least torque of gravity, over the measured one, of an axis that gravity loads; below, friction and
 # inertia dominate.
-_LOADED: Final = 0.2
+_MIN_GRAVITY_SHARE: Final = 0.2
 _POSTURES: Final = 50
 
 
@@ -82,12 +82,12 @@ class ConsistencyCheck:
     @property
     def costly(self) -> bool:
         """Whether the consistent estimate predicts noticeably worse."""
-        return self._beyond(*_COSTLY)
+        return self._beyond(*_COSTLY_ERROR_RISE)
 
     @property
     def impossible(self) -> bool:
         """Whether no consistent estimate predicts the held-out motion well."""
-        return self._beyond(*_IMPOSSIBLE)
+        return self._beyond(*_IMPOSSIBLE_ERROR_RISE)
 
     def _beyond(self, overall: float, axis: float) -> bool:
         worse_axis = self.cost > 0.0 and bool(np.any(self.held_out_rise > axis))
@@ -96,7 +96,7 @@ class ConsistencyCheck:
     @property
     def predicts_better(self) -> bool:
         """Whether the consistent estimate predicts noticeably better."""
-        return self.cost < -_COSTLY[0]
+        return self.cost < -_COSTLY_ERROR_RISE[0]
 
     @property
     def is_balanced(self) -> bool:
@@ -153,9 +153,9 @@ def check_consistency(
             if (parameter := pattern.format(joint + 1)) in unconstrained.names:
                 k = unconstrained.names.index(parameter)
                 alone = k >= model.base.rank or bool(single[k])
-                if alone and free[k] < -SIGMAS * unconstrained.std[k]:
+                if alone and free[k] < -SIGNIFICANT_SIGMAS * unconstrained.std[k]:
                     violations.append(ImpossibleParameter(quantity, name, float(free[k])))
-        if margin[joint] < _EDGE:
+        if margin[joint] < _MIN_MOMENT_RATIO:
             violations.append(ImpossibleParameter("body", name))
     return ConsistencyCheck(
         consistent=consistent,
@@ -164,7 +164,9 @@ def check_consistency(
         held_out_rise=rise,
         margin=margin,
         shifted_parameters=tuple(
-            unconstrained.names[k] for k in np.argsort(-shift, kind="stable") if shift[k] > SIGMAS
+            unconstrained.names[k]
+            for k in np.argsort(-shift, kind="stable")
+            if shift[k] > SIGNIFICANT_SIGMAS
         ),
         violations=tuple(violations),
         judged_on="in-sample" if in_sample else "held-out",
@@ -196,4 +198,4 @@ def _gravity_loaded(model: RobotModel, motion: Factor, values: Array) -> NDArray
     rigid = np.where(model.friction_columns, 0.0, values)
     weight = model.torque(rigid, Motion.at_rest(position))
     measured = np.sqrt(motion.gram[:, -1, -1] / np.maximum(motion.samples, 1))
-    return np.asarray(np.sqrt(np.mean(weight**2, axis=0)) > _LOADED * measured)
+    return np.asarray(np.sqrt(np.mean(weight**2, axis=0)) > _MIN_GRAVITY_SHARE * measured)

@@ -16,7 +16,7 @@ from identification.estimators.least_squares import RepeatedEstimate
 from identification.factor.columns import standard_factor
 from identification.factor.estimate import Estimate
 from identification.factor.factor import Factor, total_factor
-from identification.hypotheses.carried_load import LOAD, CarriedLoad, find_load
+from identification.hypotheses.carried_load import MIN_LOAD_EXPLAINED, CarriedLoad, find_load
 from identification.hypotheses.column_scores import ScorePrior
 from identification.hypotheses.column_search import ExplainedFit, Explanation
 from identification.hypotheses.diagnosis import (
@@ -43,7 +43,7 @@ from identification.validation.physical_signs import (
 )
 from identification.validation.position_jumps import PositionJump
 from identification.validation.prediction import (
-    SLOW,
+    SLOW_BANDWIDTH,
     PredictionError,
     noise_floor,
     pooled_error,
@@ -53,11 +53,12 @@ from identification.validation.prediction import (
 )
 from identification.validation.residuals import ResidualChecks, check_residuals
 
-_WORSE: Final = 1.25  # error of unseen over that of fitted motion from which something begins in it
+# error of unseen over that of fitted motion from which something begins in it
+_MIN_ERROR_GROWTH: Final = 1.25
 # Share of the rows in the rarer direction of motion below which friction and offset of a joint are
 # one column: with it their correlation is 0.98.
-_OTHER_WAY: Final = 0.01
-_MOST_RECORDINGS: Final = 3  # enough recordings to determine gravity and load
+_MIN_REVERSE_SHARE: Final = 0.01
+_MAX_RECORDINGS: Final = 3  # enough recordings to determine gravity and load
 _PLAUSIBLE: Final = Implausible((), ())
 
 
@@ -209,8 +210,8 @@ def _gravity_and_load(
     model: RobotModel, training: Sequence[Samples], held_out: Sequence[Samples]
 ) -> tuple[GravityDirection, CarriedLoad]:
     """Fit gravity and a carried load by sums that are large, and not needed afterwards."""
-    training = training[:_MOST_RECORDINGS]
-    held_out = held_out[:_MOST_RECORDINGS]
+    training = training[:_MAX_RECORDINGS]
+    held_out = held_out[:_MAX_RECORDINGS]
     sums = [standard_factor(model, some) for some in (training, held_out)]
     return find_gravity(model, *sums), find_load(model, training, held_out, *sums)
 
@@ -250,7 +251,7 @@ def gather(
     unseen = total_factor(model, held_out) if unseen is None else unseen
     gravity, load = _gravity_and_load(model, training, held_out)
     noise = _noise(model, result, training) if same_motion else None
-    floor = noise_floor(model, values, training[:_MOST_RECORDINGS], noise)
+    floor = noise_floor(model, values, training[:_MAX_RECORDINGS], noise)
     error, fitted = (_error(model, values, runs) for runs in (held_out, training))
     slow = None if noise is None else _slow_errors(model, result, held_out, error, unseen, noise)
     speed = np.max([np.abs(run.motion.velocity).max(axis=0) for run in held_out], axis=0)
@@ -258,7 +259,11 @@ def gather(
     moved = _total_time_moved(training) >= Thresholds().moved
     fit = ExplainedFit(values, floor, names, prior, context.scale_std)
     changes = find_changes(model, pooled, training, others, unseen, moved) if others else ()
-    is_worse = error.overall > _WORSE * fitted.overall and load.explained < LOAD and not changes
+    is_worse = (
+        error.overall > _MIN_ERROR_GROWTH * fitted.overall
+        and load.explained < MIN_LOAD_EXPLAINED
+        and not changes
+    )
     diagnosis = diagnose(model, training, fit, others if is_worse else (), known=known)
     return Evidence(
         estimate=pooled,
@@ -313,7 +318,7 @@ def _noise(
     """Return the noise (n,) between repetitions of one motion; None of a single one."""
     if len(result.values) < 2:
         return None
-    return repetition_noise(model, result.pooled.values, training, SLOW)
+    return repetition_noise(model, result.pooled.values, training, SLOW_BANDWIDTH)
 
 
 def _total_time_moved(runs: Sequence[Samples]) -> Array:
@@ -349,7 +354,7 @@ def _slow_errors(
 ) -> _SlowErrors:
     """Return the slow part of an error, as a share of the torque, beyond the noise (n,)."""
     values = result.pooled.values
-    slow = [slow_error(model, values, run, SLOW) for run in held_out]
+    slow = [slow_error(model, values, run, SLOW_BANDWIDTH) for run in held_out]
     changes = np.array([run.friction_change for run in slow])
     largest = np.abs(changes).argmax(axis=0)[None]
     # Two standard deviations of the estimate are no error.
@@ -376,7 +381,7 @@ def _one_way(recordings: Sequence[Samples]) -> NDArray[np.bool_]:
     forwards, backwards = np.array(directions).sum(axis=1)
     fewer = np.minimum(forwards, backwards)
     moved = forwards + backwards
-    return np.asarray((moved > 0) & (fewer < _OTHER_WAY * moved))
+    return np.asarray((moved > 0) & (fewer < _MIN_REVERSE_SHARE * moved))
 
 
 def _disagreement(result: RepeatedEstimate) -> Array:

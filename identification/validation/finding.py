@@ -9,9 +9,9 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from identification.hypotheses.carried_load import LOAD
+from identification.hypotheses.carried_load import MIN_LOAD_EXPLAINED
 from identification.hypotheses.changes import Change
-from identification.hypotheses.little_torque import MINOR
+from identification.hypotheses.little_torque import LITTLE_TORQUE_SHARE
 from identification.signals.clock import SampleTimes
 from identification.signals.row_faults import RowFault
 from identification.validation.consistency import ConsistencyCheck
@@ -309,7 +309,7 @@ class Thresholds:
     #: half of `axis`, above `unexplained` if the torque error itself has grown by a half
     generalisation: float = 2.5
     #: torque of an axis as a share of that of all axes below which it alone does not decide
-    minor: float = MINOR
+    minor: float = LITTLE_TORQUE_SHARE
     #: the same as a share of its own limit; sensors resolve some thousandths of their range
     minor_of_limit: float = 0.005
     nominal: float = 0.005  #: overall error above that of the nominal or controller's model
@@ -318,7 +318,9 @@ class Thresholds:
     moved: float = 0.5
     gravity: float = 0.5  #: squared error on unseen motion with the best gravity over declared
     gravity_angle: float = 1.0  #: degrees between the two. Other faults on the NS 16: up to 0.06
-    load: float = LOAD  #: share of the additional error that a body on the last link explains
+    load: float = (
+        MIN_LOAD_EXPLAINED  #: share of the additional error that a body on the last link explains
+    )
     outliers: float = 0.05  #: largest share of samples that counts as outliers
     #: their share of the squared residual. Injected spikes: above 0.9; heavy tails (UR10): 0.5
     outlying_power: float = 0.8

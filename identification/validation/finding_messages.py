@@ -14,7 +14,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Final, NamedTuple
 
-from identification.hypotheses.changes import COUPLED, IN_ORDER, SIGNS, Change, Meaning
+from identification.hypotheses.changes import COUPLED, ORDERS, SIGNS, Change, Meaning
 from identification.hypotheses.column_search import UNSEEN
 from identification.signals.clock import SampleTimes
 from identification.signals.messages import fault_words, time_lines
@@ -231,7 +231,7 @@ _ORDER: Final = "order of joints"
 _COUPLED_ANGLES: Final = "coupled angles"
 _CHECKS: Final[Mapping[Meaning, str]] = {
     **dict.fromkeys(SIGNS, _SIGN),
-    **dict.fromkeys(IN_ORDER, _ORDER),
+    **dict.fromkeys(ORDERS, _ORDER),
     **dict.fromkeys(COUPLED, _COUPLED_ANGLES),
 }
 _QUANTITIES: Final[Mapping[Meaning, str]] = {

@@ -18,16 +18,17 @@ from identification.estimators.prior import nominal_deviations
 from identification.model.robot import RobotModel
 from identification.signals.samples import Samples
 
-_MOST_ROWS: Final = 5_000  # that are compared with the nominal torque
+_MAX_ROWS: Final = 5_000  # that are compared with the nominal torque
 _BLOCKS: Final = 20  # parts of the recordings whose scatter gives the standard deviation
 # Model error of friction laws relative to the friction (Bittencourt and Gunnarsson 2012).
-_FRICTION_SHARE: Final = 0.03
-_WIDEST: Final = 0.5  # relative tolerance for noise and friction above which a scale is unknown
+_FRICTION_ERROR_SHARE: Final = 0.03
+# relative tolerance for noise and friction above which a scale is unknown
+_MAX_TOLERANCE: Final = 0.5
 # Weight of independent errors of links, where friction dominates the torque. On a simulated UR5
 # with link errors up to 10 % all scales were within 7 %.
-_LINKS_APART: Final = 0.05
-_SURE: Final = 2.0  # standard deviations
-_OTHER_UNIT: Final = 3.0
+_LINK_ERROR_WEIGHT: Final = 0.05
+_SIGMAS_OF_SCALE: Final = 2.0  # standard deviations
+_OTHER_UNIT_RATIO: Final = 3.0
 
 
 class NominalScale(NamedTuple):
@@ -52,7 +53,7 @@ class NominalScale(NamedTuple):
             return 1.0
         logs = np.log(self.scale[positive])
         sure = np.abs(self.scale[positive] - 1.0) > self.tolerance[positive]
-        alike = sure & (np.abs(logs) > np.log(_OTHER_UNIT)) & (logs * np.median(logs) > 0.0)
+        alike = sure & (np.abs(logs) > np.log(_OTHER_UNIT_RATIO)) & (logs * np.median(logs) > 0.0)
         most = np.count_nonzero(alike) > len(logs) / 2
         return float(np.exp(np.median(logs))) if most else 1.0
 
@@ -90,7 +91,7 @@ def nominal_scale(
     """
     bodies = nominal_deviations(model) if share is None else np.zeros((model.base.rank, 0))
     if all(run.torque_bandwidth is None for run in runs):
-        step = max(1, sum(len(run.torque) for run in runs) // _MOST_ROWS)
+        step = max(1, sum(len(run.torque) for run in runs) // _MAX_ROWS)
         runs = [run.thinned(step) for run in runs]
     scales = []
     regressors = [run.regressor(model) for run in runs]
@@ -140,13 +141,13 @@ def _scale(table: Array, torque: Array, deviations: Array, *, share: float) -> t
     scatter = np.square([part.sum() for part in residuals]).sum()
     std = np.sqrt(scatter * _BLOCKS / (_BLOCKS - 1)) / power
     lost = float(rigid @ rigid) / power - 1.0
-    misfit = _FRICTION_SHARE * np.linalg.norm(friction) / np.sqrt(power)
+    misfit = _FRICTION_ERROR_SHARE * np.linalg.norm(friction) / np.sqrt(power)
     bodies = float(np.linalg.norm(alone @ deviations)) / power
-    of_torque = share**2 * (1.0 + _LINKS_APART * lost)
-    model_error = _SURE * float(np.sqrt(of_torque + bodies**2 + misfit**2))
+    of_torque = share**2 * (1.0 + _LINK_ERROR_WEIGHT * lost)
+    model_error = _SIGMAS_OF_SCALE * float(np.sqrt(of_torque + bodies**2 + misfit**2))
     noise = student_limit(0.025, _BLOCKS - 1) * std
     tolerance = noise + model_error
     # Tolerances scale with the unit of the torque. Uncertain bodies alone leave a scale known.
     unit = max(1.0, abs(scale))
-    is_certain = noise + _SURE * misfit < _WIDEST * unit and tolerance < unit
+    is_certain = noise + _SIGMAS_OF_SCALE * misfit < _MAX_TOLERANCE * unit and tolerance < unit
     return (scale, float(tolerance)) if is_certain else (np.nan, np.inf)

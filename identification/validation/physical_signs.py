@@ -16,7 +16,7 @@ from identification.hypotheses.little_torque import little_torque
 from identification.model.friction import COULOMB
 from identification.model.robot import RobotModel
 
-SIGMAS: Final = 3.0
+SIGNIFICANT_SIGMAS: Final = 3.0
 """Standard deviations of a significant sign, change, delay or scale."""
 # Masses, rotor inertias, moments of inertia about an axis.
 _NEVER_NEGATIVE: Final = re.compile(r"m\d+|I\d+(m|xx|yy|zz)")
@@ -82,7 +82,7 @@ def implausibilities(
     chosen: list[WrongSign] = []
     torque_rms = np.sqrt(motion.gram[:, -1, -1] / np.maximum(motion.samples, 1))
     little = little_torque(torque_rms, ~model.chain.revolute)
-    limit = np.where(little, _FAR_ABOVE, 1.0) * error_rms
+    limit = np.where(little, _LITTLE_TORQUE_FACTOR, 1.0) * error_rms
     for sign, causing in _wrong_signs(model, estimate, speed, added):
         if sign.kind == "little friction at speed by a chosen term":
             chosen.append(sign)
@@ -101,7 +101,7 @@ def _is_negative(estimate: Estimate, direction: Array) -> bool:
         return False
     part = direction[determined]
     variance = float(part @ estimate.covariance[np.ix_(determined, determined)] @ part)
-    return float(direction @ estimate.values) < -SIGMAS * float(np.sqrt(variance))
+    return float(direction @ estimate.values) < -SIGNIFICANT_SIGMAS * float(np.sqrt(variance))
 
 
 def _wrong_signs(
@@ -160,7 +160,7 @@ class TopSpeedFriction(NamedTuple):
     @property
     def known(self) -> NDArray[np.bool_]:
         """Whether the sign of each is significant (n,)."""
-        return np.asarray(np.abs(self.torque) > SIGMAS * self.std)
+        return np.asarray(np.abs(self.torque) > SIGNIFICANT_SIGMAS * self.std)
 
     @property
     def all_driving(self) -> NDArray[np.bool_]:
@@ -192,4 +192,5 @@ def friction_at(model: RobotModel, speed: Array) -> Array:
     return rows
 
 
-_FAR_ABOVE: Final = 4.0  # errors of an axis of little torque; its error is mostly friction
+# errors of an axis of little torque; its error is mostly friction
+_LITTLE_TORQUE_FACTOR: Final = 4.0

@@ -17,22 +17,24 @@ from numpy.typing import NDArray
 from identification.arrays import Array
 from identification.distributions import MAD_TO_STD
 from identification.signals.recording import GAP_STEPS, Recording
-from identification.signals.row_faults import FASTEST
+from identification.signals.row_faults import MAX_ACCELERATION
 
 _ROWS_AT_ONCE: Final = 50_000  # that are searched for steps
-_STANDS_OUT: Final = 15.0  # robust standard deviations of a jump
+_JUMP_SIGMAS: Final = 15.0  # robust standard deviations of a jump
 # The same relative to the frequent large departures (starts, stops, reversals).
-_USUAL: Final = 20  # departures
-_BEYOND_USUAL: Final = 3.0
-_BESIDE: Final = 4  # steps to either side
+_USUAL_DEPARTURES: Final = 20  # departures
+_USUAL_DEPARTURE_FACTOR: Final = 3.0
+_NEIGHBOUR_STEPS: Final = 4  # steps to either side
 # Standard deviations by which other joints must move for a missing row to be visible.
-_SHOWS: Final = 5.0
-_MOVES: Final = 3.0  # multiples of the usual departure of a joint that moves
-_OFTEN: Final = 3  # departures by a whole step that an encoder does not repeat by chance
-_ON_PATH: Final = 0.25  # distance from the extrapolated path, as a share of the step
-_WHOLE: Final = 0.15  # tolerance of departures by whole steps of the motion, as a share of a step
+_VISIBLE_SIGMAS: Final = 5.0
+_MOVING_RATIO: Final = 3.0  # multiples of the usual departure of a joint that moves
+# departures by a whole step that an encoder does not repeat by chance
+_MIN_REPEATED_DEPARTURES: Final = 3
+_PATH_TOLERANCE_SHARE: Final = 0.25  # distance from the extrapolated path, as a share of the step
+# tolerance of departures by whole steps of the motion, as a share of a step
+_WHOLE_STEP_TOLERANCE: Final = 0.15
 # Resolutions by which rounding moves a step: one at its ends, half of one in the speed beside it.
-_ROUNDED: Final = 1.5
+_ROUNDING_RESOLUTIONS: Final = 1.5
 
 
 @dataclass(frozen=True)
@@ -61,7 +63,9 @@ def position_steps(recording: Recording, name: str = "the recording") -> Positio
     """Return lasting steps of the positions of a named recording that its log did not make."""
     jumps: list[PositionJump] = []
     logged: list[PositionJump] = []
-    rounded = _ROUNDED * np.array([_resolution(column) for column in recording.position.T])
+    rounded = _ROUNDING_RESOLUTIONS * np.array(
+        [_resolution(column) for column in recording.position.T]
+    )
     for parts in _pieces(recording):
         steps = _steps_of(recording, parts, name, rounded)
         jumps += steps.jumps
@@ -76,7 +80,7 @@ def _pieces(recording: Recording) -> Iterator[list[slice]]:
         for start in range(segment.start, segment.stop, _ROWS_AT_ONCE):
             stop = min(start + _ROWS_AT_ONCE, segment.stop)
             first = max(segment.start, start - 1)
-            if stop - first <= 2 * _BESIDE + 2:
+            if stop - first <= 2 * _NEIGHBOUR_STEPS + 2:
                 continue
             parts.append(slice(first, stop))
             if sum(part.stop - part.start for part in parts) >= _ROWS_AT_ONCE:
@@ -99,8 +103,15 @@ def _steps_of(
     departure, shown = _without_clock(departure, speed, steps)
     distance = np.abs(departure)
     spread = MAD_TO_STD * np.median(distance, axis=0)
-    usual = np.partition(distance, -_USUAL, axis=0)[-_USUAL] if len(distance) > 10 * _USUAL else 0.0
-    least = np.maximum(np.maximum(_STANDS_OUT * spread, _BEYOND_USUAL * usual), FASTEST * steps**2)
+    usual = (
+        np.partition(distance, -_USUAL_DEPARTURES, axis=0)[-_USUAL_DEPARTURES]
+        if len(distance) > 10 * _USUAL_DEPARTURES
+        else 0.0
+    )
+    least = np.maximum(
+        np.maximum(_JUMP_SIGMAS * spread, _USUAL_DEPARTURE_FACTOR * usual),
+        MAX_ACCELERATION * steps**2,
+    )
     least = np.maximum(least, rounded)
     # Missing or repeated rows cause departures by whole steps of the motion, also beside a gap.
     motion_step = speed * np.median(steps)
@@ -108,16 +119,16 @@ def _steps_of(
         np.rint(departure / np.where(motion_step == 0.0, np.inf, motion_step)), -1.0, GAP_STEPS
     )
     apart = np.abs(departure - count * motion_step)
-    whole = apart < np.maximum(least, _WHOLE * np.abs(motion_step))
+    whole = apart < np.maximum(least, _WHOLE_STEP_TOLERANCE * np.abs(motion_step))
     suspect = (distance - 0.5 * change > least) & (shown | ~whole)
     lasting = np.zeros_like(suspect)
     for joint, k in np.argwhere(suspect.T):
-        around = departure[max(0, k - _BESIDE) : k + _BESIDE + 1, joint]
+        around = departure[max(0, k - _NEIGHBOUR_STEPS) : k + _NEIGHBOUR_STEPS + 1, joint]
         # Otherwise the steps beside it reverse it.
         lasting[k, joint] = np.abs(around.sum()) > 0.5 * distance[k, joint]
-    by_whole_steps = (count != 0.0) & (apart < _WHOLE * np.abs(motion_step))
-    often = np.count_nonzero(lasting & by_whole_steps) >= _OFTEN
-    moving = np.abs(motion_step) > _MOVES * spread
+    by_whole_steps = (count != 0.0) & (apart < _WHOLE_STEP_TOLERANCE * np.abs(motion_step))
+    often = np.count_nonzero(lasting & by_whole_steps) >= _MIN_REPEATED_DEPARTURES
+    moving = np.abs(motion_step) > _MOVING_RATIO * spread
     together = np.count_nonzero(_nearby(lasting) & moving, axis=1)
     every = (together >= 2) & (together > 0.5 * np.count_nonzero(moving, axis=1))
     jumps: list[PositionJump] = []
@@ -129,7 +140,7 @@ def _steps_of(
             name, recording.joint_names[joint], float(time[row] - time[0]), jump
         )
         by_log = every[k] or (by_whole_steps[k, joint] and often)
-        tolerance = _ON_PATH * abs(jump) + float(rounded[joint])
+        tolerance = _PATH_TOLERANCE_SHARE * abs(jump) + float(rounded[joint])
         by_log |= _on_path(time, position[:, joint], row, tolerance)
         (logged if by_log else jumps).append(position_jump)
     return PositionSteps(tuple(jumps), tuple(logged))
@@ -157,10 +168,14 @@ def _on_path(time: Array, position: Array, row: int, tolerance: float) -> bool:
     first = row - 1
     while first > 0 and position[first - 1] == position[first]:
         first -= 1
-    if first == row - 1 or first < _BESIDE or row + _BESIDE >= len(time):
+    if first == row - 1 or first < _NEIGHBOUR_STEPS or row + _NEIGHBOUR_STEPS >= len(time):
         return False
-    before = (position[first] - position[first - _BESIDE]) / (time[first] - time[first - _BESIDE])
-    behind = (position[row + _BESIDE] - position[row]) / (time[row + _BESIDE] - time[row])
+    before = (position[first] - position[first - _NEIGHBOUR_STEPS]) / (
+        time[first] - time[first - _NEIGHBOUR_STEPS]
+    )
+    behind = (position[row + _NEIGHBOUR_STEPS] - position[row]) / (
+        time[row + _NEIGHBOUR_STEPS] - time[row]
+    )
     expected = position[first] + 0.5 * (before + behind) * (time[row] - time[first])
     return bool(abs(position[row] - expected) < tolerance)
 
@@ -169,10 +184,10 @@ def _departures(time: Array, position: Array) -> tuple[Array, Array, Array]:
     """Return how much each step departs from the neighbouring speed (m - 1, n), and this speed."""
     steps = np.diff(time)[:, None]
     speed = np.diff(position, axis=0) / steps
-    padded = np.pad(speed, ((_BESIDE, _BESIDE), (0, 0)), mode="edge")
-    windows = np.lib.stride_tricks.sliding_window_view(padded, 2 * _BESIDE + 1, axis=0)
+    padded = np.pad(speed, ((_NEIGHBOUR_STEPS, _NEIGHBOUR_STEPS), (0, 0)), mode="edge")
+    windows = np.lib.stride_tricks.sliding_window_view(padded, 2 * _NEIGHBOUR_STEPS + 1, axis=0)
     # One joint at a time, since the windows are copied.
-    sides = slice(None, _BESIDE), slice(_BESIDE + 1, None)
+    sides = slice(None, _NEIGHBOUR_STEPS), slice(_NEIGHBOUR_STEPS + 1, None)
     before, after = (
         np.column_stack([np.median(joint[:, side], axis=-1) for joint in windows.swapaxes(0, 1)])
         for side in sides
@@ -199,4 +214,4 @@ def _without_clock(departure: Array, speed: Array, steps: Array) -> tuple[Array,
     error = ((rate * off).sum(axis=1, keepdims=True) - rate * off) / (weight + steps**-2)
     without = departure - speed * error
     less = np.where(np.abs(without) < distance, without, departure)
-    return less, weight * steps**2 > _SHOWS**2
+    return less, weight * steps**2 > _VISIBLE_SIGMAS**2

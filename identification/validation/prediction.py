@@ -18,12 +18,13 @@ from identification.signals.noise import noiseless_above
 from identification.signals.samples import Samples
 from identification.signals.smoothing import low_pass
 
-FRICTION_CHANGE: Final = 0.10
+MAX_FRICTION_CHANGE: Final = 0.10
 # Hz. The torque of a rigid arm lies below, torque ripple and current noise above.
-SLOW: Final = 10.0
-_FLOOR_BLOCK: Final = 0.1  # s, shorter than what lies between two reversals, jumps or spikes
-_FLOOR_ROWS: Final = 10  # of a block, at least
-_FEWEST_BLOCKS: Final = 5  # of which a median says more than a mean
+SLOW_BANDWIDTH: Final = 10.0
+# s, shorter than what lies between two reversals, jumps or spikes
+_FLOOR_BLOCK_SECONDS: Final = 0.1
+_MIN_FLOOR_ROWS: Final = 10  # of a block, at least
+_MIN_FLOOR_BLOCKS: Final = 5  # of which a median says more than a mean
 _ROWS_AT_ONCE: Final = 30_000  # of a low-pass
 _ROWS_COMPARED: Final = 8192  # at once
 FIGURE_BANDWIDTH: Final = 30.0  # Hz, the paper's Fig. 4
@@ -163,9 +164,9 @@ def noise_floor(
 ) -> Array | None:
     """Return the standard deviation of torque noise per joint (n,) [N·m or N], NaN without rows.
 
-    It is that of the residual above `SLOW`, as of white noise, and that between repetitions below,
-    if given; None if the torque has no noise because it was filtered. The median over short blocks:
-    play, spikes and jumps of some blocks are faults, no noise.
+    It is that of the residual above `SLOW_BANDWIDTH`, as of white noise, and that between
+    repetitions below, if given; None if the torque has no noise because it was filtered. The median
+    over short blocks: play, spikes and jumps of some blocks are faults, no noise.
 
     Args:
         model: of the arm.
@@ -178,10 +179,12 @@ def noise_floor(
         return None
     parts = []
     for samples in recordings:
-        fast = residual(model, values, samples) - residual(model, values, samples, SLOW)
+        fast = residual(model, values, samples) - residual(model, values, samples, SLOW_BANDWIDTH)
         step = float(np.median(np.diff(samples.motion.time)))
-        share = max(1.0 - 2.0 * step * SLOW, 0.5)  # share of white noise above the bandwidth
-        length = max(_FLOOR_ROWS, round(_FLOOR_BLOCK / step))
+        share = max(
+            1.0 - 2.0 * step * SLOW_BANDWIDTH, 0.5
+        )  # share of white noise above the bandwidth
+        length = max(_MIN_FLOOR_ROWS, round(_FLOOR_BLOCK_SECONDS / step))
         edges = np.arange(0, len(fast), length)
         squares = np.add.reduceat(np.where(samples.usable, fast**2, 0.0), edges, axis=0) / share
         parts.append((squares, np.add.reduceat(samples.usable.astype(np.intp), edges, axis=0)))
@@ -197,8 +200,8 @@ def _usual_mean(sums: Array, rows: NDArray[np.intp]) -> Array:
     """
     usual = np.full(rows.shape[1], np.nan)
     for joint, (column, counts) in enumerate(zip(sums.T, rows.T, strict=True)):
-        whole = counts >= _FLOOR_ROWS // 2
-        if np.count_nonzero(whole) >= _FEWEST_BLOCKS:
+        whole = counts >= _MIN_FLOOR_ROWS // 2
+        if np.count_nonzero(whole) >= _MIN_FLOOR_BLOCKS:
             median = (1.0 - 2.0 / (9.0 * counts[whole])) ** 3
             usual[joint] = np.median(column[whole] / counts[whole] / median)
         elif counts.any():
@@ -218,7 +221,7 @@ def slow_error(model: RobotModel, values: Array, samples: Samples, bandwidth: fl
     """Return the error of parameters below a bandwidth, apart from changed friction.
 
     Friction varies with gear temperature, so the friction torque of each joint may be scaled by one
-    factor within `FRICTION_CHANGE`.
+    factor within `MAX_FRICTION_CHANGE`.
 
     Args:
         model: of the arm.
@@ -237,7 +240,7 @@ def slow_error(model: RobotModel, values: Array, samples: Samples, bandwidth: fl
         remainder = error - share * friction
         return PredictionError.between(samples.torque, samples.torque - remainder, usable)
 
-    forgiven = np.clip(change, -FRICTION_CHANGE, FRICTION_CHANGE)
+    forgiven = np.clip(change, -MAX_FRICTION_CHANGE, MAX_FRICTION_CHANGE)
     return SlowError(less(forgiven), change, less(change))
 
 

@@ -26,7 +26,7 @@ class PurposeLimits:
 
     contact: float | None = None  #: force at the flange that has to be seen [N]
     payload: float | None = None  #: mass at the flange that has to be seen [kg]
-    #: error of the flange after `identification.purposes.simulation_error.HORIZON` [m]
+    #: error of the flange after `identification.purposes.simulation_error.HORIZON_SECONDS` [m]
     distance: float = 5e-3
     feed_forward: float = 0.2  #: share of the torque that may be left for feedback
 

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from identification.arrays import Array, Indices
 from identification.distributions import MAD_TO_STD, student_limit
-from identification.estimators.friction_drift import PIECES, FrictionDrift, friction_trend
+from identification.estimators.friction_drift import TREND_PIECES, FrictionDrift, friction_trend
 from identification.model.robot import RobotModel
 from identification.signals.block_mean import BlockMean, block_index, block_mean
 from identification.signals.samples import Samples
@@ -24,16 +24,18 @@ from identification.validation.prediction import PredictionError
 
 Rows = NDArray[np.bool_]
 
-BINS: Final = 12
-CHANCE: Final = 0.001  # probability of a false finding per joint, over all its bins
+RESIDUAL_BINS: Final = 12
+# probability of a false finding per joint, over all its bins
+FALSE_FINDING_PROBABILITY: Final = 0.001
 # Per motor turn: eccentricity 1; strain wave gears 2; pole pairs and slots of servo motors above.
 HARMONICS: Final = (1, 2, 3, 4, 6)
-_SIGMAS: Final = 4.1  # largest of five harmonics: probability of about 0.001
-_BEYOND: Final = 6.0  # robust standard deviations; one normal sample in 500 million is beyond six
+_HARMONIC_SIGMAS: Final = 4.1  # largest of five harmonics: probability of about 0.001
+# robust standard deviations; one normal sample in 500 million is beyond six
+_OUTLIER_SIGMAS: Final = 6.0
 # Longer than the settling of a move.
-LONGEST_LAG: Final = 0.5  # s
-_MOST_LAGS: Final = 1000
-_RESOLVED: Final = 4.0  # s, parts of a spectrum of the residual
+MAX_CORRELATION_LAG: Final = 0.5  # s
+_MAX_LAGS: Final = 1000
+_SPECTRUM_PART_SECONDS: Final = 4.0  # s, parts of a spectrum of the residual
 
 
 class Profile(NamedTuple):
@@ -61,7 +63,9 @@ class Profile(NamedTuple):
         """Whether the mean of some bin differs from zero (n,): Student's t, all bins together."""
         seen = np.isfinite(self.bins.mean)
         freedom = np.maximum(self.bins.blocks - 1, 1)
-        limit = student_limit(0.5 * CHANCE / np.maximum(seen.sum(axis=1), 1)[:, None], freedom)
+        limit = student_limit(
+            0.5 * FALSE_FINDING_PROBABILITY / np.maximum(seen.sum(axis=1), 1)[:, None], freedom
+        )
         return np.asarray((self._certainty > limit).any(axis=1))
 
     def worst(self, joint: int) -> tuple[float, float]:
@@ -90,17 +94,17 @@ def _profile(
     moved = np.isfinite(lowest) & (highest > lowest)
     lowest = np.where(moved, lowest, 0.0)
     highest = np.where(moved, highest, 1.0)
-    edges = np.linspace(lowest, highest, BINS + 1, axis=1)
+    edges = np.linspace(lowest, highest, RESIDUAL_BINS + 1, axis=1)
     sums = []
     for run, residual, quantity in zip(runs, residuals, over, strict=True):
         block = block_index(run)
-        binned_sums = np.zeros((2, int(block[-1]) + 1, len(edges), BINS))
+        binned_sums = np.zeros((2, int(block[-1]) + 1, len(edges), RESIDUAL_BINS))
         for joint, usable in enumerate(run.usable.T):
             bins = np.searchsorted(edges[joint, 1:-1], quantity[:, joint], side="right")
-            cell = block * BINS + bins
+            cell = block * RESIDUAL_BINS + bins
             for table, weights in zip(binned_sums, (residual[:, joint], usable), strict=True):
-                some = np.bincount(cell, np.where(usable, weights, 0.0), len(table) * BINS)
-                table[:, joint] = some.reshape(-1, BINS)
+                some = np.bincount(cell, np.where(usable, weights, 0.0), len(table) * RESIDUAL_BINS)
+                table[:, joint] = some.reshape(-1, RESIDUAL_BINS)
         sums.append(binned_sums)
     return Profile(edges, block_mean(sums, repeated))
 
@@ -125,7 +129,9 @@ class Ripple(NamedTuple):
     def significant(self) -> Rows:
         """Whether some harmonic of a joint is significant (n,)."""
         std = np.sqrt(np.mean(self.parts.std**2, axis=-1))
-        return np.asarray((np.nan_to_num(self.amplitude) > _SIGMAS * np.nan_to_num(std)).any(-1))
+        return np.asarray(
+            (np.nan_to_num(self.amplitude) > _HARMONIC_SIGMAS * np.nan_to_num(std)).any(-1)
+        )
 
     def strongest(self, joint: int) -> int:
         """Return the periods per motor turn of a joint's largest harmonic."""
@@ -178,7 +184,7 @@ def find_outliers(torque: Array, residual: Array, usable: Rows) -> Outliers:
         if rows.any():
             error = residual[:, joint]
             distance = np.abs(error - np.median(error[rows]))
-            limit = _BEYOND * MAD_TO_STD * float(np.median(distance[rows]))
+            limit = _OUTLIER_SIGMAS * MAD_TO_STD * float(np.median(distance[rows]))
             far[:, joint] = rows & (distance > max(limit, np.finfo(np.float64).tiny))
             total[joint] = (error[rows] ** 2).sum()
             outlying[joint] = (error[far[:, joint]] ** 2).sum()
@@ -210,10 +216,10 @@ class Autocorrelation(NamedTuple):
 
 
 def autocorrelation(
-    residuals: Sequence[tuple[Array, Rows]], step: float, longest: float = LONGEST_LAG
+    residuals: Sequence[tuple[Array, Rows]], step: float, longest: float = MAX_CORRELATION_LAG
 ) -> Autocorrelation:
     """Return the autocorrelation of residuals and usable rows (m, n) up to the longest lag [s]."""
-    lags = max(2, min(_MOST_LAGS, round(longest / step)))
+    lags = max(2, min(_MAX_LAGS, round(longest / step)))
     shape = (lags + 1, residuals[0][0].shape[1])
     products, pairs = np.zeros((2, *shape))
     for residual, usable in residuals:
@@ -290,7 +296,7 @@ def check_residuals(
     )
     rows = np.maximum(sum(np.count_nonzero(run.usable, axis=0) for run in runs), 1)
     repeated = fitted if same_motion else 1
-    pieces = -(-PIECES // fitted)
+    pieces = -(-TREND_PIECES // fitted)
     drift = [
         _drift_sums(model, values, *pair, pieces) for pair in zip(training, residuals, strict=False)
     ]
@@ -364,7 +370,7 @@ def folded_noise(
             continue
         step = float(np.median(np.diff(run.motion.time[part])))
         highest = 0.5 / step
-        length = min(_length(part), round(_RESOLVED / step))
+        length = min(_length(part), round(_SPECTRUM_PART_SECONDS / step))
         if highest < 2.0 * bandwidth or length * step * bandwidth < 1.0:
             continue
         frequency, density = power_density(error[part], 1.0 / step, length)

@@ -20,12 +20,12 @@ from sim_fixtures.plant import Carried, ElasticPlant, Plant, PlantTruth, build_m
 CELL_PATH: Final = Path(__file__).with_name("cell.toml")
 """A cell file of the simulated UR5e."""
 UR5E_URDF: Final = Path(__file__).with_name("ur5e.urdf").read_text("utf-8")
-_ROOM: Final = 25.0  # °C
-_HEATING: Final = 0.25  # °C per W of friction in the long run
-_HEAT_TIME: Final = 900.0  # s
-_BANDWIDTH: Final = 60.0  # of the position loop, rad/s
+_ROOM_TEMPERATURE: Final = 25.0  # °C
+_HEATING_PER_WATT: Final = 0.25  # °C per W of friction in the long run
+_HEAT_TIME_CONSTANT: Final = 900.0  # s
+_POSITION_BANDWIDTH: Final = 60.0  # of the position loop, rad/s
 _FRICTION_SPEED: Final = 0.02  # of the controller's friction law at a reversal, rad/s
-_SUBSTEP: Final = 5e-4  # of an arm with effects that a model leaves out, s
+_SUBSTEP_SECONDS: Final = 5e-4  # of an arm with effects that a model leaves out, s
 _MOTOR_PER_JOINT: Final = 101.0 / (2.0 * np.pi)  # revolutions per rad
 
 
@@ -103,7 +103,7 @@ class SimulatedUrArm:
         if any(self._effects.elasticity):
             self.plant = ElasticPlant(
                 urdf, truth.plant, position=position, elasticity=self._effects.elasticity,
-                step=_SUBSTEP,
+                step=_SUBSTEP_SECONDS,
             )  # fmt: skip
         # Without rotors: what the arm reports as its moment is that of rigid bodies alone.
         self._model = build_model(urdf, (0.0, 0.0, -9.81), np.zeros(6))
@@ -120,7 +120,7 @@ class SimulatedUrArm:
         self.current: Array = np.zeros(6)
         self.target_moment: Array = np.zeros(6)
         self.target_current: Array = np.zeros(6)
-        self.temperature: Array = np.full(6, _ROOM + 2.0)
+        self.temperature: Array = np.full(6, _ROOM_TEMPERATURE + 2.0)
 
     def step(self, q: Array, qd: Array, qdd: Array) -> None:
         """Follow targets (6,) [rad, rad/s, rad/s²] for a cycle."""
@@ -136,7 +136,7 @@ class SimulatedUrArm:
         drive = rotor * qdd
         error = q - self.plant.position
         rate = qd - self.plant.velocity
-        correction = inertia * _BANDWIDTH * (_BANDWIDTH * error + 2.0 * rate)
+        correction = inertia * _POSITION_BANDWIDTH * (_POSITION_BANDWIDTH * error + 2.0 * rate)
         command = self.target_current + (drive + correction) / truth.stated_constant
         self.current = command
         torque = truth.torque_constant * command
@@ -150,11 +150,11 @@ class SimulatedUrArm:
         """Advance by a cycle under motor torques (6,) [N·m], in sub-steps."""
         plant = self.plant
         plant.scale_friction(self._drift.scale(plant.velocity, self._period))
-        delayed = round(self._effects.delay / _SUBSTEP)
-        for substep in range(round(self._period / _SUBSTEP)):
+        delayed = round(self._effects.delay / _SUBSTEP_SECONDS)
+        for substep in range(round(self._period / _SUBSTEP_SECONDS)):
             acting = self._torque_before if substep < delayed else torque
             motors = (_MOTOR_PER_JOINT * plant.motor_position).tolist()
-            plant.step(acting + self._ripple.torque(motors), _SUBSTEP)
+            plant.step(acting + self._ripple.torque(motors), _SUBSTEP_SECONDS)
         self._torque_before = torque
 
     def rest(self) -> None:
@@ -165,8 +165,10 @@ class SimulatedUrArm:
 
     def _warm(self) -> None:
         power = np.abs(self.plant.friction_torque * self.plant.velocity)
-        final = _ROOM + 2.0 + _HEATING * power
-        self.temperature = self.temperature + self._period / _HEAT_TIME * (final - self.temperature)
+        final = _ROOM_TEMPERATURE + 2.0 + _HEATING_PER_WATT * power
+        self.temperature = self.temperature + self._period / _HEAT_TIME_CONSTANT * (
+            final - self.temperature
+        )
 
     def measured_current(self) -> Array:
         """Return the measured current of the last cycle (6,) [A]."""

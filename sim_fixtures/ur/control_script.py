@@ -16,16 +16,16 @@ from sim_fixtures.arrays import Array
 from sim_fixtures.ur.program import ENDED, STOPPING, STREAMING, ProgramConstants, Registers
 
 FIRST_LINE: Final = "def rtde_control():"
-_READY: Final = 1
-_DONE: Final = 2
-_MOVE_J: Final = 1
-_SERVO_J: Final = 11
-_END: Final = 255
-_AT_ONCE: Final = frozenset({6, 9, 10, 11, 24, 25, 26, 27, 38, 58, *range(66, 72)})
+_READY_STATE: Final = 1
+_DONE_STATE: Final = 2
+_MOVE_J_COMMAND: Final = 1
+_SERVO_J_COMMAND: Final = 11
+_END_COMMAND: Final = 255
+_IMMEDIATE_COMMANDS: Final = frozenset({6, 9, 10, 11, 24, 25, 26, 27, 38, 58, *range(66, 72)})
 """Commands that a PC sends again and again, after which the script is ready at once."""
 _SPEED, _ACCELERATION = 6, 7
-_DEFAULT_STOP: Final = 10.0  # rad/s²
-_LOOKAHEAD: Final = 0.03  # s; the PC's own is not used
+_DEFAULT_DECELERATION: Final = 10.0  # rad/s²
+_LOOKAHEAD_SECONDS: Final = 0.03  # s; the PC's own is not used
 
 
 class ControlScript:
@@ -37,8 +37,8 @@ class ControlScript:
         nothing = np.full(6, np.inf)
         self.constants = ProgramConstants(
             token=0, velocity=nothing, deviation=nothing, period=period, patience=0, starting=0,
-            confirmed=0, start_distance=np.inf, deceleration=_DEFAULT_STOP, lookahead=_LOOKAHEAD,
-            watchdog=np.inf,
+            confirmed=0, start_distance=np.inf, deceleration=_DEFAULT_DECELERATION,
+            lookahead=_LOOKAHEAD_SECONDS, watchdog=np.inf,
         )  # fmt: skip
         self.command = position.copy()
         self.stage = STREAMING
@@ -47,29 +47,29 @@ class ControlScript:
         self._period = period
         self._executed = False
         self._path: list[Array] = []
-        outputs.ints[0] = _READY
+        outputs.ints[0] = _READY_STATE
 
     def step(self, actual: Array, is_steady: Callable[[], bool]) -> None:
         """Run one cycle."""
         del actual, is_steady
         if self._path:
             self.command = self._path.pop(0)
-            self._outputs.ints[0] = _DONE if not self._path else 0
+            self._outputs.ints[0] = _DONE_STATE if not self._path else 0
             return
         number = self._inputs.ints.get(0, 0)
-        if number == _END:
+        if number == _END_COMMAND:
             self.stage = STOPPING
-        elif number in _AT_ONCE:
-            if number == _SERVO_J:
+        elif number in _IMMEDIATE_COMMANDS:
+            if number == _SERVO_J_COMMAND:
                 self.command = self._inputs.vector(0)
-            self._outputs.ints[0] = _READY
+            self._outputs.ints[0] = _READY_STATE
         elif number == 0:
             self._executed = False
-            self._outputs.ints[0] = _READY
+            self._outputs.ints[0] = _READY_STATE
         elif not self._executed:
             self._executed = True
-            self._outputs.ints[0] = _DONE
-            if number == _MOVE_J:
+            self._outputs.ints[0] = _DONE_STATE
+            if number == _MOVE_J_COMMAND:
                 self._outputs.ints[0] = 0
                 floats = self._inputs.floats
                 self._path = self._ramp(

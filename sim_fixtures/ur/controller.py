@@ -34,8 +34,8 @@ _PLAYING: Final = 2
 _PAUSED: Final = 4
 _NORMAL: Final = 1
 _PROTECTIVE_STOP: Final = 3
-_FLANGE: Final = 5  # joint that carries the payload, from 0
-_STOPPING: Final = 0.2  # s within which a protective stop ends the motion
+_FLANGE_JOINT: Final = 5  # joint that carries the payload, from 0
+_STOPPING_SECONDS: Final = 0.2  # s within which a protective stop ends the motion
 _SAFEGUARD_STOP: Final = 5
 _EMERGENCY_STOP: Final = 7
 _SAFETY_BITS: Final = {_NORMAL: 1, _PROTECTIVE_STOP: 1 << 2, _SAFEGUARD_STOP: 1 << 4,
@@ -43,12 +43,12 @@ _SAFETY_BITS: Final = {_NORMAL: 1, _PROTECTIVE_STOP: 1 << 2, _SAFEGUARD_STOP: 1 
 _SAFETY_NAMES: Final = {_NORMAL: "NORMAL", _PROTECTIVE_STOP: "PROTECTIVE_STOP",
                         _SAFEGUARD_STOP: "SAFEGUARD_STOP",
                         _EMERGENCY_STOP: "ROBOT_EMERGENCY_STOP"}  # fmt: skip
-_LOADING: Final = 10  # cycles until a program that was sent begins
+_LOADING_CYCLES: Final = 10  # cycles until a program that was sent begins
 _STOP_DECELERATION: Final = 15.0  # of stops by the controller, rad/s²
-_MOST_DEVIATION: Final = 0.1  # rad between arm and target
-_SUDDEN: Final = 12.0  # rad/s of a set-point of servoj above which it is a jump
-_AT_REST: Final = 1e-6  # rad/s
-_STEADY: Final = 0.5  # s at rest after which is_steady() is true
+_MAX_DEVIATION: Final = 0.1  # rad between arm and target
+_MAX_SERVO_SPEED: Final = 12.0  # rad/s of a set-point of servoj above which it is a jump
+_REST_SPEED: Final = 1e-6  # rad/s
+_STEADY_SECONDS: Final = 0.5  # s at rest after which is_steady() is true
 _FLANGE_OFFSET: Final = 0.0996  # m from the last joint's frame to the flange, along its axis
 
 
@@ -280,7 +280,7 @@ class SimulatedUr:
         # None for the script of ur-rtde, whose constants come with each command.
         self._loaded: tuple[int, ProgramConstants | None] | None = None
         self._written_at = 0
-        self._moved_at = -round(_STEADY / self.period)
+        self._moved_at = -round(_STEADY_SECONDS / self.period)
         self._commanded: Array | None = None  # by servoj in the last cycle
         self._rest: Array | None = None  # where a program left the arm
         self._target = self._motion.target(0.0)
@@ -320,7 +320,7 @@ class SimulatedUr:
                 self.said.append(Said(str(error)))
                 return
             self._leave_program()
-            self._loaded = (self.cycle + _LOADING, constants)
+            self._loaded = (self.cycle + _LOADING_CYCLES, constants)
 
     def _leave_program(self) -> None:
         """Forget the program that ran; the arm stays where its target is."""
@@ -364,14 +364,16 @@ class SimulatedUr:
         if self._repeats and self._program is not None:
             time %= self._program.duration
         q, qd, qdd = self._motion.target(time if self._program is not None else 0.0)
-        decelerating = 0.0 if self._stopped_for is None or scaling == 0.0 else -1.0 / _STOPPING
+        decelerating = (
+            0.0 if self._stopped_for is None or scaling == 0.0 else -1.0 / _STOPPING_SECONDS
+        )
         self._target = q, scaling * qd, scaling**2 * qdd + decelerating * qd
         self.arm.step(*self._target)
 
     def _step_stream(self) -> None:
         """Move the target as servoj, a stop of the program, or rest have it."""
         program = self.stream
-        if np.any(np.abs(self._target[1]) > _AT_REST):
+        if np.any(np.abs(self._target[1]) > _REST_SPEED):
             self._moved_at = self.cycle
         if program is not None and program.stage == ENDED:
             self._leave_program()
@@ -402,7 +404,7 @@ class SimulatedUr:
         command = program.command
         before = command if self._commanded is None else self._commanded
         self._commanded = command.copy()
-        if (np.abs(command - before) > _SUDDEN * self.period).any():
+        if (np.abs(command - before) > _MAX_SERVO_SPEED * self.period).any():
             self._protect(Said("sudden change in target position", 204, 1))
             return
         q, qd, _ = self._target
@@ -432,19 +434,19 @@ class SimulatedUr:
 
     @property
     def _is_steady(self) -> bool:
-        return (self.cycle - self._moved_at) * self.period >= _STEADY
+        return (self.cycle - self._moved_at) * self.period >= _STEADY_SECONDS
 
     @property
     def deviation_ratio(self) -> float:
         """Distance of the arm from its target, of the largest that is allowed."""
-        return float(np.abs(self._target[0] - self.arm.plant.position).max() / _MOST_DEVIATION)
+        return float(np.abs(self._target[0] - self.arm.plant.position).max() / _MAX_DEVIATION)
 
     @property
     def speed_scaling(self) -> float:
         """Speed of the program as a fraction of its own, by the slider and by a stop."""
         if self._stopped_for is None:
             return self.slider
-        remaining = 1.0 - (self.cycle * self.period - self._stopped_for) / _STOPPING
+        remaining = 1.0 - (self.cycle * self.period - self._stopped_for) / _STOPPING_SECONDS
         return self.slider * max(0.0, remaining)
 
     def _apply(self, fault: UrFault) -> None:
@@ -561,4 +563,4 @@ def _carried(payload: UrPayload) -> Carried | None:
         return None
     x, y, z = payload.centre
     centre = np.array([x, y, z + _FLANGE_OFFSET])
-    return Carried(_FLANGE, payload.mass, centre, np.zeros((3, 3)))
+    return Carried(_FLANGE_JOINT, payload.mass, centre, np.zeros((3, 3)))

@@ -15,19 +15,19 @@ import numpy as np
 
 from sim_fixtures.arrays import Array
 
-_FIRST: Final = 24
+_FIRST_REGISTER: Final = 24
 WAITING: Final = 1
 STREAMING: Final = 2
 STOPPING: Final = 3
 ENDED: Final = 4
-_STREAM: Final = 1
-_END: Final = 2
-_STOP: Final = 3
+_STREAM_DEMAND: Final = 1
+_END_DEMAND: Final = 2
+_STOP_DEMAND: Final = 3
 _ASKED, _REFUSED, _SILENCE, _STEP, _DEVIATION, _PAUSED, _NO_START = range(1, 8)
 _NUMBER_PATTERN: Final = r"([-+0-9.e]+)"
 _LIST_PATTERN: Final = r"\[([-+0-9.e, ]+)\]"
-_FRAME: Final = 1e-7
-_MOVING: Final = 1e-6
+_CHECKSUM_TOLERANCE: Final = 1e-7
+_MIN_MOVEMENT: Final = 1e-6
 _REACH_MARGIN: Final = 1.01
 _REACH_OFFSET: Final = 1e-6
 
@@ -139,14 +139,14 @@ class RegisterProgram:
         self.watched = False
         self._received = position.copy()
         self._change: Array = np.zeros(6)
-        self._number = inputs.ints.get(_FIRST, 0)
+        self._number = inputs.ints.get(_FIRST_REGISTER, 0)
         self._silent = self._unused = self._confirmed = 0
         self._moves = False
-        outputs.ints.update({_FIRST: 0, 25: WAITING, 26: 0, 28: 0, 27: constants.token})
+        outputs.ints.update({_FIRST_REGISTER: 0, 25: WAITING, 26: 0, 28: 0, 27: constants.token})
         self._show(position)
 
     def _show(self, q: Array) -> None:
-        self._outputs.floats.update({_FIRST + k: float(q[k]) for k in range(6)})
+        self._outputs.floats.update({_FIRST_REGISTER + k: float(q[k]) for k in range(6)})
 
     def step(self, actual: Array, is_steady: Callable[[], bool]) -> None:
         """Run one cycle with the measured position (6,); `is_steady` is whether the arm rests."""
@@ -155,7 +155,7 @@ class RegisterProgram:
             ending = _DEVIATION
         outputs = self._outputs.ints
         if ending == 0:
-            outputs.update({_FIRST: self._number, 25: self.stage, 26: self._unused})
+            outputs.update({_FIRST_REGISTER: self._number, 25: self.stage, 26: self._unused})
             self._show(self.command)
         else:
             self.stage = STOPPING
@@ -164,18 +164,20 @@ class RegisterProgram:
     def _take(self, is_steady: Callable[[], bool]) -> int:
         """Take the set-point of the registers; return why the program ends, 0 if it does not."""
         inputs = self._inputs
-        number = inputs.ints.get(_FIRST, 0)
-        demand = inputs.ints.get(_FIRST + 1, 0)
-        q = inputs.vector(_FIRST)
+        number = inputs.ints.get(_FIRST_REGISTER, 0)
+        demand = inputs.ints.get(_FIRST_REGISTER + 1, 0)
+        q = inputs.vector(_FIRST_REGISTER)
         total = 0.0
         for value in q.tolist():
             total += value
-        whole = abs(total + number - inputs.floats.get(_FIRST + 6, 0.0)) < _FRAME
-        if whole and demand == _END:
+        whole = (
+            abs(total + number - inputs.floats.get(_FIRST_REGISTER + 6, 0.0)) < _CHECKSUM_TOLERANCE
+        )
+        if whole and demand == _END_DEMAND:
             return _ASKED
-        if whole and (demand == _STOP or (demand == 0 and self.stage == STREAMING)):
+        if whole and (demand == _STOP_DEMAND or (demand == 0 and self.stage == STREAMING)):
             return _REFUSED
-        if whole and demand == _STREAM and number not in (self._number, 0) and number > 0:
+        if whole and demand == _STREAM_DEMAND and number not in (self._number, 0) and number > 0:
             return self._follow(q, number)
         return self._continue(is_steady)
 
@@ -191,7 +193,7 @@ class RegisterProgram:
         if not (np.abs(change) <= reach).all():
             return _STEP
         self._change = np.zeros(6) if first else change / ahead
-        self._moves = bool((np.abs(self._change) > _MOVING).any())
+        self._moves = bool((np.abs(self._change) > _MIN_MOVEMENT).any())
         self.watched = True
         self.command, self._received = q.copy(), q.copy()
         self._number = number

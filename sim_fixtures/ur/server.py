@@ -22,14 +22,14 @@ from sim_fixtures.ur.controller import SimulatedUr, UrSettings
 RTDE_PORT: Final = 30004
 PRIMARY_PORT: Final = 30001
 REALTIME_PORT: Final = 30003
-_MOST_UNREAD: Final = 1 << 19
+_MAX_UNREAD_BYTES: Final = 1 << 19
 """Bytes that wait for a client in real time; further frames are skipped, as on a controller."""
-_MOST_AHEAD: Final = 1 << 16
+_MAX_AHEAD_BYTES: Final = 1 << 16
 """Bytes by which the controller runs ahead of its clients in virtual time."""
-_IDLE: Final = 0.01  # s between two looks at `close` in virtual time
-_POLL: Final = 5e-4  # s between two looks at the clock while a set-point is waited for
-_STATE_EVERY: Final = 0.1  # s between two states of the primary interface
-_DEAD_AFTER: Final = 10.0  # s after which a client that does not read is disconnected
+_IDLE_WAIT: Final = 0.01  # s between two looks at `close` in virtual time
+_CLOCK_POLL_PERIOD: Final = 5e-4  # s between two looks at the clock while a set-point is waited for
+_STATE_PERIOD: Final = 0.1  # s between two states of the primary interface
+_DEAD_CLIENT_TIMEOUT: Final = 10.0  # s after which a client that does not read is disconnected
 _CHECKSUMS: Final = (0x1F2E3D4C, 0x5B6A7988, 0x97A6B5C4, 0xD3E2F100, 0x0F1E2D3C, 0x4B5A6978)
 _DH: Final = (
     (0.0, -0.425, -0.3922, 0.0, 0.0, 0.0),
@@ -174,7 +174,7 @@ class UrServer:
         """Whether there are clients, and all of them have read what was sent."""
         receiving = [client for client in self._clients if client.started]
         return bool(receiving) and all(
-            len(client.waiting) < _MOST_AHEAD or self._holds(client) for client in receiving
+            len(client.waiting) < _MAX_AHEAD_BYTES or self._holds(client) for client in receiving
         )
 
     def _holds(self, client: _Client) -> bool:
@@ -205,10 +205,10 @@ class UrServer:
 
     def _exchange(self) -> None:
         """Accept, read and write what is possible until the next cycle."""
-        wait = 0.0 if self._are_ready else _IDLE
+        wait = 0.0 if self._are_ready else _IDLE_WAIT
         if self._real_time:
             wait = max(0.0, self._due - time.monotonic())
-            wait = max(wait, _POLL) if self._waits else wait
+            wait = max(wait, _CLOCK_POLL_PERIOD) if self._waits else wait
         for client in self._clients:
             writes = bool(client.waiting) and not self._holds(client)
             events = selectors.EVENT_READ | (selectors.EVENT_WRITE if writes else 0)
@@ -371,7 +371,7 @@ class UrServer:
             outputs = outputs or controller.outputs()
             self._send_outputs(client, client.data.package(outputs))
         if controller.time >= self._next_state:
-            self._next_state = controller.time + _STATE_EVERY
+            self._next_state = controller.time + _STATE_PERIOD
 
     def _send_outputs(self, client: _Client, frame: bytes) -> None:
         """Send a frame as the faults of this cycle have it."""
@@ -395,10 +395,10 @@ class UrServer:
 
     def _append(self, client: _Client, frame: bytes) -> None:
         now = time.monotonic()
-        if len(client.waiting) > _MOST_UNREAD:
+        if len(client.waiting) > _MAX_UNREAD_BYTES:
             self.skipped += 1
             client.unread_since = client.unread_since or now
-            if now - client.unread_since > _DEAD_AFTER:
+            if now - client.unread_since > _DEAD_CLIENT_TIMEOUT:
                 self._drop(client)
             return
         client.waiting += frame

@@ -16,8 +16,8 @@ from drivers.packets import LAST_NUMBER, CyclicPacket, Mode, cyclic_length, next
 from drivers.transports.can import frames
 from drivers.transports.can.frames import (
     DOWN,
-    LOAD_LIMIT,
-    PACKED,
+    MAX_BUS_LOAD,
+    PACKED_IDS,
     PAYLOADS_FD,
     UP,
     BusRates,
@@ -75,9 +75,9 @@ class TestPackets:
     def test_frames_of_other_identifiers_are_counted(self):
         """Those of the packed profiles of earlier versions as such."""
         end = Wire().near
-        for identifier in (DOWN, 0x7FF, *PACKED):
+        for identifier in (DOWN, 0x7FF, *PACKED_IDS):
             assert end.receive(Frame(identifier, bytes(64)), 0.0) is None
-        assert end.discarded == {"foreign": 2, "packed": len(PACKED)}
+        assert end.discarded == {"foreign": 2, "packed": len(PACKED_IDS)}
 
 
 class TestDisturbances:
@@ -220,7 +220,7 @@ class TestBusLoad:
         """As `docs/connect.md` has them."""
         rates = BusRates()
         assert f"{100.0 * rates.load(n_axes, period):.1f}" == percent
-        if float(percent) <= 100.0 * LOAD_LIMIT:
+        if float(percent) <= 100.0 * MAX_BUS_LOAD:
             rates.require_load(n_axes, period)
             return
         load = f"{percent} % of a cycle of {1e3 * period:g} ms; allowed is 70 %"

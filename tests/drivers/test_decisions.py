@@ -15,10 +15,10 @@ from types import SimpleNamespace
 import pytest
 
 from drivers.exchange.loop import exchange
-from drivers.packet_losses import LOSS_WINDOW, LossTracker
+from drivers.packet_losses import LOSS_WINDOW_CYCLES, LossTracker
 from drivers.session import Session
 from drivers.states import (
-    HAS_SET_POINTS,
+    STATES_WITH_SET_POINTS,
     TRANSITIONS,
     Decision,
     Input,
@@ -88,7 +88,7 @@ class TestDecision:
     def test_a_motion_goes_on_only_where_set_points_are_sent(self):
         for state, cause in ENTRIES:
             decision = decide(state, cause, losses(), Motion())
-            lost = decision.state not in HAS_SET_POINTS and cause is not Input.REFUSAL
+            lost = decision.state not in STATES_WITH_SET_POINTS and cause is not Input.REFUSAL
             assert (decision.ending is not None) == lost, (state, cause)
             if decision.ending is not None:
                 assert decision.ending[0] == "lost"
@@ -157,9 +157,9 @@ class TestLosses:
         tracker = losses()
         tracker.reject(GAP, 1)
         assert tracker.reason_to_stop_after_rejection is None
-        tracker.reject(1, LOSS_WINDOW)
+        tracker.reject(1, LOSS_WINDOW_CYCLES)
         assert tracker.reason_to_stop_after_rejection == "3 replies were lost in 100 cycles"
-        tracker.reject(1, LOSS_WINDOW + 1)
+        tracker.reject(1, LOSS_WINDOW_CYCLES + 1)
         assert (tracker.rejected, tracker.reason_to_stop_after_rejection) == (2, None)
         tracker.forget_rejected()
         assert tracker.rejected == 0

@@ -21,7 +21,7 @@ from drivers import (
     exchange,
 )
 from drivers.c4g_wire import C4gProtocol
-from drivers.exchange.loop import MAX_KINDS
+from drivers.exchange.loop import MAX_REPLIED_PACKETS
 from drivers.wire import ArmSettings
 from tests.drivers.rig import (
     MOVE,
@@ -376,7 +376,7 @@ class TestBacklog:
         exchange(link, session, ends_when=lambda: False)
         # The first one came alone.
         newest = sorted({status: number for number, status in enumerate(statuses[1:], 1)}.values())
-        expected = [*packets[:1], *(packets[number] for number in newest[-MAX_KINDS:])]
+        expected = [*packets[:1], *(packets[number] for number in newest[-MAX_REPLIED_PACKETS:])]
         assert link.sent == expected
         assert len(link.sent) + session.discards.get("late", 0) == len(packets)
 

@@ -22,12 +22,12 @@ from drivers.errors import RequestError
 from drivers.events import Counters, Outcome, PacketRejected, RepliesLost
 from drivers.exchange import control, event_log, motion_transfer
 from drivers.exchange.control import (
-    BINS,
+    FIRST_BIN_SECONDS,
     HEARTBEAT_TIMEOUT,
     IDLE_HEARTBEAT_TIMEOUT,
-    MAX_INTERVAL,
+    LATENCY_BINS,
+    MAX_CALL_INTERVAL,
     OUTCOMES,
-    SHORTEST,
     ArchiveState,
     HeartbeatMonitor,
     SharedState,
@@ -43,7 +43,7 @@ from drivers.exchange.event_log import (
     EventWriter,
     Leaving,
 )
-from drivers.exchange.loop import POLL
+from drivers.exchange.loop import POLL_PERIOD
 from drivers.exchange.serving import DETACHED_LINGER, MAX_LINGER, CommandHandler, EventLimiter
 from tests.drivers.rig import Cruise, N, still
 from tests.messages import MISSED_IN_A_ROW
@@ -188,13 +188,14 @@ class TestMotionTransfer:
 
 
 class TestLatencyBins:
-    LONGEST = upper_edge(BINS - 2)
+    LONGEST = upper_edge(LATENCY_BINS - 2)
 
     @given(
-        st.lists(st.floats(SHORTEST, LONGEST), min_size=1), st.floats(0.0, 1.0, exclude_min=True)
+        st.lists(st.floats(FIRST_BIN_SECONDS, LONGEST), min_size=1),
+        st.floats(0.0, 1.0, exclude_min=True),
     )
     def test_quantile_is_at_most_one_bin_too_long(self, latencies, share):
-        counts = [0] * BINS
+        counts = [0] * LATENCY_BINS
         for seconds in latencies:
             counts[bin_of(seconds)] += 1
         estimated = quantile(counts, share)
@@ -205,11 +206,14 @@ class TestLatencyBins:
 
     @pytest.mark.parametrize(
         ("latencies", "place"),
-        [((0.0, -1e-3, math.nan, SHORTEST), 0), ((100.0, 1e300, math.inf), BINS - 1)],
+        [
+            ((0.0, -1e-3, math.nan, FIRST_BIN_SECONDS), 0),
+            ((100.0, 1e300, math.inf), LATENCY_BINS - 1),
+        ],
     )
     def test_first_and_last_bin_are_unbounded(self, latencies, place):
         assert {bin_of(seconds) for seconds in latencies} == {place}
-        assert upper_edge(BINS - 1) == math.inf
+        assert upper_edge(LATENCY_BINS - 1) == math.inf
         assert 20.0 < self.LONGEST < 25.0, "longer than any reply that is waited for"
 
 
@@ -248,7 +252,7 @@ class TestHeartbeatMonitor:
         clock.beat = 0.0  # before the first
         assert watch(10.0) == 0.0
 
-    @pytest.mark.parametrize("longest", [MAX_INTERVAL, 0.1])
+    @pytest.mark.parametrize("longest", [MAX_CALL_INTERVAL, 0.1])
     def test_suspension_of_the_computer_is_not_silence(self, clock, longest):
         monitor = HeartbeatMonitor(lambda: clock.beat, max_interval=longest)
         clock.time += 3600.0
@@ -441,7 +445,7 @@ class TestSupervisorHeartbeat:
     def test_time_in_which_this_process_stood_still_is_no_silence(self, bench):
         bench.session.requested = True
         bench.step()
-        for _ in range(round(0.9 * HEARTBEAT_TIMEOUT / POLL)):
+        for _ in range(round(0.9 * HEARTBEAT_TIMEOUT / POLL_PERIOD)):
             bench.later(3600.0)
         assert not bench.serving.reason
         for _ in range(2):

@@ -8,8 +8,8 @@ import pytest
 from drivers import GapSeen, Guard, InitReceived, Mode, MotionEnded, MotionStarted, State
 from drivers.errors import AxisNotInMode, Check
 from drivers.events import RepliesLost
-from drivers.guard import LAG
-from drivers.open_mode import REPETITIONS, SentSetPoints
+from drivers.guard import SERVO_LAG_SECONDS
+from drivers.open_mode import MAX_RESENDS, SentSetPoints
 from drivers.packets import LAST_NUMBER, PacketSequence
 from tests.drivers.losses import FAR, at_speed, lose, planned
 from tests.drivers.rig import (
@@ -261,7 +261,7 @@ class TestLostReplies:
 
     def test_controller_that_accepts_no_reply_is_refused(self):
         rig = at_speed()
-        answer = lose(rig, REPETITIONS + 2)
+        answer = lose(rig, MAX_RESENDS + 2)
         assert assert_refused(rig, answer, Check.ACCEPTED).joint == 0
 
     @pytest.mark.parametrize("max_gap", [0, 1])
@@ -513,7 +513,7 @@ class TestPauses:
         rig.now += pause
         rig.axes["d"][:, 3] = 0.0
         error = assert_refused(rig, rig.cycle(), Check.PAUSE_VELOCITY)
-        assert error.bound == pytest.approx(LAG * limits().acceleration[0])
+        assert error.bound == pytest.approx(SERVO_LAG_SECONDS * limits().acceleration[0])
 
     @pytest.mark.parametrize("missed", [0, 2])
     @pytest.mark.parametrize(("cycles", "state"), [(3.9, State.OPEN), (4.1, State.FAULTED)])
@@ -529,7 +529,7 @@ class TestPauses:
         """As on a busy computer, whose cycle was longer."""
         rig = at_speed(1200, speed=2.0)
         rig.now += 0.9
-        rig.axes["d"][:, 3] *= 1.0 - 0.9 * LAG * 8.0 / 2.0
+        rig.axes["d"][:, 3] *= 1.0 - 0.9 * SERVO_LAG_SECONDS * 8.0 / 2.0
         rig.cycle(20)
         assert (rig.state, rig.session.stop_reason) == (State.OPEN, None)
         rig = opened(3)
@@ -742,14 +742,14 @@ class TestSentAgain:
         assert sent.set_points.resend_needed is again
 
     @pytest.mark.parametrize("behind", [1, 2])
-    @pytest.mark.parametrize("count", [5, REPETITIONS])
+    @pytest.mark.parametrize("count", [5, MAX_RESENDS])
     def test_repetition_counts_until_accepted_or_refused(self, count, behind):
         sent = Sent(SLOW)
         for repeated in range(count):
             assert sent.check(-behind) == (1 if repeated else behind)
             assert sent.set_points.resend_needed
             sent.set_points.resend()
-        if count == REPETITIONS:
+        if count == MAX_RESENDS:
             sent.refuse(-behind)
         assert sent.check(0.0) == 0
         assert not sent.set_points.resend_needed

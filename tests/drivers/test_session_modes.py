@@ -10,7 +10,7 @@ from drivers.errors import (
     Check,
 )
 from drivers.packets import MODE_FIELDS
-from drivers.states import HOLDABLE, INCREMENTAL, POSITION_MODES
+from drivers.states import HOLDABLE_MODES, INCREMENTAL_MODES, POSITION_MODES
 from planner import JointLimits, TrajectoryPlayer, plan
 from tests import messages
 from tests.drivers.rig import (
@@ -48,8 +48,8 @@ def test_fields_of_the_documented_modes():
     }  # fmt: skip
     for mode, fields in MODE_FIELDS.items():
         assert mode < 10 or MODE_FIELDS[mode - 10] == fields
-    assert {1, 4, 5, 11, 14, 15} == HOLDABLE
-    assert {2, 7, 8, 9, 12, 17} == INCREMENTAL
+    assert {1, 4, 5, 11, 14, 15} == HOLDABLE_MODES
+    assert {2, 7, 8, 9, 12, 17} == INCREMENTAL_MODES
     assert {4, 5} == POSITION_MODES
 
 

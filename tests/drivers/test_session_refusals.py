@@ -20,7 +20,7 @@ from drivers.errors import Check, ExitTimeout, ModeRefused, RefusalError
 from drivers.events import RepliesLost
 from drivers.open_mode import EXIT_RETRY_CYCLES, EXIT_TIMEOUT
 from drivers.packets import DRIVE_ON, LAST_NUMBER
-from drivers.session import FLIGHT_RECORDER, STOP_TIMEOUT
+from drivers.session import FLIGHT_RECORDER_CYCLES, STOP_TIMEOUT
 from drivers.states import POSITION_MODES
 from tests.drivers.rig import (
     PERIOD,
@@ -312,7 +312,7 @@ class TestAfterRefusal:
         rig, _ = self.refuse()
         event = rig.seen(Refused)[-1]
         recorder = event.flight_recorder
-        assert len(recorder) == FLIGHT_RECORDER
+        assert len(recorder) == FLIGHT_RECORDER_CYCLES
         assert recorder["cycle"][-1] == event.error.cycle
         assert recorder["target_current"][-1, 0] == 99.0
         assert np.isfinite(recorder["commanded_position"][:-1]).all()

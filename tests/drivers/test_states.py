@@ -10,7 +10,7 @@ import pytest
 
 from drivers import Mode
 from drivers.states import (
-    HAS_SET_POINTS,
+    STATES_WITH_SET_POINTS,
     TRANSITIONS,
     Input,
     State,
@@ -60,7 +60,7 @@ def test_laws_of_the_table():
     for state in (State.INIT, State.DRIVE_OFF, State.FREEZING, State.FAULTED):
         for what in (Input.OPEN, Input.PARTLY_OPEN):
             assert TRANSITIONS[state][what] is State.FAULTED
-    assert not HAS_SET_POINTS & set(TRANSITIONS[State.FAULTED].values())
+    assert not STATES_WITH_SET_POINTS & set(TRANSITIONS[State.FAULTED].values())
     asking = [state for state, row in TRANSITIONS.items() if Input.EXIT in row]
     assert asking == [State.OPENING, State.OPEN, State.EXITING]
 
@@ -98,7 +98,7 @@ WAITS = {
     State.INIT: {State.SYNC, State.INIT},
     State.DRIVE_OFF: {State.INIT, State.DRIVE_OFF},
     State.DRIVING_ON: {State.INIT, State.DRIVE_OFF, State.DRIVING_ON},
-    State.CLOSED: set(State) - HAS_SET_POINTS,
+    State.CLOSED: set(State) - STATES_WITH_SET_POINTS,
     State.OPENING: set(State),
     State.OPEN: set(State),
     State.FREEZING: {State.FREEZING},

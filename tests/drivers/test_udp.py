@@ -15,7 +15,7 @@ import pytest
 from drivers import CycleRing, CyclicPacket, Guard, Session, State, exchange
 from drivers.errors import TransportClosed
 from drivers.transports.base import TransportError
-from drivers.transports.udp import MAX_FOREIGN, UdpSpec, UdpTransport
+from drivers.transports.udp import MAX_FOREIGN_PACKETS, UdpSpec, UdpTransport
 from tests.drivers.rig import N, Rig, drive_train, init_packet, limits
 from tests.drivers.transport_contract import TransportContract
 
@@ -259,7 +259,7 @@ class TestPeer:
 
         transport._receive = endless
         assert transport.receive(0.0) is None
-        assert transport.rejected() == {"foreign": MAX_FOREIGN + 1}
+        assert transport.rejected() == {"foreign": MAX_FOREIGN_PACKETS + 1}
 
 
 class TestWaiting:

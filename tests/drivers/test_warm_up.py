@@ -9,14 +9,14 @@ import pytest
 
 from drivers import CyclicPacket, Mode, State
 from drivers.exchange.loop import exchange
-from drivers.exchange.warm_up import LEAD, WarmUp, may_poll
+from drivers.exchange.warm_up import LEAD_SECONDS, WarmUp, may_poll
 from drivers.packets import LAST_NUMBER
 from tests.drivers.rig import PERIOD, N, Rig, closed, drive_train, limits, moving
 
 pytestmark = pytest.mark.safety
 
 ARRIVED = 5.0
-AT_PACKET = pytest.approx(PERIOD - LEAD)
+AT_PACKET = pytest.approx(PERIOD - LEAD_SECONDS)
 
 
 class Packets:
@@ -112,7 +112,7 @@ def test_a_packet_that_comes_early_finds_no_cycle_begun(warm_up, cycles):
 
 
 def test_after_a_long_reply_the_packet_is_awaited_at_once(warm_up, cycles):
-    link = Link(now=ARRIVED + PERIOD - 0.5 * LEAD)
+    link = Link(now=ARRIVED + PERIOD - 0.5 * LEAD_SECONDS)
     warm_up.before_packet(link, moving()[0].session, ARRIVED)
     assert cycles() == 0
     assert link.waits == []
@@ -135,7 +135,7 @@ def test_the_link_polls_until_the_packet_is_overdue(warm_up, polls):
     link = Link()
     warm_up.polls = polls
     warm_up.before_packet(link, moving()[0].session, ARRIVED)
-    assert link.polls_until == (ARRIVED + PERIOD + LEAD if polls else -np.inf)
+    assert link.polls_until == (ARRIVED + PERIOD + LEAD_SECONDS if polls else -np.inf)
 
 
 def test_the_packet_of_the_cycle_passes_a_link_of_its_own():
@@ -184,7 +184,7 @@ def test_cycles_that_would_delay_replies_are_given_up(monkeypatch, shares, begun
     link = Link(comes=np.inf)
 
     def lasting():
-        link.now += shares[len(calls)] * LEAD
+        link.now += shares[len(calls)] * LEAD_SECONDS
         calls.append(link.now)
 
     monkeypatch.setattr(warm_up, "cycle", lasting)

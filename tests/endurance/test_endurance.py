@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from drivers.exchange.control import BINS, upper_edge
+from drivers.exchange.control import LATENCY_BINS, upper_edge
 from tests.endurance.__main__ import main
 from tests.endurance.piece import PROCESSES, Line, Piece
 from tests.endurance.verdict import judge, read_journal
@@ -22,7 +22,7 @@ pytestmark = pytest.mark.safety
 
 MIB = 2**20
 SECONDS = 80 * 60
-EDGES = [0.0, *(upper_edge(index) for index in range(BINS))]
+EDGES = [0.0, *(upper_edge(index) for index in range(LATENCY_BINS))]
 Change = Callable[[Line], None]
 
 
@@ -30,7 +30,7 @@ def piece(change: Change = lambda _: None, **campaign: Any) -> Piece:
     """80 minutes with noise; a change of each sample, and of the last campaign."""
     rng = np.random.default_rng(1)
     samples = []
-    counts = np.zeros(BINS, np.int64)
+    counts = np.zeros(LATENCY_BINS, np.int64)
     for second in range(0, SECONDS + 1, 5):
         sample: Line = {
             "t": float(second),

@@ -7,7 +7,7 @@ import pytest
 
 from identification.estimators import elasticity
 from identification.estimators.elasticity import (
-    RESONANCE,
+    EXPECTED_RESONANCE,
     ElasticTorque,
     elastic_torque,
     expected_compliance,
@@ -195,7 +195,7 @@ def test_links_resonate_on_the_expected_gears():
     inertia = MODEL.gear_torque(truth(), replace(rest, acceleration=np.eye(2)))
     inertia -= MODEL.gear_torque(truth(), rest)
     expected = expected_compliance(MODEL, still, truth())
-    np.testing.assert_allclose(1.0 / np.sqrt(expected * np.diag(inertia)), RESONANCE)
+    np.testing.assert_allclose(1.0 / np.sqrt(expected * np.diag(inertia)), EXPECTED_RESONANCE)
 
 
 def test_a_link_without_inertia_has_no_expected_compliance():

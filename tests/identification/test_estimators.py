@@ -53,10 +53,10 @@ from identification.estimators.covariance import (
     leverage_corrected,
     spread,
 )
-from identification.estimators.delay import LONGEST_DELAY, delay_sensitivity
+from identification.estimators.delay import MAX_ESTIMATED_DELAY, delay_sensitivity
 from identification.estimators.loss_functions import Loss
 from identification.estimators.prior import (
-    OFFSET_SHARE,
+    OFFSET_STD_SHARE,
     body_lengths,
     body_prior,
     design_effect_of,
@@ -888,7 +888,7 @@ class TestBodyPrior:
             assert values[f"f0_{joint}"] > 5.0 * abs(values[f"fo_{joint}"])
 
     @pytest.mark.parametrize(
-        ("speed", "share"), [(0.0, 1.0), (1.1, OFFSET_SHARE)], ids=["stands", "moves one way"]
+        ("speed", "share"), [(0.0, 1.0), (1.1, OFFSET_STD_SHARE)], ids=["stands", "moves one way"]
     )
     def test_an_offset_is_as_free_as_its_joint_needs(self, speed, share):
         """A joint that stands shows no friction, and what holds it is its offset."""
@@ -900,7 +900,7 @@ class TestBodyPrior:
         motion.acceleration[:, 1] = 0.0
         torque = MODEL.torque(truth(), motion) + gaussian(np.random.default_rng(1), motion)
         factor = Factor.of(model, as_samples(model, motion, torque))
-        with patch.object(prior_module, "OFFSET_SHARE", 1.0):
+        with patch.object(prior_module, "OFFSET_STD_SHARE", 1.0):
             free = body_prior(model, factor)
         offset = model.layout.size + [
             (term.symbol, term.owner) for term in model.friction.terms
@@ -1534,7 +1534,7 @@ class TestUndeterminedDelay:
         assert slow.reason.startswith("95 % interval of ± ")
         assert slow.reason.endswith(messages.TORQUES_TOO_SLOW_OR_NOISY)
         unknown = replace(slow, std=np.inf)
-        assert unknown.variance == pytest.approx(LONGEST_DELAY**2 / 3.0)
+        assert unknown.variance == pytest.approx(MAX_ESTIMATED_DELAY**2 / 3.0)
         assert replace(slow, std=1e-4).variance == pytest.approx(1e-8)
 
     def test_an_uncertain_significant_delay_is_applied(self):

@@ -737,7 +737,7 @@ class TestRefusal:
         assert mildest.subject.startswith("motor of joint_")
         assert mildest.value > mildest.bound
         assert str(mildest) in str(error)
-        monkeypatch.setattr(validation_motions, "_LONGEST", 2.0)
+        monkeypatch.setattr(validation_motions, "_MAX_DURATION", 2.0)
         error = self.refusal(seed=1)
         assert error.rejected == {"duration": 100}
         assert error.nearest["duration"].bound == 2.0

@@ -22,18 +22,24 @@ from identification.export.exported_arm import Ranges
 from identification.export.friction_curve import friction_curve, median_load
 from identification.export.parameter_files import covariance_csv, parameters_csv, parameters_json
 from identification.export.parameter_table import parameter_table
-from identification.export.simulators import AGREES, FORMATS, compare, mjcf, random_states
+from identification.export.simulators import (
+    AGREEMENT_TOLERANCE,
+    FORMATS,
+    compare,
+    mjcf,
+    random_states,
+)
 from identification.export.urdf import NotConsistentError, WriteBackError, not_in_urdf, write_urdf
 from identification.factor.estimate import estimate
 from identification.factor.factor import Factor
 from identification.model.coupling import Coupling
 from identification.model.elements import Anchors, GasCylinder, TorqueRipple, TorsionSpring
 from identification.model.friction import FrictionLaw
-from identification.model.kinematics import MOST_JOINTS, chain_from_urdf
+from identification.model.kinematics import MAX_MOVING_JOINTS, chain_from_urdf
 from identification.model.known_payload import Payload
 from identification.model.motion import Motion
 from identification.model.robot import RobotModel
-from identification.model.urdf_text import LONGEST, MOST_LINKS, refusal, urdf_tree
+from identification.model.urdf_text import MAX_CHARACTERS, MAX_LINKS, refusal, urdf_tree
 from identification.model.workspace import Workspace
 from identification.signals.noise import noiseless_above
 from identification.signals.smoothing import LowPassShape, low_passed
@@ -160,12 +166,12 @@ FAULTS |= {
     arm("</robot>", "<a>" * 100 + "</a>" * 100 + "</robot>"): "deep",
     arm("<robot ", "<robot " + "".join(f'a{i}="" ' for i in range(100_000))): "attributes",
     # overflows the reader's stack
-    chain(20_000, "fixed"): f"{MOST_LINKS} links",
-    chain(300, "revolute"): f"at most {MOST_JOINTS}",
+    chain(20_000, "fixed"): f"{MAX_LINKS} links",
+    chain(300, "revolute"): f"at most {MAX_MOVING_JOINTS}",
     arm("</robot>", "\n<gazebo:plugin/></robot>"): (
         'line 2 has an undeclared prefix; declare it, as in <robot xmlns:PREFIX="'
     ),
-    " " * (LONGEST + 1): "characters",
+    " " * (MAX_CHARACTERS + 1): "characters",
     # an incomplete inertia, of which the reader drops the tensor, sometimes mass and shapes
     **{
         without(old): f"link 'upper' has no {why}"
@@ -623,14 +629,14 @@ class TestReadBack:
     @pytest.mark.parametrize("seed", [1, 2])
     def test_trees_of_any_joints(self, form, seed):
         arm = an_arm(random_urdf(seed), friction=FrictionLaw(third="cubic"))
-        assert compared(form, arm).difference < AGREES
+        assert compared(form, arm).difference < AGREEMENT_TOLERANCE
 
     @FORMS
     def test_a_published_description(self, form):
         """With rounded angles and locked joints."""
         locked = dict.fromkeys(("panda_finger_joint1", "panda_finger_joint2"), 0.02)
         arm = an_arm(robot_text("panda_description/urdf/panda.urdf"), locked=locked)
-        assert compared(form, arm, ["a -- remark"]).difference < AGREES
+        assert compared(form, arm, ["a -- remark"]).difference < AGREEMENT_TOLERANCE
 
     @FORMS
     def test_everything_that_an_arm_can_have(self, form):
@@ -724,7 +730,7 @@ class TestLoadFriction:
         sizes = np.abs(model.gear_torque(arm.values, motion))
         expected = np.sqrt(np.mean((shares * (sizes - self.LOAD)) ** 2, axis=0))
         np.testing.assert_allclose(beyond, [expected], rtol=1e-6)
-        assert comparison.difference < AGREES
+        assert comparison.difference < AGREEMENT_TOLERANCE
 
     def test_a_joint_at_rest_has_the_friction_of_its_description(self):
         arm = an_arm(urdf_text(), friction=FrictionLaw(load=True))

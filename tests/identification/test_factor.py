@@ -15,7 +15,7 @@ from identification.estimators.covariance import with_block_covariance
 from identification.estimators.least_squares import fit_least_squares
 from identification.estimators.robust import robust_estimate
 from identification.factor.estimate import estimate, joint_weights, residual_variance
-from identification.factor.factor import QR_CONDITION, Factor, reduced, total_factor
+from identification.factor.factor import MAX_GRAM_CONDITION, Factor, reduced, total_factor
 from identification.factor.normal_equations import solve, solve_rows
 from identification.factor.rows import augmented_rows
 from identification.model.motion import Motion
@@ -192,7 +192,7 @@ class TestConditioning:
         assert reduced(MODEL, [good], Factor.of(MODEL, good)).storage == "gram"
         factor = reduced(MODEL, [bad, bad], summed("gram", [bad, bad]))
         assert factor.storage == "qr"
-        assert factor.solve(np.ones(2)).condition > QR_CONDITION
+        assert factor.solve(np.ones(2)).condition > MAX_GRAM_CONDITION
         np.testing.assert_array_equal(factor.samples, 2 * np.count_nonzero(bad.usable, axis=0))
         estimated = fit_least_squares(MODEL, [bad])
         assert "by QR" in estimated.method

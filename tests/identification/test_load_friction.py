@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from identification.estimators.least_squares import fit_least_squares
-from identification.estimators.load_friction import CONVERGED, fit_with_load
+from identification.estimators.load_friction import MAX_TORQUE_CHANGE, fit_with_load
 from identification.excitation.criteria import Objective
 from identification.factor.factor import Factor
 from identification.model.coupling import Coupling
@@ -188,7 +188,7 @@ class TestFixedPoint:
         load_fit = fit_with_load(LOADED, [samples], weighted_fit)
         again = fit_with_load(LOADED, load_fit.samples, weighted_fit, most=2)
         before, after = (_predicted(fixed_point, samples) for fixed_point in (load_fit, again))
-        assert np.sqrt(np.mean((after - before) ** 2) / np.mean(after**2)) < CONVERGED
+        assert np.sqrt(np.mean((after - before) ** 2) / np.mean(after**2)) < MAX_TORQUE_CHANGE
 
     def test_an_estimate_without_shares_saves_a_pass(self):
         samples = simulated(LOADED, VALUES, a_motion(), NOISE, 6)

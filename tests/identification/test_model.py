@@ -19,7 +19,7 @@ from identification.estimators.consistent import consistent_estimate
 from identification.export.urdf import write_urdf
 from identification.factor.estimate import estimate
 from identification.factor.factor import Factor, joined
-from identification.model.base_parameters import TOLERANCE
+from identification.model.base_parameters import DEPENDENCE_TOLERANCE
 from identification.model.coupling import Coupling
 from identification.model.elements import (
     Anchors,
@@ -31,7 +31,7 @@ from identification.model.elements import (
     TorsionSpring,
 )
 from identification.model.friction import FrictionLaw, JointFriction, dissipation, presliding_state
-from identification.model.kinematics import FROM_PINOCCHIO, chain_from_urdf
+from identification.model.kinematics import PINOCCHIO_ORDER, chain_from_urdf
 from identification.model.motion import Motion
 from identification.model.pseudo_inertia import (
     AS_GIVEN,
@@ -44,7 +44,7 @@ from identification.model.pseudo_inertia import (
     pseudo_inertia,
     reference_bodies,
 )
-from identification.model.regressor import CHUNK
+from identification.model.regressor import SAMPLES_PER_CHUNK
 from identification.model.robot import RobotModel, StandardLayout
 from identification.selection.essential import eliminate
 from identification.signals.recording import Recording
@@ -296,7 +296,7 @@ class TestPseudoInertia:
         inertial = of_points(*point_masses(seed))
         rigid_body = body(inertial)
         expected = pin.Inertia(rigid_body.mass, rigid_body.centre, rigid_body.inertia)
-        order = list(FROM_PINOCCHIO)
+        order = list(PINOCCHIO_ORDER)
         np.testing.assert_allclose(expected.toDynamicParameters()[order], inertial, atol=1e-12)
         np.testing.assert_allclose(inertial_parameters(rigid_body), inertial, atol=1e-12)
 
@@ -415,7 +415,7 @@ class TestBaseParameters:
         base = RobotModel.from_urdf(urdf_text(), gravity=gravity, rotor_inertia=rotors).base
         assert base.rank == len(base.names) == rank
         assert base.largest_dropped < 1e-10 * base.smallest_pivot
-        assert base.smallest_pivot > 1000 * TOLERANCE
+        assert base.smallest_pivot > 1000 * DEPENDENCE_TOLERANCE
         if gravity == (0.0, 0.0, 9.81):  # upside down it groups alike
             upright = RobotModel.from_urdf(urdf_text()).base
             assert np.allclose(base.grouping, upright.grouping, atol=1e-10)
@@ -941,7 +941,20 @@ class TestRegressor:
         # the last joint: link, rotor, friction
         assert len(regressor.columns[5]) == 8 + 3
 
-    @pytest.mark.parametrize("m", [0, 1, 2, 63, 65, CHUNK - 1, CHUNK, CHUNK + 1, 2 * CHUNK + 77])
+    @pytest.mark.parametrize(
+        "m",
+        [
+            0,
+            1,
+            2,
+            63,
+            65,
+            SAMPLES_PER_CHUNK - 1,
+            SAMPLES_PER_CHUNK,
+            SAMPLES_PER_CHUNK + 1,
+            2 * SAMPLES_PER_CHUNK + 77,
+        ],
+    )
     def test_samples_are_independent(self, ns16, m):
         motion = some_states(m)
         whole = ns16.regressor(motion)
@@ -973,7 +986,7 @@ class TestRegressor:
     def test_working_arrays_are_freed_with_the_model(self):
         """Without the cycle collector, which may run minutes later."""
         model = RobotModel.from_urdf(urdf_text())
-        model.regressor(some_states(CHUNK))
+        model.regressor(some_states(SAMPLES_PER_CHUNK))
         plan = weakref.ref(model.plan)
         gc.disable()
         try:

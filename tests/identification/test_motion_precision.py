@@ -18,7 +18,7 @@ from identification.excitation import (
     search,
 )
 from identification.excitation.criteria import friction_of_excitation
-from identification.excitation.motion_precision import INTERVAL
+from identification.excitation.motion_precision import INTERVAL_SIGMAS
 from identification.excitation.searches.population import Population
 from identification.excitation.searches.sensitivity import gene_slopes
 from tests.identification.searching import problem as small_problem
@@ -56,7 +56,7 @@ class TestVariances:
         information = positive(12)
         a = precision.quantities.directions
         covariance = np.linalg.inv(precision.prior + information)
-        half = INTERVAL * np.sqrt(np.diag(a @ covariance @ a.T))
+        half = INTERVAL_SIGMAS * np.sqrt(np.diag(a @ covariance @ a.T))
         np.testing.assert_allclose(precision.ratios(information), half / [0.1, 0.2, 0.3])
 
     def test_of_a_load_are_those_of_least_squares(self) -> None:
@@ -69,7 +69,7 @@ class TestVariances:
         d = load.change
         both = np.block([[data + arm_information, data @ d], [d.T @ data, d.T @ data @ d]])
         covariance = np.linalg.inv(both)[12:, 12:]
-        half = INTERVAL * np.sqrt(np.diag(load.directions @ covariance @ load.directions.T))
+        half = INTERVAL_SIGMAS * np.sqrt(np.diag(load.directions @ covariance @ load.directions.T))
         np.testing.assert_allclose(precision.ratios(data), half / load.allowed, rtol=1e-6)
 
     @pytest.mark.parametrize("kind", ["arm", "load"])

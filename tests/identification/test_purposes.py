@@ -22,8 +22,13 @@ from identification.purposes.gravity_error import (
     workspace,
 )
 from identification.purposes.purposes import gravity_compensation, single_parameters
-from identification.purposes.quiet_torque import BLOCK, PERIOD, once_in, slow_residuals
-from identification.purposes.simulation_error import HORIZON, flange_error
+from identification.purposes.quiet_torque import (
+    BLOCK_SECONDS,
+    FALSE_ALARM_PERIOD,
+    once_in,
+    slow_residuals,
+)
+from identification.purposes.simulation_error import HORIZON_SECONDS, flange_error
 from tests.identification.quiet_motion import quiet
 from tests.identification.robots import random_urdf
 from tests.identification.two_link import (
@@ -150,7 +155,9 @@ def test_what_the_motion_does_not_determine_is_an_infinite_error() -> None:
 
 
 def exceeded(peaks: Array, limit: Array) -> Array:
-    return np.count_nonzero(peaks > limit, axis=0) / (BLOCK * len(peaks)) * PERIOD
+    return (
+        np.count_nonzero(peaks > limit, axis=0) / (BLOCK_SECONDS * len(peaks)) * FALSE_ALARM_PERIOD
+    )
 
 
 @cache
@@ -158,7 +165,7 @@ def exceeded(peaks: Array, limit: Array) -> Array:
 def peaks_of(duration: float, seed: int) -> Array:
     (part,) = slow_residuals(MODEL, truth(), [quiet(duration, seed)])
     size = np.abs(part.torque)
-    rows = round(BLOCK / 0.005)
+    rows = round(BLOCK_SECONDS / 0.005)
     return size[: len(size) // rows * rows].reshape(-1, rows, 2).max(axis=1)
 
 
@@ -167,7 +174,7 @@ def test_a_threshold_holds_its_rate(duration: float) -> None:
     later = peaks_of(4000.0, 99)
     rates = []
     for seed in range(12):
-        limit = once_in(PERIOD, peaks_of(duration, seed))
+        limit = once_in(FALSE_ALARM_PERIOD, peaks_of(duration, seed))
         assert limit is not None
         rates.append(exceeded(later, limit))
     # once in its time on average; of a few seconds it errs to the larger side
@@ -175,7 +182,7 @@ def test_a_threshold_holds_its_rate(duration: float) -> None:
 
 
 def test_too_short_a_motion_has_no_threshold() -> None:
-    assert once_in(PERIOD, np.ones((4, 2))) is None
+    assert once_in(FALSE_ALARM_PERIOD, np.ones((4, 2))) is None
 
 
 def test_the_force_exceeds_a_threshold_in_most_directions() -> None:
@@ -224,7 +231,7 @@ def test_a_mass_above_the_smallest_is_seen_and_one_below_is_not() -> None:
         (part,) = slow_residuals(MODEL, truth(), [carried])
         unit = load.torque(part.motion)
         variance = (quiet_parts[0].torque ** 2).mean(axis=0)
-        rows = round(BLOCK / 0.005)
+        rows = round(BLOCK_SECONDS / 0.005)
         product = (part.torque * unit / variance).sum(axis=1)[: len(unit) // rows * rows]
         square = (unit**2 / variance).sum(axis=1)[: len(product)]
         block = product.reshape(-1, rows).sum(axis=1) / square.reshape(-1, rows).sum(axis=1)
@@ -257,7 +264,7 @@ def test_a_wrong_arm_leaves_its_path_as_pinocchio_integrates_it(seed: int) -> No
     for start in range(200, 3700, 150):
         q, v = motion.position[start].copy(), motion.velocity[start].copy()
         data = model.createData()
-        for row in range(start, start + round(HORIZON / 0.001)):
+        for row in range(start, start + round(HORIZON_SECONDS / 0.001)):
             back = rate**2 * alone * (motion.position[row] - q) + 2.0 * rate * alone * (
                 motion.velocity[row] - v
             )

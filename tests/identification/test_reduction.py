@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from identification.estimators.prior import BODY_SHARE
+from identification.estimators.prior import BODY_STD_SHARE
 from identification.factor.factor import Factor
 from identification.reduction.intervals import delayed, widened
 from identification.reduction.posterior import Posterior
@@ -37,7 +37,7 @@ def reduced(*versions, shares=(1.0,), unmodelled=True):
 
 def estimated(total):
     """Estimate with everything that widens its intervals."""
-    posterior = Posterior.of(MODEL, total.factor, BODY_SHARE, {}, Strength())
+    posterior = Posterior.of(MODEL, total.factor, BODY_STD_SHARE, {}, Strength())
     pooled = posterior.fit(total.factor).estimate
     late = delayed(pooled, total, 1e-7, posterior.precision)
     return widened(late, total, posterior, posterior.precision, np.zeros(2), ()).estimate
@@ -91,7 +91,7 @@ def drifting(count, drift):
 def test_drift_is_neither_another_law_nor_an_elastic_gear(drift):
     """The first repetitions alone do not balance at the parameters of all of them."""
     total = Reduction.total(MODEL, drifting(10, drift))
-    posterior = Posterior.of(MODEL, total.factor, BODY_SHARE, {}, Strength())
+    posterior = Posterior.of(MODEL, total.factor, BODY_STD_SHARE, {}, Strength())
     pooled = posterior.fit(total.factor).estimate
     wider = widened(pooled, total, posterior, posterior.precision, np.zeros(2), ())
     assert wider.form is not None

@@ -11,7 +11,7 @@ from identification.export.simulators import FORMATS, compare, mjcf
 from identification.model.friction import FrictionLaw
 from identification.model.motion import Motion
 from identification.model.robot import RobotModel
-from identification.rollout.mujoco_simulation import LARGEST_ERROR, Feedback, RolloutArm
+from identification.rollout.mujoco_simulation import MAX_POSITION_ERROR, Feedback, RolloutArm
 from identification.rollout.polish import Driven, polished
 from identification.rollout.position_errors import (
     HORIZONS,
@@ -95,7 +95,7 @@ def test_an_unstable_arm_is_counted_and_silent(capfd) -> None:
     assert errors.unstable == len(motion.windows)
     assert errors.unstable_joints.sum() == len(motion.windows)
     assert np.isfinite(errors.joints).all()
-    assert errors.joints[-1].max() == pytest.approx(LARGEST_ERROR)
+    assert errors.joints[-1].max() == pytest.approx(MAX_POSITION_ERROR)
     assert capfd.readouterr() == ("", "")
 
 

@@ -19,7 +19,7 @@ from identification.excitation.searches import journal
 from identification.excitation.searches.journal import Journal
 from identification.excitation.searches.methods import METHODS, SearchMethod
 from identification.excitation.searches.population import (
-    ROW,
+    ROW_LENGTH,
     Front,
     Population,
     Scores,
@@ -382,7 +382,7 @@ SEARCH = {"settings": {"seed": 1, "population": 4}, "cell": {"urdf": "a"}}
 
 def generation(seed, count=4):
     random = np.random.default_rng(seed)
-    rows = random.normal(size=(count, ROW))
+    rows = random.normal(size=(count, ROW_LENGTH))
     rows[1] = unplanned()
     return random.random((count, 8)), Scores.of_rows(rows)
 

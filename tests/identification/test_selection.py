@@ -27,13 +27,17 @@ from identification.selection.questions import (
     DELAY,
     LOAD,
     LOW_PASS,
+    MIN_TERM_IMPROVEMENT,
+    PRIOR_WEIGHTS,
     STRENGTH,
-    STRENGTHS,
-    TERM_WORTHWHILE,
     Question,
     choose_settings,
 )
-from identification.selection.scores import IMPOSSIBLE_WORTHWHILE, WORTHWHILE, SettingsTrial
+from identification.selection.scores import (
+    MIN_IMPOSSIBLE_IMPROVEMENT,
+    MIN_IMPROVEMENT,
+    SettingsTrial,
+)
 from identification.selection.settings import Settings, Strength
 from identification.signals.recording import Recording
 from identification.signals.samples import Preprocessing, prepare
@@ -314,7 +318,7 @@ class TestChosenSettings:
         recording = a_recording(falling, values, motion=a_slow_motion(0.12))
         settings, choices = chosen(recording, {"friction"})
         decision = next(choice for choice in choices if choice.name == "friction at speed")
-        assert min(decision.errors) < (1.0 - TERM_WORTHWHILE) * decision.errors[0]
+        assert min(decision.errors) < (1.0 - MIN_TERM_IMPROVEMENT) * decision.errors[0]
         assert decision.chosen == 0
         assert settings.friction["third"] == "none"
 
@@ -377,7 +381,7 @@ class TestChosenSettings:
         settings, choices = chosen(a_recording(duration=LONG), {"friction"}, model=stated)
         assert settings.friction["third"] == "quadratic"
         errors = next(choice.errors for choice in choices if choice.name == "friction at speed")
-        assert min(errors) > (1.0 - WORTHWHILE) * errors[0]
+        assert min(errors) > (1.0 - MIN_IMPROVEMENT) * errors[0]
 
     @pytest.mark.parametrize("shares", [(0.12, 0.06), (0.0, 0.0)])
     def test_load_friction_is_chosen_where_it_is(self, shares):
@@ -409,7 +413,7 @@ class TestChosenSettings:
         other = other.replace('<mass value="3"/>', f'<mass value="{0.5 * float(mass)}"/>')
         model = RobotModel.from_urdf(other, friction=FrictionLaw(third=None))
         settings, _ = chosen(a_recording(duration=LONG, noise=1.0), {"estimator"}, model=model)
-        assert (settings.strength.weight == STRENGTHS[-1]) == described
+        assert (settings.strength.weight == PRIOR_WEIGHTS[-1]) == described
 
     def test_a_negative_friction_is_not_made_possible(self):
         """Constraints that predict clearly worse are given up."""
@@ -418,7 +422,7 @@ class TestChosenSettings:
         settings, choices = chosen(a_recording(values=values), {"estimator"})
         assert not settings.strength.consistent
         decision = next(choice for choice in choices if choice.name == CONSISTENT)
-        assert decision.errors[1] < (1.0 - WORTHWHILE) * decision.errors[0]
+        assert decision.errors[1] < (1.0 - MIN_IMPROVEMENT) * decision.errors[0]
 
     @pytest.mark.parametrize(("noise", "possible"), [(6.0, False), (9.0, True)])
     def test_four_per_cent_refuse_possible_bodies_and_two_do_not(self, noise, possible):
@@ -445,7 +449,7 @@ class TestChosenSettings:
         recording = a_recording(sprung, np.append(truth(), stiffness), motion=motion, noise=0.3)
         settings, choices = chosen(recording, {"estimator"})
         decision = next(choice for choice in choices if choice.name == CONSISTENT)
-        assert decision.errors[1] < (1.0 - IMPOSSIBLE_WORTHWHILE) * decision.errors[0]
+        assert decision.errors[1] < (1.0 - MIN_IMPOSSIBLE_IMPROVEMENT) * decision.errors[0]
         assert settings.strength.consistent == possible
 
     def test_a_short_recording_is_asked_the_same_questions(self):
@@ -467,7 +471,9 @@ class TestChosenSettings:
         settings, _ = chosen(recording, {"estimator"})
         assert settings.strength.wide_rotors == wide
 
-    @pytest.mark.parametrize(("noise", "least", "most"), [(1.0, WORTHWHILE, 1.0), (2.4, 0.0, 0.01)])
+    @pytest.mark.parametrize(
+        ("noise", "least", "most"), [(1.0, MIN_IMPROVEMENT, 1.0), (2.4, 0.0, 0.01)]
+    )
     def test_rests_that_no_law_predicts_are_not_fitted(self, noise, least, most):
         """They decide the error over all rows, and say nothing of the friction in motion.
 
@@ -653,7 +659,7 @@ class TestLowPass:
     @pytest.mark.parametrize("shape", [LowPassShape(2), LowPassShape(2, causal=True)], ids=str)
     def test_a_filter_of_the_model_alone_is_none(self, shape, monkeypatch):
         """One that fits better for other reasons has no less torque above its bandwidth."""
-        monkeypatch.setattr("identification.estimators.torque_channel._WORTHWHILE", -np.inf)
+        monkeypatch.setattr("identification.estimators.torque_channel._MIN_IMPROVEMENT", -np.inf)
         recording = a_recording(noise=0.5 * NOISE, duration=20.0)
         assert not possible_low_passes(recording, MODEL)
         filtered = a_recording(noise=0.5 * NOISE, duration=20.0, shape=shape)
@@ -708,7 +714,7 @@ class TestPossibleLowPasses:
     @pytest.mark.parametrize("shape", [LowPassShape(2), LowPassShape(2, causal=True)], ids=str)
     def test_parts_of_a_recording_have_its_low_pass(self, shape, monkeypatch):
         """A table of the regressor is of one part at most."""
-        monkeypatch.setattr("identification.estimators.torque_channel._LONGEST", 6.0)
+        monkeypatch.setattr("identification.estimators.torque_channel._MAX_SEGMENT_SECONDS", 6.0)
         rows = []
         evaluate = RegressorPlan.evaluate
 

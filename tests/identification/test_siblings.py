@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from identification.estimators.siblings import FEWEST, with_siblings
+from identification.estimators.siblings import MIN_ESTIMATES, with_siblings
 from identification.factor.estimate import Estimate
 
 MEAN = np.array([10.0, 5.0, 2.0])
@@ -99,5 +99,5 @@ def test_what_no_arm_determines_stays_undetermined():
 
 
 def test_of_too_few_arms_there_is_none():
-    _, estimates = type_of(np.random.default_rng(0), FEWEST - 1, np.ones(3))
+    _, estimates = type_of(np.random.default_rng(0), MIN_ESTIMATES - 1, np.ones(3))
     assert with_siblings(estimates) is None

@@ -15,17 +15,17 @@ from identification.model.coupling import Coupling
 from identification.model.friction import FrictionLaw
 from identification.model.motion import Motion
 from identification.model.robot import RobotModel
-from identification.selection.questions import RATE
+from identification.selection.questions import SELECTION_RATE
 from identification.signals.clock import time_base, true_times
 from identification.signals.masks import (
     EDGE,
     END_PERIODS,
-    LONGEST_END,
+    MAX_END_SECONDS,
     REST,
     REVERSAL,
+    REVERSAL_SECONDS,
     SATURATED,
     STANDSTILL,
-    TURN,
     flat_topped,
     mask_rows,
     spiking,
@@ -621,9 +621,9 @@ SLIDING = RobotModel.from_urdf(URDF, friction=FrictionLaw(standstill=0.05))
 
 
 def rows_at_reversals(speed):
-    """Return the rows (m,) within half of `TURN` of a change of sign, or beside it."""
+    """Return the rows (m,) within half of `REVERSAL_SECONDS` of a change of sign, or beside it."""
     last = np.flatnonzero(speed[1:] * speed[:-1] < 0.0)
-    reach = max(0.0, 0.5 * (TURN - (TIME[1] - TIME[0])))
+    reach = max(0.0, 0.5 * (REVERSAL_SECONDS - (TIME[1] - TIME[0])))
     rows = np.zeros(len(TIME), dtype=np.bool_)
     for begin, end in zip(TIME[last] - reach, TIME[last + 1] + reach, strict=True):
         rows[(begin <= TIME) & (end >= TIME)] = True
@@ -731,7 +731,7 @@ class TestExcludedRows:
             np.testing.assert_array_equal(mask.reasons[REVERSAL][:, joint], turning)
 
     @pytest.mark.parametrize("clock", [0.0, 12.3, 1.7e9])
-    @pytest.mark.parametrize("rate", [50.0, RATE, 200.0, 2.0 * RATE, 1000.0])
+    @pytest.mark.parametrize("rate", [50.0, SELECTION_RATE, 200.0, 2.0 * SELECTION_RATE, 1000.0])
     def test_a_reversal_excludes_as_much_time_at_any_rate(self, rate, clock):
         since = np.arange(0.0, 2.0, 1.0 / rate)
         time = clock + since
@@ -743,10 +743,10 @@ class TestExcludedRows:
         )
         mask = mask_rows(recording, SLIDING, motion, np.full(2, 40.0), exclude_rows="rests")
         at = since[mask.reasons[REVERSAL][:, 0]]
-        assert TURN == 2.0 / RATE
+        assert REVERSAL_SECONDS == 2.0 / SELECTION_RATE
         for turn in (np.pi / 6.0, np.pi / 2.0):
             around = at[np.abs(at - turn) < 0.1]
-            assert len(around) == max(2, 2 * round(0.5 * TURN * rate))
+            assert len(around) == max(2, 2 * round(0.5 * REVERSAL_SECONDS * rate))
             assert around.mean() == pytest.approx(turn, abs=1.01 / rate)
 
     @pytest.mark.parametrize("friction", [True, False])
@@ -780,7 +780,7 @@ class TestExcludedRows:
         """The motion `delay` earlier must be known and away from an end."""
         _, recording = motion_and_recording()
         samples = prepare(recording, SLIDING, options=Preprocessing(torque_delay=delay))
-        end = min(LONGEST_END, END_PERIODS / float(samples.position_bandwidth.min()))
+        end = min(MAX_END_SECONDS, END_PERIODS / float(samples.position_bandwidth.min()))
         read = recording.time - delay
         inside = (read >= recording.time[0] + end) & (read <= recording.time[-1] - end)
         np.testing.assert_array_equal(samples.mask.reasons[EDGE][:, 0], ~inside)

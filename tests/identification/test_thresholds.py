@@ -6,13 +6,17 @@ import pytest
 from identification.arrays import Array
 from identification.model.flange import flange_motion
 from identification.purposes.quiet_torque import (
-    BLOCK,
+    BLOCK_SECONDS,
     SlowResidual,
     once_in,
     once_in_interval,
     slow_residuals,
 )
-from identification.purposes.thresholds import SHOWN, ContactThreshold, contact_thresholds
+from identification.purposes.thresholds import (
+    SHOWN_EXCEEDANCES,
+    ContactThreshold,
+    contact_thresholds,
+)
 from tests.identification.quiet_motion import quiet
 from tests.identification.two_link import MODEL, truth
 
@@ -33,10 +37,10 @@ def exponential(count: int, seed: int) -> Array:
 class TestInterval:
     @pytest.mark.parametrize("seconds", [60.0, 600.0])
     def test_it_holds_the_level_that_is_exceeded_once_an_hour(self, seconds: float) -> None:
-        level = np.array([1.0, 2.0]) * np.log(HOUR / BLOCK)
+        level = np.array([1.0, 2.0]) * np.log(HOUR / BLOCK_SECONDS)
         inside = []
         for seed in range(200):
-            low, high = once_in_interval(HOUR, exponential(round(seconds / BLOCK), seed))
+            low, high = once_in_interval(HOUR, exponential(round(seconds / BLOCK_SECONDS), seed))
             inside.append((low <= level) & (level <= high))
         assert 0.9 <= np.mean(inside) <= 0.99
 
@@ -59,7 +63,7 @@ class TestThresholds:
     def test_the_first_is_what_the_motion_shows_three_times(self) -> None:
         first = thresholds(60.0)[0]
         assert first.shown
-        assert first.period == pytest.approx(60.0 / SHOWN, rel=0.05)
+        assert first.period == pytest.approx(60.0 / SHOWN_EXCEEDANCES, rel=0.05)
 
     def test_a_short_motion_says_nothing_of_an_hour(self) -> None:
         assert thresholds(8.0)[-1].period < HOUR

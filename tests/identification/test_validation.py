@@ -14,7 +14,7 @@ from scipy.signal import lfilter
 from identification.arrays import Array
 from identification.estimators.covariance import with_block_covariance
 from identification.estimators.least_squares import estimate_repetitions
-from identification.estimators.prior import NOMINAL_SHARE
+from identification.estimators.prior import NOMINAL_STD_SHARE
 from identification.factor.estimate import Estimate, estimate, joint_weights
 from identification.factor.factor import Factor, total_factor
 from identification.factor.normal_equations import solve
@@ -902,7 +902,7 @@ class TestNominalScale:
             model,
             nominal(model),
             runs_of(model, standard(model, 0.1, seed), seed),
-            share=NOMINAL_SHARE,
+            share=NOMINAL_STD_SHARE,
         )
         assert np.isfinite(scale.scale[2])
         assert findings(model, nominal_scale=scale) == []
@@ -923,7 +923,7 @@ class TestNominalScale:
             torque = run.torque.copy()
             torque[:, axis] *= factor
             scaled.append(replace(run, torque=torque))
-        scale = nominal_scale(model, nominal(model), scaled, share=NOMINAL_SHARE)
+        scale = nominal_scale(model, nominal(model), scaled, share=NOMINAL_STD_SHARE)
         assert np.flatnonzero(scale.off).tolist() == [axis]
         assert scale.scale[axis] == pytest.approx(factor, rel=0.1)
         (finding,) = findings(model, nominal_scale=scale)

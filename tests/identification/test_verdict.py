@@ -13,7 +13,7 @@ from identification.factor.estimate import estimate
 from identification.factor.factor import Factor
 from identification.hypotheses import column_search
 from identification.hypotheses.carried_load import CarriedLoad
-from identification.hypotheses.changes import DISCRETE, Change, Part
+from identification.hypotheses.changes import DISCRETE_MEANINGS, Change, Part
 from identification.hypotheses.column_scores import ScorePrior
 from identification.hypotheses.column_search import (
     ExplainedFit,
@@ -426,7 +426,10 @@ class TestJudgement:
     @pytest.mark.parametrize(
         ("meaning", "part"),
         [
-            *((meaning, None) for meaning in (*DISCRETE, "delay", "load friction", "scale")),
+            *(
+                (meaning, None)
+                for meaning in (*DISCRETE_MEANINGS, "delay", "load friction", "scale")
+            ),
             *((meaning, BEGUN) for meaning in ("payload", "scale", "friction", "arm")),
         ],
     )

@@ -25,8 +25,8 @@ from planner import (
     plan,
 )
 from planner.corners import (
-    FIRST_SHARES,
-    LAST_SHARES,
+    FIRST_FLY_SHARES,
+    LAST_FLY_SHARES,
     STOP,
     StraightMoves,
     passing,
@@ -546,7 +546,7 @@ def test_a_corner_slower_than_a_stop_is_not_used(monkeypatch):
 
     monkeypatch.setattr("planner.corners.solve_many", slow)
     assert flown(points, SIX_AXES) is STOP
-    parts = FIRST_SHARES + LAST_SHARES
+    parts = FIRST_FLY_SHARES + LAST_FLY_SHARES
     tried = [cut(points, SIX_AXES, 0.5 * part)[0] for part in parts]
     np.testing.assert_array_equal(asked, tried)
 
@@ -567,7 +567,7 @@ def test_a_join_without_solution_is_replaced_by_its_neighbour(monkeypatch, misse
 
 @pytest.mark.parametrize("version", ["0.20.1", "0.1.9", "unknown", "0.19.9"])
 def test_no_corner_is_planned_with_an_unknown_solver(monkeypatch, version):
-    monkeypatch.setattr("planner.corners._VERSION", version)
+    monkeypatch.setattr("planner.corners._RUCKIG_VERSION", version)
     points = random_points(3, 3)
     assert flown(points, SIX_AXES, 0.0) is STOP
     if version == "0.19.9":

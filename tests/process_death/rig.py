@@ -94,12 +94,12 @@ class Memory:
 
     @property
     def written(self) -> int:
-        return int(self._words[cycle_records._WRITTEN])
+        return int(self._words[cycle_records._WRITTEN_WORD])
 
     @property
     def behind(self) -> int:
         """Records written that the archive process has not read; 0 before it began."""
-        read = int(self._words[cycle_records._READ])
+        read = int(self._words[cycle_records._READ_WORD])
         return self.written - read if read else 0
 
     def records(self) -> NDArray[np.void]:

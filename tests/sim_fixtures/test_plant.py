@@ -24,7 +24,7 @@ from sim_fixtures import (
     ns16,
 )
 from sim_fixtures.arm import SimulatedDrift, SimulatedRipple
-from sim_fixtures.plant import TOLERANCE, resolve_dry_friction
+from sim_fixtures.plant import FRICTION_TOLERANCE, resolve_dry_friction
 from sim_fixtures.servo import CurrentLoop, NominalModel, Servo
 from tests.sim_fixtures.bench import CELL, DRIVE, FRICTIONLESS, TRUTH, frictionless, motor_matrix
 
@@ -231,7 +231,7 @@ def test_friction_holds_what_it_can_and_opposes_what_slides(seed: int, n: int, p
     velocity = np.array(result.velocity)
     torque = np.array(result.torque)
 
-    slack = 10.0 * TOLERANCE * (coulomb.max() + 1.0)
+    slack = 10.0 * FRICTION_TOLERANCE * (coulomb.max() + 1.0)
     assert np.all(np.abs(torque) <= coulomb)
     sliding = velocity != 0.0
     np.testing.assert_allclose(torque[sliding], (coulomb * np.sign(velocity))[sliding], atol=slack)

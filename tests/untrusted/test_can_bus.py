@@ -15,7 +15,7 @@ import numpy as np
 import pytest
 
 from drivers import MotionEnded, PacketRejected, TransportClosed
-from drivers.transports.can.frames import PACKED, BusRates
+from drivers.transports.can.frames import PACKED_IDS, BusRates
 from drivers.transports.can.transport import CanTransport
 from sim_fixtures import Phase
 from sim_fixtures.can_link import CanControllerLink
@@ -94,7 +94,9 @@ def run_with(meddle: Meddle) -> tuple[Run, SharedBus]:
 def test_frames_of_another_node_are_ignored() -> None:
     rng = np.random.default_rng(1)
     session_ids = {frame.arbitration_id for frames in frames_of() for frame in frames}
-    others = [number for number in range(0x800) if number not in session_ids | REPLY_IDS | PACKED]
+    others = [
+        number for number in range(0x800) if number not in session_ids | REPLY_IDS | PACKED_IDS
+    ]
 
     def chat(bus: SharedBus, _: int) -> None:
         for number in rng.choice(others, 3):

@@ -330,7 +330,7 @@ def test_series_of_a_report_are_numbers_of_limited_size(
     )  # fmt: skip
     loaded = SimpleNamespace(joint_names=["a", "b"])
     monkeypatch.setattr(Results, "load", lambda _: loaded)
-    monkeypatch.setattr("hil.results.series._LARGEST", 1 << 22)
+    monkeypatch.setattr("hil.results.series._MAX_BYTES", 1 << 22)
     for data in bombs:
         (folder / SERIES).write_bytes(data)
         with pytest.raises(InputError, match="does not contain the series of a report"):

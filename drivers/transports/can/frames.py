@@ -23,7 +23,7 @@ DOWN: Final = 0x100
 """Identifier of the PC's frames; lower ones have priority on the bus, so replies come first."""
 UP: Final = 0x110
 """Identifier of the controller's frames."""
-PACKED: Final = frozenset((0x111, *range(0x120, 0x123), *range(0x130, 0x137), 0x180, 0x181))
+PACKED_IDS: Final = frozenset((0x111, *range(0x120, 0x123), *range(0x130, 0x137), 0x180, 0x181))
 """Identifiers of the packed profiles of before this version, which are not understood any more."""
 
 
@@ -50,11 +50,11 @@ class CanBusLoadError(CanError, remedy="use a longer cycle, a faster bus or fewe
     """The frames of a cycle take too large a share of its time."""
 
 
-LOAD_LIMIT: Final = 0.70
+MAX_BUS_LOAD: Final = 0.70
 """Largest share of a cycle for the frames, with worst-case stuffing."""
-_TAIL: Final = 1 + 2 + 7 + 3  # CRC delimiter, acknowledge, end of frame, interframe space
-_ARBITRATION: Final = 1 + 11 + 5  # start, identifier, RRS IDE FDF res BRS
-_CONTROL: Final = 1 + 4  # ESI, length
+_TAIL_BITS: Final = 1 + 2 + 7 + 3  # CRC delimiter, acknowledge, end of frame, interframe space
+_ARBITRATION_BITS: Final = 1 + 11 + 5  # start, identifier, RRS IDE FDF res BRS
+_CONTROL_BITS: Final = 1 + 4  # ESI, length
 
 
 def fd_bits(n_bytes: int) -> tuple[int, int]:
@@ -65,10 +65,10 @@ def fd_bits(n_bytes: int) -> tuple[int, int]:
     equal bits and then after every fourth.
     """
     crc, fixed = (17, 6) if n_bytes <= 16 else (21, 7)
-    payload = _CONTROL + 8 * n_bytes
-    early = (_ARBITRATION - 1) // 4
-    late = (_ARBITRATION + payload - 1) // 4 - early
-    return _ARBITRATION + early + _TAIL, payload + late + 4 + crc + fixed
+    payload = _CONTROL_BITS + 8 * n_bytes
+    early = (_ARBITRATION_BITS - 1) // 4
+    late = (_ARBITRATION_BITS + payload - 1) // 4 - early
+    return _ARBITRATION_BITS + early + _TAIL_BITS, payload + late + 4 + crc + fixed
 
 
 @dataclass(frozen=True)
@@ -88,23 +88,23 @@ class BusRates:
         return 2.0 * sum(map(self.duration, payload_sizes(cyclic_length(n_axes)))) / period
 
     def require_load(self, n_axes: int, period: float) -> None:
-        """Check that the frames of a cycle fit `LOAD_LIMIT`; raises CanBusLoadError."""
+        """Check that the frames of a cycle fit `MAX_BUS_LOAD`; raises CanBusLoadError."""
         load = self.load(n_axes, period)
-        if load > LOAD_LIMIT:
+        if load > MAX_BUS_LOAD:
             count = 2 * len(payload_sizes(cyclic_length(n_axes)))
             raise CanBusLoadError(
                 f"{count} frames for {n_axes} axes fill {100.0 * load:.1f} % of a cycle of "
-                f"{1e3 * period:g} ms; allowed is {100.0 * LOAD_LIMIT:.0f} %"
+                f"{1e3 * period:g} ms; allowed is {100.0 * MAX_BUS_LOAD:.0f} %"
             )
 
 
-LONGEST: Final = 1500
+MAX_PACKET_BYTES: Final = 1500
 """Bytes of the longest packet."""
-SIZE: Final = 64
+FRAME_BYTES: Final = 64
 _PREFIX: Final = struct.Struct("<BBH")
 _HEAD: Final = struct.Struct("<BBHI")
-_FIRST: Final = SIZE - _HEAD.size
-_OTHER: Final = SIZE - _PREFIX.size
+_FIRST_FRAME_PAYLOAD: Final = FRAME_BYTES - _HEAD.size
+_NEXT_FRAME_PAYLOAD: Final = FRAME_BYTES - _PREFIX.size
 """Bytes of a packet in the first and in each other frame: whole words, so that none is in two."""
 TRANSFER_TIMEOUT: Final = 1.0
 """Time without a new frame after which a transfer is abandoned, s."""
@@ -114,11 +114,11 @@ DUPLICATE_TIME: Final = 0.1
 
 def payload_sizes(n_bytes: int) -> list[int]:
     """Return the bytes of each frame of a packet with this length."""
-    remaining_bytes = max(0, n_bytes - _FIRST)
-    full, last = divmod(remaining_bytes, _OTHER)
+    remaining_bytes = max(0, n_bytes - _FIRST_FRAME_PAYLOAD)
+    full, last = divmod(remaining_bytes, _NEXT_FRAME_PAYLOAD)
     sizes = [
         _HEAD.size + n_bytes - remaining_bytes,
-        *[SIZE] * full,
+        *[FRAME_BYTES] * full,
         *([_PREFIX.size + last] if last else []),
     ]
     return [_padded(size) for size in sizes]
@@ -136,12 +136,12 @@ def payloads(packet: bytes, transfer: int) -> list[bytes]:
     (u16). Frame 0 has the CRC-32 and the first 56 bytes of the packet, the others up to 60 bytes;
     the last one is padded with zeros.
     """
-    if not 1 <= len(packet) <= LONGEST:
-        raise ValueError(f"a packet has 1..{LONGEST} bytes, not {len(packet)}")
+    if not 1 <= len(packet) <= MAX_PACKET_BYTES:
+        raise ValueError(f"a packet has 1..{MAX_PACKET_BYTES} bytes, not {len(packet)}")
     length = len(packet)
-    parts = [_HEAD.pack(transfer, 0, length, zlib.crc32(packet)) + packet[:_FIRST]]
-    for index, at in enumerate(range(_FIRST, length, _OTHER), start=1):
-        parts.append(_PREFIX.pack(transfer, index, length) + packet[at : at + _OTHER])
+    parts = [_HEAD.pack(transfer, 0, length, zlib.crc32(packet)) + packet[:_FIRST_FRAME_PAYLOAD]]
+    for index, at in enumerate(range(_FIRST_FRAME_PAYLOAD, length, _NEXT_FRAME_PAYLOAD), start=1):
+        parts.append(_PREFIX.pack(transfer, index, length) + packet[at : at + _NEXT_FRAME_PAYLOAD])
     return [part.ljust(_padded(len(part)), b"\0") for part in parts]
 
 
@@ -196,7 +196,7 @@ class TransferAssembler:
         if head is None:
             return None
         _, _, length, crc = _HEAD.unpack_from(head)
-        if 1 <= length <= LONGEST:
+        if 1 <= length <= MAX_PACKET_BYTES:
             needed = range(1, len(payload_sizes(length)))
             if not self._parts.keys() >= set(needed):
                 return None
@@ -235,7 +235,7 @@ class CanEndpoint:
             CanBusLoadError: it is the init packet of a session that this bus cannot carry.
         """
         if frame.id != self._receives:
-            self.discarded["packed" if frame.id in PACKED else "foreign"] += 1
+            self.discarded["packed" if frame.id in PACKED_IDS else "foreign"] += 1
             return None
         packet = self._assembler.add(frame.data, time)
         if packet is not None:

@@ -34,8 +34,8 @@ _REMEDIES = {
 }
 
 
-_CLOCK: Final = 80_000_000  # Hz
-_SAMPLE_POINT: Final = 80.0  # %
+_CLOCK_HZ: Final = 80_000_000  # Hz
+_SAMPLE_POINT_PERCENT: Final = 80.0  # %
 
 
 def open_bus(
@@ -83,11 +83,11 @@ def _slcan_rates(rates: BusRates) -> dict[str, Any]:
     """
     # Only the rates are sent to the adapter, not the sample points.
     timing = can.BitTimingFd.from_sample_point(
-        f_clock=_CLOCK,
+        f_clock=_CLOCK_HZ,
         nom_bitrate=rates.bitrate,
-        nom_sample_point=_SAMPLE_POINT,
+        nom_sample_point=_SAMPLE_POINT_PERCENT,
         data_bitrate=rates.data_bitrate,
-        data_sample_point=_SAMPLE_POINT,
+        data_sample_point=_SAMPLE_POINT_PERCENT,
     )
     return {"timing": timing}
 
@@ -122,7 +122,7 @@ SEND_TIMEOUT: Final = 0.05
 """Longest wait for a full send queue, s; a packet not accepted by then is lost."""
 START_TIMEOUT: Final = 0.5
 """The same before the session has cyclic packets, s: there are many frames, and nothing moves."""
-MAX_QUEUED: Final = 1000
+MAX_QUEUED_FRAMES: Final = 1000
 """Frames read after the time-out."""
 _MAX_ECHOES: Final = 256
 
@@ -155,7 +155,7 @@ class CanLink:
         self._require_open()
         end = time.monotonic() + timeout
         remaining = timeout
-        queued = MAX_QUEUED
+        queued = MAX_QUEUED_FRAMES
         while True:
             message = self._next(max(0.0, remaining))
             if message is not None:

@@ -25,19 +25,19 @@ from identification.excitation.searches.sensitivity import Linearisation
 
 Fitness = Callable[[Scores], Array]
 
-_BOX: Final = 0.1  # first half width of the box, as a fraction of each gene's range
-_WIDEST: Final = 0.2
-_SMALLEST: Final = 1e-4
+_FIRST_HALF_WIDTH: Final = 0.1  # first half width of the box, as a fraction of each gene's range
+_MAX_HALF_WIDTH: Final = 0.2
+_MIN_HALF_WIDTH: Final = 1e-4
 _CURVATURE: Final = 5.0  # rho
-_NONCONVEX: Final = 5.0  # least offset of the linearisation at a distance of 1
+_MIN_LINEARISATION_OFFSET: Final = 5.0  # least offset of the linearisation at a distance of 1
 _BUNDLE_SIZE: Final = 20  # linearisations in the bundle
-_SHARE: Final = 0.05  # of the predicted gain that makes a step
-_PATIENCE: Final = 4  # failures before the box is made smaller
-_BACKOFF: Final = 0.1  # from the bounds; by so much more after each infeasible step
-_MOST_BACKOFF: Final = 0.5
-_FRACTIONS: Final = np.array((1.0, 0.4))  # of a step that are scored
+_MIN_GAIN_SHARE: Final = 0.05  # of the predicted gain that makes a step
+_MAX_FAILURES: Final = 4  # failures before the box is made smaller
+_BACKOFF_STEP: Final = 0.1  # from the bounds; by so much more after each infeasible step
+_MAX_BACKOFF: Final = 0.5
+_STEP_FRACTIONS: Final = np.array((1.0, 0.4))  # of a step that are scored
 
-TRIED: Final = len(_FRACTIONS)
+SCORED_STEPS: Final = len(_STEP_FRACTIONS)
 """Motions that a step scores."""
 
 
@@ -52,7 +52,7 @@ class _Cut(NamedTuple):
         """Return by how much the linearisation may exceed the fitness at other genes, >= 0."""
         change = genes - self.genes
         error = self.fitness + float(np.sum(self.slopes.gradient * change)) - fitness
-        return max(abs(error), _NONCONVEX * float(np.sum(change**2)))
+        return max(abs(error), _MIN_LINEARISATION_OFFSET * float(np.sum(change**2)))
 
     def left(self, genes: Array) -> Array:
         """Return the linearised margins (1 + c,) at other genes."""
@@ -90,22 +90,22 @@ def improve(ascent: Ascent, genes: Array, scores: Scores, steps: int) -> tuple[A
     bundle = [_Cut(best[0], value, slopes)]
     failures = 0
     backoff = 0.0
-    box = _BOX
+    box = _FIRST_HALF_WIDTH
     for _ in range(steps):
-        if box < _SMALLEST or ascent.stop():
+        if box < _MIN_HALF_WIDTH or ascent.stop():
             break
         centre = best[0]
         here = next(cut for cut in bundle if cut.genes is centre)
         near = [c for c in bundle if c is not here and np.abs(c.genes - centre).max() <= 2 * box]
         bundle = [here, *near[-_BUNDLE_SIZE:]]
         change, gain = _step(bundle, centre, value, box, backoff)
-        tried = np.clip(centre + _FRACTIONS[:, None] * change, 0.0, 1.0)
+        tried = np.clip(centre + _STEP_FRACTIONS[:, None] * change, 0.0, 1.0)
         trial_scores = ascent.score(tried.copy())
         values = np.where(trial_scores.usable, ascent.fitness(trial_scores), -np.inf)
         index = int(np.argmax(values))
-        if values[index] > value + _SHARE * max(gain, 0.0):
+        if values[index] > value + _MIN_GAIN_SHARE * max(gain, 0.0):
             if values[index] - value > 0.5 * gain:
-                box = min(1.5 * box, _WIDEST)
+                box = min(1.5 * box, _MAX_HALF_WIDTH)
             best = (tried[index].copy(), trial_scores.take(index))
             value = values[index]
             failures = 0
@@ -117,11 +117,11 @@ def improve(ascent: Ascent, genes: Array, scores: Scores, steps: int) -> tuple[A
             continue
         failures += 1
         if not np.any(trial_scores.feasible):
-            backoff = min(backoff + _BACKOFF, _MOST_BACKOFF)
+            backoff = min(backoff + _BACKOFF_STEP, _MAX_BACKOFF)
         refused = _refused(ascent, tried[0].copy(), trial_scores.take(0))
         if refused is not None:
             bundle.append(refused)
-        if refused is None or failures >= _PATIENCE:
+        if refused is None or failures >= _MAX_FAILURES:
             box *= 0.6
             failures = min(failures, 1)
     return best

@@ -19,8 +19,8 @@ from identification.arrays import Array
 from identification.excitation.genomes import Genome, ViaPointGenome
 from planner import FourierSeries, PiecewiseCubic, PlannerError
 
-_REACH: Final = 2  # points before and after one that the motion changes with it
-_ROUNDING: Final = 1e-9  # of the duration, relative
+_CHANGED_NEIGHBOURS: Final = 2  # points before and after one that the motion changes with it
+_DURATION_ROUNDING: Final = 1e-9  # of the duration, relative
 
 
 @dataclass(frozen=True, eq=False)
@@ -59,7 +59,7 @@ class PlannedMoves:
         apart = durations[len(moves) :] - 0.5 * (lengths[:-1] + lengths[1:])
         middles = 0.5 * lengths[0] + np.concatenate(([0.0], np.cumsum(apart)))
         duration = motion.duration
-        if abs(middles[-1] + 0.5 * lengths[-1] - duration) > _ROUNDING * duration:
+        if abs(middles[-1] + 0.5 * lengths[-1] - duration) > _DURATION_ROUNDING * duration:
             return None
         return cls(motion, points, speed, lengths, middles)
 
@@ -73,8 +73,8 @@ class PlannedMoves:
         """
         points, _ = genome.decode(genes)
         moved = genome.point_of(which)
-        first = np.maximum(moved - _REACH, 0)
-        last = np.minimum(moved + _REACH, len(self.points) - 1)
+        first = np.maximum(moved - _CHANGED_NEIGHBOURS, 0)
+        last = np.minimum(moved + _CHANGED_NEIGHBOURS, len(self.points) - 1)
         parts = genome.planned(
             [row[a : b + 1] for row, a, b in zip(points, first, last, strict=True)],
             np.tile(self.speed, (len(points), 1)),
@@ -86,10 +86,10 @@ class PlannedMoves:
                 yield None
                 continue
             begin = float(self.middles[a] - 0.5 * self.lengths[a])
-            enter = float(self.middles[a]) if a == point - _REACH else 0.0
+            enter = float(self.middles[a]) if a == point - _CHANGED_NEIGHBOURS else 0.0
             end = begin + part.duration
             left = self.motion.duration
-            if b == point + _REACH:
+            if b == point + _CHANGED_NEIGHBOURS:
                 end -= 0.5 * float(self.lengths[b - 1])
                 left = float(self.middles[b - 1])
             yield LocalChange(part, begin, enter, left, end - left)

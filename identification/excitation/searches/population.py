@@ -32,9 +32,9 @@ from identification.excitation.violation import KINDS, Violation, excess_by_kind
 from planner import PlannerCrashed, PlannerError, PlanningTimedOut
 from planner.worker import WorkerProcess, chunks_of, load, map_in_children, pack
 
-_MEASURES: Final = len(CRITERIA)
+_N_MEASURES: Final = len(CRITERIA)
 
-ROW: Final = _MEASURES + 2 + len(KINDS)
+ROW_LENGTH: Final = _N_MEASURES + 2 + len(KINDS)
 """Length of a row of scores: `CRITERIA`, precision, duration, one excess for each of `KINDS`."""
 
 
@@ -71,15 +71,15 @@ class Scores(NamedTuple):
 
     @property
     def rows(self) -> Array:
-        """The scores as one array, (m, ROW)."""
+        """The scores as one array, (m, ROW_LENGTH)."""
         return np.column_stack(self)
 
     @classmethod
     def of_rows(cls, rows: Array) -> Self:
-        """Return the scores in an array (m, ROW)."""
-        measures = rows[:, :_MEASURES]
-        (precision, duration) = rows[:, _MEASURES : _MEASURES + 2].T
-        return cls(measures, precision, duration, rows[:, _MEASURES + 2 :])
+        """Return the scores in an array (m, ROW_LENGTH)."""
+        measures = rows[:, :_N_MEASURES]
+        (precision, duration) = rows[:, _N_MEASURES : _N_MEASURES + 2].T
+        return cls(measures, precision, duration, rows[:, _N_MEASURES + 2 :])
 
 
 def finite(measures: Array) -> NDArray[np.bool_]:
@@ -88,7 +88,7 @@ def finite(measures: Array) -> NDArray[np.bool_]:
 
 
 def unplanned() -> Array:
-    """Return the row (ROW,) of an unplannable motion."""
+    """Return the row (ROW_LENGTH,) of an unplannable motion."""
     excess = np.where(np.array(KINDS) == "planning", np.inf, 0.0)
     return np.concatenate((-SENSE * np.inf, [np.inf, np.nan], excess))
 
@@ -113,7 +113,7 @@ class Front:
     def empty(cls, n_genes: int, criteria: tuple[str, ...] = OF_PAPER) -> Self:
         """Return the front of no motions."""
         none = np.empty(0)
-        return cls(np.empty((0, n_genes)), np.empty((0, _MEASURES)), none, none, criteria)
+        return cls(np.empty((0, n_genes)), np.empty((0, _N_MEASURES)), none, none, criteria)
 
     @classmethod
     def of(cls, genes: Array, scores: Scores, criteria: tuple[str, ...] = OF_PAPER) -> Self:
@@ -243,7 +243,7 @@ def _unplannable(error: PlannerError) -> Violation:
     return Violation("planning", f"the motion ({error})", np.inf, 0.0, None)
 
 
-CHUNK: Final = 8
+MOTIONS_PER_CHUNK: Final = 8
 """Motions per call to a child process; few, so that all children finish a generation together."""
 
 
@@ -252,7 +252,7 @@ class Population:
 
     Scores do not depend on the number of workers, to the last bit: each child has one thread for
     linear algebra. A motion that alone crashes its process twice, or exceeds the timeout [s] (of
-    `CHUNK` motions, then of one alone), is scored as unplannable.
+    `MOTIONS_PER_CHUNK` motions, then of one alone), is scored as unplannable.
 
     Raises:
         PlannerNotStarted: in `score`: a process cannot be started.
@@ -279,7 +279,7 @@ class Population:
         results = map_in_children(
             self._children,
             _score,
-            chunks_of(len(genes), CHUNK),
+            chunks_of(len(genes), MOTIONS_PER_CHUNK),
             lambda chunk: (self._packed, genes[list(chunk)]),
             done=scored,
         )

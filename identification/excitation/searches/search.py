@@ -13,7 +13,7 @@ from identification.arrays import Array
 from identification.excitation.criteria import SENSE, Criteria, columns
 from identification.excitation.excitation import Excitation
 from identification.excitation.genomes import ViaPointGenome
-from identification.excitation.searches.bundle_method import TRIED, Ascent, improve
+from identification.excitation.searches.bundle_method import SCORED_STEPS, Ascent, improve
 from identification.excitation.searches.journal import Journal
 from identification.excitation.searches.methods import METHODS, SearchMethod
 from identification.excitation.searches.population import (
@@ -61,11 +61,11 @@ RESCORE_PERIOD: Final = 0.001
 """Sample period of the criteria of the chosen motion, s."""
 
 # First seeds of independent random streams: evolution and first generation.
-_STREAM: Final = 6
-_FIRST: Final = 4
+_EVOLUTION_STREAM: Final = 6
+_FIRST_GENERATION_STREAM: Final = 4
 # Excess of a motion that leaves a parameter without excitation: it ranks behind all that excite,
 # and before unplannable ones, whose excess is infinite.
-_UNEXCITING: Final = 1e6
+_UNEXCITING_EXCESS: Final = 1e6
 _MEASURE_STEP: Final = 1e-3  # of criteria, for the derivatives of a fitness
 
 
@@ -112,7 +112,9 @@ class Evolution:
             xl=np.zeros(first.shape[1]),
             xu=np.ones(first.shape[1]),
         )
-        self._algorithm.setup(problem, termination=NoTermination(), seed=[_STREAM, settings.seed])
+        self._algorithm.setup(
+            problem, termination=NoTermination(), seed=[_EVOLUTION_STREAM, settings.seed]
+        )
         self._asked: Any = None
 
     def ask(self) -> Array | None:
@@ -127,7 +129,7 @@ class Evolution:
 
     def tell(self, scores: Scores, costs: Array) -> None:
         """Record scores, and costs to minimise (m,), of the generation that `ask` returned."""
-        unexciting = np.where(scores.exciting, 0.0, _UNEXCITING)
+        unexciting = np.where(scores.exciting, 0.0, _UNEXCITING_EXCESS)
         excess = np.column_stack((scores.excess, unexciting))
         finite_costs = np.nan_to_num(np.where(scores.usable, costs, 0.0))
         self._asked.set("F", finite_costs[:, None], "G", excess)
@@ -207,7 +209,7 @@ def search(
 
 def most_evaluations(settings: SearchSettings) -> int:
     """Return the largest number of motions that a search scores in all its phases."""
-    return settings.population * settings.generations + TRIED * settings.gradient
+    return settings.population * settings.generations + SCORED_STEPS * settings.gradient
 
 
 class _Search:
@@ -244,7 +246,7 @@ class _Search:
     def run(self) -> Design:
         settings = self._settings
         goal = self._goal
-        random = np.random.default_rng((_FIRST, settings.seed))
+        random = np.random.default_rng((_FIRST_GENERATION_STREAM, settings.seed))
         first = self._genome.sample(random, settings.population)
         if isinstance(self._genome, ViaPointGenome) and len(goal.method.reach) > 1:
             first = self._genome.contracted(first, goal.method.reach)

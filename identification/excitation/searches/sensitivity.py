@@ -46,16 +46,18 @@ class SensitivityProblem(Protocol):
 
 
 _SAMPLE_PERIOD: Final = 0.022  # s, at most; steps along slopes of twice that gain less
-_FEWEST_SAMPLES: Final = 900
+_MIN_SAMPLES: Final = 900
 _GENE_STEP: Final = 1e-4
 _POSITION_STEP: Final = 1e-3  # rad or m
 _VELOCITY_STEP: Final = 1e-3  # rad/s or m/s, at least
 _ACCELERATION_STEP: Final = 1.0  # exact: the regressor is linear in accelerations
 _DURATION_STEP: Final = 1e-3  # relative
-_LOADED: Final = 0.75  # loads above this fraction of the limit are followed
-_NEAR: Final = 0.08  # pairs of bodies closer than this to their least distance are followed [m]
-_RESERVE: Final = 1e-3  # margin to each bound, relative, above the rounding of a check
-_SPARE: Final = 1e-3  # m, likewise: the check of a motion does not resolve a distance at its bound
+_MIN_LOAD_SHARE: Final = 0.75  # loads above this fraction of the limit are followed
+# pairs of bodies closer than this to their least distance are followed [m]
+_NEAR_DISTANCE: Final = 0.08
+_BOUND_RESERVE: Final = 1e-3  # margin to each bound, relative, above the rounding of a check
+# m, likewise: the check of a motion does not resolve a distance at its bound
+_DISTANCE_RESERVE: Final = 1e-3
 
 
 class Margin(NamedTuple):
@@ -141,7 +143,7 @@ def sensitivity_of(problem: SensitivityProblem, genes: Array, weights: Array | N
     (motion,) = problem.genome.motions(genes[None])
     if isinstance(motion, PlannerError):
         raise motion
-    middles = midpoints(motion, min(_SAMPLE_PERIOD, motion.duration / _FEWEST_SAMPLES))
+    middles = midpoints(motion, min(_SAMPLE_PERIOD, motion.duration / _MIN_SAMPLES))
     time = middles.time
     states = _states(middles)
     constraints = problem.constraints
@@ -156,7 +158,7 @@ def sensitivity_of(problem: SensitivityProblem, genes: Array, weights: Array | N
     criterion, values, by_duration = _excitation(
         problem.objective, states, steps, weights, motion.duration / len(time)
     )
-    longest = (1.0 - _RESERVE) * constraints.max_duration
+    longest = (1.0 - _BOUND_RESERVE) * constraints.max_duration
     return Sensitivity(
         time=time,
         states=states,
@@ -285,7 +287,7 @@ def _loads(currents: CurrentModel, motion: Motion) -> Iterator[Margin]:
     """Yield the margin, as a fraction, at each peak of the load of a motor or joint."""
     loads = currents.loads(motion)
     before, after = (np.full((1, loads.shape[1]), -np.inf) for _ in range(2))
-    is_peak = loads > np.maximum(_LOADED, np.concatenate((before, loads[:-1])))
+    is_peak = loads > np.maximum(_MIN_LOAD_SHARE, np.concatenate((before, loads[:-1])))
     is_peak &= loads >= np.concatenate((loads[1:], after))
     sample, column = np.nonzero(is_peak)
     if len(sample) == 0:
@@ -301,7 +303,7 @@ def _loads(currents: CurrentModel, motion: Motion) -> Iterator[Margin]:
             change[reversing[:, joint]] = 0.0
         slope[:, kind, joint] = -change[row, column]
     for peak, at, which, place in zip(slope, sample, column, row, strict=True):
-        margin = float(1.0 - _RESERVE - loads[at, which])
+        margin = float(1.0 - _BOUND_RESERVE - loads[at, which])
         yield Margin(float(motion.time[at]), chosen[:, place], peak, margin)
 
 
@@ -331,7 +333,7 @@ def _distances(checker: CollisionChecker, time: Array, states: Array) -> Iterato
     count = len(q)
     pair, sample = np.indices((pairs, count)).reshape(2, -1)
     bound = checker.separation.bound(path.bodies, pair, sample).reshape(pairs, count)
-    near = bound < checker.required[:, None] + _NEAR
+    near = bound < checker.required[:, None] + _NEAR_DISTANCE
     for index in range(pairs):
         for run in _runs(near[index]):
             nearest = run[np.argmin(bound[index, run])]
@@ -345,7 +347,7 @@ def _distances(checker: CollisionChecker, time: Array, states: Array) -> Iterato
                 continue
             slope = np.zeros((3, n))
             slope[0] = (distance[:n] - distance[n:]) / (2.0 * _POSITION_STEP)
-            margin = here - checker.required[index] - _SPARE
+            margin = here - checker.required[index] - _DISTANCE_RESERVE
             yield Margin(float(time[nearest]), states[:, nearest], slope, margin)
 
 

@@ -22,7 +22,7 @@ _REALS: Final = {"double": np.float64, "single": np.float32}
 _FUNCTIONS: Final = ("sin", "cos", "sqrt", "exp", "tanh", "fabs")
 _MACROS: Final = ("ARM_SIN", "ARM_COS", "ARM_SQRT", "ARM_EXP", "ARM_TANH", "ARM_ABS")
 _COLUMNS: Final = ",\n    ".join(FRICTION_COLUMNS)
-_WIDTH: Final = 100  # of the comment at the top
+_COMMENT_COLUMNS: Final = 100  # of the comment at the top
 
 
 class Threshold(Protocol):
@@ -142,7 +142,7 @@ def _comment(tables: ControlTables, remarks: Sequence[str], precision: Precision
 def _folded(text: str) -> Iterator[str]:
     line = " *"
     for word in text.split():
-        if len(line) + 1 + len(word) > _WIDTH:
+        if len(line) + 1 + len(word) > _COMMENT_COLUMNS:
             yield line
             line = " *  "
         line += f" {word}"

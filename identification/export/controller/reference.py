@@ -10,7 +10,7 @@ import pinocchio as pin
 from identification.arrays import Array
 from identification.export.exported_arm import ExportedArm
 from identification.export.urdf import rnea
-from identification.model.kinematics import FROM_PINOCCHIO, pinocchio_model
+from identification.model.kinematics import PINOCCHIO_ORDER, pinocchio_model
 from identification.model.motion import Motion
 
 
@@ -21,7 +21,7 @@ def pinocchio_bodies(arm: ExportedArm) -> pin.Model:
     links = arm.standard[arm.model.layout.links]
     for k, parameters in enumerate(links, start=1):
         ordered = np.empty(len(parameters))
-        ordered[list(FROM_PINOCCHIO)] = parameters
+        ordered[list(PINOCCHIO_ORDER)] = parameters
         model.inertias[k] = pin.Inertia.FromDynamicParameters(ordered)
     payload = arm.model.payload
     if payload is not None:

@@ -22,7 +22,7 @@ gravity : ARRAY [1..3] OF LREAL := ARM_GRAVITY_VECTOR; (* base axes [m/s2] *)
     payload_mass : LREAL := ARM_PAYLOAD_MASS; (* [kg] *)
     payload_centre : ARRAY [1..3] OF LREAL := ARM_PAYLOAD_CENTRE; (* in the payload frame [m] *)
     payload_inertia : ARRAY [1..6] OF LREAL := ARM_PAYLOAD_INERTIA; (* xx xy xz yy yz zz *)"""
-_PER_LINE: Final = 5  # numbers of a table
+_NUMBERS_PER_LINE: Final = 5  # numbers of a table
 _BLOCKS: Final = ("DYNAMICS", "FRICTION", "TORQUE", "GRAVITY", "MASS_MATRIX", "OBSERVER")
 _FRICTION_NAMES: Final = {
     "FRICTION_COULOMB": "coulomb",
@@ -142,7 +142,7 @@ def _integers(name: str, values: Sequence[int], note: str) -> str:
 def _reals(name: str, values: Array, note: str) -> str:
     bounds = ", ".join(f"1..{size}" for size in values.shape)
     numbers = [_number(value) for value in values.ravel().tolist()]
-    width = values.shape[-1] if values.ndim > 1 else _PER_LINE
+    width = values.shape[-1] if values.ndim > 1 else _NUMBERS_PER_LINE
     rows = [", ".join(numbers[k : k + width]) for k in range(0, len(numbers), width)]
     lines = ",\n        ".join(rows)
     comment = f" (* {note} *)" if note else ""

@@ -10,9 +10,9 @@ from identification.hypotheses.diagnosis import RigidTorque, TorqueDiagnosis
 from identification.hypotheses.search import Step
 from identification.validation.evidence import Evidence
 from identification.validation.finding import Finding, Thresholds, Value
-from identification.validation.physical_signs import SIGMAS
+from identification.validation.physical_signs import SIGNIFICANT_SIGMAS
 
-_OTHER_SCALE: Final = 3.0  # of the torque to that of the masses; descriptions in use are closer
+_MAX_SCALE_RATIO: Final = 3.0  # of the torque to that of the masses; descriptions in use are closer
 
 
 def is_other(evidence: Evidence) -> bool:
@@ -125,8 +125,8 @@ def another_arm(evidence: Evidence, _: Thresholds) -> Finding | None:
     rigid = evidence.diagnosis.rigid
     if not np.isfinite(rigid.scale) or evidence.context.nominal_scale is None:
         return None
-    far = SIGMAS * rigid.std
-    if rigid.scale - far < _OTHER_SCALE and rigid.scale + far > 1.0 / _OTHER_SCALE:
+    far = SIGNIFICANT_SIGMAS * rigid.std
+    if rigid.scale - far < _MAX_SCALE_RATIO and rigid.scale + far > 1.0 / _MAX_SCALE_RATIO:
         return None
     scale = {"scale": rigid.scale}
     return Finding("another arm", "wrong", "check masses and units", "cause", scale)

@@ -20,9 +20,9 @@ from identification.validation.finding import (
 )
 
 # Ratio of torque errors that is no chance: three standard deviations of 24 blocks, as in 12 s.
-_GROWN: Final = 1.5
+_MIN_ERROR_GROWTH: Final = 1.5
 # Where torque and its prediction are noise of the same size, the error is this share of the torque.
-_NOISE_ALONE: Final = 2.0**0.5
+_NOISE_ALONE_ERROR: Final = 2.0**0.5
 
 
 def _minor(evidence: Evidence, limits: Thresholds) -> Mask:
@@ -83,21 +83,21 @@ def axis_error(evidence: Evidence, limits: Thresholds) -> Finding | None:
 def noisy_axis_error(evidence: Evidence, limits: Thresholds) -> Finding | None:
     """Return such axes of little torque whose error may be noise alone."""
     relative = evidence.held_out.relative
-    joints = (relative > limits.axis) & ~(relative > _NOISE_ALONE)
+    joints = (relative > limits.axis) & ~(relative > _NOISE_ALONE_ERROR)
     return _of_little_torque(evidence, limits, joints, "move faster")
 
 
 def axis_error_of_little_torque(evidence: Evidence, limits: Thresholds) -> Finding | None:
     """Return such axes of little torque whose error is more than noise."""
     _, grown = _growth(evidence, limits)
-    joints = (evidence.held_out.relative > max(limits.axis, _NOISE_ALONE)) & ~grown
+    joints = (evidence.held_out.relative > max(limits.axis, _NOISE_ALONE_ERROR)) & ~grown
     return _of_little_torque(evidence, limits, joints, "check the drives and the unit")
 
 
 def grown_axis_error_of_little_torque(evidence: Evidence, limits: Thresholds) -> Finding | None:
     """Return such axes of little torque whose error is large on held-out motion alone."""
     _, grown = _growth(evidence, limits)
-    joints = (evidence.held_out.relative > max(limits.axis, _NOISE_ALONE)) & grown
+    joints = (evidence.held_out.relative > max(limits.axis, _NOISE_ALONE_ERROR)) & grown
     return _of_little_torque(evidence, limits, joints, "cover the motion")
 
 
@@ -177,7 +177,7 @@ def _unexplained_axes(evidence: Evidence, limits: Thresholds) -> tuple[Mask, Mas
 
 def _beyond_noise(evidence: Evidence) -> Mask:
     """Return axes whose error exceeds what noise alone explains (n,)."""
-    return np.asarray(evidence.held_out.relative > _NOISE_ALONE)
+    return np.asarray(evidence.held_out.relative > _NOISE_ALONE_ERROR)
 
 
 def nothing_explained_by_noise(evidence: Evidence, limits: Thresholds) -> Finding | None:
@@ -240,7 +240,7 @@ def _far_generalisation(evidence: Evidence, limits: Thresholds) -> tuple[Array, 
     growth, grown = _growth(evidence, limits)
     # Less torque on unseen motion alone raises the share.
     ratio = error.rms / np.maximum(evidence.training.rms, 1e-300)
-    least = np.where(ratio > _GROWN, limits.unexplained, 0.5 * limits.axis)
+    least = np.where(ratio > _MIN_ERROR_GROWTH, limits.unexplained, 0.5 * limits.axis)
     # Little torque does not excuse an axis that was fitted several times better.
     far = grown & (error.relative > least) & ~_lost_in_noise(evidence, limits)
     return growth, far, grown & ~far

@@ -20,7 +20,7 @@ from identification.validation.finding import (
     Value,
 )
 from identification.validation.findings.scale import all_opposite
-from identification.validation.physical_signs import SIGMAS
+from identification.validation.physical_signs import SIGNIFICANT_SIGMAS
 
 _THROUGHOUT: Final[Mapping[Meaning, tuple[FindingKey, RemedyKey]]] = {
     "delay": ("delay of the torque", "use the delay found"),
@@ -160,7 +160,7 @@ def _fault(each: Explanation, evidence: Evidence, limits: Thresholds) -> Finding
     if is_constant(each.change):
         # Of a torque's scale over those of the others, whose scales are in that of the change.
         std = float(np.hypot(scale_std[[*each.change.joints]].max(), each.std))
-        if abs(each.size or 0.0) <= SIGMAS * std:
+        if abs(each.size or 0.0) <= SIGNIFICANT_SIGMAS * std:
             return Finding(
                 "torque constant, as assumed",
                 "information",

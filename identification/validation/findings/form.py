@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from identification.estimators.friction_form import UNCERTAIN
+from identification.estimators.friction_form import UNCERTAIN_PROBABILITY
 from identification.validation.evidence import Evidence
 from identification.validation.finding import Finding, Thresholds
 
@@ -12,7 +12,9 @@ def form_of_friction(evidence: Evidence, limits: Thresholds) -> Finding | None:
     uncertainty = evidence.form
     if uncertainty is None:
         return None
-    joints = (uncertainty.probability > UNCERTAIN) & (uncertainty.share > limits.friction)
+    joints = (uncertainty.probability > UNCERTAIN_PROBABILITY) & (
+        uncertainty.share > limits.friction
+    )
     if not joints.any():
         return Finding("complete friction law", "good")
     terms = []

@@ -6,7 +6,7 @@ import numpy as np
 
 from identification.validation.evidence import Evidence
 from identification.validation.finding import Finding, Thresholds, Value
-from identification.validation.physical_signs import SIGMAS
+from identification.validation.physical_signs import SIGNIFICANT_SIGMAS
 
 
 def nothing_held_out(evidence: Evidence, _: Thresholds) -> Finding | None:
@@ -59,7 +59,7 @@ def delay(evidence: Evidence, limits: Thresholds) -> Finding | None:
     assumed = evidence.context.assumed_delay
     if delays is None or evidence.context.commanded_positions:
         return None
-    beyond = max(limits.delay * delays.cycle, SIGMAS * delays.std)
+    beyond = max(limits.delay * delays.cycle, SIGNIFICANT_SIGMAS * delays.std)
     differs = abs(delays.delay - assumed) > beyond
     far = abs(delays.delay - delays.assumed) > beyond  # and yet combined with what is stated
     values: dict[str, Value] = {

@@ -9,7 +9,7 @@ import numpy as np
 from identification.validation.evidence import Evidence
 from identification.validation.finding import Finding, RemedyKey, Thresholds, Value
 
-_INERTIA_OFF: Final = 1.2  # ratio of inertias; data sheets are accurate to 10 %
+_MAX_INERTIA_RATIO: Final = 1.2  # ratio of inertias; data sheets are accurate to 10 %
 
 
 def nominal_model(evidence: Evidence, limits: Thresholds) -> Finding | None:
@@ -48,7 +48,7 @@ def controller_inertia(evidence: Evidence, _: Thresholds) -> Finding | None:
     if inertia is None:
         return None
     ratio = inertia.ratio
-    off = np.abs(np.log(ratio)) > np.log(_INERTIA_OFF)
+    off = np.abs(np.log(ratio)) > np.log(_MAX_INERTIA_RATIO)
     if off.any():
         step: RemedyKey = "check the constant and the payload"
         return Finding("controller's inertia differs", "doubtful", step).about(off, ratio=ratio)

@@ -16,7 +16,7 @@ from identification.validation.finding import (
     Value,
 )
 from identification.validation.findings.faults import gravity_error, is_constant
-from identification.validation.prediction import FRICTION_CHANGE
+from identification.validation.prediction import MAX_FRICTION_CHANGE
 
 
 def load(evidence: Evidence, limits: Thresholds) -> Finding | None:
@@ -102,7 +102,7 @@ def friction(evidence: Evidence, limits: Thresholds) -> Finding | None:
         alike = joints & _mask([each.joint for each in found if each.alike], evidence)
         # An error below that of a pattern is one of rounding or smoothing.
         noticed = evidence.held_out.relative > limits.pattern
-        if np.any(joints & noticed & (np.abs(change) > FRICTION_CHANGE)):
+        if np.any(joints & noticed & (np.abs(change) > MAX_FRICTION_CHANGE)):
             return _large_change(change, joints, explained=joints, alike=alike)
         if evidence.friction_change is None:
             return _small_change(change, joints, alike, limits)
@@ -122,7 +122,7 @@ def friction(evidence: Evidence, limits: Thresholds) -> Finding | None:
 def _large_change(change: Array, joints: Mask, *, explained: Mask, alike: Mask) -> Finding:
     """Return a change beyond what temperature causes."""
     values = _alike(alike) | {
-        "limit": FRICTION_CHANGE,
+        "limit": MAX_FRICTION_CHANGE,
         "explained": tuple(np.flatnonzero(explained).tolist()),
     }
     return Finding("changed friction", "wrong", _remedy(alike), "cause", values).about(

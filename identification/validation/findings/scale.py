@@ -22,7 +22,7 @@ from identification.validation.physical_signs import WrongSign
 # Beyond this ratio the unit is wrong, or motor torques are in place of joint torques (gear ratios
 # are 30 to 200); descriptions in use are closer.
 _IMPOSSIBLE_SCALE: Final = 10.0
-_NEAR: Final = 0.5  # of -1: scale of a torque of the opposite sign
+_SIGN_TOLERANCE: Final = 0.5  # of -1: scale of a torque of the opposite sign
 
 
 class _TorqueScale(NamedTuple):
@@ -47,7 +47,7 @@ def _torque_scale(evidence: Evidence) -> _TorqueScale | None:
         scale = scale.without(j for each in evidence.explanations for j in each.change.joints)
     common = scale.common
     off = np.isfinite(scale.scale) if common != 1.0 else scale.off
-    near = np.abs(scale.scale + 1.0) < _NEAR
+    near = np.abs(scale.scale + 1.0) < _SIGN_TOLERANCE
     opposite = off & (scale.scale + scale.tolerance < 0.0) & near
     return _TorqueScale(
         scale=scale.scale,

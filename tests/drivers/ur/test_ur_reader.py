@@ -92,7 +92,7 @@ def test_frames_in_one_batch_and_text_between_them_are_all_read() -> None:
 def test_all_frames_before_the_end_are_read(
     kind: str, reason: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(reader_module, "SILENCE", 0.3)
+    monkeypatch.setattr(reader_module, "SILENCE_TIMEOUT", 0.3)
     with reading(UrFault(kind, 250)) as (reader, _):
         assert len(stamps_of(reader, 10_000)) == 250
         with pytest.raises(TransportClosed, match=reason):

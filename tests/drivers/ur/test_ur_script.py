@@ -11,8 +11,16 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from drivers.ur.registers import CHECK, DEMAND, NUMBER, POSITIONS, Demand, Ending, Stage
-from drivers.ur.script import CONFIRMED, STARTING, StreamProgram
+from drivers.ur.registers import (
+    ANGLE_REGISTERS,
+    CHECK_REGISTER,
+    DEMAND_REGISTER,
+    NUMBER_REGISTER,
+    Demand,
+    Ending,
+    Stage,
+)
+from drivers.ur.script import MIN_CONFIRMED_SET_POINTS, STARTING_CYCLES, StreamProgram
 from sim_fixtures.ur.program import ProgramConstants, ProgramError, RegisterProgram, Registers
 
 pytestmark = pytest.mark.safety
@@ -75,9 +83,9 @@ class Machine:
 def write(
     registers: Registers, q: np.ndarray, number: int, demand: int, check: float = 0.0
 ) -> None:
-    registers.ints.update({NUMBER: number, DEMAND: demand})
-    registers.floats.update(dict(zip(POSITIONS, q.tolist(), strict=True)))
-    registers.floats[CHECK] = sum(q.tolist()) + number + check
+    registers.ints.update({NUMBER_REGISTER: number, DEMAND_REGISTER: demand})
+    registers.floats.update(dict(zip(ANGLE_REGISTERS, q.tolist(), strict=True)))
+    registers.floats[CHECK_REGISTER] = sum(q.tolist()) + number + check
 
 
 KINDS = (
@@ -99,7 +107,7 @@ KINDS = (
 @settings(max_examples=150, deadline=None)
 @given(
     kinds=st.lists(st.sampled_from(KINDS), min_size=1, max_size=40),
-    before=st.integers(0, CONFIRMED + 3),
+    before=st.integers(0, MIN_CONFIRMED_SET_POINTS + 3),
     pushed=st.integers(0, 80),
     steady=st.booleans(),
 )
@@ -151,7 +159,7 @@ def test_registers_of_an_earlier_run_move_nothing() -> None:
     """Inputs keep their value when their writer has gone."""
     machine = Machine(PROGRAM, 900)
     write(machine.inputs, np.full(6, 1.0), 900, Demand.STREAM)
-    for _ in range(STARTING + 2):
+    for _ in range(STARTING_CYCLES + 2):
         machine.cycle()
     assert machine.over and machine.outputs.ints[28] == Ending.NO_START
     assert all(call[1] == [0.0] * 6 for call in machine.calls if call[0] == "servoj")
@@ -172,7 +180,7 @@ def test_silence_ends_it_after_its_patience(silence: int) -> None:
     machine = Machine(PROGRAM)
     step = np.array([1e-3, 0, 0, 0, 0, 0])
     machine.steady = False
-    for number in range(1, CONFIRMED + 20):
+    for number in range(1, MIN_CONFIRMED_SET_POINTS + 20):
         write(machine.inputs, machine.actual + step * (number > 1), number, Demand.STREAM)
         machine.actual = machine.actual + step * (number > 1)
         machine.cycle()
@@ -197,19 +205,19 @@ def test_another_text_is_refused_by_the_simulated_controller(text: str) -> None:
 def test_a_number_far_ahead_permits_no_further_step(leap: int) -> None:
     """A number may be ahead by what can be missed; a set-point may be away by no more."""
     machine = Machine(PROGRAM)
-    for number in range(1, CONFIRMED + 5):
+    for number in range(1, MIN_CONFIRMED_SET_POINTS + 5):
         write(machine.inputs, np.zeros(6), number, Demand.STREAM)
         machine.cycle()
     reach = PROGRAM.velocity[0] * PROGRAM.period * min(leap, PROGRAM.patience)
     for away, ends in ((0.99 * reach, False), (1.05 * reach, True)):
         q = np.array([away, 0, 0, 0, 0, 0])
         machine.actual = q
-        write(machine.inputs, q, CONFIRMED + 4 + leap, Demand.STREAM)
+        write(machine.inputs, q, MIN_CONFIRMED_SET_POINTS + 4 + leap, Demand.STREAM)
         machine.cycle()
         assert machine.over == ends
         if not ends:
             machine = Machine(PROGRAM)
-            for number in range(1, CONFIRMED + 5):
+            for number in range(1, MIN_CONFIRMED_SET_POINTS + 5):
                 write(machine.inputs, np.zeros(6), number, Demand.STREAM)
                 machine.cycle()
     assert machine.outputs.ints[28] == Ending.STEP
@@ -218,10 +226,10 @@ def test_a_number_far_ahead_permits_no_further_step(leap: int) -> None:
 @pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf, 1e300])
 def test_numbers_that_are_none_move_nothing(value: float) -> None:
     machine = Machine(PROGRAM)
-    for number in range(1, CONFIRMED + 5):
+    for number in range(1, MIN_CONFIRMED_SET_POINTS + 5):
         write(machine.inputs, np.zeros(6), number, Demand.STREAM)
         machine.cycle()
-    for number in range(CONFIRMED + 5, CONFIRMED + 15):
+    for number in range(MIN_CONFIRMED_SET_POINTS + 5, MIN_CONFIRMED_SET_POINTS + 15):
         write(machine.inputs, np.array([value, 0, 0, 0, 0, 0]), number, Demand.STREAM)
         machine.cycle()
     assert machine.over

@@ -162,7 +162,7 @@ def test_our_reader_takes_chunks_of_every_compression_and_layout(
     copy = tmp_path / path.name
     content = replace(Content.of(path), library="mcap", cycles_per_chunk=COUNT)
     replace(content, chunk_size=40_000, compression=compression).write(copy)
-    monkeypatch.setattr("hil.archive.scan._BATCH", 0)
+    monkeypatch.setattr("hil.archive.scan._BATCH_BYTES", 0)
     again = open_archive(copy)
     assert again.complete, again.missing
     for name, column in ours.columns.items():

@@ -27,7 +27,7 @@ from drivers.packets import InitPacket
 from drivers.states import State
 from hil.archive import Archive, ArchiveSpec, Recorder, open_archive
 from hil.archive.process import BUFFERED_CYCLES, PreTriggerBuffer
-from hil.archive.recorder import _TEXTS
+from hil.archive.recorder import _EVENT_TEXTS
 from hil.cell import Cell
 from hil.control.simulated_cell import simulated_controller
 from sim_fixtures.ns16 import CELL_PATH
@@ -143,7 +143,7 @@ class TestRecorder:
 
 
 def test_every_event_has_a_text_and_a_level() -> None:
-    assert _TEXTS.keys() == {*get_args(ExchangeEvent)}
+    assert _EVENT_TEXTS.keys() == {*get_args(ExchangeEvent)}
 
 
 def at(*numbers: int) -> NDArray[np.void]:

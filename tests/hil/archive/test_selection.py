@@ -40,7 +40,7 @@ class TestTimes:
             path = path.with_name("truncated.mcap")
             sound = 30
             path.write_bytes(written.data[: written.chunks[3].offset])
-        with mock.patch("hil.archive.scan._BATCH", batch):  # bytes of chunks decoded at once
+        with mock.patch("hil.archive.scan._BATCH_BYTES", batch):  # bytes of chunks decoded at once
             archive = open_archive(path, start=start, stop=stop)
         chosen = within(written.rows["cycle"], start, stop) & (np.arange(43) < sound)
         assert np.array_equal(archive.columns["cycle"], written.rows["cycle"][chosen])

@@ -243,7 +243,7 @@ class TestNumbers:
 
     @pytest.mark.slow
     def test_do_not_depend_on_workers_order_or_cache(self, folder, tmp_path, monkeypatch):
-        monkeypatch.setattr(batch_run, "PARTITION", 1)
+        monkeypatch.setattr(batch_run, "ARCHIVES_PER_TASK", 1)
         with Cluster(2) as cluster:
             alone = batch(folder, cluster=cluster)
         files = sorted((folder / "archives").glob("*.mcap"), reverse=True)
@@ -262,7 +262,7 @@ class TestCache:
         long_ago = time.time() - 100.0
         for path in (folder / "archives").glob("*.mcap"):
             os.utime(path, (long_ago, long_ago))
-        monkeypatch.setattr(archive_discovery, "_UNTOUCHED", 0)
+        monkeypatch.setattr(archive_discovery, "_MIN_UNCHANGED_NS", 0)
         first = batch(folder, cache=CacheLocation())
         assert (first.read, first.cached) == (5, 0)
         with monkeypatch.context() as patch:
@@ -635,7 +635,7 @@ class TestGroups:
 class TestMetadata:
     def test_cached_ones_are_valid_until_the_programs_change(self, tmp_path, arm, monkeypatch):
         path = recording(tmp_path / "data" / "a.mcap", arm)
-        monkeypatch.setattr(archive_discovery, "_UNTOUCHED", 0)
+        monkeypatch.setattr(archive_discovery, "_MIN_UNCHANGED_NS", 0)
         time.sleep(0.01)  # then its time stamps are trusted
         opened = []
         read = archive_discovery.open_archive

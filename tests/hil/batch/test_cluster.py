@@ -135,7 +135,7 @@ class TestSchedulersByHand:
     @pytest.mark.slow
     def test_killed_workers_change_no_bit(self, folder, expected, tmp_path, monkeypatch):
         """One while it works; then all of them, until another one starts."""
-        monkeypatch.setattr(batch_run, "PARTITION", 1)
+        monkeypatch.setattr(batch_run, "ARCHIVES_PER_TASK", 1)
         cache = CacheLocation(str(tmp_path))
         go = tmp_path / "go"
         with HandMade() as processes, Cluster(scheduler=processes.address) as cluster:
@@ -154,7 +154,7 @@ class TestSchedulersByHand:
     def test_a_killed_scheduler_is_reported_and_its_work_is_cached(
         self, folder, expected, tmp_path, monkeypatch
     ):
-        monkeypatch.setattr(batch_run, "PARTITION", 1)
+        monkeypatch.setattr(batch_run, "ARCHIVES_PER_TASK", 1)
         cache = CacheLocation(str(tmp_path))
         with HandMade() as processes, Cluster(scheduler=processes.address) as cluster:
             cluster.client(5).register_plugin(work.Held(HELD, tmp_path / "never"))
@@ -169,7 +169,7 @@ class TestSchedulersByHand:
 
     @pytest.mark.slow
     def test_without_workers_is_reported(self, folder, monkeypatch):
-        monkeypatch.setattr(cluster_module, "PATIENCE", 1.0)
+        monkeypatch.setattr(cluster_module, "WORKER_TIMEOUT", 1.0)
         with (
             HandMade(workers=0) as processes,
             pytest.raises(ClusterError, match=r"has no worker.*dask worker tcp://"),

@@ -36,7 +36,7 @@ from hil.batch.archive_reduction import (
 from hil.batch.cache import HEADER, JSON, NPZ, NUMBERS, CacheError, CacheLocation, code_digest
 from hil.batch.cluster import Cluster, ClusterTask, SkippedArchive, error_of
 from hil.batch.estimates import BatchArm
-from hil.batch.graph import PARTITION, BatchResult, _Campaign
+from hil.batch.graph import ARCHIVES_PER_TASK, BatchResult, _Campaign
 from hil.batch.table import COLUMNS, write_tables
 from hil.cell import Cell
 from hil.cell.schema import PayloadTable, TorsionSpringTable
@@ -67,7 +67,11 @@ def a_ref(index):
 def test_partitions_do_not_depend_on_the_order_of_archives(order):
     refs = [a_ref(k) for k in order]
     partitions = _Campaign(refs[0].key, refs).partitions
-    assert [len(part) for part in partitions] == [PARTITION, PARTITION, 40 - 2 * PARTITION]
+    assert [len(part) for part in partitions] == [
+        ARCHIVES_PER_TASK,
+        ARCHIVES_PER_TASK,
+        40 - 2 * ARCHIVES_PER_TASK,
+    ]
     assert [wanted.ref.index for part in partitions for wanted in part] == list(range(40))
 
 

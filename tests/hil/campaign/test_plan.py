@@ -18,15 +18,15 @@ from hil.base.errors import InputError
 from hil.base.progress import Silent
 from hil.campaign import Campaign, CampaignPlan, MotionRefusedError, design, plan_around
 from hil.campaign.identified_campaign import identify_campaign
-from hil.campaign.plan import LEAST, quick_settings
+from hil.campaign.plan import MIN_POPULATION, quick_settings
 from hil.cell import Cell
 from hil.cli import app
 from hil.cli import demo as demo_module
-from hil.control.motion_checks import PLANNED_CURRENT, MotionChecks
+from hil.control.motion_checks import USABLE_CURRENT_SHARE, MotionChecks
 from hil.control.simulator_process import SimulatorProcess
 from hil.design import load_design, preset
 from hil.design.design import DesignFolder, run_design
-from hil.report.output_files import FILES
+from hil.report.output_files import EXPORT_FILES
 from hil.results.results import Results
 from identification.excitation import Constraints, Criteria, Excitation, sampled
 from planner import FourierSeries, PiecewiseCubic
@@ -40,7 +40,7 @@ pytestmark = pytest.mark.long
 @pytest.mark.parametrize("candidates", [1, 5, 300])
 def test_the_quick_search_tries_no_more_than_it_may(cell: Cell, candidates: int) -> None:
     search = quick_settings(cell.with_values({"campaign.candidates": candidates})).search
-    assert search.population * search.generations <= max(LEAST, candidates)
+    assert search.population * search.generations <= max(MIN_POPULATION, candidates)
     assert search.population * search.generations > 0.75 * candidates
 
 
@@ -66,7 +66,7 @@ def test_motions_are_planned_within_a_share_of_the_currents(
     limits = [float(limit * worst / 0.9) for limit in cell.drive_train.current_limit]
     weak = cell.with_values({"drive_train.current_limit": limits})
     excitation = design(weak, Silent())
-    assert max(_largest_shares(weak, excitation)) <= PLANNED_CURRENT
+    assert max(_largest_shares(weak, excitation)) <= USABLE_CURRENT_SHARE
     # What was designed elsewhere is judged by the whole limit before it is sent.
     assert MotionChecks.of(weak).refusal(strong.excitation.trajectory) is None
 
@@ -260,7 +260,7 @@ def test_an_earlier_campaign_is_not_removed_for_a_bad_motion(
 ) -> None:
     """Whatever an earlier one left, with the files that identification writes for other tools."""
     wild = FourierSeries(cell.home, np.full((6, 1), 2.0), np.full((6, 1), 3.0), 5.0, 1.0)
-    for name in ("manifest.json", "results.json", "report.html", *FILES):
+    for name in ("manifest.json", "results.json", "report.html", *EXPORT_FILES):
         (tmp_path / name).write_text("{}")
     monkeypatch.setattr(demo_module, "load_design", lambda *_: designed(wild))
     with pytest.raises(MotionRefusedError, match=r"the excitation .*design another motion\."):

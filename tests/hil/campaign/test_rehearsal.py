@@ -29,7 +29,13 @@ from hil.campaign.identified_campaign import identify_campaign
 from hil.campaign.rehearsal_criteria import of_currents, of_motions
 from hil.campaign.rehearsal_record import CRITERIA, Rehearsal
 from hil.campaign.simulated_sessions import result_of
-from hil.campaign.twin import FASTEST, SPREAD, Twin, link_faults, too_far_without_a_packet
+from hil.campaign.twin import (
+    MAX_RESONANCE,
+    PARAMETER_SPREAD,
+    Twin,
+    link_faults,
+    too_far_without_a_packet,
+)
 from hil.cell import Cell
 from hil.cell.toml_edits import with_values
 from hil.cli import app
@@ -88,7 +94,7 @@ def test_simulated_parameters_are_within_a_tenth_of_nominal(designed: Campaign, 
     stated = nominal != 0.0
     apart = np.abs(twin.truth[stated] / nominal[stated] - 1.0)
     # Each base parameter of this arm is a sum of figures of one sign, or of one figure.
-    assert np.all(apart <= SPREAD + 1e-12)
+    assert np.all(apart <= PARAMETER_SPREAD + 1e-12)
     assert np.all(apart > 0.0)
     assert np.all(twin.truth[~stated] == 0.0)
     other = Twin.of(designed.cell, seed=seed + 10, repetitions=3)
@@ -390,7 +396,7 @@ def test_springs_of_the_twin_suit_axes_that_carry_each_other(cell: Cell) -> None
     none = np.zeros(7)
     assert (compliance[:3] > 0.0).all() and not compliance[3:].any()
     step = 0.5 * cell.period
-    assert FASTEST * step <= 1.0
+    assert MAX_RESONANCE * step <= 1.0
     for angles in (HOME, [0.0, 0.0, 0.0, -90.0, 0.0, 40.0, 0.0]):
         plant = ElasticPlant(
             cell.urdf,

@@ -353,7 +353,7 @@ class TestCampaign:
         self, designed: Path, monkeypatch: pytest.MonkeyPatch
     ) -> None:
         with monkeypatch.context() as strict:
-            strict.setattr("hil.campaign.rehearsal_criteria.MOST_ERROR", 0.0)
+            strict.setattr("hil.campaign.rehearsal_criteria.MAX_ERROR_RATIO", 0.0)
             text = refusal("rehearse", designed)
         assert "design a better excitation (`hil design`)" in text
         accepted(*DESIGN, "-o", "b")
@@ -408,7 +408,7 @@ class TestBatch:
         self, folder: Path, monkeypatch: pytest.MonkeyPatch
     ) -> None:
         for module in ("batch.estimates", "pipeline.estimating"):
-            monkeypatch.setattr(f"hil.{module}.QR_CONDITION", 1.0)
+            monkeypatch.setattr(f"hil.{module}.MAX_GRAM_CONDITION", 1.0)
         text = accepted("batch", folder, "--estimator", "wls")
         assert "`hil identify` on these archives uses QR" in text
         accepted("identify", folder / "a", "--estimator", "wls")
@@ -416,7 +416,7 @@ class TestBatch:
     def test_more_campaigns_than_are_shown(
         self, folder: Path, here: Path, monkeypatch: pytest.MonkeyPatch
     ) -> None:
-        monkeypatch.setattr("hil.cli.batch._MOST_LINES", 0)
+        monkeypatch.setattr("hil.cli.batch._MAX_LINES", 0)
         assert "1 more: see --output and --json" in accepted("batch", folder)
         accepted("batch", folder, "--output", "tables")
         assert list((here / "tables").glob("*.csv"))

@@ -364,7 +364,7 @@ def test_a_blocked_terminal_delays_no_stop(tmp_path: Path) -> None:
 def test_split_key_sequences_are_joined(monkeypatch: pytest.MonkeyPatch) -> None:
     """Over a slow line the parts of an arrow come one by one; none of them is a key."""
     monkeypatch.setattr(
-        "hil.campaign.operator_keys._SEQUENCE_WAIT", 5.0
+        "hil.campaign.operator_keys._ESCAPE_TIMEOUT", 5.0
     )  # this machine may be slow, too
     near, far = pty.openpty()
     pressed: list[str] = []

@@ -35,7 +35,7 @@ def designed(tmp_path_factory: pytest.TempPathFactory) -> Campaign:
 @pytest.fixture(autouse=True)
 def however_short(monkeypatch: pytest.MonkeyPatch) -> None:
     """Campaigns of these tests are shorter than a second process is worthwhile for."""
-    monkeypatch.setattr(simulated_sessions, "SHORTEST", 0.0)
+    monkeypatch.setattr(simulated_sessions, "MIN_SPLIT_SECONDS", 0.0)
 
 
 def again(campaign: Campaign, folder: Path) -> Campaign:
@@ -84,7 +84,7 @@ def test_the_motions_are_divided_in_order_by_their_duration(designed: Campaign) 
 def test_short_motions_need_no_second_session(
     designed: Campaign, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(simulated_sessions, "SHORTEST", 1000.0)
+    monkeypatch.setattr(simulated_sessions, "MIN_SPLIT_SECONDS", 1000.0)
     assert halves(designed.motions) == (designed.motions, ())
 
 

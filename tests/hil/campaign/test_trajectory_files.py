@@ -13,7 +13,7 @@ import pytest
 from ruamel.yaml import YAML
 from typer.testing import CliRunner
 
-from hil.campaign.trajectory_files import SCRIPT_RATE, SLOW, trajectory_files
+from hil.campaign.trajectory_files import SCRIPT_RATE, SLOW_SPEED_SHARE, trajectory_files
 from hil.cell import Cell
 from hil.cell.toml_edits import with_values
 from hil.cli import app
@@ -135,12 +135,12 @@ def test_each_file_is_slow_at_first_and_says_what_it_is() -> None:
     cell = Cell.load(CELL_PATH)
     files = files_of(cell, cell.joint_limits)
     fast, slow = (MotionTable.of(files[f"excitation{end}.csv"]) for end in ("", "_slow"))
-    assert slow.duration == pytest.approx(fast.duration / SLOW)
+    assert slow.duration == pytest.approx(fast.duration / SLOW_SPEED_SHARE)
     time = np.linspace(0.0, fast.duration, 50)
     for k, (quick, stretched) in enumerate(
-        zip(fast.sample(time), slow.sample(time / SLOW), strict=True)
+        zip(fast.sample(time), slow.sample(time / SLOW_SPEED_SHARE), strict=True)
     ):
-        np.testing.assert_allclose(stretched, SLOW**k * quick, atol=2e-3)
+        np.testing.assert_allclose(stretched, SLOW_SPEED_SHARE**k * quick, atol=2e-3)
 
     for name in ("excitation.script", "excitation.yaml", "excitation_slow.yaml", "README.txt"):
         text = files[name]
@@ -154,7 +154,7 @@ def test_the_program_asks_first_and_its_speed_scales_time() -> None:
     text = files_of(cell, cell.joint_limits)["excitation.script"]
     assert text.index("popup(") < text.index("movej(")
     assert "blocking=True" in text
-    assert f"  global speed = {SLOW:g}\n" in text
+    assert f"  global speed = {SLOW_SPEED_SHARE:g}\n" in text
 
     def commands(speed: float) -> list[tuple[str, Any]]:
         """Names and targets of the commands that the program gives at a speed."""

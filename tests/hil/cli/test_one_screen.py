@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from typer.testing import CliRunner
 
 from hil.base.errors import HilError
-from hil.base.one_screen import COLUMNS, LINES, Paragraph, brief, one_screen
+from hil.base.one_screen import SCREEN_COLUMNS, SCREEN_LINES, Paragraph, brief, one_screen
 from hil.cli import app
 from tests.hil.fast_cell import QUICK_GRADIENT, fast_cell
 from tests.hil.simulated_logs import simulate, urdf_path, write_log
@@ -26,8 +26,8 @@ _SENTENCE = 8  # words of what is no figure, name or title
 def require_one_screen(text: str) -> None:
     """At most 24 lines of 100 columns, and nothing twice."""
     lines = text.rstrip("\n").split("\n")
-    assert len(lines) <= LINES, text
-    assert max(map(len, lines)) <= COLUMNS, max(lines, key=len)
+    assert len(lines) <= SCREEN_LINES, text
+    assert max(map(len, lines)) <= SCREEN_COLUMNS, max(lines, key=len)
     clauses = [clause.strip() for clause in re.split(r"[;:.]\s", " ".join(text.split()))]
     told = Counter(clause for clause in clauses if len(clause.split()) >= _SENTENCE)
     assert not [clause for clause, times in told.items() if times > 1], text
@@ -37,18 +37,18 @@ class TestText:
     def test_long_text_takes_the_room_that_is_left(self) -> None:
         long = "word " * 60
         shown = one_screen([Paragraph(long, "found  "), *["row"] * 22])
-        assert len(shown) == LINES
+        assert len(shown) == SCREEN_LINES
         assert shown[0].startswith("found  word") and shown[1].startswith("       word")
         assert shown[1].endswith(" ...")
 
     def test_empty_lines_go_before_text_is_cut(self) -> None:
         parts = [Paragraph("word " * 60), "", *["row"] * 21, ""]
         shown = one_screen(parts)
-        assert len(shown) == LINES and "" not in shown
+        assert len(shown) == SCREEN_LINES and "" not in shown
 
     def test_of_too_many_lines_the_ends_stay(self) -> None:
         shown = brief([f"line {k}" for k in range(40)], last=2)
-        assert len(shown) == LINES
+        assert len(shown) == SCREEN_LINES
         assert shown[0] == "line 0" and shown[-2:] == ["line 38", "line 39"]
         assert "17 more lines: -v" in shown
         require_one_screen("\n".join(brief([f"{k} " * 200 for k in range(50)])))
@@ -141,7 +141,7 @@ def printed(*words: object) -> str:
     """What a command prints, or the text of its refusal."""
     result = CliRunner().invoke(app, [*map(str, words)])
     if isinstance(result.exception, HilError):
-        return "\n".join(textwrap.wrap(str(result.exception), COLUMNS))
+        return "\n".join(textwrap.wrap(str(result.exception), SCREEN_COLUMNS))
     assert isinstance(result.exception, SystemExit | None), result.exception
     return result.stdout or result.output
 

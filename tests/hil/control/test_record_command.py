@@ -34,12 +34,12 @@ from hil.cli import record as record_cli
 from hil.cli.record import record as record_command
 from hil.control.record import archive_path, record
 from hil.control.simulated_cell import (
-    OWN_SPEED,
+    OWN_SPEED_SHARE,
     controller_settings,
     own_postures,
     simulated_controller,
 )
-from hil.control.simulator_process import SIMULATE, free_port
+from hil.control.simulator_process import SIMULATE_COMMAND, free_port
 from hil.pipeline.identification import identify_archives
 from planner.moves import SEGMENT_VELOCITY
 from sim_fixtures.ns16 import CELL_PATH
@@ -119,7 +119,7 @@ def test_the_controller_moves_as_its_interpolator_plans(recorded: Path, cell: Ce
     """At a constant share of the joints' speed limits, and never above it."""
     rate = np.abs(open_archive(recorded).columns["target_velocity"]) / cell.joint_limits.velocity
     fastest = rate.max(axis=1)
-    assert fastest.max() == pytest.approx(SEGMENT_VELOCITY * OWN_SPEED, rel=1e-3)
+    assert fastest.max() == pytest.approx(SEGMENT_VELOCITY * OWN_SPEED_SHARE, rel=1e-3)
     assert np.mean(fastest > 0.999 * fastest.max()) > 0.2
 
 
@@ -212,7 +212,7 @@ def recorder_of(cell: Path, *options: object) -> Any:
 def own_motion(cell: Path, port: int, *options: str) -> tuple[object, ...]:
     """A simulated controller whose own program moves the arm without a rest of a second."""
     where = ("--udp", f"127.0.0.1:{port}", "--own-motion", "--patience", "2")
-    return (*SIMULATE, cell, "--json", *where, *options)
+    return (*SIMULATE_COMMAND, cell, "--json", *where, *options)
 
 
 def wait_until_recorded(archive: Path, recorder: subprocess.Popen[str], cycles: int = 500) -> None:

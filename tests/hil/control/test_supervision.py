@@ -30,11 +30,11 @@ from drivers.states import State
 from hil.archive import Archive, ArchiveSpec, ArchiveWriter, open_archive
 from hil.base.errors import ControllerError
 from hil.campaign import Stop
-from hil.campaign.operator import BETWEEN, ExpectedMotion, RunStatus, RunWatch
+from hil.campaign.operator import SECONDS_BETWEEN_MOTIONS, ExpectedMotion, RunStatus, RunWatch
 from hil.cell import Cell
 from hil.control.connection import StartTimeout
 from hil.control.link import Standstill
-from hil.control.live_link import STALL, ExchangeMonitor, Heartbeat
+from hil.control.live_link import STALL_TIMEOUT, ExchangeMonitor, Heartbeat
 from hil.control.motion_watch import MotionProgress, OperatorRequest
 from hil.control.motions import player_of
 from hil.control.simulated_cell import simulated_link
@@ -367,10 +367,10 @@ def test_heartbeats_end_when_the_supervising_loop_stalls() -> None:
 
     assert beats_in(600.0) >= 11_999, "between motions work may take long"
     heart.turn()
-    assert beats_in(0.9 * STALL) > 10
+    assert beats_in(0.9 * STALL_TIMEOUT) > 10
     heart.turn()
-    beats_in(2.0 * STALL)
-    assert clock.now - given[-1] > 0.9 * STALL
+    beats_in(2.0 * STALL_TIMEOUT)
+    assert clock.now - given[-1] > 0.9 * STALL_TIMEOUT
     heart.turn()
     assert beats_in(0.5) > 5, "and resume with the loop"
     heart.rest()
@@ -439,16 +439,16 @@ def test_an_override_is_counted_once_in_the_time_left() -> None:
         return watch.status.time_left
 
     watch.begin("dryrun", 1, 5, 8.0, 0.2)
-    full = 5 * 40.0 + 2 * 10.0 + 6 * BETWEEN
+    full = 5 * 40.0 + 2 * 10.0 + 6 * SECONDS_BETWEEN_MOTIONS
     assert left(1.0, 0.0, 8.0) == pytest.approx(full)
     assert left(0.3, 0.0, 8.0) == pytest.approx(full)
     # What is requested in the dry run does not count for what follows it.
     assert left(0.1, 0.0, 8.0) == pytest.approx(full + 5 * 40.0)
     watch.begin("excitation", 1, 2, 10.0, 1.0)
-    assert left(0.5, 5.0, 10.0) == pytest.approx(10.0 + 20.0 + BETWEEN)
+    assert left(0.5, 5.0, 10.0) == pytest.approx(10.0 + 20.0 + SECONDS_BETWEEN_MOTIONS)
     watch.end()
     assert watch.status.motion is None
-    assert watch.status.time_left == pytest.approx(20.0 + BETWEEN)
+    assert watch.status.time_left == pytest.approx(20.0 + SECONDS_BETWEEN_MOTIONS)
 
 
 @pytest.mark.parametrize(

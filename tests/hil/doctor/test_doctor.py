@@ -38,7 +38,7 @@ from hil.doctor.checks import (
     try_port,
 )
 from hil.doctor.diagnosis import (
-    RESERVE,
+    REPLY_RESERVE_SECONDS,
     Diagnosis,
     Fitness,
     Latency,
@@ -64,7 +64,7 @@ def test_a_stall_counts_each_of_its_cycles() -> None:
     stall = latency(50e-6, 7.95e-3)
     assert stall.late_cycles(1e-3) == 8
     assert stall.late_cycles(2e-3) == 4
-    assert latency(1e-3 - 2 * RESERVE).late_cycles(1e-3) == 0
+    assert latency(1e-3 - 2 * REPLY_RESERVE_SECONDS).late_cycles(1e-3) == 0
 
 
 @given(samples, st.floats(0.0, 0.01))
@@ -171,7 +171,7 @@ def test_page_and_json_agree_and_remedies_come_worst_first() -> None:
 
 # --- probes ----------------------------------------------------------------------------------
 def test_a_lost_packet_counts_its_whole_wait(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(probe, "TIMEOUT", 0.05)
+    monkeypatch.setattr(probe, "REPLY_TIMEOUT", 0.05)
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as far:
         far.bind(("127.0.0.1", 0))
 
@@ -206,7 +206,7 @@ def test_missed_deadlines_are_one_long_latency(monkeypatch: pytest.MonkeyPatch) 
 
 def test_a_probe_that_fails_or_hangs_gives_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
     assert run_probe(["no such probe"], 0.0) is None
-    monkeypatch.setattr("hil.doctor.diagnosis._GRACE", 0.3)
+    monkeypatch.setattr("hil.doctor.diagnosis._PROBE_GRACE", 0.3)
     began = time.monotonic()
     assert run_probe(["echo"], 0.0) is None  # waits 5 s for packets
     assert time.monotonic() - began < 4.0

@@ -27,7 +27,7 @@ from hil.importers.imported_robot import Robot
 from hil.importers.log import import_log
 from hil.pipeline import stored_identification
 from hil.pipeline.identification import Identification
-from hil.report.output_files import FILES, Exports
+from hil.report.output_files import EXPORT_FILES, Exports
 from hil.results.results import Results
 from hil.results.servo_result import ServoResults
 from identification.export.parameter_files import parameters_json
@@ -87,7 +87,7 @@ def command(*arguments: object) -> Any:
 
 def test_files_with_provenance_are_written(arm: IdentifiedArm, tmp_path: Path) -> None:
     written = exported(arm, tmp_path)
-    assert ALL == set(FILES) == {path.name for path in tmp_path.iterdir()}
+    assert ALL == set(EXPORT_FILES) == {path.name for path in tmp_path.iterdir()}
     assert not written.withheld
     assert set(written.result.written) == ALL
     assert json.loads((tmp_path / "parameters.json").read_text())["provenance"] == PROVENANCE

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from hil.compare.comparison import holm
-from hil.fleet.series_changes import FEWEST, SIBLINGS, Series, common_course, courses
+from hil.fleet.series_changes import MIN_RECORDINGS, MIN_SIBLINGS, Series, common_course, courses
 
 LONG = partial(pytest.param, marks=pytest.mark.long)
 MONTHS = 24
@@ -145,7 +145,7 @@ class TestNotInvented:
         assert alarms <= 1
 
     def test_a_short_series_has_no_model(self):
-        family = fleet(0, months=FEWEST - 1)
+        family = fleet(0, months=MIN_RECORDINGS - 1)
         assert courses(family) == [None] * len(family)
 
 
@@ -195,7 +195,7 @@ class TestAllTogether:
 
     def test_is_unknown_before_a_year_and_of_few_robots(self):
         assert common_course(fleet(1, months=12)) is None
-        assert common_course(fleet(1, robots=SIBLINGS)) is None
+        assert common_course(fleet(1, robots=MIN_SIBLINGS)) is None
         assert common_course([]) is None
 
     def test_robots_that_came_later_do_not_count(self):

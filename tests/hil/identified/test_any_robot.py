@@ -17,7 +17,7 @@ from typer.testing import CliRunner
 from hil.base.errors import ArchiveError
 from hil.base.progress import Silent
 from hil.cli import app
-from hil.cli.verdict import NOT_GOOD
+from hil.cli.verdict import EXIT_NOT_GOOD
 from hil.importers.column_map import ColumnMap, Quantity, TimeColumn
 from hil.importers.imported_robot import Robot
 from hil.importers.log import import_log
@@ -195,7 +195,7 @@ def fitted_by(commands: list[str], output: Path) -> FittedResult:
         status = 0
         if arguments[0] == "identify":
             arguments = [*arguments, "--output", str(output)]
-            status = NOT_GOOD
+            status = EXIT_NOT_GOOD
         result = CliRunner().invoke(app, arguments)
         assert result.exit_code == status, (command, result.output, result.exception)
     return Results.load(output / "results.json").fitted

@@ -364,7 +364,10 @@ class TestIdentify:
         folder = tmp_path / "a"
         report = folder / "report.html"
         shown = result.stdout.splitlines()
-        assert len(shown) <= one_screen.LINES and max(map(len, shown)) <= one_screen.COLUMNS
+        assert (
+            len(shown) <= one_screen.SCREEN_LINES
+            and max(map(len, shown)) <= one_screen.SCREEN_COLUMNS
+        )
         assert "fitted    a.csv: 3 joints" in result.output
         assert "predicted b.csv: 3 joints" in result.output
         before = (folder / "results.json").stat().st_mtime_ns

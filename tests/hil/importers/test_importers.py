@@ -467,7 +467,7 @@ class TestStructs:
         assert np.array_equal(arrays["position"], Q)
 
     def test_number_of_elements_is_limited(self, tmp_path, robot, monkeypatch):
-        monkeypatch.setattr(array_files, "MOST_NUMBERS", 50)
+        monkeypatch.setattr(array_files, "MAX_ELEMENTS", 50)
         savemat(tmp_path / "a.mat", {"log": LOG})
         with pytest.raises(SourceError, match="too large to be read in one piece"):
             read_arrays(tmp_path / "a.mat", robot, position={"columns": "log.joint.q"})

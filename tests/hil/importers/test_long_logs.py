@@ -13,19 +13,25 @@ from hil.archive import open_archive
 from hil.base.errors import SourceError
 from hil.importers.column_map import Format
 from hil.importers.conclusions import Excerpt
-from hil.importers.excerpt import DURATION, STRETCH, activity, chosen_stretches, excerpt_of
+from hil.importers.excerpt import (
+    MAX_EXCERPT_SECONDS,
+    STRETCH_ROWS,
+    activity,
+    chosen_stretches,
+    excerpt_of,
+)
 from hil.importers.imported_robot import Robot
 from hil.importers.log_files import LogFiles
 from hil.importers.messages import sentence
 from hil.importers.recording_import import ImportedRecording, ImportOptions, read_recording
 from hil.importers.text_table import TextTable
 from hil.pipeline.sources import cell_of, source_of
-from identification.signals.recording import PAUSE, Recording, cut_at_pauses
+from identification.signals.recording import PAUSE_SECONDS, Recording, cut_at_pauses
 from tests.hil.importers.moving_log import JOINTS, URDF
 
 RATE = 250.0  # Hz
-ROWS = 8 * STRETCH
-LONGEST = 3 * STRETCH
+ROWS = 8 * STRETCH_ROWS
+LONGEST = 3 * STRETCH_ROWS
 
 
 def moving(time: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -62,7 +68,7 @@ def test_rows_of_a_long_log_are_those_of_the_file(robot: Robot, tmp_path: Path) 
     imported = read(path, robot, LONGEST)
     whole = read(path, robot, None)
     columns = imported.archive.columns
-    assert 2 * STRETCH < len(columns["stamp"]) <= LONGEST
+    assert 2 * STRETCH_ROWS < len(columns["stamp"]) <= LONGEST
     rows = np.searchsorted(whole.archive.columns["stamp"], columns["stamp"])
     for name in ("stamp", "position", "torque"):
         assert np.array_equal(columns[name], whole.archive.columns[name][rows])
@@ -117,24 +123,24 @@ def test_a_compressed_log_is_read_in_stretches(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("encoding", ["utf-8", "utf-8-sig", "utf-16", "cp1252"])
 def test_encodings_and_decimal_commas_of_long_logs(encoding: str, tmp_path: Path) -> None:
-    time = np.arange(4 * STRETCH) / RATE
+    time = np.arange(4 * STRETCH_ROWS) / RATE
     plain = written(tmp_path / "plain.csv", time, *moving(time)).read_text()
     text = plain.replace(",", ";").replace(".", ",").replace("q1", "Position1 (°)", 1)
     path = tmp_path / "log.csv"
     path.write_bytes(text.replace("\n", "\r\n").encode(encoding))
-    table = TextTable.read(path, Format(), 2 * STRETCH)
+    table = TextTable.read(path, Format(), 2 * STRETCH_ROWS)
     assert table.names[1] == "Position1 (°)"
-    assert len(table.lines) == 2 * STRETCH - 1
+    assert len(table.lines) == 2 * STRETCH_ROWS - 1
     values = table.numbers(["time", 1], "position")
     assert np.allclose(values[:, 1], moving(values[:, 0])[0][:, 0], atol=1e-6)
 
 
 def test_stretches_in_which_the_arm_stands_are_left_out() -> None:
-    stamp = np.arange(20 * STRETCH) * 4_000_000
+    stamp = np.arange(20 * STRETCH_ROWS) * 4_000_000
     position, _ = moving(1e-9 * stamp)
-    still = np.arange(len(stamp)) // STRETCH % 5 > 0
+    still = np.arange(len(stamp)) // STRETCH_ROWS % 5 > 0
     position[still] = 0.1
-    chosen = excerpt_of(stamp, position, 6 * STRETCH)
+    chosen = excerpt_of(stamp, position, 6 * STRETCH_ROWS)
     assert chosen is not None
     assert chosen.stretches == 4
     assert not still[chosen.rows].any()
@@ -163,7 +169,7 @@ def test_rows_are_limited_and_so_is_time() -> None:
     assert excerpt_of(np.arange(rows) * 1_000_000, position, rows) is None
     slow = excerpt_of(np.arange(rows) * 4_000_000, position, rows)
     assert slow is not None
-    assert 0.9 * DURATION < len(slow.rows) / RATE <= DURATION
+    assert 0.9 * MAX_EXCERPT_SECONDS < len(slow.rows) / RATE <= MAX_EXCERPT_SECONDS
 
 
 class TestPauses:
@@ -185,7 +191,7 @@ class TestPauses:
 
     def test_shorter_ones_stay_as_they_are(self) -> None:
         time = np.arange(200) * 0.01
-        time[100:] += PAUSE - 1.0
+        time[100:] += PAUSE_SECONDS - 1.0
         recording = Recording(time, np.zeros((200, 3)), JOINTS)
         assert cut_at_pauses(recording) is recording
 
@@ -200,7 +206,7 @@ class TestPauses:
 
 
 def test_hil_import_reads_every_row(robot: Robot, tmp_path: Path) -> None:
-    time = np.arange(2 * STRETCH) / RATE
+    time = np.arange(2 * STRETCH_ROWS) / RATE
     path = written(tmp_path / "log.csv", time, *moving(time))
     read(path, robot, None).write(tmp_path / "log.mcap")
-    assert open_archive(tmp_path / "log.mcap").n_samples == 2 * STRETCH
+    assert open_archive(tmp_path / "log.mcap").n_samples == 2 * STRETCH_ROWS

@@ -417,7 +417,7 @@ def test_damaged_databases_are_refused(tmp_path, robot, statements, sentence):
 
 
 def test_huge_packed_files_are_refused(tmp_path, monkeypatch):
-    monkeypatch.setattr(bags, "_SLACK", 1000)
+    monkeypatch.setattr(bags, "_BLOCK_BYTES", 1000)
     path = tmp_path / "x.db3.zstd"
     path.write_bytes(zstandard.compress(bytes(1 << 26)))
     with pytest.raises(SourceError, match="1000 times"), bags.open_bag(path):
@@ -485,7 +485,7 @@ class TestChunks:
             read_mcap(path)
 
     def test_size_is_limited(self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-        monkeypatch.setattr(mcap_messages, "MOST_BYTES", 600)
+        monkeypatch.setattr(mcap_messages, "MAX_TOTAL_BYTES", 600)
         path = chunked(tmp_path / "x.mcap")
         with pytest.raises(SourceError, match="too large to be read"):
             read_mcap(path)

@@ -30,7 +30,7 @@ from hil.cell.toml_edits import urdf_limits
 from hil.cli import app
 from hil.control.motion_checks import collision_checker
 from hil.control.simulated_cell import simulated_link
-from hil.control.simulator_process import SIMULATE, free_port
+from hil.control.simulator_process import SIMULATE_COMMAND, free_port
 from hil.importers.imported_robot import Robot
 from hil.new import cell_of_urdf, from_archive
 from hil.new.cell_text import with_fixed
@@ -236,7 +236,8 @@ def test_an_archive_of_another_arm_is_refused(
 def test_the_init_packet_is_read_over_udp(tmp_path: Path) -> None:
     port = free_port()
     simulator = subprocess.Popen(
-        [*SIMULATE, str(CELL_PATH), "--udp", f"127.0.0.1:{port}", "--json", "--duration", "60"],
+        [*SIMULATE_COMMAND, str(CELL_PATH), "--udp", f"127.0.0.1:{port}", "--json",
+         "--duration", "60"],
         stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, text=True,
     )  # fmt: skip
     try:

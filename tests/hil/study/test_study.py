@@ -24,8 +24,15 @@ from hil.base.progress import Silent
 from hil.cell import Cell
 from hil.control.planted_arm import planted_values
 from hil.design.messages import NoExcitationError
-from hil.study import FULL, QUICK, StudyResults, StudySettings, run_study, study_settings
-from hil.study.campaigns import CLASSES, StudyExecution, execute
+from hil.study import (
+    FULL_STUDY,
+    QUICK_STUDY,
+    StudyResults,
+    StudySettings,
+    run_study,
+    study_settings,
+)
+from hil.study.campaigns import MOTION_CLASSES, StudyExecution, execute
 from hil.study.criteria_relations import relations_of
 from hil.study.estimates import HeldOutForms
 from hil.study.method_comparison import MIN_UNITS, compared, verdict_of
@@ -197,7 +204,7 @@ class TestSearches:
     """Every method has the same duration, limits and number of searches."""
 
     def test_ten_searches_of_each_method_have_one_duration(self) -> None:
-        plans = search_plans(FULL, 6)
+        plans = search_plans(FULL_STUDY, 6)
         assert [plan.method for plan in plans] == ["a"] * 10 + ["b"] * 10 + ["gradient"] * 10
         assert len({(plan.method, plan.choices[0].settings.seed) for plan in plans}) == 30
         for plan in plans:
@@ -212,7 +219,7 @@ class TestSearches:
                     assert settings.sines.length == 16.0
 
     def test_open_choices_share_an_effort_that_is_alike(self) -> None:
-        plans = {plan.method: plan for plan in search_plans(FULL, 6)}
+        plans = {plan.method: plan for plan in search_plans(FULL_STUDY, 6)}
         tried = {
             method: sum(
                 choice.settings.search.population * choice.settings.search.generations
@@ -222,7 +229,9 @@ class TestSearches:
         }
         assert tried["a"] == tried["b"]
         assert len(plans["a"].choices) == len(SINES)
-        assert len(search_plans(FULL, 7)[0].choices) == 2  # printed frequencies are of six joints
+        assert (
+            len(search_plans(FULL_STUDY, 7)[0].choices) == 2
+        )  # printed frequencies are of six joints
 
     @pytest.mark.parametrize(("method", "best"), [("a", "det"), ("b", "fit")])
     def test_a_method_takes_the_best_by_its_own_criterion(self, method: Any, best: str) -> None:
@@ -309,7 +318,7 @@ class TestWhole:
         expected = [NONE, *(Condition(name, k) for name in errors for k in (1, 2)), ALL]
         assert [row.key for row in results.conditions] == [row.key for row in expected]
         for condition in results.conditions:
-            for motions in CLASSES:
+            for motions in MOTION_CLASSES:
                 assert condition.comparison("a", "b", motions).motion_count == 3
                 assert condition.comparison("a", "b", motions, printed_sizes=True).ratio > 0.0
 
@@ -414,7 +423,9 @@ def test_a_study_in_the_background_ends_within_a_second(
 
 def test_the_quick_study_has_fewer_of_everything() -> None:
     smaller = [
-        name for name in StudySettings.model_fields if getattr(QUICK, name) != getattr(FULL, name)
+        name
+        for name in StudySettings.model_fields
+        if getattr(QUICK_STUDY, name) != getattr(FULL_STUDY, name)
     ]
     assert set(smaller) == {
         "searches", "motions", "effort_a", "effort_b", "effort_gradient", "gradient_steps"

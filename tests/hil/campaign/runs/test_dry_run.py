@@ -13,7 +13,7 @@ from hil.campaign import (
     Campaign,
     CampaignFolderError,
 )
-from hil.campaign.dry_run_record import OVERRIDE, DryRunRecord, agreement, not_accepted
+from hil.campaign.dry_run_record import MAX_DRY_RUN_OVERRIDE, DryRunRecord, agreement, not_accepted
 from hil.campaign.errors import (
     AgainstGravityError,
     DryRunError,
@@ -60,8 +60,8 @@ def test_the_dry_run_is_every_motion_slowly(make: Make) -> None:
         planned = np.abs(motion.sample(np.arange(0, motion.duration, campaign.cell.period))[1])
         limits = campaign.cell.joint_limits.velocity
         speed = peak_speed(campaign, name)
-        assert speed * limits == pytest.approx(OVERRIDE * planned.max(axis=0), rel=0.01)
-        assert np.all(speed <= OVERRIDE)
+        assert speed * limits == pytest.approx(MAX_DRY_RUN_OVERRIDE * planned.max(axis=0), rel=0.01)
+        assert np.all(speed <= MAX_DRY_RUN_OVERRIDE)
 
     with pytest.raises(DryRunError, match=r"was done, but is not accepted; .*--accept-dry-run`"):
         campaign.run()
@@ -180,7 +180,7 @@ def test_an_unwatched_move_is_no_faster_than_a_dry_run(copied: Campaign) -> None
     moves = [name for name in result.archives if name.startswith("move")]
     assert len(moves) >= 2
     for name in moves:
-        assert peak_speed(copied, name).max() <= OVERRIDE * 1.001
+        assert peak_speed(copied, name).max() <= MAX_DRY_RUN_OVERRIDE * 1.001
 
 
 def test_a_stop_while_a_dry_run_is_asked_for(copied: Campaign) -> None:

@@ -13,15 +13,15 @@ import pytest
 from hil.campaign import (
     Campaign,
 )
-from hil.campaign.operator import RunStatus
 from hil.campaign.campaign_run import RunResult
-from hil.campaign.warm_up_stage import WarmUpStage
 from hil.campaign.joint_warm_up import (
-    COLD_AFTER,
+    COLD_AFTER_SECONDS,
     FrictionMeter,
     WarmUpRecord,
     change_per_motion,
 )
+from hil.campaign.operator import RunStatus
+from hil.campaign.warm_up_stage import WarmUpStage
 from hil.control.motion_checks import MotionChecks
 from hil.control.planted_arm import planted_truth
 from hil.control.simulated_cell import simulated_link
@@ -92,7 +92,7 @@ def test_the_arm_warms_up_and_again_when_it_has_cooled_down(make: Make) -> None:
     again = run()
     assert kinds(again) == ["move", "excitation", "move"], "still warm"
     assert again.archives[1] == "excitation_001_a2.mcap", "no number is given twice"
-    for seconds in (COLD_AFTER + 60.0, -3600.0):  # and where a clock was put back
+    for seconds in (COLD_AFTER_SECONDS + 60.0, -3600.0):  # and where a clock was put back
         (campaign.folder.archives / campaign.folder.completed("excitation")[1].name).unlink()
         rested(campaign, seconds)
         assert kinds(run()) == ["move", *["warmup"] * 5, "excitation", "move"]
