@@ -28,7 +28,7 @@ def clock_lines(clock: TimeBase) -> list[str]:
     if clock.pauses == 1:
         lines.append(f"cut at a pause of {duration_text(clock.longest_pause)}")
     elif clock.pauses:
-        longest = f"{duration_text(clock.longest_pause)}"
+        longest = duration_text(clock.longest_pause)
         lines.append(f"cut at {clock.pauses} pauses, the longest of {longest}")
     return lines
 

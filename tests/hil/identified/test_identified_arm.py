@@ -293,7 +293,7 @@ class TestLoaded:
         place = tmp_path / "arm"
         shutil.copytree(saved, place)
         shutil.copyfile(place / "b.mcap", place / "a.mcap")
-        with pytest.raises(InputError, match="its archives are others"):
+        with pytest.raises(InputError, match="its archives are not the ones that were identified"):
             hil.load(place)
 
     def test_a_folder_without_results_is_refused(self, tmp_path: Path) -> None:

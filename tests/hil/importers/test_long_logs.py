@@ -182,7 +182,7 @@ class TestPauses:
         path = written(tmp_path / "log.csv", time, position, torque)
         imported = read(path, robot, None)
         said = [sentence(each) for each in imported.examined.found]
-        assert any("cut at a pause of 1200 s" in line for line in said)
+        assert any("cut at a pause of 20 min" in line for line in said)
         archive = imported.archive
         recording = source_of(archive, cell_of(archive)).recording
         assert [part.stop for part in recording.segments()] == [2500, 6000]

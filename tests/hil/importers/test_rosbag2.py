@@ -487,5 +487,5 @@ class TestChunks:
     def test_size_is_limited(self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
         monkeypatch.setattr(mcap_messages, "MAX_TOTAL_BYTES", 600)
         path = chunked(tmp_path / "x.mcap")
-        with pytest.raises(SourceError, match="too large to be read"):
+        with pytest.raises(SourceError, match="too large for one reading"):
             read_mcap(path)
