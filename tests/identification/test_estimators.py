@@ -95,6 +95,7 @@ from tests.identification.two_link import (
 )
 from tests.sim_fixtures.bench import DRIVE, MinimalPC
 from tests.sim_fixtures.bench import TRUTH as PLANT
+from tests.tiers import quick_ones
 
 
 class TestRepeatedRecordings:
@@ -148,7 +149,7 @@ def whole():
 class TestParts:
     """Any split of a recording gives the same values and covariance."""
 
-    @pytest.mark.parametrize("name", [*PIECES, "instrumental"])
+    @pytest.mark.parametrize("name", quick_ones([*PIECES][:2], [*PIECES, "instrumental"]))
     @given(places=st.lists(st.integers(1, 999), max_size=12))
     @settings(max_examples=6, deadline=None)
     def test_they_add_up(self, name, places):
@@ -1399,6 +1400,7 @@ class TestDelay:
         assert estimate.delay == pytest.approx(7e-4, abs=3e-5)
         assert estimate.half_interval < 3e-5
 
+    @pytest.mark.long
     def test_the_scale_of_torques_does_not_bias_it(self):
         """An error of some per cent for one joint follows the motion, as the delay does."""
         errors = []

@@ -79,6 +79,7 @@ def bits(motion):
 
 
 class TestGenomes:
+    @pytest.mark.long
     @GENOMES
     def test_motions_do_not_depend_on_batch_and_process(self, genome):
         genes = some_genes(genome, 5)

@@ -138,9 +138,9 @@ class TestIdentify:
     @pytest.mark.parametrize(
         ("options", "remedy"),
         [
-            (("--estimator", "iv"), "--estimator wls"),
+            pytest.param(("--estimator", "iv"), "--estimator wls", marks=pytest.mark.long),
             (("--friction", "coulomb,dust"), "--friction"),
-            (("--fit-all", "--predict"), "omit --fit-all"),
+            pytest.param(("--fit-all", "--predict"), "omit --fit-all", marks=pytest.mark.long),
         ],
     )
     def test_options_that_do_not_fit(

@@ -29,6 +29,7 @@ from hil.control.simulated_cell import with_simulation
 from hil.control.ur_simulation import UrPeer, served_arm, simulated_ur
 from hil.control.virtual_link import VirtualLink
 from sim_fixtures.ur import CELL_PATH, UR5E_URDF, UrArmTruth, UrFault
+from tests.tiers import quick_ones
 
 HOST = "127.0.0.1"
 
@@ -61,7 +62,7 @@ def test_the_arm_is_that_of_the_cell_file() -> None:
     np.testing.assert_allclose(constants[loaded], UrArmTruth().stated_constant[loaded], rtol=1e-6)
 
 
-@pytest.mark.parametrize("own_speed", [0.05, 0.3, 1.0])
+@pytest.mark.parametrize("own_speed", quick_ones([0.3], [0.05, 0.3, 1.0]))
 def test_its_program_keeps_to_the_limits(own_speed: float) -> None:
     cell = at_free_ports(**{"limits.upper_deg": [20.0, -70.0, 130.0, -60.0, 0.0, 90.0]})
     server = served_arm(cell, own_speed=own_speed)

@@ -298,6 +298,7 @@ class TestReuse:
     def folder(self, identified: Path, tmp_path: Path) -> Path:
         return Path(shutil.copytree(identified, tmp_path / "folder"))
 
+    @pytest.mark.long
     def test_the_file_is_that_of_a_new_identification(
         self, folder: Path, monkeypatch: pytest.MonkeyPatch
     ) -> None:

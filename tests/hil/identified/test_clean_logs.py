@@ -85,6 +85,7 @@ def test_nothing_is_wrong(arm: IdentifiedArm) -> None:
     assert not [finding for finding in findings if any(word in finding.words for word in words)]
 
 
+@pytest.mark.long
 def test_it_is_exported(arm: IdentifiedArm, tmp_path: Path) -> None:
     folder = arm.save(tmp_path / "result")
     line = ["export", str(folder), "--to", "urdf", "-o", str(tmp_path / "arm.urdf")]

@@ -184,6 +184,7 @@ class TestSaved:
         assert result.verdict.good
         assert sorted(path.name for path in folder.iterdir()) == ["a.csv", "b.csv", "three.urdf"]
 
+    @pytest.mark.long
     def test_it_is_what_the_command_writes(self, folder: Path, result: Any, tmp_path: Path) -> None:
         saved = result.save(tmp_path / "python")
         arguments = ("identify", "a.csv", "--urdf", "three.urdf", "--predict", "b.csv", "--quiet")
@@ -214,6 +215,7 @@ class TestSaved:
             tmp_path / "a" / "a.mcap", predict=tmp_path / "a" / "b.mcap"
         ).verdict.good
 
+    @pytest.mark.long
     def test_the_archive_is_in_memory_until_it_is_saved(
         self, folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
     ) -> None:

@@ -385,6 +385,7 @@ class TestIdentify:
         verdicts = [run.stdout.splitlines()[0] for run in (result, again)]
         assert verdicts[0].startswith("Good for feed-forward") and verdicts[1] == verdicts[0]
 
+    @pytest.mark.long
     def test_archives_get_a_folder_as_well(self, tmp_path: Path, urdf: Path) -> None:
         archive = tmp_path / "rec.mcap"
         columns = ColumnMap.model_validate(

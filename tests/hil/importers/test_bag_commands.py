@@ -222,6 +222,7 @@ class TestStateOfAController:
         assert imported.recording.position == pytest.approx(MOVED.position)
         assert imported.entries["command_topic"] == "/arm_controller/controller_state"
 
+    @pytest.mark.long
     def test_has_the_measured_state_too(self, tmp_path, urdf) -> None:
         """Where the bag has no joint states."""
         messages = Messages()
@@ -543,6 +544,7 @@ class TestServo:
         gains = [row.value for row in results.servo if row.name == "kp"]
         assert gains == pytest.approx(KP, rel=0.05)
 
+    @pytest.mark.long
     def test_a_look_finds_no_torque(self, tmp_path, moved) -> None:
         self.imported(tmp_path, moved._replace(**{
             name: values[:500] for name, values in moved._asdict().items()

@@ -25,6 +25,7 @@ from tests import messages
 from tests.hil.importers.bag_messages import PERIOD, STAMPS, WHOLE, Message, message
 from tests.hil.importers.bags import DEFINITION, STATE, bag, mcap
 from tests.hil.importers.moving_log import COUNT, JOINTS, POSITION, SLOPE, TIME, TORQUE, URDF
+from tests.tiers import quick_ones
 
 
 @pytest.fixture
@@ -104,7 +105,7 @@ def assert_right(archive: Archive, *, rows: slice = slice(None), tolerance: floa
     assert columns["torque"] == pytest.approx(TORQUE[rows], abs=1e3 * tolerance)
 
 
-@pytest.fixture(params=["db3", "bag"])
+@pytest.fixture(params=quick_ones(["bag"], ["db3", "bag"]))
 def each_kind(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> None:
     """Bags of ROS 2 in a database, and of ROS 1."""
     monkeypatch.setattr(Typed, "suffix", request.param)
@@ -194,7 +195,7 @@ class TestPublishers:
         assert f"{COUNT} of {2 * COUNT} messages have 0 for all positions" in typed.message
         assert "second publisher" in typed.message
 
-    @pytest.mark.parametrize("share", [1, 4])
+    @pytest.mark.parametrize("share", quick_ones([4], [1, 4]))
     def test_so_is_one_of_a_fixed_pose(self, urdf, share: int) -> None:
         pose = POSITION * 0.0 + (0.3, -0.4, 1.5)
         both = [
@@ -290,7 +291,7 @@ class TestClocks:
         assert_right(typed.archive, rows=slice(3, None))
         assert "left out: messages at the start without a stamp (3)" in typed.message
 
-    @pytest.mark.parametrize("first", [0, 100])
+    @pytest.mark.parametrize("first", quick_ones([100], [0, 100]))
     def test_a_clock_that_stands_still_is_named(self, urdf, first: int) -> None:
         stalled = [
             message(k, stamp=STAMPS[first] if first <= k < 300 or not first else None)

@@ -26,6 +26,7 @@ from tests.hil.importers.moving_log import (
     assert_right,
     text,
 )
+from tests.tiers import quick_ones
 
 TABLE = np.column_stack([TIME, POSITION, TORQUE])
 SAMPLES = [
@@ -102,7 +103,7 @@ def check(source: Path, without: Sequence[int] = ()) -> None:
     assert_right(open_archive(source.with_name("out.mcap")), without=without)
 
 
-@pytest.mark.parametrize("packed", [False, True])
+@pytest.mark.parametrize("packed", quick_ones([True], [False, True]))
 @pytest.mark.parametrize("kind", JSON)
 def test_samples_in_json(tmp_path: Path, urdf: Path, kind: str, *, packed: bool) -> None:
     suffix, content = JSON[kind]

@@ -128,10 +128,20 @@ def late(table: Mapping[str, Floats]) -> dict[str, Floats]:
     ("plant", "aspect", "phrase"),
     [
         (negated, "signs", "torque negated: all joints"),
-        (exchanged, "order", f"torque columns are of {JOINTS[1]}, {JOINTS[0]}, {JOINTS[2]}"),
+        pytest.param(
+            exchanged,
+            "order",
+            f"torque columns are of {JOINTS[1]}, {JOINTS[0]}, {JOINTS[2]}",
+            marks=pytest.mark.long,
+        ),
         (of_motors, "side", "motor side (before the gears), or a current"),
         (late, "delay", "torque 4"),
-        (to_the_ground, "coupling", f"{JOINTS[1]} is recorded plus the angle of {JOINTS[0]}"),
+        pytest.param(
+            to_the_ground,
+            "coupling",
+            f"{JOINTS[1]} is recorded plus the angle of {JOINTS[0]}",
+            marks=pytest.mark.long,
+        ),
     ],
 )
 def test_a_planted_meaning_is_named(
