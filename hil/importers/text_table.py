@@ -305,6 +305,15 @@ class TextTable:
 
     def _index(self, column: Column, field: str) -> int:
         place = self._place(column)
+        same = [index for index, name in enumerate(self.names) if name == column]
+        if len(same) > 1 and not field.startswith("time"):  # exports repeat their one clock
+            raise SourceError(
+                self.path,
+                f"{len(same)} columns have the name {column!r}",
+                field=field,
+                remedy="rename them, or give their indices from 0 in the map:"
+                f" {' or '.join(map(str, same))}",
+            )
         if place is not None:
             return place
         if self.names:

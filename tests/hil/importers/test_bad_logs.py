@@ -78,6 +78,12 @@ def with_text(path: Path, table: Table) -> Path:
     return path
 
 
+def with_one_name_twice(path: Path, table: Table) -> Path:
+    text = csv(path, table).read_text()
+    path.write_text(text.replace("tau2", "tau1", 1))
+    return path
+
+
 def with_a_word(path: Path, table: Table) -> Path:
     lines = csv(path, table).read_text().splitlines()
     cells = lines[300].split(",")
@@ -134,6 +140,7 @@ CASES: list[tuple[Callable[[Path, Table], Path], str, str]] = [
     (first_rows(99), "has 99 samples in 0.", "record a motion of all joints, of 10 s or more"),
     (with_text, "line 301 has nothing in column q1", "--drop-missing"),
     (with_a_word, "line 301 has 'stopped' in column q2", "--drop-missing"),
+    (with_one_name_twice, "2 columns have the name 'tau1'", "from 0 in the map: 7 or 8"),
     (with_two_clocks, "stamp and t are all named as time", "--columns 'time=t'"),
     (of_another_motion, "its torque does not follow the arm of the URDF", "give the URDF of this"),
     (a_urdf, "is a robot description (URDF), not a recording", "LOG --urdf arm.urdf"),
