@@ -20,7 +20,7 @@ PACKAGES: Final = ("drivers", "planner", "identification", "sim_fixtures", "hil"
 CEILINGS: Final[Mapping[str, int]] = {
     "import circles": 0,
     "folder circles": 0,
-    "imports inside functions": 17,
+    "imports inside functions": 16,
     "banned names": 0,
     "functions over 60 lines": 4,
     "motions taken apart": 0,
@@ -28,7 +28,7 @@ CEILINGS: Final[Mapping[str, int]] = {
     "long names of tests": 0,
     "tests of hil outside a room": 0,
     "class names defined twice": 0,
-    "helpers of other test modules": 7,
+    "helpers of other test modules": 1,
     "long signatures without Args": 0,
 }
 """Figures that no change may exceed. Size has none: features are not traded for lines."""
