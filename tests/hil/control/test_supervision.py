@@ -531,7 +531,7 @@ def test_noise_recorded_while_the_arm_moved_is_recorded_again(tmp_path: Path) ->
 
 PROGRAM = """
 import numpy as np
-from hil.control.live_link import LARGE, return_large_arrays
+from hil.control.live_link import MMAP_THRESHOLD_BYTES, return_large_arrays
 
 def mapped():
     return int(open("/proc/self/statm").read().split()[0]) * 4096
@@ -540,7 +540,7 @@ return_large_arrays()
 teacher = np.ones(4_000_000)
 del teacher  # glibc would now take what is smaller from its heap
 before = mapped()
-arrays = [np.ones(2 * LARGE // 8) for _ in range(40)]
+arrays = [np.ones(2 * MMAP_THRESHOLD_BYTES // 8) for _ in range(40)]
 small = [np.ones(100) for _ in range(1000)]  # above them, and stay
 del arrays
 print(mapped() - before)
