@@ -7,8 +7,10 @@ from __future__ import annotations
 
 import argparse
 import ast
+import gc
 import re
 from collections.abc import Iterable, Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import cache, cached_property
 from graphlib import CycleError, TopologicalSorter
@@ -47,13 +49,25 @@ _MANY: Final = 4  # Parameters of a signature that needs a word on each
 @cache
 def tree_of(module: Path) -> ast.Module:
     """Syntax tree of a module, parsed once for all tests of a process."""
-    return ast.parse(module.read_text("utf-8"))
+    with _no_collection():
+        return ast.parse(module.read_text("utf-8"))
 
 
 @cache
 def nodes_of(module: Path) -> tuple[ast.AST, ...]:
     """All nodes of a module, likewise."""
-    return tuple(ast.walk(tree_of(module)))
+    with _no_collection():
+        return tuple(ast.walk(tree_of(module)))
+
+
+@contextmanager
+def _no_collection() -> Iterator[None]:
+    """Pause the garbage collector: it took half of the time, and trees are no garbage."""
+    gc.disable()
+    try:
+        yield
+    finally:
+        gc.enable()
 
 
 @dataclass(frozen=True)

@@ -26,6 +26,7 @@ def ensemble(posterior):
     return draw_ensemble(MODEL, *posterior, count=400, seed=5)
 
 
+@pytest.mark.long
 def test_every_arm_can_be_built(ensemble) -> None:
     assert len(ensemble) == 400
     for standard, values in zip(ensemble.standard, ensemble.values, strict=True):

@@ -1363,6 +1363,7 @@ class TestDelay:
         estimate = estimate_delay(filtered, MODEL, options=Preprocessing(torque_bandwidth=8.0))
         assert estimate.delay == pytest.approx(0.003, abs=4e-4)
 
+    @pytest.mark.long
     def test_noise_does_not_bias_it_and_the_interval_covers(self):
         """Mean within its standard error, scatter over seeds as estimated."""
         estimates = [estimate_delay(delayed(1.6e-3, seed=seed), MODEL) for seed in range(12)]

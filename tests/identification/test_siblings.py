@@ -39,6 +39,7 @@ def type_of(random, count, std):
     return true, [estimated(values, std) for values in measured]
 
 
+@pytest.mark.long
 def test_the_spread_between_arms_is_estimated():
     spreads = []
     for seed in range(20):

@@ -286,6 +286,7 @@ def test_cycles_of_a_silent_controller_are_not_missed():
     copies=st.lists(st.integers(0, 3), min_size=30),
     naps=st.lists(st.tuples(st.floats(0.0, 0.03), st.floats(0.0, 0.02)), max_size=4),
 )
+@pytest.mark.long
 def test_each_cycle_accepts_at_most_one_answer_of_its_own(delays, copies, naps):
     def answer(index, packet):
         if index == 0:

@@ -124,6 +124,7 @@ class TestNotInvented:
         p_values = [courses(fleet(seed, robots=1))[0].p_value for seed in range(30)]
         assert np.mean(np.array(p_values) < 0.05) <= 0.15
 
+    @pytest.mark.long
     def test_a_robot_of_more_noise_than_its_siblings(self):
         alarms = 0
         for seed in range(20):

@@ -312,6 +312,7 @@ class TestDataFrame:
     """A table in memory is a log."""
 
     @pytest.mark.parametrize("indexed", quick_ones([True], [False, True]))
+    @pytest.mark.long
     def test_it_gives_what_its_file_gives(
         self,
         folder: Path,

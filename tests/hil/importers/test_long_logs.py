@@ -111,6 +111,7 @@ def test_a_cell_without_a_number_is_named_by_its_line(tmp_path: Path) -> None:
         TextTable.read(path, Format(), LONGEST).numbers(["q1"], "position")
 
 
+@pytest.mark.long
 def test_a_compressed_log_is_read_in_stretches(tmp_path: Path) -> None:
     time = np.arange(ROWS) / RATE
     path = written(tmp_path / "log.csv", time, *moving(time))

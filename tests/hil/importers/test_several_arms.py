@@ -172,6 +172,7 @@ def test_joints_that_are_no_arm_are_refused_as_before(tmp_path: Path, urdf: Path
         import_recording(path, tmp_path / "a.mcap", lambda _: Robot.from_urdf(urdf))
 
 
+@pytest.mark.long
 def test_a_gripper_that_a_bag_has_not_is_fixed_by_every_import(tmp_path: Path) -> None:
     path = robot_of_arms(tmp_path, ("arm", 3))
     finger = chain("finger", 1, "arm_l3")

@@ -359,6 +359,7 @@ class TestOtherArm:
     def weak(self, text: str) -> str:
         return text.replace("effort='99'", "effort='0.1'")
 
+    @pytest.mark.long
     def test_range_and_torque_contradict_it(
         self, tmp_path: Path, table: Mapping[str, Floats]
     ) -> None:
@@ -476,6 +477,7 @@ class TestOtherArm:
         assert not self.contradictions(path, urdf).found
 
     @pytest.mark.parametrize("change", quick_ones(["narrow"], ["narrow", "weak"]))
+    @pytest.mark.long
     def test_one_of_them_alone_may_be_a_limit_that_is_wrong(
         self, tmp_path: Path, table: Mapping[str, Floats], change: str
     ) -> None:
