@@ -233,6 +233,7 @@ class TestReading:
         assert refusal("<!-- a > b -->\n" + arm("<mass ", "<mass\n\t")) is None
 
     @pytest.mark.parametrize("text", [ARM, ARM[:-1]])
+    @pytest.mark.long
     def test_a_description_of_20_mb_is_freed_after_reading(self, text):
         refusal(text)
         gc.collect()

@@ -109,6 +109,7 @@ class TestJointsThatWereNotRecorded:
         assert option == "--locked lift"
         assert typed(*line, *option.split(), "-o", folder / "locked").exit_code == 0
 
+    @pytest.mark.long
     def test_all_others_are_locked_with_a_map_that_has_joints(self, folder: Path) -> None:
         line = ["import", "log", folder / "log.csv", "--urdf", folder / "longer.urdf"]
         line += ["--lock-others", "-o", folder / "others.mcap"]

@@ -432,6 +432,7 @@ class TestOutputFolder:
         (tmp_path / "a-2").write_text("notes")
         assert folder_beside(path, sources_text([path], [])) == tmp_path / "a-3"
 
+    @pytest.mark.long
     def test_no_archive_replaces_the_recording(self, tmp_path: Path, urdf: Path) -> None:
         """A foreign MCAP file in the folder that was named for the results."""
         source = tmp_path / "x.mcap"

@@ -121,6 +121,7 @@ def test_a_moving_arm_states_no_constants(tmp_path: Path, monkeypatch: pytest.Mo
     assert any("hold the arm still" in note for note in said["notes"])
 
 
+@pytest.mark.long
 def test_a_motion_is_found_for_the_new_cell_as_it_is(
     server: UrServer, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
