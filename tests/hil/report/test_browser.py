@@ -198,7 +198,7 @@ class TestPaper:
         assert page_count(page.pdf(prefer_css_page_size=True)) == 1
         page.emulate_media(media="print")
         for selector in (".verdict", ".occasion", f'[data-chart="t{joints - 1}"] > svg',
-                         'text="Variance explained [%]"'):  # fmt: skip
+                         'th:text-is("R²")'):  # fmt: skip
             assert page.locator(selector).first.is_visible()
         assert not page.locator("#parameters").is_visible()
         opened.close()
