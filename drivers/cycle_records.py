@@ -68,11 +68,11 @@ class RowColumns:
     """How numbers of packets become fields of rows, a few operations for all of them.
 
     Args:
-        layout: of a row: its floats, then its integers.
-        places: of each number of a row among those of a packet; -1 where the packet has none.
-        factors: of each.
-        count: numbers of a packet.
-        unknown: integer that the packet does not have; other numbers are NaN.
+        layout: fields of a row: floats first, then integers.
+        places: index in the packet of each number of a row; -1 if the packet lacks it.
+        factors: scale of each number.
+        count: numbers in a packet.
+        unknown: value of integers that the packet lacks; missing floats are NaN.
     """
 
     def __init__(

@@ -53,7 +53,7 @@ def has_servo(archive: Archive) -> bool:
 
 
 def require_commands(archive: Archive, recording: Path, *, fitted: bool) -> None:
-    """Check that commanded positions and measured ones are those of a servo.
+    """Check that the recording has the commands and measured positions of a servo.
 
     Args:
         archive: of a recording.

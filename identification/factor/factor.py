@@ -371,7 +371,7 @@ class Factor:
         return replace(self, matrices=matrices, counts=counts, block=block)
 
     def scaled(self, times: float) -> Self:
-        """Return the sums of rows that count so many times each."""
+        """Return the sums with every row weighted by `times`."""
         counts = np.rint(times * self.counts).astype(np.intp)
         return replace(self, matrices=tuple(times * m for m in self.matrices), counts=counts)
 

@@ -21,7 +21,7 @@ _SIGNIFICANT_SIGMAS: Final = 3.0  # standard errors over the blocks of a signifi
 _EXPLAINED_ERROR_RATIO: Final = 0.55
 _LONE_JOINT_ERROR_RATIO: Final = 0.7  # the same, if the joint then is as good as the others
 _SAME_PART_ERROR_RATIO: Final = 0.85  # the same, if separate parameters for the part do no better
-# noise floors; those of coloured noise are underestimated by a third
+# noise floors; a floor of coloured noise is estimated a third too low
 _NEAR_NOISE_FLOORS: Final = 2.0
 _MIN_POWER_SHARE: Final = 1e-20  # squared torque of an axis that counts, as a share of the largest
 _SEPARATE_ERROR_RATIO: Final = 1.1  # error ratio to separate parameters

@@ -1,9 +1,9 @@
-"""What prepared recordings of one arm are other than stated: the one question of every command.
+"""How recordings of one arm differ from what was stated, asked in one place for every command.
 
-In this order: whether there are bodies and gravity in the torque, and the times are those of the
-motion; whether signs, orders, coupled angles, zeros and scales of joints are other than stated;
-then, with a fit whose errors are to be explained, delay, friction by the load, drift of a joint,
-and load, scale and friction of parts.
+In this order: whether the torque contains bodies and gravity, and whether the time scale fits the
+motion; then signs, orders, coupled angles, zeros and scales of joints; finally, if a fit has errors
+to explain, delay, friction that grows with load, drift of a joint, and load, scale and friction of
+parts of the motion.
 """
 
 from __future__ import annotations
@@ -55,7 +55,7 @@ ROWS: Final = 700
 _WEIGHTLESS_ERROR_RATIO: Final = 0.7
 _SURE_SIGMAS: Final = 4.5  # standard errors of it
 _MIN_ROWS: Final = 100  # that say something of bodies
-# of the nominal torque, below which bodies are not those of the arm
+# share of the nominal torque below which the bodies are not the arm's
 _MIN_NOMINAL_SCALE: Final = 1.0 / 3.0
 # torque of bodies over that of friction where there is none of bodies
 _MIN_BODY_TORQUE_RATIO: Final = 0.5

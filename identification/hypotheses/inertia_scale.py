@@ -110,7 +110,7 @@ def find_inertia_scale(
 
 
 def retimed(model: RobotModel, samples: Samples, factor: float) -> Samples:
-    """Return samples whose recorded times are so many times the true ones, with these."""
+    """Return samples at their true times, if recorded times are too long by a factor."""
     motion = samples.motion
     start = motion.time[0]
     motion = replace(

@@ -23,7 +23,7 @@ COVERED_SHARE: Final = 0.95
 """Of directions and postures: the force is seen in so many."""
 _SEED: Final = 20140902
 _LEVER_ROUNDING: Final = 1e-9  # m, of a lever
-_MIN_LEVERAGE: Final = 0.1  # of the median one; with less a mass cannot be told from the residual
+_MIN_LEVERAGE: Final = 0.1  # of the median; below it a mass is indistinguishable from the residual
 
 
 class ContactLevel(NamedTuple):

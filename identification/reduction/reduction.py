@@ -35,7 +35,7 @@ class Unmodelled:
     elastic: ElasticTorque | None
 
     def scaled(self, times: float) -> Unmodelled:
-        """Return the sums of rows that count so many times each."""
+        """Return the sums with every row weighted by `times`."""
         elastic = None if self.elastic is None else self.elastic.scaled(times)
         return Unmodelled(self.forms.scaled(times), elastic)
 

@@ -81,10 +81,9 @@ def contacts_of(motion: ServoMotion, fit: ServoFit, resolution: Array) -> list[C
 
 
 def _beyond(motion: ServoMotion, every: int, fit: ServoFit) -> tuple[Array, Array]:
-    """Return what neither motion nor friction explains (m, n), and its standard deviation (m, n).
+    """Return the unexplained position error of the servo (m, n) and its standard deviation (m, n).
 
-    In position errors of the servo, of every so many instants of a motion; friction is that at
-    rest, the largest.
+    At every `every`-th sample, beyond what motion and static friction, the largest, explain.
     """
     estimate = fit.estimate
     n, count = estimate.coordinates.shape

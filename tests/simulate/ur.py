@@ -137,22 +137,34 @@ def scenario(seed: int, outcomes: Callable[[str], object] = lambda _: None) -> S
     return Scenario(f"python -m tests.simulate.ur --seed {seed}", lines, seen)
 
 
-def main() -> None:
-    """Play seeds; print those that break a law, and what became of the motions."""
-    parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
+def violations(seed: int, ends: Counter[str]) -> list[str]:
+    """Play a seed; return a sentence and the script for each law that was broken."""
+    played = scenario(seed, lambda outcome: ends.update([outcome]))
+    script = "  ".join(played.lines)
+    return [f"{played.name}: {law}: {text}\n    {script}" for law, text in judged(played)]
+
+
+def play_seeds(description: str, play: Callable[[int, Counter[str]], Sequence[str]]) -> None:
+    """Play the seeds of the command line; print what breaks a law, and how the runs ended.
+
+    Args:
+        description: of the command; its first line is shown.
+        play: plays a seed, counts how its runs ended, and returns the violations.
+    """
+    parser = argparse.ArgumentParser(description=description.partition("\n")[0])
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--count", type=int, default=1)
     options = parser.parse_args()
     ends: Counter[str] = Counter()
     broken = 0
     for seed in range(options.seed, options.seed + options.count):
-        played = scenario(seed, lambda outcome: ends.update([outcome]))
-        for law, text in judged(played):
+        for text in play(seed, ends):
             broken += 1
-            sys.stdout.write(f"{played.name}: {law}: {text}\n    {'  '.join(played.lines)}\n")
+            sys.stdout.write(f"{text}\n")
+            sys.stdout.flush()
     sys.stdout.write(f"{options.count} seeds, {broken} violations; {dict(ends)}\n")
     sys.exit(1 if broken else 0)
 
 
 if __name__ == "__main__":
-    main()
+    play_seeds(__doc__, violations)

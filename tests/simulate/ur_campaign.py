@@ -8,12 +8,11 @@ without faults, as its operator would.
 
 from __future__ import annotations
 
-import argparse
 import random
-import sys
 import tempfile
 from collections import Counter
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any, Final
 
@@ -35,7 +34,7 @@ from tests.laws.table import Scenario, judged
 from tests.process_death.ends import ENDS
 from tests.process_death.play import completed_evidence, finish_in_virtual_time
 from tests.simulate.draws import Story
-from tests.simulate.ur import DRAWS, PREFIX
+from tests.simulate.ur import DRAWS, PREFIX, play_seeds
 
 CYCLES: Final = 3600
 """Of the campaign without faults; faults are drawn in these."""
@@ -162,32 +161,15 @@ def archives_of(campaign: Campaign) -> tuple[tuple[ArchiveFile, ...], tuple[str,
 
 
 def violations(stage: CampaignStage, seed: int, ends: Counter[str]) -> list[str]:
-    """Play a seed; return a sentence for each law that was broken."""
+    """Play a seed; return a sentence and the script for each law that was broken."""
+    script = "  ".join(draw_script(seed))
     with tempfile.TemporaryDirectory() as folder:
         return [
-            f"{scenario.name}: {law}: {text}"
+            f"{scenario.name}: {law}: {text}\n    {script}"
             for scenario in stage.scenarios(seed, Path(folder), ends)
             for law, text in judged(scenario)
         ]
 
 
-def main() -> None:
-    """Play seeds; print those that break a law, and how the runs ended."""
-    parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
-    parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument("--count", type=int, default=1)
-    options = parser.parse_args()
-    ends: Counter[str] = Counter()
-    stage = CampaignStage.set_up()
-    broken = 0
-    for seed in range(options.seed, options.seed + options.count):
-        for text in violations(stage, seed, ends):
-            broken += 1
-            sys.stdout.write(f"{text}\n    {'  '.join(draw_script(seed))}\n")
-            sys.stdout.flush()
-    sys.stdout.write(f"{options.count} campaigns, {broken} violations; {dict(ends)}\n")
-    sys.exit(1 if broken else 0)
-
-
 if __name__ == "__main__":
-    main()
+    play_seeds(__doc__, partial(violations, CampaignStage.set_up()))

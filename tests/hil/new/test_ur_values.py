@@ -100,13 +100,17 @@ def test_constants_are_those_that_the_arm_states(
     assert any("weigh a known payload" in note for note in said["notes"])
 
 
-def test_a_urdf_gives_masses_and_the_arm_the_rest(
-    server: UrServer, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def cell_with_masses(server: UrServer, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Cell:
     urdf = tmp_path / "ur5e.urdf"
     urdf.write_text(UR5E_URDF)
     _, path = made_by(server, tmp_path, monkeypatch, "--urdf", str(urdf))
-    cell = Cell.load(path)
+    return Cell.load(path)
+
+
+def test_a_urdf_gives_masses_and_the_arm_the_rest(
+    server: UrServer, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    cell = cell_with_masses(server, tmp_path, monkeypatch)
     assert cell.file.cell.urdf == "ur5e.urdf" and cell.urdf == UR5E_URDF
     assert cell.file.cell.serial_number == "20235500123"
 
@@ -126,10 +130,7 @@ def test_a_motion_is_found_for_the_new_cell_as_it_is(
     server: UrServer, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """On a floor, with a margin of 2 cm: joints that turn twice need one turn."""
-    urdf = tmp_path / "ur5e.urdf"
-    urdf.write_text(UR5E_URDF)
-    _, path = made_by(server, tmp_path, monkeypatch, "--urdf", str(urdf))
-    cell = Cell.load(path)
+    cell = cell_with_masses(server, tmp_path, monkeypatch)
     assert (cell.workspace.floor, cell.workspace.margin) == (0.0, 0.02)
     assert cell.campaign.range_share == 0.5
     plan = design(cell, Silent())
