@@ -47,10 +47,10 @@ def look(
 ) -> None:
     """Show what each channel of a recording is, how certain that is, and what it can determine.
 
-    Names, units and the slope of the positions tell a part, and with --urdf the torque tells the
-    rest: side, sign, order and zero of the joints, gravity, mounting, delay and low-pass. Where two
-    explanations fit equally well, both are shown with their errors; on a terminal you choose,
-    otherwise the lines to choose from are printed for the map, and the exit status is 2.
+    Names, units and the slope of the positions decide some of it; with --urdf the torque decides
+    the rest: side, sign, order and zero of the joints, gravity, mounting, delay and low-pass.
+    Where two explanations fit equally well, both are shown with their errors; on a terminal you
+    choose, otherwise the lines to choose from are printed for the map, and the exit status is 2.
 
     **Example:** `hil look log.csv --urdf arm.urdf`
 
