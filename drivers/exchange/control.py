@@ -112,8 +112,9 @@ class SharedState(ctypes.Structure):
         ended_outcome: of the last of them, an index of `OUTCOMES`.
         ended_interval: of its records, -1 if open mode was not reached.
         overflow: records overwritten before they were archived.
-        late: packets without a reply within a cycle of their arrival: dropped for a newer one, or
+        late: packets without a reply within a cycle of their arrival: left out for a newer one, or
             replied to late; `replied_late` of them got a reply.
+        late_packets: packets that came late themselves (`drivers.punctuality`).
         rejected: replies not accepted by the controller.
         worst_turnaround_us: longest time from arrival (in the kernel, if the link has time stamps)
             to the departure of the reply, µs.
@@ -156,6 +157,7 @@ class SharedState(ctypes.Structure):
     foreign: int
     late: int
     replied_late: int
+    late_packets: int
     rejected: int
     refused: int
     worst_turnaround_us: float

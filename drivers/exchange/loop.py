@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
+from dataclasses import dataclass
 from typing import Final, NamedTuple
 
 from drivers.errors import TransportClosed
+from drivers.punctuality import BUNCHED, CAME_LATE, LEFT_OUT, REPLIED_TO_LATE
 from drivers.session import Session
 from drivers.states import STATES_WITH_SET_POINTS, State
 from drivers.transports.base import Transport
@@ -92,7 +94,7 @@ class ReceiveQueue:
     A reply to any other comes too late, and a motion would run ahead of the arm by one step for
     each. Of each kind (length, status, modes) only the newest packet gets a reply, so that
     the session sees axes open and close; packets before and after an init packet are of different
-    kinds. The others are counted as "late".
+    kinds. The others are counted as left out or as bunched (`drivers.punctuality`).
 
     A full queue contains the oldest packets. If the newest packet found is so old that later ones
     were dropped, it gets no reply either while axes are open: the next one comes within a cycle.
@@ -147,19 +149,20 @@ class ReceiveQueue:
     def _newest(self, first: Arrival, period: float) -> tuple[Arrival, ...]:
         """Return the newest of each kind among a packet and the packets queued behind it."""
         transport = self._transport
-        backlog = _Backlog(self._session.wire)
+        backlog = _Backlog(self._session.wire, _BUNCHED_PERIODS * period)
         backlog.add(first)
         for _ in range(_MAX_BACKLOG):
             packet = transport.receive(0.0)
             if packet is None:
                 break
             backlog.add(self._arrival(packet, self._stamp(), transport.now))
-        arrivals = tuple(arrival for _, arrival in backlog.newest)
-        dropped = backlog.dropped
-        if dropped and self._too_old(arrivals, period):
+        arrivals = tuple(queued.arrival for queued in backlog.newest)
+        left_out = backlog.left_out
+        if left_out + backlog.bunched and self._too_old(arrivals, period):
             arrivals = ()
-            dropped = dropped + 1
-        self._session.discarded("late", dropped)
+            left_out += 1
+        self._session.discarded(LEFT_OUT, left_out)
+        self._session.discarded(BUNCHED, backlog.bunched)
         return arrivals
 
     def _too_old(self, arrivals: tuple[Arrival, ...], period: float) -> bool:
@@ -177,54 +180,84 @@ class ReceiveQueue:
         return age > max(_OLD_BACKLOG_PERIODS * period, _OLD_BACKLOG_SECONDS)
 
 
+@dataclass(eq=False)
+class _Queued:
+    """A packet of a backlog; `bunched` if another came closely after it."""
+
+    kind: _Kind
+    number: int
+    arrival: Arrival
+    bunched: bool = False
+
+
 class _Backlog:
     """The newest packet of each kind, in the order of arrival.
 
     Two packets whose numbers are far apart are both retained: one is of another session, or its
     number is corrupt, which the session can decide.
 
+    Args:
+        wire: of the session.
+        bunch: time between two arrivals below which the earlier packet was delayed on its way, s.
+
     Attributes:
-        newest: kind and packet.
-        dropped: packets not retained, without repetitions of one that was.
+        newest: packets, one of each kind.
+        left_out, bunched: packets not retained, without repetitions of one that was, by
+            `drivers.punctuality`.
     """
 
-    def __init__(self, wire: Wire) -> None:
-        self.dropped = 0
-        self.newest: list[tuple[_Kind, Arrival]] = []
+    def __init__(self, wire: Wire, bunch: float) -> None:
+        self.left_out = 0
+        self.bunched = 0
+        self.newest: list[_Queued] = []
         self._wire = wire
-        self._numbers: list[int] = []  # of the newest
+        self._bunch = bunch
+        self._last: _Queued | None = None
         self._sessions = 0
 
     def add(self, arrival: Arrival) -> None:
         """Add a packet that came after the others."""
-        packet = arrival.packet
-        starts, sort, number = self._wire.sort(packet)
+        starts, sort, number = self._wire.sort(arrival.packet)
         self._sessions += starts
-        kind = self._sessions, sort
+        last, queued = self._last, _Queued((self._sessions, sort), number, arrival)
+        self._last = queued
+        if last is not None:
+            last.bunched = self._follows_closely(last.arrival, arrival)
         ahead = self._wire.ahead
-        for place, (other, earlier) in enumerate(self.newest):
-            if other != kind:
+        for other in self.newest:
+            if other.kind != queued.kind:
                 continue
-            if packet == earlier.packet:
+            if arrival.packet == other.arrival.packet:
                 return
-            if ahead(self._numbers[place], number) <= _NUMBER_WINDOW:
-                self.dropped += 1  # it was overtaken on its way
+            if ahead(other.number, number) <= _NUMBER_WINDOW:
+                queued.bunched = last is not None and last.bunched  # it was overtaken on its way
+                self._count(queued)
                 return
-            if ahead(number, self._numbers[place]) <= _NUMBER_WINDOW:
-                self._drop(place)
+            if ahead(number, other.number) <= _NUMBER_WINDOW:
+                self._drop(other)
                 break
         if len(self.newest) >= MAX_REPLIED_PACKETS:
-            self._drop(0)
-        self.newest.append((kind, arrival))
-        self._numbers.append(number)
+            self._drop(self.newest[0])
+        self.newest.append(queued)
 
-    def _drop(self, place: int) -> None:
-        del self.newest[place], self._numbers[place]
-        self.dropped += 1
+    def _follows_closely(self, earlier: Arrival, later: Arrival) -> bool:
+        """Whether the link delayed the earlier packet: it is known when both came."""
+        known = earlier.stamped and later.stamped
+        return known and later.arrived - earlier.arrived < self._bunch
+
+    def _drop(self, queued: _Queued) -> None:
+        self.newest.remove(queued)
+        self._count(queued)
+
+    def _count(self, queued: _Queued) -> None:
+        if queued.bunched:
+            self.bunched += 1
+        else:
+            self.left_out += 1
 
 
 class _LatenessMonitor:
-    """Counts replies that leave more than a cycle after their packet arrived, as "replied to late".
+    """Counts packets that came late, and replies that left late (`drivers.punctuality`).
 
     More than `max_late` in a row, each overtaken by the controller's next packet, stop a motion on
     its path: the controller has accepted none of them, or each in a later cycle than intended. A
@@ -236,6 +269,8 @@ class _LatenessMonitor:
         self._max_late = max_late
         self._late_reply_at = -math.inf
         self._consecutive = 0
+        self._arrived = math.nan  # that of the last packet
+        self._cycle = 0
 
     def before_reply(self, arrived: float) -> None:
         """Record the arrival of a packet; infinite if it is not known."""
@@ -247,10 +282,18 @@ class _LatenessMonitor:
         if self._consecutive > self._max_late and self._session.state is State.OPEN:
             self._session.stop(f"{self._consecutive} consecutive replies left too late")
 
-    def after_reply(self, arrived: float, sent: float) -> None:
+    def after_reply(self, arrived: float, sent: float, *, stamped: bool) -> None:
         """Record the time at which its reply left."""
-        if sent - arrived > self._session.period:
-            self._session.discarded("replied to late", 1)
+        session = self._session
+        period = session.period
+        cycles = session.cycle - self._cycle
+        if cycles:  # not the packet before once more
+            if cycles > 0 and arrived - self._arrived > (cycles + 1) * period:
+                session.discarded(CAME_LATE, 1)
+            self._arrived = arrived if stamped else math.nan
+            self._cycle = session.cycle
+        if sent - arrived > period:
+            session.discarded(REPLIED_TO_LATE, 1)
             self._late_reply_at = sent
         else:
             self._late_reply_at = -math.inf
@@ -306,7 +349,7 @@ def exchange(
                     # Silence is counted from the reply: the packet may have been queued for long.
                     if session.deadline != deadline:
                         session.sent(now)
-                    lateness.after_reply(arrived, now)
+                    lateness.after_reply(arrived, now, stamped=stamped)
                 peers.after_packet(reply is not None)
             handled += 1
             if handled % _COUNT_EVERY == 0:

@@ -45,6 +45,7 @@ from drivers.exchange.event_log import (
 from drivers.exchange.loop import POLL_PERIOD
 from drivers.exchange.motion_transfer import READ, WITHDRAWN, Inbox, unpack
 from drivers.motion_source import MotionSource, progress_of
+from drivers.punctuality import REPLIED_TO_LATE, Punctuality
 from drivers.session import Session
 from drivers.states import State
 from drivers.transports.base import Transport
@@ -383,8 +384,10 @@ class CommandHandler:
         control.overflow = self._ring.overflow
         control.malformed = counters.malformed + discarded.get("malformed", 0)
         control.foreign = discarded.get("foreign", 0)
-        control.replied_late = discarded.get("replied to late", 0)
-        control.late = discarded.get("late", 0) + control.replied_late
+        punctuality = Punctuality.of(discarded)
+        control.replied_late = discarded.get(REPLIED_TO_LATE, 0)
+        control.late = punctuality.late_replies
+        control.late_packets = punctuality.late_packets
         control.worst_turnaround_us = 1e6 * self._worst
         control.motion_time, control.rate = progress_of(self._source)
 

@@ -21,6 +21,7 @@ from typing import Final
 
 from drivers.errors import TransportClosed
 from drivers.packets import HEADER_LENGTH
+from drivers.transports.arrival import CONTROL_BYTES, SO_TIMESTAMPNS, ArrivalClock
 from drivers.transports.base import (
     DirectRoute,
     FreePort,
@@ -38,15 +39,10 @@ TYPE_OF_SERVICE: Final = 0x28
 BUSY_POLL_US: Final = 50
 """Time that the kernel may poll the network device before it sleeps, µs."""
 # Constants of asm-generic/socket.h that the socket module lacks.
-_SO_TIMESTAMPNS: Final = 35
 _SO_BUSY_POLL: Final = 46
 _SO_MEMINFO: Final = 55
 _MEMINFO: Final = struct.Struct("=9I")
 _TIMEVAL: Final = struct.Struct("@qq")
-_TIMESPEC: Final = struct.Struct("@qq")
-_CONTROL_SPACE: Final = socket.CMSG_SPACE(_TIMESPEC.size)
-_MAX_CLOCK_STEP: Final = 1e-3
-"""Change of the difference between wall and monotonic clock that means that one was set, s."""
 MAX_FOREIGN_PACKETS: Final = 1000
 """Datagrams of other hosts skipped after the time-out, more than a queue usually holds."""
 
@@ -99,8 +95,7 @@ class UdpTransport:
         address: host and port bound.
         notes: optional socket options refused by the system.
         arrived: time at which the kernel received the last datagram, on the clock of `now`, not
-            before the previous one; None if unknown. If the system's clock was set in between,
-            the time at which it was read.
+            before the previous one; None if unknown (`ArrivalClock`).
         polls_until: time until which `receive` polls instead of sleeping: a processor that slept
             wakes up slowly, a virtual one most of all. In the past at first.
     """
@@ -111,8 +106,7 @@ class UdpTransport:
         self.address: tuple[str, int] = self._socket.getsockname()
         self.notes = _set_options(self._socket)
         self._timeout = math.nan
-        self._earliest = time.monotonic()  # no later datagram arrived before
-        self._offset = time.time() - self._earliest
+        self._clock = ArrivalClock()
         self.arrived: float | None = None
         self.polls_until = -math.inf
         self._receive = self._socket.recvmsg
@@ -151,7 +145,7 @@ class UdpTransport:
             flags = socket.MSG_DONTWAIT if polls else self._flags(timeout)
             try:
                 packet, control, _, sender = self._receive(
-                    MAX_PACKET_BYTES + 1, _CONTROL_SPACE, flags
+                    MAX_PACKET_BYTES + 1, CONTROL_BYTES, flags
                 )
             except BlockingIOError:
                 if polls:
@@ -169,7 +163,7 @@ class UdpTransport:
             if (sender == self._peer and len(packet) <= MAX_PACKET_BYTES) or self._accepts(
                 packet, sender
             ):
-                self.arrived = self._arrival(control)
+                self.arrived = self._clock.arrival(control)
                 return packet
             # Foreign datagrams do not extend the wait, but those queued behind them are read.
             timeout = max(0.0, end - time.monotonic())
@@ -257,24 +251,6 @@ class UdpTransport:
             return False
         return True
 
-    def _arrival(self, control: list[tuple[int, int, bytes]]) -> float | None:
-        """Convert the kernel's time of arrival from the wall clock to the monotonic clock."""
-        if not control:
-            return None
-        seconds, nanoseconds = _TIMESPEC.unpack(control[0][2])
-        wall = time.time()
-        now = time.monotonic()
-        offset = self._offset
-        self._offset = wall - now
-        if abs(self._offset - offset) > _MAX_CLOCK_STEP:
-            arrived = now
-        else:
-            # The queue is in order: an older stamp means that the clock was set since.
-            queued = wall - seconds - 1e-9 * nanoseconds
-            arrived = min(now, max(now - queued, self._earliest))
-        self._earliest = arrived
-        return arrived
-
     def _count(self, kind: str) -> None:
         self._rejected[kind] = self._rejected.get(kind, 0) + 1
 
@@ -342,7 +318,7 @@ def _set_options(udp: socket.socket) -> tuple[str, ...]:
         ("IP_TOS", socket.IPPROTO_IP, socket.IP_TOS, TYPE_OF_SERVICE),
         ("SO_PRIORITY", socket.SOL_SOCKET, socket.SO_PRIORITY, SOCKET_PRIORITY),
         ("SO_BUSY_POLL", socket.SOL_SOCKET, _SO_BUSY_POLL, BUSY_POLL_US),
-        ("SO_TIMESTAMPNS", socket.SOL_SOCKET, _SO_TIMESTAMPNS, 1),
+        ("SO_TIMESTAMPNS", socket.SOL_SOCKET, SO_TIMESTAMPNS, 1),
     ):
         try:
             udp.setsockopt(level, option, value)

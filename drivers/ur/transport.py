@@ -7,6 +7,7 @@ computer is needed.
 
 from __future__ import annotations
 
+import os
 import select
 import socket
 import struct
@@ -17,6 +18,7 @@ from dataclasses import dataclass
 from typing import Final
 
 from drivers.errors import TransportClosed
+from drivers.transports.arrival import CONTROL_BYTES, SO_TIMESTAMPNS, ArrivalClock
 from drivers.transports.base import (
     DirectRoute,
     Need,
@@ -136,6 +138,9 @@ class UrTransport:
     A reply is a frame of inputs, with a program behind it if one is to run.
 
     Attributes:
+        arrived: time at which the kernel received the last frame, on the clock of `now`; None if
+            unknown, and of a frame that was read together with a later one.
+        notes: optional socket options refused by the system.
         polls_until: time until which `receive` polls instead of sleeping.
     """
 
@@ -149,9 +154,9 @@ class UrTransport:
         self._socket = connection
         self._primary: socket.socket | None = primary
         self._splitter = agreed.splitter
-        self._ready: deque[bytes] = deque([description.encode()])
+        self._ready: deque[tuple[bytes, float | None]] = deque([(description.encode(), None)])
         self._ready += [
-            rtde.frame(rtde.FrameType(kind), payload)
+            (rtde.frame(rtde.FrameType(kind), payload), None)
             for _, (kind, payload) in agreed.frames
             if kind in (rtde.FrameType.DATA, rtde.FrameType.TEXT)
         ]
@@ -160,6 +165,9 @@ class UrTransport:
         self._program = bytearray()
         self._counts: dict[str, int] = {}
         self._closed = False
+        self._clock = ArrivalClock()
+        self.arrived: float | None = None
+        self.notes = _stamped(connection)
         self.polls_until = float("-inf")
         for each in (connection, primary):
             each.setblocking(False)
@@ -183,9 +191,15 @@ class UrTransport:
             left = end - time.monotonic()
             polls = time.monotonic() < self.polls_until
             self._read(0.0 if polls else max(0.0, left))
-            if not self._ready and left <= 0.0:
+            if self._ready:
+                break
+            if left <= 0.0:
                 return None
-        return self._ready.popleft()
+            if polls:
+                # To threads of the same priority, as `UdpTransport` does.
+                os.sched_yield()
+        packet, self.arrived = self._ready.popleft()
+        return packet
 
     def _read(self, timeout: float) -> None:
         """Read what has come on both connections, waiting for the first of it."""
@@ -201,7 +215,7 @@ class UrTransport:
 
     def _read_frames(self) -> None:
         try:
-            data = self._socket.recv(_READ_BYTES)
+            data, control, _, _ = self._socket.recvmsg(_READ_BYTES, CONTROL_BYTES)
         except BlockingIOError:
             return
         except OSError as error:
@@ -212,9 +226,12 @@ class UrTransport:
             frames = self._splitter.feed(data)
         except rtde.RtdeError as error:
             raise TransportClosed(str(error)) from error
-        for kind, payload in frames:
+        arrived = self._clock.arrival(control)
+        for k, (kind, payload) in enumerate(frames, 1):
             if kind in (rtde.FrameType.DATA, rtde.FrameType.TEXT):
-                self._ready.append(rtde.frame(rtde.FrameType(kind), payload))
+                # The stamp is that of the last byte: when earlier frames came is not known.
+                stamp = arrived if k == len(frames) else None
+                self._ready.append((rtde.frame(rtde.FrameType(kind), payload), stamp))
 
     def _read_primary(self) -> None:
         """Read what the primary interface says; without it, motions end as usual."""
@@ -234,7 +251,7 @@ class UrTransport:
             self._note(text)
 
     def _note(self, text: str) -> None:
-        self._ready.append(rtde.text_frame(text, "controller"))
+        self._ready.append((rtde.text_frame(text, "controller"), None))
 
     def wait(self, timeout: float) -> bool:
         """Whether a frame is there within `timeout` s; to the precision of timers."""
@@ -299,6 +316,15 @@ class UrTransport:
             with suppress(OSError):
                 self._primary.close()
             self._primary = None
+
+
+def _stamped(connection: socket.socket) -> tuple[str, ...]:
+    """Have the kernel attach times of arrival; returns the refusal, if it is one."""
+    try:
+        connection.setsockopt(socket.SOL_SOCKET, SO_TIMESTAMPNS, 1)
+    except OSError as error:
+        return (f"SO_TIMESTAMPNS = 1 was refused ({error.strerror})",)
+    return ()
 
 
 class _Loopback:

@@ -252,6 +252,7 @@ class ArchiveOutcome(BaseModel):
         outcome, reason: such as ``completed``, ``stopped``, ``refused``; why it did not complete.
         samples, events: numbers written.
         lost_packets, records_lost, events_lost: lost by the link and by this PC.
+        late_packets: that came late themselves; None if none did, or none were counted.
         late_replies: late, or omitted because a newer packet had arrived.
         repaired: whether the file was repaired with loss.
         samples_lost, losses: by repairs, None where unknown; a sentence each.
@@ -268,6 +269,7 @@ class ArchiveOutcome(BaseModel):
     lost_packets: _Count = None
     records_lost: _Count = None
     events_lost: _Count = None
+    late_packets: _Count = None
     late_replies: Annotated[_Count, Field(alias="late_answers")] = None
     replies_not_accepted: Annotated[_Count, Field(alias="answers_not_taken")] = None
     repaired: Annotated[bool, BeforeValidator(lambda text: text == "yes")] = False

@@ -35,6 +35,7 @@ from drivers.exchange.event_log import (
     ExchangeStarted,
     Leaving,
 )
+from drivers.punctuality import LATE_PACKETS, LATE_REPLIES
 from drivers.states import Outcome
 from hil.archive.header import REPLIES_LOST
 from hil.archive.schema import Level
@@ -95,8 +96,6 @@ def level_of(event: ExchangeEvent) -> Level:
 
 Records = NDArray[np.void]
 
-LATE_KINDS = frozenset({"late", "replied to late"})
-"""Kinds of `PacketRejected`: dropped for a newer packet, or replied to after its cycle."""
 AFTERMATH_SECONDS = 0.5  # Time recorded after a motion was refused or lost, s
 
 
@@ -128,6 +127,7 @@ class Recorded:
         records, records_lost: cycles archived, and overwritten before they could be.
         events_lost: events overwritten before they could be archived.
         missed: packets that never arrived.
+        late_packets: packets that came late themselves (`drivers.punctuality`).
         late: packets whose reply was late, or left out for a newer one.
         not_accepted: replies that the controller did not accept.
         disk_waited: longest write [s].
@@ -144,6 +144,7 @@ class Recorded:
     late: int
     not_accepted: int
     disk_waited: float
+    late_packets: int = 0
 
 
 class Recorder:
@@ -170,6 +171,7 @@ class Recorder:
         self.records = 0
         self._records_lost = 0
         self._events_lost = 0
+        self._late_packets = 0
         self._late = 0
         self._not_accepted = 0
         self._drive_train = drive_train
@@ -190,8 +192,10 @@ class Recorder:
                 self._events_lost += event.count
             elif isinstance(event, RepliesLost):
                 self._not_accepted += event.count
-            elif isinstance(event, PacketRejected) and event.kind in LATE_KINDS:
+            elif isinstance(event, PacketRejected) and event.kind in LATE_REPLIES:
                 self._late += event.count
+            elif isinstance(event, PacketRejected) and event.kind in LATE_PACKETS:
+                self._late_packets += event.count
             self._archive(event)
         if lost:
             self._records_lost += lost
@@ -226,6 +230,8 @@ class Recorder:
             "late_answers": self._late,
             "answers_not_taken": self._not_accepted,
         }
+        if self._late_packets:
+            counts["late_packets"] = self._late_packets
         details = {key: str(value) for key, value in counts.items()}
         self.writer.close(outcome, reason=reason, details=details)
         return Recorded(
@@ -240,6 +246,7 @@ class Recorder:
             late=self._late,
             not_accepted=self._not_accepted,
             disk_waited=self.writer.file.slowest_flush,
+            late_packets=self._late_packets,
         )
 
     def update(self, events: Sequence[ExchangeEvent]) -> None:

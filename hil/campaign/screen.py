@@ -69,7 +69,8 @@ def _times(motion: MotionProgress) -> str:
 
 
 def _packets(motion: MotionProgress) -> str:
-    return f"{motion.missed} missed, {motion.late} late, {motion.not_accepted} not accepted"
+    packets = f"packets {motion.missed} missed, {motion.late_packets} late"
+    return f"{packets}; replies {motion.late} late, {motion.not_accepted} not accepted"
 
 
 def _motion_rows(names: Sequence[str], motion: MotionProgress) -> list[RenderableType]:
@@ -80,7 +81,7 @@ def _motion_rows(names: Sequence[str], motion: MotionProgress) -> list[Renderabl
     done = motion.motion_time or 0.0
     total = motion.duration or math.inf
     progress.add_row(ProgressBar(total, done), _times(motion))
-    lost = motion.missed or motion.late or motion.not_accepted
+    lost = motion.missed or motion.late_packets or motion.late or motion.not_accepted
     packets = Text(f"cycles {motion.cycles}, {_packets(motion)}", "bold yellow" if lost else "")
     if motion.position is None and motion.following_error is None:
         return [progress, packets]

@@ -153,6 +153,7 @@ _UNITS: Final[Mapping[str, str | Mapping[str, str]]] = {
         "outcome.records_lost": "cycles",
         "outcome.events_lost": "events",
         "outcome.late_answers": "packets",
+        "outcome.late_packets": "packets",
         "outcome.answers_not_taken": "replies",
         "outcome.lost_packets": "packets",
         "outcome.repaired.samples_lost": "samples",

@@ -229,6 +229,7 @@ def _figures(path: Path, done: Recorded, cell: Cell) -> dict[str, object]:
         "cycles": done.records,
         "duration": done.records * cell.period,
         "missed": done.missed,
+        "late_packets": done.late_packets,
         "late": done.late,
         "not_accepted": done.not_accepted,
         "records_lost": done.records_lost,
@@ -237,8 +238,9 @@ def _figures(path: Path, done: Recorded, cell: Cell) -> dict[str, object]:
 
 
 LINE: Final = (
-    "{archive}: {duration:.1f} s in {cycles} cycles, {missed} packets missed, {late} replies "
-    "late, {not_accepted} not accepted, {records_lost} records and {events_lost} events lost; "
+    "{archive}: {duration:.1f} s in {cycles} cycles, {missed} packets missed, {late_packets} "
+    "late, {late} replies late, {not_accepted} not accepted, {records_lost} records and "
+    "{events_lost} events lost; "
     "{outcome}: {reason}"
 )
 HEARD_LINE: Final = (
@@ -287,7 +289,10 @@ class View:
             f"{progress.cycles * self._cell.period:.1f} s  {progress.missed} missed"
         )
         if self._replies:
-            text += f", {progress.late} late, {progress.not_accepted} not accepted"
+            text += (
+                f", {progress.late_packets} late, replies {progress.late} late, "
+                f"{progress.not_accepted} not accepted"
+            )
         if progress.position is None or not np.isfinite(progress.position).all():
             return text
         return f"{text}  {AngleFrame.pendant(self._cell).text_of_angles(progress.position)}"

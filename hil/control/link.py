@@ -64,7 +64,7 @@ class Progress:
 
     Attributes:
         cycles: archived so far.
-        missed, late, not_accepted: see `Recorded`.
+        missed, late_packets, late, not_accepted: see `Recorded`.
         position: (n,) rad, measured last; None before the first record.
         waiting: what was received until a packet of the controller was replied to; "" since then.
         over: why nothing is recorded any more while replies continue; "" during the recording.
@@ -76,6 +76,7 @@ class Progress:
     position: Array | None = None
     late: int = 0
     not_accepted: int = 0
+    late_packets: int = 0
     waiting: str = ""
     over: str = ""
 
@@ -468,6 +469,7 @@ class MotionLink:
                 self._position,
                 late=status.late,
                 not_accepted=status.not_accepted,
+                late_packets=status.late_packets,
                 waiting="" if status.replied else self._waiting(),
                 over=over,
             )

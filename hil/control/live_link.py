@@ -240,6 +240,7 @@ class LivePort:
             ended_count=status.ended_count,
             motion_time=status.motion_time,
             rate=status.rate,
+            late_packets=status.late_packets,
         )
 
     def failure(self) -> str | None:

@@ -78,6 +78,7 @@ class MotionProgress:
         motion_time, duration: s of the planned motion, done and in total; None if unknown.
         cycles, missed, late, not_accepted: packets of this motion that got a reply, never arrived,
             got it late or not at all, and whose reply was not accepted.
+        late_packets: packets of this motion that came late themselves.
         position: rad, measured.
         following_error: rad, the controller's target minus position.
         current: A at the motors, the controller's target; no current is measured.
@@ -101,6 +102,7 @@ class MotionProgress:
     override: float = 1.0
     rate: float | None = None
     held: bool = False
+    late_packets: int = 0
 
 
 class MotionWatch(Protocol):

@@ -112,7 +112,9 @@ class OperatorControl:
         self._due = time.monotonic() + SHOW_PERIOD
         if len(records := self._port.new_records()):
             self._last = records[-1:].copy()
-        replied, missed, late, not_accepted = np.subtract(status.counts, self._before).tolist()
+        replied, missed, late_packets, late, not_accepted = np.subtract(
+            status.counts, self._before
+        ).tolist()
         arrays: dict[str, Array] = {}
         if self._last is not None:
             last = self._last[0]
@@ -134,6 +136,7 @@ class OperatorControl:
                 missed=missed,
                 late=late,
                 not_accepted=not_accepted,
+                late_packets=late_packets,
                 state=status.state,
                 override=self.fraction,
                 rate=None if math.isnan(status.rate) else status.rate,

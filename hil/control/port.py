@@ -31,6 +31,7 @@ class PortStatus:
         cycle: the controller's.
         replied, missed, late, not_accepted: packets that got a reply, never arrived, got it late or
             not at all, and whose reply was not accepted.
+        late_packets: packets that came late themselves.
         foreign: packets from other addresses.
         ended_count: motions that have ended, also where the event of it was lost.
         motion_time, rate: elapsed time [s] of the last motion at its planned speed, and motion time
@@ -47,11 +48,12 @@ class PortStatus:
     ended_count: int
     motion_time: float
     rate: float
+    late_packets: int = 0
 
     @property
-    def counts(self) -> tuple[int, int, int, int]:
-        """Packets that got a reply, were missed, got it late, and were not accepted."""
-        return self.replied, self.missed, self.late, self.not_accepted
+    def counts(self) -> tuple[int, int, int, int, int]:
+        """Packets that got a reply, were missed, came late, got it late, and were not accepted."""
+        return self.replied, self.missed, self.late_packets, self.late, self.not_accepted
 
 
 class ControllerPort(Protocol):

@@ -14,6 +14,7 @@ from drivers.events import Event, MotionEnded
 from drivers.exchange.loop import exchange
 from drivers.guard import Guard
 from drivers.motion_source import MotionSource, progress_of
+from drivers.punctuality import Punctuality
 from drivers.session import Session
 from drivers.states import STATES_WITH_SET_POINTS
 from drivers.transports.base import Transport
@@ -75,18 +76,20 @@ class VirtualPort:
         counters = self.session.counters
         ring = self.ring
         discarded = counters.discarded
+        punctuality = Punctuality.of(discarded)
         motion_time, rate = progress_of(self._source)
         return PortStatus(
             state=self.session.state,
             cycle=int(ring.cycle[(ring.written - 1) % ring.capacity]),
             replied=counters.replied,
             missed=counters.missed,
-            late=discarded.get("late", 0) + discarded.get("replied to late", 0),
+            late=punctuality.late_replies,
             not_accepted=counters.rejected,
             foreign=discarded.get("foreign", 0),
             ended_count=self._ended_count,
             motion_time=motion_time,
             rate=rate,
+            late_packets=punctuality.late_packets,
         )
 
     def failure(self) -> str | None:

@@ -214,6 +214,8 @@ IN_THE_SESSION = {
 }  # fmt: skip
 BESIDE = {"states", "packet_losses", "cycle_records"}
 """The session's table, what it counts as lost, and the ring that receives the record."""
+CLOCK = {"arrival"}
+"""By which a socket's times of arrival are read; no packet passes it."""
 
 
 BEFORE = {"udp", "loop"}
@@ -269,7 +271,7 @@ def test_a_packet_from_the_network_passes_nine_files():
         assert len(controller.recv(2048)) == len(rig.packet())
     assert rig.state is State.OPEN
     assert rig.session.execution is not None
-    assert passed == BEFORE | IN_THE_SESSION | BESIDE
+    assert passed == BEFORE | IN_THE_SESSION | BESIDE | CLOCK
     assert len(BEFORE | IN_THE_SESSION) == 9
 
 
@@ -316,5 +318,5 @@ def test_a_frame_from_a_ur_controller_passes_nine_files():
         assert theirs.recv(2048)[2:3] == b"U"
     assert bench.state is State.OPEN
     assert bench.session.execution is not None
-    assert passed == FROM_RTDE | BESIDE
+    assert passed == FROM_RTDE | BESIDE | CLOCK
     assert len(FROM_RTDE) == 9

@@ -211,6 +211,11 @@ class Bunched(Link):
         self.now = max(self.now, self.arrived)
         return packet
 
+    def wake_up(self, now):
+        """This process does not run until `now`."""
+        self.now = max(self.now, now)
+        return False
+
 
 class TestBacklog:
     """Replies to packets that arrived while the exchange was not running."""
@@ -307,6 +312,26 @@ class TestBacklog:
         assert len(self.serve(rig, on_time, late)) == 3
         assert source.advances <= advances + 1
         assert state in self.states(rig)
+
+    @pytest.mark.parametrize(
+        ("apart", "counts"),
+        [
+            (0.01, {"late": 1, "bunched": 3}),
+            (0.49, {"late": 1, "bunched": 3}),
+            (0.51, {"late": 4}),
+            (1.0, {"late": 4}),
+        ],
+    )
+    def test_packets_that_come_closely_together_are_not_left_out_by_this_computer(
+        self, apart, counts
+    ):
+        """It reads one, and four that came from a cycle later on, after the last of them."""
+        rig, _ = moving()
+        packets = [rig.packet() for _ in range(5)]
+        times = rig.now + PERIOD * np.array([1.0, *(2.0 + apart * np.arange(4))])
+        link = Bunched(zip(times, packets, strict=True))
+        exchange(link, rig.session, ends_when=lambda: link.wake_up(times[-1]))
+        assert rig.session.counters.discarded == counts
 
     def test_overtaken_packets_of_a_backlog_are_dropped(self):
         rig, source = moving()
@@ -405,6 +430,7 @@ class EchoSession:
     deadline = 1e9
 
     def __init__(self):
+        self.cycle = 0
         self.discards = {}
         self.stops = []
 
@@ -549,6 +575,51 @@ def test_estimated_arrivals_count_no_reply_as_late(slower):
     assert session.discards.get("replied to late", 0) == 0
     assert session.stops == []
     assert np.diff(arrivals).min() > 0.9 * PERIOD, "they are recorded as they were received"
+
+
+class TestPacketsThatComeLate:
+    """A rig's controller sends in its cycle, and the link delays what it sends."""
+
+    def serve(self, delays, *, skipped=0, away=0.0):
+        """Packets come so many cycles late; `skipped` ones before the last are lost."""
+        rig = closed()
+        times, packets = [], []
+        for cycle, delay in enumerate(delays, 1):
+            packet = rig.packet()
+            if not len(delays) - skipped <= cycle < len(delays):
+                times.append(rig.now + (cycle + delay) * PERIOD)
+                packets.append(packet)
+        link = Bunched(zip(times, packets, strict=True))
+        exchange(link, rig.session, ends_when=lambda: link.wake_up(link.now + away * PERIOD))
+        return rig.session.counters
+
+    @pytest.mark.parametrize(
+        ("delays", "counts"),
+        [
+            ([0.0] * 20, {}),
+            ([0.0, 0.4] * 10, {}),
+            ([0.0] * 10 + [1.2, 0.25] + [0.0] * 10, {"bunched": 1}),
+            ([0.0] * 10 + [1.01] * 10, {"came late": 1}),
+            ([0.0] * 10 + [0.0, 5.0] + [5.0] * 10, {"came late": 1}),
+        ],
+    )
+    def test_they_are_counted_as_packets_and_not_as_replies(self, delays, counts):
+        """By their number: a controller whose cycles are shifted was late once."""
+        assert self.serve(delays).discarded == counts
+
+    def test_packets_lost_before_one_do_not_make_it_late(self):
+        counters = self.serve([0.0] * 20, skipped=6)
+        assert (counters.missed, counters.discarded) == (6, {})
+
+    def test_a_computer_that_reads_late_is_to_blame_itself(self):
+        assert self.serve([0.0] * 20, away=1.2).discarded.keys() == {"late"}
+
+    def test_without_times_of_arrival_no_packet_is_called_late(self):
+        rig = closed()
+        first, second = rig.packet(), rig.packet()
+        link = Backlogged([[first], [second]], rig.now, silence=0.0)
+        exchange(link, rig.session, ends_when=lambda: bool(setattr(link, "now", link.now + 0.1)))
+        assert rig.session.counters.discarded == {}
 
 
 class TestFullQueue:

@@ -517,6 +517,9 @@ class TestPublished:
         assert (block.ended_count, block.outcome, block.ended_interval) == (1, "refused", 3)
 
     def test_late_replies_are_counted_sent_or_not(self, bench):
-        bench.session.counters.discarded = {"late": 4, "replied to late": 3}
+        bench.session.counters.discarded = {
+            "late": 4, "replied to late": 3, "came late": 5, "bunched": 6,
+        }  # fmt: skip
         bench.serving.conclude()
         assert (bench.control.late, bench.control.replied_late) == (7, 3)
+        assert bench.control.late_packets == 11, "they are not this computer's"

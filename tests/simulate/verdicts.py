@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import Any, Final, Self
 
 from drivers.events import Event, GapSeen, InitReceived, LinkLost, MotionEnded, RepliesLost
+from drivers.punctuality import BUNCHED, LEFT_OUT
 from tests.faults import kind_of, parse_script
 from tests.laws.evidence import Broken, Evidence
 from tests.laws.table import Scenario, broken, judged
@@ -68,7 +69,7 @@ MET: Final[dict[str, Callable[[Life, Observed], Any]]] = {
     "a duplicate was answered": lambda life, _: life.counters.duplicates,
     "a stale packet was left out": lambda life, _: life.counters.stale,
     "a malformed packet was left out": lambda life, _: life.counters.malformed,
-    "packets piled up": lambda life, _: life.counters.discarded.get("late"),
+    "packets piled up": lambda life, _: {LEFT_OUT, BUNCHED} & life.counters.discarded.keys(),
     "packets were missed": lambda life, _: life.counters.missed,
     "more were missed than allowed": lambda life, seen: any(
         gap.missed > seen.cell.controller.max_gap for gap in _events(life, GapSeen)

@@ -174,13 +174,16 @@ class TestArchiveProcess:
         memory.events.write(RepliesLost(2, 10))
         memory.events.write(PacketRejected("replied to late", 3))
         memory.events.write(PacketRejected("late", 4))
+        memory.events.write(PacketRejected("came late", 5))
+        memory.events.write(PacketRejected("bunched", 6))
         wait(lambda: open_archive(path).n_samples > 0)
         for number in range(5000):  # far more than the log holds, faster than it is read
             memory.events.write(PacketRejected("foreign", number))
         done = rig.end()
         stored = outcome(path)
-        assert (done.late, done.not_accepted) == (7, 2)
+        assert (done.late, done.late_packets, done.not_accepted) == (7, 11, 2)
         assert (stored.late_replies, stored.replies_not_accepted) == (7, 2)
+        assert stored.late_packets == 11
         assert stored.events_lost == done.events_lost > 0
         # The name of lost replies in archives is older than that of their event.
         names = {event.name for event in complete_archive(path).events}

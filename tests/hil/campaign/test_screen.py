@@ -44,6 +44,7 @@ def status(**changes: Any) -> RunStatus:
     """A repetition in the middle, with something of everything."""
     motion = {
         "motion_time": 6.2, "duration": 18.6, "cycles": 123456, "missed": 2, "late": 1,
+        "late_packets": 3,
         "not_accepted": 0, "state": State.OPEN,
         "following_error": np.radians([0.0, 0.15, -0.2, 0.01, -0.02, 1.01]),
         "following_share": np.array([0.0, 0.31, 0.85, 0.02, 0.04, 1.3]),
@@ -77,7 +78,8 @@ class TestPicture:
         text = "\n".join(rows)
         for phrase in (
             "10.2.12.150", "repetition 7 of 30", "19:05 left", "6.2 of 18.6 s",
-            "override 80 %", "now 75 %", "cycles 123456, 2 missed, 1 late, 0 not accepted",
+            "override 80 %", "now 75 %",
+            "cycles 123456, packets 2 missed, 3 late; replies 1 late, 0 not accepted",
             "repetition 5 rejected: its current differs", layout.HELP,
         ):  # fmt: skip
             assert phrase in text

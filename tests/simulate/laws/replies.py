@@ -9,6 +9,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 from typing import Final
 
+from drivers.punctuality import BUNCHED, LEFT_OUT
 from tests.drivers.oracle import LAST, number_of
 from tests.simulate.observed import Life, Observed
 
@@ -52,7 +53,7 @@ def _counters(life: Life, conversation: Heard) -> Iterator[str]:
     # Waiting packets that were being read at the end are not counted.
     given = [index for index, other in enumerate(life.exchanged) if other.given]
     pile = [index for index in conversation.left_out if given and index < given[-1]]
-    late = counters.discarded.get("late", 0)
+    late = counters.discarded.get(LEFT_OUT, 0) + counters.discarded.get(BUNCHED, 0)
     left_out = len(conversation.left_out)
     refused = counters.stale + counters.malformed + counters.ended
     for name, number, least, most in (
