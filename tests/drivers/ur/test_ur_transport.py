@@ -58,7 +58,7 @@ def test_a_frame_came_when_the_kernel_received_it(
     assert before <= transport.arrived <= after
 
 
-def test_of_frames_that_are_read_at_once_only_the_last_has_a_time(
+def test_of_frames_read_at_once_the_last_has_a_time(
     link: tuple[UrTransport, socket.socket],
 ) -> None:
     transport, theirs = link
