@@ -1,13 +1,13 @@
 """Identification with default settings and an ordinary fit, on real and on degraded recordings.
 
 Run with ``python -m benchmarks.board [--data FOLDER] [--only NAME] [--splits WHICH]
-[--degraded] [--choices] [--json] [--page FILE]``, where FOLDER holds the folders of recordings that
-`benchmarks/recordings` describes. ``--fetch [FROM ...]`` collects these in FOLDER instead
-(`benchmarks.fetch`); ``--page docs/board.md`` writes the page (`benchmarks.board_page`), with
-``--rows FILE`` from a saved line of JSON instead of measuring. With ``--splits short`` the first
-and the last 40 % of each log are fitted and its rest is predicted; with ``--splits perturbed``
-other pairs of motions, halves of logs, their first 10, 20 and 30 s, and one row in two, which show
-what becomes of other recordings of these robots.
+[--degraded] [--choices] [--averaging] [--json] [--page FILE]``, where FOLDER holds the folders of
+recordings that `benchmarks/recordings` describes. ``--fetch [FROM ...]`` collects these in FOLDER
+instead (`benchmarks.fetch`); ``--page docs/board.md`` writes the page (`benchmarks.board_page`),
+with ``--rows FILE`` from a saved line of JSON instead of measuring. With ``--splits short`` the
+first and the last 40 % of each log are fitted and its rest is predicted; with ``--splits
+perturbed`` other pairs of motions, halves of logs, their first 10, 20 and 30 s, and one row in two,
+which show what becomes of other recordings of these robots.
 
 Errors are ||tau - tau_hat|| / ||tau|| over all joints and every row of what is predicted, of the
 torque as it was recorded. *hil* imports a recording and identifies from the archive as `hil
@@ -21,7 +21,8 @@ worst, and which rows are above 1.03 of `plain` or above a nominal model.
 
 With ``--choices``, each row is repeated without each automatic choice in turn
 (`benchmarks.choices`): the error over that with all of them, and in the summary whether the other
-robots would keep the choice.
+robots would keep the choice. With ``--averaging``, each row has what averaged answers would be
+worth (`benchmarks.averaging`), and the summary whether the other robots would average.
 
 With ``--degraded``, the first held-out split of each robot and of the simulated cell is repeated
 with copies of the logs, each with one fault (`benchmarks.degradations`): the error, that of the
@@ -43,6 +44,7 @@ from typing import Any, Final, Literal, NamedTuple, get_args
 import numpy as np
 
 from benchmarks import parser_of, plain_fit, show
+from benchmarks.averaging import ALL, watched
 from benchmarks.board_page import commit, write_page
 from benchmarks.choices import CHOICES, judged_by_others, taken, without
 from benchmarks.degradations import CAUSES, DEGRADATIONS, EXPECTED, FITTED_ONLY, HARMLESS
@@ -179,17 +181,19 @@ def row(
     logs: Mapping[str, JointLog],
     *,
     choices: bool = False,
+    averaging: bool = False,
 ) -> Row:
     """All errors on one split of logs, which the archives hold, and the seconds that two took.
 
-    With `choices`, `without` has the error without each choice over that with all.
+    With `choices`, `without` has the error without each choice over that with all; with
+    `averaging`, `averaged` has the error with averaged answers over that as it is.
 
     `inside` is None in sample; `white_inside`: of the intervals that white residuals would have.
     Seconds are of the processor.
     """
     parts = cut(split, logs)
     start = time.process_time()
-    with taken() as made:
+    with taken() as made, watched() as seen:
         ours = identified_split(split, archives, parts)
     middle = time.process_time()
     fit, fit_joints = fit_errors(parts)
@@ -215,11 +219,17 @@ def row(
         "inside": None if calibration is None else calibration.inside,
         "white_inside": None if calibration is None else calibration.white_inside,
         **({"without": left_out} if choices else {}),
+        **({"averaged": seen.ratios()} if averaging else {}),
     }
 
 
 def rows_of(
-    name: str, data: Path, which: Which = "configured", *, choices: bool = False
+    name: str,
+    data: Path,
+    which: Which = "configured",
+    *,
+    choices: bool = False,
+    averaging: bool = False,
 ) -> Iterator[Row]:
     """Every split of a configuration, or every other one, in the folder of all recordings."""
     published = Published.named(name)
@@ -231,7 +241,7 @@ def rows_of(
             seconds = {log: float(np.ptp(values.time)) for log, values in logs.items()}
             splits = published.perturbed_splits(seconds)
         for split in splits:
-            yield row(name, split, archives, logs, choices=choices)
+            yield row(name, split, archives, logs, choices=choices, averaging=averaging)
 
 
 def import_all(published: Published, data: Path, folder: Path) -> dict[str, Path]:
@@ -369,6 +379,13 @@ def summary(rows: Sequence[Row], degraded: Sequence[Row]) -> dict[str, Any]:
             ]
         if "without" in rows[0]:
             figures["choices"] = judged_by_others(rows)
+        if "averaged" in rows[0]:
+            figures["averaging"] = judged_by_others(rows, "averaged")
+            averaged = [row["ratio"] * row["averaged"][ALL] for row in rows]
+            figures["worst_averaged"] = max(averaged)
+            figures["mean_averaged"] = float(np.exp(np.log(averaged).mean()))
+            figures["averaged_above_one"] = sum(ratio > 1.0 for ratio in averaged)
+            figures["above_one"] = int(np.sum(ratios > 1.0))
     if degraded:
         figures |= {"degraded": list(degraded), "right": sum(row["right"] for row in degraded)}
     return figures
@@ -401,6 +418,18 @@ def summary_lines(figures: Mapping[str, Any]) -> Iterator[str]:
             f" {judged['worst']:.2f}); left out by the others of"
             f" {', '.join(judged['dropped_by']) or 'none'}"
         )
+    for answers, judged in figures.get("averaging", {}).items():
+        yield (
+            f"with averaged answers, {answers}: {judged['mean']:.3f} ({judged['best']:.2f} to"
+            f" {judged['worst']:.2f}); averaged by the others of"
+            f" {', '.join(judged['dropped_by']) or 'none'}"
+        )
+    if "averaging" in figures:
+        yield (
+            f"with averaged answers, hil / plain: geometric mean {figures['mean_averaged']:.3f},"
+            f" worst {figures['worst_averaged']:.3f}, above 1 in {figures['averaged_above_one']}"
+            f" rows ({figures['above_one']} as it is)"
+        )
     if "right" in figures:
         yield f"right verdicts: {figures['right']} of {len(figures['degraded'])}"
 
@@ -420,6 +449,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
         " halves, 10 to 30 s, one row in two",
     )
     parser.add_argument("--choices", action="store_true", help="without each choice as well")
+    parser.add_argument("--averaging", action="store_true", help="averaged answers as well")
     parser.add_argument("--degraded", action="store_true", help="spoilt copies as well")
     parser.add_argument(
         "--fetch", nargs="*", type=Path, metavar="FROM",
@@ -442,7 +472,13 @@ def main(arguments: Sequence[str] | None = None) -> None:
     rows: list[Row] = []
     degraded: list[Row] = []
     for name in wanted:
-        measured = rows_of(name, options.data, options.splits, choices=options.choices)
+        measured = rows_of(
+            name,
+            options.data,
+            options.splits,
+            choices=options.choices,
+            averaging=options.averaging,
+        )
         for row in () if name == SIMULATED else measured:
             rows.append(row)
             if not options.json:

@@ -124,7 +124,12 @@ def page_text(rows: Sequence[Mapping[str, Any]], commit: str) -> str:
     losses = [line for line in every if line.is_loss]
     others = [line for line in every if not line.is_loss]
     return "\n".join(
-        [*_introduction(here, losses, commit), *_tables(losses, others), *_choices(rows)]
+        [
+            *_introduction(here, losses, commit),
+            *_tables(losses, others),
+            *_choices(rows),
+            *_averaging(rows),
+        ]
     )
 
 
@@ -155,7 +160,7 @@ a range covers a group of rows. Sources that the report does not name are *not n
 _COMMANDS: Final = """\
 ```text
 python -m benchmarks.board --fetch FROM --data DIR   # collects the recordings
-python -m benchmarks.board --data DIR --choices --page docs/board.md
+python -m benchmarks.board --data DIR --choices --averaging --page docs/board.md
 ```"""
 _WIDTH: Final = 110
 
@@ -205,22 +210,38 @@ geometric, over robots. *Others* is the mean where each robot follows what the o
 which is the judgement leave-one-robot-out: at 1 no robot would drop the choice.
 """
 
+_AVERAGING: Final = """\
+Each cell is the error with averaged answers (`benchmarks/averaging.py`) over that as it is: below
+1 averaging pays, above it costs; empty within 0.5 %. *Mean* is geometric, over robots. *Others* is
+the mean where each robot averages if that is better on the other robots: at 1 none would.
+"""
+
 
 def _choices(rows: Sequence[Mapping[str, Any]]) -> Iterator[str]:
     """Yield what each row has without each choice, and whether the other robots keep it."""
-    if not rows or any("without" not in row for row in rows):
-        return
-    judged = judged_by_others(rows)
-    used = [name for name in judged if any(abs(row["without"][name] - 1.0) > _SEEN for row in rows)]
-    yield "## Without each choice"
+    if rows and all("without" in row for row in rows):
+        yield from _judged("Without each choice", _CHOICES, rows, "without")
+
+
+def _averaging(rows: Sequence[Mapping[str, Any]]) -> Iterator[str]:
+    """Yield what each row has with averaged answers, and whether the other robots average."""
+    if rows and all("averaged" in row for row in rows):
+        yield from _judged("With averaged answers", _AVERAGING, rows, "averaged")
+
+
+def _judged(title: str, text: str, rows: Sequence[Mapping[str, Any]], key: str) -> Iterator[str]:
+    judged = judged_by_others(rows, key)
+    used = [name for name in judged if any(abs(row[key][name] - 1.0) > _SEEN for row in rows)]
+    yield f"## {title}"
     yield ""
-    yield from _wrapped(_CHOICES)
+    yield from _wrapped(text)
     yield f"| row | {' | '.join(used)} |"
     yield f"|---|{'---|' * len(used)}"
     for row in rows:
-        yield f"| {row['data']}, {row['split']} | {' | '.join(_cells(row['without'], used))} |"
-    for title, key in (("mean", "mean"), ("others", "left_to_others")):
-        yield f"| *{title}* | {' | '.join(f'{judged[name][key]:.3f}' for name in used)} |"
+        yield f"| {row['data']}, {row['split']} | {' | '.join(_cells(row[key], used))} |"
+    for name_of_row, figure in (("mean", "mean"), ("others", "left_to_others")):
+        cells = " | ".join(f"{judged[name][figure]:.3f}" for name in used)
+        yield f"| *{name_of_row}* | {cells} |"
     yield ""
     unused = ", ".join(name for name in judged if name not in used)
     if unused:

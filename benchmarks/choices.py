@@ -117,18 +117,24 @@ def _added_delay(settings: Settings) -> float:
     return abs(settings.preprocessing.torque_delay - settings.stated_delay)
 
 
-def judged_by_others(rows: Sequence[Mapping[str, Any]]) -> dict[str, dict[str, Any]]:
+def judged_by_others(
+    rows: Sequence[Mapping[str, Any]], key: str = "without"
+) -> dict[str, dict[str, Any]]:
     """Whether the other robots would keep each choice, and the mean ratio if they decide.
 
     `mean`: geometric mean over robots of the error without it over that with it; `dropped_by`: the
     robots whose others would leave it out; `left_to_others`: geometric mean over robots of the
     error that their others choose over that with the choice.
+
+    Args:
+        rows: of the board.
+        key: under which a row has the error without each choice over that with it.
     """
     table = {}
-    for choice in CHOICES:
+    for choice in rows[0][key]:
         robots: dict[str, list[float]] = {}
         for row in rows:
-            robots.setdefault(row["data"], []).append(float(np.log(row["without"][choice])))
+            robots.setdefault(row["data"], []).append(float(np.log(row[key][choice])))
         means = {name: float(np.mean(logs)) for name, logs in robots.items()}
         dropped = [
             name

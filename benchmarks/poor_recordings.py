@@ -34,6 +34,7 @@ from numpy.typing import NDArray
 
 from benchmarks import parser_of, plain_fit, show
 from benchmarks.arms import urdf
+from benchmarks.averaging import ALL, watched
 from benchmarks.board import ABOVE_PLAIN, identified
 from benchmarks.coverage import drawn_body
 from benchmarks.joint_log import JointLog
@@ -390,12 +391,16 @@ def drawn(seed: int) -> Drawn:
     return Drawn(case, log_fitted.rows(slice(0, cut)), log_fitted.rows(slice(cut, None)))
 
 
-def errors_of(draw: Drawn) -> dict[str, Any]:
-    """Errors [%] of hil and of ordinary fits, and the ratio of hil to the ordinary one."""
+def errors_of(draw: Drawn, *, averaging: bool = False) -> dict[str, Any]:
+    """Errors [%] of hil and of ordinary fits, and the ratio of hil to the ordinary one.
+
+    With `averaging`, `averaged` is the error of hil with averaged answers over that as it is.
+    """
     with tempfile.TemporaryDirectory() as scratch:
         fitted = draw.fitted.imported(Path(scratch) / "fitted.mcap")
         predicted = draw.predicted.imported(Path(scratch) / "predicted.mcap")
-        ours = identified(fitted, [predicted])
+        with watched() as seen:
+            ours = identified(fitted, [predicted])
     robot = draw.fitted.pinocchio_model()
     fits = {"plain": plain_fit.fit, "plain + prior": plain_fit.fit_with_prior}
     if plain_fit.has_masses(robot):
@@ -405,7 +410,10 @@ def errors_of(draw: Drawn) -> dict[str, Any]:
         torque = fit(robot, draw.fitted.measured).predicted_torque(draw.predicted.measured)
         errors[name] = plain_fit.relative_error(draw.predicted.torque, torque)
     result: dict[str, Any] = {name: round(100.0 * error, 2) for name, error in errors.items()}
-    return {**result, "ratio": round(errors["hil"] / errors["plain"], 3)}
+    result["ratio"] = round(errors["hil"] / errors["plain"], 3)
+    if averaging:
+        result["averaged"] = round(seen.ratios()[ALL], 4)
+    return result
 
 
 def summary(rows: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
@@ -421,6 +429,19 @@ def summary(rows: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
         "worst_ratio": float(ratios.max()),
         "above_plain": above,
         "behind_nominal_friction": behind,
+        **_averaged(rows),
+    }
+
+
+def _averaged(rows: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
+    """The same figures with averaged answers, of rows that have them."""
+    ratios = [row["ratio"] * row["averaged"] for row in rows if "averaged" in row]
+    if not ratios:
+        return {}
+    return {
+        "mean_averaged": float(np.exp(np.log(np.maximum(ratios, 1e-6)).mean())),
+        "worst_averaged": max(ratios),
+        "averaged_above_plain": sum(ratio > ABOVE_PLAIN for ratio in ratios),
     }
 
 
@@ -429,13 +450,14 @@ def main() -> None:
     parser = parser_of(__doc__)
     parser.add_argument("--seeds", type=int, default=30)
     parser.add_argument("--first-seed", type=int, default=0)
+    parser.add_argument("--averaging", action="store_true", help="averaged answers as well")
     options = parser.parse_args()
     rows = []
     for seed in range(options.first_seed, options.first_seed + options.seeds):
         draw = drawn(seed)
         row: dict[str, Any] = {"seed": seed, "case": draw.case}
         try:
-            row |= errors_of(draw)
+            row |= errors_of(draw, averaging=options.averaging)
         except (HilError, IdentificationError) as error:
             row["refused"] = str(error)
         rows.append(row)

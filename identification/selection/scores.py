@@ -213,7 +213,7 @@ class SettingsTrial:
         """
         theirs, ours = (self.errors(each).segments for each in (other, chosen))
         change, std = _change(theirs, ours, transfer)
-        return math.exp(-0.5 * (max(0.0, change) / std) ** 2)
+        return 1.0 if change <= 0.0 else math.exp(-0.5 * (change / std) ** 2)
 
     def decide_last(self, name: str, candidates: Sequence[Settings]) -> SettingDecision:
         """Return the last candidate up to which none predicts worse than the first.
@@ -258,7 +258,7 @@ class SettingsTrial:
     def stiffness(self, joint: str, settings: Settings) -> float:
         """Return the fitted stiffness of the torsion spring of a joint [N·m/rad]."""
         model = self.model(settings)
-        values = self._values(settings)
+        values = self.values(settings)
         springs = [
             placed.part
             for placed in model.elements.identified
@@ -326,12 +326,12 @@ class SettingsTrial:
     def fitted_error(self, settings: Settings) -> float:
         """Return the error of the fitted rows themselves; infinite if none can be fitted."""
         try:
-            values = self._values(settings)
+            values = self.values(settings)
         except (IdentificationError, np.linalg.LinAlgError):
             return math.inf
         return self._folds(settings).fitted.relative_error(values)
 
-    def _values(self, settings: Settings) -> Array:
+    def values(self, settings: Settings) -> Array:
         """Return the parameters (p,) that all fitted rows give."""
         return self._estimator(settings)(self._folds(settings).fitted)
 
@@ -358,7 +358,7 @@ class SettingsTrial:
         Up to twice those recorded and at least to a usual one, which another motion may have.
         """
         model = self.model(settings)
-        values = self._values(settings)
+        values = self.values(settings)
         table = model.friction.table(values[model.friction_part])
         fastest = np.max(
             [np.abs(each.motion.velocity).max(axis=0) for each in self.samples(settings)], axis=0
@@ -405,7 +405,7 @@ class SettingsTrial:
         as bodies that cannot exist may be (Yoshida and Khalil 2000).
         """
         model = self.model(settings)
-        values = self._values(settings)
+        values = self.values(settings)
         samples = self.samples(settings)
         moved = [(each.motion.position, each.motion.acceleration) for each in samples]
         alike = np.flatnonzero(_correlation(moved) ** 2 > 1.0 - 1.0 / _MAX_VARIANCE_INFLATION)
@@ -439,7 +439,7 @@ class SettingsTrial:
 
         Weighted by the torque of their joints: that of a joint with hardly any torque is open.
         """
-        values = self._values(settings)
+        values = self.values(settings)
         power = self._folds(settings).fitted.gram[:, -1, -1]
         model = self.model(settings)
         shares = [
@@ -468,7 +468,7 @@ class SettingsTrial:
         if not model.friction.has_load:
             return samples
         without = settings.with_friction(load=False)
-        values = self._values(without)
+        values = self.values(without)
         return [each.with_load(self.model(without), values) for each in samples]
 
     def _retain_samples(self, settings: Settings) -> None:

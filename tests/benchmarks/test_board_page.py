@@ -11,6 +11,7 @@ from typing import Any
 import pytest
 
 from benchmarks import board, board_page, fetch
+from benchmarks.averaging import ALL, COLUMNS
 from benchmarks.board_page import Line
 from benchmarks.choices import CHOICES
 from benchmarks.published import Published, Source, known
@@ -142,6 +143,13 @@ class TestPage:
         assert "| row | rows | velocity |" in section
         assert "| gen3, a to b | 1.20 | 0.90 |" in section
         assert "| gen3, a to b | 1.10 |  |" in section
+        assert "bandwidth" in section.split("Without effect on every row:")[1]
+
+    def test_averaged_answers_are_shown_where_they_change_a_row(self) -> None:
+        rows = [row(0.05, averaged=dict.fromkeys(COLUMNS, 1.0) | {"rows": 1.2, ALL: 0.9})]
+        section = board_page.page_text(rows, "abc").split("## With averaged answers")[1]
+        assert "| row | rows | all but the prior |" in section
+        assert "| gen3, a to b | 1.20 | 0.90 |" in section
         assert "bandwidth" in section.split("Without effect on every row:")[1]
 
     def test_without_choices_there_is_no_such_section(self) -> None:
