@@ -22,6 +22,8 @@ from identification.arrays import Array
 from identification.estimators.prior import GaussianPrior, body_prior
 from identification.factor.factor import MIN_NOISE, Factor
 from identification.factor.normal_equations import solve_positive
+from identification.model.motion import Motion
+from identification.model.regressor import Regressor
 from identification.model.robot import RobotModel
 from identification.signals.samples import Samples
 
@@ -196,6 +198,7 @@ class _Point(NamedTuple):
     residuals: Array  # of the usable rows (m, n)
     squares: Array  # their sums (n,)
     cost: float  # twice the negative log posterior
+    regressor: Regressor  # of the positions with these zeros
 
     @property
     def joints(self) -> Array:
@@ -245,11 +248,17 @@ class _Problem:
             return self.settled(fit.zero, fit.gain, weights)
         return self.settled(zeros, zeros, weights)
 
+    def moved(self, zero: Array) -> Motion:
+        """Return the motion with zeros (n,) added to its positions."""
+        motion = self.samples.motion
+        return replace(motion, position=motion.position + zero)
+
     def at(self, zero: Array, gain: Array, weights: Array) -> _Point:
         """Return the point of these zeros and scales, with the parameters fitted to them."""
-        motion = self.samples.motion
-        motion = replace(motion, position=motion.position + zero)
-        blocks, columns = self.model.regressor(motion)
+        return self._at(self.model.regressor(self.moved(zero)), zero, gain, weights)
+
+    def _at(self, regressor: Regressor, zero: Array, gain: Array, weights: Array) -> _Point:
+        blocks, columns = regressor
         matrix = self.information.copy()
         right = self.information @ self.prior.mean
         tables = []
@@ -271,7 +280,7 @@ class _Problem:
         joints = np.concatenate([zero, gain]) / np.repeat(_PRIOR_SPREADS, self.n)
         log = float((self.rows * np.log(squares)).sum()) / ROWS_PER_FACT
         cost = log + float(away @ self.information @ away) / ROWS_PER_FACT + float(joints @ joints)
-        return _Point(values, zero, gain, residuals, squares, cost)
+        return _Point(values, zero, gain, residuals, squares, cost, regressor)
 
     def weights(self, squares: Array) -> Array:
         """Return the weights of the joints (n,) by their squared residuals."""
@@ -287,7 +296,7 @@ class _Problem:
         point = self.at(zero, gain, weights)
         for _ in range(_WEIGHTING_ROUNDS):
             before = point.cost
-            point = self.at(zero, gain, self.weights(point.squares))
+            point = self._at(point.regressor, zero, gain, self.weights(point.squares))
             if before - point.cost < _COST_TOLERANCE:
                 break
         return point
@@ -296,9 +305,7 @@ class _Problem:
         """Return the sums at a point, with columns of zero for what is fixed."""
         p = self.model.n_parameters
         n = self.n
-        motion = self.samples.motion
-        motion = replace(motion, position=motion.position + point.zero)
-        torque = self.model.torque(point.values, motion)
+        torque, turned = self._turned(point, free)
         factor = 1.0 + point.gain
         weights = self.weights(point.squares)
         matrix = np.zeros((p + 2 * n, p + 2 * n))
@@ -308,31 +315,28 @@ class _Problem:
         gradient = np.zeros(p + 2 * n)
         gradient[:p] = -self.information @ (point.values - self.prior.mean)
         gradient[p:] = -own * point.joints
-        turned = self._turned(point, torque, free)
-        blocks, columns = self.model.regressor(motion)
-        fixed = np.concatenate([np.zeros(p, dtype=np.bool_), ~free])
-        for joint, (block, places) in enumerate(zip(blocks, columns, strict=True)):
+        zeros = np.flatnonzero(free[:n])
+        for joint, (block, places) in enumerate(zip(*point.regressor, strict=True)):
             usable = self.samples.usable[:, joint]
-            table = np.zeros((int(usable.sum()), p + 2 * n))
-            table[:, places] = factor[joint] * block[usable]
-            table[:, p : p + n] = factor[joint] * turned[:, usable, joint].T
-            table[:, p + n + joint] = torque[usable, joint]
-            table[:, fixed] = 0.0
-            matrix += weights[joint] * (table.T @ table)
-            gradient += weights[joint] * (table.T @ point.residuals[usable, joint])
-        gradient[fixed] = 0.0
+            gains = np.flatnonzero(free[n:] & (np.arange(n) == joint))
+            at = np.concatenate([places, p + zeros, p + n + gains])
+            moved = np.hstack([block, turned[:, :, joint].T])[usable]
+            scaled = torque[usable][:, gains]
+            table = np.hstack([factor[joint] * moved, scaled])
+            matrix[np.ix_(at, at)] += weights[joint] * (table.T @ table)
+            gradient[at] += weights[joint] * (table.T @ point.residuals[usable, joint])
+        gradient[p:][~free] = 0.0
         return _Sums(matrix, gradient)
 
-    def _turned(self, point: _Point, torque: Array, free: Mask) -> Array:
-        """Return the derivative of the torque by each zero (n, m, n)."""
-        motion = self.samples.motion
-        derivative = np.zeros((self.n, *torque.shape))
-        for joint in np.flatnonzero(free[: self.n]):
-            position = motion.position + point.zero
-            position[:, joint] += _DERIVATIVE_STEP
-            moved = self.model.torque(point.values, replace(motion, position=position))
-            derivative[joint] = (moved - torque) / _DERIVATIVE_STEP
-        return derivative
+    def _turned(self, point: _Point, free: Mask) -> tuple[Array, Array]:
+        """Return the torque (m, n), and its derivative by each free zero (k, m, n)."""
+        joints = np.flatnonzero(free[: self.n])
+        motion = self.moved(point.zero)
+        moved = Motion.joined([motion] * (1 + len(joints)))  # one call for all
+        position = moved.position.reshape(-1, *motion.position.shape)
+        position[range(1, len(position)), :, joints] += _DERIVATIVE_STEP
+        torque, *turned = self.model.torque(point.values, moved).reshape(position.shape)
+        return torque, (np.reshape(turned, (-1, *torque.shape)) - torque) / _DERIVATIVE_STEP
 
 
 def _of_any_scale(prior: GaussianPrior) -> Array:
