@@ -18,7 +18,13 @@ from hil.cli.identify_options import delay_from
 from hil.cli.verdict import EXIT_NOT_GOOD
 from hil.pipeline.sources import archives_in
 from hil.pipeline.torque_constants import GainsFound, find_gains
+from identification.estimators.current_gains import (
+    MAX_RELATIVE_STD,
+    GainProblem,
+    UndeterminedGain,
+)
 from identification.model.known_payload import Payload
+from identification.text import percentage
 
 
 def torque_constants(
@@ -134,10 +140,28 @@ def _motors(result: GainsFound) -> list[dict[str, Any]]:
             "torque_constant": float(value) if determined else None,
             "std": float(std) if determined else None,
             "half_interval": float(gains.interval_factor * std) if determined else None,
-            "not_determined": reason,
+            "not_determined": None if reason is None else _undetermined_words(reason),
         }
         for name, value, std, determined, reason in zip(*columns, strict=True)
     ]
+
+
+def _undetermined_words(gain: UndeterminedGain) -> str:
+    """Return why a gain is not determined."""
+    match gain.problem:
+        case GainProblem.NO_ROW:
+            return "the motor has no usable row"
+        case GainProblem.NOT_LOADED:
+            return "the payload does not load it"
+        case GainProblem.INSEPARABLE:
+            return "the payload's torque is not separable from the robot's own"
+        case GainProblem.NOT_POSITIVE:
+            return "its estimate is not positive: the payload's torque is below the noise"
+        case GainProblem.IMPRECISE:
+            return (
+                f"its relative standard deviation is {percentage(gain.relative_std)}, limit"
+                f" {percentage(MAX_RELATIVE_STD)}"
+            )
 
 
 def as_dict(result: GainsFound) -> dict[str, object]:

@@ -84,6 +84,7 @@ from hil.look.readings import (
     Wrapped,
 )
 from hil.look.result import ChangedReading, Look, Row, TiedReading
+from identification.estimators.delay_messages import undetermined_words
 from identification.hypotheses.changes import COUPLED, ORDERS, Meaning
 from identification.signals.messages import clock_lines, fault_words, time_lines
 from identification.text import number, percentage
@@ -586,7 +587,7 @@ def _(interval: DelayInterval) -> str:
 
 @_worded.register
 def _(problem: DelayProblem) -> str:
-    return problem.problem
+    return undetermined_words(problem.estimate)
 
 
 @_worded.register

@@ -596,7 +596,7 @@ def _delay_row(delay: DelayEstimate | None) -> Row:
         reading = TorqueDelay(delay.delay, confirmed=False)
         evidence = DelayInterval(half, unconfirmed=True)
         return Row("delay", reading, Certainty.UNDETERMINED, (evidence,), Decide.RECORD_FASTER)
-    problem = DelayProblem(str(delay.reason))
+    problem = DelayProblem(delay)
     return Row("delay", Fact.NO_DELAY_SEEN, Certainty.LIKELY, (problem,), Decide.RECORD_FASTER)
 
 

@@ -18,6 +18,7 @@ from hil.importers.conclusions import (
     RecordedArm,
     StatedUnit,
 )
+from identification.estimators.delay import DelayEstimate
 from identification.hypotheses.changes import Change
 from identification.signals.clock import SampleTimes, TimeBase
 from identification.signals.row_faults import RowFault
@@ -400,9 +401,9 @@ class DelayInterval:
 
 @dataclass(frozen=True)
 class DelayProblem:
-    """Why no delay is seen."""
+    """Why no delay is seen: the estimate that does not determine it."""
 
-    problem: str
+    estimate: DelayEstimate
 
 
 @dataclass(frozen=True)

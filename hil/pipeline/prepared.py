@@ -25,6 +25,7 @@ from identification.estimators.delay import (
     DelayEstimate,
     estimate_delay,
 )
+from identification.estimators.delay_messages import delay_lines
 from identification.estimators.torque_channel import possible_low_passes
 from identification.model.elements import TorqueRipple
 from identification.model.robot import RobotModel
@@ -305,7 +306,7 @@ class _DelayChoice:
         unused = cls(estimate, stated.preprocessing.torque_delay, (), ())
         if estimate is None:
             return unused
-        described = _described(estimate)
+        described = delay_lines(estimate)
         if options.delay == "auto":
             if not estimate.significant:
                 return replace(unused, notes=described, errors={unused.assumed: estimate.variance})
@@ -607,25 +608,6 @@ def _averaged_for(duration: float, sources: Sequence[Source]) -> list[Recording]
 
 def _step(recording: Recording) -> float:
     return float(np.median(np.diff(recording.time)))
-
-
-def _delay_words(estimate: DelayEstimate) -> str:
-    if not estimate.determined and not estimate.significant:
-        return f"all axes: not determined; {estimate.reason}"
-    half = estimate.half_interval
-    differs = "" if estimate.significant or estimate.unconfirmed else "not "
-    return (
-        f"all axes: {estimate.delay * 1e3:.3f} ms ± {half * 1e3:.3f} ms"
-        f" ({estimate.delay / estimate.cycle:.2f} ± {half / estimate.cycle:.2f} cycles),"
-        f" {differs}significantly different from the {estimate.assumed * 1e3:.3g} ms assumed"
-    )
-
-
-def _described(estimate: DelayEstimate) -> tuple[str, ...]:
-    note = f"delay of the torque behind the position, {_delay_words(estimate)}"
-    if estimate.significant:
-        return (note,)
-    return note, f"no other delay than the assumed {estimate.assumed * 1e3:.3g} ms was applied"
 
 
 @dataclass(frozen=True, eq=False)

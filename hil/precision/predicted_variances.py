@@ -18,7 +18,7 @@ from hil.cell import Cell
 from hil.pipeline.prepared import stated_delay, with_stated_delay
 from identification.distributions import student_limit
 from identification.estimators.covariance import MIN_FINE_BLOCKS
-from identification.estimators.delay import DelayEstimate, predicted_rate
+from identification.estimators.delay import DelayEstimate, UndeterminedDelay, predicted_rate
 from identification.estimators.elasticity import (
     elastic_torque,
     expected_compliance,
@@ -138,7 +138,7 @@ class PredictedRows:
             assumed=stated,
             cycle=cycle,
             interval_factor=self.interval_factor(),
-            reason=None if np.isfinite(std) else "the motion does not show it",
+            reason=None if np.isfinite(std) else UndeterminedDelay.INSEPARABLE,
             significant=False,
         )
         if self.cell.file.controller is None:

@@ -215,6 +215,8 @@ def _axes(figure: Figure, left: float, top: float, width: float, height: float) 
     rectangle = (left / whole[0], bottom / whole[1], width / whole[0], height / whole[1])
     axes = figure.add_axes(rectangle)
     axes.patch.set_visible(False)
+    for axis in (axes.xaxis, axes.yaxis):
+        axis.set_label_coords(0.0, 0.0)  # no label, whose place would take every text's extent
     return axes
 
 

@@ -68,7 +68,18 @@ def page(**changes: Any) -> Iterator[None]:
     with _settings, warnings.catch_warnings(), mpl.rc_context():
         # A name may have glyphs that are missing in DejaVu.
         warnings.filterwarnings("ignore", message=r"Glyph \d+")
-        mpl.rcdefaults()
-        fixed: Any = {"svg.fonttype": "none", "svg.hashsalt": "hil", "text.parse_math": False}
-        mpl.rcParams.update(fixed | _STYLE | changes)
+        settings: Any = mpl.rcParams
+        dict.update(settings, _checked_settings())
+        settings.update(changes)
         yield
+
+
+@cache
+def _checked_settings() -> dict[str, Any]:
+    """Return the settings of all pictures, which matplotlib checks one by one: here, once."""
+    settings: Any = mpl.rcParams
+    with mpl.rc_context():
+        mpl.rcdefaults()
+        settings.update({"svg.fonttype": "none", "svg.hashsalt": "hil", "text.parse_math": False})
+        settings.update(_STYLE)
+        return dict(settings)

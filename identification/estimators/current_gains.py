@@ -18,6 +18,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from enum import Enum
 from typing import Final, NamedTuple
 
 import numpy as np
@@ -35,7 +36,6 @@ from identification.factor.blocks import FINE_BLOCK, merged
 from identification.factor.factor import MIN_NOISE, Factor
 from identification.factor.normal_equations import NormalEquations, Solution, solve
 from identification.model.robot import RobotModel
-from identification.text import percentage
 
 MAX_RELATIVE_STD: Final = 0.05  # tolerance of a maker's torque constant
 MAX_BLOCKS: Final = 400
@@ -48,6 +48,24 @@ _MAX_MATRIX_VALUES: Final = 2e7  # of the information matrices of all blocks
 _MIN_BLOCKS: Final = 60
 
 
+class GainProblem(Enum):
+    """Why the gain of a motor is not determined."""
+
+    NO_ROW = "no usable row"
+    NOT_LOADED = "not loaded by the payload"
+    INSEPARABLE = "payload not separable from the robot"
+    NOT_POSITIVE = "not positive"
+    IMPRECISE = "imprecise"
+
+
+@dataclass(frozen=True)
+class UndeterminedGain:
+    """A gain that is not determined, and why."""
+
+    problem: GainProblem
+    relative_std: float  #: standard deviation over the gain; infinite if that is zero
+
+
 @dataclass(frozen=True, eq=False)
 class Gains:
     """Gains of n motors."""
@@ -55,7 +73,7 @@ class Gains:
     motor_names: tuple[str, ...]  #: (n,)
     values: Array  #: torque per current (n,) [N·m/A or N/A], NaN if undetermined
     std: Array  #: standard deviations, cluster-robust (n,); infinite likewise
-    reasons: tuple[str | None, ...]  #: why the gain is undetermined, or None
+    reasons: tuple[UndeterminedGain | None, ...]  #: why the gain is undetermined, or None
     interval_factor: float  #: standard deviations in half a 95 % interval
 
     @property
@@ -142,7 +160,7 @@ class _Layout(NamedTuple):
 
 def _reasons(
     total: Array, rows: NDArray[np.intp], inverse: Array, determined: NDArray[np.bool_], std: Array
-) -> tuple[str | None, ...]:
+) -> tuple[UndeterminedGain | None, ...]:
     """Return why each motor's gain is undetermined or None, from inverse and std (n,)."""
     p = total.shape[1] - 3
     magnitude = np.abs(inverse)
@@ -152,21 +170,20 @@ def _reasons(
     # Whether the payload's torque on a motor exceeds rounding.
     powers = np.diagonal(total, axis1=1, axis2=2)
     loaded = powers[:, p] > _MIN_LOAD_RATIO**2 * powers[:, :p].max(axis=1, initial=0.0)
-    good = determined & (inverse > 0.0) & (relative <= MAX_RELATIVE_STD)
     checks = (  # first match
-        (rows == 0, "the motor has no usable row"),
-        (good, None),
-        (~loaded, "the payload does not load it"),
-        (~determined, "the payload's torque is not separable from the robot's own"),
-        (~(inverse > 0.0), "its estimate is not positive: the payload's torque is below the noise"),
+        (rows == 0, GainProblem.NO_ROW),
+        (determined & (inverse > 0.0) & (relative <= MAX_RELATIVE_STD), None),
+        (~loaded, GainProblem.NOT_LOADED),
+        (~determined, GainProblem.INSEPARABLE),
+        (~(inverse > 0.0), GainProblem.NOT_POSITIVE),
     )
-    return tuple(
-        next(
-            (reason for holds, reason in checks if holds[m]),
-            f"its relative standard deviation is {percentage(relative[m])}, limit "
-            f"{percentage(MAX_RELATIVE_STD)}",
-        )
+    found = [
+        next((problem for holds, problem in checks if holds[m]), GainProblem.IMPRECISE)
         for m in range(len(total))
+    ]
+    return tuple(
+        None if problem is None else UndeterminedGain(problem, share)
+        for problem, share in zip(found, relative.tolist(), strict=True)
     )
 
 

@@ -17,6 +17,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from enum import Enum
 from functools import cached_property
 from typing import Any, Final, NamedTuple
 
@@ -177,6 +178,15 @@ class CombinedDelay:
         return (self.mean - used) ** 2 + self.variance
 
 
+class UndeterminedDelay(Enum):
+    """Why a delay is not determined; :mod:`.delay_messages` words it."""
+
+    INSEPARABLE = "not separable from the parameters"
+    WIDE_INTERVAL = "wide interval"
+    AT_LIMIT = "at the longest delay tested"
+    OTHER_MINIMUM = "another minimum is as deep"
+
+
 @dataclass(frozen=True, eq=False)
 class DelayEstimate:
     """Delay of the torque of all axes relative to the position."""
@@ -186,12 +196,13 @@ class DelayEstimate:
     assumed: float  # delay with which the samples were prepared [s]
     cycle: float  # usual step of the clock [s]
     interval_factor: float  # standard deviations in half a 95 % interval
-    reason: str | None  # why the delay is undetermined, or None
+    reason: UndeterminedDelay | None  # None: it is determined
     # whether the delay differs from `assumed` at 99 % and predicts left-out blocks better
     significant: bool
     # whether it differs so and does not predict left-out blocks better; without a prior, parts
     # that determine little are predicted badly with any delay
     unconfirmed: bool = False
+    other: float = float("nan")  # delay of another minimum as deep [s]; NaN without one
 
     @property
     def determined(self) -> bool:
@@ -321,9 +332,10 @@ def _estimated(
         assumed=assumed,
         cycle=reader.cycle,
         interval_factor=factor,
-        reason=_undetermined_reason(factor * std, at_limit, other + assumed),
+        reason=_undetermined_reason(factor * std, at_limit, other),
         significant=differs and confirmed,
         unconfirmed=differs and not confirmed,
+        other=other + assumed,
     )
 
 
@@ -363,18 +375,17 @@ def _other_minimum(grid: Array, heights: Array, shift: float, height: float) -> 
     return float(grid[valleys[np.argmin(heights[valleys])]]) if valleys.size else float("nan")
 
 
-def _undetermined_reason(half_interval: float, at_limit: bool, other: float) -> str | None:
+def _undetermined_reason(
+    half_interval: float, at_limit: bool, other: float
+) -> UndeterminedDelay | None:
     if not np.isfinite(half_interval):
-        return "the motion does not separate a delay from the other parameters"
+        return UndeterminedDelay.INSEPARABLE
     if half_interval > MAX_HALF_INTERVAL:
-        return (
-            f"95 % interval of ± {half_interval * 1e3:.2g} ms: the torques change too slowly, or"
-            " are too noisy"
-        )
+        return UndeterminedDelay.WIDE_INTERVAL
     if at_limit:
-        return "the residual decreases up to the longest delay tested"
+        return UndeterminedDelay.AT_LIMIT
     if np.isfinite(other):
-        return f"a delay of {other * 1e3:.0f} ms explains the torques as well"
+        return UndeterminedDelay.OTHER_MINIMUM
     return None
 
 

@@ -6,7 +6,6 @@ from dataclasses import replace
 from typing import Final
 
 import numpy as np
-from scipy.integrate import cumulative_trapezoid
 
 from identification.hypotheses.scores import Score, score_of
 from identification.hypotheses.search import EXPLAINED_ERROR
@@ -41,7 +40,8 @@ def _integrated_error(model: RobotModel, samples: Samples, rows: int) -> float:
     part = samples.between(longest.start, longest.stop)
     if part.usable.any(axis=1).sum() < _FEWEST_ROWS:
         return float("inf")
-    torque = cumulative_trapezoid(part.torque, part.motion.time, axis=0, initial=0.0)
+    steps = np.diff(part.motion.time)[:, None] * (part.torque[1:] + part.torque[:-1]) / 2.0
+    torque = np.cumsum(np.concatenate([np.zeros_like(part.torque[:1]), steps]), axis=0)
     integrated = replace(part, torque=np.asarray(torque - torque.mean(axis=0)), parent=None)
     few = integrated.thinned(max(1, len(torque) // rows))
     return score_of(model.with_friction(offset=True), few).overall

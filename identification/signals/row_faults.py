@@ -137,20 +137,17 @@ def _jumps(recording: Recording, gap: Rows) -> Iterator[tuple[int, NDArray[np.in
     position = recording.position[places]
     if len(position) < 2 * _NEIGHBOUR_ROWS + 2:
         return
-    step = np.diff(position, axis=0)
-    padded = np.pad(np.abs(step), ((_NEIGHBOUR_ROWS, _NEIGHBOUR_ROWS), (0, 0)), mode="edge")
-    windows = np.lib.stride_tricks.sliding_window_view(padded, 2 * _NEIGHBOUR_ROWS + 1, axis=0)
-    before, after = windows[..., :_NEIGHBOUR_ROWS], windows[..., _NEIGHBOUR_ROWS + 1 :]
-    usual = np.maximum(np.median(before, axis=-1), np.median(after, axis=-1))
-    clock = np.diff(recording.time[places])
     median = recording.usual_step
     if not median:
         return
-    passed = np.maximum(clock / median, 1.0)[:, None] + GAP_STEPS
-    possible = (
-        passed * usual + MAX_ACCELERATION * (passed * median) ** 2 + 3.0 * _resolution(position)
-    )
+    step = np.diff(position, axis=0)
+    passed = np.maximum(np.diff(recording.time[places]) / median, 1.0)[:, None] + GAP_STEPS
+    possible = MAX_ACCELERATION * (passed * median) ** 2 + 3.0 * _resolution(position)
+    # Medians of a neighbourhood take their time, and few steps are beyond a joint that stands.
     beyond = np.abs(step) > possible
+    some = np.flatnonzero(beyond.any(axis=1))
+    usual = _usual_steps(step, some)
+    beyond[some] = np.abs(step[some]) > passed[some] * usual + possible[some]
     moving = np.count_nonzero(np.ptp(position, axis=0) > 0.0)
     found = np.flatnonzero(np.count_nonzero(beyond, axis=1) >= max(2.0, 0.5 * moving))
     breaks = {part.start for part in recording.segments()}
@@ -163,6 +160,18 @@ def _jumps(recording: Recording, gap: Rows) -> Iterator[tuple[int, NDArray[np.in
         joints = np.flatnonzero(beyond[place - 1])
         if (np.abs(stays)[joints] > 0.5 * np.abs(step[place - 1])[joints]).all():
             yield row, joints
+
+
+def _usual_steps(step: Array, places: NDArray[np.intp]) -> Array:
+    """Return the usual size (k, n) of the steps (m, n) next to some of them (k,), on either side.
+
+    The median of a few, on the side where they are larger.
+    """
+    padded = np.pad(np.abs(step), ((_NEIGHBOUR_ROWS, _NEIGHBOUR_ROWS), (0, 0)), mode="edge")
+    windows = np.lib.stride_tricks.sliding_window_view(padded, 2 * _NEIGHBOUR_ROWS + 1, axis=0)
+    windows = windows[places]
+    before, after = windows[..., :_NEIGHBOUR_ROWS], windows[..., _NEIGHBOUR_ROWS + 1 :]
+    return np.asarray(np.maximum(np.median(before, axis=-1), np.median(after, axis=-1)))
 
 
 def _written_before(recording: Recording, row: int) -> int:

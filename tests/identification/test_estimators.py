@@ -53,7 +53,12 @@ from identification.estimators.covariance import (
     leverage_corrected,
     spread,
 )
-from identification.estimators.delay import MAX_ESTIMATED_DELAY, delay_sensitivity
+from identification.estimators.delay import (
+    MAX_ESTIMATED_DELAY,
+    UndeterminedDelay,
+    delay_sensitivity,
+)
+from identification.estimators.delay_messages import undetermined_words
 from identification.estimators.loss_functions import Loss
 from identification.estimators.prior import (
     OFFSET_STD_SHARE,
@@ -74,7 +79,6 @@ from identification.signals.recording import in_succession
 from identification.signals.smoothing import low_pass
 from sim_fixtures import ControllerSettings, SimulatedController
 from sim_fixtures.ns16 import CELL_PATH, urdf_text
-from tests import messages
 from tests.identification.robots import robot_text
 from tests.identification.two_link import (
     MODEL,
@@ -1456,14 +1460,16 @@ class TestDelay:
         far = replace(estimate, delay=5e-3, std=1e-4).combined(0.0, 1e-3)
         assert far.mean == pytest.approx(5e-3, abs=1e-5)
         assert far.variance == pytest.approx(1e-4**2, rel=0.01)
-        for std, reason in ((np.inf, "not separated"), (1e-4, "at a limit")):
+        for std, reason in (
+            (np.inf, UndeterminedDelay.INSEPARABLE), (1e-4, UndeterminedDelay.AT_LIMIT),
+        ):  # fmt: skip
             unknown = replace(estimate, std=std, reason=reason).combined(0.0, 1e-3)
             assert unknown.mean == 0.0
             assert unknown.variance == pytest.approx(believed)
 
     def test_a_delay_beyond_the_range_is_undetermined(self):
         estimate = estimate_delay(delayed(0.06), MODEL)
-        assert estimate.reason == messages.RESIDUAL_DECREASES
+        assert estimate.reason is UndeterminedDelay.AT_LIMIT
         assert estimate.applied == 0.0
 
     def test_it_is_found_beside_an_assumed_delay(self):
@@ -1534,8 +1540,8 @@ class TestUndeterminedDelay:
         slow = estimate_delay(delayed(0.0, speed=0.05), MODEL)
         assert not slow.determined
         assert slow.applied == 0.0
-        assert slow.reason.startswith("95 % interval of ± ")
-        assert slow.reason.endswith(messages.TORQUES_TOO_SLOW_OR_NOISY)
+        assert slow.reason is UndeterminedDelay.WIDE_INTERVAL
+        assert undetermined_words(slow).startswith("95 % interval of ± ")
         unknown = replace(slow, std=np.inf)
         assert unknown.variance == pytest.approx(MAX_ESTIMATED_DELAY**2 / 3.0)
         assert replace(slow, std=1e-4).variance == pytest.approx(1e-8)

@@ -7,7 +7,7 @@ import pinocchio as pin
 import pytest
 
 from identification.errors import IdentificationError, ModelError
-from identification.estimators.current_gains import identify_gains
+from identification.estimators.current_gains import GainProblem, identify_gains
 from identification.estimators.payload_estimate import NAMES, PayloadError, identify_payload
 from identification.estimators.payload_problem import Run
 from identification.factor.columns import gain_factor
@@ -336,7 +336,9 @@ class TestGains:
         assert gains.determined.tolist() == [True, False]
         assert np.isnan(gains.values[1])
         assert np.isinf(gains.std[1])
-        assert gains.reasons == (None, "the payload does not load it")
+        assert [reason and reason.problem for reason in gains.reasons] == [
+            None, GainProblem.NOT_LOADED,
+        ]  # fmt: skip
         gains = lifted(Payload(4.0, (0.2, 0.0, 0.1)))
         assert np.all(np.abs(gains.values - PLANTED) < 4.0 * gains.std)
 

@@ -7,6 +7,7 @@ import numpy as np
 import pinocchio as pin
 import pytest
 
+from identification.estimators.delay import UndeterminedDelay
 from identification.estimators.least_squares import estimate_repetitions
 from identification.estimators.prior import body_prior
 from identification.factor.estimate import estimate
@@ -661,7 +662,7 @@ class TestJudgement:
 
     def test_a_delay_of_a_wide_interval_is_suspected(self):
         """It differs significantly, and was not applied."""
-        wide = replace(LATE, delay=0.009, std=1e-3, reason="95 % interval of ± 2 ms")
+        wide = replace(LATE, delay=0.009, std=1e-3, reason=UndeterminedDelay.WIDE_INTERVAL)
         suspected = found(delays=wide)["suspected delay"]
         assert suspected.level == "doubtful"
         assert_figures(suspected, {"delay": 9.0, "half_interval": 2.0, "assumed": 0.0})

@@ -46,7 +46,7 @@ from hil.look.readings import (
 )
 from hil.look.result import Aspect, TiedReading
 from hil.pipeline.sources import cell_of, source_of
-from identification.estimators.delay import DelayEstimate
+from identification.estimators.delay import DelayEstimate, UndeterminedDelay
 from identification.hypotheses.changes import Axes, Change
 from identification.hypotheses.scores import Score, compare, score_of
 from identification.model.robot import RobotModel
@@ -190,7 +190,7 @@ def test_a_meaning_planted_in_a_real_log(shared_data: Path, arm: str, meaning: s
 def test_a_delay_that_other_parts_do_not_confirm_is_open() -> None:
     delay = DelayEstimate(
         delay=0.03, std=0.003, assumed=0.0, cycle=0.004, interval_factor=2.0,
-        reason="95 % interval of ± 6 ms", significant=False,
+        reason=UndeterminedDelay.WIDE_INTERVAL, significant=False,
     )  # fmt: skip
     row, _ = channel_rows(delay, None)
     assert row.reading == TorqueDelay(0.03, confirmed=False)

@@ -34,7 +34,7 @@ from hil.report.output_files import settings_result, write_outcome
 from hil.results.results import SCHEMA_VERSION, Results
 from identification.errors import IdentificationError
 from identification.estimators.consistent import SolverError
-from identification.estimators.delay import DelayEstimate
+from identification.estimators.delay import DelayEstimate, UndeterminedDelay
 from identification.model.friction import FrictionLaw
 from identification.selection.questions import SuggestedDelay
 from identification.selection.settings import Settings, Strength
@@ -576,7 +576,7 @@ def test_a_delay_that_was_applied_is_in_the_results(wide, applied, stated):
     """Also one with an interval too wide to be called determined, or without an estimate."""
     estimate = DelayEstimate(
         delay=0.004, std=1e-3, assumed=0.0, cycle=1e-3, interval_factor=2.0,
-        reason="95 % interval of ± 2 ms", significant=True,
+        reason=UndeterminedDelay.WIDE_INTERVAL, significant=True,
     )  # fmt: skip
     prepared = SimpleNamespace(
         delays=estimate if wide else None,
@@ -588,7 +588,7 @@ def test_a_delay_that_was_applied_is_in_the_results(wide, applied, stated):
     assert (delays.found, delays.applied) == ([stated] * 2, [applied] * 2)
 
 
-@pytest.mark.parametrize("reason", ["95 % interval of ± 2 ms", None])
+@pytest.mark.parametrize("reason", [UndeterminedDelay.WIDE_INTERVAL, None])
 def test_a_delay_that_predicts_no_better_is_not_applied(reason):
     """One with a wide interval stays suspected: inner prediction does not speak against it."""
     estimate = DelayEstimate(
@@ -614,7 +614,7 @@ def test_inner_prediction_decides_on_an_unconfirmed_delay(log):
     assert applied.significant and "compensated" in notes[-1]
     refused, (note,) = choice.confirmed_by(Preprocessing())
     assert not refused.significant and note.endswith("predicts no better")
-    wide = replace(estimate, reason="95 % interval of ± 2 ms")
+    wide = replace(estimate, reason=UndeterminedDelay.WIDE_INTERVAL)
     assert not _DelayChoice.of(wide, sources, Settings(Preprocessing()), Options()).suggested
 
 
