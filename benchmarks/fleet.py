@@ -24,10 +24,9 @@ import pinocchio as pin
 from numpy.typing import NDArray
 from scipy.signal import lfilter
 
-from hil.compare.comparison import MIN_RELATIVE_CHANGE, holm
+from hil.compare.comparison import FALSE_ALARM_RATE, MIN_RELATIVE_CHANGE, holm
 from hil.fleet.covariates import warmed
 from hil.fleet.series_changes import Course, Series, common_course, courses
-from hil.fleet.trend import FALSE_ALARM_RATE
 
 Array = NDArray[np.float64]
 FaultKind = Literal["wear", "lubricant", "replacement", "tool"]

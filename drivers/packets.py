@@ -27,6 +27,8 @@ HEADER_LENGTH: Final = 12
 AXIS_LENGTH: Final = 36
 MAX_AXES: Final = 20
 MAX_CYCLIC_LENGTH: Final = HEADER_LENGTH + AXIS_LENGTH * MAX_AXES
+MAX_PACKET_BYTES: Final = 1500
+"""Bytes of the longest packet (the buffer of the manufacturer's library)."""
 N_ARMS: Final = 4
 AXES_PER_ARM: Final = 10
 NO_SLOT: Final = 0xFF

@@ -12,6 +12,8 @@ MAD_TO_STD: Final = 1.4826
 """Standard deviation of a normal variable over its median absolute value."""
 NORMAL_95: Final = 1.96
 """Standard deviations in half a 95 % interval of known variance."""
+SIGNIFICANT_SIGMAS: Final = 3.0
+"""Standard deviations of a significant sign, change, correction, delay or scale."""
 
 
 def normal_limit(share: ArrayLike) -> Any:

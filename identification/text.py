@@ -6,7 +6,7 @@ import math
 from collections.abc import Sequence
 from typing import Final
 
-_LARGEST_DECIMAL: Final = 1e6
+LARGEST_DECIMAL: Final = 1e6
 _LONGEST_IN_SECONDS: Final = 300.0
 _LONGEST_IN_MINUTES: Final = 180.0
 
@@ -33,7 +33,7 @@ def joined(names: Sequence[str], most: int = 6) -> str:
 
 def number(value: float, digits: int = 3) -> str:
     """Format with `digits` significant digits, without an exponent from 1e-4 to 1e6: 1324."""
-    is_whole = 10.0**digits <= abs(float(f"{value:.{digits}g}")) < _LARGEST_DECIMAL
+    is_whole = 10.0**digits <= abs(float(f"{value:.{digits}g}")) < LARGEST_DECIMAL
     return f"{value:.0f}" if is_whole else f"{value:.{digits}g}"
 
 

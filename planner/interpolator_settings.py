@@ -27,7 +27,7 @@ from planner.motion_queue import MotionQueue
 from planner.moves import Move, Overrides, checked_shares
 
 # Tolerance on motion times [s].
-_TIME_TOLERANCE: Final = 1e-9
+_MOTION_TIME_TOLERANCE: Final = 1e-9
 # COMAU's default of FLY_PER.
 _DEFAULT_FLY_PERCENT: Final = 100.0
 
@@ -221,7 +221,7 @@ class MoveSettings:
         if least == -seconds:
             valid = "0 s where the target is the point before"
             raise InvalidSetting("motion time", seconds, valid)
-        if least > _TIME_TOLERANCE:
+        if least > _MOTION_TIME_TOLERANCE:
             raise _TimeTooShortError(f"the move takes longer than its motion time of {seconds} s")
         slow = 1.0
         while excess(slow) < 0.0:

@@ -28,10 +28,10 @@ from planner.piecewise_cubic import PiecewiseCubic, Trajectory, check_limits, ch
 
 FORMAT: Final = "joint motion plan"
 VERSION: Final = 1
-# Tolerances between a stored motion and the same one planned on another machine: of positions
-# [rad] and duration [s], and of rates as a share of their limits.
-_PLAN_TOLERANCE = 1e-9
-_RATE_TOLERANCE = 1e-6
+PLAN_TOLERANCE: Final = 1e-9
+"""Between a stored motion and the same one planned on another machine, of positions [rad] and
+duration [s]."""
+_RATE_TOLERANCE: Final = 1e-6  # likewise, of rates as a share of their limits
 
 
 class _Data(BaseModel):
@@ -195,7 +195,7 @@ def _check_motion(stored: PiecewiseCubic, planned: MotionPlan) -> None:
     apart = float(apart.max())
     rates = float(max(np.max(fast / limits.velocity), np.max(steep / limits.acceleration)))
     late = abs(stored.duration - other.duration)
-    if not (apart <= _PLAN_TOLERANCE and late <= _PLAN_TOLERANCE and rates <= _RATE_TOLERANCE):
+    if not (apart <= PLAN_TOLERANCE and late <= PLAN_TOLERANCE and rates <= _RATE_TOLERANCE):
         raise InvalidPlanFile(
             f"the stored motion of {stored.duration:.6f} s differs from the one planned through "
             f"the moves ({other.duration:.6f} s) by up to {apart:.3g} rad: the moves were edited, "

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from bisect import bisect_right
 from math import ceil, sqrt
-from typing import Literal, NamedTuple
+from typing import Final, Literal, NamedTuple
 
 import numpy as np
 
@@ -95,8 +95,9 @@ def _merged(trajectory: PiecewiseCubic) -> tuple[list[float], Array]:
 
 # Tolerance on times, as a share of the period.
 _TIME_TOLERANCE = 1e-9
-# Tolerance on the range of a joint for set-points rounded to float32, as a share of half the range.
-_FLOAT32_RANGE_ROUNDING = 9e-7
+FLOAT32_RANGE_ROUNDING: Final = 9e-7
+"""Rounding of a position at its limit in packets, as a share of half a joint's range; guard and
+player allow as much."""
 # Newton steps to the nearest point of the path.
 _NEWTON_STEPS = 8
 # Largest change of motion time in `resume_from` [s].
@@ -265,7 +266,7 @@ class TrajectoryPlayer:
     def _check_range(self, offset: Array) -> None:
         limits = self._limits
         rounding = position_rounding(self._limits)
-        slack = np.maximum(rounding, 0.5 * _FLOAT32_RANGE_ROUNDING * (limits.upper - limits.lower))
+        slack = np.maximum(rounding, 0.5 * FLOAT32_RANGE_ROUNDING * (limits.upper - limits.lower))
         for reach, bound, sign in (
             (self._lower + offset, limits.lower, -1.0),
             (self._upper + offset, limits.upper, 1.0),

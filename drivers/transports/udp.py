@@ -20,7 +20,7 @@ from pathlib import Path
 from typing import Final
 
 from drivers.errors import TransportClosed
-from drivers.packets import HEADER_LENGTH
+from drivers.packets import HEADER_LENGTH, MAX_PACKET_BYTES
 from drivers.transports.arrival import CONTROL_BYTES, SO_TIMESTAMPNS, ArrivalClock
 from drivers.transports.base import (
     DirectRoute,
@@ -30,8 +30,6 @@ from drivers.transports.base import (
     TransportSpec,
 )
 
-MAX_PACKET_BYTES: Final = 1500
-"""Bytes of the longest datagram accepted (the buffer of the manufacturer's library)."""
 SOCKET_PRIORITY: Final = 6
 """SO_PRIORITY: the highest without privileges."""
 TYPE_OF_SERVICE: Final = 0x28

@@ -17,7 +17,7 @@ CONNECT_TIMEOUT: Final = 5.0
 _RATE_OF_MAJOR_VERSION: Final = {3: 125.0}
 """Frames per second by major version of the software (CB3)."""
 _E_SERIES_RATE: Final = 500.0
-_READ_BYTES: Final = 1 << 16
+READ_BYTES: Final = 1 << 16
 
 
 class RtdeAddress(Protocol):
@@ -153,7 +153,7 @@ class RtdeConnection:
 
     def _receive(self) -> list[tuple[float, rtde.RtdeFrame]]:
         """Return the frames of the next piece of the stream, with the time of its arrival."""
-        data = self._socket.recv(_READ_BYTES)
+        data = self._socket.recv(READ_BYTES)
         now = self._clock()
         if not data:
             cut = self.splitter.unfinished

@@ -18,7 +18,7 @@ from drivers.ur.outputs import N_JOINTS, POWER_MODES, ROBOT_RUNNING
 from drivers.ur.reader import OutputFrames
 from drivers.ur.rtde import RtdeError
 
-_MAX_GRID_DEVIATION: Final = 0.25
+MAX_GRID_DEVIATION: Final = 0.25
 """Of a time stamp, in cycles."""
 
 
@@ -84,7 +84,7 @@ class CycleCounter:
         before = stamps[0] - self._period if self._newest is None else self._newest
         cycles = np.diff(stamps, prepend=before) / self._period
         steps = np.rint(cycles)
-        wrong = np.flatnonzero(~((steps >= 1) & (np.abs(cycles - steps) <= _MAX_GRID_DEVIATION)))
+        wrong = np.flatnonzero(~((steps >= 1) & (np.abs(cycles - steps) <= MAX_GRID_DEVIATION)))
         if wrong.size:
             first = int(wrong[0])
             self._fault = self._fault_of(cycles[first])
@@ -96,7 +96,7 @@ class CycleCounter:
 
     def _fault_of(self, cycles: float) -> RtdeError:
         """Return why a time stamp cannot follow so many cycles after another."""
-        if not cycles >= 1 - _MAX_GRID_DEVIATION:
+        if not cycles >= 1 - MAX_GRID_DEVIATION:
             return RtdeError("the controller's time stamps go back: it was started again")
         problem = f"the controller's time stamps are not {1e3 * self._period:g} ms apart"
         return RtdeError(f"{problem}: correct controller.cycle_ms")

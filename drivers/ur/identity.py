@@ -18,6 +18,7 @@ from typing import Final
 import numpy as np
 
 from drivers.arrays import Array
+from drivers.ur.messages import MAX_PACKAGE_BYTES, PACKAGE
 
 PRIMARY_PORT: Final = 30001
 DASHBOARD_PORT: Final = 29999
@@ -28,14 +29,11 @@ MODELS: Final[Mapping[int, str]] = {
 }  # fmt: skip
 """Names of arms by their type; those of the e-Series end in e, except UR20 and UR30."""
 _WITHOUT_E: Final = (7, 8)
-_PACKAGE: Final = struct.Struct(">IB")
 _ROBOT_STATE_PACKAGE: Final = 16
 _KINEMATICS_PART: Final = 5
 _CONFIGURATION_PART: Final = 6
 _KINEMATICS_SIZE: Final = 6 * 4 + 4 * 6 * 8
 _CONFIGURATION_SIZE: Final = 4 * 6 * 8 + 5 * 8 + 4 * 6 * 8 + 4 * 4
-_MAX_PACKAGE_BYTES: Final = 1 << 20
-"""Bytes of a package; longer ones are not of this interface."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -167,11 +165,11 @@ REQUESTS: Final = (
 def _parts(state: bytes) -> Iterator[tuple[int, bytes]]:
     """Yield type and content of each part of a state."""
     start = 0
-    while start + _PACKAGE.size <= len(state):
-        length, kind = _PACKAGE.unpack_from(state, start)
-        if length < _PACKAGE.size or start + length > len(state):
+    while start + PACKAGE.size <= len(state):
+        length, kind = PACKAGE.unpack_from(state, start)
+        if length < PACKAGE.size or start + length > len(state):
             raise ValueError(f"a part of {length} bytes in a state of {len(state)}")
-        yield kind, state[start + _PACKAGE.size : start + length]
+        yield kind, state[start + PACKAGE.size : start + length]
         start += length
 
 
@@ -185,10 +183,10 @@ def _read_state(host: str, port: int) -> bytes:
     with socket.create_connection((host, port), IDENTITY_TIMEOUT) as connection:
         connection.settimeout(IDENTITY_TIMEOUT)
         while time.monotonic() < deadline:
-            length, kind = _PACKAGE.unpack(_exactly(connection, _PACKAGE.size))
-            if not _PACKAGE.size <= length <= _MAX_PACKAGE_BYTES:
+            length, kind = PACKAGE.unpack(_exactly(connection, PACKAGE.size))
+            if not PACKAGE.size <= length <= MAX_PACKAGE_BYTES:
                 raise ValueError(f"a package of {length} bytes")
-            payload = _exactly(connection, length - _PACKAGE.size)
+            payload = _exactly(connection, length - PACKAGE.size)
             if kind == _ROBOT_STATE_PACKAGE and _CONFIGURATION_PART in dict(_parts(payload)):
                 return payload
     raise TimeoutError(f"no configuration within {IDENTITY_TIMEOUT:g} s")
@@ -209,13 +207,13 @@ def _ask_dashboard(host: str, port: int) -> dict[str, str]:
     with socket.create_connection((host, port), IDENTITY_TIMEOUT) as connection:
         connection.settimeout(IDENTITY_TIMEOUT)
         with connection.makefile("rwb") as stream:
-            stream.readline(_MAX_PACKAGE_BYTES)  # the greeting
+            stream.readline(MAX_PACKAGE_BYTES)  # the greeting
             replies = {}
             for request in REQUESTS:
                 stream.write(f"{request}\n".encode())
                 stream.flush()
                 replies[request] = (
-                    stream.readline(_MAX_PACKAGE_BYTES).decode("utf-8", "replace").strip()
+                    stream.readline(MAX_PACKAGE_BYTES).decode("utf-8", "replace").strip()
                 )
             with suppress(OSError):
                 stream.write(b"quit\n")

@@ -10,10 +10,11 @@ import struct
 from collections.abc import Iterator
 from typing import Final
 
-_PACKAGE: Final = struct.Struct(">IB")
+PACKAGE: Final = struct.Struct(">IB")
 _MESSAGE_PACKAGE: Final = 20
 _CONTENT: Final = struct.Struct(">QbB")
-_MAX_PACKAGE_BYTES: Final = 1 << 20
+MAX_PACKAGE_BYTES: Final = 1 << 20
+"""Bytes of a package; longer ones are not of this interface."""
 _KEY_MESSAGE: Final = 7
 _ERROR_MESSAGE: Final = 6
 _EXCEPTION_MESSAGE: Final = 10
@@ -34,14 +35,14 @@ class MessageReader:
                 if (text := message_text(content))]  # fmt: skip
 
     def _packages(self) -> Iterator[tuple[int, bytes]]:
-        while len(self._rest) >= _PACKAGE.size:
-            length, kind = _PACKAGE.unpack_from(self._rest)
-            if not _PACKAGE.size <= length <= _MAX_PACKAGE_BYTES:
+        while len(self._rest) >= PACKAGE.size:
+            length, kind = PACKAGE.unpack_from(self._rest)
+            if not PACKAGE.size <= length <= MAX_PACKAGE_BYTES:
                 self._rest.clear()  # no primary interface: what follows means nothing
                 return
             if len(self._rest) < length:
                 return
-            content = bytes(self._rest[_PACKAGE.size : length])
+            content = bytes(self._rest[PACKAGE.size : length])
             del self._rest[:length]
             yield kind, content
 

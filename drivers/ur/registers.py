@@ -11,8 +11,9 @@ from __future__ import annotations
 from enum import IntEnum
 from typing import Final
 
+from drivers.ur.outputs import N_JOINTS
+
 FIRST_REGISTER: Final = 24
-N_JOINTS: Final = 6
 ANGLE_REGISTERS: Final = tuple(range(FIRST_REGISTER, FIRST_REGISTER + N_JOINTS))
 """Float registers of the set-point, controller angles [rad]; in the output the one used."""
 CHECK_REGISTER: Final = FIRST_REGISTER + N_JOINTS

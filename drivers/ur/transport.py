@@ -30,6 +30,7 @@ from drivers.transports.base import (
 from drivers.ur import rtde
 from drivers.ur.connection import (
     CONNECT_TIMEOUT,
+    READ_BYTES,
     RtdeConnection,
     connected,
     link_name,
@@ -44,7 +45,6 @@ from drivers.ur.wire import OPTIONAL, REQUIRED
 
 MAX_UNSENT_BYTES: Final = 1 << 14
 """Bytes of replies that may wait for the network; further ones are dropped."""
-_READ_BYTES: Final = 1 << 16
 
 
 @dataclass(frozen=True)
@@ -215,7 +215,7 @@ class UrTransport:
 
     def _read_frames(self) -> None:
         try:
-            data, control, _, _ = self._socket.recvmsg(_READ_BYTES, CONTROL_BYTES)
+            data, control, _, _ = self._socket.recvmsg(READ_BYTES, CONTROL_BYTES)
         except BlockingIOError:
             return
         except OSError as error:
@@ -237,7 +237,7 @@ class UrTransport:
         """Read what the primary interface says; without it, motions end as usual."""
         assert self._primary is not None
         try:
-            data = self._primary.recv(_READ_BYTES)
+            data = self._primary.recv(READ_BYTES)
         except BlockingIOError:
             return
         except OSError:
@@ -342,7 +342,7 @@ class _Loopback:
     def receive(self, timeout: float) -> bytes | None:
         if not select.select((self._here,), (), (), timeout)[0]:
             return None
-        return self._here.recv(_READ_BYTES)
+        return self._here.recv(READ_BYTES)
 
     def send(self, packet: bytes) -> None:
         with suppress(BlockingIOError):

@@ -38,6 +38,7 @@ from drivers.packets import DRIVE_ON
 from drivers.states import AxesReport, Input, State
 from drivers.ur import outputs
 from drivers.ur.arm_state import STATE_DTYPE, state_columns
+from drivers.ur.cycles import MAX_GRID_DEVIATION
 from drivers.ur.description import START, UrDescription
 from drivers.ur.expected import ExpectedArm
 from drivers.ur.identity import ArmIdentity
@@ -119,8 +120,6 @@ _TARGET_TOLERANCE: Final = 1e-9
 _REMEDY: Final = (
     "look at the arm and at the pendant; when the arm is ready again, run the same command"
 )
-_MAX_GRID_DEVIATION: Final = 0.25
-"""Largest distance of a time stamp from a whole number of cycles, in cycles."""
 _ALL_JOINTS: Final = np.ones(N_JOINTS, dtype=np.bool_)
 _NO_JOINTS: Final = np.zeros(N_JOINTS, dtype=np.bool_)
 
@@ -314,12 +313,12 @@ class UrWire:
         stamp: float = values[layout.at["timestamp"].start]
         period = self._settings.period
         ahead = 1.0 if self._stamp is None else (stamp - self._stamp) / period
-        if self._broken and not ahead >= 1.0 - _MAX_GRID_DEVIATION:
+        if self._broken and not ahead >= 1.0 - MAX_GRID_DEVIATION:
             ahead = 1.0  # started again meanwhile
-        if not ahead >= 1.0 - _MAX_GRID_DEVIATION:
+        if not ahead >= 1.0 - MAX_GRID_DEVIATION:
             return Stale(f"the time stamp {stamp:.3f} s does not follow {self._stamp:.3f} s")
         steps = round(ahead) if ahead < _STAMP_MODULUS else 0
-        if steps < 1 or abs(ahead - steps) > _MAX_GRID_DEVIATION:
+        if steps < 1 or abs(ahead - steps) > MAX_GRID_DEVIATION:
             problem = f"{1e3 * period:g} ms, the controller's cycle, or a multiple"
             raise PacketError("time between two frames", f"{1e3 * ahead * period:.3g} ms", problem)
         self._broken = False

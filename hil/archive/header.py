@@ -51,6 +51,7 @@ REPLIES_LOST = "AnswersLost"  # Name of the event `drivers.events.RepliesLost`
 EPISODE = "episode"  # Entry of an imported recording: its number, where a file has several
 REJECTED = "rejected"  # Outcome of a motion that completed and failed its quality check
 MAX_RECORDED_JOINTS: Final = 256
+SEQUENCE_MODULUS: Final = 1 << 32  # of the numbers of messages
 
 _CHECKSUM_DIGITS = 8  # of a checksum
 _PATTERN = re.compile(

@@ -132,7 +132,7 @@ class CommandSocket:
         self._socket.close()
 
 
-END_TIMEOUT = 30.0  # Time for the last flush of a slow disk, s
+LAST_FLUSH_TIMEOUT = 30.0  # Time for the last flush of a slow disk, s
 HUNG_TIMEOUT = 5.0
 """Time without a heartbeat after which the process is killed, s; a slow disk does not stop it."""
 NO_TIME = (
@@ -238,12 +238,12 @@ class ArchiveProcessHandle:
         """Close the open archive and end the process, killed if it hangs; return its fault."""
         if self.alive:
             self.send(Shutdown())
-        deadline = time.monotonic() + END_TIMEOUT
+        deadline = time.monotonic() + LAST_FLUSH_TIMEOUT
         while self.process.alive and not self._gone:
             if self.monitor.silence() > HUNG_TIMEOUT:
                 self.kill(silent_for(HUNG_TIMEOUT))
             elif time.monotonic() > deadline:
-                self.kill(f"did not end within {END_TIMEOUT:g} s and was killed")
+                self.kill(f"did not end within {LAST_FLUSH_TIMEOUT:g} s and was killed")
             else:
                 self.process.wait(EXIT_POLL_PERIOD)
         if not self._ended_for and self.process.status not in (0, None):

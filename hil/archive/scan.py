@@ -24,6 +24,7 @@ from hil.archive.container import Damage, Head, Record
 from hil.archive.header import (
     METADATA,
     OUTCOME,
+    SEQUENCE_MODULUS,
     ArchiveHeader,
     ArchiveOutcome,
     HeaderError,
@@ -40,7 +41,6 @@ NUMERIC_TOPICS = (
 """Channels with one message per sample."""
 ALL_TIMES: Final = -(1 << 63), 1 << 63  # ns, before and after every stamp
 _BATCH_BYTES: Final = 1 << 20  # bytes of chunks decoded at once: few calls, and all in the cache
-_SEQUENCE_MODULUS = 1 << 32  # message numbers are modulo this
 _MAX_DAMAGES = 1000  # of one file; what follows is not read
 _MIN_BYTES_PER_SAMPLE = 8  # bytes of a file for one sample, of an arm at rest
 _COLUMN_OF: Final = {"effort": "torque"}  # names of message fields that differ from the column's
@@ -456,8 +456,8 @@ class Scan:
                 raise Damage(offset, "(chunk) has messages out of order")
             first = int(sequence[0])
             gap = first - self._next.get(topic, first if self._skipped else 0)
-            gap %= _SEQUENCE_MODULUS
-            if gap > _SEQUENCE_MODULUS // 2:
+            gap %= SEQUENCE_MODULUS
+            if gap > SEQUENCE_MODULUS // 2:
                 raise Damage(offset, "(chunk) repeats messages of previous chunks")
             if gap:
                 missing[topic] = gap

@@ -25,6 +25,7 @@ from hil.archive.header import (
     KINDS,
     METADATA,
     OUTCOME,
+    SEQUENCE_MODULUS,
     ArchiveName,
     checksum,
     with_checksum,
@@ -54,7 +55,6 @@ from hil.base.terminal_text import with_joint_names
 
 FLUSH_PERIOD = 0.1  # s of the controller's time in one chunk; a crash loses at most that
 _SAMPLES_PER_CHUNK: Final = 1000
-_SEQUENCE_MODULUS: Final = 1 << 32  # message numbers are counted modulo this
 _UNLIMITED_CHUNK_BYTES: Final = 1 << 62  # bytes of a chunk: it ends at `flush` only
 _COMPRESSION: Final = CompressionType.LZ4
 """Of chunks. With Zstandard at the only level of the library files are a fifth smaller, and take
@@ -179,7 +179,7 @@ class ArchiveFile:
     def add(self, batch: Batch) -> None:
         """Add messages of several channels to the chunk in progress, one of each at each stamp."""
         topics = [*batch.messages]
-        numbers = (self.counts[topics[0]] + np.arange(len(batch.stamp))) % _SEQUENCE_MODULUS
+        numbers = (self.counts[topics[0]] + np.arange(len(batch.stamp))) % SEQUENCE_MODULUS
         stamps = batch.stamp.tolist()
         channels = [self._numbers[topic] for topic in topics]
         messages = [rows.view(f"V{rows.itemsize}").tolist() for rows in batch.messages.values()]
@@ -200,7 +200,7 @@ class ArchiveFile:
             self._add_message(EVENTS, event.stamp, event.encode())
 
     def _add_message(self, topic: str, stamp: int, data: bytes) -> None:
-        number = self.counts[topic] % _SEQUENCE_MODULUS
+        number = self.counts[topic] % SEQUENCE_MODULUS
         self._writer.add_message(self._numbers[topic], stamp, data, stamp, number)
         self.counts[topic] += 1
 

@@ -9,6 +9,10 @@ from typing import Final
 
 SCREEN_LINES: Final = 24
 SCREEN_COLUMNS: Final = 100
+MAX_JOINT_ROWS: Final = 8
+"""Rows of a table of joints, next to what else is on the screen."""
+TAIL_LINES: Final = 3
+"""Lines at the end of a long list: files, what was skipped, counts."""
 _ELLIPSIS: Final = " ..."
 
 

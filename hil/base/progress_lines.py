@@ -54,6 +54,7 @@ def _clock(seconds: float) -> str:
 
 FIRST_LINE_DELAY: Final = 1.0  # s after which a stage that is not over is named
 LINE_PERIOD: Final = 30.0  # s, the longest silence during a stage
+STATUS_LINE_PERIOD: Final = 5.0  # s between two lines on a moving arm, where there is no terminal
 _POLL_PERIOD: Final = 0.25  # Period of looking whether a line is due, s
 _MIN_SHARE_FOR_ESTIMATE: Final = 0.05  # Share of a task from which the time left is estimated
 

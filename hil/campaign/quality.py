@@ -25,6 +25,7 @@ from hil.base.errors import ArchiveError
 from hil.cell import Cell
 from hil.control.motions import CampaignMotion
 from hil.control.slips import slip_of
+from identification.distributions import MAD_TO_STD
 from identification.signals.noise import STANDSTILL_WINDOW_SECONDS
 from identification.signals.recording import stuck
 from identification.text import percentage
@@ -217,7 +218,7 @@ class RepetitionCheck:
             bound = np.full(len(new[row]), first)
             if len(past) >= MIN_REPETITIONS_FOR_SCATTER - 1:
                 middle = np.median(past[:, row], axis=0)
-                scatter = 1.4826 * np.median(np.abs(past[:, row] - middle), axis=0)
+                scatter = MAD_TO_STD * np.median(np.abs(past[:, row] - middle), axis=0)
                 usual = np.maximum(_MIN_BOUND_FACTOR * middle, middle + _OUTLIER_SIGMAS * scatter)
                 bound = np.maximum(usual, least)
             joint = int(np.argmax(new[row] / bound))

@@ -28,7 +28,7 @@ from rich.table import Table
 from rich.text import Text
 
 from hil.base.progress import Silent, Task, put
-from hil.base.progress_lines import LINE_PERIOD, progress_console
+from hil.base.progress_lines import LINE_PERIOD, STATUS_LINE_PERIOD, progress_console
 from hil.base.terminal_text import plural, printable
 from hil.campaign.dry_run_record import DryRunRecord
 from hil.campaign.operator import RunStatus
@@ -183,7 +183,6 @@ def confirmed(console: Console, question: str, word: str, stop: Stop) -> bool:
 # --- the screen
 
 REFRESH_PERIOD: Final = 0.1  # s between two pictures
-STATUS_LINE_PERIOD: Final = 5.0  # s between two lines where there is no terminal
 LAST_PICTURE_TIMEOUT: Final = 0.5  # s that a terminal may take for the last picture
 SHOWN_MESSAGES = 5
 MAX_STORED_MESSAGES = 200

@@ -16,7 +16,7 @@ from hil.base.terminal_text import typed
 from hil.cell.gripper_names import links_of
 
 LINKS_REMEDY: Final = "name links of the URDF, the tip farther from the root than the base"
-_MAX_NAMES: Final = 12
+MAX_NAMES: Final = 12
 _MIN_ARM_JOINTS: Final = 3
 """Joints of an arm: with fewer it is the head, the lift or the wheels of a robot."""
 _SIDES: Final = {"left": "left", "l": "left", "right": "right", "r": "right"}
@@ -74,7 +74,7 @@ def joints_between(path: Path | None, text: str, links: Links) -> list[str]:
         if link is not None and link not in names:
             matches = get_close_matches(link, names, n=3)
             heading = "the nearest are" if matches else "its links are"
-            remedy = f"{heading} {', '.join((matches or names)[:_MAX_NAMES])}"
+            remedy = f"{heading} {', '.join((matches or names)[:MAX_NAMES])}"
             raise InputError(path, f"has no link {link!r}", field=option, remedy=remedy)
     ends = [links.tip] if links.tip is not None else list(to_link)
     joints: dict[str, None] = {}

@@ -47,8 +47,8 @@ T = TypeVar("T")
 UR_MAX_GAP: Final = 4
 """`max_gap` of Universal Robots controllers without another: a set-point is used some two cycles
 after it was sent, and a computer without a real-time system is late now and then."""
-UR_FLANGES: Final = ("tool0", "flange")
-"""Frames in which such a controller states a payload."""
+FLANGES: Final = ("tool0", "flange")
+"""Links of URDFs that are the frame in which a controller states a payload."""
 ASSUMED_PAYLOAD: Final = "robot.payload"
 """Entry of `[cell] assumed` in the cell of an arm with a payload that is to be weighed."""
 
@@ -296,7 +296,7 @@ class Cell:
     def expected_arm(self) -> ExpectedArm:
         """The arm that must be at the other end of a link to Universal Robots."""
         table, payload = self.controller.rtde, self.file.robot.payload
-        at_flange = payload is not None and payload.frame in UR_FLANGES
+        at_flange = payload is not None and payload.frame in FLANGES
         return ExpectedArm(
             serial_number=self.file.cell.serial_number,
             model=table.model,

@@ -11,7 +11,7 @@ from typing import Annotated, Any, Final
 import typer
 
 from hil.base.files import convert_write_errors, make_folder
-from hil.base.one_screen import brief
+from hil.base.one_screen import TAIL_LINES, brief
 from hil.base.progress import reporter as make_reporter
 from hil.base.terminal_text import plural, printable
 from hil.batch import graph as run
@@ -87,9 +87,6 @@ def batch(
         raise typer.Exit(EXIT_SOME_BROKEN)
 
 
-_TAIL_LINES: Final = 3  # lines at the end: files, what was skipped, counts
-
-
 def _print(
     result: BatchResult,
     maps: Mapping[LogMap, int],
@@ -110,7 +107,7 @@ def _print(
     if result.skipped and not quiet:
         lines.append(skipped_line(result.skipped))
     lines.append(_counts(result))
-    for line in lines if verbose else brief(lines, last=_TAIL_LINES):
+    for line in lines if verbose else brief(lines, last=TAIL_LINES):
         typer.echo(printable(line))
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated, Final
+from typing import Annotated
 
 import typer
 
@@ -13,11 +13,9 @@ from hil.base.progress import reporter as make_reporter
 from hil.base.terminal_text import printable
 from hil.batch.cluster import Cluster
 from hil.cli.arguments import JsonOption, QuietOption, VerboseOption, print_json
+from hil.cli.verdict import EXIT_CHANGED
 from hil.compare import comparison as comparing
 from identification.text import unit_text
-
-EXIT_CHANGED: Final = 5
-"""Exit status with --fail-on-change: something has changed."""
 
 
 def compare(

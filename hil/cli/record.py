@@ -19,7 +19,7 @@ from hil.archive.recorder import Recorded
 from hil.base.arrays import Array
 from hil.base.errors import ControllerError, HilError, InputError, OperatorStopError
 from hil.base.progress import put, say
-from hil.base.progress_lines import LINE_PERIOD, progress_console
+from hil.base.progress_lines import LINE_PERIOD, STATUS_LINE_PERIOD, progress_console
 from hil.campaign import Progress, stop_on_interrupt
 from hil.cell import AngleFrame, Cell
 from hil.cell.schema import LINKS
@@ -31,8 +31,6 @@ from hil.control.ur_recording import ConstantsFound, listening, record_arm
 from identification.text import percentage
 
 Kind = Annotated[Literal["excitation", "validation", "standstill"], typer.Option(metavar="USE")]
-STATUS_LINE_PERIOD = 5.0
-"""Time between two lines, s."""
 
 
 @dataclass(frozen=True)

@@ -10,7 +10,7 @@ import typer
 
 from hil.base.errors import InputError
 from hil.base.files import make_folder
-from hil.base.one_screen import SCREEN_LINES, Paragraph, Part, columns, one_screen
+from hil.base.one_screen import MAX_JOINT_ROWS, SCREEN_LINES, Paragraph, Part, columns, one_screen
 from hil.base.progress import Reporter, say
 from hil.base.progress import reporter as make_reporter
 from hil.cli.arguments import (
@@ -22,7 +22,7 @@ from hil.cli.arguments import (
     with_options,
 )
 from hil.cli.identify_options import EstimatorOption, Identifying, servo_from
-from hil.cli.verdict import EXIT_NOT_GOOD, MAX_JOINT_ROWS
+from hil.cli.verdict import EXIT_NOT_GOOD
 from hil.pipeline.options import Options
 from hil.pipeline.stored_identification import read_or_identify
 from hil.plots.plan_picture import save

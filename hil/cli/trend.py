@@ -10,13 +10,14 @@ from typing import Annotated, Final
 import typer
 
 from hil.base.files import convert_write_errors, make_folder, write_files
-from hil.base.one_screen import brief
+from hil.base.one_screen import TAIL_LINES, brief
 from hil.base.progress import reporter as make_reporter
 from hil.base.terminal_text import plural, printable
 from hil.cli.arguments import JsonOption, QuietOption, VerboseOption, print_json, with_options
 from hil.cli.fleet_options import Fleet, RecordingsArgument, last, map_lines, skipped_line
 from hil.cli.identify_options import Identifying
 from hil.cli.imports import RARE, Described, Reading
+from hil.cli.verdict import EXIT_CHANGED
 from hil.fleet.conditions import Conditions
 from hil.fleet.documents import as_dict
 from hil.fleet.estimated import estimated_fleet
@@ -27,10 +28,7 @@ from hil.fleet.trend import FleetTrend, fleet_trend
 from hil.fleet.trend_limits import TrendLimit
 from hil.fleet.trend_page import trend_page
 
-EXIT_CHANGED: Final = 5
-"""Exit status with --fail-on-change: something has changed."""
 _MAX_BROKEN_LINES: Final = 8
-_TAIL_LINES: Final = 3  # lines at the end: files, what was skipped, counts
 
 
 @with_options(Identifying, "how")
@@ -117,7 +115,7 @@ def _print(
     if result.skipped and not quiet:
         lines.append(skipped_line(result.skipped))
     lines = [f"{verdict(result)}.", *lines, _counts(result)]
-    for line in lines if verbose else brief(lines, last=_TAIL_LINES):
+    for line in lines if verbose else brief(lines, last=TAIL_LINES):
         typer.echo(printable(line))
 
 

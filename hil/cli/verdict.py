@@ -10,7 +10,7 @@ from typing import Final
 
 import typer
 
-from hil.base.one_screen import Paragraph, Part, columns, one_screen
+from hil.base.one_screen import MAX_JOINT_ROWS, Paragraph, Part, columns, one_screen
 from hil.base.progress import say
 from hil.base.terminal_text import printable, typed
 from hil.results.results import JointJudgement, OverallJudgement, Results
@@ -20,10 +20,11 @@ from identification.validation.verdict import fault_of
 
 EXIT_NOT_GOOD = 5
 """Exit status of a command whose model is not good."""
+EXIT_CHANGED: Final = 5
+"""Exit status with --fail-on-change: something has changed."""
 
 MAX_SHOWN: Final = 3
 """Findings, and next steps, on one screen."""
-MAX_JOINT_ROWS: Final = 8  # rows on one screen
 _MISSING: Final = "-"
 _LEVELS: Final = {"wrong": "wrong", "doubtful": "doubtful", "information": "info", "good": "ok"}
 LABEL_COLUMNS: Final = 10

@@ -34,7 +34,8 @@ MIN_REPETITIONS: Final = 15
 """Repetitions needed to estimate their correlation. With fewer the effective number is 1, as all
 may have been recorded while the arm warmed up."""
 CONFIDENCE: Final = 0.95  #: Of each interval
-FALSE_ALARM_RATE: Final = 0.01  #: Probability of any change of an arm that has none
+FALSE_ALARM_RATE: Final = 0.01
+"""Probability of any change where there is none: of an arm, or in a fleet at one time of asking."""
 MIN_RELATIVE_CHANGE: Final = 0.05  #: Smallest relevant change, as a share of the first value
 FRICTION_SPEEDS: Final = np.geomspace(0.02, 5.0, 40)  # rad/s or m/s
 _MAX_CORRELATION: Final = 0.95

@@ -50,6 +50,7 @@ from .port import ControllerPort
 
 REST_TIMEOUT: Final = 30.0
 """s for an arm to come to rest, and for the archive of a motion that has ended."""
+SESSION_END_TIMEOUT: Final = 30.0  # s within which a session must end after that was requested
 CLOSE_TIMEOUT: Final = 1.0  # s for the axes to close after the motion of a failed archive
 SLOW_FLUSH_SECONDS: Final = 1.0  # Duration of one flush that is reported as a fault of the disk, s
 NOT_STARTED: Final = "it had not begun"

@@ -52,6 +52,7 @@ from hil.archive.process_handle import (
 from hil.archive.recorder import Recorded
 from hil.base.errors import ArchiveWriteError, ControllerError
 from hil.cell import Cell
+from hil.control.link import SESSION_END_TIMEOUT
 from hil.control.motion_watch import Stop
 
 from .link import MotionLink
@@ -59,9 +60,10 @@ from .port import PortStatus
 
 T = TypeVar("T")
 
-HEARTBEAT_PERIOD: Final = 0.05  # s; the exchange stops the arm after 0.5 s without a heartbeat
+SUPERVISOR_HEARTBEAT_PERIOD: Final = 0.05
+"""s; the exchange stops the arm after 0.5 s without a heartbeat."""
 STALL_TIMEOUT: Final = 1.0  # Longest time between two turns of the loop that supervises a motion, s
-HUNG_TIMEOUT: Final = 5.0
+EXCHANGE_HUNG_TIMEOUT: Final = 5.0
 """s without a heartbeat after which an exchange process is killed: the controller, without replies
 for so long, has acted by its own watchdog."""
 EARLIER_EXCHANGE_TIMEOUT: Final = 30.0
@@ -69,7 +71,6 @@ EARLIER_EXCHANGE_TIMEOUT: Final = 30.0
 the arm to rest and to end."""
 SUPERVISION_PERIOD: Final = 0.02  # Period of the supervising loop, s
 OPEN_TIMEOUT = 10.0  # s within which a file must have been created, or completed
-END_TIMEOUT: Final = 30.0  # s within which a session must end after that was requested
 _M_MMAP_THRESHOLD: Final = -3
 MMAP_THRESHOLD_BYTES: Final = 128 * 1024  # Bytes; glibc's own value, before it adapts
 
@@ -100,7 +101,7 @@ class Heartbeat:
         def beat() -> None:
             while not self._ended:
                 self.update()
-                time.sleep(HEARTBEAT_PERIOD)
+                time.sleep(SUPERVISOR_HEARTBEAT_PERIOD)
 
         threading.Thread(target=beat, daemon=True).start()
 
@@ -161,9 +162,9 @@ class ExchangeMonitor:
 
     def failure(self) -> str | None:
         """Return why the process no longer replies, None while it does; kill one that hangs."""
-        if self.exchange.alive and self._monitor.silence() > HUNG_TIMEOUT:
+        if self.exchange.alive and self._monitor.silence() > EXCHANGE_HUNG_TIMEOUT:
             self.exchange.kill()
-            self.ended_for = silent_for(HUNG_TIMEOUT)
+            self.ended_for = silent_for(EXCHANGE_HUNG_TIMEOUT)
         if self.exchange.alive:
             return None
         self._read()
@@ -352,7 +353,7 @@ class LivePort:
         try:
             self.finish()
             self.exchange.finish()
-            deadline = time.monotonic() + END_TIMEOUT
+            deadline = time.monotonic() + SESSION_END_TIMEOUT
             while self.failure() is None and time.monotonic() < deadline:
                 self.exchange.send_heartbeat()
                 time.sleep(SUPERVISION_PERIOD)
@@ -360,8 +361,8 @@ class LivePort:
                 problem = f"the exchange process {self._monitor.ended_for}"
             if self.exchange.alive:
                 problem = (
-                    f"the exchange process still replies {END_TIMEOUT:g} s after it was asked to "
-                    "end (an axis is open); it ends when the axes are closed"
+                    f"the exchange process still replies {SESSION_END_TIMEOUT:g} s after it was "
+                    "asked to end (an axis is open); it ends when the axes are closed"
                 )
         finally:
             failure = self.archive.end()

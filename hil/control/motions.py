@@ -24,10 +24,8 @@ from planner import (
     in_child,
     plan_moves,
 )
+from planner.player import FLOAT32_RANGE_ROUNDING
 
-_FLOAT32_RANGE_ROUNDING: Final = 9e-7
-"""Rounding of a position at its limit in packets, as a share of half a joint's range; guard and
-player allow as much."""
 MIN_MOVE: Final = 1e-6  # rad; a shorter move is left out
 START_TOLERANCE: Final = 1e-3  # Largest distance of the arm from the start of a motion, rad
 REPEATED: Final = ("excitation", "warmup")  # Kinds of motion that run the excitation
@@ -75,7 +73,7 @@ class CampaignMotion:
 def at_limit(posture: Array, limits: JointLimits) -> Array:
     """Return a posture (n,) [rad], moved back to limits that are exceeded by rounding only."""
     within = np.clip(posture, limits.lower, limits.upper)
-    rounding = 0.5 * _FLOAT32_RANGE_ROUNDING * (limits.upper - limits.lower)
+    rounding = 0.5 * FLOAT32_RANGE_ROUNDING * (limits.upper - limits.lower)
     return np.where(np.abs(posture - within) <= rounding, within, posture)
 
 

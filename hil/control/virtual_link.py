@@ -25,12 +25,12 @@ from hil.archive.live import LiveView
 from hil.archive.recorder import Recorded
 from hil.base.errors import ControllerError
 from hil.cell import Cell
+from hil.control.link import SESSION_END_TIMEOUT
 from hil.control.motion_watch import Stop
 
 from .link import MotionLink
 from .port import PortStatus
 
-END_TIMEOUT: Final = 30.0  # s within which a session must end after that was requested
 DRAIN_CYCLES: Final = 100
 """Cycles after which records are archived: 100 ms at 1 kHz, the flush period."""
 AFTERMATH_CYCLES: Final = 1000
@@ -213,15 +213,16 @@ class VirtualPort:
         return archiving.recorder.close(outcome, reason)
 
     def close(self) -> None:
-        """Ask the controller to end the session, and reply until it does, at most `END_TIMEOUT` s.
+        """Ask the controller to end the session, and reply until it does.
 
-        A restarted controller was not asked, and continues with closed axes.
+        At most `SESSION_END_TIMEOUT` s. A restarted controller was not asked, and continues with
+        closed axes.
 
         Raises:
             ControllerError: an axis is still open after that time.
         """
         self.finish()
-        deadline = self.now + END_TIMEOUT
+        deadline = self.now + SESSION_END_TIMEOUT
 
         def finished() -> bool:
             self.ring.drain()
@@ -230,7 +231,8 @@ class VirtualPort:
         self.exchange_until(finished)
         if self.session.state in STATES_WITH_SET_POINTS:
             raise ControllerError(
-                f"an axis is still open {END_TIMEOUT:g} s after the controller was asked to end"
+                f"an axis is still open {SESSION_END_TIMEOUT:g} s after the controller was asked"
+                " to end"
             )
 
     @property

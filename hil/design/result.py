@@ -26,6 +26,7 @@ from identification.excitation import (
 )
 from planner import FourierSeries, PiecewiseCubic, PlanFile, PlannerError, in_child
 from planner.arrays import DAMAGED_DATA_ERRORS, Whole, numbers, strict
+from planner.plan_file import PLAN_TOLERANCE
 
 from .settings import RESULT_FORMAT, DesignSettings, settings_of, with_present_fields
 
@@ -36,9 +37,7 @@ DECISIVE: Final = ("urdf", "robot", "limits")
 checked before the motion is sent."""
 
 _DIGEST_DIGITS: Final = 16
-# Largest difference of a motion planned on another computer [rad], and number of compared instants.
-_PLAN_TOLERANCE: Final = 1e-9
-_COMPARED_INSTANTS: Final = 9
+_COMPARED_INSTANTS: Final = 9  # of a stored motion with the same one planned on another computer
 _LIMITS: Final = ("lower", "upper", "velocity", "acceleration", "jerk")
 _REMEDY: Final = "design it again (`hil design`)"
 _HEAD: Final = """\
@@ -200,9 +199,7 @@ class DesignResult:
             problem = f"is not a designed excitation ({' '.join(str(error).split()):.200})"
             raise InputError(path, problem, remedy=_REMEDY) from error
         planned = _positions(result.excitation.trajectory)
-        if positions.shape != planned.shape or np.any(
-            np.abs(planned - positions) > _PLAN_TOLERANCE
-        ):
+        if positions.shape != planned.shape or np.any(np.abs(planned - positions) > PLAN_TOLERANCE):
             raise InputError(
                 path,
                 "its moves do not plan to the motion that was designed",

@@ -15,6 +15,7 @@ from hil.base.errors import InputError
 from hil.base.files import make_folder, write_files
 from hil.base.safe_input import read_input
 from hil.pipeline.identified_model import IdentifiedModel, ensemble_of, remarks_of
+from identification.estimators.prior import DETERMINED_STD_RATIO
 from identification.export.actuators import Actuators, FieldRange, Quantity, ranges_of
 from identification.export.exported_arm import ExportedArm
 from identification.export.patching import PatchError, patched
@@ -45,7 +46,6 @@ _FIELDS: Final[Mapping[str, Mapping[str, Quantity]]] = {
 OWN_FILE: Final = "give an MJCF or URDF with the joints of the arm by name"
 """Remedy for a file that cannot be changed."""
 _MIN_SAMPLED_ARMS: Final = 100  # arms of which ranges are estimated
-_DETERMINED_STD_RATIO: Final = 0.5  # of the prior's deviation, above which the motion says little
 
 
 @dataclass(frozen=True)
@@ -197,7 +197,7 @@ def drives_of(model: IdentifiedModel, count: int, seed: int) -> Actuators:
         deviation = draws[name].std(axis=0)
         low = np.maximum(value - reach * deviation, 0.0)
         fields[name] = FieldRange(
-            value, low, value + reach * deviation, deviation <= _DETERMINED_STD_RATIO * known[name]
+            value, low, value + reach * deviation, deviation <= DETERMINED_STD_RATIO * known[name]
         )
     fields["limit"] = FieldRange.exact(np.asarray(arm.ranges.effort))
     turning = np.asarray(arm.model.chain.revolute, np.bool_)

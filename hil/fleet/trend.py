@@ -15,7 +15,7 @@ import numpy as np
 
 from hil.base.arrays import Array
 from hil.batch.cluster import SkippedArchive
-from hil.compare.comparison import MIN_RELATIVE_CHANGE, holm
+from hil.compare.comparison import FALSE_ALARM_RATE, MIN_RELATIVE_CHANGE, holm
 from hil.fleet.covariates import warmed
 from hil.fleet.quantities import CAUSES, FollowedQuantity, QuantityName
 from hil.fleet.series import (
@@ -28,8 +28,6 @@ from hil.fleet.series import (
 from hil.fleet.series_changes import MIN_SIBLINGS, Course, common_course, courses, scattered
 from hil.fleet.trend_limits import TrendLimit
 
-FALSE_ALARM_RATE: Final = 0.01
-"""Probability of any change in a fleet that has none, at one time of asking."""
 _FORECAST_MONTHS: Final = 240.0  # months within which a limit is foreseen
 _SEASON: Final = ("cosine of a year", "sine of a year")
 

@@ -9,7 +9,7 @@ import numpy as np
 
 from hil.base.arrays import Array
 from hil.base.version import software
-from hil.compare.comparison import MIN_RELATIVE_CHANGE
+from hil.compare.comparison import FALSE_ALARM_RATE, MIN_RELATIVE_CHANGE
 from hil.fleet.messages import (
     month,
     name_of,
@@ -19,7 +19,11 @@ from hil.fleet.messages import (
     verdict,
 )
 from hil.fleet.series import REFERENCE_MONTHS
-from hil.fleet.trend import FALSE_ALARM_RATE, FleetTrend, QuantityTrend, RobotTrend
+from hil.fleet.trend import (
+    FleetTrend,
+    QuantityTrend,
+    RobotTrend,
+)
 from hil.report.chart import Caption, Chart, Legend, Plot
 from hil.report.panels import Panel, chart_panel
 from hil.report.rendering import environment, page_bytes

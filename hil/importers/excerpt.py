@@ -15,12 +15,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hil.base.arrays import Array
+from hil.importers.stamps import PAUSE_NS
 
 MAX_EXCERPT_ROWS: Final = 480_000
 """Rows that are read of one recording."""
 MAX_EXCERPT_SECONDS: Final = 800.0
 """Time that is used of one recording [s]: memory follows blocks of time."""
-_PAUSE_NS: Final = 10**9  # ns
 STRETCH_ROWS: Final = 8_192
 """Rows that are read together."""
 PROBE_STRIDE: Final = 64
@@ -79,7 +79,7 @@ def excerpt_of(stamp: NDArray[np.int64], position: Array, longest: int) -> Stret
     most = int(min(longest, MAX_EXCERPT_SECONDS * rate))
     if len(stamp) <= most:
         return None
-    parts = [0, *(np.flatnonzero(steps > _PAUSE_NS) + 1).tolist(), len(stamp)]
+    parts = [0, *(np.flatnonzero(steps > PAUSE_NS) + 1).tolist(), len(stamp)]
     stretches = [
         slice(start, min(start + STRETCH_ROWS, b))
         for a, b in pairwise(parts)

@@ -53,8 +53,10 @@ from identification.signals.recording import MIN_MOVEMENT, unwrap
 _LIMIT_TOLERANCE: Final = 0.05  # rad or m beyond a limit, for calibration and overshoot
 _MIN_TRAVEL: Final = 0.1  # rad or m
 _SCALE_TOLERANCE: Final = 0.1  # of velocity over slope of the position, for filters
-_MIN_CORRELATION: Final = 0.7
-_MAX_LIMIT_RATIO: Final = 3.0  # times the URDF's limit, of speed and of torque
+MIN_CORRELATION: Final = 0.7
+"""Correlation of a velocity with the slope of its position."""
+MAX_LIMIT_RATIO: Final = 3.0
+"""Times the URDF's limit of speed or torque; right logs of arms reach 1.7 of a stated torque."""
 _OTHER_UNIT_RATIO: Final = 30.0  # between the errors of a nominal torque and a factor of 1000
 _THOUSAND: Final = 1000.0
 _BLOCK_SECONDS: Final = 0.05  # s, over which signals are averaged before they are differentiated
@@ -284,7 +286,7 @@ def has_degrees_per_second(time: Array, position: Array, velocity: Array) -> boo
     per_degree = math.radians(1.0) * factor
     itself = np.diag(correlation)
     return bool(
-        (itself >= _MIN_CORRELATION).all() and (abs(per_degree - 1.0) < _SCALE_TOLERANCE).all()
+        (itself >= MIN_CORRELATION).all() and (abs(per_degree - 1.0) < _SCALE_TOLERANCE).all()
     )
 
 
@@ -334,7 +336,7 @@ def _positions(
         return
     usual = np.quantile(moved / steps[whole], 0.9, axis=0)
     for name, speed, limit in zip(names, usual, limits.velocity, strict=True):
-        if speed > _MAX_LIMIT_RATIO * limit:
+        if speed > MAX_LIMIT_RATIO * limit:
             yield FastJoint(name, float(speed), float(limit))
 
 
@@ -357,10 +359,10 @@ def _velocities(
         return
     factor, correlation = against_position(time, position[:, moving], velocity[:, moving])
     itself = np.diag(correlation)
-    if itself.min() < _MIN_CORRELATION:
+    if itself.min() < MIN_CORRELATION:
         columns = scipy.optimize.linear_sum_assignment(-correlation)[1]
         best = correlation[np.arange(len(moving)), columns]
-        if best.min() >= _MIN_CORRELATION:
+        if best.min() >= MIN_CORRELATION:
             order = list(names)
             for joint, column in zip(moving, columns, strict=True):
                 order[moving[column]] = names[joint]
@@ -368,7 +370,7 @@ def _velocities(
             return
     off = {}
     for k, joint in enumerate(moving):
-        if itself[k] < _MIN_CORRELATION:
+        if itself[k] < MIN_CORRELATION:
             yield UnrelatedVelocity(names[joint], float(itself[k]))
         elif abs(factor[k] - 1.0) > _SCALE_TOLERANCE:
             off[names[joint]] = float(factor[k])
@@ -411,7 +413,7 @@ def _torques(samples: ImportedSamples, names: Sequence[str], limits: Array) -> I
     for name, largest, limit in zip(names, np.abs(samples.torque).max(axis=0), limits, strict=True):
         if largest == 0.0:
             yield ZeroTorque(name)
-        elif largest > _MAX_LIMIT_RATIO * limit:
+        elif largest > MAX_LIMIT_RATIO * limit:
             yield LargeTorque(name, float(largest), float(limit))
     yield from constant_torques(samples.position, samples.torque, names)
 
@@ -450,7 +452,7 @@ def _torque_size(
         if not compared.any():
             return
         ratio = np.abs(samples.torque).max(axis=0)[compared] / limits[compared]
-        lowest = _THOUSAND / _MAX_LIMIT_RATIO
+        lowest = _THOUSAND / MAX_LIMIT_RATIO
     ratios = dict(zip(_those(names, compared), ratio.tolist(), strict=True))
     if ratio.max() < 1.0 / lowest:
         yield TorqueSize(ratios, by_masses, too_large=False)

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from hil.base.arrays import Array
 from hil.importers.stamps import is_clock
 
-_MIN_CORRELATION: Final = 0.9  # correlation of a velocity with the slope of its position
+_MIN_UNNAMED_CORRELATION: Final = 0.9  # correlation of a velocity with the slope of its position
 _MAX_SLOPE_DEVIATION: Final = 0.1  # relative deviation of a velocity from the slope
 _MAX_ROWS: Final = 20_000
 _MIN_ROWS: Final = 8  # rows
@@ -74,7 +74,7 @@ def _slope_ratio(position: Array, other: Array) -> float | None:
     if len(position) < _MIN_ROWS or not moving.any():
         return None
     pairs = [*zip(slopes[:, moving].T, other[:, moving].T, strict=True)]
-    if np.median([np.corrcoef(*pair)[0, 1] for pair in pairs]) < _MIN_CORRELATION:
+    if np.median([np.corrcoef(*pair)[0, 1] for pair in pairs]) < _MIN_UNNAMED_CORRELATION:
         return None
     return float(np.median([np.std(slope) / np.std(column) for slope, column in pairs]))
 

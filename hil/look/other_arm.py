@@ -12,7 +12,7 @@ from hil.base.arrays import Array
 from hil.cell import Cell
 from hil.cell.toml_edits import urdf_limits
 from hil.importers.conclusions import Certainty
-from hil.importers.plausibility import limit_excess, whole_turns
+from hil.importers.plausibility import MAX_LIMIT_RATIO, limit_excess, whole_turns
 from hil.look.physics import Size
 from hil.look.readings import (
     BeyondEffort,
@@ -36,8 +36,6 @@ _RANGE_QUANTILE: Final = 0.99  # quantile of the rows, so that single spikes are
 _MAX_RANGE_EXCESS: Final = 0.17  # rad or m beyond a range; zeros of the same arm differ by less
 _FAR_RANGE_EXCESS: Final = np.pi / 4.0  # the same, of one finding that is enough
 _MAX_TURNS_OFF: Final = 3  # by which the count of an encoder may be off
-# of a speed or torque; right logs of real arms reach 1.7 of a stated torque
-_MAX_LIMIT_RATIO: Final = 3.0
 # of the torque; right logs of short motions have up to 0.29 as well
 _UNEXPLAINED_ERROR: Final = 0.15
 
@@ -94,13 +92,13 @@ class Contradictions:
         if excess.max() > _MAX_RANGE_EXCESS:
             joint = int(excess.argmax())
             motion = BeyondRange(names[joint], float(excess[joint]), turns=bool(turns[joint]))
-        elif speed.max() > _MAX_LIMIT_RATIO:
+        elif speed.max() > MAX_LIMIT_RATIO:
             joint = int(speed.argmax())
             motion = BeyondSpeed(names[joint], float(speed[joint]))
         expected = Size.of(cell, model, samples)
         factor = expected.factor or 1.0
         # A factor of 1000 is another unit, which a look names.
-        if effort.max() > _MAX_LIMIT_RATIO and not expected.is_thousand:
+        if effort.max() > MAX_LIMIT_RATIO and not expected.is_thousand:
             joint = int(effort.argmax())
             size = BeyondEffort(names[joint], float(effort[joint]))
         elif expected.is_off and factor > 1.0 and not expected.is_thousand:

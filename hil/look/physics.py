@@ -66,7 +66,7 @@ from identification.hypotheses.scores import is_backwards
 from identification.hypotheses.search import EXPLAINED_ERROR, SEPARATE_SIGMAS, Readings, Step
 from identification.model.link_wrenches import LINK_SYMBOLS
 from identification.model.motion import Motion
-from identification.model.robot import RobotModel
+from identification.model.robot import STANDARD_GRAVITY, RobotModel
 from identification.signals.recording import Recording
 from identification.signals.samples import Preprocessing, Samples
 from identification.validation.nominal_scale import nominal_scale
@@ -111,7 +111,6 @@ _WEAK_STD_RATIO: Final = 0.9
 # Masses of arms over the cube of their reach, kg/m³: 11 (Gen3) to 216 (TX40).
 _ARM_DENSITY: Final = 45.0
 _DENSITY_SPREAD: Final = 3.0  # factor of one standard deviation
-_STANDARD_GRAVITY: Final = 9.81
 
 
 @dataclass(frozen=True)
@@ -191,7 +190,7 @@ def _by_reach(model: RobotModel, samples: Samples) -> float | None:
     if not weight > 0.0 or not reach > 0.0:
         return None
     mass = _ARM_DENSITY * reach**3
-    return float(weight / (0.3 * mass * _STANDARD_GRAVITY * reach))
+    return float(weight / (0.3 * mass * -STANDARD_GRAVITY[2] * reach))
 
 
 @dataclass(frozen=True, eq=False)

@@ -24,7 +24,7 @@ from hil.importers.conclusions import (
     StatedUnit,
     UnitBasis,
 )
-from hil.importers.plausibility import against_position, outside_limits
+from hil.importers.plausibility import MIN_CORRELATION, against_position, outside_limits
 from hil.importers.recording_import import ImportedRecording
 from hil.importers.units import Kind
 from hil.look.readings import (
@@ -51,7 +51,6 @@ from identification.signals.clock import time_base
 from identification.signals.noise import noiseless_above
 from identification.signals.recording import MIN_MOVEMENT, UNWRAPPED, Recording
 
-_MIN_CORRELATION: Final = 0.7  # correlation of a velocity with the slope of its position
 _MAX_RATIO_DEVIATION: Final = 0.1  # relative deviation of their ratio
 _MAX_LAG_SECONDS: Final = 0.1  # s
 _MIN_LAG_STEPS: Final = 1.5  # sampling steps
@@ -149,8 +148,8 @@ def _velocity(recording: Recording) -> Row:
     )
     itself = np.diag(correlation)
     names = [recording.joint_names[joint] for joint in moving]
-    if itself.min() < _MIN_CORRELATION:
-        bad = tuple(name for name, r in zip(names, itself, strict=True) if r < _MIN_CORRELATION)
+    if itself.min() < MIN_CORRELATION:
+        bad = tuple(name for name, r in zip(names, itself, strict=True) if r < MIN_CORRELATION)
         evidence = Correlation(float(itself.min()))
         decider = NextStep.CHECK_COLUMNS
         return Row("velocity", NotSlopes(bad), Certainty.CERTAIN, (evidence,), decider)

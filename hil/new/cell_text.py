@@ -24,7 +24,7 @@ from hil.base.arrays import Array
 from hil.base.errors import InputError
 from hil.base.safe_input import read_input, read_text
 from hil.base.toml_text import comment_lines, inline
-from hil.cell.arms import Links, joints_outside
+from hil.cell.arms import MAX_NAMES, Links, joints_outside
 from hil.cell.errors import UNKNOWN, WHERE, models_of
 from hil.cell.gripper_names import gripper_joints, links_of
 from hil.cell.schema import CellFile
@@ -377,9 +377,6 @@ def cell_of_urdf(
     return replace(made, urdf=made.urdf or arm, values=made.values | CellValues(notes=(note,)))
 
 
-_MAX_NAMES: Final = 12
-
-
 def _note_on_gripper(fingers: Sequence[str], chain: Chain, text: str) -> str:
     """Return a note on joints that seem to belong to a gripper."""
     links = links_of(text)
@@ -390,12 +387,12 @@ def _note_on_gripper(fingers: Sequence[str], chain: Chain, text: str) -> str:
         if parents[name] >= 0 and chain.joint_names[parents[name]] not in fingers
     }
     tip = wrists.pop() if len(wrists) == 1 else "LINK"
-    names = ", ".join(fingers[:_MAX_NAMES])
-    if len(fingers) > _MAX_NAMES:
-        names += f" and {len(fingers) - _MAX_NAMES} others"
+    names = ", ".join(fingers[:MAX_NAMES])
+    if len(fingers) > MAX_NAMES:
+        names += f" and {len(fingers) - MAX_NAMES} others"
     looks = "looks like a joint" if len(fingers) == 1 else "look like joints"
     note = f"{names} {looks} of a gripper or hand by name: "
-    if len(fingers) <= _MAX_NAMES:
+    if len(fingers) <= MAX_NAMES:
         fixing = " ".join(f"--fix {name}" for name in fingers)
         note += f"fix what is not identified ({fixing}), or "
     return f"{note}name the last link of the arm (--tip {tip})"
@@ -414,7 +411,7 @@ def _note_on_branches(text: str, chain: Chain) -> list[str]:
     if len(ends) > 1:
         notes.append(
             f"the joints form {len(ends)} branches, with the last moving links "
-            f"{', '.join(ends[:_MAX_NAMES])}: choose one arm with --base LINK --tip LINK"
+            f"{', '.join(ends[:MAX_NAMES])}: choose one arm with --base LINK --tip LINK"
         )
     return notes
 

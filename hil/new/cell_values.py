@@ -26,7 +26,8 @@ from hil.base.safe_input import parse_toml
 from hil.cell.errors import UNKNOWN
 from hil.cell.toml_edits import urdf_limits
 from hil.control.connection import Connection
-from hil.control.live_link import END_TIMEOUT, ExchangeMonitor
+from hil.control.link import SESSION_END_TIMEOUT
+from hil.control.live_link import ExchangeMonitor
 from hil.control.motion_watch import Stop
 from identification.excitation import CollisionModelError, Workspace
 from planner import JointLimits
@@ -297,7 +298,7 @@ def read_init(
         return _waited_for(exchange, wait, stop)
     finally:
         exchange.finish()
-        exchange.wait(END_TIMEOUT)
+        exchange.wait(SESSION_END_TIMEOUT)
         exchange.close()
 
 

@@ -18,6 +18,7 @@ from drivers.ur.torque_constants import RELATIVE_UNCERTAINTY, by_size, stated_co
 from drivers.ur.transport import RtdeSpec
 from hil.base.arrays import Array
 from hil.base.errors import ControllerError, InputError
+from hil.cell.cell import FLANGES
 from hil.cell.errors import UNKNOWN
 from hil.cell.gripper_names import links_of
 from hil.cell.schema import RtdeTable
@@ -34,8 +35,6 @@ JOINT_NAMES: Final = (
     "wrist_3_joint",
 )
 """Of the URDF by the maker."""
-FLANGES: Final = ("tool0", "flange")
-"""Links of URDFs that are the frame of the controller's payload: by the maker, and of `hil`."""
 CONVENTION: Final = "of every arm of this maker"
 """Origin of gears, signs and offsets: angles are those of the URDF, torques follow by the ratio."""
 _LISTENING_SECONDS: Final = 1.0

@@ -13,6 +13,7 @@ import numpy as np
 from hil.base.arrays import Array
 from hil.base.errors import ArchiveError, InputError
 from hil.base.progress import Reporter
+from hil.cell.cell import FLANGES
 from hil.pipeline.carried_weight import require_weight
 from hil.pipeline.cell_context import TorqueScale, torque_scale
 from hil.pipeline.options import Options
@@ -45,7 +46,6 @@ from identification.validation.finding_messages import MOUNTING_STEP
 
 from .payload_settings import NOT_DETERMINED, ControllerLoad, controller_settings
 
-_FLANGES: Final = ("tool0", "flange")  # flange frames of controllers, by their ROS-Industrial names
 _MIN_CENTRE_LIMIT: Final = 0.5  # m, of a hand tool on an arm that is shorter itself
 _FITTED_SHARE: Final = 0.7  # of each bare recording, when the direction of gravity is tried
 _MAX_BARE_RECORDINGS: Final = 3  # enough to determine gravity
@@ -546,5 +546,5 @@ def flange_of(model: RobotModel) -> str:
     last = {
         name: pose for name, pose in model.chain.frames.items() if pose.joint == model.n_joints - 1
     }
-    named = next((name for name in _FLANGES if name in last), None)
+    named = next((name for name in FLANGES if name in last), None)
     return named or min(last, key=lambda name: float(np.abs(last[name].translation).sum()))

@@ -26,8 +26,8 @@ from hil.report.chart import (
 from hil.report.numbers import MISSING, fixed, percent, significant
 from hil.results.results import FittedResult, Results, ValidationResult, by_id
 from hil.results.series import ReportSeries
+from identification.distributions import NORMAL_95
 
-_NORMAL_95: Final = 1.96  # Half a 95 % interval, in standard errors
 # Percentiles of the torque inside the axes; outliers may lie outside.
 _SHOWN_PERCENTILES: Final = (0.5, 99.5)
 _MAX_REPETITION_TICKS: Final = 6  # with a tick each
@@ -263,7 +263,7 @@ def residual_charts(results: Results) -> dict[str, list[Chart]]:
             note = f"RMS error {significant(joint.rms)} {joint.unit}"
             caption = Caption(f"{what[0]}{j}", joint.joint, note, f"mean residual over {what}")
             centre = np.array(profile.centre, np.float64)
-            reach = np.where(np.isfinite(std), _NORMAL_95 * std, 0.0)
+            reach = np.where(np.isfinite(std), NORMAL_95 * std, 0.0)
             ends = np.stack([mean - reach, mean + reach], axis=1)
             x_range = padded(centre[np.isfinite(mean)])
             traces = [

@@ -14,6 +14,7 @@ from hil.report.figures import FRICTION_LAW, MEASURED, RESIDUAL, Joint
 from hil.report.numbers import significant
 from hil.results.results import Results
 from hil.results.series import ReportSeries
+from identification.distributions import MAD_TO_STD
 from identification.validation.finding import Level
 
 if TYPE_CHECKING:
@@ -108,7 +109,6 @@ BY_CHECK: Final[Mapping[str, Picture]] = {
 """Pictures of all others."""
 
 _OUTLIER: Final = 6.0  # robust standard deviations
-_ROBUST: Final = 1.4826  # standard deviation over median absolute deviation, of a Gaussian
 _WIDTH: Final = 300.0  # of a picture beside its finding [px]
 _HEIGHT: Final = 150.0
 _LOWER: Final = 0.7  # of the height in the figure of all joints
@@ -253,7 +253,7 @@ def _outliers(series: ReportSeries, joint: Joint) -> Chart | None:
     measured = series.example_measured[:, joint.number]
     error = measured - series.example_predicted[:, joint.number]
     deviation = np.abs(error - np.median(error))
-    far = deviation > _OUTLIER * _ROBUST * np.median(deviation)
+    far = deviation > _OUTLIER * MAD_TO_STD * np.median(deviation)
     marks = {"x": time[far], "dots": True}
     plots = (
         Plot(

@@ -8,9 +8,10 @@ from __future__ import annotations
 import math
 import re
 
+from identification.text import LARGEST_DECIMAL
+
 MISSING = "–"
 _SMALLEST_DECIMAL = 1e-4
-_LARGEST_DECIMAL = 1e6
 _MAX_DECIMALS = 6
 _MOMENT = re.compile(r"(\d{4}-\d\d-\d\d)T(\d\d:\d\d)(?::[\d.]+)?(Z|[+-]\d\d:\d\d|)")
 
@@ -19,7 +20,7 @@ def significant(value: float | None, digits: int = 3) -> str:
     """Format with `digits` significant digits; with an exponent below 1e-4 and from 1e6."""
     if value is None or not math.isfinite(value) or value == 0.0:
         return fixed(value, 0)
-    if not _SMALLEST_DECIMAL <= abs(value) < _LARGEST_DECIMAL:
+    if not _SMALLEST_DECIMAL <= abs(value) < LARGEST_DECIMAL:
         return _short_exponent(f"{value:.{digits - 1}e}")
     # Round first: 9.996 to three digits is 10.0.
     exponent = int(f"{abs(value):.{digits - 1}e}".split("e")[1])

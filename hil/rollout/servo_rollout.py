@@ -27,7 +27,6 @@ from hil.rollout.polishing import polish
 from hil.rollout.torque_rollout import (
     MAX_WINDOWS,
     POLISHED_WINDOWS,
-    WINDOW_STRIDE,
     Rollout,
     leading_effect,
     nominal_arm,
@@ -52,7 +51,7 @@ from identification.rollout.position_errors import (
 )
 from identification.rollout.servo_by_positions import NAMES, EncoderFit, fit_servo
 from identification.rollout.servo_by_torque import lead_of
-from identification.rollout.windows import STEP_SECONDS, windows_of
+from identification.rollout.windows import STEP_SECONDS, WINDOW_STRIDE, windows_of
 
 _FRICTION = "coulomb,viscous"
 _UNITS = ("N·m/rad", "N·m·s/rad", "kg·m²", "N·m", "N·m·s/rad")

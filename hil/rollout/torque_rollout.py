@@ -60,7 +60,7 @@ from identification.rollout.servo_by_torque import (
     identify_servo,
     lead_of,
 )
-from identification.rollout.windows import STEP_SECONDS, Stretch, windows_of
+from identification.rollout.windows import STEP_SECONDS, WINDOW_STRIDE, Stretch, windows_of
 from identification.text import number
 
 PICTURE = "rollout.png"
@@ -68,7 +68,6 @@ POLISHED = "polished.xml"
 MAX_WINDOWS: Final = 1000
 """Windows that are simulated at most."""
 _FEW_WINDOWS: Final = 200  # of which the error of each sample is computed
-WINDOW_STRIDE: Final = 0.1  # s between the starts of windows
 POLISHED_WINDOWS: Final = 60  # of the fitted motion
 # share of the mean square error that mending an effect has to remove
 _MIN_ERROR_REDUCTION: Final = 0.1

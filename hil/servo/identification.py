@@ -35,14 +35,18 @@ from hil.results.servo_result import (
 from hil.results.servo_series import ServoSeries
 from hil.servo.maker_file import maker_parameters
 from hil.servo.messages import verdict_of
-from identification.servo.choice import ServoFit, fit_servos, steps_of_a_fit
+from identification.servo.choice import FIT_ITERATIONS, ServoFit, fit_servos, steps_of_a_fit
 from identification.servo.contacts import contacts_of
 from identification.servo.intervals import intervals_of, widened_covariance
 from identification.servo.parameters import TERMS, in_units
 from identification.servo.prediction import predicted
 from identification.servo.pushes import pushes_of
 from identification.servo.recorded_motion import Grid, ServoMotion, motions_of
-from identification.servo.simulator_terms import ENGINES, FIT_ITERATIONS, Engine, fits_in_simulators
+from identification.servo.simulator_terms import (
+    ENGINES,
+    Engine,
+    fits_in_simulators,
+)
 from identification.signals.recording import MIN_MOVEMENT
 
 _MIN_RESOLUTION: Final = 1e-5  # rad or m, least resolution of positions

@@ -7,7 +7,7 @@ from typing import Final
 
 import numpy as np
 
-from hil.base.one_screen import SCREEN_COLUMNS, Paragraph, Part, columns
+from hil.base.one_screen import MAX_JOINT_ROWS, SCREEN_COLUMNS, Paragraph, Part, columns
 from hil.results.servo_result import (
     ServoContact,
     ServoPrediction,
@@ -36,7 +36,6 @@ _SHOWN: Final = {
 _MISSED: Final = 0.3
 """Share of the motion, from which on a tenth of its square is missed."""
 _MOSTLY: Final = 0.5  # of a motion, from which on it is judged without what something held
-_MAX_JOINT_ROWS: Final = 8  # of the table of joints
 _MAX_LINES: Final = 3  # recordings, warnings and next steps on a screen
 
 
@@ -184,7 +183,7 @@ def screen(results: ServoResults, read: Sequence[Part] = ()) -> list[Part]:
     verdict = results.verdict
     parts: list[Part] = [Paragraph(verdict.line), *read, ""]
     parts += columns(_errors(results, results.validation[:_MAX_LINES]))
-    parts += ["", *columns(_parameters(results, [*results.joint_names][:_MAX_JOINT_ROWS])), ""]
+    parts += ["", *columns(_parameters(results, [*results.joint_names][:MAX_JOINT_ROWS])), ""]
     parts.append(
         f"delay of commands {1e3 * results.delay:.0f} ms; ? = not determined by the motion"
     )

@@ -10,13 +10,13 @@ from numpy.typing import NDArray
 from scipy.stats import rankdata
 
 from hil.base.arrays import Array
+from hil.study.settings import BOOTSTRAP_DRAWS
 from identification.excitation import Method
 
 from .model_errors import NONE, Condition
 from .results import Criterion, DesignPoint, Quantity, Relation
 from .searches import Search
 
-_BOOTSTRAP_DRAWS: Final = 2000
 _SEED: Final = 20140902
 
 
@@ -117,7 +117,7 @@ def _draws(groups: Sequence[NDArray[np.intp]]) -> NDArray[np.intp]:
     """Return designs that are resampled within their methods, (draws, d)."""
     random = np.random.default_rng(_SEED)
     return np.concatenate(
-        [group[random.integers(0, len(group), (_BOOTSTRAP_DRAWS, len(group)))] for group in groups],
+        [group[random.integers(0, len(group), (BOOTSTRAP_DRAWS, len(group)))] for group in groups],
         axis=1,
     )
 

@@ -8,13 +8,13 @@ import numpy as np
 from scipy import stats
 
 from hil.base.arrays import Array
+from hil.study.settings import BOOTSTRAP_DRAWS
 
 from .results import Verdict
 
 #: A difference of errors below this share exists and does not matter
 SMALL_DIFFERENCE: Final = 0.02
 MIN_UNITS: Final = 3  #: Searches needed for their scatter
-_BOOTSTRAP_DRAWS: Final = 2000
 _SEED: Final = 20140901
 
 
@@ -61,7 +61,7 @@ def compared(first: Array, second: Array) -> Ratio:
 
 def _weights(count: int, random: np.random.Generator) -> Array:
     """Return the weights (draws, count) of means over count - 1 units with replacement."""
-    return random.multinomial(count - 1, [1.0 / count] * count, _BOOTSTRAP_DRAWS) / (count - 1.0)
+    return random.multinomial(count - 1, [1.0 / count] * count, BOOTSTRAP_DRAWS) / (count - 1.0)
 
 
 def verdict_of(ratio: float, low: float | None, high: float | None) -> Verdict:

@@ -53,6 +53,8 @@ class StudySettings(Frozen):
     cell: str = Field(default="", description="digest of the cell, empty for the paper's NS 16")
 
 
+BOOTSTRAP_DRAWS: Final = 2000
+"""Draws of every interval by resampling."""
 FULL_STUDY: Final = StudySettings(
     seed=1,
     searches=10,

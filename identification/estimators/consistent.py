@@ -31,7 +31,7 @@ from identification.factor.estimate import Estimate, estimate, joint_weights
 from identification.factor.factor import Factor
 from identification.factor.normal_equations import NormalEquations, rows_of
 from identification.model.friction import dissipation
-from identification.model.link_wrenches import LINK_SYMBOLS
+from identification.model.link_wrenches import N_LINK
 from identification.model.pseudo_inertia import (
     ReferenceBodies,
     inertial_from_pseudo,
@@ -40,7 +40,6 @@ from identification.model.pseudo_inertia import (
 )
 from identification.model.robot import RobotModel
 
-_N_LINK: Final = len(LINK_SYMBOLS)
 # smallest eigenvalue of a pseudo-inertia relative to the reference's
 _MIN_EIGENVALUE_RATIO: Final = 1e-6
 _MIN_ROTOR_EIGENVALUE: Final = 1e-6  # of the rotors' matrix, relative to its scale
@@ -274,9 +273,9 @@ def _of_full_rank(matrix: Array) -> Array:
 def _symmetric_basis() -> Array:
     """Return the unit entries of a symmetric 4x4 matrix (10, 4, 4)."""
     rows, columns = np.triu_indices(4)
-    basis = np.zeros((_N_LINK, 4, 4))
-    basis[np.arange(_N_LINK), rows, columns] = 1.0
-    basis[np.arange(_N_LINK), columns, rows] = 1.0
+    basis = np.zeros((N_LINK, 4, 4))
+    basis[np.arange(N_LINK), rows, columns] = 1.0
+    basis[np.arange(N_LINK), columns, rows] = 1.0
     return basis
 
 

@@ -30,7 +30,7 @@ from identification.errors import IdentificationError
 from identification.estimators.covariance import block_length, spread
 from identification.estimators.delay_nuisances import nuisances
 from identification.estimators.load_friction import fit_with_load
-from identification.factor.blocks import count_by_block, merged
+from identification.factor.blocks import FOLDS, count_by_block, merged
 from identification.factor.estimate import Estimate, estimate, inverse_variance, residual_variance
 from identification.factor.factor import Factor, no_rows_message
 from identification.factor.normal_equations import NormalEquations, Solution, solve
@@ -64,7 +64,6 @@ _CONVERGED_SECONDS = 1e-6  # s
 _CONVERGED_STD_SHARE = 0.02  # share of the standard deviation
 # difference of log variance up to which two minima are equally good
 _EQUAL_LOG_VARIANCE: Final = 0.05
-_FOLDS: Final = 5
 _TIME_BLOCKS: Final = 80  # blocks of time
 _ROWS_AT_ONCE: Final = 8192
 _FALSE_DELAY_PROBABILITY: Final = 0.005  # one-sided probability of a false delay
@@ -445,7 +444,7 @@ class _Blocks:
         if not with_delay:
             gram[:, self.delay] = 0.0
             gram[:, :, self.delay] = 0.0
-        folds = np.array([gram[k::_FOLDS].sum(axis=0) for k in range(_FOLDS)])
+        folds = np.array([gram[k::FOLDS].sum(axis=0) for k in range(FOLDS)])
         error = 0.0
         for fold in folds:
             values = _solved(folds.sum(axis=0) - fold, self.delay + 1).values

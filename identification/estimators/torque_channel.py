@@ -20,6 +20,7 @@ from identification.arrays import Array
 from identification.factor.blocks import EqualRuns, add_grams, equal_runs
 from identification.factor.factor import MIN_NOISE
 from identification.model.robot import RobotModel
+from identification.signals.clock import MAX_STEP_DEVIATION
 from identification.signals.masks import MAX_END_SECONDS, edge_rows
 from identification.signals.noise import noiseless_above
 from identification.signals.recording import Recording
@@ -52,7 +53,6 @@ _MIN_STRETCH_SECONDS: Final = 0.5 / LOWEST_BANDWIDTH  # s
 # change of the window during the filter's lag; a window without a level part would be the most
 # accurate, but the rows of the middle alone would decide.
 _TAPER_SHARE: Final = 0.5
-_MAX_STEP_DEVIATION: Final = 0.01  # of a step; rows at other times are interpolated
 # s of zeros, against the periodicity of the transform
 _PADDING_SECONDS: Final = 1.0 / LOWEST_BANDWIDTH
 # s; longer segments are transformed in parts, whose tables stay small
@@ -478,7 +478,7 @@ class _Segment:
         """Interpolate signals (c, m) at even times."""
         even = np.linspace(self.time[0], self.time[-1], len(self.time))
         step = even[1] - even[0]
-        if np.abs(self.time - even).max() <= _MAX_STEP_DEVIATION * step:
+        if np.abs(self.time - even).max() <= MAX_STEP_DEVIATION * step:
             return signals
         return np.array([np.interp(even, self.time, signal) for signal in signals])
 

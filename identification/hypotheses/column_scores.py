@@ -8,13 +8,17 @@ from typing import Final, NamedTuple
 import numpy as np
 
 from identification.arrays import Array
+from identification.distributions import SIGNIFICANT_SIGMAS
 from identification.estimators.prior import GaussianPrior
+from identification.factor.blocks import FOLDS
 from identification.factor.normal_equations import solve_with_ridge
 from identification.hypotheses.changes import Change
-from identification.hypotheses.columns import FOLDS, ColumnSums, folded
-from identification.model.link_wrenches import LINK_SYMBOLS
+from identification.hypotheses.columns import (
+    ColumnSums,
+    folded,
+)
+from identification.model.link_wrenches import MASS_INDEX
 
-_SIGNIFICANT_SIGMAS: Final = 3.0  # standard errors over the blocks of a significant correction
 # Ratio of the fit's error on the affected joints, with the correction over that without: 0.55 is
 # 70 % of the squared error. True faults of simulated and real arms, without noise known: at most
 # 0.5, a payload in half of a recording 0.66; false ones: at least 0.9.
@@ -29,7 +33,6 @@ _MIN_ROWS: Final = 10
 MIN_BLOCKS: Final = 2
 # Ridge as a share of each column's information, for columns that the motion hardly determines.
 _RIDGE: Final = 1e-6
-MASS_INDEX: Final = LINK_SYMBOLS.index("m")
 
 
 class ScorePrior(NamedTuple):
@@ -125,7 +128,7 @@ class ColumnScore(NamedTuple):
         if len(blocks) < MIN_BLOCKS:
             return ratio, np.inf
         error = np.std(blocks, ddof=1) / np.sqrt(len(blocks))
-        return ratio, float(np.exp(blocks.mean() + _SIGNIFICANT_SIGMAS * error))
+        return ratio, float(np.exp(blocks.mean() + SIGNIFICANT_SIGMAS * error))
 
 
 def _geometric_mean(ratios: Array) -> float:

@@ -19,7 +19,6 @@ import numpy as np
 from identification.arrays import Array
 from identification.hypotheses.changes import Change, Meaning, Part
 from identification.hypotheses.column_scores import (
-    MASS_INDEX,
     MIN_BLOCKS,
     ColumnScore,
     ScorePrior,
@@ -28,6 +27,7 @@ from identification.hypotheses.column_scores import (
 )
 from identification.hypotheses.columns import BLOCKS, ColumnSums, columns_of
 from identification.hypotheses.sizes import estimated_size
+from identification.model.link_wrenches import MASS_INDEX
 from identification.model.robot import RobotModel
 from identification.signals.recording import MIN_MOVEMENT
 from identification.signals.samples import Samples

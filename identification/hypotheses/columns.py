@@ -12,16 +12,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from identification.arrays import Array
+from identification.factor.blocks import FOLDS
 from identification.hypotheses.changes import Change
-from identification.model.link_wrenches import LINK_SYMBOLS
+from identification.model.link_wrenches import N_LINK
 from identification.model.regressor import RegressorPlan
 from identification.model.robot import RobotModel
 from identification.signals.samples import Samples
 
 _MAX_ROWS: Final = 3000  # of all recordings together
 BLOCKS: Final = 10  # of all recordings together
-FOLDS: Final = 5
-_N_LINK: Final = len(LINK_SYMBOLS)
 _STEP: Final = 1e-4  # rad, of a derivative
 
 
@@ -132,13 +131,13 @@ def _tables(model: RobotModel, samples: Samples, values: Array, some: NDArray[np
         loads = tuple(samples.as_measured(j, block)[some] for j, block in enumerate(loads))
     else:
         blocks, columns = model.regressor(motion)
-    tables = np.zeros((n, len(some), p + _N_LINK + 2 + 2 * n))
+    tables = np.zeros((n, len(some), p + N_LINK + 2 + 2 * n))
     for j in range(n):
         tables[j][:, columns[j]] = blocks[j]
         tables[j][:, p + payload.columns[j]] = loads[j]
-    tables[:, :, p + _N_LINK] = _rate(model, samples, values, some).T
-    tables[:, :, p + _N_LINK + 1] = _load_friction(model, samples, values, part, some).T
-    tables[:, :, p + _N_LINK + 2 : -n] = _drift(model, samples, values, some)
+    tables[:, :, p + N_LINK] = _rate(model, samples, values, some).T
+    tables[:, :, p + N_LINK + 1] = _load_friction(model, samples, values, part, some).T
+    tables[:, :, p + N_LINK + 2 : -n] = _drift(model, samples, values, some)
     tables[:, :, -n:] = samples.torque[some]
     return tables
 
@@ -218,16 +217,16 @@ def columns_of(tables: ColumnSums, model: RobotModel, values: Array, change: Cha
     _, n, width, _ = tables.gram.shape
     p = model.n_parameters
     joints = list(change.joints or range(model.n_joints))
-    count = {"payload": _N_LINK, "arm": p, "load friction": n}.get(change.meaning, 1)
+    count = {"payload": N_LINK, "arm": p, "load friction": n}.get(change.meaning, 1)
     columns = np.zeros((n, width, count))
     if change.meaning == "delay":
-        columns[joints, p + _N_LINK, 0] = -1.0
+        columns[joints, p + N_LINK, 0] = -1.0
     elif change.meaning == "load friction":
-        columns[joints, p + _N_LINK + 1, joints] = 1.0
+        columns[joints, p + N_LINK + 1, joints] = 1.0
     elif change.meaning == "drift":
-        columns[:, p + _N_LINK + 2 + joints[0], 0] = 1.0
+        columns[:, p + N_LINK + 2 + joints[0], 0] = 1.0
     elif change.meaning == "payload":
-        columns[:, p : p + _N_LINK] = np.eye(_N_LINK)
+        columns[:, p : p + N_LINK] = np.eye(N_LINK)
     elif change.meaning == "arm":
         columns[:, :p] = np.eye(p)
     else:

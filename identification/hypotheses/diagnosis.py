@@ -36,6 +36,7 @@ from identification.hypotheses.scores import (
 from identification.hypotheses.search import (
     EXPLAINED_ERROR,
     SEPARATE_SIGMAS,
+    SURE_SIGMAS,
     Readings,
     Step,
     find_readings,
@@ -53,7 +54,6 @@ ROWS: Final = 700
 """Rows of all recordings in which something other than stated is searched for."""
 # error ratio of a torque without gravity that chance does not make
 _WEIGHTLESS_ERROR_RATIO: Final = 0.7
-_SURE_SIGMAS: Final = 4.5  # standard errors of it
 _MIN_ROWS: Final = 100  # that say something of bodies
 # share of the nominal torque below which the bodies are not the arm's
 _MIN_NOMINAL_SCALE: Final = 1.0 / 3.0
@@ -162,7 +162,7 @@ class TorqueDiagnosis:
         return (
             found is not None
             and found.ratio < _WEIGHTLESS_ERROR_RATIO
-            and found.sigmas < -_SURE_SIGMAS
+            and found.sigmas < -SURE_SIGMAS
         )
 
     @property

@@ -11,9 +11,8 @@ from identification.arrays import Array
 from identification.factor.columns import under_gravity
 from identification.factor.factor import Factor
 from identification.factor.normal_equations import solve_with_ridge
-from identification.model.robot import RobotModel
+from identification.model.robot import STANDARD_GRAVITY, RobotModel
 
-_STANDARD_GRAVITY: Final = 9.81  # m/s²
 _FRICTION_PASSES: Final = 2
 _MAX_TURNS: Final = 20
 _STEP_SHARES: Final = (1.0, 0.5, 0.1)  # of a Gauss-Newton step that are tried
@@ -71,7 +70,7 @@ def find_gravity(model: RobotModel, training: Factor, held_out: Factor) -> Gravi
         errors = factor.squared_errors(fitted(gravity)[0])
         return np.maximum(np.maximum(errors, 1e-12 * factor.gram[:, -1, -1]), 1e-300)
 
-    size = float(np.linalg.norm(model.gravity)) or _STANDARD_GRAVITY
+    size = float(np.linalg.norm(model.gravity)) or -STANDARD_GRAVITY[2]
     starts = [model.gravity, *(size * sign * axis for axis in np.eye(3) for sign in (1.0, -1.0))]
     first = min(starts, key=misfit)
     if not np.any(first):

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from identification.arrays import Array
 from identification.estimators.prior import body_prior, posterior_values
+from identification.factor.blocks import FOLDS
 from identification.factor.factor import Factor
 from identification.hypotheses.little_torque import little_torque
 from identification.model.motion import Motion
@@ -19,7 +20,6 @@ from identification.signals.samples import Samples
 DRIVING_FRICTION_SIGMAS: Final = 4.0  # standard errors of a friction that drives a joint
 _MIN_FRICTION_SHARE: Final = 0.02  # of the torque of a joint
 _BLOCKS: Final = 20
-_FOLDS: Final = 5
 # Rows that count as one beside the prior. Where other parts are predicted they are seven in all: a
 # wrong reading needs bodies that no arm has, which a weak prior would allow. Of few rows, all of
 # which are fitted, that would be too few to tell orders of a wrist apart.
@@ -113,15 +113,15 @@ def score_of(
     squares = np.zeros((len(factor), factor.n_joints))
     weights: Array | None = None
     estimates: list[Array] = []
-    for fold in range(_FOLDS):
-        left_out = np.arange(len(factor)) % _FOLDS == fold
+    for fold in range(FOLDS):
+        left_out = np.arange(len(factor)) % FOLDS == fold
         values, weights = posterior_values(
             factor.without(left_out), prior, _ROWS_PER_FACT_LEFT_OUT, weights
         )
         estimates.append(values)
         squares[left_out] = _squares(factor, values, left_out)
     friction = np.array(estimates) @ _friction_columns(model, samples).T
-    deviation = np.sqrt((_FOLDS - 1) * friction.var(axis=0))
+    deviation = np.sqrt((FOLDS - 1) * friction.var(axis=0))
     torque = factor.gram[:, -1, -1]
     rms = np.maximum(np.sqrt(torque / np.maximum(factor.samples, 1)), 1e-300)
     mean = friction.mean(axis=0)

@@ -18,6 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from identification.arrays import Array
+from identification.distributions import SIGNIFICANT_SIGMAS
 from identification.factor.estimate import Estimate
 from identification.factor.factor import Factor
 from identification.model.robot import RobotModel
@@ -27,7 +28,6 @@ from identification.signals.samples import Samples
 ChangeKind = Literal["gain", "friction"]
 
 _KINDS: Final[tuple[ChangeKind, ...]] = ("gain", "friction")
-_SIGNIFICANT_SIGMAS: Final = 3.0  # standard deviations of a significant change
 # Smallest change that is named; a torque constant drifts by some per cent with the temperature of
 # its magnets.
 _MIN_CHANGE: Final = 0.03
@@ -164,11 +164,7 @@ def find_changes(
             explains &= left < max(_MAX_REMAINING_ERROR[0] * usual[joint], _MAX_REMAINING_ERROR[1])
             size = abs(ratio - 1.0)
             # A factor below zero is no change of one quantity.
-            if (
-                ratio > 0.0
-                and explains
-                and size > max(_MIN_CHANGE, _SIGNIFICANT_SIGMAS * deviation)
-            ):
+            if ratio > 0.0 and explains and size > max(_MIN_CHANGE, SIGNIFICANT_SIGMAS * deviation):
                 trials.append(UnseenChange(kind, joint, ratio, deviation, left))
         if trials:
             least = min(trial.relative for trial in trials)

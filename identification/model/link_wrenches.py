@@ -14,12 +14,16 @@ matrix times the primitives.
 
 from __future__ import annotations
 
+from typing import Final
+
 import numpy as np
 
 from identification.arrays import Array
 
 # Order of the ten inertial parameters of a link.
 LINK_SYMBOLS = ("Ixx", "Ixy", "Ixz", "Iyy", "Iyz", "Izz", "mcx", "mcy", "mcz", "m")
+N_LINK: Final = len(LINK_SYMBOLS)
+MASS_INDEX: Final = LINK_SYMBOLS.index("m")
 N_INERTIA = 6
 N_PRIMITIVES = 12
 

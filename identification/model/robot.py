@@ -24,11 +24,10 @@ from identification.model.elements import Element, ElementError, JointElements, 
 from identification.model.friction import OFFSET, FrictionLaw, JointFriction
 from identification.model.kinematics import Chain, chain_from_urdf
 from identification.model.known_payload import Load, Payload
-from identification.model.link_wrenches import LINK_SYMBOLS
+from identification.model.link_wrenches import LINK_SYMBOLS, N_LINK
 from identification.model.motion import Motion, joint_arrays
 from identification.model.regressor import Regressor, RegressorPlan
 
-_N_LINK = len(LINK_SYMBOLS)
 _N_SINGLE_DIGITS = 9
 _NO_ROTOR_RATIO = 1e-7  # of the largest parameter of the link: what a solver leaves of zero
 
@@ -53,7 +52,7 @@ class StandardLayout:
     @property
     def width(self) -> int:
         """Parameters of one joint: ten, or eleven with a rotor."""
-        return _N_LINK + self.rotor_inertia
+        return N_LINK + self.rotor_inertia
 
     @property
     def size(self) -> int:
@@ -63,12 +62,12 @@ class StandardLayout:
     @cached_property
     def links(self) -> Indices:
         """Indices of the ten inertial parameters of each link (n, 10)."""
-        return self._joint_blocks[:, :_N_LINK]
+        return self._joint_blocks[:, :N_LINK]
 
     @cached_property
     def rotors(self) -> Indices:
         """Indices of the rotor inertias (n,), or (0,)."""
-        return self._joint_blocks[:, _N_LINK:].reshape(-1)
+        return self._joint_blocks[:, N_LINK:].reshape(-1)
 
     @property
     def couplings(self) -> Indices:
@@ -93,8 +92,8 @@ class StandardLayout:
         first = self.n_joints * self.width
         there = set(map(int, pivots))
         joints = range(0, first, self.width)
-        links = [[k for k in range(_N_LINK) if start + k in there] for start in joints]
-        rotors = [self.rotor_inertia and start + _N_LINK in there for start in joints]
+        links = [[k for k in range(N_LINK) if start + k in there] for start in joints]
+        rotors = [self.rotor_inertia and start + N_LINK in there for start in joints]
         return links, rotors, sorted(k - first for k in there if k >= first)
 
     def rotors_at_bound(self, standard: Array) -> NDArray[np.bool_]:
@@ -136,7 +135,7 @@ class StandardLayout:
             sliding = (not self.revolute[i]) + (not self.revolute[j])
             return ("kg·m²", "kg·m", "kg")[sliding]
         joint, symbol = divmod(standard, self.width)
-        if symbol == _N_LINK:
+        if symbol == N_LINK:
             return "kg·m²" if self.revolute[joint] else "kg"
         return {"I": "kg·m²", "mc": "kg·m", "m": "kg"}[LINK_SYMBOLS[symbol].rstrip("xyz")]
 

@@ -18,10 +18,9 @@ from identification.errors import ModelError
 from identification.model.elements import TorqueRipple
 from identification.model.friction import FrictionLaw
 from identification.model.kinematics import PINOCCHIO_ORDER
-from identification.model.link_wrenches import LINK_SYMBOLS
+from identification.model.link_wrenches import LINK_SYMBOLS, MASS_INDEX
 from identification.model.robot import RobotModel
 
-_MASS_INDEX: Final = LINK_SYMBOLS.index("m")
 _MIN_MASS: Final = 1e-3  # kg: pinocchio needs the centre of mass, mc / m
 _PARAMETER_ROUNDING: Final = 1e-9  # relative to the largest base parameter
 
@@ -122,17 +121,15 @@ def _bodies(model: RobotModel, base: Array) -> Array:
     links = model.layout.links
     grouping = model.base.grouping[:, links.ravel()]
     bodies = model.nominal[links]
-    bodies[:, _MASS_INDEX] = np.where(
-        bodies[:, _MASS_INDEX] < _MIN_MASS, 1.0, bodies[:, _MASS_INDEX]
-    )
-    is_mass = np.arange(bodies.size) % len(LINK_SYMBOLS) == _MASS_INDEX
+    bodies[:, MASS_INDEX] = np.where(bodies[:, MASS_INDEX] < _MIN_MASS, 1.0, bodies[:, MASS_INDEX])
+    is_mass = np.arange(bodies.size) % len(LINK_SYMBOLS) == MASS_INDEX
     most = _PARAMETER_ROUNDING * max(1.0, np.abs(base).max(initial=0.0))
     for free in (~is_mass, np.ones_like(is_mass)):
         missing = base - grouping @ bodies.ravel()
         change, *_ = np.linalg.lstsq(grouping[:, free], missing, rcond=None)
         if np.abs(grouping[:, free] @ change - missing).max(initial=0.0) < most:
             bodies.reshape(-1)[free] += change
-            if np.all(bodies[:, _MASS_INDEX] > _MIN_MASS):
+            if np.all(bodies[:, MASS_INDEX] > _MIN_MASS):
                 return bodies
             break
     raise ModelError("no bodies with positive masses have these parameters")

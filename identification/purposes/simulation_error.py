@@ -22,7 +22,13 @@ from identification.model.flange import flange_motion
 from identification.model.friction import VISCOUS
 from identification.model.motion import Motion
 from identification.model.robot import RobotModel
-from identification.rollout.windows import STEP_SECONDS, Windows, stretches_of, windows_of
+from identification.rollout.windows import (
+    STEP_SECONDS,
+    WINDOW_STRIDE,
+    Windows,
+    stretches_of,
+    windows_of,
+)
 from identification.signals.samples import Samples
 from identification.validation.prediction import driving_residual
 
@@ -30,8 +36,6 @@ HORIZON_SECONDS: Final = 0.2
 """Time of a simulation [s]."""
 FEEDBACK_BANDWIDTH: Final = 1.0
 """Natural frequency of the feedback that keeps the arm near its motion [Hz]."""
-WINDOW_STRIDE: Final = 0.1
-"""Time between the starts of simulations [s]."""
 _MAX_SIMULATIONS: Final = 200  # simulations
 _STEPS_PER_INERTIA: Final = 8  # steps of one inertia
 

@@ -8,9 +8,10 @@ Without a torque the bodies have to be given. Of each joint and for each delay d
 
 is linear in five numbers, none of which is negative. What disturbs a joint is in its position, and
 by the servo in all columns, but not in the command: delayed commands, their directions and the
-torque of the bodies along them are instruments. The constant is one of every `BLOCK_SECONDS`, for
-the integral action of a servo. The delay is that of least error of all joints; as a later command
-resembles more viscous friction, standard deviations are those with an unknown delay of each joint.
+torque of the bodies along them are instruments. There is a constant for every `CONSTANT_SECONDS`,
+for the integral action of a servo. The delay is that of least error of all joints; as a later
+command resembles more viscous friction, standard deviations are those with an unknown delay of each
+joint.
 
 Bodies of which all masses are larger by a factor have gains, friction and rotor inertias that are
 larger by it, and the same motion: positions determine no factor.
@@ -32,7 +33,7 @@ from identification.export.exported_arm import ExportedArm
 from identification.export.simulators import rigid_torque
 from identification.model.motion import Motion
 from identification.rollout.servo_by_torque import (
-    BLOCK_SECONDS,
+    CONSTANT_SECONDS,
     MAX_SERVO_DELAY,
     NoServoError,
     PositionServo,
@@ -191,7 +192,7 @@ def _lengths(columns: Array) -> Array:
 
 def _joints_of(arm: ExportedArm, stretches: Sequence[Stretch], step: float) -> list[_Joint]:
     """Return the equations of each joint of an arm without rotors."""
-    rows = round(BLOCK_SECONDS / step)
+    rows = round(CONSTANT_SECONDS / step)
     count = arm.model.n_joints
     # The same rows for every delay: those whose command is known.
     with_command = slice(round(MAX_SERVO_DELAY / step) + 1, -1)
@@ -203,7 +204,7 @@ def _joints_of(arm: ExportedArm, stretches: Sequence[Stretch], step: float) -> l
             columns = np.stack(columns_of(stretch), axis=1)[with_command]
             blocks += without_means(columns, rows)
         if not blocks:
-            raise NoServoError(f"no stretch lasts {BLOCK_SECONDS:g} s")
+            raise NoServoError(f"no stretch lasts {CONSTANT_SECONDS:g} s")
         return np.concatenate(blocks).reshape(len(blocks) * rows, -1, count)
 
     def servo(delay: float) -> Array:

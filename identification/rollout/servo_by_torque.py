@@ -12,7 +12,7 @@ from identification.arrays import Array
 from identification.errors import IdentificationError
 from identification.rollout.windows import Stretch
 
-BLOCK_SECONDS: Final = 0.5
+CONSTANT_SECONDS: Final = 0.5
 """Time over which the sum of gravity, friction and integral action counts as constant [s]."""
 MAX_SERVO_DELAY: Final = 0.04
 """Largest delay of the command that is tried [s]."""
@@ -89,7 +89,7 @@ def _gains_at(
     stretches: Sequence[Stretch], delay: float, step: float
 ) -> tuple[float, PositionServo]:
     """Return the share of the torque's variance that is left over, and the gains."""
-    rows = round(BLOCK_SECONDS / step)
+    rows = round(CONSTANT_SECONDS / step)
     errors = []
     rates = []
     torques = []
@@ -102,7 +102,7 @@ def _gains_at(
         rates += without_means((rate - stretch.motion.velocity)[with_command], rows)
         torques += without_means(stretch.torque[with_command], rows)
     if not errors:
-        raise NoServoError(f"no stretch lasts {BLOCK_SECONDS:g} s")
+        raise NoServoError(f"no stretch lasts {CONSTANT_SECONDS:g} s")
     error, rate, torque = (np.concatenate(part) for part in (errors, rates, torques))
     n = error.shape[1]
     left = 0.0

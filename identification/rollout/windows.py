@@ -19,6 +19,8 @@ from identification.signals.samples import Samples
 
 STEP_SECONDS: Final = 5e-3
 """Time step of a simulation [s]."""
+WINDOW_STRIDE: Final = 0.1
+"""Time between the starts of simulations [s]."""
 _MIN_SAMPLES: Final = 4  # of a stretch that is interpolated
 
 

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from identification.arrays import Array
 from identification.distributions import student_limit
+from identification.estimators.prior import DETERMINED_STD_RATIO
 from identification.servo.choice import ServoFit
 from identification.servo.fit import ServoEstimate
 from identification.servo.parameters import (
@@ -23,7 +24,6 @@ from identification.servo.parameters import (
     without_absent,
 )
 
-_DETERMINED_STD_RATIO: Final = 0.5  # of the prior's deviation, above which the motion says little
 _MAX_INTERVAL_FACTOR: Final = 2.0  # upper end over value, above which a parameter is not determined
 _VANISHES: Final = np.array([name not in ABSENT for name in NAMES])  # without effect at zero
 _POWER: Final = np.array([term.torque for term in TERMS])
@@ -62,7 +62,7 @@ def intervals_of(fit: ServoFit) -> ServoIntervals:
     least, most = _changed_by_unseen(fit, covariance)
     narrow &= (least >= 1.0 / _MAX_INTERVAL_FACTOR) & (most <= _MAX_INTERVAL_FACTOR)
     determined = np.asarray(
-        (spread <= _DETERMINED_STD_RATIO * prior) & narrow & estimate.present & fit.shown
+        (spread <= DETERMINED_STD_RATIO * prior) & narrow & estimate.present & fit.shown
     )
     absent = without_absent(natural(estimate.coordinates), estimate.present)
     lower, upper = (np.where(estimate.present, end, absent) for end in ends)

@@ -12,14 +12,13 @@ from typing import Final, Literal, get_args
 import numpy as np
 
 from identification.arrays import Array
-from identification.servo.choice import ServoFit
+from identification.servo.choice import FIT_ITERATIONS, ServoFit
 from identification.servo.fit import ServoWindows, fit
 from identification.servo.parameters import NAMES
 from identification.servo.recorded_motion import ServoMotion
 
 Engine = Literal["mujoco", "physx"]
 ENGINES: Final[tuple[Engine, ...]] = get_args(Engine)
-FIT_ITERATIONS: Final = 12
 
 _COMMON: Final = ("kp", "armature", "viscous", "coulomb", "delay", "offset", "limit")
 TERMS_OF_ENGINE: Final[Mapping[Engine, tuple[str, ...]]] = {

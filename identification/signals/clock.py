@@ -16,6 +16,7 @@ import scipy
 from numpy.typing import NDArray
 
 from identification.arrays import Array
+from identification.distributions import MAD_TO_STD
 from identification.signals.recording import GAP_STEPS, PAUSE_SECONDS, Recording, RecordingError
 
 Rows = NDArray[np.bool_]
@@ -528,6 +529,6 @@ def _robust_rms(values: Array) -> Array:
     levels = []
     for column in np.abs(values).T:
         some = column[column > 0.0]
-        most = _OUTLIER_SIGMAS * 1.4826 * float(np.median(some)) if some.size else np.inf
+        most = _OUTLIER_SIGMAS * MAD_TO_STD * float(np.median(some)) if some.size else np.inf
         levels.append(np.sqrt(np.mean(np.minimum(some, most) ** 2)) if some.size else np.inf)
     return np.array(levels)

@@ -22,6 +22,7 @@ import scipy
 from numpy.typing import NDArray
 
 from identification.arrays import Array
+from identification.signals.clock import MAX_STEP_DEVIATION
 from identification.signals.noise import ROWS_AT_ONCE
 
 Complex = NDArray[np.complex128]
@@ -341,7 +342,6 @@ def _third_differences(values: Array) -> Array:
 
 
 _MAX_CUTOFF_SHARE: Final = 0.45  # largest cut-off as a share of the sampling rate
-_MAX_STEP_DEVIATION: Final = 0.01  # of a step
 _COLUMNS_AT_ONCE: Final = 8  # columns; more would leave the processor's cache
 _NEGLIGIBLE_RESPONSE_SHARE: Final = 1e-6  # share of the impulse response that a reflection may lack
 
@@ -398,7 +398,7 @@ def low_passed(
     if shape == SMOOTHER:
         return low_pass(time, columns, bandwidth)
     step = float(np.median(np.diff(time)))
-    if np.abs(np.diff(time) - step).max() <= _MAX_STEP_DEVIATION * step:
+    if np.abs(np.diff(time) - step).max() <= MAX_STEP_DEVIATION * step:
         return _filtered(columns, bandwidth * step, shape)
     even = np.arange(time[0], time[-1] + step, step)
     filtered = _filtered(_interpolated(even, time, columns), bandwidth * step, shape)

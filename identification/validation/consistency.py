@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from identification.arrays import Array
+from identification.distributions import SIGNIFICANT_SIGMAS
 from identification.estimators.consistent import ConsistentEstimate, consistent_estimate
 from identification.estimators.prior import BodyPrior
 from identification.factor.estimate import Estimate
@@ -18,7 +19,6 @@ from identification.hypotheses.little_torque import little_torque
 from identification.model.motion import Motion
 from identification.model.pseudo_inertia import pseudo_inertia, reference_bodies
 from identification.model.robot import RobotModel
-from identification.validation.physical_signs import SIGNIFICANT_SIGMAS
 
 # Smallest second moment of a link relative to the nominal body's at which a bound counts as active.
 _MIN_MOMENT_RATIO: Final = 0.01

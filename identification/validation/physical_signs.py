@@ -10,14 +10,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from identification.arrays import Array
+from identification.distributions import SIGNIFICANT_SIGMAS
 from identification.factor.estimate import Estimate
 from identification.factor.factor import Factor
 from identification.hypotheses.little_torque import little_torque
 from identification.model.friction import COULOMB
 from identification.model.robot import RobotModel
 
-SIGNIFICANT_SIGMAS: Final = 3.0
-"""Standard deviations of a significant sign, change, delay or scale."""
 # Masses, rotor inertias, moments of inertia about an axis.
 _NEVER_NEGATIVE: Final = re.compile(r"m\d+|I\d+(m|xx|yy|zz)")
 

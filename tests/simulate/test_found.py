@@ -178,7 +178,7 @@ class TestClosedLink:
 
     @pytest.fixture(autouse=True)
     def patience(self, monkeypatch: pytest.MonkeyPatch) -> None:
-        monkeypatch.setattr(virtual_link, "END_TIMEOUT", 0.5)
+        monkeypatch.setattr(virtual_link, "SESSION_END_TIMEOUT", 0.5)
 
     def test_it_does_not_wait_forever_for_a_restarted_controller(
         self, cell: Cell, controller: SimulatedController

@@ -14,7 +14,7 @@ from dataclasses import dataclass
 from typing import Final, NamedTuple
 
 from drivers.errors import DriverError, PacketError
-from drivers.packets import InitPacket, cyclic_length, is_init
+from drivers.packets import MAX_PACKET_BYTES, InitPacket, cyclic_length, is_init
 from drivers.transports.base import TransportError
 
 PAYLOADS_FD: Final = (0, 1, 2, 3, 4, 5, 6, 7, 8, 12, 16, 20, 24, 32, 48, 64)
@@ -98,8 +98,6 @@ class BusRates:
             )
 
 
-MAX_PACKET_BYTES: Final = 1500
-"""Bytes of the longest packet."""
 FRAME_BYTES: Final = 64
 _PREFIX: Final = struct.Struct("<BBH")
 _HEAD: Final = struct.Struct("<BBHI")

@@ -6,11 +6,11 @@ from typing import Final
 
 import numpy as np
 
+from identification.distributions import SIGNIFICANT_SIGMAS
 from identification.hypotheses.diagnosis import RigidTorque, TorqueDiagnosis
 from identification.hypotheses.search import Step
 from identification.validation.evidence import Evidence
 from identification.validation.finding import Finding, Thresholds, Value
-from identification.validation.physical_signs import SIGNIFICANT_SIGMAS
 
 _MAX_SCALE_RATIO: Final = 3.0  # of the torque to that of the masses; descriptions in use are closer
 

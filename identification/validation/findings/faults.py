@@ -8,6 +8,7 @@ from typing import Final
 import numpy as np
 
 from identification.arrays import Array
+from identification.distributions import SIGNIFICANT_SIGMAS
 from identification.hypotheses.changes import SIGNS, Change, Meaning
 from identification.hypotheses.column_search import Explanation
 from identification.validation.evidence import Evidence
@@ -20,7 +21,6 @@ from identification.validation.finding import (
     Value,
 )
 from identification.validation.findings.scale import all_opposite
-from identification.validation.physical_signs import SIGNIFICANT_SIGMAS
 
 _THROUGHOUT: Final[Mapping[Meaning, tuple[FindingKey, RemedyKey]]] = {
     "delay": ("delay of the torque", "use the delay found"),

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 
+from identification.distributions import SIGNIFICANT_SIGMAS
 from identification.validation.evidence import Evidence
 from identification.validation.finding import Finding, Thresholds, Value
-from identification.validation.physical_signs import SIGNIFICANT_SIGMAS
 
 
 def nothing_held_out(evidence: Evidence, _: Thresholds) -> Finding | None:
