@@ -33,10 +33,10 @@ algebra before numpy is loaded.
 
 from __future__ import annotations
 
-from importlib import import_module
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from hil.base import errors
+from hil.base.first_use import on_first_use
 
 if TYPE_CHECKING:
     from os import PathLike
@@ -44,6 +44,7 @@ if TYPE_CHECKING:
     from hil.archive import open_archive
     from hil.archive.recording_of_archive import open_recording
     from hil.base.progress import LineReporter, Reporter, Silent, reporter
+    from hil.base.version import __version__ as __version__
     from hil.batch.graph import reidentify
     from hil.campaign import Campaign
     from hil.campaign.identified_campaign import identify_campaign
@@ -70,35 +71,6 @@ if TYPE_CHECKING:
     from hil.pipeline.options import Options
     from hil.results.results import Results
     from hil.study import run_study
-
-_MODULE_OF_NAME = {
-    **dict.fromkeys(("LineReporter", "Silent", "reporter"), "base.progress"),
-    **dict.fromkeys(("Stop", "stop_on_interrupt"), "control.motion_watch"),
-    **dict.fromkeys(("plan_move", "send"), "control.move"),
-    "Campaign": "campaign",
-    "Cell": "cell",
-    "ColumnMap": "importers.column_map",
-    "IdentifiedArm": "identified.identified_arm",
-    "IdentifiedServo": "identified.identified_servo",
-    "ImportOptions": "importers.recording_import",
-    "Options": "pipeline.options",
-    "Results": "results.results",
-    "Robot": "importers.imported_robot",
-    "Screen": "campaign.screen",
-    "cell_link": "control.cell_link",
-    "export_model": "export.model_files",
-    "identify_archives": "pipeline.identification",
-    "identify_campaign": "campaign.identified_campaign",
-    "identify_servo": "identified.identified_arm",
-    "load": "identified.identified_arm",
-    "import_log": "importers.log",
-    "import_rosbag2": "importers.rosbag2",
-    "open_archive": "archive",
-    "open_recording": "archive.recording_of_archive",
-    "reidentify": "batch.graph",
-    "run_study": "study",
-    "simulated_controller": "control.simulated_cell",
-}
 
 __all__ = [
     "Campaign",
@@ -169,15 +141,34 @@ def identify(
     return arm_from(recordings, urdf, robot, predict, reading, options, reporter)
 
 
-def __getattr__(name: str) -> Any:
-    if name == "__version__":
-        return import_module("hil.base.version").software()["hil"]
-    if name in _MODULE_OF_NAME:
-        return getattr(import_module(f"hil.{_MODULE_OF_NAME[name]}"), name)
-    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-
-
-def __dir__() -> list[str]:
-    """Return all public names, loaded or not, and the loaded modules."""
-    helpers = {"Any", "TYPE_CHECKING", "annotations", "import_module"}
-    return sorted({*globals(), *__all__} - helpers)
+if not TYPE_CHECKING:
+    __getattr__, __dir__ = on_first_use(
+        __name__,
+        {
+            "hil.archive": ("open_archive",),
+            "hil.archive.recording_of_archive": ("open_recording",),
+            "hil.base.progress": ("LineReporter", "Silent", "reporter"),
+            "hil.base.version": ("__version__",),
+            "hil.batch.graph": ("reidentify",),
+            "hil.campaign": ("Campaign",),
+            "hil.campaign.identified_campaign": ("identify_campaign",),
+            "hil.campaign.screen": ("Screen",),
+            "hil.cell": ("Cell",),
+            "hil.control.cell_link": ("cell_link",),
+            "hil.control.motion_watch": ("Stop", "stop_on_interrupt"),
+            "hil.control.move": ("plan_move", "send"),
+            "hil.control.simulated_cell": ("simulated_controller",),
+            "hil.export.model_files": ("export_model",),
+            "hil.identified.identified_arm": ("IdentifiedArm", "identify_servo", "load"),
+            "hil.identified.identified_servo": ("IdentifiedServo",),
+            "hil.importers.column_map": ("ColumnMap",),
+            "hil.importers.imported_robot": ("Robot",),
+            "hil.importers.log": ("import_log",),
+            "hil.importers.recording_import": ("ImportOptions",),
+            "hil.importers.rosbag2": ("import_rosbag2",),
+            "hil.pipeline.identification": ("identify_archives",),
+            "hil.pipeline.options": ("Options",),
+            "hil.results.results": ("Results",),
+            "hil.study": ("run_study",),
+        },
+    )

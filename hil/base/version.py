@@ -5,6 +5,7 @@ from __future__ import annotations
 from functools import cache
 from importlib.metadata import version
 
+__version__ = version("hil")
 _PACKAGES = ("hil", "numpy", "scipy", "pin", "ruckig", "pymoo", "mcap")
 
 

@@ -1,9 +1,9 @@
 """Campaign: plan, run, archive; resumable. Names are imported on first use."""
 
-from importlib import import_module
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from hil.base.errors import CampaignFolderError
+from hil.base.first_use import on_first_use
 
 if TYPE_CHECKING:
     from hil.control.errors import MotionFailedError, MotionRefusedError
@@ -33,27 +33,18 @@ __all__ = [
     "plan_around",
     "stop_on_interrupt",
 ]
-_MODULE_OF_NAME = {
-    "Campaign": "hil.campaign.campaign",
-    "CampaignFolder": "hil.campaign.folder",
-    **dict.fromkeys(("MotionFailedError", "MotionRefusedError"), "hil.control.errors"),
-    **dict.fromkeys(("MotionLink", "Progress"), "hil.control.link"),
-    "NotRehearsedError": "hil.campaign.errors",
-    "VirtualLink": "hil.control.virtual_link",
-    **dict.fromkeys(("Stop", "stop_on_interrupt"), "hil.control.motion_watch"),
-    **dict.fromkeys(
-        ("CampaignPlan", "PlannedMotion", "design", "plan_around"), "hil.campaign.plan"
-    ),
-}
 
-if not TYPE_CHECKING:  # which would accept any name
-
-    def __getattr__(name: str) -> Any:
-        if name not in _MODULE_OF_NAME:
-            raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-        return getattr(import_module(_MODULE_OF_NAME[name]), name)
-
-
-def __dir__() -> list[str]:
-    """Return all names, including names that are not loaded yet."""
-    return [*globals(), *__all__]
+if not TYPE_CHECKING:
+    __getattr__, __dir__ = on_first_use(
+        __name__,
+        {
+            "hil.campaign.campaign": ("Campaign",),
+            "hil.campaign.errors": ("NotRehearsedError",),
+            "hil.campaign.folder": ("CampaignFolder",),
+            "hil.campaign.plan": ("CampaignPlan", "PlannedMotion", "design", "plan_around"),
+            "hil.control.errors": ("MotionFailedError", "MotionRefusedError"),
+            "hil.control.link": ("MotionLink", "Progress"),
+            "hil.control.motion_watch": ("Stop", "stop_on_interrupt"),
+            "hil.control.virtual_link": ("VirtualLink",),
+        },
+    )

@@ -5,8 +5,9 @@ The pytest plugin is `hil.testing.plugin`; the names here are those behind its f
 
 from __future__ import annotations
 
-from importlib import import_module
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
+
+from hil.base.first_use import on_first_use
 
 if TYPE_CHECKING:
     from .faulty import (
@@ -27,13 +28,5 @@ __all__ = [
     "shortened",
 ]
 
-
-def __getattr__(name: str) -> Any:
-    if name in __all__:
-        return getattr(import_module(f"{__name__}.faulty"), name)
-    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-
-
-def __dir__() -> list[str]:
-    """Return all names, including names that are not loaded yet."""
-    return [*globals(), *__all__]
+if not TYPE_CHECKING:
+    __getattr__, __dir__ = on_first_use(__name__, {"hil.testing.faulty": __all__})
