@@ -60,7 +60,7 @@ from hil.look.result import Aspect, ParameterGroup, Row, TiedReading
 from identification.estimators.delay import DelayEstimate
 from identification.estimators.prior import DETERMINED_STD_RATIO, body_prior, fit_posterior
 from identification.factor.factor import Factor
-from identification.hypotheses.changes import COUPLED, ORDERS, Axes, Change, Meaning
+from identification.hypotheses.changes import COUPLED, ORDERS, SIGNS, UNITS, Axes, Change, Meaning
 from identification.hypotheses.diagnosis import RigidTorque, TorqueDiagnosis, rigid_torque
 from identification.hypotheses.scores import is_backwards
 from identification.hypotheses.search import EXPLAINED_ERROR, SEPARATE_SIGMAS, Readings, Step
@@ -82,18 +82,12 @@ MOUNTINGS: Final = {
 }
 """Gravity in the base frame by mounting [m/s²]; "" for a torque without gravity."""
 _ASPECTS: Final[Mapping[Meaning, Aspect]] = {
-    "torque sign": "signs",
-    "position sign": "signs",
-    "axis sign": "signs",
-    "torque order": "order",
-    "position order": "order",
-    "joint order": "order",
-    "degrees": "angle unit",
-    "radians": "angle unit",
+    **dict.fromkeys(SIGNS, "signs"),
+    **dict.fromkeys(ORDERS, "order"),
+    **dict.fromkeys(UNITS, "angle unit"),
+    **dict.fromkeys(COUPLED, "coupling"),
     "zero": "zero",
     "scale": "scale",
-    "angle sum": "coupling",
-    "angle difference": "coupling",
     "no gravity": "gravity",
     "mounting": "mounting",
 }
@@ -329,7 +323,7 @@ class TorqueFindings:
         return self._changed("order", steps, ColumnOrder(torque, position), Decide.NAME_JOINTS)
 
     def _signs(self) -> Row:
-        steps = self.steps("torque sign", "position sign", "axis sign")
+        steps = self.steps(*SIGNS)
         decider = Decide.PUSH_A_JOINT
         if steps:
             return self._changed("signs", steps, self._changes(steps), decider)

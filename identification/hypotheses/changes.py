@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
-from typing import Final, Literal, NamedTuple
+from typing import Final, Literal, NamedTuple, get_args
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,15 +19,13 @@ from identification.model.robot import RobotModel
 from identification.signals.recording import Recording
 from identification.signals.samples import Samples
 
+Sign = Literal["torque sign", "position sign", "axis sign"]
+Order = Literal["torque order", "position order", "joint order"]
+Coupled = Literal["angle sum", "angle difference"]
 Meaning = Literal[
-    "torque sign",
-    "position sign",
-    "axis sign",
-    "torque order",
-    "position order",
-    "joint order",
-    "angle sum",
-    "angle difference",
+    Sign,
+    Order,
+    Coupled,
     "degrees",
     "radians",
     "zero",
@@ -42,12 +40,12 @@ Meaning = Literal[
     "arm",
 ]
 DEGREE: Final = np.pi / 180.0
-SIGNS: Final[tuple[Meaning, ...]] = ("torque sign", "position sign", "axis sign")
-ORDERS: Final[tuple[Meaning, ...]] = ("torque order", "position order", "joint order")
+SIGNS: Final[tuple[Sign, ...]] = get_args(Sign)
+ORDERS: Final[tuple[Order, ...]] = get_args(Order)
 SIZED: Final[tuple[Meaning, ...]] = ("zero", "scale")
 UNITS: Final[tuple[Meaning, ...]] = ("degrees", "radians")
 GRAVITIES: Final[tuple[Meaning, ...]] = ("mounting", "no gravity")
-COUPLED: Final[tuple[Meaning, ...]] = ("angle sum", "angle difference")
+COUPLED: Final[tuple[Coupled, ...]] = get_args(Coupled)
 """The recorded angle of the first joint contains that of the second, added or taken off."""
 DISCRETE_MEANINGS: Final[tuple[Meaning, ...]] = (*SIGNS, *ORDERS, *COUPLED)
 """Changes without a size."""

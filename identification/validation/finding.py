@@ -10,11 +10,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from identification.hypotheses.carried_load import MIN_LOAD_EXPLAINED
-from identification.hypotheses.changes import Change
+from identification.hypotheses.changes import Change, Coupled, Order, Sign
 from identification.hypotheses.little_torque import LITTLE_TORQUE_SHARE
 from identification.signals.clock import SampleTimes
 from identification.signals.row_faults import RowFault
 from identification.validation.consistency import ConsistencyCheck
+from identification.validation.physical_signs import SignKind
 from identification.validation.position_jumps import PositionJump
 
 Mask = NDArray[np.bool_]
@@ -70,14 +71,9 @@ FindingKey = Literal[
     "torque constant",
     "torque constant, as assumed",
     "load friction",
-    "torque sign",
-    "position sign",
-    "axis sign",
-    "torque order",
-    "position order",
-    "joint order",
-    "angle sum",
-    "angle difference",
+    Sign,
+    Order,
+    Coupled,
     "payload of a part",
     "torque of a part",
     "friction of a part",
@@ -88,10 +84,7 @@ FindingKey = Literal[
     "changed friction",
     "slightly changed friction",
     # bodies and friction
-    "negative Coulomb friction",
-    "little friction at speed",
-    "little friction at speed by a chosen term",
-    "negative parameter",
+    SignKind,
     "no consistent parameters",
     "friction law lacks a term",
     "complete friction law",
