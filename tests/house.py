@@ -30,7 +30,7 @@ CEILINGS: Final[Mapping[str, int]] = {
     "long names of tests": 0,
     "tests of hil outside a room": 0,
     "class names defined twice": 0,
-    "helpers of other test modules": 1,
+    "helpers of other test modules": 0,
     "long signatures without Args": 0,
 }
 """Figures that no change may exceed. Size has none: features are not traded for lines."""

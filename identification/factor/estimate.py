@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from identification.arrays import Array, Indices
+from identification.distributions import NORMAL_95
 from identification.factor.factor import Factor, require_rows
 from identification.factor.normal_equations import Solution
 from identification.model.robot import RobotModel
@@ -68,7 +69,7 @@ class Estimate:
     condition: float  #: condition number of the weighted regressor with unit columns
     undetermined: tuple[str, ...] = ()  #: undetermined parameters, alone or in a combination
     #: standard deviations in half a 95 % interval: 1.96, more for covariances of few data
-    interval_factor: float = 1.96
+    interval_factor: float = NORMAL_95
     #: change of the parameters by a standard deviation of the scale of each joint's torque (p, n);
     #: None: it is exact
     scale_change: Array | None = None
@@ -115,7 +116,7 @@ def estimate_of(
     weights: Array,
     method: str,
     covariance: Array | None = None,
-    interval_factor: float = 1.96,
+    interval_factor: float = NORMAL_95,
 ) -> Estimate:
     """Return the estimate of a solution.
 

@@ -12,15 +12,18 @@ from hil.base.errors import SourceError
 from hil.importers.conclusions import ChannelMeaning, OtherClock
 from hil.importers.imported_robot import Robot
 from hil.importers.recording_import import ImportedRecording, ImportOptions, read_recording
-from tests.hil.importers.lerobot_set import JOINTS, motion
-from tests.hil.importers.test_lerobot import urdf
+from tests.hil.importers.lerobot_set import JOINTS, motion, write_urdf
 
 Array = NDArray[np.float64]
-__all__ = ["urdf"]  # a fixture
 
 RATE = 50.0
 LAG = 0.08  # s by which positions follow
 DURATION = 20.0
+
+
+@pytest.fixture
+def urdf(tmp_path: Path) -> Path:
+    return write_urdf(tmp_path)
 
 
 def table(path: Path, names: list[str], time: Array, values: Array) -> Path:

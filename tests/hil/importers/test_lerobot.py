@@ -19,33 +19,21 @@ from hil.importers.imported_robot import Robot
 from hil.importers.lerobot import DataSet, is_data_set
 from hil.importers.recording_import import ImportOptions, read_episodes, read_recording
 from hil.pipeline.sources import refuse_duplicates
-from tests.hil.importers.lerobot_set import FPS, JOINTS, Array, motion
-
-LOWER, UPPER = -0.2, 1.8  # rad, of the gripper
-REACH = 1.9  # rad, of the other joints
-URDF = """<robot name="arm"><link name="base"/>
-{}</robot>"""
-LINK = """<joint name="{name}" type="revolute"><parent link="{parent}"/><child link="{name}_link"/>
-<origin xyz="0 0 0.1"/><axis xyz="0 1 0"/>
-<limit lower="{lower}" upper="{upper}" effort="3" velocity="9"/></joint>
-<link name="{name}_link"><inertial><origin xyz="0 0 0.05"/><mass value="0.1"/>
-<inertia ixx="1e-4" iyy="1e-4" izz="1e-4" ixy="0" ixz="0" iyz="0"/></inertial></link>"""
+from tests.hil.importers.lerobot_set import (
+    FPS,
+    JOINTS,
+    LOWER,
+    REACH,
+    UPPER,
+    Array,
+    motion,
+    write_urdf,
+)
 
 
 @pytest.fixture
 def urdf(tmp_path: Path) -> Path:
-    path = tmp_path / "arm.urdf"
-    parents = ("base", "pan_link", "lift_link")
-    ends = ((-REACH, REACH), (-REACH, REACH), (LOWER, UPPER))
-    path.write_text(
-        URDF.format(
-            "\n".join(
-                LINK.format(name=name, parent=parent, lower=lower, upper=upper)
-                for name, parent, (lower, upper) in zip(JOINTS, parents, ends, strict=True)
-            )
-        )
-    )
-    return path
+    return write_urdf(tmp_path)
 
 
 def percent(gripper: Array) -> Array:
