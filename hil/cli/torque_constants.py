@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, Final
 
 import tomlkit
 import typer
@@ -26,6 +26,8 @@ from identification.estimators.current_gains import (
 from identification.model.known_payload import Payload
 from identification.text import percentage
 
+_NOT_DETERMINED: Final = "not determined"
+
 
 def torque_constants(
     archives: Annotated[list[Path], typer.Argument(metavar="ARCHIVE")],
@@ -42,7 +44,7 @@ def torque_constants(
 
     Prints TOML for a cell file ([drive_train]) or a column map ([drive]), with 95 % intervals, and
     the relative standard deviation of each constant, which `hil payload` uses. Motors whose
-    constant the data do not determine are listed with the value nan, which cell and map refuse:
+    constant the data do not determine are listed as "not determined", which cell and map refuse:
     exit status 5.
 
     Options:
@@ -107,19 +109,25 @@ def assumption(frame: str | None) -> str:
 
 
 def _as_toml(result: GainsFound, assumed: str | None) -> str:
-    """Format constants and their uncertainty as TOML; what is not determined is nan."""
+    """Format constants and their uncertainty as TOML; what is not determined is a text."""
     side = "motor side" if result.motor_side else "joint side, gears included"
     constants = tomlkit.array()
     for motor in _motors(result):
         if motor["not_determined"] is None:
-            value = float(f"{motor['torque_constant']:.6g}")
+            value: float | str = float(f"{motor['torque_constant']:.6g}")
             comment = f"{motor['name']} ± {motor['half_interval']:.2g}"
         else:
-            value = math.nan
-            comment = f"{motor['name']}: not determined; {motor['not_determined']}"
+            value = _NOT_DETERMINED
+            comment = f"{motor['name']}: {motor['not_determined']}"
         constants.add_line(value, comment=comment)
     constants.add_line(indent="")
-    uncertainty = inline([float(f"{share:.2g}") for share in result.gains.relative_std])
+    gains = result.gains
+    uncertainty = inline(
+        [
+            float(f"{share:.2g}") if determined else _NOT_DETERMINED
+            for share, determined in zip(gains.relative_std, gains.determined, strict=True)
+        ]
+    )
     uncertainty.comment("relative standard deviations")
     document = tomlkit.document()
     heads = ([assumed] if assumed else []) + [f"N·m/A ({side}), 95 % intervals"]

@@ -35,12 +35,12 @@ from hil.look.undescribed import undescribed_robot
 from hil.pipeline.sources import Source, cell_of, source_of
 from identification.errors import IdentificationError
 from identification.estimators.delay import DelayEstimate, estimate_delay
-from identification.estimators.torque_channel import possible_low_passes
 from identification.hypotheses.changes import Axes
 from identification.hypotheses.diagnosis import few_rows, torque_of
 from identification.hypotheses.inertia_scale import retimed
 from identification.hypotheses.scores import score_of
 from identification.hypotheses.search import EXPLAINED_ERROR, Readings, find_readings
+from identification.hypotheses.torque_low_pass import TorqueLowPass, torque_low_pass
 from identification.model.robot import RobotModel
 from identification.signals.recording import Recording, RecordingError
 from identification.signals.samples import Preprocessing, Samples, prepare
@@ -216,12 +216,11 @@ def mountings(cell: Cell) -> dict[str, RobotModel]:
 
 def _channel(
     recording: Recording, model: RobotModel
-) -> tuple[DelayEstimate | None, Preprocessing | None]:
+) -> tuple[DelayEstimate | None, TorqueLowPass | None]:
     """Return delay and low-pass of the torque; None where the motion does not say."""
     some = recording.between(0, min(recording.n_samples, _DELAY_SAMPLES))
     try:
         delay = estimate_delay(some, model, options=SETTINGS)
-        low_passes = possible_low_passes(some, model, options=SETTINGS)
+        return delay, torque_low_pass(some, model, SETTINGS)
     except IdentificationError:
         return None, None
-    return delay, low_passes[-1] if low_passes else None

@@ -461,7 +461,8 @@ def _(delay: TorqueDelay) -> str:
 
 @_worded.register
 def _(low_pass: LowPassedTorque) -> str:
-    return f"torque low-passed at {number(low_pass.bandwidth, 2)} Hz"
+    perhaps = "" if low_pass.confirmed else "perhaps: "
+    return f"{perhaps}torque low-passed at {number(low_pass.bandwidth, 2)} Hz"
 
 
 @_worded.register
@@ -592,7 +593,10 @@ def _(problem: DelayProblem) -> str:
 
 @_worded.register
 def _(shape: FilterShape) -> str:
-    return f"order {shape.order}, {'causal' if shape.causal else 'without phase'}, fits better"
+    kind = f"order {shape.order}, {'causal' if shape.causal else 'without phase'}"
+    if shape.confirmed:
+        return f"{kind}, fits better"
+    return f"{kind}; a delay, or friction that reverses smoothly, predicts as well"
 
 
 @_worded.register

@@ -64,11 +64,12 @@ from identification.hypotheses.changes import COUPLED, ORDERS, SIGNS, UNITS, Axe
 from identification.hypotheses.diagnosis import RigidTorque, TorqueDiagnosis, rigid_torque
 from identification.hypotheses.scores import is_backwards
 from identification.hypotheses.search import EXPLAINED_ERROR, SEPARATE_SIGMAS, Readings, Step
+from identification.hypotheses.torque_low_pass import TorqueLowPass
 from identification.model.link_wrenches import LINK_SYMBOLS
 from identification.model.motion import Motion
 from identification.model.robot import STANDARD_GRAVITY, RobotModel
 from identification.signals.recording import Recording
-from identification.signals.samples import Preprocessing, Samples
+from identification.signals.samples import Samples
 from identification.validation.nominal_scale import nominal_scale
 
 MOUNTINGS: Final = {
@@ -561,16 +562,20 @@ def without_torque(recording: Recording) -> Row:
     return Row("torque", Fact.MOTOR_CURRENT, Certainty.CERTAIN, (Basis.NAME_OR_UNIT,), decider)
 
 
-def channel_rows(delay: DelayEstimate | None, low_pass: Preprocessing | None) -> Iterator[Row]:
+def channel_rows(delay: DelayEstimate | None, low_pass: TorqueLowPass | None) -> Iterator[Row]:
     """Yield delay and low-pass of the torque."""
     yield _delay_row(delay)
-    if low_pass is None or low_pass.torque_bandwidth is None:
+    bandwidth = None if low_pass is None else low_pass.settings.torque_bandwidth
+    if low_pass is None or bandwidth is None:
         none = (Basis.NO_FILTER_BETTER,)
         yield Row("low-pass", Fact.NO_LOW_PASS, Certainty.LIKELY, none)
         return
-    reading = LowPassedTorque(low_pass.torque_bandwidth)
-    shape = FilterShape(low_pass.torque_shape.order, low_pass.torque_shape.causal)
-    yield Row("low-pass", reading, Certainty.LIKELY, (shape,), Decide.ASK_FOR_FILTER)
+    confirmed = low_pass.confirmed
+    shape = low_pass.settings.torque_shape
+    reading = LowPassedTorque(bandwidth, confirmed=confirmed)
+    certainty = Certainty.LIKELY if confirmed else Certainty.UNDETERMINED
+    evidence = (FilterShape(shape.order, shape.causal, confirmed=confirmed),)
+    yield Row("low-pass", reading, certainty, evidence, Decide.ASK_FOR_FILTER)
 
 
 def _delay_row(delay: DelayEstimate | None) -> Row:

@@ -213,9 +213,10 @@ class TorqueDelay:
 
 @dataclass(frozen=True)
 class LowPassedTorque:
-    """Bandwidth of the torque [Hz]."""
+    """Bandwidth of the torque [Hz]; `confirmed` if nothing that resembles it predicts as well."""
 
     bandwidth: float
+    confirmed: bool = True
 
 
 Reading = (
@@ -408,10 +409,11 @@ class DelayProblem:
 
 @dataclass(frozen=True)
 class FilterShape:
-    """The shape of the low-pass that fits better."""
+    """The shape of the low-pass that fits better; `confirmed` as in `LowPassedTorque`."""
 
     order: int
     causal: bool
+    confirmed: bool = True
 
 
 @dataclass(frozen=True)

@@ -203,6 +203,7 @@ def test_a_look_needs_nothing_but_the_archive(recorded: Path) -> None:
     for aspect, fact in (("signs", Fact.SIGNS_OF_URDF), ("gravity", Fact.WITH_GRAVITY)):
         assert (rows[aspect].reading, rows[aspect].certainty) == (fact, Certainty.CERTAIN)
     assert rows["side"].certainty is Certainty.CERTAIN
+    assert rows["low-pass"].reading is Fact.NO_LOW_PASS
 
 
 def test_frames_that_did_not_come_are_gaps(tmp_path: Path) -> None:

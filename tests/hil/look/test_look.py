@@ -49,6 +49,7 @@ from hil.pipeline.sources import cell_of, source_of
 from identification.estimators.delay import DelayEstimate, UndeterminedDelay
 from identification.hypotheses.changes import Axes, Change
 from identification.hypotheses.scores import Score, compare, score_of
+from identification.hypotheses.torque_low_pass import TorqueLowPass
 from identification.model.robot import RobotModel
 from identification.signals.samples import prepare
 from tests.hil.importers.bags import STATE, bag, state, states
@@ -200,6 +201,15 @@ def test_a_delay_that_other_parts_do_not_confirm_is_open() -> None:
     assert row_text(early).reading == "perhaps: torque 30 ms before the position"
     unseen, _ = channel_rows(replace(delay, delay=0.005), None)
     assert unseen.reading is Fact.NO_DELAY_SEEN
+
+
+def test_a_low_pass_that_something_resembles_is_open() -> None:
+    filtered = replace(SETTINGS, torque_bandwidth=24.0)
+    _, row = channel_rows(None, TorqueLowPass(filtered, confirmed=False))
+    assert row.certainty is Certainty.UNDETERMINED
+    assert row_text(row).reading == "perhaps: torque low-passed at 24 Hz"
+    _, likely = channel_rows(None, TorqueLowPass(filtered, confirmed=True))
+    assert likely.certainty is Certainty.LIKELY
 
 
 def test_degrees_are_concluded(tmp_path: Path, urdf: Path, table: Mapping[str, Floats]) -> None:

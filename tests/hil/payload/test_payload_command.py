@@ -391,10 +391,13 @@ def test_a_vertical_axis_in_slow_motion_has_no_constant(tmp_path: Path) -> None:
         archive_of_currents(tmp_path, name, replace(slow, torque=slow.torque + noise))
     status, text = run(tmp_path, "empty.mcap", *BOTH, "-q", command="torque-constants")
     assert status == 5
-    assert "nan, # shoulder_pan_joint: not determined; " in text
+    assert '"not determined", # shoulder_pan_joint: ' in text
+    assert "nan" not in text
     assert "shoulder_lift_joint ±" in text
-    pasted = tomllib.loads(text)["torque_constant"]
+    entries = tomllib.loads(text)
+    pasted = entries["torque_constant"]
     assert len(pasted) == len(CONSTANTS)
+    assert entries["torque_uncertainty"][0] == "not determined"
     with pytest.raises(ValidationError, match="torque_constant"):
         Drive(torque_constant=pasted)
 
