@@ -7,12 +7,14 @@ run`, while an ordinary process drains its ring.
     python -m benchmarks.turnaround_ur [--minutes N] [--busy] [--json]
 
 A set-point is late if it comes more than one cycle after its frame was sent; the output says where
-the time of each went. With `--busy` every processor is kept busy by an ordinary process.
+the time of each went. `packets_late`, `replies_late` and `not_accepted` are the counts of
+`drivers.punctuality`, of the whole session: only the second are this program's. `machine_busy` is
+the share of all processors in use, ours and others'. With `--busy` every processor is kept busy by
+an ordinary process.
 """
 
 from __future__ import annotations
 
-import gc
 import multiprocessing
 import os
 import tempfile
@@ -144,9 +146,6 @@ def control(settings: Settings) -> None:
         robot, settings.cycles,
         rtde=table.port, primary=table.primary_port, dashboard=table.dashboard_port,
     )  # fmt: skip
-    gc.collect()
-    gc.freeze()
-    gc.disable()
     report = enter(settings.realtime)
     streamed = False
 
@@ -180,7 +179,7 @@ def measure(cycles: int, folder: Path) -> dict[str, Any]:
     answering = RealTimeSettings(priority=50, cpu=max(processors))
     asking = replace(answering, priority=60, cpu=min(processors))
     ends, arrivals = folder / "ends.npz", folder / "arrivals.npz"
-    stolen = steal_ticks()
+    stolen, ticks = steal_ticks(), processor_ticks()
     controller = _spawn.Process(
         target=control, args=(Settings(cell, cycles, asking, str(ends)),), daemon=True
     )
@@ -225,8 +224,20 @@ def measure(cycles: int, folder: Path) -> dict[str, Any]:
         times |= {f"exchange_{name}": array for name, array in file.items()}
     return times | {
         "status": status, "log": log, "endings": endings, "realtime": realtime,
-        "steal": steal_ticks() - stolen,
+        "steal": steal_ticks() - stolen, "busy": busy_share(ticks), "load": os.getloadavg(),
     }  # fmt: skip
+
+
+def processor_ticks() -> Array:
+    """Return the ticks of all processors by use, as in /proc/stat."""
+    return np.array(Path("/proc/stat").read_text().split("\n", 1)[0].split()[1:9], float)
+
+
+def busy_share(before: Array) -> float:
+    """Return the share of the processors' time since then that was not idle."""
+    passed = processor_ticks() - before
+    idle = passed[3] + passed[4]  # idle, and waiting for a disk
+    return float(1.0 - idle / max(passed.sum(), 1.0))
 
 
 def _started(settings: ExchangeSettings) -> ExchangeProcess:
@@ -273,7 +284,12 @@ def summary(times: Mapping[str, Any], cycles: int) -> dict[str, Any]:
         "frame_latest_ms": round(1e3 * float(np.nanmax(sent - due)), 3),
         "exchange_scheduling": times["realtime"],
         "controller_scheduling": str(times["scheduling"]),
+        "packets_late": times["status"].late_packets,
+        "replies_late": times["status"].late,
+        "not_accepted": times["status"].rejected,
         "steal_ticks": times["steal"],
+        "machine_busy": round(times["busy"], 2),
+        "load_average": round(times["load"][0], 1),
         "ended_by": ", ".join(times["endings"]),
         "log": times["log"],
     }

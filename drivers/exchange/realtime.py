@@ -1,4 +1,4 @@
-"""Real-time settings of a process: scheduling, locked memory, idle states, garbage collection."""
+"""Real-time settings of a process: scheduling, memory, idle states, timers, garbage collection."""
 
 from __future__ import annotations
 
@@ -7,6 +7,7 @@ import gc
 import os
 import resource
 import struct
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Final, Literal
@@ -18,6 +19,7 @@ _MCL_CURRENT = 1
 _MCL_FUTURE = 2
 _M_TRIM_THRESHOLD = -1
 _M_MMAP_MAX = -4
+_PR_SET_TIMERSLACK = 29
 _HEAP_RESERVE_BYTES: Final = 32 << 20
 """Bytes of heap allocated, and so locked, before the first cycle."""
 _open_files: list[int] = []
@@ -53,14 +55,9 @@ class RealTimeReport:
 
 
 def enter(settings: RealTimeSettings) -> RealTimeReport:
-    """Apply the settings to this process, and switch the garbage collector off.
-
-    From here on the process must not create reference cycles.
-    """
+    """Apply the settings to this process, after `without_pauses`."""
     refused: list[str] = []
-    gc.collect()
-    gc.freeze()
-    gc.disable()
+    without_pauses()
     locked = _lock_memory(refused) if settings.lock_memory else "nothing"
     awake = settings.hold_cpu_awake and _hold_cpu_awake(refused)
     if settings.cpu is not None:
@@ -69,6 +66,18 @@ def enter(settings: RealTimeSettings) -> RealTimeReport:
     return RealTimeReport(
         scheduling, locked == "all", awake, tuple(refused), memory_in_use_locked=locked == "in use"
     )
+
+
+def without_pauses() -> None:
+    """Switch the garbage collector off, and have waits of this thread end when they are due.
+
+    No permission is needed for it. From here on the process must not create reference cycles.
+    """
+    gc.collect()
+    gc.freeze()
+    gc.disable()
+    with suppress(OSError, AttributeError):  # the default slack is 50 µs
+        ctypes.CDLL(None, use_errno=True).prctl(_PR_SET_TIMERSLACK, 1, 0, 0, 0)
 
 
 def _schedule(priority: int, refused: list[str]) -> str:

@@ -250,7 +250,7 @@ class View:
     """Progress of a recording: a line every 5 s, and one when it is over.
 
     Progress is shown on a terminal: standard output, else standard error. Without one it goes to
-    standard error, less often. `replies` says whether there are any to be late.
+    standard error, less often. `replies` says whether there are any to be late, and a state of their session.
     """
 
     def __init__(self, cell: Cell, *, quiet: bool, replies: bool = True) -> None:
@@ -282,11 +282,9 @@ class View:
     def _line(self, progress: Progress) -> str:
         if progress.waiting:
             return progress.waiting
-        text = (
-            f"{progress.state.name.lower().replace('_', ' ')}  "
-            f"{progress.cycles * self._cell.period:.1f} s  {progress.missed} missed"
-        )
+        text = f"{progress.cycles * self._cell.period:.1f} s  {progress.missed} missed"
         if self._replies:
+            text = f"{progress.state.name.lower().replace('_', ' ')}  {text}"
             text += (
                 f", {progress.late_packets} late, replies {progress.late} late, "
                 f"{progress.not_accepted} not accepted"

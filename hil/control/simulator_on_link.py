@@ -2,27 +2,24 @@
 
 from __future__ import annotations
 
-import ctypes
 import gc
 import os
 import signal
 import time
 from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager
 from dataclasses import dataclass
 from importlib import import_module
 from types import FrameType
-from typing import Final
 
 from drivers.errors import DriverError
+from drivers.exchange.realtime import without_pauses
 from drivers.transports.base import TransportError
 from hil.base.errors import ControllerError, InputError
 from hil.cell.field_error import FieldError
 from hil.cell.schema import LINKS, ControllerTable
 from sim_fixtures import ControllerSettings, Phase, SimulatedController, serve
 from sim_fixtures.settings import PlantDiverged
-
-_PR_SET_TIMERSLACK: Final = 29
 
 
 def open_controller_link(
@@ -125,11 +122,7 @@ def realtime_process(priority: int | None) -> Iterator[None]:
             problem = f"the system refuses a real-time priority of {priority} ({error.strerror})"
             remedy = "leave --priority out, or raise the limit (ulimit -r) or run as root"
             raise InputError(None, problem, remedy=remedy) from error
-    with suppress(OSError, AttributeError):  # the default slack is 50 µs
-        ctypes.CDLL(None, use_errno=True).prctl(_PR_SET_TIMERSLACK, 1, 0, 0, 0)
-    gc.collect()
-    gc.freeze()
-    gc.disable()
+    without_pauses()
     try:
         yield
     finally:

@@ -5,6 +5,7 @@ One thread serves all of them and runs the controller, in real time or as fast a
 
 from __future__ import annotations
 
+import os
 import selectors
 import socket
 import struct
@@ -126,7 +127,9 @@ class UrServer:
             listener = socket.create_server((host, port))
         except OSError as error:
             self.close()
-            raise SimulationError(f"{host}:{port} ({name}): {error.strerror}") from error
+            # `strerror` of `create_server` repeats the address.
+            reason = os.strerror(error.errno or 0)
+            raise SimulationError(f"{host}:{port} ({name}): {reason}") from error
         listener.setblocking(False)
         self.ports[name] = listener.getsockname()[1]
         self._selector.register(listener, selectors.EVENT_READ, serve)
