@@ -83,7 +83,8 @@ class InputsInUseError(RtdeError):
     """Inputs that another client of the controller writes; `names` are theirs."""
 
     def __init__(self, names: Sequence[str]) -> None:
-        super().__init__(f"another program writes {', '.join(names)}")
+        further = f" and {len(names) - 1} more of the registers" if len(names) > 1 else ""
+        super().__init__(f"another program writes {names[0]}{further}")
         self.names = tuple(names)
 
 

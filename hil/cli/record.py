@@ -250,7 +250,8 @@ class View:
     """Progress of a recording: a line every 5 s, and one when it is over.
 
     Progress is shown on a terminal: standard output, else standard error. Without one it goes to
-    standard error, less often. `replies` says whether there are any to be late, and a state of their session.
+    standard error, less often. `replies` says whether there are any to be late, and a state of
+    their session.
     """
 
     def __init__(self, cell: Cell, *, quiet: bool, replies: bool = True) -> None:
