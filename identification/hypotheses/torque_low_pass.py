@@ -55,8 +55,8 @@ def torque_low_pass(
     scores = [_score(recording, model, how) for how in candidates]
     best = min(range(len(scores)), key=lambda index: scores[index].overall)
     settings, filtered = candidates[best], scores[best]
-    plain = compare(filtered, _score(recording, model, options), model)
-    if not (plain.ratio < 1.0 and plain.sigmas < -SURE_SIGMAS):
+    as_recorded = compare(filtered, _score(recording, model, options), model)
+    if not (as_recorded.ratio < 1.0 and as_recorded.sigmas < -SURE_SIGMAS):
         return None
     rivals = (compare(filtered, rival, model) for rival in _rivals(recording, model, settings))
     confirmed = all(rival.ratio < 1.0 and rival.sigmas < -SEPARATE_SIGMAS for rival in rivals)
@@ -71,13 +71,13 @@ def _rivals(recording: Recording, model: RobotModel, settings: Preprocessing) ->
     """Yield the scores of the lag alone, and of smooth reversals."""
     shape, bandwidth = settings.torque_shape, settings.torque_bandwidth
     assert bandwidth is not None
-    plain = replace(settings, torque_bandwidth=None)
+    unfiltered = replace(settings, torque_bandwidth=None)
     if shape.causal:
         late = settings.torque_delay + shape.lag(bandwidth)
-        yield _score(recording, model, replace(plain, torque_delay=late))
+        yield _score(recording, model, replace(unfiltered, torque_delay=late))
 
     def reversing(speed: float) -> Score:
-        return _score(recording, model.with_friction(tanh=speed), plain)
+        return _score(recording, model.with_friction(tanh=speed), unfiltered)
 
     scores = {speed: reversing(speed) for speed in _REVERSAL_SPEEDS}
     best = min(scores, key=lambda speed: scores[speed].overall)
