@@ -229,7 +229,7 @@ def _described(move: CheckedMove, cell: Cell, link: MotionLink) -> str:
     width = max(len(name) for name in (*cell.joint_names, "joint"))
     lines = [f"{'joint':{width}}  {'from':>9}  {'to':>9}  {'by':>9}   peak speed"]
     lines += [
-        f"{name:{width}}  {a:8.2f}°  {b:8.2f}°  {b - a:+8.2f}°  {peak:7.2f} °/s"
+        f"{name:{width}}  {a:z8.2f}°  {b:z8.2f}°  {b - a:+z8.2f}°  {peak:7.2f} °/s"
         for name, a, b, peak in zip(cell.joint_names, start, end, peaks, strict=True)
     ]
     who = "a SIMULATED controller" if link.only_simulated else f"the controller of {cell.name}"
