@@ -207,7 +207,9 @@ _CHOICES: Final = """\
 Each cell is the error without a choice over that with all of them: above 1 the choice pays, below
 it costs; empty within 0.5 %. A choice that is left out has its first candidate. *Mean* is
 geometric, over robots. *Others* is the mean where each robot follows what the other robots prefer,
-which is the judgement leave-one-robot-out: at 1 no robot would drop the choice.
+which is the judgement leave-one-robot-out: at 1 no robot would drop the choice. *Reversal* is for
+logs of simulators, whose friction reverses smoothly: without it, one with tanh(v / 0.05 rad/s) is
+said to be filtered (`tests/hil/identified/test_clean_logs.py`).
 """
 
 _AVERAGING: Final = """\
