@@ -1,4 +1,4 @@
-"""What it would be worth to average answers that cannot be told apart.
+"""What it would be worth to average candidates that predict equally well.
 
 Used by ``python -m benchmarks.board --averaging`` and ``python -m benchmarks.poor_recordings
 --averaging``. Every candidate that a question weighed gives parameters, with all other settings as
@@ -141,6 +141,24 @@ class Watched:
         return np.concatenate(
             [(each.torque - each.predicted_torque(model, values)).ravel() for each in samples]
         )
+
+
+class Ratios(NamedTuple):
+    """Errors over those of an ordinary fit, over rows of the board."""
+
+    mean: float  # geometric
+    worst: float
+    losses: int  # rows above one
+    rows: int
+
+
+def ratios_of(rows: Sequence[Mapping[str, Any]], *, averaged: bool = False) -> Ratios:
+    """Return the ratios of rows as they are, or with all answers averaged but the prior's."""
+    ratios = [
+        row["hil"] / row["plain"] * (row["averaged"][ALL] if averaged else 1.0) for row in rows
+    ]
+    mean = float(np.exp(np.log(ratios).mean()))
+    return Ratios(mean, max(ratios), sum(ratio > 1.0 for ratio in ratios), len(rows))
 
 
 @contextmanager

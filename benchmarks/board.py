@@ -44,7 +44,7 @@ from typing import Any, Final, Literal, NamedTuple, get_args
 import numpy as np
 
 from benchmarks import parser_of, plain_fit, show
-from benchmarks.averaging import ALL, watched
+from benchmarks.averaging import ratios_of, watched
 from benchmarks.board_page import commit, write_page
 from benchmarks.choices import CHOICES, judged_by_others, taken, without
 from benchmarks.degradations import CAUSES, DEGRADATIONS, EXPECTED, FITTED_ONLY, HARMLESS
@@ -381,11 +381,7 @@ def summary(rows: Sequence[Row], degraded: Sequence[Row]) -> dict[str, Any]:
             figures["choices"] = judged_by_others(rows)
         if "averaged" in rows[0]:
             figures["averaging"] = judged_by_others(rows, "averaged")
-            averaged = [row["ratio"] * row["averaged"][ALL] for row in rows]
-            figures["worst_averaged"] = max(averaged)
-            figures["mean_averaged"] = float(np.exp(np.log(averaged).mean()))
-            figures["averaged_above_one"] = sum(ratio > 1.0 for ratio in averaged)
-            figures["above_one"] = int(np.sum(ratios > 1.0))
+            figures["averaged_ratios"] = ratios_of(rows, averaged=True)._asdict()
     if degraded:
         figures |= {"degraded": list(degraded), "right": sum(row["right"] for row in degraded)}
     return figures
@@ -424,11 +420,11 @@ def summary_lines(figures: Mapping[str, Any]) -> Iterator[str]:
             f" {judged['worst']:.2f}); averaged by the others of"
             f" {', '.join(judged['dropped_by']) or 'none'}"
         )
-    if "averaging" in figures:
+    if "averaged_ratios" in figures:
+        averaged = figures["averaged_ratios"]
         yield (
-            f"with averaged answers, hil / plain: geometric mean {figures['mean_averaged']:.3f},"
-            f" worst {figures['worst_averaged']:.3f}, above 1 in {figures['averaged_above_one']}"
-            f" rows ({figures['above_one']} as it is)"
+            f"with averaged answers, hil / plain: geometric mean {averaged['mean']:.3f}, worst"
+            f" {averaged['worst']:.3f}, above 1 in {averaged['losses']} rows"
         )
     if "right" in figures:
         yield f"right verdicts: {figures['right']} of {len(figures['degraded'])}"

@@ -9,7 +9,7 @@ from typing import Any, cast
 import numpy as np
 import pytest
 
-from benchmarks.averaging import ALL, QUESTIONS, Watched, watched
+from benchmarks.averaging import ALL, QUESTIONS, Watched, ratios_of, watched
 from hil.pipeline.prepared import Prepared
 from identification.selection.averaging import AveragedBandwidth
 from identification.selection.folds import Errors
@@ -119,3 +119,15 @@ def test_candidates_of_every_decision_are_seen(monkeypatch: pytest.MonkeyPatch) 
         SettingsTrial(MODEL, lambda *_: []).decide(BANDWIDTH, [CHOSEN, OTHER])
     assert seen.weighed == {BANDWIDTH: [CHOSEN, OTHER]}
     assert seen.prepared is None
+
+
+def test_ratios_of_rows_with_and_without_averaging() -> None:
+    rows = [
+        {"hil": hil, "plain": 0.1, "averaged": {ALL: ratio}}
+        for hil, ratio in ((0.2, 0.4), (0.05, 1.0))
+    ]
+    now = ratios_of(rows)
+    averaged = ratios_of(rows, averaged=True)
+    assert now[1:] == (2.0, 1, 2)
+    assert averaged[1:] == pytest.approx((0.8, 0, 2))
+    assert (now.mean, averaged.mean) == pytest.approx((1.0, np.sqrt(0.4)))
