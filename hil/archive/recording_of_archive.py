@@ -13,7 +13,12 @@ from hil.archive import Archive, open_archive
 from hil.archive.header import REPLIES_LOST
 from hil.base.arrays import Array
 from hil.base.errors import ArchiveError
-from identification.signals.recording import Recording, unwrapped
+from identification.signals.angle_wraps import (
+    unwrapped,
+)
+from identification.signals.recording import (
+    Recording,
+)
 
 _ALWAYS = ("cycle", "gap", "position")
 _CHANNELS = {

@@ -47,8 +47,13 @@ from hil.importers.publishers import MIN_SAMPLE_DISTANCE, alternating_samples
 from hil.importers.stamps import MAX_SAMPLING_RATE, MIN_SAMPLING_RATE
 from identification.model.motion import Motion
 from identification.model.urdf_text import urdf_tree
+from identification.signals.angle_wraps import (
+    unwrap,
+)
 from identification.signals.clock import time_base
-from identification.signals.recording import MIN_MOVEMENT, unwrap
+from identification.signals.recording import (
+    MIN_MOVEMENT,
+)
 
 _LIMIT_TOLERANCE: Final = 0.05  # rad or m beyond a limit, for calibration and overshoot
 _MIN_TRAVEL: Final = 0.1  # rad or m

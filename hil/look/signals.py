@@ -47,9 +47,15 @@ from hil.look.readings import (
 )
 from hil.look.result import Aspect, Row
 from hil.pipeline.sources import Source
+from identification.signals.angle_wraps import (
+    UNWRAPPED,
+)
 from identification.signals.clock import time_base
 from identification.signals.noise import noiseless_above
-from identification.signals.recording import MIN_MOVEMENT, UNWRAPPED, Recording
+from identification.signals.recording import (
+    MIN_MOVEMENT,
+    Recording,
+)
 
 _MAX_RATIO_DEVIATION: Final = 0.1  # relative deviation of their ratio
 _MAX_LAG_SECONDS: Final = 0.1  # s

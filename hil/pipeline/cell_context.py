@@ -21,8 +21,13 @@ from identification.estimators.torque_scale import TORQUE_CONSTANT_STD, describe
 from identification.factor.estimate import Estimate
 from identification.model.friction import TERMS, FrictionLaw
 from identification.selection.questions import FRICTION_AT_SPEED, LOAD, LOW_PASS, REVERSAL
+from identification.signals.angle_wraps import (
+    UNWRAPPED,
+)
 from identification.signals.masks import SATURATED, SPIKE
-from identification.signals.recording import UNWRAPPED, Recording
+from identification.signals.recording import (
+    Recording,
+)
 from identification.signals.row_faults import RowFaultKind
 from identification.signals.samples import Samples
 from identification.validation.controller_inertia import InertiaRatio, inertia_ratio

@@ -25,6 +25,7 @@ from identification.excitation import (
 )
 from identification.model.elements import TorqueRipple
 from identification.selection.essential import Elimination
+from identification.selection.messages import cut_words
 from identification.signals.samples import Samples
 from identification.validation.consistency import ConsistencyCheck
 from identification.validation.evidence import Evidence
@@ -147,6 +148,7 @@ def _essential(choice: Elimination | str) -> results.EssentialResult | None:
     estimate = choice.estimate
     return results.EssentialResult.of(
         choice,
+        reason=cut_words(choice),
         parameters=results.EssentialParameter.rows(
             name=estimate.names,
             unit=estimate.units,

@@ -24,7 +24,6 @@ from identification.factor.estimate import Estimate, estimate_of, joint_weights
 from identification.factor.factor import Factor, joined
 from identification.factor.normal_equations import Solution, solve
 from identification.model.robot import RobotModel
-from identification.text import percentage
 
 _SIGNIFICANCE_LEVEL: Final = 0.05
 _TINY: Final = 1e-300
@@ -64,7 +63,7 @@ class Elimination:
     steps: tuple[EliminationStep, ...]
     cut: int  #: index of the chosen step
     refused: tuple[str, ...]  #: parameters whose removal was refused, in order
-    reason: str  #: explanation of the cut
+    rule: CutRule  #: of the cut
     #: of the remaining parameters, with cluster-robust covariance that ignores their selection
     estimate: Estimate
     values: Array  #: for the full model (p,), zero if removed
@@ -134,7 +133,7 @@ def eliminate(
         steps=tuple(path.steps),
         cut=cut,
         refused=refused,
-        reason=_reason(path.steps, cut, refused, rule),
+        rule=rule,
         estimate=with_block_covariance(classical, part, weights, name),
         values=chosen.values,
     )
@@ -281,21 +280,3 @@ def _is_significant(difference: Array) -> bool:
 @lru_cache
 def _limit(freedom: int) -> float:
     return float(student_limit(_SIGNIFICANCE_LEVEL, freedom))
-
-
-def _reason(steps: list[EliminationStep], cut: int, refused: tuple[str, ...], rule: CutRule) -> str:
-    """Describe why the cut is at this step."""
-    full = steps[0]
-    chosen = steps[cut]
-    text = (
-        f"{chosen.left} of {full.left} parameters are essential: their relative standard deviations"
-        f" differ by a factor of {chosen.spread:.3g}"
-    )
-    if refused:
-        text += f"; removing these raises the error on held-out motion: {', '.join(refused)}"
-    elif chosen.spread < rule.spread:
-        text += f", less than {rule.spread:g}"
-    return (
-        f"{text}. Error on the motion used for the choice: {percentage(full.held_out, 2)} with all"
-        f" parameters, {percentage(chosen.held_out, 2)} with these"
-    )

@@ -9,7 +9,14 @@ from hil.pipeline.cell_context import _friction_law, _resolution, _sampling_rate
 from identification.model.friction import FrictionLaw
 from identification.selection.questions import LOAD
 from identification.selection.settings import Choice
-from identification.signals.recording import UNWRAPPED, Recording, unwrap, unwrapped
+from identification.signals.angle_wraps import (
+    UNWRAPPED,
+    unwrap,
+    unwrapped,
+)
+from identification.signals.recording import (
+    Recording,
+)
 from identification.signals.samples import Preprocessing
 from tests.identification.two_link import MODEL, as_samples, one_sine
 
