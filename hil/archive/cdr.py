@@ -109,7 +109,7 @@ class LayoutBuilder:
         """Return the layout of the fields added so far; `LayoutError` if two have one name."""
         names, formats, offsets = ([field[k] for field in self._fields] for k in range(3))
         if len(set(names)) != len(names):
-            raise LayoutError("two of its fields have one name")
+            raise LayoutError("two of its fields have the same name")
         size = len(self._template)
         fields: Any = {"names": names, "formats": formats, "offsets": offsets, "itemsize": size}
         return MessageLayout(np.dtype(fields), bytes(self._template), tuple(self._constant))
@@ -178,7 +178,7 @@ def fixed_layout(definition: str) -> MessageLayout:
             builder.variable("nanosec", "uint32")
             builder.string("")
         elif kind not in _PRIMITIVES:
-            raise LayoutError(f"{match['name']} is of the type {kind}, no number")
+            raise LayoutError(f"{match['name']} is of type {kind}, not a number")
         elif count is None:
             builder.variable(match["name"], kind)
         elif not count.isdecimal() or len(count) > _MAX_COUNT_DIGITS or int(count) > _MAX_ELEMENTS:

@@ -102,7 +102,7 @@ def archive_files(paths: Sequence[Path]) -> list[Path]:
         inside = sorted(path.glob("*.mcap")) or sorted(path.glob("archives/*.mcap"))
         if not inside:
             problem = "has no archive (*.mcap) in it, and none in its folder archives"
-            raise InputError(path, problem, remedy="name an archive, or a folder of them")
+            raise InputError(path, problem, remedy="give an archive, or a folder of them")
         files += inside
     return files
 

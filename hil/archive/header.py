@@ -136,7 +136,7 @@ class Findings(BaseModel):
 
 _UNREADABLE: Final[Mapping[str, Any]] = {
     "planted": {},
-    "findings": Findings(lines=(), warnings=("the findings of its import cannot be read",)),
+    "findings": Findings(lines=(), warnings=("the findings of the import cannot be read",)),
     "losses": (),
 }
 

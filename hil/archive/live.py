@@ -189,7 +189,7 @@ def _serve(view: LiveView) -> tuple[WebSocketServer, foxglove.Context]:
             message_backlog_size=MAX_CLIENT_MESSAGES,
         )
     except Exception as error:  # the library documents no narrower one
-        remedy = "name an address of this computer and a free port"
+        remedy = "give an address of this computer and a free port"
         raise LiveViewError(None, f"--live {view}: {error}", remedy=remedy) from error
     return server, context
 

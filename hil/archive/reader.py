@@ -210,7 +210,7 @@ def scan_file(path: Path, **options: Any) -> Scan:
     except OSError as error:
         remedy = "check whether it was moved or removed, and whether it can be copied"
         if isinstance(error, IsADirectoryError):
-            remedy = "name an archive in it (*.mcap)"
+            remedy = "give an archive in it (*.mcap)"
         elif isinstance(error, FileNotFoundError):
             remedy = remedy_for_missing(path, "check whether it was moved or removed")
         raise ArchiveError(path, f"cannot be read: {error.strerror}", remedy=remedy) from error
@@ -239,4 +239,4 @@ def _unreadable(path: Path, scan: Scan) -> ArchiveError:
         problem = "is not an MCAP file"
     else:
         problem = f"is truncated before its first data: {scan.faults[0]}"
-    return NotAnArchiveError(path, problem, remedy="name a file that hil recorded or imported")
+    return NotAnArchiveError(path, problem, remedy="give a file that hil recorded or imported")

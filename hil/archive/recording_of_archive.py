@@ -71,7 +71,7 @@ def recording_of(archive: Archive) -> Recording:
     columns = archive.columns
     if not archive.n_samples or "position" not in columns:
         problem = f"has no sample{f' ({archive.damage})' if archive.damage else ''}"
-        remedy = "record it again, or name a time within the recording"
+        remedy = "record it again, or give a time within the recording"
         raise ArchiveError(archive.path, problem, remedy=remedy)
     imported = archive.kind == "imported"
     by_program = archive.header.by_controller_program

@@ -76,7 +76,7 @@ def repair(
     path = Path(path)
     scan = scan_archive(path, all_channels=True)[1]
     if scan.mixed:
-        problem = "its beginning and its end are of two recordings, its samples of either"
+        problem = "its beginning and its end are from different recordings, its samples from either"
         raise ArchiveError(path, problem, remedy="restore it from a copy, or record again")
     target = path.resolve() if in_place else Path(output) if output else repaired_name(path)
     if not in_place and os.path.lexists(target):

@@ -233,7 +233,7 @@ class Scan:
                 raise Damage(offset, "(metadata 'hil.outcome') belongs to another recording")
             self.outcome = outcome
         elif name in (METADATA, OUTCOME):
-            raise Damage(offset, f"(metadata {name!r}) is there a second time")
+            raise Damage(offset, f"(metadata {name!r}) occurs twice")
 
     def _read(self) -> None:
         """Read the wanted records in order."""
@@ -289,7 +289,7 @@ class Scan:
         elif record.opcode == container.ATTACHMENT:
             attachment = container.parse_attachment(record)
             if attachment.name in self.attachments:
-                raise Damage(offset, f"(attachment {attachment.name!r}) is there a second time")
+                raise Damage(offset, f"(attachment {attachment.name!r}) occurs twice")
             self.attachments[attachment.name] = attachment.data
         elif record.opcode in _DEFINITION_OPCODES:
             self.parser.define(record)

@@ -243,7 +243,7 @@ class ArchiveFile:
                 self._close()
             raise ArchiveWriteError(
                 self._path,
-                f"cannot be written further: {error.strerror}",
+                f"cannot be written any more: {error.strerror}",
                 remedy="what was flushed before can be read; make room or repair the disk, "
                 "and record again",
             ) from error

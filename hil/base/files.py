@@ -25,10 +25,10 @@ def make_folder(path: Path) -> None:
         path.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise InputError(
-            path, f"cannot be created ({error.strerror})", remedy="name another folder"
+            path, f"cannot be created ({error.strerror})", remedy="choose another folder"
         ) from error
     if not os.access(path, os.W_OK | os.X_OK):
-        raise InputError(path, "cannot be written to", remedy="name another folder")
+        raise InputError(path, "cannot be written to", remedy="choose another folder")
 
 
 def user_cache() -> Path:
@@ -49,10 +49,10 @@ def lock_folder(root: Path, work: str, option: str) -> Iterator[None]:
     def refusal(error: OSError) -> InputError:
         if isinstance(error, BlockingIOError):
             problem = f"a {work} is running in it"
-            remedy = f"wait until it ends, stop it (Ctrl-C), or name another folder ({option})"
+            remedy = f"wait until it ends, stop it (Ctrl-C), or choose another folder ({option})"
         else:
             problem = f"cannot be locked ({error.strerror})"
-            remedy = f"name a folder on a disk of this PC ({option})"
+            remedy = f"give a folder on a disk of this PC ({option})"
         return InputError(root, problem, remedy=remedy)
 
     with file_lock(root, refusal):
@@ -95,7 +95,7 @@ def convert_write_errors(folder: Path) -> Iterator[None]:
         yield
     except OSError as error:
         problem = f"cannot be written to ({os.strerror(error.errno) if error.errno else error})"
-        remedy = "make room, or name another folder"
+        remedy = "make room, or choose another folder"
         raise InputError(folder, problem, remedy=remedy) from error
 
 

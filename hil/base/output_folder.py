@@ -51,10 +51,12 @@ def require_possible(folder: Path) -> None:
     existing = next(path for path in (folder, *folder.resolve().parents) if path_exists(path))
     if not existing.is_dir():
         raise InputError(
-            folder, f"cannot be created ({existing} is a file)", remedy="name another folder"
+            folder, f"cannot be created ({existing} is a file)", remedy="choose another folder"
         )
     if not os.access(existing, os.W_OK | os.X_OK):
-        raise InputError(existing, "cannot be written to", remedy="name another folder (--output)")
+        raise InputError(
+            existing, "cannot be written to", remedy="choose another folder (--output)"
+        )
 
 
 def _candidates(recording: Path) -> Iterator[Path]:

@@ -234,7 +234,7 @@ def remedy_for_missing(path: Path, otherwise: str) -> str:
     return otherwise
 
 
-def read_input(path: Path, otherwise: str = "name another file") -> str:
+def read_input(path: Path, otherwise: str = "choose another file") -> str:
     """Return the text of a file named by the user, or raise InputError."""
     try:
         return read_text(path)
@@ -243,7 +243,7 @@ def read_input(path: Path, otherwise: str = "name another file") -> str:
         if isinstance(error, UnicodeDecodeError):
             otherwise = "save it as UTF-8"
         elif reason == _NO_FILE:
-            otherwise = "write it to a file first, and name that"
+            otherwise = "write it to a file first, and give that"
         elif isinstance(error, FileNotFoundError):
             otherwise = remedy_for_missing(path, otherwise)
         raise InputError(path, f"cannot be read ({reason})", remedy=otherwise) from error
@@ -254,7 +254,7 @@ def parse_json(text: str | bytes) -> Any:
     try:
         return json.loads(text)
     except RecursionError as error:
-        raise ValueError("it is nested too deep") from error
+        raise ValueError("it is nested too deeply") from error
 
 
 def parse_toml(text: str) -> dict[str, Any]:
@@ -262,7 +262,7 @@ def parse_toml(text: str) -> dict[str, Any]:
     try:
         document = tomllib.loads(text)
     except RecursionError as error:
-        raise ValueError("it is nested too deep") from error
+        raise ValueError("it is nested too deeply") from error
     level: list[Any] = [document]
     for _ in range(_MAX_NESTING_DEPTH):  # the parser does not limit dotted keys
         level = [
@@ -273,4 +273,4 @@ def parse_toml(text: str) -> dict[str, Any]:
         ]
         if not level:
             return document
-    raise ValueError("it is nested too deep")
+    raise ValueError("it is nested too deeply")

@@ -16,7 +16,7 @@ from typing import Any, Final, Literal, NamedTuple, Protocol
 from hil.archive import Archive, ArchiveName, ArchiveOutcome, open_archive
 from hil.archive.campaign_archives import Entry, RecordedCampaign
 from hil.archive.check import recording_date
-from hil.archive.header import KINDS, SUFFIX
+from hil.archive.header import KIND_NAMES, KINDS, SUFFIX
 from hil.base.errors import ArchiveError, CampaignFolderError, InputError
 from hil.base.files import digest, file_digest, json_digest
 from hil.base.progress import Reporter
@@ -517,7 +517,7 @@ def _select(inspected: dict[str, ArchiveRef | SkippedArchive]) -> Discovery:
             unusable.append(archive)
         elif entry is None:
             if entries is not None and archive.use in USES and ArchiveName.parse(archive.name):
-                skipped.append(SkippedArchive(place, _UNCHECKED))
+                skipped.append(SkippedArchive(place, _UNCHECKED, noun="unchecked recording"))
             else:
                 read.append(archive)
         elif entry.sha256 != archive.sha256:
@@ -532,15 +532,15 @@ def _select(inspected: dict[str, ArchiveRef | SkippedArchive]) -> Discovery:
             key = (ref.folder, ref.kind, ref.index)
             latest[key] = max(latest.get(key, 0), ref.attempt)
     for archive in unusable:
-        if reason := _not_needed(archive.path, latest):
-            skipped.append(SkippedArchive(archive.path, reason))
+        if (excluded := _not_needed(archive.path, latest)) is not None:
+            skipped.append(excluded)
         else:
             broken.append(archive)
     seen: dict[str, str] = {}
     refs: list[ArchiveRef] = []
     for ref in read:
-        if reason := _exclusion(ref, latest):
-            skipped.append(SkippedArchive(ref.origin, reason))
+        if (excluded := _exclusion(ref, latest)) is not None:
+            skipped.append(excluded)
         elif (copy := _copy(ref, seen)) is not None:
             skipped.append(copy)
         else:
@@ -579,39 +579,49 @@ def _campaign_records(campaign: str) -> Iterator[RecordedCampaign]:
         yield RecordedCampaign(Path(copy))
 
 
-def _not_needed(place: str, latest: _Attempts) -> str:
-    """Return why an unusable archive, such as one of a killed run, is not needed; "" if it is."""
+def _not_needed(place: str, latest: _Attempts) -> SkippedArchive | None:
+    """Return an unusable archive that is not needed, such as one of a killed run; None if it is."""
     name = ArchiveName.parse(name_of(place))
     if name is None:
-        return ""
+        return None
     if name.kind in _NEVER_FITTED:
-        return f"is a {name.kind}"
+        return _of_kind(place, name.kind)
     last = latest.get((folder_of(place), name.kind, name.index), 0)
-    return f"was replaced by attempt {last}" if name.attempt < last else ""
+    return _replaced(place, last) if name.attempt < last else None
 
 
-def _exclusion(ref: ArchiveRef, latest: _Attempts) -> str:
-    """Return why an archive is not to be fitted, "" if it is unless it is a copy."""
+def _exclusion(ref: ArchiveRef, latest: _Attempts) -> SkippedArchive | None:
+    """Return an archive that is not fitted, with the reason; None if it is, unless it is a copy."""
     if ref.use not in USES:
-        return f"is a {ref.use}"
+        return _of_kind(ref.origin, ref.use)
     if ref.simulated and _REHEARSAL in ref.origin:
-        return "belongs to a rehearsal"
+        return SkippedArchive(ref.origin, "belongs to a rehearsal", noun="rehearsal recording")
     if _LOADED.search(ref.origin):
-        return "was recorded with a payload that was to be weighed"
+        reason = "was recorded with the payload of a payload campaign"
+        return SkippedArchive(ref.origin, reason, noun="loaded recording")
     if ref.outcome != _COMPLETED:
-        return f"ended {ref.outcome}"
+        return SkippedArchive(ref.origin, f"ended {ref.outcome}", noun=f"{ref.outcome} motion")
     last = latest.get((ref.folder, ref.kind, ref.index), ref.attempt)
-    return f"was replaced by attempt {last}" if ref.attempt and ref.attempt < last else ""
+    return _replaced(ref.origin, last) if ref.attempt and ref.attempt < last else None
+
+
+def _of_kind(place: str, kind: str) -> SkippedArchive:
+    noun = KIND_NAMES.get(kind, kind)
+    return SkippedArchive(place, f"is a {noun}", noun=noun)
+
+
+def _replaced(place: str, attempt: int) -> SkippedArchive:
+    return SkippedArchive(place, f"was replaced by attempt {attempt}", noun="replaced attempt")
 
 
 def _copy(ref: ArchiveRef, seen: dict[str, str]) -> SkippedArchive | None:
     """Return the archive in `seen` that this one copies; else add it to `seen` and return None."""
     content = ref.content or ref.sha256
     if content in seen and ref.use != "standstill":
-        return SkippedArchive(ref.origin, "is a copy", seen[content])
+        return SkippedArchive(ref.origin, "is a copy", seen[content], "copy")
     if ref.attempt:
         first = seen.setdefault(f"{ref.folder} {ref.record}", ref.name)
         if first != ref.name:
-            return SkippedArchive(ref.origin, "is a copy or a repaired version", first)
+            return SkippedArchive(ref.origin, "is a copy or a repaired version", first, "copy")
     seen[content] = ref.origin
     return None

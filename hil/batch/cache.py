@@ -199,7 +199,7 @@ def cache_errors(path: Path) -> Iterator[None]:
         yield
     except OSError as error:
         problem = f"cannot be written ({error.strerror})"
-        remedy = "make room, or name another folder with --cache, or none"
+        remedy = "make room, or choose another folder with --cache, or none"
         raise CacheError(path, problem, remedy=remedy) from error
 
 

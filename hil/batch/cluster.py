@@ -77,11 +77,13 @@ class SkippedArchive(NamedTuple):
     Attributes:
         reason: without the archive that it is a copy of.
         copy_of: that archive, "" for none.
+        noun: what it is, for a count of the skipped ones, such as "move".
     """
 
     path: str
     reason: str
     copy_of: str = ""
+    noun: str = "unusable recording"
 
     @property
     def message(self) -> str:
@@ -210,7 +212,7 @@ class Cluster:
                 None,
                 f"no Dask scheduler answers at {address}",
                 field="--scheduler",
-                remedy="start one with `dask scheduler`, or name the address that it prints, such"
+                remedy="start one with `dask scheduler`, or give the address that it prints, such"
                 " as tcp://host:8786",
             ) from error
         self._open.callback(client.close)

@@ -132,7 +132,7 @@ def _filesystem(url: str) -> tuple[Any, str]:
     except ImportError as error:
         raise InputError(url, f"cannot be opened ({error})", remedy="install that") from error
     except ValueError as error:
-        remedy = "name a folder, or a URL that fsspec opens, such as https:// or s3://"
+        remedy = "give a folder, or a URL that fsspec opens, such as https:// or s3://"
         raise InputError(url, f"cannot be opened ({error})", remedy=remedy) from error
     return filesystem, path
 

@@ -60,7 +60,7 @@ def find_recordings(roots: Sequence[str], logs: KindsOfLogs | None = None) -> Fo
         elif path.is_dir():
             search.walk(path.resolve())
         else:
-            remedy = remedy_for_missing(path, "name a folder with recordings below it")
+            remedy = remedy_for_missing(path, "give a folder with recordings below it")
             raise InputError(root, "does not exist", remedy=remedy)
     return FoundRecordings(
         tuple(sorted(search.archives)), tuple(sorted(search.logs)), tuple(search.refused)

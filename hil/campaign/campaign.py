@@ -188,10 +188,10 @@ def require_replaceable(root: Path) -> None:
     """Refuse to replace a campaign with recordings (CampaignFolderError)."""
     if CampaignFolder(root).manifest():
         raise CampaignFolderError(
-            root, "holds a campaign with recordings", "name another folder (-o)"
+            root, "holds a campaign with recordings", "choose another folder (-o)"
         )
     if any((root / PAYLOADS).glob("*")):
-        raise CampaignFolderError(root, "holds payload campaigns", "name another folder (-o)")
+        raise CampaignFolderError(root, "holds payload campaigns", "choose another folder (-o)")
 
 
 def campaign_of_design(root: Path, cell: Cell, excitation: Excitation | CampaignPlan) -> Campaign:

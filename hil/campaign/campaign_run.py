@@ -183,7 +183,7 @@ class _CampaignRun:
                 require_allowed(sent, narrowed)
             if below := narrower_limits(cell, link.connection, "current_limit"):
                 self._archives.notes.append(
-                    f"the controller's own current limits counted ({'; '.join(below)})"
+                    f"the controller's own, lower current limits were used ({'; '.join(below)})"
                 )
             # Dry run and warm-up use the moves of the motions that they are made of.
             straight = CheckedMoves(cell, narrowed)

@@ -50,7 +50,7 @@ PAYLOAD_RESULT: Final = "payload.json"
 """File of a payload that was weighed, in its folder."""
 SIDES: Final = ("bare", "loaded")
 """Campaigns in the folder of a payload: the same motion without and with it."""
-_ANOTHER: Final = "{} is not the one this campaign began with"
+_ANOTHER: Final = "{} is not the one with which this campaign began"
 _RESTORE: Final = "restore it, or begin a new campaign"
 
 
@@ -172,7 +172,7 @@ class CampaignFolder(RecordedCampaign):
         def refusal(error: OSError) -> CampaignFolderError:
             if isinstance(error, BlockingIOError):
                 return CampaignFolderError(
-                    self.root, "another run is at work on it", "wait for its end, or stop it"
+                    self.root, "another run is using it", "wait until it ends, or stop it"
                 )
             problem = f"{LOCK} cannot be written ({error.strerror})"
             return CampaignFolderError(self.root, problem, "make it a writable file")

@@ -52,7 +52,7 @@ def require_gates(
         root = campaign.folder.root
         raise NotRehearsedError(
             root,
-            "was not rehearsed, and its link leads out of this computer",
+            "was not rehearsed, and its link leaves this computer",
             "only a simulated controller on this computer (127.0.0.1) is driven without a "
             f"rehearsal: run `hil rehearse {typed(root)}`",
         )
@@ -82,7 +82,7 @@ def require_dry_run(
     first = f"run `{folder.run_command} --dry-run`"
     if dry_run is None and options.accept_dry_run and not simulated:
         remedy = f"{first}, watch the arm, and accept it then"
-        raise DryRunError(root, "cannot be accepted before it was done", remedy)
+        raise DryRunError(root, "cannot be accepted before it is done", remedy)
     if can_answer or options.dry_run_only or options.accept_dry_run:
         return
     if dry_run is None:

@@ -160,7 +160,7 @@ class RunWatch:
             became = "the last request remained active"
             if self._request.held and not self.stop.requested:
                 self.stop.requested = True
-                became = "the arm was held and could not be released any more: the run was stopped"
+                became = "the arm was held and could not be released: the run was stopped"
                 self._problems.pop("request", None)
             self._problems.setdefault(
                 "request",

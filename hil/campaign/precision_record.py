@@ -60,7 +60,7 @@ class Reached:
         if repetitions == 1:  # what differs between repetitions is not known
             return text
         if self.more is None:
-            return f"{text}, which repeating this motion does not improve enough"
+            return f"{text}, which more repetitions do not improve enough"
         return f"{text}, about {self.more} more"
 
 
@@ -156,7 +156,7 @@ class PrecisionRecord:
         if self.outcome == "met":
             return f"{text}: all requirements are met, no more {self.unit}s"
         if self.outcome == "out of reach" and self.unit == "pair":
-            remains = "that is more than repetitions of [campaign]"
+            remains = "that is more than repetitions in [campaign]"
             if look.worst.more is None:
                 remains = (
                     "what remains is the scale of the torque (weigh a known load with hil "

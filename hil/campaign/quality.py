@@ -129,7 +129,7 @@ def problem_of(executed: Executed, trajectory: Motion, cell: Cell) -> QualityPro
         if standstill is not None:
             start, travel = standstill
             return QualityProblem(
-                f"{name} is stuck: its position stays the same from {start * cell.period:.2f} s "
+                f"{name} is stuck: its position does not change from {start * cell.period:.2f} s "
                 f"after the start on while it is commanded to move by {travel:.3g} rad"
             )
     for name, column in zip(cell.joint_names, high.T, strict=True):
@@ -356,11 +356,11 @@ class ArchiveReview:
             self._reject(name, reason)
         later = f"{len(alike) + 1} later ones agree with each other and not with"
         self.notes.append(
-            f"packets were missed in {', '.join(accepted)}, all that counted; they were rejected"
-            f" because {later} them, in which none was missed: they were disturbed alike, or the"
-            " arm was changed after them"
+            f"packets were missed in {', '.join(accepted)}, all accepted ones; they were rejected "
+            f"because {later} them, in which none was missed: all of them were disturbed, or the "
+            f"arm was changed after them"
             if several
-            else f"{accepted[0]} was the only repetition that counted, and was rejected because"
+            else f"{accepted[0]} was the only accepted repetition, and was rejected because"
             f" {later} it: it was disturbed, or the arm was changed after it"
         )
         self._check = RepetitionCheck(self._cell, self._motion)

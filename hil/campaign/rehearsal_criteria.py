@@ -101,8 +101,8 @@ def of_currents(cell: Cell, folder: CampaignFolder, name: str, bound: float) -> 
 
 
 _CORRECT = (
-    "correct the cause, by [limits] or [drive_train] of the cell file, or what the simulated arm"
-    " is made from ([nominal], [controller], [simulation])"
+    "correct the cause, by [limits] or [drive_train] of the cell file, or the tables of the "
+    "simulated arm ([nominal], [controller], [simulation])"
 )
 
 
@@ -239,7 +239,7 @@ def of_estimate(twin: Twin, folder: CampaignFolder, reporter: Reporter) -> list[
             MAX_PARAMETER_SIGMAS,
             f"the errors of {finite.sum()} parameters are at most {apart[farthest]:.3g} standard "
             f"deviations ({estimate.names[farthest]}), {MAX_PARAMETER_SIGMAS:g} are allowed",
-            "drive train or model of the cell file do not match the arm",
+            "drive train or model in the cell file do not match the arm",
         ),
         criterion(
             "unseen motion",

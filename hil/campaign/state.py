@@ -69,7 +69,7 @@ class CampaignState:
         require_runnable(cell, plan, checks)
         make_folder(root)
         if any(path.name not in DESIGN_FILES for path in root.iterdir()):
-            raise CampaignFolderError(root, "is not empty", "name a new folder")
+            raise CampaignFolderError(root, "is not empty", "choose a new folder")
         made = CampaignFolder(root)
         own_cell = cell.with_urdf(made.cell, made.urdf.name)
         files = {made.urdf: own_cell.urdf, made.cell: own_cell.text, made.plan: plan.to_text()}
@@ -101,7 +101,7 @@ class CampaignState:
             raise CampaignFolderError(
                 there.root,
                 "is not a campaign folder",
-                remedy_for_missing(there.root, "name one that has plan.json"),
+                remedy_for_missing(there.root, "give one that has plan.json"),
             )
         return cls(there, Cell.load(there.cell), CampaignPlan.load(there.plan))
 
@@ -117,7 +117,7 @@ class CampaignState:
         if not same or not fits:
             what = "excitation" if same else "cell"
             raise CampaignFolderError(
-                self.folder.root, f"holds a campaign with another {what}", "name a new folder"
+                self.folder.root, f"holds a campaign with another {what}", "choose a new folder"
             )
         return self
 

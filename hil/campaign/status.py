@@ -224,7 +224,7 @@ def _gate(campaign: CampaignState, step: CampaignStep, record: Path) -> Campaign
     if step.done or record.exists() or not campaign.cell.only_simulated:
         return step
     if all(_motions(campaign, kind, kind).done for kind in ("excitation", "validation")):
-        return CampaignStep("done", "left out, as a simulated arm allows")
+        return CampaignStep("done", "left out, which a simulated arm allows")
     return step
 
 
@@ -352,7 +352,7 @@ def _end_of_killed(path: Path) -> str:
     except HilError:
         outcome = None
     if outcome is None:
-        return "it was never closed, for the program or the computer ended"
+        return "it was never closed: the program or the computer stopped"
     return f"the program ended before it checked the motion ({outcome.outcome}: {outcome.reason})"
 
 

@@ -35,7 +35,7 @@ SLOW_SPEED_SHARE: Final = 0.2  # Speed of the slow variants, as a share of that 
 MIN_SCRIPT_SPEED: Final = 0.01
 README: Final = "README.txt"
 WARNING: Final = (
-    "The arm will move. Checked by the model only: limits, torques, floor, walls, self-collision.",
+    "The arm will move. Only checked by the model: limits, torques, floor, walls, self-collision.",
     "Run the slow motion first, at the start posture, with a hand at the emergency stop.",
 )
 

@@ -15,7 +15,7 @@ from hil.base.errors import InputError
 from hil.base.terminal_text import typed
 from hil.cell.gripper_names import links_of
 
-LINKS_REMEDY: Final = "name links of the URDF, the tip farther from the root than the base"
+LINKS_REMEDY: Final = "give links of the URDF, the tip farther from the root than the base"
 MAX_NAMES: Final = 12
 _MIN_ARM_JOINTS: Final = 3
 """Joints of an arm: with fewer it is the head, the lift or the wheels of a robot."""

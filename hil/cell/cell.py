@@ -73,7 +73,7 @@ class Cell:
             CellError: a field is invalid.
         """
         path = Path(path)
-        text = _read(path, path, "", None, "name a TOML file")
+        text = _read(path, path, "", None, "give a TOML file")
         name = _parse(path, text).cell.urdf
         urdf_path = path.parent / name
         urdf = _read(urdf_path, path, "cell.urdf", name, f"put a URDF at {urdf_path}")
@@ -146,7 +146,7 @@ class Cell:
         }
         changed = self._with_robot(friction=common.model_copy(update={"joints": joints}))
         if [law.table() for law in changed.model.friction.laws] != [dict(law) for law in laws]:
-            raise ValueError("the friction laws do not belong to this arm's joints")
+            raise ValueError("the friction laws belong to joints of another arm")
         return changed
 
     def without_payload(self) -> Cell:
@@ -630,7 +630,7 @@ def _check_assumed(cell: Cell) -> None:
             problem = f"is missing, but listed in cell.assumed as {name}"
             raise cell.error(table, None, problem, f"add a table [{table}], or remove the name")
         if field not in dict(entries):
-            remedy = 'name fields as "table.field"'
+            remedy = 'write fields as "table.field"'
             raise cell.error("cell.assumed", name, "names no field of this file", remedy)
 
 

@@ -71,7 +71,7 @@ def demo(
     if resume:
         if excitation is not None:
             problem = "contradicts --resume, which continues with the excitation of the campaign"
-            remedy = "omit --excitation, or name another folder"
+            remedy = "omit --excitation, or choose another folder"
             raise InputError(excitation, problem, remedy=remedy)
         campaign = Campaign.open(output)
         _require_same(campaign, repetitions=repetitions, validation=validation, seed=seed)
@@ -115,7 +115,7 @@ def _require_same(
             raise InputError(
                 campaign.folder.root,
                 f"its campaign was begun with {option} {begun}, not {given}",
-                remedy=f"omit {option} with --resume, or name another folder",
+                remedy=f"omit {option} with --resume, or choose another folder",
             )
 
 
@@ -148,18 +148,18 @@ def _require_replaceable(output: Path, *, force: bool) -> None:
     if not output.exists() and not output.is_symlink():
         return
     if output.is_symlink() or not output.is_dir():
-        raise CampaignFolderError(output, "is not a folder", "name a folder")
+        raise CampaignFolderError(output, "is not a folder", "give a folder")
     entries = {path.name for path in output.iterdir()}
     if entries and not force:
         remedy = (
-            "name another folder (--output), or add --resume to continue or --force to replace it"
+            "choose another folder (--output), or add --resume to continue or --force to replace it"
         )
         raise CampaignFolderError(output, "is not empty", remedy)
     foreign = sorted(entries - _OURS)
     if foreign or (entries and "manifest.json" not in entries):
         what = f"contains {foreign[0]}" if foreign else "is not a campaign"
         problem = f"{what}, so --force will not remove it"
-        raise CampaignFolderError(output, problem, "name another folder")
+        raise CampaignFolderError(output, problem, "choose another folder")
 
 
 def _make_room(output: Path) -> None:

@@ -146,7 +146,7 @@ def design(
         typer.echo(preset_text(show_settings), nl=False)
         return
     if cell is None:
-        raise InputError(None, "no cell file", remedy="name a cell file: hil design CELL")
+        raise InputError(None, "no cell file", remedy="give a cell file: hil design CELL")
     at_most_one(method=method, settings=settings, quick=quick)
     at_most_one(resume=resume, force=force)
     reporter = make_reporter(quiet=quiet or json, messages=verbose)

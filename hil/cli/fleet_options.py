@@ -127,13 +127,10 @@ def map_lines(maps: Mapping[LogMap, int], *, verbose: bool) -> Iterator[str]:
 
 
 def skipped_line(skipped: Sequence[SkippedArchive]) -> str:
-    """Count the skipped archives by reason, without the name of another archive in it."""
-    others = [
-        unused._replace(copy_of="another") if unused.copy_of else unused for unused in skipped
-    ]
-    counts = Counter(unused.message for unused in others)
-    reasons = "; ".join(f"{count} {reason}" for reason, count in counts.most_common())
-    return f"skipped, not for fitting: {reasons}"
+    """Count the recordings that were not fitted, by what they are."""
+    counts = Counter(unused.noun for unused in skipped)
+    kinds = ", ".join(plural(count, noun) for noun, count in counts.most_common())
+    return f"{plural(len(skipped), 'recording')} not fitted: {kinds}"
 
 
 def last(lines: Sequence[str], most: int, where: str) -> Iterator[str]:

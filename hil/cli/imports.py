@@ -242,7 +242,8 @@ class Reading:
         list[str] | None,
         typer.Option(
             metavar="RECORDED=URDF",
-            help="Other name of joints in a bag (repeatable), as in fer_joint{}=panda_joint{}.",
+            help="Joints of a bag under their URDF names (repeatable), such as "
+            "fer_joint{}=panda_joint{}.",
             rich_help_panel=CHANNELS,
         ),
     ] = None
@@ -250,7 +251,7 @@ class Reading:
         Path | None,
         typer.Option(
             metavar="FILE",
-            help="Commanded positions of a log in a file of their own.",
+            help="File with the commanded positions of a log.",
             rich_help_panel=CHANNELS,
         ),
     ] = None
@@ -266,7 +267,7 @@ class Reading:
         EpisodeUnit | None,
         typer.Option(
             metavar="UNIT",
-            help="Of a LeRobot data set: deg, or range for -100 to 100.",
+            help="Unit of a LeRobot data set: deg, or range for -100 to 100.",
             rich_help_panel=CHANNELS,
         ),
     ] = None
@@ -275,7 +276,7 @@ class Reading:
         bool,
         typer.Option(
             "--drop-missing",
-            help="Leave out rows of a log in which a number is missing.",
+            help="Drop rows of a log in which a number is missing.",
             rich_help_panel=CHANNELS,
         ),
     ] = False

@@ -194,6 +194,6 @@ def _require_free(path: Path, *, force: bool, urdf_read: Path | None = None) -> 
     """Refuse to replace a file without --force, and the URDF that is read."""
     if urdf_read is not None and path.resolve() == urdf_read.resolve():
         problem = "is the URDF to read"
-        raise InputError(path, problem, remedy="name another --output")
+        raise InputError(path, problem, remedy="choose another --output")
     if path.exists() and not force:
-        raise InputError(path, "exists already", remedy="name another --output, or add --force")
+        raise InputError(path, "exists already", remedy="choose another --output, or add --force")

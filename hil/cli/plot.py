@@ -60,7 +60,9 @@ def plot(
         )
         return
     if others:
-        say(f"note: {archive} is the first of {len(others) + 1} archives; name another to plot it")
+        say(
+            f"note: {archive} is the first of {len(others) + 1} archives; choose another to plot it"
+        )
     for problem in (view.facts.damage, view.facts.lost):
         if problem:
             typer.echo(printable(f"note: {problem}"))

@@ -132,7 +132,7 @@ def with_rtde(cell: Cell, link: str | None) -> Cell:
     fields = LINKS["rtde"].parse(address) if name == "rtde" else None
     if fields is None:
         remedy = "write rtde:HOST or rtde:HOST:PORT; the cell file describes other links"
-        problem = f"{link!r} is no link that is only listened to"
+        problem = f"{link!r} is not a link that can only be listened to"
         raise InputError(None, problem, field="--link", remedy=remedy)
     table = cell.file.controller
     cycle_ms = 2 if table is None or table.transport != "rtde" else table.cycle_ms

@@ -125,7 +125,7 @@ def _opened(root: Path) -> Campaign:
         problem = "is one side of a payload campaign"
         remedy = f"run `{opened.folder.run_command}`"
         if not CampaignFolder(whole).sealed:
-            problem = f"lies where a payload campaign has a side; {whole.resolve()} is no campaign"
+            problem = f"is a side of a payload campaign, but {whole.resolve()} is no campaign"
             remedy = "move the folder to a path without payload/NAME and run it there"
         raise InputError(root, problem, remedy=remedy)
     if opened.cell.assumes_payload:

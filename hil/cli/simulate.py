@@ -429,8 +429,8 @@ def _replies(served: Served) -> str:
         )
     unused = {
         "too late": summary.late,
-        "a further one in its cycle": summary.surplus,
-        "of wrong number, length or content": summary.rejected,
+        "a second reply in one cycle": summary.surplus,
+        "with a wrong number, length or content": summary.rejected,
     }
     replies = [f"{count} {reason}" for reason, count in unused.items() if count]
     if replies:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import textwrap
 from pathlib import Path
 from typing import Annotated, Any, Final
 
@@ -10,6 +11,7 @@ import tomlkit
 import typer
 
 from hil.base.errors import InputError
+from hil.base.one_screen import SCREEN_COLUMNS
 from hil.base.progress import reporter as make_reporter
 from hil.base.progress import say
 from hil.base.toml_text import comment_lines, inline
@@ -128,12 +130,13 @@ def _as_toml(result: GainsFound, assumed: str | None) -> str:
             for share, determined in zip(gains.relative_std, gains.determined, strict=True)
         ]
     )
-    uncertainty.comment("relative standard deviations")
     document = tomlkit.document()
-    heads = ([assumed] if assumed else []) + [f"N·m/A ({side}), 95 % intervals"]
+    heads = textwrap.wrap(assumed or "", SCREEN_COLUMNS - 2)
+    heads.append(f"N·m/A ({side}), 95 % intervals")
     for line in comment_lines("\n".join(heads)):
         document.add(line)
     document.add("torque_constant", constants)
+    document.add(*comment_lines("relative standard deviations"))
     document.add("torque_uncertainty", uncertainty)
     return tomlkit.dumps(document).rstrip("\n")
 
@@ -167,7 +170,7 @@ def _undetermined_words(gain: UndeterminedGain) -> str:
             return "its estimate is not positive: the payload's torque is below the noise"
         case GainProblem.IMPRECISE:
             return (
-                f"its relative standard deviation is {percentage(gain.relative_std)}, limit"
+                f"its standard deviation is {percentage(gain.relative_std, 1)}, limit"
                 f" {percentage(MAX_RELATIVE_STD)}"
             )
 

@@ -97,7 +97,7 @@ class Connection:
                 self._rejected += event.count
                 packets = plural(self._rejected, "packet")
                 self.no_reply = event.reason
-                self.not_understood = f"{packets} came and got no reply: {event.reason}"
+                self.not_understood = f"{packets} came and were not replied to: {event.reason}"
 
     def reset_motion(self) -> None:
         """Forget the last motion: another one is about to be requested."""
@@ -191,8 +191,8 @@ class ControllerWords:
         match state:
             case State.SYNC:
                 problem = (
-                    f"did not begin a session {after} (state SYNC): it is silent, or still in one "
-                    f"that began before this program; {self.restart} and try again"
+                    f"did not begin a session {after} (state SYNC): it is silent, or is still in "
+                    f"a session that began before this program; {self.restart} and try again"
                 )
             case State.ENDED:
                 problem = f"ended the session {after} before its {self.drive_on}"

@@ -59,7 +59,7 @@ class SlippedError(MotionFailedError):
     def __init__(self, motion: str, slip: str, archive: str) -> None:
         super().__init__(motion, "rejected", slip, archive)
         remedy = (
-            "it does not count, and nothing else was moved. Check encoder, coupling, belt and "
+            "it is not used, and nothing else was moved. Check encoder, coupling, belt and "
             "brake of that joint, and its position at a known mark, before the arm moves again"
         )
         self.args = (f"{self.archived}; {remedy}.",)

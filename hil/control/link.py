@@ -53,7 +53,7 @@ REST_TIMEOUT: Final = 30.0
 SESSION_END_TIMEOUT: Final = 30.0  # s within which a session must end after that was requested
 CLOSE_TIMEOUT: Final = 1.0  # s for the axes to close after the motion of a failed archive
 SLOW_FLUSH_SECONDS: Final = 1.0  # Duration of one flush that is reported as a fault of the disk, s
-NOT_STARTED: Final = "it had not begun"
+NOT_STARTED: Final = "it had not started"
 """Reason of a motion that was stopped before it was requested."""
 STOPPED: Final = "stopped by the operator"
 WAIT_REPORT_DELAY: Final = 2.0  # s after which a controller that is not ready is reported
@@ -153,7 +153,7 @@ class MotionLink:
                 self._report_waiting(state, timeout)
             return ready or stop.requested or waited > timeout
 
-        self._exchange_until(finished, "the controller gets no replies")
+        self._exchange_until(finished, "the controller receives no replies")
         self._poll()
         self.connection.require_usable()
         if stop.requested:
@@ -603,7 +603,7 @@ class _Supervision:
         if ended is None:
             failure = self._port.failure() or recorded.reason
             raise ControllerError(
-                f"{failure}; the controller gets no replies and acts by its own watchdog; "
+                f"{failure}; the controller receives no replies and acts by its own watchdog; "
                 f"the archive ({recorded.outcome}) is complete up to then"
             )
         if ended.reason == NO_ARCHIVE:
@@ -658,7 +658,7 @@ def recording_end(
     """
     ends = (
         (restarted, "stopped", "the controller began a new session"),
-        (complete, "completed", "as long as was asked for"),
+        (complete, "completed", "for the requested time"),
         (ended, "completed", "the controller ended the session"),
         (bool(lost), "lost", lost),
         (stopped, "stopped" if limited else "completed", "ended by the operator"),

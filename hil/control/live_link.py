@@ -577,8 +577,9 @@ def _started(
         if reported != holder:
             reported = holder
             report(
-                f"{whose}: if that run was killed, it replies to the controller until the arm has "
-                f"rested, and then ends; waiting for that, up to {EARLIER_EXCHANGE_TIMEOUT:g} s"
+                f"{whose}: if that run was killed, its exchange replies to the controller until "
+                f"the arm is at rest, and then ends; waiting for that, up to "
+                f"{EARLIER_EXCHANGE_TIMEOUT:g} s"
             )
         while is_exchange(holder):
             if stop.requested:

@@ -65,7 +65,7 @@ def always_so(violation: Violation, checker: CollisionChecker) -> str | None:
         return None
     message = f"{violation.subject} are {nearest:.3f} to {farthest:.3f} m apart in any posture"
     if nearest >= violation.bound:
-        return f"{message}, closer to contact than can be resolved; narrow [workspace] margin"
+        return f"{message}, too close to contact to be resolved; narrow [workspace] margin"
     if nearest > 0.0:
         return f"{message}; [workspace] margin must be below that"
     return f"{message}: they overlap; correct their collision shapes in the URDF"

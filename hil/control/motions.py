@@ -215,7 +215,7 @@ def _require(motion: CampaignMotion, problem: str | None) -> None:
         return
     remedy = "design another motion"
     if motion.from_arm:
-        remedy = "jog the arm to where the straight way to the motion is free"
+        remedy = "jog the arm to a posture from which the straight path to the motion is free"
     elif motion.kind == "standstill":
         remedy = "correct home_deg or standstill_s in [campaign], or [workspace], of the cell file"
     raise MotionRefusedError(str(motion), problem, remedy)

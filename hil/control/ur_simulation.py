@@ -162,7 +162,7 @@ def served_arm(
     """
     if len(cell.joint_names) != N_JOINTS:
         problem = f"has {len(cell.joint_names)} joints; an arm on RTDE has {N_JOINTS}"
-        raise cell.error("cell.urdf", cell.file.cell.urdf, problem, "name a cell of six joints")
+        raise cell.error("cell.urdf", cell.file.cell.urdf, problem, "give a cell of six joints")
     table = cell.controller
     try:
         settings = replace(_settings(cell), payload=_payload(cell))

@@ -54,12 +54,12 @@ class DesignFolder:
         if self._has_settings():
             present.append(self.settings)
         elif self.settings.exists():
-            problem = "exists and is not of a design, which would write its settings there"
-            remedy = "name another folder (-o), or move the file"
+            problem = "exists and belongs to no design, which would write its settings there"
+            remedy = "choose another folder (-o), or move the file"
             raise InputError(self.settings, problem, remedy=remedy)
         if present and not force:
             problem = f"has a design already ({present[0].name})"
-            remedy = "resume it (--resume), name another folder (-o), or add --force"
+            remedy = "resume it (--resume), choose another folder (-o), or add --force"
             raise InputError(self.root, problem, remedy=remedy)
         with convert_write_errors(self.root):
             for path in (self.result, self.picture, self.journal, self.settings):
@@ -73,7 +73,7 @@ class DesignFolder:
             InputError: there is none.
         """
         if not self._has_settings():
-            remedy = "start one without --resume, or name its folder (-o)"
+            remedy = "start one without --resume, or give its folder (-o)"
             raise InputError(self.root, "has no design to resume", remedy=remedy)
         return load_settings(self.settings)
 
@@ -171,7 +171,7 @@ def run_design(
             if settings != folder.resumed_settings():
                 raise SettingsError(
                     folder.settings,
-                    "are not the settings that were asked for",
+                    "differ from the requested settings",
                     remedy="resume the search without options, or start one in another folder (-o)",
                 )
         else:

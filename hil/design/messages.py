@@ -85,8 +85,9 @@ def advice_on_branches(chain: Chain) -> str | None:
     fixing = " ".join(f"--fix {name}" for name in others)
     last = ", ".join(chain.joint_names[end] for end in ends)
     return (
-        f"the {chain.n_joints} joints form {len(ends)} arms, with the last joints {last}: move one "
-        f"at a time, with a cell whose other joints are fixed (`hil new --urdf ARM.urdf {fixing}`)"
+        f"the {chain.n_joints} joints form {len(ends)} arms, with the last joints {last}: move "
+        f"one arm at a time, with a cell in which the other joints are fixed (`hil new --urdf "
+        f"ARM.urdf {fixing}`)"
     )
 
 

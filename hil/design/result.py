@@ -181,7 +181,7 @@ class DesignResult:
             text = read_text(path)
         except (OSError, UnicodeDecodeError) as error:
             reason = error.strerror if isinstance(error, OSError) else error
-            remedy = remedy_for_missing(path, "name a file that `hil design` wrote")
+            remedy = remedy_for_missing(path, "give a file that `hil design` wrote")
             raise InputError(path, f"cannot be read ({reason})", remedy=remedy) from error
         try:
             data = from_text(text)
@@ -202,7 +202,7 @@ class DesignResult:
         if positions.shape != planned.shape or np.any(np.abs(planned - positions) > PLAN_TOLERANCE):
             raise InputError(
                 path,
-                "its moves do not plan to the motion that was designed",
+                "planning its moves does not give the designed motion",
                 remedy=f"{_REMEDY}, or use the software listed in [software]",
             )
         return result
@@ -222,7 +222,7 @@ class DesignResult:
                 f"was designed for the cell {then['name']!r}, which differs from {cell.name!r} in "
                 f"{' and '.join(different)}",
                 field="cell",
-                remedy=f"name its own cell, or {_REMEDY}",
+                remedy=f"give its own cell, or {_REMEDY}",
             )
 
     @classmethod

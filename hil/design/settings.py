@@ -281,7 +281,7 @@ def _read(path: Path) -> dict[str, Any]:
         raw = parse_toml(read_text(path))
     except OSError as error:
         problem = f"cannot be read ({error.strerror})"
-        raise SettingsError(path, problem, remedy="name a TOML file") from error
+        raise SettingsError(path, problem, remedy="give a TOML file") from error
     except ValueError as error:
         remedy = "see `hil design --show-settings gradient`"
         raise SettingsError(path, f"is not TOML ({error})", remedy=remedy) from error

@@ -142,8 +142,8 @@ class ExportedEnsemble:
                 f"the spread of fewer than {MIN_ARMS} arms is mostly chance: draw more, such as"
                 " --ensemble 20"
                 if len(arms) < MIN_ARMS
-                else "warning: the nearest arms that can be built do not vary as the intervals say:"
-                " do not randomise between them"
+                else "warning: the nearest physically consistent arms do not scatter as the "
+                "intervals state: do not use them for randomisation"
             )
         if isinstance(self.difference, str):
             lines.append(f"warning: not read back: {self.difference}")

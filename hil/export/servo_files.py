@@ -248,7 +248,7 @@ def _archives(folder: Path, results: ServoResults) -> tuple[Cell, tuple[Source, 
     ]
     for path in (*fitted, *predicted):
         if not path_exists(path):
-            remedy = "leave archives and results in one folder, or identify again"
+            remedy = "keep archives and results in one folder, or identify again"
             raise InputError(path, "is missing: the results were computed from it", remedy=remedy)
     sources = gather_sources(
         fitted, results.split, predicted, in_sample=results.in_sample, with_torque=False
@@ -372,7 +372,10 @@ def _remarks(results: ServoResults) -> tuple[str, ...]:
         " as in the URDF.",
         f"Verdict: {results.verdict.line}",
         *(
-            [f"The torque scale of {unknown} is not determined: gains and friction hold together."]
+            [
+                f"The torque scale of {unknown} is not determined: gains and friction are only"
+                " valid together."
+            ]
             if unknown
             else []
         ),
@@ -384,6 +387,6 @@ def _remarks(results: ServoResults) -> tuple[str, ...]:
             if planned
             else []
         ),
-        "With these values the terms of this simulator come closest to the motion.",
+        "With these values this simulator's terms reproduce the motion best.",
         f"archives: {', '.join(results.archives)}",
     )

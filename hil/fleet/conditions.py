@@ -21,7 +21,7 @@ _FIELD: Final = "--conditions"
 _DATES: Final = ("when", "date", "time", "timestamp", "datetime")
 _ROBOT: Final = "robot"
 _REMEDY: Final = (
-    "give a CSV file with a column when of dates, and one of numbers for each condition"
+    "give a CSV file with dates in a column `when`, and a column of numbers for each condition"
 )
 _DAY: Final = 86400.0  # s
 

@@ -88,7 +88,7 @@ def estimated_fleet(
     found = discover(roots, cache, cluster, reporter, importing, naming.place)
     refs = [ref for ref in found.refs if ref.use == "excitation" and ref.when]
     undated = [
-        SkippedArchive(ref.origin, "has no date")
+        SkippedArchive(ref.origin, "has no date", noun="undated recording")
         for ref in found.refs
         if ref.use == "excitation" and not ref.when
     ]

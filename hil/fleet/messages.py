@@ -128,7 +128,7 @@ def notes(fleet: FleetTrend) -> Iterator[str]:
     if not fleet.covariates:
         yield (
             "no recording has a temperature: warm-up and season count as noise from day to day"
-            + (", except for what all robots have in common" if fleet.seasonal else "")
+            + (", except for changes that all robots share" if fleet.seasonal else "")
         )
     for robot, places in fleet.twice.items():
         yield (

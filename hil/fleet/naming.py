@@ -64,7 +64,7 @@ class RobotNaming:
         if key == "metadata" and name:
             return cls("metadata", name)
         if ROBOT not in text:
-            problem = f"{text!r} does not say where the robot is named"
+            problem = f"{text!r} does not state where the robot is named"
             raise InputError(None, problem, field=_FIELD, remedy=_REMEDY)
         unknown = {*re.findall(r"\{[^}]*\}", text)} - {ROBOT, DATE}
         if unknown or text.count(DATE) > 1:

@@ -107,7 +107,7 @@ def tracked_quantities(
     gravity, motion = _rigid_weights(model, reference)
     loads = np.array([float(np.sqrt(weights @ reference)) for weights in gravity.values()])
     for j, (joint, turns) in enumerate(zip(model.joint_names, model.chain.revolute, strict=True)):
-        unit, speed_unit = ("N·m", "rad/s") if turns else ("N", "m/s")
+        unit, per_speed = ("N·m", "N·m·s/rad") if turns else ("N", "N·s/m")
         if friction[:, j].any():
             best = _best_speed(fits, friction[:, j])
             speed = float(FRICTION_SPEEDS[best])
@@ -117,7 +117,7 @@ def tracked_quantities(
                 yield TrackedQuantity(FollowedQuantity(joint, "coulomb", unit), j, at_rest[j])
             slope = (weights - at_rest[j]) / speed
             if slope.any():
-                viscous = FollowedQuantity(joint, "viscous", f"{unit} / ({speed_unit})")
+                viscous = FollowedQuantity(joint, "viscous", per_speed)
                 yield TrackedQuantity(viscous, j, slope)
         if loads[j] > _MIN_GRAVITY_SHARE * loads.max():
             weights = gravity[j] / loads[j]

@@ -185,7 +185,7 @@ def read_table(path: Path, conditions: Conditions = Conditions()) -> list[TypeSe
     for entry in entries:
         by_type.setdefault(entry.kind, []).append(entry)
     if not by_type:
-        raise InputError(path, "has no row", field=_FIELD, remedy="name another table")
+        raise InputError(path, "has no row", field=_FIELD, remedy="choose another table")
     return [_series(kind, members, conditions) for kind, members in by_type.items()]
 
 

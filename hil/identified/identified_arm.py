@@ -404,7 +404,7 @@ def identify_recordings(
             recording.
     """
     if not recordings:
-        raise InputError(None, "there is no recording", remedy="name a log, a bag or an archive")
+        raise InputError(None, "there is no recording", remedy="give a log, a bag or an archive")
     if robot_of is None:
         return _of_archives(recordings, predict, options, compare, reporter)
     with staged(recordings, predict, robot_of, reading, reporter) as staging:

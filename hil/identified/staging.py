@@ -62,7 +62,7 @@ class Staging:
             place = folder / archive.name
             if place.resolve() in recordings:
                 problem = "is the recording itself, which its archive would replace"
-                raise InputError(place, problem, remedy="name another folder: --output FOLDER")
+                raise InputError(place, problem, remedy="choose another folder: --output FOLDER")
 
     def write_to(self, folder: Path) -> Mapping[Path, Path]:
         """Write archives and maps to an existing folder; return their paths by the paths in memory.

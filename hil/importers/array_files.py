@@ -177,7 +177,7 @@ class ArrayFile:
             vector = self._array(column, field)
             if vector.ndim == 2 and 1 not in vector.shape:
                 problem = f"array {column!r} has the shape {vector.shape}"
-                remedy = "name an array of one dimension, or one of its columns by index"
+                remedy = "give an array of one dimension, or one of its columns by index"
                 raise SourceError(self.path, problem, field=field, remedy=remedy)
             return vector.ravel()
         matrix = self._matrix(array, field)
@@ -270,7 +270,7 @@ def _head(stream: IO[bytes]) -> tuple[tuple[int, ...], np.dtype[Any]] | None:
 def _mat(path: Path) -> Contents:
     if lost := lost_bytes(path):
         problem = (
-            f"its data are lost: of MATLAB 7.3 it has the header, and then {lost} bytes that are "
+            f"its data are lost: it has the header of MATLAB 7.3, and then {lost} bytes that are "
             "all zero, as after an interrupted copy or on a full disk"
         )
         raise SourceError(path, problem, remedy="copy it again, or save it again in MATLAB")

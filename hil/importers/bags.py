@@ -52,11 +52,11 @@ def bag_files(source: Path) -> list[Path]:
             open_file(file).close()  # raises for a pipe, which would block
     except OSError as error:
         problem = f"cannot be read: {error.strerror}"
-        remedy = "name a .db3, .mcap or .bag file, or a bag's folder"
+        remedy = "give a .db3, .mcap or .bag file, or a bag's folder"
         raise SourceError(error.filename, problem, remedy=remedy) from error
     if not files:
         problem = "has no .db3, no .mcap and no .bag file in it"
-        raise SourceError(source, problem, remedy="name the folder of a bag")
+        raise SourceError(source, problem, remedy="give the folder of a bag")
     if source.is_dir():
         _require_parts(source, {_unpacked_name(file) for file in files})
     unpacked = {file.name for file in files if file.suffix not in _PACKED}
@@ -77,13 +77,13 @@ def _require_parts(folder: Path, present: set[str]) -> None:
         names = [Path(str(name)).name for name in named]
     except Exception as error:  # of YAML in any state
         problem = f"cannot be read ({error or type(error).__name__})".replace("\n", " ")
-        remedy = "repair it, or name the parts of the bag one by one"
+        remedy = "repair it, or give the files of the bag one by one"
         raise SourceError(metadata, problem, remedy=remedy) from error
     missing = [name for name in names if _unpacked_name(Path(name)) not in present]
     if missing:
         problem = f"{', '.join(missing)}: named in metadata.yaml, and not in the folder"
         remedy = (
-            "copy what is missing into it; to use one part alone, name its file: "
+            "copy what is missing into it; to use one part alone, give its file: "
             f"{', '.join(sorted(present))}"
         )
         raise SourceError(folder, problem, remedy=remedy)
@@ -259,7 +259,7 @@ def _not_a_bag(file: Path, error: Exception) -> SourceError:
     kind = "a bag of ROS 1" if _storage(file) == ".bag" else "a rosbag2 in sqlite3 storage"
     reason = re.sub(r"\S*part_\d+\.\w+'?", file.name, str(error)) or type(error).__name__
     problem = f"is not {kind}, or damaged ({reason})"
-    remedy = "name the .db3, .mcap or .bag file, or the bag's folder"
+    remedy = "give the .db3, .mcap or .bag file, or the bag's folder"
     if _is_database(file):
         remedy = "copy it again, together with the file that ends in -wal, if there is one"
     elif _starts_with(file, _ROS_1_MAGIC):
@@ -320,7 +320,7 @@ def _unpack(file: Path, target: Path) -> None:
                 output.write(block)
                 if output.tell() > most:
                     raise SourceError(
-                        file, f"becomes more than {MAX_COMPRESSION_RATIO} times as large"
+                        file, f"expands to more than {MAX_COMPRESSION_RATIO} times as large"
                     )
     except (OSError, zstandard.ZstdError) as error:
         raise SourceError(file, f"cannot be decompressed ({error})") from error

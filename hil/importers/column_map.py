@@ -214,10 +214,10 @@ class ColumnMap(_Table):
                 raise FieldError(problem, remedy)
             if unit in RATED and quantity.rated is None:
                 whole = "100 %" if unit == RATED[0] else "1000 ‰"
-                problem = f"{name} is in parts of a rated value"
+                problem = f"{name} is a fraction of a rated value"
                 raise FieldError(problem, f"give {name}.rated, the value of {whole} in SI units")
             if quantity.side == "motor" and name != "motor_current" and not self.drive.geared:
-                raise ValueError(f"{name} is of the motor side, so drive.gear_ratio is needed")
+                raise ValueError(f"{name} is on the motor side, so drive.gear_ratio is needed")
             if quantity.files is not None and (quantity.file or quantity.joints_along):
                 raise ValueError(f"{name} has files, so it has neither file nor joints_along")
             if isinstance(quantity.files, str) and "{}" not in quantity.files:
@@ -230,7 +230,9 @@ class ColumnMap(_Table):
                 remedy = f"give {KINEMATIC[0]}.coupled"
                 raise FieldError(f"{name} has no coupled angles", remedy)
             if any(joint == other for joint, other, _ in quantity.coupled):
-                raise FieldError(f"{name}.coupled is of two joints each", f"use {name}.scale")
+                raise FieldError(
+                    f"{name}.coupled names two joints in each entry", f"use {name}.scale"
+                )
             if 0.0 in np.atleast_1d(quantity.scale):
                 raise ValueError(f"{name}.scale is 0, which removes the recorded values")
         if any(motor == joint for motor, joint, _ in self.drive.coupling):
@@ -264,7 +266,7 @@ class ColumnMap(_Table):
         except (OSError, ValueError) as error:
             reason = error.strerror if isinstance(error, OSError) else error
             problem = f"cannot be read ({reason})"
-            remedy = f"name a TOML file, or a ready map: {', '.join(ready_maps())}"
+            remedy = f"give a TOML file, or a ready map: {', '.join(ready_maps())}"
             if isinstance(error, FileNotFoundError):
                 remedy = remedy_for_missing(path, remedy)
             raise SourceError(path, problem, remedy=remedy) from error

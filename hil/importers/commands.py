@@ -142,7 +142,7 @@ def commanded_positions(
                 concluded.append(NotCommands(topic, str(error)))
         if not commands and chosen is not None:
             others = ", ".join(name for names in _candidates(bag.topics, states) for name in names)
-            remedy = f"name another one ({others}), or none: --command-topic {NO_COMMAND}"
+            remedy = f"choose another one ({others}), or none: --command-topic {NO_COMMAND}"
             problem = sentence(concluded[-1])
             raise SourceError(bag.files[0], problem, field="--command-topic", remedy=remedy)
         if commands:
@@ -197,7 +197,7 @@ def _commands_of(bag: Bag, topic: str, measured: Measured) -> Commands:
     except SourceError as error:
         raise _NotCommandsError(f"its messages cannot be read ({error.problem})") from error
     except (AttributeError, LookupError, TypeError, ValueError) as error:
-        raise _NotCommandsError("its messages have other fields, or of other lengths") from error
+        raise _NotCommandsError("its messages differ in fields or lengths") from error
     known = np.asarray(np.isfinite(values).all(axis=1))
     if np.count_nonzero(known) < 2:
         raise _NotCommandsError("it has no command at the time of the measured positions")

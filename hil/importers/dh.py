@@ -145,7 +145,7 @@ def _moving(row: _Row, parent: str, child: str, lift: float) -> tuple[str, str]:
 
 
 def _rows(path: Path) -> list[_Row]:
-    lines = read_input(path, "name a table of DH parameters").removeprefix("\ufeff").splitlines()
+    lines = read_input(path, "give a table of DH parameters").removeprefix("\ufeff").splitlines()
     filled = [
         (number, line)
         for number, line in enumerate(lines, 1)

@@ -45,7 +45,7 @@ def trees(
     except Exception as error:  # protobuf does not document what it raises
         raise MessageError(f"cannot be decoded ({error or type(error).__name__})") from error
     if not all(isinstance(tree, dict) for tree in decoded):
-        raise MessageError("are no objects with named fields")
+        raise MessageError("are not objects with named fields")
     return decoded
 
 
@@ -85,7 +85,7 @@ def columns_of_trees(
     rows = [dict(numbers_of(message)) for message in messages]
     names = list(rows[0])
     if any(row.keys() != rows[0].keys() for row in rows):
-        raise MessageError("have other fields or names from message to message")
+        raise MessageError("have fields or names that change from message to message")
     stamps = [stamp_of(message) for message in messages]
     are_stamped = all(stamp is not None for stamp in stamps) and any(stamps)
     arrays: dict[str, NDArray[Any]] = {

@@ -158,7 +158,7 @@ class _Search:
         if times:
             file, column = next(iter(times.values()))
             return {"file": file, "column": column}
-        problem = "none of its files has times"
+        problem = "none of its files contains a time"
         remedy = "state --sample-rate HZ"
         raise SourceError(self._folder, problem, field="time", remedy=remedy)
 
@@ -202,7 +202,7 @@ class _Search:
         if not path.is_file():
             names = ", ".join(file.name for file in files_in(self._folder))
             problem = f"there is no file {name!r} for {kind.replace('_', ' ')}"
-            remedy = f"name one of its files: {names}"
+            remedy = f"choose one of its files: {names}"
             raise SourceError(self._folder, problem, field=kind, remedy=remedy)
         for candidates in self._held.values():
             for each in candidates:

@@ -76,7 +76,7 @@ class Robot:
             InputError: the file cannot be read, is not a valid URDF, or has no such joint.
         """
         path = Path(path)
-        otherwise = "name a URDF file"
+        otherwise = "give a URDF file"
         urdf = read_input(path, otherwise) if convention is None else urdf_of_dh(path, convention)
         try:
             pinocchio_model(urdf)

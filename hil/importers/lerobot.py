@@ -243,7 +243,7 @@ def _names(folder: Path, info: Mapping[str, Any], feature: str) -> tuple[str, ..
     if isinstance(names, dict):  # {"motors": [...]}, as of version 2.0
         names = next(iter(names.values()), None)
     if not isinstance(names, list) or not all(isinstance(name, str) for name in names):
-        problem = f"names no numbers of {feature}"
+        problem = f"has no numbers for {feature}"
         remedy = "give a data set of an arm, whose states and actions are positions of its joints"
         raise SourceError(folder / INFO, problem, field=feature, remedy=remedy)
     return tuple(_PREFIXES.sub("", _SUFFIXES.sub("", name)) for name in names)
@@ -284,7 +284,7 @@ def _calibrated(path: Path, joints: Sequence[str]) -> Array:
         by_name = {_PREFIXES.sub("", str(name)): entry for name, entry in content.items()}
         spans = [float(by_name[j]["range_max"]) - float(by_name[j]["range_min"]) for j in joints]
     except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
-        problem = f"is no calibration of these joints by LeRobot ({error})"
+        problem = f"is not a LeRobot calibration of these joints ({error})"
         remedy = f"give its JSON with range_min and range_max of {', '.join(joints)}"
         raise SourceError(path, problem, field="--calibration", remedy=remedy) from error
     if not min(spans) > 0.0:

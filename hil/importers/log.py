@@ -253,7 +253,7 @@ class _Log:
         bit = sign_bit_of(values)
         if bit is None and not are_per_mille(names, values):
             return
-        problem = "has whole numbers and the name of the object 6077h: per mille of a rated one"
+        problem = "has whole numbers and the name of object 6077h: per mille of a rated value"
         if bit is not None:
             problem = f"is a magnitude with the sign in bit {bit}, as servos write their load"
         entries = [] if columns is None else [f"columns = {json.dumps(columns)}"]
@@ -270,9 +270,9 @@ class _Log:
             return
         joint = self.joints[int(np.argmin(has))]
         problem = f"joint {joint} has no number in any row, the others have"
-        remedy = f"name the column that has it, or leave out [{name}]"
+        remedy = f"give the column that has it, or leave out [{name}]"
         if name == "position":
-            remedy = f"name the column that has it, or lock the joint: --locked {joint}=POSITION"
+            remedy = f"give the column that has it, or lock the joint: --locked {joint}=POSITION"
         raise SourceError(self.path, problem, field=name, remedy=remedy)
 
     def _factor(self, name: str, quantity: Quantity, stated: Sequence[str | None]) -> float | Array:
@@ -361,7 +361,7 @@ class _Log:
         for other in others:
             if self._times(other, time) != times:
                 problem = f"has other times than {first.path.name}"
-                remedy = "name one file of times for all joints: [time] file"
+                remedy = "give one file of times for all joints: [time] file"
                 raise SourceError(other.path, problem, field="time", remedy=remedy)
         valid = np.array([time is not None for time in times])
         if not valid.any() or (not valid.all() and self._map.format.missing == "refuse"):
@@ -660,7 +660,7 @@ class _Log:
                 values = file.matrix(quantity.array, field)
             if 1 not in values.shape:
                 problem = f"has the shape {values.shape}, expected one column"
-                remedy = "name one of each file, by name or by index from 0: columns = [1]"
+                remedy = "choose one of each file, by name or by index from 0: columns = [1]"
                 raise SourceError(file.path, problem, field=field, remedy=remedy)
             columns_of_files.append(values.ravel())
         places = [os.path.relpath(file.path, self._folder) for file in files]
@@ -706,7 +706,7 @@ class _Log:
                 f"there is no {what[:-1]} {missing[0]!r} for {self.joints[joint]}, joint "
                 f"{joint + 1} of {count}; there are {', '.join(available) or 'none'}",
                 field=field,
-                remedy=f"{NOT_RECORDED}, name the joints of the log in joints, or list its {what}",
+                remedy=f"{NOT_RECORDED}, list the joints of the log in joints, or list its {what}",
             )
             named = [joint for joint, name in zip(self.joints, by_joint, strict=True) if has(name)]
             raise refusal.of(len(named) or sum(map(has, names)), named, filter(has, names))
@@ -717,7 +717,7 @@ class _Log:
                 f"{len(present)} {what} are called {pattern!r} ({present[0]} to {present[-1]}), "
                 f"and there are {count} joints: {', '.join(self.joints)}",
                 field=field,
-                remedy=f"name the URDF's joint of each in joints, or list {count} {what}",
+                remedy=f"give the URDF's joint of each in joints, or list {count} {what}",
             )
         return chosen
 
@@ -739,7 +739,7 @@ class _Log:
                 f"{name} has the shape {matrix.shape}, joints along its {along}, and there are "
                 f"{count} joints: {', '.join(self.joints)}",
                 field=name,
-                remedy=f"{NOT_RECORDED}, name the joints of the log in joints, or give the columns "
+                remedy=f"{NOT_RECORDED}, list the joints of the log in joints, or give the columns "
                 "of the joints",
             )
             if isinstance(refusal, UnrecordedJointError):
@@ -750,7 +750,7 @@ class _Log:
     def _file(self, name: str | None, field: str) -> TextTable | ArrayFile:
         if name is None and self.path.is_dir():
             problem = "is a folder"
-            remedy = 'name a file in it: file = "q.txt", or one per joint: files = "q_{}.txt"'
+            remedy = 'give a file in it: file = "q.txt", or one per joint: files = "q_{}.txt"'
             raise SourceError(self.path, problem, field=field, remedy=remedy)
         path = self.path if name is None else self._folder / name
         if path not in self.files:

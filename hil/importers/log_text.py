@@ -138,7 +138,7 @@ def table_text(path: Path, text: str) -> str:
 def _unreadable(path: Path, error: Exception) -> SourceError:
     """Return the error for a file whose bytes are no text."""
     problem = f"cannot be read ({error.strerror if isinstance(error, OSError) else error})"
-    remedy = f"name a text file, or one that ends in {', '.join(READERS)}"
+    remedy = f"give a text file, or one that ends in {', '.join(READERS)}"
     if isinstance(error, FileNotFoundError):
         remedy = remedy_for_missing(path, remedy)
     elif isinstance(error, CompressionError):

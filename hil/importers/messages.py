@@ -207,13 +207,13 @@ def source_of(unit: StatedUnit | ConcludedUnit) -> str:
     if isinstance(unit, EncoderTicks):
         return (
             f"{none} ticks of an encoder of {unit.ticks}, with zero at {unit.middle}: within the "
-            "limits of the URDF, which radians and degrees leave"
+            "limits of the URDF, which they would exceed in radians and in degrees"
         )
     if unit.kind == "time":
         return f"{none} {unit.unit}, which gives a usual rate"
     if unit.kind == "velocity":
         return f"{none} degrees per second, the slope of the positions"
-    return f"{none} degrees, within the limits of the URDF, which radians leave by far"
+    return f"{none} degrees, within the limits of the URDF, far outside of them in radians"
 
 
 @worded.register
@@ -266,13 +266,13 @@ def _(merged: MergedMessages) -> str:
         "with the same stamps" if merged.same_stamps else "interpolated to the stamps of the first"
     )
     kinds = " and ".join(f"({', '.join(joints)})" for joints in merged.groups)
-    return f"merged from messages of their own, {how}: {kinds}"
+    return f"merged from separate messages, {how}: {kinds}"
 
 
 @worded.register
 def _(restarted: ClockRestarted) -> str:
     return (
-        f"the clock begins again {restarted.parts - 1} times: read as {restarted.parts} motions "
+        f"the clock restarts {restarted.parts - 1} times: read as {restarted.parts} motions "
         "with a second between them"
     )
 
@@ -302,7 +302,8 @@ def _(base: OneTimeBase) -> str:
     counts = ", ".join(f"{name} {count}" for name, count in base.counts.items())
     some = f"; {base.left_out} of these have no neighbour in time" if base.left_out else ""
     return (
-        f"quantities at times of their own ({counts} samples) were interpolated to the times of "
+        f"quantities with time stamps of their own ({counts} samples) were interpolated to the "
+        f"times of "
         f"the {base.base.replace('_', ' ')}{some}"
     )
 
@@ -310,15 +311,15 @@ def _(base: OneTimeBase) -> str:
 @worded.register
 def _(clock: OtherClock) -> str:
     return (
-        f"commands are on another clock: moved by {clock.offset:.3f} s, where their speeds best"
-        " match the speeds of the positions; their delay is then not known"
+        f"commands are on another clock: moved by {clock.offset:.3f} s, at which speeds of "
+        f"commands and positions match best; their delay is then unknown"
     )
 
 
 @worded.register
 def _(velocity: PartialVelocity) -> str:
     joints = ", ".join(velocity.joints)
-    problem = f"joint {joints} has none in any message, the others have it"
+    problem = f"joint {joints} has no value in any message, the others have one"
     return f"velocity: {problem}: left out for all"
 
 
@@ -383,9 +384,9 @@ def _(same: SameStamp) -> str:
 @worded.register
 def _(alternation: Alternation) -> str:
     return (
-        f"samples go to and fro between two sequences up to {number(alternation.apart)} "
-        f"rad or m apart ({alternation.count} samples): two sources write these joints, one of them"
-        " other or older samples; record one of them"
+        f"samples alternate between two sequences up to {number(alternation.apart)} "
+        f"rad or m apart ({alternation.count} samples): two sources write these joints, one of "
+        f"them with other or older samples; record only one"
     )
 
 
@@ -443,9 +444,9 @@ def _(fast: FastJoint) -> str:
 @worded.register
 def _(other: VelocityOrder) -> str:
     return (
-        "the velocities are in another order than the positions: as mapped they deviate "
-        f"from the slopes by {other.deviation:.0f} %, in the order {', '.join(other.order)} by "
-        f"{other.least:.0f} %: name the columns of both in the same order"
+        "the velocities are in another order than the positions: as mapped they differ from the "
+        "slopes by {other.deviation:.0f} %, in the order {', '.join(other.order)} by "
+        f"{other.least:.0f} %: list the columns of both in the same order"
     )
 
 

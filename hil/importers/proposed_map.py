@@ -441,7 +441,7 @@ class _Search:
             f"{count} {'channel is' if count == 1 else 'channels are'} named as {kind} "
             f"({group.label}), and the URDF has {len(self._joints)} joints: {joints}"
         )
-        otherwise = "or name the URDF's joint of each channel in joints of a map (--map map.toml)"
+        otherwise = "or give the URDF's joint of each channel in joints of a map (--map map.toml)"
         if count < len(self._joints) or self._recorded:
             absent, which = self._absent(group)
             options = " ".join(f"--locked {name}" for name in absent)

@@ -777,5 +777,5 @@ def _joints_of(columns: ColumnMap, path: Path) -> tuple[str, ...]:
 
 def _no_joints(source: Path) -> tuple[str, ...]:
     problem = "does not name the recorded joints"
-    remedy = "name the joints that were not recorded with --locked NAME, or give a map with joints"
+    remedy = "lock the joints that were not recorded (--locked NAME), or give a map with joints"
     raise SourceError(source, problem, field="--lock-others", remedy=remedy)

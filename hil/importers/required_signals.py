@@ -75,11 +75,11 @@ def require_commands(archive: Archive, recording: Path, *, fitted: bool) -> None
         remedy = "record the commanded positions, or name them (--columns)"
         raise SourceError(recording, problem, field=field, remedy=remedy)
     if fitted and not np.ptp(commanded, axis=0).any():
-        problem = "no command changes, so that nothing is seen of a servo"
+        problem = "no command changes, so that no servo can be identified"
         remedy = "record motion from commands, or name their channels (--columns)"
         raise SourceError(recording, problem, field=field, remedy=remedy)
     if np.ptp(position, axis=0).any() and np.mean((position == commanded).all(axis=1)) >= _COPIED:
-        problem = "the positions are the commands, bit for bit: nobody measured them"
+        problem = "the positions are the commands, bit for bit: they were not measured"
         remedy = "record or name measured positions (--columns 'position=NAME{}')"
         raise SourceError(recording, problem, field="position", remedy=remedy)
     size = command_size(position, commanded)

@@ -100,7 +100,7 @@ def on_one_base(parts: Mapping[str, Timed], source: Path) -> OnOneBase:
     if np.count_nonzero(whole) < 2:
         spans = "; ".join(_span(name, of_joints) for name, of_joints in columns.items())
         problem = f"its quantities were not recorded at the same time ({spans})"
-        remedy = "name the columns of one recording, or give all of them one clock"
+        remedy = "give columns of one recording, or record all of them on one clock"
         raise SourceError(source, problem, field="time", remedy=remedy)
     counts = {name: min(len(stamp) for stamp, _ in each) for name, each in columns.items()}
     conclusion = OneTimeBase(counts, rarest, int(np.count_nonzero(~whole)))

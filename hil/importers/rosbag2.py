@@ -184,11 +184,11 @@ def _choose(bag: Bag, topic: str | None) -> str:
         problem = f"{topic} is not a topic of {JOINT_STATE}"
     listing = ", ".join(f"{name} ({kind})" for name, kind in bag.topics.items()) or "none"
     remedy = (
-        f"name one of its topics: {listing}; `hil import log` reads other messages, with a "
+        f"choose one of its topics: {listing}; `hil import log` reads other messages, with a "
         "column map"
     )
     if fitting:
-        remedy = f"name one of its topics: --topic {fitting[0]}; it has {listing}"
+        remedy = f"choose one of its topics: --topic {fitting[0]}; it has {listing}"
     raise SourceError(bag.files[0], problem, field="topic", remedy=remedy)
 
 
@@ -384,7 +384,7 @@ class _States:
                 joints = tuple(np.array(part.joints)[absent].tolist())
                 if name == "effort":
                     listing = ", ".join(joints)
-                    problem = f"joint {listing} has none in any message, the others have it"
+                    problem = f"joint {listing} has no value in any message, the others have one"
                     remedy = "record it; --effort ignore imports the motion alone"
                     raise SourceError(self._source, problem, field=name, remedy=remedy)
                 if name == "velocity":
@@ -458,7 +458,7 @@ class _States:
         kinds = " and ".join(f"({', '.join(part.joints)})" for part in parts)
         apart = "" if exact else self._too_far_apart(stamp, parts, joined)
         if len(stamp) < 2 or apart:
-            problem = f"{kinds} come in messages of their own, {apart or 'not at the same time'}"
+            problem = f"{kinds} are in separate messages, {apart or 'not at the same time'}"
             remedy = f"record them in one message; {_AT_REST}"
             raise SourceError(self._source, problem, field="joints", remedy=remedy)
         groups = tuple(tuple(part.joints) for part in parts)

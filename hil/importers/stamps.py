@@ -177,11 +177,11 @@ def check_clock(stamp: Stamps, path: Path, remedy: str | None = None) -> None:
             f"({backward.size} such steps)"
         )
         cut = "cut the recording where its clock runs backwards"
-        other = remedy or "name another time column"
+        other = remedy or "choose another time column"
         raise SourceError(path, problem, field="time", remedy=f"{cut}, or {other}")
     if steps.size and not steps.any():
         problem = f"all {len(stamp)} samples have the same time"
-        other = remedy or "name the column of the time, or give sample_rate instead"
+        other = remedy or "give the column of the time, or give sample_rate instead"
         raise SourceError(path, problem, field="time", remedy=other)
     rate = 1e9 / float(np.median(steps[steps > 0])) if steps.size else np.inf
     if rate < _MIN_PLAUSIBLE_RATE:

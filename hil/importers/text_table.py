@@ -42,7 +42,7 @@ if TYPE_CHECKING:
     import pandas as pd
 
 
-_EMPTY: Final = "record again, or name the file that has the samples"
+_EMPTY: Final = "record again, or give the file that has the samples"
 _PROBE_LINES: Final = 100  # lines
 _MAX_TIME_DIGITS: Final = 30  # digits before the point, more than of nanoseconds since 1970
 _QUOTES: Final = "\"'"
@@ -501,7 +501,7 @@ def _width(names: Sequence[str], first: Sequence[str], path: Path) -> int:
         raise SourceError(
             path,
             f"has {len(names)} names ({', '.join(names)}) above rows of {width} numbers",
-            remedy="name the other columns, or count columns from 0: [format] header = "
+            remedy="name every column in the header, or count columns from 0: [format] header = "
             "false and skip_rows",
         )
     return width

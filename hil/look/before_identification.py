@@ -66,7 +66,7 @@ _MAX_UNSIGNED_JOINTS: Final = 2
 _MAX_WARNED_CONTRADICTIONS: Final = 2
 _OF_AXES: Final = ("order", "signs", "zero", "coupling")
 _REMEDY: Final = (
-    "give the URDF of this arm; to identify in spite of that, give the column map "
+    "give the URDF of this arm; to identify anyway, give the column map "
     "(`hil look LOG --urdf ARM.urdf -o map.toml`, --map map.toml)"
 )
 
@@ -205,7 +205,7 @@ def _require_measured(archive: Archive, source: Path) -> None:
     position, torque = (np.asarray(archive.columns[name]) for name in ("position", "torque"))
     constant = constant_torques(position, torque, cell_of(archive).joint_names)
     if constant:
-        remedy = "name the channel that was measured (--columns 'torque=NAME{}'), or record it"
+        remedy = "give the channel that was measured (--columns 'torque=NAME{}'), or record it"
         raise SourceError(source, sentence(constant[0]), field="torque", remedy=remedy)
 
 
@@ -429,14 +429,14 @@ def undecided(
         problem = f"may not be of the arm of the URDF: {found}; and {problem}"
         return SourceError(source, problem, field="--urdf", remedy=f"{_REMEDY}; or {remedy}")
     if choices[0].aspect in _OF_AXES:
-        remedy += "; if none of these is so, give the URDF of this arm"
+        remedy += "; if none of these is the case, give the URDF of this arm"
     return SourceError(source, problem, field=choices[0].aspect, remedy=remedy)
 
 
 def _not_of_arm(source: Path, found: Finding) -> SourceError:
     finding = worded(found, Naming())
     remedy = (
-        f"{finding.next_step}; to identify in spite of that, give the column map (`hil look LOG"
+        f"{finding.next_step}; to identify anyway, give the column map (`hil look LOG"
         " --urdf ARM.urdf -o map.toml`, --map map.toml)"
     )
     return SourceError(source, finding.words, field="torque", remedy=remedy)
@@ -448,7 +448,8 @@ def _without_sign(source: Path, count: int) -> SourceError:
         " not recorded"
     )
     remedy = (
-        "record the torque with its sign; where a bit of the numbers has it, give a column map with"
+        "record the torque with its sign; where a bit of the numbers holds it, give a column map "
+        "with"
         " [torque] sign_bit = N (`hil look LOG --urdf ARM.urdf -o map.toml`, --map map.toml)"
     )
     return SourceError(source, problem, field="torque", remedy=remedy)

@@ -125,7 +125,7 @@ _FACTS: Final[Mapping[Fact, str]] = {
     Fact.NO_DELAY: "none",
     Fact.NO_DELAY_SEEN: "none seen",
     Fact.NO_LOW_PASS: "none in the torque",
-    Fact.NO_BODIES: "next to nothing of bodies: a model was subtracted from the torque",
+    Fact.NO_BODIES: "almost nothing of the bodies: a model was subtracted from the torque",
     Fact.RATE_OF_TORQUE: "the rate of a torque (N·m/s)",
     Fact.NONE_FITS: "no tested explanation fits; the nearest are above",
     Fact.OTHER_ARM: "may not be the arm of the URDF",
@@ -137,8 +137,8 @@ _BASES: Final[Mapping[Basis, str]] = {
     Basis.STATED_UNIT: "by the name and the unit that is stated",
     Basis.NAME_AND_RATE: "by the name; a usual rate",
     Basis.ROW_NAMES: "in the order of the names in the rows",
-    Basis.NO_TURN: "no step of a turn",
-    Basis.TURNS: "steps of a turn",
+    Basis.NO_TURN: "no jump by a full turn",
+    Basis.TURNS: "jumps by a full turn",
     Basis.EVERY_ROW: "every row of every joint",
     Basis.POSITIONS_ALONE: "by the positions alone",
     Basis.LIMITS: "limits of the URDF",
@@ -161,7 +161,7 @@ _BASES: Final[Mapping[Basis, str]] = {
     Basis.NO_BODIES: "friction torque does not show it",
     Basis.RATE: "the rate of a torque does not show it",
     Basis.INTEGRAL: "its integral follows the arm",
-    Basis.INERTIA: "the inertia in the torque is that of other times, the weight as the URDF's",
+    Basis.INERTIA: "the torque's inertia fits other times, its weight fits the URDF",
 }
 _STEPS: Final[Mapping[NextStep, str]] = {
     NextStep.STATE_UNIT_OR_GEARS: "state unit, sign or gears of both",
@@ -170,7 +170,7 @@ _STEPS: Final[Mapping[NextStep, str]] = {
     NextStep.STATE_TORQUE_CONSTANT: (
         "[drive] torque_constant of a map (N·m/A), or `hil torque-constants`"
     ),
-    NextStep.NAME_JOINTS: "name the joint of each column",
+    NextStep.NAME_JOINTS: "give the joint of each column",
     NextStep.ESTIMATE_DELAY: "--delay auto",
     NextStep.GIVE_URDF: "add --urdf ARM.urdf",
     NextStep.GIVE_URDF_OF_THIS_ARM: "give the URDF of this arm",
@@ -179,18 +179,18 @@ _STEPS: Final[Mapping[NextStep, str]] = {
     NextStep.MOVE_EACH_JOINT: "move the joints one by one",
     NextStep.REVERSE_THE_ROWS: "reverse the order of the rows, but not the times",
     NextStep.STATE_RATE: "state the rate of the controller (--sample-rate HZ)",
-    NextStep.PUSH_A_JOINT: "push one joint by hand and see its torque",
+    NextStep.PUSH_A_JOINT: "push one joint by hand and watch its torque",
     NextStep.COMPARE_A_POSTURE: "compare a posture with the URDF's (viewer)",
     NextStep.RECORD_ALL_TORQUE: "record the torque before a model is subtracted from it",
     NextStep.WEIGH_A_LOAD: "hold a known load with and without it (`hil torque-constants`)",
-    NextStep.TURN_ONE_JOINT: "turn one joint alone and see which angles change",
-    NextStep.HOLD_STILL: "hold the arm still, stretched out, and see the torque",
+    NextStep.TURN_ONE_JOINT: "turn one joint alone and watch which angles change",
+    NextStep.HOLD_STILL: "hold the arm still, stretched out, and read the torque",
     NextStep.RECORD_MEASURED: "record the measured ones",
     NextStep.RECORD_MEASURED_IF_ANY: "record the measured ones if the controller has them",
     NextStep.RECORD_TORQUE: "record it",
     NextStep.RECORD_FASTER: "record faster motion",
     NextStep.RECORD_PAYLOAD: "record with and without it (`hil payload`)",
-    NextStep.IMPORT_COMMANDS: "`hil identify` finds servo and friction of them",
+    NextStep.IMPORT_COMMANDS: "`hil identify` finds their servo and friction",
     NextStep.ASK_FOR_POSITIONS: "ask for the raw encoder positions",
     NextStep.ASK_FOR_UNIT: "ask for the unit of the channel",
     NextStep.ASK_FOR_FILTER: "ask for the filter of the channel",
@@ -544,7 +544,7 @@ def _(nearest: NearestZero) -> str:
 
 @_worded.register
 def _(unseen: UnseenFriction) -> str:
-    return f"friction is not seen in {', '.join(unseen.joints)}"
+    return f"no friction is visible in {', '.join(unseen.joints)}"
 
 
 @_worded.register
@@ -574,7 +574,7 @@ def _(size: SizeRatio) -> str:
 def _(body: LastBody) -> str:
     return (
         f"the motion determines {body.determined} of the {body.total} parameters of the body of"
-        f" {body.joint}, with all that it carried"
+        f" {body.joint}, including everything it carried"
     )
 
 
@@ -716,17 +716,15 @@ def _(explained: ExplainedTorque) -> str:
 def _(none: NoJointTorque) -> str:
     factor = "" if none.ratio is None else f"*{number(1.0 / none.ratio, 2)}"
     if none.unexplained is not None:
-        reason = f"no masses explain {percentage(none.unexplained)} of it, as of the load"
+        reason = f"no masses explain {percentage(none.unexplained)} of it"
     elif none.ratio is not None:
-        reason = (
-            f"it is {number(none.ratio, 2)} times the torque that the URDF's masses need, the load"
-        )
+        reason = f"it is {number(none.ratio, 2)} times the torque that the URDF's masses need"
     elif none.is_load:
-        reason = "it is named as the load"
+        reason = "its name says so"
     else:
-        reason = "it is never negative, although the joints move in both directions, as of the load"
+        reason = "it is never negative, although the joints move in both directions"
     return (
-        f"torque: left out, {reason} or the duty of a servo; to use it in spite of that, name it:"
+        f"torque: left out as the load or duty of a servo: {reason}; to use it anyway, name it:"
         f" --columns 'torque=NAME{factor}'"
     )
 

@@ -354,7 +354,7 @@ def cell_of_urdf(
     Raises:
         InputError: the URDF is not of an open chain.
     """
-    text = read_input(path, "name a URDF")
+    text = read_input(path, "give a URDF")
     names = _moving_joints(path, text)
     links = Links(base=base, tip=tip)
     if not links:
@@ -395,7 +395,7 @@ def _note_on_gripper(fingers: Sequence[str], chain: Chain, text: str) -> str:
     if len(fingers) <= MAX_NAMES:
         fixing = " ".join(f"--fix {name}" for name in fingers)
         note += f"fix what is not identified ({fixing}), or "
-    return f"{note}name the last link of the arm (--tip {tip})"
+    return f"{note}give the last link of the arm (--tip {tip})"
 
 
 def _note_on_branches(text: str, chain: Chain) -> list[str]:

@@ -161,13 +161,13 @@ def clear_home(urdf: str, cell_values: CellValues, mesh_folders: Sequence[str]) 
                 notes.append(
                     f"the collision shapes of {', '.join(check.links)} were not found: in "
                     f"campaign.home_deg their frames are {MIN_FRAME_HEIGHT * 100:g} cm off the "
-                    "floor, and nothing else was checked of them"
+                    "floor, and nothing else about them was checked"
                 )
             if floor is None:
                 values["workspace.floor"] = "none"
                 notes.append("no posture tried is clear of a floor at 0 m: no floor is assumed")
             return CellValues.of_origin(ASSUMED, values, notes)
-    return CellValues(notes=("every posture tried is a contact: correct campaign.home_deg",))
+    return CellValues(notes=("every posture tried is in contact: correct campaign.home_deg",))
 
 
 def _turned(home: Array, limits: JointLimits) -> Iterator[Array]:
@@ -213,7 +213,7 @@ def from_archive(path: str | PathLike[str], joint_names: Sequence[str]) -> CellV
     archive = open_archive(path, fields=())
 
     def refusal(problem: str, field: str = "", remedy: str = "") -> ArchiveError:
-        remedy = remedy or "name an archive that hil wrote"
+        remedy = remedy or "give an archive that hil wrote"
         return ArchiveError(archive.path, problem, field=field, remedy=remedy)
 
     if archive.joint_names != tuple(joint_names):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import shlex
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -12,6 +13,7 @@ import numpy as np
 
 from hil.base.arrays import Array
 from hil.base.errors import ArchiveError, InputError
+from hil.base.one_screen import columns
 from hil.base.progress import Reporter
 from hil.cell.cell import FLANGES
 from hil.pipeline.carried_weight import require_weight
@@ -162,7 +164,7 @@ class PayloadFound:
         torque = self.wrist_torque
         low, high = estimate.intervals[0]
         centre = ", ".join(
-            f"{1e3 * part:.1f}" if self.determines(name) else "?"
+            f"{_rounded(1e3 * part, 1)}" if self.determines(name) else "?"
             for name, part in zip(NAMES[1:4], body.centre, strict=True)
         )
         lines = [
@@ -189,8 +191,9 @@ class PayloadFound:
             distance = float(np.linalg.norm(body.centre))
             lines.append(
                 f"A load of {body.mass:.3g} kg whose centre of mass is {distance:.2g} m from the"
-                " frame is larger than any of foam: the difference may be of the arm itself, not of"
-                " a load. Record both on a warm arm, one after the other, and check with a load of"
+                " frame would be larger than a block of foam: the difference may be a change of "
+                "the arm itself. Record both on a warm arm, one after the other, and check with a "
+                "load of"
                 " known mass."
             )
         if self.mounting is not None:
@@ -230,11 +233,9 @@ class PayloadFound:
         Without `settings` the commands of controllers are named and not written.
         """
         lines = [*self.sentences, ""]
+        figures = columns([_row(*row) for row in self.table])
         lines += [
-            f"{name:5} {'not determined':>10}"
-            if value is None
-            else f"{name:5} {value:10.5g}  {low:10.5g} to {high:<10.5g} {unit}"
-            for name, value, low, high, unit in self.table
+            f"{figure}  {row[-1]}".rstrip() for figure, row in zip(figures, self.table, strict=True)
         ]
         for controller, command in self.controllers.items() if settings else ():
             lines += ["", f"{controller}:", command]
@@ -278,6 +279,21 @@ class PayloadFound:
             "loaded": list(self.loaded),
             "warnings": list(self.warnings),
         }
+
+
+def _row(name: str, value: float | None, low: float, high: float, _: str) -> tuple[str, ...]:
+    """Return the cells of a figure, rounded to two digits of half its interval."""
+    if value is None:
+        return (name, "not determined", "", "", "")
+    half = 0.5 * (high - low)
+    finite = np.isfinite(half) and half > 0.0
+    decimals = max(0, 1 - math.floor(math.log10(half))) if finite else 4
+    shown, low_text, high_text = (_rounded(each, decimals) for each in (value, low, high))
+    return (name, shown, low_text, "to", high_text)
+
+
+def _rounded(value: float, decimals: int) -> str:
+    return f"{round(value, decimals) + 0.0:.{decimals}f}"  # + 0.0: no minus before a zero
 
 
 def find_payload(

@@ -372,8 +372,8 @@ def payload_warnings(cell: Cell) -> list[str]:
     if "robot.payload" not in cell.file.cell.assumed:
         return []
     return [
-        "the arm carried a payload of assumed figures ([robot.payload]): what they are wrong by is "
-        "in the parameters of the last link (weigh it with `hil payload`)"
+        "the figures of the payload are assumed ([robot.payload]): their errors are in the "
+        "parameters of the last link (weigh it with `hil payload`)"
     ]
 
 

@@ -206,7 +206,7 @@ def stored_identification(
     except (HilError, IdentificationError, ValueError, LookupError, TypeError) as error:
         raise NotReusableError(f"{PARAMETERS_JSON} cannot be used ({error})") from error
     if estimate.names != prepared.sources.cell.model.parameter_names:
-        raise NotReusableError(f"the parameters of {PARAMETERS_JSON} are others")
+        raise NotReusableError(f"the parameters of {PARAMETERS_JSON} differ")
     return StoredIdentification(folder, results, estimate, prepared, tuple(paths), present, content)
 
 
@@ -252,7 +252,7 @@ def _stored_values(cell: Cell, content: Mapping[str, Any]) -> tuple[Array, Array
     links = stored["links"]
     motors = stored["motor_friction"]
     if [entry["name"] for entry in content["parameters"]] != list(model.parameter_names):
-        raise ValueError("its parameters are others")
+        raise ValueError("its parameters differ")
     standard = np.zeros(layout.size)
     standard[layout.links] = [[link[symbol] for symbol in LINK_SYMBOLS] for link in links]
     if layout.rotor_inertia:

@@ -112,7 +112,7 @@ def view_of(
     head = open_archive(path, fields=())
     stamp = head.columns["stamp"]
     if not len(stamp):
-        raise ArchiveError(path, "contains no sample", remedy="name another archive")
+        raise ArchiveError(path, "contains no sample", remedy="choose another archive")
     origin = float(stamp[0]) * 1e-9
     last = float(stamp[-1] - stamp[0]) * 1e-9
     begin = 0.0 if start is None else max(start, 0.0)
@@ -159,7 +159,7 @@ def _wanted(names: Sequence[str], joints: Sequence[str]) -> list[int]:
                 None,
                 f"{joint!r} is not a joint",
                 field="--joint",
-                remedy=f"name one of {', '.join(names)}",
+                remedy=f"choose one of {', '.join(names)}",
             )
     return sorted({index_of[joint] for joint in joints}) or list(range(len(names)))
 

@@ -321,7 +321,7 @@ class PrecisionDesign:
                 year = ratio * requirement.value
                 raise InputError(
                     None,
-                    f"{requirement} cannot be had: a year of motion leaves "
+                    f"{requirement} cannot be reached: a year of motion leaves "
                     f"{requirement.shown(year)} ({worst})",
                     field="--precision",
                     remedy=f"a day leaves {requirement.shown(year * math.sqrt(365.0))}, an hour "

@@ -26,14 +26,14 @@ MEANINGS: Final = {
     "armature": "inertia of the rotor, at the joint",
     "viscous": "friction by velocity",
     "coulomb": "dry friction of a moving joint",
-    "static": "dry friction above it at rest",
+    "static": "additional dry friction at rest",
     "speed": "velocity at which static friction has faded to 37 %",
     "load": "dry friction for each N·m (N) that the bodies load the joint with",
     "limit": "largest torque of the servo",
     "dead_band": "position error up to which the servo exerts nothing",
     "acceleration": "largest acceleration of the set-point on its way to a command",
     "delay": "time from a command to the servo",
-    "offset": "zero of the servo above that of the encoder",
+    "offset": "zero of the servo above the encoder's",
 }
 HELD: Final = "something held the arm"
 _MOTIONS: Final = 4  # on a page

@@ -65,8 +65,8 @@ def verdict_of(results: ServoResults) -> ServoVerdict:
     )
     if results.stuck:
         warnings.append(
-            f"{', '.join(results.stuck)} never moved in the fitted motions, though commanded to:"
-            " nothing is known of these servos, and errors over all joints are without them"
+            f"{', '.join(results.stuck)} never moved in the fitted motions, although commanded "
+            f"to: nothing is known about these servos, and errors over all joints exclude them"
         )
     for archive, contacts in results.fitted_contacts.items():
         warnings.append(
@@ -88,8 +88,8 @@ def verdict_of(results: ServoResults) -> ServoVerdict:
             )
     if missed:
         warnings.append(
-            f"of the motion of {', '.join(missed)} more than a tenth (of its square) is missed:"
-            " its commands may be late by more than 0.2 s, or of other joints"
+            f"more than a tenth of the motion of {', '.join(missed)} (of its square) is not"
+            " predicted: commands may be late by more than 0.2 s, or belong to other joints"
         )
     if not good:
         steps.append("look at the report: a joint that touched something cannot be predicted")
@@ -102,7 +102,7 @@ def verdict_of(results: ServoResults) -> ServoVerdict:
     if scale:
         warnings.append(
             f"the torque scale of {', '.join(scale)} is not determined: gravity and inertia of the"
-            " bodies hardly show in its position; gains and friction hold together only"
+            " bodies hardly show in its position; gains and friction are valid only together"
         )
     return ServoVerdict(good=good, line=line, warnings=warnings, next_steps=steps)
 
@@ -148,7 +148,7 @@ def _touched(prediction: ServoPrediction, unit: str) -> str:
         most = max(prediction.pushed, key=lambda push: abs(push.change_mrad))
         joints = ", ".join(push.joint for push in prediction.pushed)
         parts.append(
-            f"something pushed {joints}, which moved while the command rested and the model stood,"
+            f"something pushed {joints}, which moved while command and model were at rest,"
             f" {most.joint} by {most.change_mrad:.0f} {unit} at {most.time:.1f} s"
         )
     text = f"in {prediction.archive}, {'; '.join(parts)}"
@@ -213,7 +213,8 @@ def whole(results: ServoResults) -> list[str]:
     lines += [*columns(rows, left=2), ""]
     lines.append(f"delay of commands: {1e3 * results.delay:.3g} ms")
     lines += [
-        f"{choice.joint}: {' and '.join(choice.terms)} left out, other windows are predicted better"
+        f"{choice.joint}: {' and '.join(choice.terms)} left out, which predicts other windows "
+        f"better"
         for choice in results.term_choices
         if not choice.present
     ]

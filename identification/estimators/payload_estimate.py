@@ -169,8 +169,8 @@ def _determined_mass(estimate: _BodyEstimate) -> tuple[float, float, float]:
             distance = estimate.moment[0] / -mass
             raise PayloadError(
                 f"the loaded recordings are {-mass:.3g} kg lighter than the bare ones, with a"
-                f" centre of mass {distance:.2g} m from the frame: that is no load of either, but"
-                " a change of the arm itself; record both on a warm arm, one after the other"
+                f" centre of mass {distance:.2g} m from the frame: that is not a load but a "
+                f"change of the arm itself; record both on a warm arm, one after the other"
             )
         raise PayloadError(
             f"the bare recordings carry {-mass:.3g} kg more than the loaded ones; check whether"

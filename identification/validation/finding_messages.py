@@ -320,7 +320,7 @@ SENTENCES: Final[Mapping[FindingKey, Sentence]] = {
     "retimed": Sentence("clock", "{recordings:6}: {times}"),
     "repeated samples": Sentence(
         "clock",
-        "the log repeats position samples, has them late or lacks rows: {samples:6} (first:"
+        "the log repeats or delays position samples, or lacks rows: {samples:6} (first:"
         " {first:time}); the arm moved on",
     ),
     "unwrapped angles": Sentence(
@@ -373,8 +373,8 @@ SENTENCES: Final[Mapping[FindingKey, Sentence]] = {
     ),
     "no bodies": Sentence(
         NO_BODIES,
-        "there is next to nothing of bodies in the torque, at most {over_friction:pc0} of its"
-        " friction on any axis, and {scale:.2g} times what the masses of the URDF need: a model of"
+        "the torque contains almost nothing of the bodies, at most {over_friction:pc0} of its "
+        "friction on any axis, and {scale:.2g} times what the masses of the URDF need: a model of"
         " the arm was subtracted from it, as by a controller that reports external torque",
     ),
     "no gravity": Sentence(
@@ -389,13 +389,13 @@ SENTENCES: Final[Mapping[FindingKey, Sentence]] = {
     ),
     "other times": Sentence(
         OTHER_TIMES,
-        "the recorded times are {time:.3g} times the true ones: with these, inertia and weight of"
-        " the torque are of the arm of the URDF",
+        "the recorded times are {time:.3g} times the true ones: with these, inertia and weight in "
+        "the torque fit the arm of the URDF",
     ),
     "torque of another run": Sentence(
         TORQUE_AND_MOTION,
-        "whatever the masses, {error:pc0} of the torque of {motion} stays unexplained: it is of"
-        " another run than the positions, of another arm, or its columns are not read as they are",
+        "whatever the masses, {error:pc0} of the torque of {motion} stays unexplained: it is from "
+        "another run than the positions, from another arm, or its columns are read wrongly",
     ),
     "rows backwards": Sentence(
         "time",
@@ -415,7 +415,8 @@ SENTENCES: Final[Mapping[FindingKey, Sentence]] = {
     ),
     "alike": Sentence(
         "{change:check}",
-        "several explanations fit alike: {alike:or}; with each of them, rows that did not choose"
+        "several explanations fit equally well: {alike:or}; with each of them, rows that did not "
+        "choose"
         " it are predicted with {error:pc0} of the error",
     ),
     "nearest": Sentence("{change:check}", f"{_NEAREST} {{change}}"),
@@ -503,7 +504,8 @@ SENTENCES: Final[Mapping[FindingKey, Sentence]] = {
         " in the other data",
     ),
     "arm of a part": _fault(
-        "sameness", "{part} is probably of another arm, tool or setting than the other data"
+        "sameness",
+        "{part} was probably recorded with another arm, tool or setting than the other data",
     ),
     "load": Sentence(
         "load",
@@ -579,8 +581,8 @@ SENTENCES: Final[Mapping[FindingKey, Sentence]] = {
         LEFT_OPEN,
         "parameters that fit the recording equally well (to {fitted:pc1}) deviate by {open:pc1} of"
         " the torque on {motion}, since the fitted motion leaves them open; the error of"
-        " {overall:pc1} there does not tell a fault of such an effect (low sampling rate, coarse"
-        " resolution, small payload) from chance",
+        " {overall:pc1} there may come from a fault with such an effect (low sampling rate, "
+        "coarse resolution, small payload) or from chance",
     ),
     "nothing explained": Sentence(
         "variance explained (R²)",

@@ -211,13 +211,13 @@ def test_no_exception_is_left_over() -> None:
 
 
 FAST = ("connect.md", "i-have-a-log.md", "motion.md", "README.md")
-AFTER_A_DEMO = ("commands.md", "controller.md", "tutorial.md")
+AFTER_A_DEMO = ("commands.md", "tutorial.md")
 AFTER_TWO = {
     "commands.md": ("march", "june"),
     "batch.md": ("march", "june"),
     "design.md": ("demo",),
 }  # Pages that name campaigns of one arm, and how
-SLOW = ("batch.md", "commands.md", "controller.md", "design.md", "tutorial.md")
+SLOW = ("batch.md", "commands.md", "design.md", "tutorial.md")
 
 
 @pytest.mark.parametrize(

@@ -103,7 +103,7 @@ def test_words_have_no_full_stop_and_no_capital(text: str) -> None:
                 "doubtful",
                 values={"samples": (RepeatedSamples("one", 3, "a.mcap"),), "first": FIRST},
             ),
-            "the log repeats position samples, has them late or lacks rows: one 3 in a.mcap (first:"
+            "the log repeats or delays position samples, or lacks rows: one 3 in a.mcap (first:"
             " one after 1.500 s of a.mcap); the arm moved on",
             "",
         ),
@@ -121,7 +121,8 @@ def test_words_have_no_full_stop_and_no_capital(text: str) -> None:
                 "angle difference", "wrong", "state the coupled difference", joints=(2, 1)
             ),
             "the recorded angle of three is probably its own less the angle of two",
-            "turn one joint alone and see which angles change; if so, state it in the column map of"
+            "turn one joint alone and watch which angles change; if so, state it in the column "
+            "map of"
             " the log: coupled = [[3, 2, -1]] in [position] and [velocity] (joints by their"
             " columns, from 1)",
         ),
@@ -137,7 +138,8 @@ def test_words_have_no_full_stop_and_no_capital(text: str) -> None:
                 },
                 joints=(0,),
             ),
-            "several explanations fit alike: position and torque of one negated or the angle of two"
+            "several explanations fit equally well: position and torque of one negated or the "
+            "angle of two"
             " plus the angle of one; with each of them, rows that did not choose it are predicted"
             " with 50 % of the error",
             "jog one and compare direction, order and torque with the column map",

@@ -40,7 +40,7 @@ NAMED: Final = {
     "archive": (
         *(f"the archive process {what}" for what in (*GONE, "sent no heartbeat")),
         NO_ARCHIVE,  # of the exchange, where the supervisor is late to notice
-        "cannot be written further",
+        "cannot be written any more",
     ),
     "controller": ("controller", "link", "silent", "nothing received", "no packet", "packet"),
 }

@@ -104,7 +104,7 @@ def test_only_the_newest_archive_may_be_truncated(
 @pytest.mark.parametrize(
     ("victim", "text", "true"),
     [
-        ("exchange", "the exchange process ended; the controller gets no replies", True),
+        ("exchange", "the exchange process ended; the controller receives no replies", True),
         ("exchange", "the exchange process is gone: no such process", True),
         ("exchange", f"repetition 1 was lost: {NOTHING_RECEIVED}", False),
         ("exchange", "the controller did not answer the exchange process", False),
@@ -237,7 +237,7 @@ def round_in_which(victim: Victim) -> int:
             4,
             "with `hil doctor`); the arm was brought to rest",
         ),
-        ("archive", "disk-full", 2, "cannot be written further"),
+        ("archive", "disk-full", 2, "cannot be written any more"),
     ],
 )
 def test_what_is_no_kill_brings_the_arm_to_rest_too(

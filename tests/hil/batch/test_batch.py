@@ -384,7 +384,7 @@ def test_the_command_exits_with_5_if_archives_are_broken(folder, tmp_path):
     ran = CliRunner().invoke(app, command)
     assert ran.exit_code == 0, ran.output
     assert "3 repetitions in 1 campaign of 1 arm; 5 recordings read" in ran.output
-    assert re.search(r"^skipped, not for fitting: .*\d is a move", ran.output, re.MULTILINE)
+    assert re.search(r"^\d+ recordings not fitted: .*\d moves", ran.output, re.MULTILINE)
     (folder / "archives" / "bad.mcap").write_bytes(b"")
     ran = CliRunner().invoke(app, [*command, "--json"])
     assert ran.exit_code == 5, ran.output

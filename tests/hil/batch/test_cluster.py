@@ -280,7 +280,7 @@ class TestUrls:
             ("{server}/nothing.mcap", r"nothing.mcap: the server answers 404"),
             ("http://127.0.0.1:1/line", r"127.0.0.1:1/line: cannot be read: .*[Cc]onnect"),
             ("memory://nowhere", "memory://nowhere: does not exist"),
-            ("nonsense://line", r"cannot be opened .*name a folder, or a URL"),
+            ("nonsense://line", r"cannot be opened .*give a folder, or a URL"),
             ("s3://line", r"s3://line: cannot be opened .*[Ii]nstall"),
         ],
     )

@@ -274,7 +274,7 @@ class TestCache:
 
         monkeypatch.setattr(np, "savez", full)
         cache = CacheLocation(str(tmp_path))
-        with pytest.raises(CacheError, match=r"No space left.*make room, or name another folder"):
+        with pytest.raises(CacheError, match=r"No space left.*make room, or choose another folder"):
             cache.write("/data/a.mcap", KEY, {}, {})
         assert not [path for path in tmp_path.rglob("*") if path.is_file()]
 

@@ -196,7 +196,7 @@ class TestStop:
             def task(self, title: str, total: float) -> Iterator[Task]:
                 yield Task(lambda *_: setattr(stop, "requested", True))
 
-        with pytest.raises(MotionFailedError, match="it had not begun"):
+        with pytest.raises(MotionFailedError, match="it had not started"):
             execute(arm.campaign, arm.link, stop=stop, reporter=StopAfterTheFirst())
         assert [entry.name for entry in arm.campaign.folder.manifest()] == ["move_000_a1.mcap"]
 

@@ -40,8 +40,10 @@ PACKAGES = re.compile(
     r"hil/(campaign|control|design|precision|batch)/|hil/cli/(run|rehearse|status|design|batch)\.py"
 )
 TYPED = {
-    "resume it (--resume), name another folder (-o), or add --force": "test_a_folder_with_a_design",
-    "start one without --resume, or name its folder (-o)": "test_nothing_to_resume",
+    "resume it (--resume), choose another folder (-o), or add --force": (
+        "test_a_folder_with_a_design"
+    ),
+    "start one without --resume, or give its folder (-o)": "test_nothing_to_resume",
     "see `hil design --show-settings gradient`": "test_settings_that_are_none",
     "design it again (`hil design`)": "test_a_design_that_was_edited",
     "run `hil rehearse FIELD`": "test_each_refusal_names_the_next_command",
@@ -60,10 +62,10 @@ TYPED = {
     'state it, for example --precision "parameters 5 %, torque 10"': "test_no_precision",
     "add --until-precise": "test_a_precision_without_an_end",
     "omit --workers, or --scheduler": "test_workers_of_a_cluster",
-    "make room, or name another folder with --cache, or none": "test_a_cache_that_is_no_folder",
+    "make room, or choose another folder with --cache, or none": "test_a_cache_that_is_no_folder",
     "resume with the same cell and settings, or start again (--force)":
         "test_another_cell_than_that_of_the_search",
-    "name a file that `hil design` wrote": "test_the_name_of_no_design",
+    "give a file that `hil design` wrote": "test_the_name_of_no_design",
     "for a payload add --for payload": "test_the_mass_of_a_payload",
     "FIELD; no motion of this arm can meet it": "test_a_torque_of_uncertain_scale",
     "FIELD % of each joint's torque; recordings measure it (--given)":
@@ -196,7 +198,7 @@ class TestDesign:
     def test_the_name_of_no_design(self, designed: Path, monkeypatch: pytest.MonkeyPatch) -> None:
         monkeypatch.setattr("hil.cli.demo.CELL_PATH", designed / "cell.toml")
         line = ("demo", "--repetitions", 2, "--validation", 1, "-o", "shown", "--excitation")
-        assert "name a file that `hil design` wrote" in refusal(*line, "absent.toml")
+        assert "give a file that `hil design` wrote" in refusal(*line, "absent.toml")
         accepted(*line, designed / "excitation.toml")
 
     def test_the_mass_of_a_payload(self, here: Path) -> None:
@@ -387,7 +389,7 @@ class TestBatch:
     def test_a_cache_that_is_no_folder(self, folder: Path, here: Path) -> None:
         (here / "cache").write_text("")
         text = refusal("batch", folder, "--cache", here / "cache")
-        assert "name another folder with --cache, or none" in text
+        assert "choose another folder with --cache, or none" in text
         accepted("batch", folder, "--cache", here / "other")
         accepted("batch", folder, "--cache", "none")
 

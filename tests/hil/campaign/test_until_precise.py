@@ -186,7 +186,7 @@ class TestRecord:
         record = PrecisionRecord("hash", ("parameters 5 %",))
         for count in (2, 3, 4):
             record = record.with_look(PrecisionLook(count, (reached(0.051, 1),)), limit=30)
-        assert "which repeating this motion does not improve enough" in record.message
+        assert "which more repetitions do not improve enough" in record.message
         assert "another motion" in record.message
 
     def test_one_requirement_in_reach_continues(self) -> None:

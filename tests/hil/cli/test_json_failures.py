@@ -113,7 +113,7 @@ def test_errors_of_a_disk_are_not_bad_input(
     monkeypatch.setattr("hil.archive.writer.os.write", refuse)
     with pytest.raises(ArchiveWriteError) as of_archive:
         write_samples(tmp_path / "a.mcap", samples, joint_names=("a",), metadata={})
-    failed = write_error(Failed(1, "a.mcap", "cannot be written further", "make room", number))
+    failed = write_error(Failed(1, "a.mcap", "cannot be written any more", "make room", number))
     for error in (of_folder.value, of_archive.value, failed):
         assert exit_code_of(error) == as_json(error)["exit_code"] == 1
 

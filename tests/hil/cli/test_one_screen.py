@@ -9,15 +9,23 @@ from collections.abc import Callable, Mapping
 from pathlib import Path
 
 import numpy as np
+import pinocchio as pin
 import pytest
 from numpy.typing import NDArray
 from typer.testing import CliRunner
 
+from benchmarks.fleet import Fault, Fleet, FleetPlan, write_fleet
+from benchmarks.fleet import urdf as fleet_urdf
 from hil.base.errors import HilError
 from hil.base.one_screen import SCREEN_COLUMNS, SCREEN_LINES, Paragraph, brief, one_screen
+from hil.cell import Cell
 from hil.cli import app
-from tests.hil.fast_cell import QUICK_GRADIENT, fast_cell
-from tests.hil.simulated_logs import simulate, urdf_path, write_log
+from identification.errors import IdentificationError
+from planner.errors import PlannerError
+from tests.hil.batch_work import NOTHING_OPEN
+from tests.hil.fast_cell import QUICK_GRADIENT, fast_cell, mirrored
+from tests.hil.payload.load_archives import CENTRE, LAW, MASS, archive_of_currents
+from tests.hil.simulated_logs import archive_of, simulate, urdf_path, write_log
 
 Floats = NDArray[np.float64]
 _SENTENCE = 8  # words of what is no figure, name or title
@@ -140,7 +148,7 @@ def written(folder: Path, name: str, arm: Mapping[str, Floats]) -> Path:
 def printed(*words: object) -> str:
     """What a command prints, or the text of its refusal."""
     result = CliRunner().invoke(app, [*map(str, words)])
-    if isinstance(result.exception, HilError):
+    if isinstance(result.exception, HilError | IdentificationError | PlannerError):
         return "\n".join(textwrap.wrap(str(result.exception), SCREEN_COLUMNS))
     assert isinstance(result.exception, SystemExit | None), result.exception
     return result.stdout or result.output
@@ -184,6 +192,95 @@ def test_a_campaign_fills_one_screen(tmp_path: Path) -> None:
         ("status", folder),
         ("identify", folder),
         ("doctor", cell),
+    ):
+        require_one_screen(printed(*words))
+
+
+WRONG_CELLS: Mapping[str, Callable[[Cell], Cell]] = {
+    "a joint mirrored": lambda cell: mirrored(cell, "[-1, -1]"),
+    "a motor without current": lambda cell: _changed(cell, "current_limit", "[20.0, 0.4]"),
+    "not rehearsed": lambda cell: cell,
+}
+
+
+def _changed(cell: Cell, field: str, value: str) -> Cell:
+    text = re.sub(rf"^{field} = .*$", f"{field} = {value}", cell.text, flags=re.MULTILINE)
+    return Cell.from_texts(text, cell.urdf, cell.path)
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("name", WRONG_CELLS)
+def test_a_campaign_that_fails_fills_one_screen(name: str, tmp_path: Path) -> None:
+    """At whatever step it is refused."""
+    cell = WRONG_CELLS[name](fast_cell(tmp_path))
+    cell.path.write_text(cell.text)
+    folder = tmp_path / "run"
+    settings = tmp_path / "search.toml"
+    settings.write_text(QUICK_GRADIENT)
+    rehearsal = () if name == "not rehearsed" else (("rehearse", folder),)
+    for words in (
+        ("design", cell.path, "-o", folder, "--settings", settings),
+        *rehearsal,
+        ("run", folder, "--dry-run"),
+        ("run", folder, "--accept-dry-run", "--no-identify"),
+        ("status", folder),
+        ("doctor", cell.path, "--quick", "--duration", "1"),
+    ):
+        require_one_screen(printed(*words))
+
+
+@pytest.fixture(scope="module")
+def weighed(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Torques and currents with a load of 4 kg and without, on a wall, and in slow motion."""
+    folder = tmp_path_factory.mktemp("weighed")
+    load = pin.Inertia(MASS, CENTRE, np.zeros((3, 3)))
+    fast, slow = np.arange(0.0, 12.0, 8e-3), np.arange(0.0, 60.0, 2e-2)
+    for seed, (name, body) in enumerate({"empty": None, "full": load}.items()):
+        made = simulate("ur5_robot.urdf", fast, seed=seed, load=body)
+        arrays = {"t": made.time, "q": made.position, "tau": made.torque}
+        archive_of(folder / f"{name}.mcap", made.urdf, law=LAW, **arrays)
+        archive_of_currents(folder, f"current_{name}", made)
+        made = simulate("ur5_robot.urdf", slow, seed=seed, load=body, pace=0.03)
+        archive_of_currents(folder, f"slow_{name}", made)
+    made = simulate("ur5_robot.urdf", fast, seed=3, gravity=(0.0, -9.81, 0.0))
+    arrays = {"t": made.time, "q": made.position, "tau": made.torque}
+    archive_of(folder / "wall.mcap", made.urdf, law=LAW, **arrays)
+    return folder
+
+
+CARRIED = "--mass 4 --centre 0,0.09,0.12"
+WEIGHINGS = (
+    "payload empty.mcap --loaded full.mcap",
+    "payload empty.mcap --loaded full.mcap --check mass=4.5 --check cx=0.2",
+    "payload full.mcap --loaded empty.mcap",
+    "payload wall.mcap --loaded full.mcap",
+    "payload --model empty.mcap full.mcap",
+    f"torque-constants current_empty.mcap --loaded current_full.mcap {CARRIED}",
+    "torque-constants current_empty.mcap --loaded current_full.mcap --mass 4",
+    f"torque-constants slow_empty.mcap --loaded slow_full.mcap {CARRIED}",
+    f"torque-constants empty.mcap --loaded full.mcap {CARRIED}",
+    "torque-constants current_empty.mcap",
+)
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("line", WEIGHINGS)
+def test_a_load_fills_one_screen(line: str, weighed: Path) -> None:
+    words = [weighed / word if word.endswith(".mcap") else word for word in line.split()]
+    require_one_screen(printed(*words))
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("faults", [0, 5])
+def test_a_fleet_fills_one_screen(faults: int, tmp_path: Path) -> None:
+    """Ten robots, of which none or five wear."""
+    worn = tuple(Fault(robot, "wear", robot % 3, 0.5, 0.1) for robot in range(faults))
+    plan = FleetPlan(robots=10, months=4, duration=6.0, day=0.005, faults=worn)
+    write_fleet(tmp_path / "logs", Fleet(plan))
+    naming = ("--robot", "{robot}/{date}.csv", "--urdf", fleet_urdf(), *NOTHING_OPEN[:-2])
+    for words in (
+        ("trend", tmp_path / "logs", *naming, "--limit", "friction+60%"),
+        ("batch", tmp_path / "logs", *naming, "-o", tmp_path / "tables"),
     ):
         require_one_screen(printed(*words))
 

@@ -318,7 +318,7 @@ def test_a_motion_that_is_not_accepted_moves_nothing(
 def test_a_stop_before_the_request_sends_nothing(cell: Cell) -> None:
     port = ScriptedPort()
     assert run(cell, port, Stop(requested=True)) == MotionEnded(
-        "stopped", "it had not begun", -1, -1
+        "stopped", "it had not started", -1, -1
     )
     assert port.diary == ["open", "stopped"]
 

@@ -323,7 +323,7 @@ def test_a_hold_while_a_motion_is_handed_over_is_applied(
         monkeypatch.setattr(link.port.exchange, "submit", asked)
         path = tmp_path / "held.mcap"
         ended = link.run(player_of(cell, motion), spec_of(cell, path), stop, watch=Holding(Stop()))
-        assert (ended.outcome, ended.reason) == ("stopped", "it had not begun")
+        assert (ended.outcome, ended.reason) == ("stopped", "it had not started")
         archive = open_archive(path)
         assert archive.complete
         if archive.n_samples:  # none where it was closed at once

@@ -443,5 +443,5 @@ class TestClosing:
     def test_of_replies_that_were_of_no_use(self) -> None:
         text = self.lines(2, missed=4, late=1, rejected=3)
         assert "1164 cycles, 4 without a valid reply in time" in text
-        assert "replies not used: 1 too late, 3 of wrong number, length or content" in text
+        assert "replies not used: 1 too late, 3 with a wrong number, length or content" in text
         assert "2 packets from other addresses not read" in text

@@ -247,7 +247,7 @@ def test_a_request_before_a_motion_begins_is_applied(
 
     monkeypatch.setattr(ArchiveSpec, "open", slowly)
     ended = arm.run(Watcher(script), stop)
-    assert (ended.outcome, ended.reason, ended.interval) == ("stopped", "it had not begun", -1)
+    assert (ended.outcome, ended.reason, ended.interval) == ("stopped", "it had not started", -1)
     assert arm.archive.complete
     assert not arm.archive.n_samples
 

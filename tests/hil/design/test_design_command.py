@@ -146,7 +146,7 @@ def test_an_earlier_design_is_only_overwritten_with_force(invoke, settings, copi
     assert (copied / "notes.txt").read_text() == "mine"
     (copied / "settings.toml").write_text("mine = true\n")
     for more in ((), ("--force",)):
-        with pytest.raises(InputError, match=r"settings\.toml: exists and is not of a design"):
+        with pytest.raises(InputError, match=r"settings\.toml: exists and belongs to no design"):
             invoke(*arguments, *more)
     assert (copied / "settings.toml").read_text() == "mine = true\n"
 
@@ -267,7 +267,7 @@ def test_invalid_arguments_are_refused(invoke, settings, tmp_path, arguments, me
 
 
 def test_other_settings_or_another_cell_cannot_resume_a_search(invoke, bare, tmp_path):
-    with pytest.raises(InputError, match="not the settings that were asked for"):
+    with pytest.raises(InputError, match="differ from the requested settings"):
         invoke(CELL_PATH, "--resume", "-o", bare[0], "--seed", 2)
     path = edited(tmp_path, "[155.0, 155.0,", "[150.0, 155.0,")
     with pytest.raises(InputError, match=r"search\.journal: this journal .* cell limits was"):

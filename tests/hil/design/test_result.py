@@ -98,7 +98,7 @@ def test_another_file_is_refused(text, tmp_path, old, new, message):
 @pytest.mark.parametrize(
     ("old", "new", "message"),
     [
-        (r"(positions_deg = \[\[)[^,]+", r"\g<1>45.0", "do not plan to the motion"),
+        (r"(positions_deg = \[\[)[^,]+", r"\g<1>45.0", "planning its moves does not give"),
         (r"(?s)positions_deg = \[\[.*\]\]", 'positions = "x"', "is not a designed excitation"),
         (r"(?s)positions_deg = \[\[.*\]\]", "positions = [[1.0], [2.0, 3.0]]",
          "is not a designed excitation"),

@@ -127,7 +127,7 @@ def test_invalid_settings_name_file_field_value_and_remedy(text, named, tmp_path
         assert word in text
     for word in ("Value error", "value error", "dictionary", "instance of"):
         assert word not in text
-    with pytest.raises(SettingsError, match=r"none\.toml: cannot be read.*name a TOML file"):
+    with pytest.raises(SettingsError, match=r"none\.toml: cannot be read.*give a TOML file"):
         load_settings(tmp_path / "none.toml")
 
 

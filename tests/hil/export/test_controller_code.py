@@ -300,7 +300,7 @@ class TestObserver:
 
 
 def test_the_loop_of_the_page_compiles(tmp_path: Path) -> None:
-    page = (Path(__file__).parents[3] / "docs" / "controller.md").read_text("utf-8")
+    page = (Path(__file__).parents[3] / "docs" / "simulators.md").read_text("utf-8")
     (loop,) = re.findall(r"```c\n(.*?)```", page, re.DOTALL)
     level = ContactThreshold(60.0, True, (1.0,) * 6, (1.0,) * 6, (1.0,) * 6, 50.0, 5.0)
     code = c_source(control_tables(an_arm(urdf_text())), "arm", [], "double", [level])
@@ -315,7 +315,7 @@ def test_the_loop_of_the_page_compiles(tmp_path: Path) -> None:
 
 
 def test_the_page_names_every_function() -> None:
-    page = (Path(__file__).parents[3] / "docs" / "controller.md").read_text("utf-8")
+    page = (Path(__file__).parents[3] / "docs" / "simulators.md").read_text("utf-8")
     header = c_source(control_tables(an_arm(urdf_text())), "arm", []).header
     for name in re.findall(r"^void (arm_\w+)\(", header, re.MULTILINE):
         assert name in page, name

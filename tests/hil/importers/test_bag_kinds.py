@@ -166,7 +166,7 @@ class TestPublishers:
         rare += [message(k, joints=(2,)) for k in range(0, COUNT, 20)]
         typed = Typed(urdf, rare, "--lock-others")
         assert typed.refused
-        assert "come in messages of their own, for (ankle) up to 80 ms apart, where hip " in (
+        assert "are in separate messages, for (ankle) up to 80 ms apart, where hip " in (
             typed.message
         )
         assert "(hip, knee) and (ankle)" in typed.message
@@ -223,7 +223,7 @@ class TestPublishers:
         ]
         typed = Typed(urdf, both)
         (warning,) = typed.archive.header.findings.warnings
-        assert "samples go to and fro between two sequences up to 0.2" in warning
+        assert "samples alternate between two sequences up to 0.2" in warning
         assert "two sources write these joints" in warning
 
     def test_a_pose_to_which_the_arm_returns_is_none(self, urdf) -> None:
@@ -253,7 +253,7 @@ class TestMissingQuantities:
         effort[:, 1] = np.nan
         typed = Typed(urdf, [message(k, effort=effort) for k in range(COUNT)])
         assert typed.refused
-        assert "effort: joint knee has none in any message, the others have it" in typed.message
+        assert "effort: joint knee has no value in any message" in typed.message
         assert typed.options() == ["--effort", "ignore"]
         assert "torque" not in typed.again(*typed.options()).archive.columns
 
@@ -262,7 +262,7 @@ class TestMissingQuantities:
         velocity[:, 1] = np.nan
         typed = Typed(urdf, [message(k, velocity=velocity) for k in range(COUNT)])
         assert "velocity" not in typed.archive.columns
-        assert "velocity: joint knee has none in any message" in typed.message
+        assert "velocity: joint knee has no value in any message" in typed.message
 
 
 @pytest.mark.usefixtures("each_kind")
@@ -331,7 +331,7 @@ class TestFiles:
         folder = self.folder(urdf, named=6)
         with pytest.raises(SourceError, match=r"bag_4\.db3, bag_5\.db3: named in metadata") as no:
             self.read(folder, urdf)
-        assert "to use one part alone, name its file: bag_0.db3" in str(no.value)
+        assert "to use one part alone, give its file: bag_0.db3" in str(no.value)
         assert self.read(folder / "bag_0.db3", urdf).n_samples == COUNT // 4
         (folder / "metadata.yaml").write_text("{")
         with pytest.raises(SourceError, match=r"metadata\.yaml: cannot be read"):

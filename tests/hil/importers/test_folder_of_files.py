@@ -1,4 +1,4 @@
-"""A folder with a file for each quantity, and quantities at times of their own."""
+"""A folder with a file for each quantity, and quantities with time stamps of their own."""
 
 from __future__ import annotations
 

@@ -191,7 +191,7 @@ REFUSED: list[tuple[str, dict[str, Any], str]] = [
         ({"files": "p{}.txt"}, r"position.files: there is no file 'p1.txt' for hip, joint 1"),
         ({"files": ("q_1.txt",)}, "position.files: has 1 entries; one for each of the joints"),
         ({"files": ("tau0.dat", "tau1.dat", "short.dat")}, "tau1.dat 20, short.dat 5"),
-        ({}, r'run: position.file: is a folder; name a file in it: file = "q.txt"'),
+        ({}, r'run: position.file: is a folder; give a file in it: file = "q.txt"'),
     )),
     *((f"wide{k}.csv", {}, rf"columns: 5 columns are called 'q{{}}' \(q{k} to q{k + 4}\).* 3 joints"
        ": hip.*joints.*list 3") for k in (0, 1)),
@@ -337,7 +337,7 @@ class TestBadInput:
             read(tmp_path / "b.csv", robot)
         # The column without a name may be the first or the last.
         longer = log(tmp_path / "c.csv", VALUES, "t,q1,q2,q3")
-        with pytest.raises(SourceError, match=r"4 names .* rows of 7 numbers; name the other"):
+        with pytest.raises(SourceError, match=r"4 names .* rows of 7 numbers; name every column"):
             read(longer, robot)
 
 

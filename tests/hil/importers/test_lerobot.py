@@ -254,7 +254,7 @@ def test_a_calibration_of_other_joints_is_refused(tmp_path: Path, urdf: Path) ->
     folder = written(tmp_path / "pick", [(data, data)])
     calibration = tmp_path / "arm.json"
     calibration.write_text('{"other": {"range_min": 1, "range_max": 2}}')
-    with pytest.raises(SourceError, match="is no calibration of these joints") as refused:
+    with pytest.raises(SourceError, match="is not a LeRobot calibration") as refused:
         recordings(folder, urdf, calibration=calibration)
     assert refused.value.remedy
 
@@ -262,7 +262,7 @@ def test_a_calibration_of_other_joints_is_refused(tmp_path: Path, urdf: Path) ->
 def test_a_data_set_without_joints_is_refused(tmp_path: Path, urdf: Path) -> None:
     data = in_degrees(motion(4.0, 0.0))
     folder = written(tmp_path / "pick", [(data, data)], names=[0, 1, 2])
-    with pytest.raises(SourceError, match="names no numbers of observation"):
+    with pytest.raises(SourceError, match="has no numbers for observation"):
         recordings(folder, urdf, units="deg")
 
 

@@ -466,7 +466,7 @@ class TestOtherArm:
             choices = (TiedReading(aspect, MOVED, 0.13, GravityOption((0.0, 0.0, 0.0))),) * 2
             remedy = undecided(tmp_path / "a.csv", choices, Contradictions()).remedy
             assert remedy is not None
-            assert ("if none of these is so, give the URDF of this arm" in remedy) == said
+            assert ("if none of these is the case, give the URDF of this arm" in remedy) == said
 
     @staticmethod
     def contradictions(log: Path, urdf: Path) -> Contradictions:

@@ -405,7 +405,7 @@ def test_pipes_and_other_encodings_are_refused(tmp_path: Path, two_joints: Path)
                 read(Path(f"/dev/fd/{reading}"))
     finally:
         os.close(reading)
-    with pytest.raises(InputError, match="name a URDF"):
+    with pytest.raises(InputError, match="give a URDF"):
         cell_of_urdf(tmp_path, {})
     two_joints.write_bytes(TWO_JOINTS.replace("hip", "h\xfc").encode("latin-1"))
     with pytest.raises(InputError, match="save it as UTF-8"):
@@ -486,7 +486,7 @@ class TestOneArmOfARobot:
         ("links", "sentence"),
         [
             ({"tip": "tol"}, "--tip: has no link 'tol'; the nearest are tool"),
-            ({"base": "arm", "tip": "base"}, "link 'base' does not hang on link 'arm'"),
+            ({"base": "arm", "tip": "base"}, "link 'base' is not a descendant of link 'arm'"),
             ({"base": "arm", "tip": "tool"}, "no joint moves between arm and tool"),
         ],
     )

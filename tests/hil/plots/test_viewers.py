@@ -132,7 +132,7 @@ def test_a_part_of_the_time_and_some_joints(excitation: Path) -> None:
         for trace in quantity.traces:
             assert np.nanmin(trace.time) >= 1.0 - 1e-9
             assert np.nanmax(trace.time) <= 2.0 + 1e-9
-    with pytest.raises(InputError, match="name one of joint_1"):
+    with pytest.raises(InputError, match="choose one of joint_1"):
         view_of(excitation, joints=("7",))
     with pytest.raises(ArchiveError, match="without a sample in this interval"):
         view_of(excitation, start=1e4)

@@ -56,7 +56,11 @@ class TestPolishAdvice:
     ("count", "spread", "said"),
     [
         (20, 1.01, ""),
-        (20, 0.4, "warning: the nearest arms that can be built do not vary as the intervals say"),
+        (
+            20,
+            0.4,
+            "warning: the nearest physically consistent arms do not scatter",
+        ),
         (3, 0.6, "the spread of fewer than 10 arms is mostly chance"),
     ],
 )

@@ -25,12 +25,14 @@ from hil.pipeline.identified_model import predicted_parts
 from hil.report.chart_picture import draw_charts
 from hil.report.output_files import REPORT
 from hil.report.rollout_section import overview_charts, overview_legends
-from hil.results.provenance import PARAMETERS_JSON
+from hil.results.provenance import PARAMETERS_JSON, RESULTS
+from hil.results.results import Results
 from hil.results.rollout_result import ROLLOUT, ArmErrors, RolloutResult
 from hil.rollout.torque_rollout import POLISHED
 from identification.rollout.servo_by_torque import PositionServo
 from identification.text import percentage
 from tests import messages
+from tests.hil.simulated_logs import simulate, urdf_path, write_log
 from tests.identification.two_link import MODEL, URDF, four_sines, truth
 
 pytestmark = pytest.mark.long
@@ -89,6 +91,40 @@ def test_it_reads_what_was_identified(folder: Path, monkeypatch: pytest.MonkeyPa
         np.array(anew["identified"]["joints"]), rel=1e-6
     )
     assert read["inside"] == pytest.approx(np.array(anew["inside"]), abs=0.02)
+
+
+class TestFlangeErrorOfTheVerdict:
+    """Computed from the torque error without a simulator, and simulated by MuJoCo."""
+
+    FACTOR = 1.5
+    HORIZON = 0.2  # s
+
+    def require_alike(self, folder: Path) -> None:
+        done = run("rollout", folder, "--samples", "3", "-q")
+        assert done.exit_code in (0, 5), done.output
+        rollout = RolloutResult.load(folder / ROLLOUT)
+        simulated = rollout.identified.tool[rollout.horizons.index(self.HORIZON)]
+        purposes = Results.load(folder / RESULTS).verdict.purposes
+        (computed,) = [each.figure for each in purposes if each.name == "simulation"]
+        assert simulated is not None and computed is not None
+        assert simulated / self.FACTOR < computed < simulated * self.FACTOR
+
+    def test_of_a_campaign(self, folder: Path) -> None:
+        self.require_alike(folder)
+
+    @pytest.mark.parametrize("noise", [1.0, 10.0])
+    @pytest.mark.parametrize(
+        ("urdf", "locked"),
+        [("ur5_robot.urdf", ()), ("panda.urdf", ("panda_finger_joint1", "panda_finger_joint2"))],
+    )
+    def test_of_a_log(
+        self, urdf: str, locked: tuple[str, ...], noise: float, tmp_path: Path
+    ) -> None:
+        made = simulate(urdf, np.arange(0.0, 12.0, 0.01), locked=locked, noise=noise)
+        columns = (made.time, made.position, made.torque)
+        log = write_log(tmp_path / "log.csv", ["t", "q{}", "tau{}"], *columns)
+        run("identify", log, "--urdf", urdf_path(urdf), "-o", tmp_path / "out", "-q")
+        self.require_alike(tmp_path / "out")
 
 
 class TestSectionOfTheReport:

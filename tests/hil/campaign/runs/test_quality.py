@@ -100,7 +100,7 @@ def test_a_disturbed_first_repetition_rejects_no_others(make: Make, undisturbed:
         "000_a1",
     ]
     assert OTHERS_AGREE in result.rejected[2].reason
-    assert any("excitation_000_a1.mcap was the only repetition" in note for note in result.notes)
+    assert any("excitation_000_a1.mcap was the only accepted repetition" in note for note in result.notes)
     good = [path.name[11:-5] for path in campaign.folder.completed("excitation")]
     assert good == ["000_a2", "001_a3", "002_a1"]
     touched = open_archive(campaign.folder.archives / "excitation_000_a1.mcap")
@@ -178,7 +178,7 @@ def test_a_truncated_stuck_or_saturated_motion_is_named(undisturbed: Campaign) -
         (short, "cycles are archived"),
         ({"missed": few}, None),
         ({"missed": many}, "packets were missed"),
-        ({"position": position}, "elbow is stuck: its position stays the same from 0.20 s"),
+        ({"position": position}, "elbow is stuck: its position does not change from 0.20 s"),
         ({"current": current}, None),
         ({"current": saturated}, "current of elbow was at its limit for 10 ms"),
     ):
