@@ -8,7 +8,7 @@ run`, while an ordinary process drains its ring.
 
 A set-point is late if it comes more than one cycle after its frame was sent; the output says where
 the time of each went. `packets_late`, `replies_late` and `not_accepted` are the counts of
-`drivers.punctuality`, of the whole session: only the second are this program's. `machine_busy` is
+`drivers.punctuality` during the motion: only the second are this program's. `machine_busy` is
 the share of all processors in use, ours and others'. With `--busy` every processor is kept busy by
 an ordinary process.
 """
@@ -40,6 +40,11 @@ from sim_fixtures.ur import CELL_PATH, SimulatedUr, UrArmTruth, UrServer, UrSett
 PERIOD: Final = 0.002
 _BEARABLE: Final = 50
 """Set-points in a row that may be late without an end of the measurement."""
+_SETTLING_SECONDS: Final = 1.0
+"""Time after which the frames that came while the exchange started are read."""
+_COUNTS: Final = (
+    ("packets_late", "late_packets"), ("replies_late", "late"), ("not_accepted", "rejected"),
+)  # fmt: skip
 _spawn = multiprocessing.get_context("spawn")
 
 
@@ -200,6 +205,8 @@ def measure(cycles: int, folder: Path) -> dict[str, Any]:
     reader = _spawn.Process(target=drain, args=(os.getpid(), exchange.ring_fd, str(arrivals)))
     try:
         reader.start()
+        time.sleep(_SETTLING_SECONDS)
+        before = exchange.status()
         exchange.submit(Sinusoids(LOOP + FADE, PERIOD, loop=LOOP))
         while controller.is_alive():
             exchange.send_heartbeat()
@@ -223,7 +230,7 @@ def measure(cycles: int, folder: Path) -> dict[str, Any]:
     with np.load(arrivals) as file:
         times |= {f"exchange_{name}": array for name, array in file.items()}
     return times | {
-        "status": status, "log": log, "endings": endings, "realtime": realtime,
+        "status": status, "before": before, "log": log, "endings": endings, "realtime": realtime,
         "steal": steal_ticks() - stolen, "busy": busy_share(ticks), "load": os.getloadavg(),
     }  # fmt: skip
 
@@ -284,9 +291,10 @@ def summary(times: Mapping[str, Any], cycles: int) -> dict[str, Any]:
         "frame_latest_ms": round(1e3 * float(np.nanmax(sent - due)), 3),
         "exchange_scheduling": times["realtime"],
         "controller_scheduling": str(times["scheduling"]),
-        "packets_late": times["status"].late_packets,
-        "replies_late": times["status"].late,
-        "not_accepted": times["status"].rejected,
+        **{
+            name: getattr(times["status"], field) - getattr(times["before"], field)
+            for name, field in _COUNTS
+        },
         "steal_ticks": times["steal"],
         "machine_busy": round(times["busy"], 2),
         "load_average": round(times["load"][0], 1),
