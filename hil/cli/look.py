@@ -13,7 +13,7 @@ import typer
 from hil.base.files import write_output
 from hil.base.one_screen import SCREEN_COLUMNS, SCREEN_LINES, Paragraph, Part, one_screen
 from hil.base.progress import say
-from hil.base.terminal_text import printable
+from hil.base.terminal_text import printable, typed
 from hil.cli.arguments import JsonOption, VerboseOption, print_json, with_options
 from hil.cli.imports import Described, Reading
 from hil.importers.conclusions import Certainty
@@ -100,8 +100,8 @@ def screen(result: Look) -> list[str]:
         parts += ["", "this recording can determine", *determined(result.groups)]
     steps = [
         Paragraph(row_text(row).decide, f"next  {row.aspect}: ", 2)
-        for row in result.rows
-        if row.certainty is Certainty.UNDETERMINED and row.decider is not None
+        for row in sorted(result.rows, key=lambda row: not row.is_fault)
+        if row.has_step
     ]
     questions = [part for choices in result.questions for part in question(choices)]
     parts += ["", *questions, *_options(result), "reasons, and all rows: -v"]
@@ -126,7 +126,10 @@ def question(choices: Sequence[TiedReading]) -> list[Paragraph]:
 
 
 def _options(result: Look) -> list[str]:
-    return [] if result.gravity is None else [f"hil identify {gravity_option(result.gravity)}"]
+    if result.gravity is None:
+        return []
+    stated = gravity_option(result.gravity)
+    return [f"hil identify {typed(result.source)} --urdf ARM.urdf {stated}"]
 
 
 def _ask(choices: Sequence[TiedReading]) -> TiedReading | None:
@@ -145,7 +148,9 @@ def table(rows: Sequence[Row]) -> list[str]:
         text = row_text(row)
         lines.append(f"{row.aspect:{width}}  {row.certainty:{_CERTAINTY_COLUMNS}}  {text.reading}")
         lines.append(f"{indent}{text.reason}")
-        if text.decide and row.certainty is not Certainty.CERTAIN:
+        if text.decide and row.is_fault:
+            lines.append(f"{indent}to do: {text.decide}")
+        elif text.decide and row.certainty is not Certainty.CERTAIN:
             lines.append(f"{indent}to decide: {text.decide}")
     return lines
 

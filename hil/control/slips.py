@@ -19,8 +19,8 @@ from hil.archive.recording_of_archive import recording_of
 from hil.archive.repair import amend_outcome
 from hil.base.arrays import Array
 from hil.base.errors import ArchiveError
+from identification.signals.position_steps import PositionJump, position_jumps
 from identification.signals.recording import Recording
-from identification.validation.position_jumps import PositionJump, position_jumps
 
 from .errors import SlippedError
 

@@ -45,6 +45,7 @@ from identification.hypotheses.diagnosis import (
 )
 from identification.hypotheses.scores import Score, compare, score_of
 from identification.hypotheses.search import SURE_SIGMAS
+from identification.signals.position_steps import PositionJump, position_steps
 from identification.signals.recording import MIN_MOVEMENT
 from identification.signals.samples import Samples, prepare
 from identification.text import percentage
@@ -120,7 +121,7 @@ def concluded(
         ratio = size.factor if size is not None and size.by_masses else None
         reason = NoJointTorque(is_load=True, ratio=ratio)
         return Concluded(_without_torque(imported, source, robot_of, use, reason))
-    if asked is None:
+    if asked is None or asked.is_unexplained_by_jumps:
         return Concluded(imported)
     found = asked.diagnosis()
     _require_torque_of_arm(source, found)
@@ -218,12 +219,14 @@ class _Asked:
         samples: of the recording.
         rows: some of them.
         score: of these.
+        jumps: steps of the positions that no arm makes.
     """
 
     cell: Cell
     samples: Samples
     rows: Samples
     score: Score
+    jumps: tuple[PositionJump, ...] = ()
 
     def diagnosis(self) -> TorqueDiagnosis:
         """Return what the torque is as a whole, and the joints where it follows the arm."""
@@ -238,6 +241,11 @@ class _Asked:
         return self.score.overall > _SUSPECT_ERROR or bool(
             np.any(self.score.friction < _DRIVING_FRICTION_SIGMAS)
         )
+
+    @property
+    def is_unexplained_by_jumps(self) -> bool:
+        """Whether positions jump, so that torque that does not follow them says nothing more."""
+        return bool(self.jumps) and self._is_far
 
     def is_suspect(self, found: TorqueDiagnosis) -> bool:
         """Return whether the torque does not follow the arm as it is read."""
@@ -310,12 +318,13 @@ def _asked(archive: Archive) -> _Asked | None:
     """Return the rows of an archive of which something is asked; None if they cannot be used."""
     cell = cell_of(archive)
     try:
-        recording = source_of(archive, cell).recording
-        samples = prepare(recording, cell.model, options=SETTINGS)
+        source = source_of(archive, cell)
+        samples = prepare(source.recording, cell.model, options=SETTINGS)
         rows = few_rows([samples])
         if not rows.usable.any():
             return None  # nothing moves
-        return _Asked(cell, samples, rows, score_of(cell.model, rows))
+        jumps = position_steps(source.recording, source.name).jumps
+        return _Asked(cell, samples, rows, score_of(cell.model, rows), jumps)
     except (IdentificationError, ValueError):
         return None  # the identification says what is wrong
 

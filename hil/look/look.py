@@ -132,11 +132,12 @@ def _with_torque(
         return Look(source.name, tuple(rows), (), (), imported.map_text)
     finding = _finding(source, imported, cell, recording)
     delay, low_pass = _channel(finding.axes.read(recording), finding.readings.model)
-    channel = physics.channel_rows(delay, low_pass)
+    channel = list(physics.channel_rows(delay, low_pass))
     groups = physics.determined(finding.readings)
     score = finding.readings.score
     if score.overall > EXPLAINED_ERROR:
         rows = [_no_longer_certain_unit(row, score.overall) for row in rows]
+        channel = [physics.no_longer_certain(row, score.overall) for row in channel]
     rows = [*rows, *finding.rows(groups), *channel]
     contradictions = Contradictions.of(
         cell, finding.readings.model, finding.readings.samples, score, score.overall

@@ -86,7 +86,7 @@ from hil.look.readings import (
 from hil.look.result import ChangedReading, Look, Row, TiedReading
 from identification.estimators.delay_messages import undetermined_words
 from identification.hypotheses.changes import COUPLED, ORDERS, Meaning
-from identification.signals.messages import clock_lines, fault_words, time_lines
+from identification.signals.messages import clock_lines, fault_words, jump_words, time_lines
 from identification.text import number, percentage
 
 _FACTS: Final[Mapping[Fact, str]] = {
@@ -159,6 +159,7 @@ _BASES: Final[Mapping[Basis, str]] = {
     Basis.NO_FILTER_BETTER: "none predicts it better",
     Basis.FREE_PARAMETERS: "with free parameters, before a fit of the friction law",
     Basis.NO_BODIES: "friction torque does not show it",
+    Basis.NO_GRAVITY: "torque without gravity does not show it",
     Basis.RATE: "the rate of a torque does not show it",
     Basis.INTEGRAL: "its integral follows the arm",
     Basis.INERTIA: "the torque's inertia fits other times, its weight fits the URDF",
@@ -191,10 +192,12 @@ _STEPS: Final[Mapping[NextStep, str]] = {
     NextStep.RECORD_FASTER: "record faster motion",
     NextStep.RECORD_PAYLOAD: "record with and without it (`hil payload`)",
     NextStep.IMPORT_COMMANDS: "`hil identify` finds their servo and friction",
+    NextStep.CHECK_ENCODER: "check encoder and cable, or cut the recording before the jump",
     NextStep.ASK_FOR_POSITIONS: "ask for the raw encoder positions",
     NextStep.ASK_FOR_UNIT: "ask for the unit of the channel",
     NextStep.ASK_FOR_FILTER: "ask for the filter of the channel",
 }
+_MAX_JUMPS: Final = 3  # that a row names
 _CHANGES: Final[Mapping[Meaning, str]] = {
     "torque sign": "torque negated",
     "position sign": "position negated",
@@ -368,7 +371,8 @@ def _(clock: ClockReading) -> str:
 @_worded.register
 def _(rows: RowsReading) -> str:
     times = () if rows.times is None else time_lines(rows.times)
-    return "; ".join([*map(fault_words, rows.faults), *times])
+    jumps = [jump_words(jump) for jump in rows.jumps[:_MAX_JUMPS]]
+    return "; ".join([*jumps, *map(fault_words, rows.faults), *times])
 
 
 @_worded.register

@@ -240,7 +240,9 @@ class TorqueFindings:
         if self.is_backwards:
             backwards = (Basis.DRIVING_FRICTION,)
             step = Decide.REVERSE_THE_ROWS
-            rows.insert(0, Row("time", Fact.BACKWARDS, Certainty.LIKELY, backwards, step))
+            likely = Certainty.LIKELY
+            row = Row("time", Fact.BACKWARDS, likely, backwards, step, is_fault=True)
+            rows.insert(0, row)
         if self.torque.time is not None:
             rows.insert(0, _other_times(self.torque.time))
         if self.rigid.is_nothing or self.torque.is_rate:
@@ -368,7 +370,8 @@ class TorqueFindings:
     def _no_bodies(self) -> Row:
         share = RigidShare(float(self.rigid.over_friction.max()), self.rigid.scale)
         decider = Decide.RECORD_ALL_TORQUE
-        return Row("bodies", Fact.NO_BODIES, Certainty.CERTAIN, (share,), decider)
+        certain = Certainty.CERTAIN
+        return Row("bodies", Fact.NO_BODIES, certain, (share,), decider, is_fault=True)
 
     def _scale(self) -> Iterator[Row]:
         """Yield the scales of torques, if some differ from the others."""
@@ -396,6 +399,9 @@ class TorqueFindings:
         decider = Decide.STATE_GRAVITY
         if steps:
             return self._changed("mounting", steps, Mounting(steps[-1].change.name), decider)
+        if self.steps("no gravity"):
+            undetermined = Certainty.UNDETERMINED
+            return Row("mounting", Fact.STATED_MOUNTING, undetermined, (Basis.NO_GRAVITY,), decider)
         return self._unchanged("mounting", Fact.STATED_MOUNTING, "mounting", decider=decider)
 
     def _size(self) -> Row:
@@ -521,12 +527,14 @@ _RATE: Final = Row(
     Certainty.CERTAIN,
     (Basis.INTEGRAL,),
     Decide.RECORD_TORQUE,
+    is_fault=True,
 )
 
 
 def _other_times(factor: float) -> Row:
     """Return the row of recorded times that are not of the motion."""
-    return Row("time", OtherTimes(factor), Certainty.LIKELY, (Basis.INERTIA,), Decide.STATE_RATE)
+    found, step = OtherTimes(factor), Decide.STATE_RATE
+    return Row("time", found, Certainty.LIKELY, (Basis.INERTIA,), step, is_fault=True)
 
 
 def _says_nothing(row: Row, basis: Basis) -> Row:

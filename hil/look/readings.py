@@ -21,6 +21,7 @@ from hil.importers.conclusions import (
 from identification.estimators.delay import DelayEstimate
 from identification.hypotheses.changes import Change
 from identification.signals.clock import SampleTimes, TimeBase
+from identification.signals.position_steps import PositionJump
 from identification.signals.row_faults import RowFault
 
 Vector = tuple[float, ...]
@@ -88,10 +89,11 @@ class ClockReading:
 
 @dataclass(frozen=True)
 class RowsReading:
-    """Rows that are not of the motion, and times of the others that are not their stamps."""
+    """Rows that are not of the motion, times that are not stamps, and steps no arm makes."""
 
     faults: tuple[RowFault, ...]
     times: SampleTimes | None
+    jumps: tuple[PositionJump, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -277,6 +279,7 @@ class Basis(Enum):
     NO_FILTER_BETTER = auto()
     FREE_PARAMETERS = auto()
     NO_BODIES = auto()
+    NO_GRAVITY = auto()
     RATE = auto()
     INTEGRAL = auto()  #: of the torque follows the arm
     INERTIA = auto()  #: is that for other times, with the weight of the URDF
@@ -541,6 +544,7 @@ class NextStep(Enum):
     RECORD_FASTER = auto()
     RECORD_PAYLOAD = auto()
     IMPORT_COMMANDS = auto()
+    CHECK_ENCODER = auto()
     ASK_FOR_POSITIONS = auto()
     ASK_FOR_UNIT = auto()
     ASK_FOR_FILTER = auto()

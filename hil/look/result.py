@@ -54,6 +54,7 @@ class Row:
         evidence: from what, most often one thing.
         decider: what would decide it; None if there is nothing.
         is_changed: whether the torque says that it is other than recorded.
+        is_fault: whether it is wrong, and no map corrects it.
     """
 
     aspect: Aspect
@@ -62,6 +63,14 @@ class Row:
     evidence: tuple[Evidence, ...]
     decider: Decider | None = None
     is_changed: bool = False
+    is_fault: bool = False
+
+    @property
+    def has_step(self) -> bool:
+        """Whether a person has something to do: to decide it, or to mend what is wrong."""
+        return self.decider is not None and (
+            self.is_fault or self.certainty is Certainty.UNDETERMINED
+        )
 
 
 @dataclass(frozen=True)

@@ -52,6 +52,7 @@ from identification.signals.angle_wraps import (
 )
 from identification.signals.clock import time_base
 from identification.signals.noise import noiseless_above
+from identification.signals.position_steps import position_steps
 from identification.signals.recording import (
     MIN_MOVEMENT,
     Recording,
@@ -85,9 +86,20 @@ def rows(source: Source, imported: ImportedRecording, arm: Cell | None) -> list[
     concluded = imported.concluded
     units = [each for each in imported.examined.found if isinstance(each, _UNIT_CONCLUSIONS)]
     table = [_time(recording, concluded, units)]
-    if source.faults or source.retimed:
-        found = RowsReading(source.faults, source.times if source.retimed else None)
-        table.append(Row("rows", found, Certainty.CERTAIN, (Basis.POSITIONS_ALONE,)))
+    jumps = position_steps(recording, source.name).jumps
+    if source.faults or source.retimed or jumps:
+        found = RowsReading(source.faults, source.times if source.retimed else None, jumps)
+        step = NextStep.CHECK_ENCODER if jumps else None
+        table.append(
+            Row(
+                "rows",
+                found,
+                Certainty.CERTAIN,
+                (Basis.POSITIONS_ALONE,),
+                step,
+                is_fault=bool(jumps),
+            )
+        )
     table += [row for each in concluded if (row := _concluded(each, units)) is not None]
     if recording.velocity is not None:
         table.append(_velocity(recording))
@@ -209,7 +221,9 @@ def _measured(
     copied = next((each for each in found if isinstance(each, CopiedCommands)), None)
     if copied is not None:
         decider = NextStep.RECORD_MEASURED
-        return Row("positions", Fact.COMMANDED, Certainty.CERTAIN, (copied,), decider)
+        return Row(
+            "positions", Fact.COMMANDED, Certainty.CERTAIN, (copied,), decider, is_fault=True
+        )
     names = [
         each.channels
         for each in concluded
@@ -221,9 +235,10 @@ def _measured(
     quiet = noiseless_above(recording.time, recording.position, recording.segments())
     lag = velocity_lag(recording)
     if lag is not None and lag > 0.0:
-        evidence = LateVelocity(lag)
+        evidence = (LateVelocity(lag),)
         decider = NextStep.RECORD_MEASURED
-        return Row("positions", Fact.COMMANDED, Certainty.LIKELY, (evidence,), decider)
+        likely = Certainty.LIKELY
+        return Row("positions", Fact.COMMANDED, likely, evidence, decider, is_fault=True)
     if quiet is None:
         return Row("positions", Fact.MEASURED, Certainty.CERTAIN, (Basis.ENCODER_NOISE,))
     reading = SmoothPositions(quiet)

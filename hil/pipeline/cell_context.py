@@ -25,6 +25,7 @@ from identification.signals.angle_wraps import (
     UNWRAPPED,
 )
 from identification.signals.masks import SATURATED, SPIKE
+from identification.signals.position_steps import PositionJump, position_steps
 from identification.signals.recording import (
     Recording,
 )
@@ -41,7 +42,6 @@ from identification.validation.finding import (
     Value,
 )
 from identification.validation.nominal_scale import nominal_scale
-from identification.validation.position_jumps import PositionJump, position_steps
 from identification.validation.prediction import PredictionError, pooled_error
 from identification.validation.residuals import folded_noise
 from planner.arrays import numbers
@@ -192,6 +192,7 @@ def joint_ranges(sources: Sources) -> tuple[Array, Array]:
 _ROW_REMEDIES: Final[Mapping[RowFaultKind, RemedyKey]] = {
     RowFaultKind.FROZEN: "find why the logger stopped",
     RowFaultKind.WRITTEN_TWICE: "check what wrote rows twice",
+    RowFaultKind.DISPLACED: "check what displaced rows",
     RowFaultKind.JUMP: "separate the motions",
 }
 

@@ -176,6 +176,13 @@ class TorqueDiagnosis:
         return tuple(step for step in self.steps if step.change.meaning == "zero")
 
     @property
+    def has_clear_zeros(self) -> bool:
+        """Whether a zero is clearly other than stated, and nothing explains the torque better."""
+        if self.readings is None or not self.readings.adequacy.is_enough:
+            return False
+        return any(step.is_clear and not step.alike for step in self.zeros)
+
+    @property
     def discrete(self) -> tuple[Step, ...]:
         """The signs, orders and coupled angles that are other than stated."""
         return tuple(step for step in self.steps if step.change.is_discrete)

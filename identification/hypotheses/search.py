@@ -130,10 +130,15 @@ class Step:
     is_adequate: bool = True  # whether no free fit explains the rows much better
 
     @property
-    def is_explained(self) -> bool:
+    def is_clear(self) -> bool:
         """Whether the arm explains the torque with it, and certainly worse without."""
         is_certain = not self.by_friction and self.sigmas < -SURE_SIGMAS
-        return self.error < EXPLAINED_ERROR and self.is_adequate and is_certain
+        return self.error < EXPLAINED_ERROR and is_certain
+
+    @property
+    def is_explained(self) -> bool:
+        """Whether that is so, and no free fit explains the torque much better."""
+        return self.is_clear and self.is_adequate
 
     @property
     def is_far(self) -> bool:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from identification.signals.clock import MAX_STEP_DEVIATION, SampleTimes, TimeBase
+from identification.signals.position_steps import PositionJump
 from identification.signals.row_faults import RowFault, RowFaultKind
 from identification.text import duration_text, number, percentage
 
@@ -55,6 +56,14 @@ def time_lines(times: SampleTimes) -> list[str]:
     return lines
 
 
+def jump_words(jump: PositionJump) -> str:
+    """Return what is wrong with a step of a position."""
+    return (
+        f"the position of {jump.joint} jumps by {number(jump.size, 2)} rad or m at"
+        f" {number(jump.time, 4)} s, faster than an arm can move"
+    )
+
+
 def fault_words(fault: RowFault) -> str:
     """Return what is wrong with rows, and what was done about it."""
     at = f"at {number(fault.time, 4)} s"
@@ -66,6 +75,14 @@ def fault_words(fault: RowFault) -> str:
             )
         case RowFaultKind.WRITTEN_TWICE:
             return f"{fault.rows} rows {at} were written before, bit for bit, and were left out"
+        case RowFaultKind.DISPLACED:
+            one = fault.rows == 1
+            return (
+                f"the position of {', '.join(fault.joints)} is displaced by up to"
+                f" {number(fault.size, 2)} rad or m in {fault.rows} row{'' if one else 's'}, and"
+                f" where it was after {'it' if one else 'them'}{', first' if not one else ''} {at}:"
+                f" {'it was' if one else 'they were'} left out"
+            )
         case RowFaultKind.JUMP:
             return (
                 f"the positions of {', '.join(fault.joints)} jump {at}, further than any arm moves"

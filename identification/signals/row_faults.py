@@ -1,11 +1,11 @@
-"""Rows that a log cannot have from one motion: frozen, written twice, or of another motion.
+"""Rows that a log cannot have from one motion: frozen, written twice, displaced, of another motion.
 
 Positions alone show them, so they are left out before anything is judged by torque.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from enum import Enum, auto
 from typing import Final
@@ -14,15 +14,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from identification.arrays import Array
+from identification.signals.position_steps import MAX_ACCELERATION, Excursion, excursions
 from identification.signals.recording import GAP_STEPS, Recording
 
 Rows = NDArray[np.bool_]
 
-# Acceleration within one step of the clock; robots reach a fifth of it.
-MAX_ACCELERATION: Final = 150.0
-"""rad/s² or m/s²"""
 _NEIGHBOUR_ROWS: Final = 4  # rows to either side
 _MIN_REPEATED_ROWS: Final = 10  # rows that are written twice
+# share of the rows that may be displaced: of more, these may be where the joint was
+_MAX_DISPLACED: Final = 0.5
 _HELD_QUANTILE: Final = 0.9  # quantile of the rows for which a sample is held in a slower channel
 
 
@@ -31,6 +31,7 @@ class RowFaultKind(Enum):
 
     FROZEN = auto()  #: the logger repeated a row while the arm moved on
     WRITTEN_TWICE = auto()  #: the same rows again
+    DISPLACED = auto()  #: a joint was not where they say, and is again after them
     JUMP = auto()  #: another motion begins, or rows are missing and the stamps do not show it
 
 
@@ -43,7 +44,8 @@ class RowFault:
         time: of the first of them, or of the first row after a jump [s].
         duration: of the rows [s].
         rows: how many were left out; 0 at a jump, which separates two motions.
-        joints: whose positions jump.
+        joints: whose positions jump, or are displaced.
+        size: of the step into displaced rows, the largest [rad or m].
     """
 
     kind: RowFaultKind
@@ -51,6 +53,7 @@ class RowFault:
     duration: float
     rows: int
     joints: tuple[str, ...] = ()
+    size: float = 0.0
 
 
 def without_faulty_rows(recording: Recording) -> tuple[Recording, tuple[RowFault, ...]]:
@@ -64,10 +67,15 @@ def without_faulty_rows(recording: Recording) -> tuple[Recording, tuple[RowFault
     if recording.gap_before is not None:
         gap |= recording.gap_before
     gap[[stop for _, stop in frozen if stop < len(gap)]] = True
+    displaced = _displaced(replace(recording, gap_before=gap), valid)
+    ends = np.zeros_like(gap)
+    for each in displaced:
+        ends[[each.start, each.stop]] = True
+    faults += _displacements(recording, displaced)
     starts: list[tuple[int, NDArray[np.intp] | None]] = [
         (part.start, None) for part in recording.segments()[1:]
     ]
-    for row, joints in (*starts, *_jumps(recording, gap)):
+    for row, joints in (*starts, *_jumps(recording, gap | ends)):
         if not valid[row]:
             continue
         stop = row + _written_before(recording, row)
@@ -82,6 +90,10 @@ def without_faulty_rows(recording: Recording) -> tuple[Recording, tuple[RowFault
         names = tuple(np.array(recording.joint_names)[joints].tolist())
         time = float(recording.time[row])
         faults.append(RowFault(RowFaultKind.JUMP, time, 0.0, 0, names))
+    for each in displaced:
+        valid[each.start : each.stop] = False
+        # Few missing rows are no gap.
+        gap[each.stop] |= each.stop - each.start >= GAP_STEPS
     if not faults:
         return recording, ()
     faults.sort(key=lambda fault: fault.time)
@@ -92,6 +104,34 @@ def _fault(kind: RowFaultKind, recording: Recording, start: int, stop: int) -> R
     time = recording.time
     duration = float(time[min(stop, len(time) - 1)] - time[start])
     return RowFault(kind, float(time[start]), duration, stop - start)
+
+
+def _displaced(recording: Recording, valid: Rows) -> list[Excursion]:
+    """Return valid rows in which joints are displaced; none where these are most of all."""
+    places = np.flatnonzero(valid)
+    found = [
+        each._replace(start=int(places[each.start]), stop=int(places[each.stop]))
+        for each in excursions(recording.rows(valid))
+    ]
+    rows = np.zeros(recording.n_samples, np.bool_)
+    for each in found:
+        rows[each.start : each.stop] = True
+    return found if np.count_nonzero(rows) < _MAX_DISPLACED * len(rows) else []
+
+
+def _displacements(recording: Recording, found: Sequence[Excursion]) -> Iterator[RowFault]:
+    """Yield the displaced rows of each joint."""
+    time = recording.time
+    for joint in sorted({each.joint for each in found}):
+        own = [each for each in found if each.joint == joint]
+        yield RowFault(
+            RowFaultKind.DISPLACED,
+            float(time[min(each.start for each in own)]),
+            float(sum(time[each.stop] - time[each.start] for each in own)),
+            sum(each.stop - each.start for each in own),
+            (recording.joint_names[joint],),
+            max(abs(each.size) for each in own),
+        )
 
 
 def _frozen(recording: Recording) -> Iterator[tuple[int, int]]:

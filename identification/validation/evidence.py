@@ -29,6 +29,7 @@ from identification.hypotheses.gravity_direction import GravityDirection, find_g
 from identification.hypotheses.scores import score_of
 from identification.hypotheses.unseen_changes import UnseenChange, find_changes
 from identification.model.robot import RobotModel
+from identification.signals.position_steps import PositionJump
 from identification.signals.samples import Samples
 from identification.validation.consistency import ConsistencyCheck
 from identification.validation.controller_inertia import InertiaRatio
@@ -41,7 +42,6 @@ from identification.validation.physical_signs import (
     dissipation_of,
     implausibilities,
 )
-from identification.validation.position_jumps import PositionJump
 from identification.validation.prediction import (
     SLOW_BANDWIDTH,
     PredictionError,

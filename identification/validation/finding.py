@@ -13,10 +13,10 @@ from identification.hypotheses.carried_load import MIN_LOAD_EXPLAINED
 from identification.hypotheses.changes import Change, Coupled, Order, Sign
 from identification.hypotheses.little_torque import LITTLE_TORQUE_SHARE
 from identification.signals.clock import SampleTimes
+from identification.signals.position_steps import PositionJump
 from identification.signals.row_faults import RowFault
 from identification.validation.consistency import ConsistencyCheck
 from identification.validation.physical_signs import SignKind
-from identification.validation.position_jumps import PositionJump
 
 Mask = NDArray[np.bool_]
 Level = Literal["good", "information", "doubtful", "wrong"]
@@ -55,6 +55,7 @@ FindingKey = Literal[
     "torque of another run",
     "rows backwards",
     "zeros",
+    "zeros, not all certain",
     "zeros, nearest",
     "alike",
     "nearest",
@@ -143,6 +144,7 @@ RemedyKey = Literal[
     "check the encoder of a joint",
     "find why the logger stopped",
     "check what wrote rows twice",
+    "check what displaced rows",
     "separate the motions",
     "check for damaged packets",
     "record the positions",
@@ -161,6 +163,7 @@ RemedyKey = Literal[
     "record both in one run",
     "reverse the rows",
     "correct the zeros",
+    "correct the zeros if so",
     "compare a posture",
     "jog and compare",
     "compare with the map",

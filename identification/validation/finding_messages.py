@@ -18,6 +18,7 @@ from identification.hypotheses.changes import COUPLED, ORDERS, SIGNS, Change, Me
 from identification.hypotheses.column_search import UNSEEN
 from identification.signals.clock import SampleTimes
 from identification.signals.messages import fault_words, time_lines
+from identification.signals.position_steps import PositionJump
 from identification.signals.row_faults import RowFault
 from identification.text import joined, number, percentage
 from identification.validation.consistency import ConsistencyCheck, ImpossibleParameter
@@ -29,7 +30,6 @@ from identification.validation.finding import (
     RepeatedSamples,
     Role,
 )
-from identification.validation.position_jumps import PositionJump
 
 UNTESTED: Final = "tested"
 """Name of the check whether every joint was tested on held-out motion."""
@@ -408,6 +408,12 @@ SENTENCES: Final[Mapping[FindingKey, Sentence]] = {
         " that did not choose it are predicted with {error:pc0} of the error",
         "{degrees:+.1f}°",
     ),
+    "zeros, not all certain": Sentence(
+        "zeros",
+        "zeros of joints differ from the URDF, not all of them certainly: {each} to be added; with"
+        " that, rows that did not choose it are predicted with {error:pc0} of the error",
+        "{degrees:+.1f}°",
+    ),
     "zeros, nearest": Sentence(
         "zeros",
         f"{_NEAREST} zeros of joints that differ from the URDF ({{each}})",
@@ -774,6 +780,9 @@ REMEDIES: Final[Mapping[RemedyKey, str]] = {
         "find out why the logger stopped; the rest of the recording is used"
     ),
     "check what wrote rows twice": "check what wrote rows twice; they were used once",
+    "check what displaced rows": (
+        "check encoder and cable of the joint; all other rows of the recording are used"
+    ),
     "separate the motions": (
         "give the motions as files of their own if they are of different days"
     ),
@@ -815,6 +824,10 @@ REMEDIES: Final[Mapping[RemedyKey, str]] = {
     "correct the zeros": (
         "correct them: [position] offset = [{offsets:.4f}] (rad) in the column map; compare with a"
         " posture of the arm"
+    ),
+    "correct the zeros if so": (
+        "compare a posture of the arm with the URDF at the same angles; if it is so: [position]"
+        " offset = [{offsets:.4f}] (rad) in the column map"
     ),
     "compare a posture": "compare a posture of the arm with the URDF at the same angles",
     "jog and compare": ("jog {joints} and compare direction, order and torque with the column map"),

@@ -13,6 +13,7 @@ import pytest
 
 from hil.pipeline import cell_context
 from identification.hypotheses.changes import Change
+from identification.signals.position_steps import PositionJump
 from identification.validation.finding import Finding, FindingKey, RemedyKey, RepeatedSamples
 from identification.validation.finding_messages import (
     REMEDIES,
@@ -33,7 +34,6 @@ from identification.validation.findings import (
     scale,
 )
 from identification.validation.physical_signs import SignKind
-from identification.validation.position_jumps import PositionJump
 
 NAMING = Naming(("one", "two", "three"))
 FIRST = PositionJump("a.mcap", "one", 1.5, 0.25)

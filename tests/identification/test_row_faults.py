@@ -66,12 +66,6 @@ class TestSoundRecordings:
         lost = np.random.default_rng(1).random(COUNT) > 0.05
         assert without_faulty_rows(recording.rows(lost))[1] == ()
 
-    def test_a_wrong_row_is_no_jump(self) -> None:
-        recording = moving()
-        position = recording.position.copy()
-        position[700] = 0.9
-        assert without_faulty_rows(replace(recording, position=position))[1] == ()
-
     def test_the_jump_of_one_encoder_is_left_to_its_check(self) -> None:
         recording = moving()
         position = recording.position.copy()
@@ -95,6 +89,49 @@ class TestFrozenLogger:
         recording = moving(noise=0.0, rest=1.0)
         torque = np.round(recording.torque, 1) if recording.torque is not None else None
         assert without_faulty_rows(replace(recording, torque=torque))[1] == ()
+
+
+class TestDisplacedRows:
+    @pytest.mark.parametrize("rows", [1, 3, 5, 60, 900])
+    @pytest.mark.parametrize("size", [0.02, -0.3])
+    def test_rows_of_one_joint_are_left_out(self, rows: int, size: float) -> None:
+        recording = moving()
+        position = recording.position.copy()
+        position[700 : 700 + rows, 1] += size
+        sound, (fault,) = without_faulty_rows(replace(recording, position=position))
+        assert fault.kind is RowFaultKind.DISPLACED
+        assert fault.joints == ("b",)
+        assert fault.rows == rows
+        assert fault.time == pytest.approx(700 / RATE)
+        assert fault.size == pytest.approx(abs(size), abs=5e-3)
+        kept = np.delete(np.arange(COUNT), np.arange(700, 700 + rows))
+        np.testing.assert_array_equal(sound.position, recording.position[kept])
+
+    @pytest.mark.parametrize("rows", [1, 5, 20])
+    def test_so_are_rows_of_zeros_of_all_joints(self, rows: int) -> None:
+        recording = moving()
+        position = recording.position.copy()
+        position[700 : 700 + rows] = 0.0
+        sound, faults = without_faulty_rows(replace(recording, position=position))
+        assert {fault.kind for fault in faults} == {RowFaultKind.DISPLACED}
+        assert {fault.rows for fault in faults} == {rows}
+        kept = np.delete(np.arange(COUNT), np.arange(700, 700 + rows))
+        np.testing.assert_array_equal(sound.time, recording.time[kept])
+
+    def test_several_of_a_joint_are_one_fault(self) -> None:
+        recording = moving()
+        position = recording.position.copy()
+        for first in (500, 900, 1300):
+            position[first : first + 4, 2] += 0.2
+        (fault,) = without_faulty_rows(replace(recording, position=position))[1]
+        assert fault.rows == 12
+        assert fault.joints == ("c",)
+
+    def test_most_of_a_recording_is_not_left_out(self) -> None:
+        recording = moving()
+        position = recording.position.copy()
+        position[400:1600, 1] += 0.4
+        assert without_faulty_rows(replace(recording, position=position))[1] == ()
 
 
 class TestTwoMotions:

@@ -25,6 +25,7 @@ from identification.model.mass_matrix import mass_matrices
 from identification.model.robot import RobotModel
 from identification.selection.folds import FOLDS
 from identification.signals.masks import EDGE, SATURATED, STANDSTILL, RowMask
+from identification.signals.position_steps import position_jumps, position_steps
 from identification.signals.recording import Recording
 from identification.signals.samples import Preprocessing, prepare
 from identification.validation.calibration import TorqueMeans, calibrate, inner_errors
@@ -35,7 +36,6 @@ from identification.validation.finding_messages import consistency_words
 from identification.validation.nominal_friction import with_fitted_friction
 from identification.validation.nominal_scale import nominal_scale
 from identification.validation.physical_signs import Implausible, implausibilities
-from identification.validation.position_jumps import position_jumps, position_steps
 from identification.validation.prediction import (
     PredictionError,
     noise_floor,

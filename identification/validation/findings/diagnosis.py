@@ -10,7 +10,7 @@ from identification.distributions import SIGNIFICANT_SIGMAS
 from identification.hypotheses.diagnosis import RigidTorque, TorqueDiagnosis
 from identification.hypotheses.search import Step
 from identification.validation.evidence import Evidence
-from identification.validation.finding import Finding, Thresholds, Value
+from identification.validation.finding import Finding, RemedyKey, Thresholds, Value
 
 _MAX_SCALE_RATIO: Final = 3.0  # of the torque to that of the masses; descriptions in use are closer
 
@@ -20,7 +20,7 @@ def is_other(evidence: Evidence) -> bool:
     found = evidence.diagnosis
     if found is None:
         return False
-    zeros = any(step.sure for step in found.zeros)
+    zeros = any(step.sure for step in found.zeros) or found.has_clear_zeros
     return found.is_otherwise or found.is_backwards or zeros
 
 
@@ -85,13 +85,15 @@ def _zeros(found: TorqueDiagnosis) -> Finding | None:
     offsets = np.zeros(len(found.rigid.over_friction))
     for step in steps:
         offsets[list(step.change.joints)] += step.change.size
-    certain = all(step.sure for step in steps)
     values: dict[str, Value] = {
         "error": _ratio(steps[0]),
         "offsets": tuple((offsets + 0.0).tolist()),
     }
-    if certain:
+    if all(step.sure for step in steps):
         finding = Finding("zeros", "wrong", "correct the zeros", "cause", values)
+    elif found.has_clear_zeros:
+        remedy: RemedyKey = "correct the zeros if so"
+        finding = Finding("zeros, not all certain", "wrong", remedy, "cause", values)
     else:
         finding = Finding("zeros, nearest", "doubtful", "compare a posture")
     return finding.about(offsets != 0.0, degrees=np.degrees(offsets))

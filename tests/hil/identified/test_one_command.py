@@ -29,7 +29,7 @@ from hil.importers.proposed_map import proposed_map
 from hil.importers.recording_import import ImportOptions, import_recording
 from hil.importers.rosbag2 import import_rosbag2
 from hil.pipeline.sources import cell_of
-from identification.validation.position_jumps import position_jumps
+from identification.signals.position_steps import position_jumps
 from tests.hil.identified.command import hil
 from tests.hil.importers.bag_messages import WHOLE, message
 from tests.hil.importers.bags import DEFINITION, STATE, bag, mcap, state

@@ -2,7 +2,8 @@
 
 They depart from the steps beside them, and later steps do not reverse them. Departures common to
 the other joints are errors of the clock and are subtracted first. Samples that the log repeats, or
-has late, are recognised by their place on the path of the motion.
+has late, are recognised by their place on the path of the motion. Steps whose sum is zero enclose
+an excursion: rows in which the joint was not where they say, before and after which it was.
 """
 
 from __future__ import annotations
@@ -17,8 +18,10 @@ from numpy.typing import NDArray
 from identification.arrays import Array
 from identification.distributions import MAD_TO_STD
 from identification.signals.recording import GAP_STEPS, Recording
-from identification.signals.row_faults import MAX_ACCELERATION
 
+# Acceleration within one step of the clock; robots reach a fifth of it.
+MAX_ACCELERATION: Final = 150.0
+"""rad/s² or m/s²"""
 _ROWS_AT_ONCE: Final = 50_000  # that are searched for steps
 _JUMP_SIGMAS: Final = 15.0  # robust standard deviations of a jump
 # The same relative to the frequent large departures (starts, stops, reversals).
@@ -54,6 +57,15 @@ class PositionSteps(NamedTuple):
     logged: tuple[PositionJump, ...]  # of the log: samples repeated or late, rows missing
 
 
+class Excursion(NamedTuple):
+    """Rows in which a joint was not where they say."""
+
+    joint: int
+    start: int
+    stop: int
+    size: float  # of the step into them [rad or m]
+
+
 def position_jumps(recording: Recording, name: str = "the recording") -> list[PositionJump]:
     """Return lasting steps of the measured positions of a named recording, by joint and time."""
     return list(position_steps(recording, name).jumps)
@@ -63,9 +75,7 @@ def position_steps(recording: Recording, name: str = "the recording") -> Positio
     """Return lasting steps of the positions of a named recording that its log did not make."""
     jumps: list[PositionJump] = []
     logged: list[PositionJump] = []
-    rounded = _ROUNDING_RESOLUTIONS * np.array(
-        [_resolution(column) for column in recording.position.T]
-    )
+    rounded = _rounding(recording)
     for parts in _pieces(recording):
         steps = _steps_of(recording, parts, name, rounded)
         jumps += steps.jumps
@@ -90,52 +100,75 @@ def _pieces(recording: Recording) -> Iterator[list[slice]]:
         yield parts
 
 
+@dataclass(frozen=True, eq=False)
+class _Departures:
+    """Steps within stretches of a recording, and how they depart from the steps beside them."""
+
+    after: NDArray[np.intp]  # row after each step (k,)
+    size: Array  # without the motion and errors of the clock (k, n)
+    least: Array  # that neither noise nor rounding make (k, n)
+    motion: Array  # usual step of the motion (k, n)
+    suspect: NDArray[np.bool_]  # (k, n)
+    by_whole_steps: NDArray[np.bool_]  # of the motion (k, n)
+    moving: NDArray[np.bool_]  # (k, n)
+
+    @classmethod
+    def of(cls, recording: Recording, parts: Sequence[slice], rounded: Array) -> _Departures:
+        """Compare the steps of stretches; rounding moves those of each joint by (n,)."""
+        time = recording.time
+        position = recording.position
+        pieces = [_departures(time[part], position[part]) for part in parts]
+        departure, speed, change = map(np.concatenate, zip(*pieces, strict=True))
+        steps = np.concatenate([np.diff(time[part]) for part in parts])[:, None]
+        after = np.concatenate([np.arange(part.start + 1, part.stop) for part in parts])
+        departure, shown = _without_clock(departure, speed, steps)
+        distance = np.abs(departure)
+        spread = MAD_TO_STD * np.median(distance, axis=0)
+        usual = (
+            np.partition(distance, -_USUAL_DEPARTURES, axis=0)[-_USUAL_DEPARTURES]
+            if len(distance) > 10 * _USUAL_DEPARTURES
+            else 0.0
+        )
+        least = np.maximum(
+            np.maximum(_JUMP_SIGMAS * spread, _USUAL_DEPARTURE_FACTOR * usual),
+            MAX_ACCELERATION * steps**2,
+        )
+        least = np.maximum(least, rounded)
+        # Missing or repeated rows cause departures by whole steps of the motion, also at a gap.
+        motion = speed * np.median(steps)
+        count = np.clip(
+            np.rint(departure / np.where(motion == 0.0, np.inf, motion)), -1.0, GAP_STEPS
+        )
+        apart = np.abs(departure - count * motion)
+        whole = apart < np.maximum(least, _WHOLE_STEP_TOLERANCE * np.abs(motion))
+        suspect = (distance - 0.5 * change > least) & (shown | ~whole)
+        by_whole_steps = (count != 0.0) & (apart < _WHOLE_STEP_TOLERANCE * np.abs(motion))
+        moving = np.abs(motion) > _MOVING_RATIO * spread
+        return cls(after, departure, least, motion, suspect, by_whole_steps, moving)
+
+
 def _steps_of(
     recording: Recording, parts: Sequence[slice], name: str, rounded: Array
 ) -> PositionSteps:
     """Return the lasting steps within stretches of a recording, larger than by rounding (n,)."""
     time = recording.time
     position = recording.position
-    pieces = [_departures(time[part], position[part]) for part in parts]
-    departure, speed, change = map(np.concatenate, zip(*pieces, strict=True))
-    steps = np.concatenate([np.diff(time[part]) for part in parts])[:, None]
-    after = np.concatenate([np.arange(part.start + 1, part.stop) for part in parts])
-    departure, shown = _without_clock(departure, speed, steps)
-    distance = np.abs(departure)
-    spread = MAD_TO_STD * np.median(distance, axis=0)
-    usual = (
-        np.partition(distance, -_USUAL_DEPARTURES, axis=0)[-_USUAL_DEPARTURES]
-        if len(distance) > 10 * _USUAL_DEPARTURES
-        else 0.0
-    )
-    least = np.maximum(
-        np.maximum(_JUMP_SIGMAS * spread, _USUAL_DEPARTURE_FACTOR * usual),
-        MAX_ACCELERATION * steps**2,
-    )
-    least = np.maximum(least, rounded)
-    # Missing or repeated rows cause departures by whole steps of the motion, also beside a gap.
-    motion_step = speed * np.median(steps)
-    count = np.clip(
-        np.rint(departure / np.where(motion_step == 0.0, np.inf, motion_step)), -1.0, GAP_STEPS
-    )
-    apart = np.abs(departure - count * motion_step)
-    whole = apart < np.maximum(least, _WHOLE_STEP_TOLERANCE * np.abs(motion_step))
-    suspect = (distance - 0.5 * change > least) & (shown | ~whole)
-    lasting = np.zeros_like(suspect)
-    for joint, k in np.argwhere(suspect.T):
-        around = departure[max(0, k - _NEIGHBOUR_STEPS) : k + _NEIGHBOUR_STEPS + 1, joint]
+    found = _Departures.of(recording, parts, rounded)
+    distance = np.abs(found.size)
+    lasting = np.zeros_like(found.suspect)
+    for joint, k in np.argwhere(found.suspect.T):
+        around = found.size[max(0, k - _NEIGHBOUR_STEPS) : k + _NEIGHBOUR_STEPS + 1, joint]
         # Otherwise the steps beside it reverse it.
         lasting[k, joint] = np.abs(around.sum()) > 0.5 * distance[k, joint]
-    by_whole_steps = (count != 0.0) & (apart < _WHOLE_STEP_TOLERANCE * np.abs(motion_step))
+    by_whole_steps = found.by_whole_steps
     often = np.count_nonzero(lasting & by_whole_steps) >= _MIN_REPEATED_DEPARTURES
-    moving = np.abs(motion_step) > _MOVING_RATIO * spread
-    together = np.count_nonzero(_nearby(lasting) & moving, axis=1)
-    every = (together >= 2) & (together > 0.5 * np.count_nonzero(moving, axis=1))
+    together = np.count_nonzero(_nearby(lasting) & found.moving, axis=1)
+    every = (together >= 2) & (together > 0.5 * np.count_nonzero(found.moving, axis=1))
     jumps: list[PositionJump] = []
     logged: list[PositionJump] = []
     for joint, k in np.argwhere(lasting.T):
-        row = int(after[k])
-        jump = float(departure[k, joint])
+        row = int(found.after[k])
+        jump = float(found.size[k, joint])
         position_jump = PositionJump(
             name, recording.joint_names[joint], float(time[row] - time[0]), jump
         )
@@ -144,6 +177,74 @@ def _steps_of(
         by_log |= _on_path(time, position[:, joint], row, tolerance)
         (logged if by_log else jumps).append(position_jump)
     return PositionSteps(tuple(jumps), tuple(logged))
+
+
+def excursions(recording: Recording) -> list[Excursion]:
+    """Return rows in which single joints were not where they say, by joint and row.
+
+    The steps into and out of them add up to less than what is a step, or the motion goes on after
+    them as before.
+    """
+    rounded = _rounding(recording)
+    found: list[Excursion] = []
+    for parts in _pieces(recording):
+        departures = _Departures.of(recording, parts, rounded)
+        for joint in np.flatnonzero(departures.suspect.any(axis=0)).tolist():
+            found += _excursions_of(recording, departures, joint, float(rounded[joint]))
+    return found
+
+
+def _excursions_of(
+    recording: Recording, departures: _Departures, joint: int, rounded: float
+) -> Iterator[Excursion]:
+    """Yield the excursions of a joint: the fewest steps in a row after which it goes on."""
+    position = recording.position[:, joint]
+    steps: list[_Step] = []  # into an excursion, or lasting
+    for k in np.flatnonzero(departures.suspect[:, joint]).tolist():
+        row = int(departures.after[k])
+        size = float(departures.size[k, joint])
+        tolerance = _PATH_TOLERANCE_SHARE * abs(size) + rounded
+        if _on_path(recording.time, position, row, tolerance):
+            continue
+        steps.append(_Step(row, size, float(departures.least[k, joint])))
+        for first in range(len(steps) - 2, -1, -1):
+            total = sum(step.size for step in steps[first:])
+            returns = abs(total) < steps[first].least + steps[-1].least
+            if returns or _continues(recording.time, position, steps[first], steps[-1]):
+                into = steps[first].row
+                yield Excursion(joint, into, row, float(position[into] - position[into - 1]))
+                del steps[first:]
+                break
+
+
+def _continues(time: Array, position: Array, into: _Step, out: _Step) -> bool:
+    """Return whether positions (m,) after a step go on where those before another one led to.
+
+    Between them they need not follow the motion, as zeros do not.
+    """
+    start, stop = into.row - 1, out.row
+    first, last = max(start - _NEIGHBOUR_STEPS, 0), min(stop + _NEIGHBOUR_STEPS, len(time) - 1)
+    if first == start or last == stop or into.size * out.size > 0.0:
+        return False
+    before = (position[start] - position[first]) / (time[start] - time[first])
+    after = (position[last] - position[stop]) / (time[last] - time[stop])
+    passed = time[stop] - time[start]
+    expected = position[start] + 0.5 * (before + after) * passed
+    doubt = abs(position[stop] - expected) + 0.5 * abs(after - before) * passed
+    return bool(doubt < _PATH_TOLERANCE_SHARE * min(abs(into.size), abs(out.size)))
+
+
+class _Step(NamedTuple):
+    """A step of a position."""
+
+    row: int  # after it
+    size: float
+    least: float  # that is one
+
+
+def _rounding(recording: Recording) -> Array:
+    """Return by how much rounding may move a step of each joint (n,)."""
+    return _ROUNDING_RESOLUTIONS * np.array([_resolution(each) for each in recording.position.T])
 
 
 def _nearby(marked: NDArray[np.bool_]) -> NDArray[np.bool_]:
