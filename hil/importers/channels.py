@@ -182,9 +182,9 @@ def _of_folder(folder: Path, form: Format | None, files: LogFiles) -> Iterator[C
 
 
 def _of_table(table: TextTable) -> Iterator[Channel]:
-    names = table.names or tuple(map(str, range(table.width)))
+    names = (table.names or tuple(map(str, range(table.width))))[: table.width]
     rate = None
-    kinds = [kind_of(name, table.unit(place)) for place, name in enumerate(names[: table.width])]
+    kinds = [kind_of(name, table.unit(place)) for place, name in enumerate(names)]
     first = table.dialect.cells(table.lines[0])
     texts = table.texts
     if names[0] == "" and all(kind != "time" for kind, _ in kinds) and is_date(first[0]):
@@ -195,7 +195,7 @@ def _of_table(table: TextTable) -> Iterator[Channel]:
     for place, (kind, _) in enumerate(kinds):
         if kind == "time" and rate is None:
             rate = _rate(table, place)
-    for place, name in enumerate(names[: table.width]):
+    for place, name in enumerate(names):
         kind, number = kinds[place]
         beginning = first[place] if place < len(first) else ""
         yield Channel(

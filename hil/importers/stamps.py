@@ -177,6 +177,8 @@ def check_clock(stamp: Stamps, path: Path, remedy: str | None = None) -> None:
             f"({backward.size} such steps)"
         )
         cut = "cut the recording where its clock runs backwards"
+        if backward.size == len(steps):
+            cut = "write the rows in the order of their times"
         other = remedy or "choose another time column"
         raise SourceError(path, problem, field="time", remedy=f"{cut}, or {other}")
     if steps.size and not steps.any():

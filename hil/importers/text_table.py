@@ -12,6 +12,7 @@ from decimal import Decimal
 from functools import cached_property
 from itertools import count
 from pathlib import Path
+from textwrap import shorten
 from typing import TYPE_CHECKING, Any, Final, NamedTuple
 
 import numpy as np
@@ -44,6 +45,8 @@ if TYPE_CHECKING:
 
 _EMPTY: Final = "record again, or give the file that has the samples"
 _PROBE_LINES: Final = 100  # lines
+_MAX_NAMES_SHOWN: Final = 300  # characters
+_MAX_CELL_SHOWN: Final = 30  # characters
 _MAX_TIME_DIGITS: Final = 30  # digits before the point, more than of nanoseconds since 1970
 _QUOTES: Final = "\"'"
 _BRACKETS: Final = "[]() "
@@ -105,6 +108,9 @@ class TextTable:
         if FORTRAN.search(rows[0][1]):
             rows = [(number, FORTRAN.sub("e", line)) for number, line in rows]
         width = _width(names, dialect.cells(rows[0][1]), path)
+        beginning = rows[:_PROBE_LINES]
+        if any(names[width:]) and all(len(dialect.cells(line)) <= width for _, line in beginning):
+            raise _unlike(names, width, path)
         if not names and form.header is None and comments:
             commented = dialect.cells(comments[-1].lstrip().lstrip("#%/"))
             names = tuple(commented) if len(commented) == width > 1 else ()
@@ -282,8 +288,7 @@ class TextTable:
             unread = [row for row, time in enumerate(times) if time is None]
         if unread and not self.gaps:
             text = texts[unread[0]]
-            shown = repr(text) if text else "nothing"
-            problem = f"line {numbers[unread[0]]} has {shown} for the time"
+            problem = f"line {numbers[unread[0]]} has {_shown(text)} for the time"
             raise SourceError(self.path, problem, field="time", remedy=self._remedy(text))
         return times
 
@@ -378,8 +383,9 @@ class TextTable:
             return values
         row = int(invalid[0])
         name = self.names[index] if index < len(self.names) else str(index)
-        shown = repr(texts[row]) if texts[row] else "nothing"
-        problem = f"line {self.numbered[row]} has {shown} in column {name}, not a number"
+        problem = (
+            f"line {self.numbered[row]} has {_shown(texts[row])} in column {name}, not a number"
+        )
         remedy = self._remedy(texts[row])
         raise SourceError(self.path, problem, field=field, remedy=remedy)
 
@@ -498,13 +504,25 @@ def _width(names: Sequence[str], first: Sequence[str], path: Path) -> int:
     if len(names) < width > 1 and not first[-1]:
         width -= 1  # each line ends with a delimiter
     if names and len(names) < width:
-        raise SourceError(
-            path,
-            f"has {len(names)} names ({', '.join(names)}) above rows of {width} numbers",
-            remedy="name every column in the header, or count columns from 0: [format] header = "
-            "false and skip_rows",
-        )
+        raise _unlike(names, width, path)
     return width
+
+
+def _unlike(names: Sequence[str], width: int, path: Path) -> SourceError:
+    listed = shorten(", ".join(names), _MAX_NAMES_SHOWN, placeholder=", ...")
+    remedy = "name every column in the header, or count columns from 0: [format] header = false and skip_rows"
+    if all(name.lstrip("-").isdecimal() for name in names):
+        remedy = "write numbers with points, or with commas and semicolons between the columns"
+    problem = f"has {len(names)} names ({listed}) above rows of {width} numbers"
+    return SourceError(path, problem, remedy=remedy)
+
+
+def _shown(cell: str) -> str:
+    """Return a cell for a message, the beginning of a long one."""
+    if not cell:
+        return "nothing"
+    is_long = len(cell) > _MAX_CELL_SHOWN
+    return repr(cell[:_MAX_CELL_SHOWN]) + (" ..." if is_long else "")
 
 
 def _transposed(

@@ -133,6 +133,16 @@ class TestDisplacedRows:
         position[400:1600, 1] += 0.4
         assert without_faulty_rows(replace(recording, position=position))[1] == ()
 
+    def test_stamps_that_repeat_are_no_obstacle(self) -> None:
+        recording = moving()
+        position = recording.position.copy()
+        position[700:760, 1] += 0.3
+        stamps = np.floor(recording.time * 50.0) / 50.0
+        with np.errstate(all="raise"):
+            (fault,) = without_faulty_rows(replace(recording, time=stamps, position=position))[1]
+        assert fault.kind is RowFaultKind.DISPLACED
+        assert fault.rows == 60
+
 
 class TestTwoMotions:
     def test_the_jump_between_them_separates_them(self) -> None:

@@ -84,6 +84,28 @@ def with_one_name_twice(path: Path, table: Table) -> Path:
     return path
 
 
+def with_a_name_too_many(path: Path, table: Table) -> Path:
+    text = csv(path, table).read_text()
+    path.write_text(text.replace("tau3", "tau3,note", 1))
+    return path
+
+
+def with_commas_between_commas(path: Path, table: Table) -> Path:
+    names, *rows = csv(path, table).read_text().splitlines()
+    path.write_text("\n".join([names, *(row.replace(".", ",") for row in rows)]) + "\n")
+    return path
+
+
+def with_zeros_of_a_lost_block(path: Path, table: Table) -> Path:
+    text = csv(path, table).read_bytes()
+    path.write_bytes(text[:20_000] + bytes(4096) + text[24_096:])
+    return path
+
+
+def from_last_to_first(path: Path, table: Table) -> Path:
+    return csv(path, {name: values[::-1] for name, values in table.items()})
+
+
 def with_a_word(path: Path, table: Table) -> Path:
     lines = csv(path, table).read_text().splitlines()
     cells = lines[300].split(",")
@@ -141,6 +163,10 @@ CASES: list[tuple[Callable[[Path, Table], Path], str, str]] = [
     (with_text, "line 301 has nothing in column q1", "--drop-missing"),
     (with_a_word, "line 301 has 'stopped' in column q2", "--drop-missing"),
     (with_one_name_twice, "2 columns have the name 'tau1'", "from 0 in the map: 7 or 8"),
+    (with_a_name_too_many, "has 11 names", "name every column in the header"),
+    (with_commas_between_commas, "above rows of", "semicolons between the columns"),
+    (with_zeros_of_a_lost_block, "\\x00' ... in column", "correct it"),
+    (from_last_to_first, "older than the previous one", "in the order of their times"),
     (with_two_clocks, "stamp and t are all named as time", "--columns 'time=t'"),
     (of_another_motion, "its torque does not follow the arm of the URDF", "give the URDF of this"),
     (a_urdf, "is a robot description (URDF), not a recording", "LOG --urdf arm.urdf"),
@@ -193,6 +219,13 @@ def test_it_is_refused_in_one_sentence(
     assert "/hil-" not in message  # no temporary file, which nobody finds
     assert result.exception.exit_code == 2
     assert [*tmp_path.iterdir()] == [source]
+
+
+def test_a_header_that_ends_in_a_comma_is_read(tmp_path: Path, urdf: Path, table: Table) -> None:
+    source = csv(tmp_path / "log.csv", table)
+    source.write_text(source.read_text().replace("\n", ",\n", 1))
+    result = typed("import", "log", source, "--urdf", urdf, "-o", tmp_path / "log.mcap")
+    assert result.exit_code == 0, result.exception
 
 
 @pytest.mark.parametrize("write", [with_text, with_a_word])
