@@ -509,11 +509,14 @@ def _width(names: Sequence[str], first: Sequence[str], path: Path) -> int:
 
 
 def _unlike(names: Sequence[str], width: int, path: Path) -> SourceError:
-    listed = shorten(", ".join(names), _MAX_NAMES_SHOWN, placeholder=", ...")
-    remedy = "name every column in the header, or count columns from 0: [format] header = false and skip_rows"
+    shown = shorten(", ".join(names), _MAX_NAMES_SHOWN, placeholder=", ...")
+    remedy = (
+        "name every column in the header, or count columns from 0: [format] header = false and"
+        " skip_rows"
+    )
     if all(name.lstrip("-").isdecimal() for name in names):
         remedy = "write numbers with points, or with commas and semicolons between the columns"
-    problem = f"has {len(names)} names ({listed}) above rows of {width} numbers"
+    problem = f"has {len(names)} names ({shown}) above rows of {width} numbers"
     return SourceError(path, problem, remedy=remedy)
 
 
