@@ -14,6 +14,7 @@ from hil.base.arrays import Array
 from hil.base.errors import SourceError
 from hil.importers.conclusions import ClockRestarted, CounterContinued, Sample, SortedSamples
 from hil.importers.units import TIMES
+from identification.signals.recording import PAUSE_SECONDS
 from identification.text import number
 
 Stamps = NDArray[np.int64]
@@ -24,7 +25,8 @@ _MAX_TIME_NS: Final = 10**40  # ns; more is no time in any unit
 _MIN_PLAUSIBLE_RATE: Final = 10.0  # Hz; 5 kHz in ms, read as s, are 5 Hz
 _MAX_WRAP_STEPS: Final = 10  # median steps that a counter may pass where it wraps
 _MIN_PART_NS: Final = 10**9  # ns of a motion that was recorded after another one
-PAUSE_NS: Final = 10**9  # ns between them
+# ns between them, beyond the pauses in which rows of one motion may be late
+PAUSE_NS: Final = round(1.1e9 * PAUSE_SECONDS)
 _MIN_ROWS: Final = 20  # rows
 _MAX_SWAPPED_SHARE: Final = 0.02  # share of the samples of a recording that may have changed places
 _MIN_USUAL_STEP_SHARE: Final = 0.9  # of the steps of a clock are usual ones

@@ -62,6 +62,7 @@ from identification.estimators.prior import DETERMINED_STD_RATIO, body_prior, fi
 from identification.factor.factor import Factor
 from identification.hypotheses.changes import COUPLED, ORDERS, SIGNS, UNITS, Axes, Change, Meaning
 from identification.hypotheses.diagnosis import RigidTorque, TorqueDiagnosis, rigid_torque
+from identification.hypotheses.inertia_scale import shows_times
 from identification.hypotheses.scores import is_backwards
 from identification.hypotheses.search import EXPLAINED_ERROR, SEPARATE_SIGMAS, Readings, Step
 from identification.hypotheses.torque_low_pass import TorqueLowPass
@@ -223,6 +224,12 @@ class TorqueFindings:
         readings = self.readings
         return is_backwards(readings.model, readings.samples, readings.score)
 
+    @property
+    def _shows_times(self) -> bool:
+        """Whether the torque tells the times from others."""
+        readings = self.readings
+        return shows_times(readings.model, readings.samples, readings.score)
+
     def rows(self, groups: Sequence[ParameterGroup] = ()) -> list[Row]:
         """Return the rows of the table; `groups` are the parameters that are determined."""
         rows = [
@@ -245,6 +252,10 @@ class TorqueFindings:
             rows.insert(0, row)
         if self.torque.time is not None:
             rows.insert(0, _other_times(self.torque.time))
+        elif not self._shows_times:
+            little = (Basis.LITTLE_INERTIA,)
+            step = Decide.STATE_RATE
+            rows.insert(0, Row("time", Fact.TIMES_UNSEEN, Certainty.UNDETERMINED, little, step))
         if self.rigid.is_nothing or self.torque.is_rate:
             rest = [row for row in rows if row.aspect != "side"]
             bodies, basis = _RATE, Basis.RATE

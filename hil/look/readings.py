@@ -34,6 +34,7 @@ class Fact(Enum):
     CONTINUOUS = auto()
     WITHIN_LIMITS = auto()
     COMMANDED = auto()
+    TIMES_UNSEEN = auto()
     BACKWARDS = auto()  #: the rows run backwards in time
     MEASURED = auto()
     SLOPE = auto()  #: the velocity is that of the position
@@ -280,6 +281,7 @@ class Basis(Enum):
     FREE_PARAMETERS = auto()
     NO_BODIES = auto()
     NO_GRAVITY = auto()
+    LITTLE_INERTIA = auto()
     RATE = auto()
     INTEGRAL = auto()  #: of the torque follows the arm
     INERTIA = auto()  #: is that for other times, with the weight of the URDF

@@ -27,6 +27,7 @@ from identification.model.nominal_masses import without_masses
 from identification.model.robot import RobotModel
 from identification.signals.samples import Samples
 
+_OTHER_TIMES: Final = (0.5, 2.0)  # recorded times over true ones
 _TRIED: Final = (0.25, 0.5, 0.8, 1.25, 2.0, 4.0)
 _FURTHER: Final = 2.0  # factor to the next, where the last is the best
 _MOST: Final = 200.0  # times of a rate that is off by 14
@@ -107,6 +108,26 @@ def find_inertia_scale(
     if against.ratio > least:
         return None
     return InertiaScale(best, error, score.overall, against, _weight(model, samples, best))
+
+
+def shows_times(model: RobotModel, samples: Samples, score: Score) -> bool:
+    """Return whether a torque tells times from times that are twice or half as long.
+
+    It does not where friction hides the inertia, or the motion is slow. Without gravity nothing
+    but the masses of the description does.
+
+    Args:
+        model: of the arm.
+        samples: of a recording, as read.
+        score: of these.
+    """
+    if not np.any(model.gravity):
+        return False
+    for time in _OTHER_TIMES:
+        lighter = _lighter(model, time**2)
+        if compare(score_of(lighter, samples), score, lighter).sigmas < SEPARATE_SIGMAS:
+            return False
+    return True
 
 
 def retimed(model: RobotModel, samples: Samples, factor: float) -> Samples:

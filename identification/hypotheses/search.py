@@ -91,9 +91,11 @@ _MIN_ZERO_SEPARATION: Final = 60.0 * DEGREE  # between two zeros that are not on
 _FAR_ZERO_STARTS: Final = 2  # zeros far from what is stated at which a fit starts
 _NEEDED_SIGMAS: Final = 2.0  # standard errors of one of several zeros and scales that its fit needs
 _ADEQUATE_ERROR_RATIO: Final = 1.2  # error ratio to a free fit, of a reading that explains the rows
-# the same of each joint: a mean hides one that is not explained
+# The same of each joint, as a mean hides one that is not explained: of four joints that share one
+# error the mean reaches 1.2 where that of one alone is 2.
 _ADEQUATE_JOINT_ERROR_RATIO: Final = 2.0
-# zeros beyond it are of no assembly: a sign and a near one look alike
+# A joint turned by more than a right angle is nearer to its reverse, so that its sign and a nearer
+# zero may look alike.
 _FAR_ZERO: Final = 90.0 * DEGREE
 # signs of least error with zeros and scales beside them, which are compared
 _COMPARED_SIGNS: Final = 3

@@ -112,6 +112,20 @@ def test_two_torques_without_their_sign_are_found_at_once(joints: tuple[int, ...
     assert all(step.sure for step in readings.steps)
 
 
+@pytest.mark.long
+@pytest.mark.parametrize(("joint", "angle"), [(0, 2.2), (1, 2.0), (1, -2.5)])
+def test_a_sign_that_adds_nothing_to_a_zero_is_not_named(joint: int, angle: float) -> None:
+    """A zero beyond a right angle is asked whether a sign and a nearer zero explain it as well."""
+    q, torque, _ = motion()
+    recording = Recording(TIME, q - angle * (np.arange(3) == joint), NAMES, torque)
+    samples = prepare(recording, model(), options=Preprocessing(14.0, exclude_rows="rests"))
+    (step,) = find_readings(model(), samples).steps
+    assert step.is_far
+    assert step.sure
+    assert (step.change.meaning, step.change.joints) == ("zero", (joint,))
+    assert step.change.size == pytest.approx(angle, abs=0.05)
+
+
 def test_one_joint_whose_friction_alone_speaks_is_not_sure() -> None:
     """A lag of the torque looks like friction that drives the joint."""
     step = Step(Change("torque sign", (1,)), error=0.05, before=0.05, ratio=1.0, sigmas=0.0)
