@@ -25,8 +25,10 @@ _MAX_TIME_NS: Final = 10**40  # ns; more is no time in any unit
 _MIN_PLAUSIBLE_RATE: Final = 10.0  # Hz; 5 kHz in ms, read as s, are 5 Hz
 _MAX_WRAP_STEPS: Final = 10  # median steps that a counter may pass where it wraps
 _MIN_PART_NS: Final = 10**9  # ns of a motion that was recorded after another one
-# ns between them, beyond the pauses in which rows of one motion may be late
-PAUSE_NS: Final = round(1.1e9 * PAUSE_SECONDS)
+PAUSE_NS: Final = 10**9
+"""Pause that separates two motions [ns]."""
+# ns between motions whose clock began again, in which rows of one motion are not late
+_RESTART_NS: Final = round(1.1e9 * PAUSE_SECONDS)
 _MIN_ROWS: Final = 20  # rows
 _MAX_SWAPPED_SHARE: Final = 0.02  # share of the samples of a recording that may have changed places
 _MIN_USUAL_STEP_SHARE: Final = 0.9  # of the steps of a clock are usual ones
@@ -141,7 +143,7 @@ def without_restarts(stamp: Stamps) -> Restarted:
         return Restarted(stamp, None)
     joined = [parts[0]]
     for part in parts[1:]:
-        joined.append(part - part[0] + joined[-1][-1] + PAUSE_NS)
+        joined.append(part - part[0] + joined[-1][-1] + _RESTART_NS)
     return Restarted(np.concatenate(joined), ClockRestarted(len(parts)))
 
 

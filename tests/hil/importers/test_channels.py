@@ -9,7 +9,9 @@ import pytest
 
 from hil.importers.channels import channels_of, kind_of
 from hil.importers.column_map import ColumnMap, ready_maps
+from hil.importers.stamps import without_restarts
 from hil.importers.units import unit_of
+from identification.signals.recording import PAUSE_SECONDS
 from tests.hil.importers.bag_messages import WHOLE
 from tests.hil.importers.bags import DEFINITION, STATE, bag, drives, mcap
 from tests.hil.importers.moving_log import COUNT, JOINTS, NAMES, POSITION, RATE, TIME, rows, text
@@ -80,3 +82,13 @@ def test_joint_states_name_their_joints(tmp_path: Path, suffix: str) -> None:
 def test_other_messages_have_a_channel_for_each_field(tmp_path: Path) -> None:
     names = [channel.name for channel in channels_of(drives(tmp_path / "x.mcap"))]
     assert "/drives/drives/1/angle" in names
+
+
+def test_motions_of_a_clock_that_begins_again_are_no_late_rows() -> None:
+    """Rows of one motion are late for `PAUSE_SECONDS` at most."""
+    part = np.arange(500, dtype=np.int64) * 8_000_000
+    found = without_restarts(np.concatenate([part, part]))
+    assert found.restarted is not None
+    steps = np.diff(found.stamp)
+    assert np.count_nonzero(steps > 1e9 * PAUSE_SECONDS) == 1
+    assert np.median(steps) == 8_000_000
