@@ -111,8 +111,8 @@ def _displaced(recording: Recording, valid: Rows) -> list[Excursion]:
     if not recording.usual_step:
         return []
     if (np.diff(recording.time) <= 0.0).any():  # stamps that repeat are not the times of rows
-        rows = np.arange(recording.n_samples)
-        recording = replace(recording, time=rows * recording.usual_step)
+        even = recording.usual_step * np.arange(recording.n_samples, dtype=np.float64)
+        recording = replace(recording, time=np.asarray(even, dtype=np.float64))
     places = np.flatnonzero(valid)
     found = [
         each._replace(start=int(places[each.start]), stop=int(places[each.stop]))
