@@ -749,7 +749,7 @@ _COVER: Final = (
 _WARM_UP: Final = "warm the arm up by moving it before recording"
 _ALL_SIGNS: Final = "check the sign of the torque and the direction of each axis"
 _COUPLED: Final = (
-    "turn one joint alone and see which angles change; if so, state it in the column map of the"
+    "turn one joint alone and watch which angles change; if so, state it in the column map of the"
     " log: coupled = [[{numbers}, FACTOR]] in [position] and [velocity] (joints by their columns,"
     " from 1)"
 )
