@@ -207,7 +207,8 @@ FIRST_SET_POINT_FRACTION: Final = 0.1
 """Share of the following-error threshold allowed between target and arm at the first set-point,
 and later between the target and the set-points sent last."""
 SERVO_LAG_SECONDS: Final = 0.05
-"""Lag of the arm's velocity behind that of its set-points, s: position loops of robots have a gain
+"""Lag of the arm's velocity behind the set-points' velocity, s: position loops of robots have a
+gain
 of 20 to 50 /s."""
 
 # Rows of the matrix of checked quantities, in the order in which a violation is reported.

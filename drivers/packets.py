@@ -36,7 +36,7 @@ NO_SLOT: Final = 0xFF
 DRIVE_ON: Final = 5
 """Status byte of an arm whose drive is on, controller to PC."""
 EXIT_FROM_OPEN: Final = 1
-"""Status byte that asks for the end of open mode, PC to controller."""
+"""Status byte that requests the end of open mode, PC to controller."""
 
 _HEADER: Final = struct.Struct("<i4s4s")
 _NUMBER: Final = struct.Struct("<i")

@@ -65,7 +65,7 @@ class Input(IntEnum):
     REFUSAL = 10
     """The session refused a set-point."""
     EXIT = 11
-    """The session asked for the end of open mode."""
+    """The session requested the end of open mode."""
     SILENCE = 12
     """No packet before the deadline."""
 
@@ -76,7 +76,7 @@ HOLDABLE_MODES: Final = frozenset(mode for mode, d in MODE_FIELDS.items() if d[:
 INCREMENTAL_MODES: Final = OPEN_MODES - HOLDABLE_MODES
 """Open modes in which zero is the safe reply."""
 POSITION_MODES: Final = frozenset({Mode.POSITION, Mode.POSITION_RELATIVE})
-"""Open modes in which the PC generates the targets: those in which a motion can run."""
+"""Open modes in which the PC generates the targets, so that a motion can run."""
 CLOSED_MODES: Final = frozenset({Mode.CLOSED, Mode.CLOSED_MIRRORED})
 PAUSE_MODES: Final = frozenset({Mode.PAUSE_BY_PC, Mode.PAUSE_BY_CONTROLLER})
 KNOWN_MODES: Final = OPEN_MODES | CLOSED_MODES | PAUSE_MODES | {Mode.DRIVING_ON}

@@ -20,7 +20,7 @@ class ModelError(IdentificationError, ValueError):
 
 
 class ShapeError(IdentificationError, ValueError):
-    """An array that does not have the shape the model asks for.
+    """An array whose shape does not fit the model.
 
     Attributes:
         name: what the array is.

@@ -27,7 +27,7 @@ IDENTITY_TIMEOUT: Final = 2.0
 MODELS: Final[Mapping[int, str]] = {
     1: "UR5", 2: "UR10", 3: "UR3", 4: "UR16", 7: "UR20", 8: "UR30"
 }  # fmt: skip
-"""Names of arms by their type; those of the e-Series end in e, except UR20 and UR30."""
+"""Names of arms by their type; names of the e-Series end in e, except UR20 and UR30."""
 _WITHOUT_E: Final = (7, 8)
 _ROBOT_STATE_PACKAGE: Final = 16
 _KINEMATICS_PART: Final = 5

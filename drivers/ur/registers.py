@@ -27,7 +27,7 @@ STAGE_REGISTER: Final = FIRST_REGISTER + 1
 UNUSED_REGISTER: Final = FIRST_REGISTER + 2
 """Output: cycles without a new set-point since the program began."""
 TOKEN_REGISTER: Final = FIRST_REGISTER + 3
-"""Output: number of the program, which differs from that of any other."""
+"""Output: number of the program, different from any other program's."""
 ENDING_REGISTER: Final = FIRST_REGISTER + 4
 """Output: an `Ending`."""
 

@@ -114,7 +114,7 @@ _NUMBER_MODULUS: Final = 1 << 24
 """Numbers of set-points; with them the sum of a frame is exact to some 1e-9."""
 _STAMP_MODULUS: Final = 1 << 30
 _REMEMBERED_TARGETS: Final = 64
-"""Set-points that are compared with those that the controller states to have used."""
+"""Set-points that are compared with the ones the controller reports as used."""
 _TARGET_TOLERANCE: Final = 1e-9
 """Difference of two angles that are one [rad]."""
 _REMEDY: Final = (
@@ -510,7 +510,7 @@ class UrWire:
             raise ArmNotReadyError(difference, remedy, cycle)
 
     def _require_undisturbed(self, cycle: int) -> None:
-        """Require full speed, and that nobody moves the arm by hand."""
+        """Require full speed, and no freedrive."""
         if self._int("robot_status_bits") >> FREEDRIVE_BIT & 1:
             remedy = "release the freedrive button"
             raise ArmNotReadyError("a person moves the arm by hand (freedrive)", remedy, cycle)

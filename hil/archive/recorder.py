@@ -295,7 +295,7 @@ _EVENT_FIELDS: Final[Mapping[type, Sequence[str]]] = {
     OverrideChanged: ("fraction",),
     HoldChanged: ("held",),
 }
-"""Data of an event beside its cycle."""
+"""Data of an event in addition to its cycle."""
 _REFUSAL_DATA: Final = ("joint", "value", "bound", "unit")
 
 

@@ -195,7 +195,7 @@ OTHERS: Final[Mapping[str, str]] = {
     "motor_current": MOTOR_CURRENT,
     "commanded_position": COMMANDED_POSITION,
 }
-"""Topics of what an imported recording has beside joint states."""
+"""Topics of an imported recording in addition to joint states."""
 STATE_TOPICS: Final = (UR_STATE,)
 """Topics of what a controller sends in each cycle beyond `/hil/cycle`."""
 

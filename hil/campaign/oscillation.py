@@ -10,8 +10,8 @@ import numpy as np
 from hil.base.arrays import Array
 
 SMOOTHING_SECONDS: Final = 0.05
-"""Moving mean that is subtracted from the following error, s. It leaves what oscillates within it:
-slower parts are those of the motion."""
+"""Moving mean that is subtracted from the following error, s. Oscillations within it remain;
+slower parts belong to the motion."""
 BLOCK_LENGTHS: Final = (1, 4, 16)
 """Half-waves whose rms is compared: noise hides slow growth from one half-wave to the next."""
 MIN_GROWING_BLOCKS: Final = 8  # Fewest blocks of uninterrupted growth

@@ -31,7 +31,7 @@ from .twin import Twin
 MAX_PARAMETER_SIGMAS: Final = 4.0
 """Largest deviation of an estimate from the simulated value, in standard deviations."""
 MAX_ERROR_RATIO: Final = 1.2
-"""Largest error on unseen motion, as a multiple of that of the simulated parameters."""
+"""Largest error on unseen motion, as a multiple of the simulated parameters' error."""
 MAX_SPEED_SHARE: Final = 1.05
 """Largest measured speed, as a share of the limit that a plan keeps; the rest is control error."""
 SATURATION_SHARE: Final = 0.99  # Share of the current limit from which a motor is saturated

@@ -67,7 +67,7 @@ FORMER_OPTIONS: Final[Mapping[str, Mapping[str, str]]] = {
 """Options by their names in version 0.1: the present name in each command that has it."""
 
 FORMER_METHODS: Final[Mapping[str, str]] = {"balanced": "gradient", "front": "gradient"}
-"""Methods of `hil design` in version 0.1, and those that replaced them. Settings files that name
+"""Methods of `hil design` in version 0.1, and their replacements. Settings files that name
 them are refused by `hil.design.settings`, whose list is the same; it is slow to load."""
 
 _METHOD_OPTIONS: Final = ("--method", "--show-settings")  # of `hil design`

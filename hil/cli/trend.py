@@ -132,7 +132,7 @@ def _counts(result: FleetTrend) -> str:
 
 
 def _written(result: FleetTrend, output: Path | None, table: Path | None) -> list[Path]:
-    """Write the report and the table that were asked for; return their paths."""
+    """Write the requested report and table; return their paths."""
     written = []
     if output is not None:
         make_folder(output.parent)

@@ -35,7 +35,7 @@ def is_since_start(name: str) -> bool:
 
 
 def may_explain(name: str) -> bool:
-    """Return whether a column is a covariate without being asked for."""
+    """Return whether a column is a covariate without being requested."""
     return is_heat(name) or is_since_start(name)
 
 

@@ -1,4 +1,4 @@
-"""Positions of a log that are its commands, bit for bit: nobody measured them."""
+"""Positions of a log that equal its commands bit for bit: they were not measured."""
 
 from __future__ import annotations
 

@@ -295,7 +295,7 @@ def _calibrated(path: Path, joints: Sequence[str]) -> Array:
 
 
 def _require_like(path: Path, joint: str, calibrated: float, described: float) -> None:
-    """Raise SourceError if a calibrated range is by far another than that of the URDF [rad]."""
+    """Raise SourceError if a calibrated range differs by far from the URDF's [rad]."""
     least, most = _CALIBRATED
     if np.isfinite(described) and not least < calibrated / described < most:
         problem = f"calibrates {calibrated:.3g} rad, and the URDF has a range of {described:.3g}"

@@ -1,4 +1,4 @@
-"""A column map that nobody wrote: proposed from the names and units of a log's channels.
+"""A column map proposed from the names and units of a log's channels.
 
 The map goes through the ordinary import, which concludes units that nothing states and checks
 positions, velocities and torques against the URDF.

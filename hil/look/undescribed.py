@@ -1,4 +1,4 @@
-"""The robot of a recording whose arm nobody described: joints without lengths and masses."""
+"""The robot of a recording without a description of its arm: joints without lengths and masses."""
 
 from __future__ import annotations
 

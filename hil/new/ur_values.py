@@ -36,7 +36,7 @@ JOINT_NAMES: Final = (
 )
 """Of the URDF by the maker."""
 CONVENTION: Final = "of every arm of this maker"
-"""Origin of gears, signs and offsets: angles are those of the URDF, torques follow by the ratio."""
+"""Origin of gears, signs and offsets: angles as in the URDF, torques scaled by the ratio."""
 _LISTENING_SECONDS: Final = 1.0
 """Time for which outputs are read, s."""
 _COULOMB_SHARE: Final = 0.05

@@ -279,7 +279,7 @@ def _wrapped(sources: Sequence[Source]) -> Iterator[Finding]:
 
 
 def _added_friction(prepared: Prepared) -> tuple[str, ...]:
-    """Return the symbols of friction terms that inner prediction chose and nobody stated."""
+    """Return the symbols of friction terms chosen by inner prediction without being stated."""
     chosen = prepared.settings.friction
     if not any(choice.name == FRICTION_AT_SPEED for choice in prepared.settings.choices):
         return ()

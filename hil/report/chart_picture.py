@@ -66,7 +66,7 @@ def draw_charts(
 
 
 def draw_torque(axes: Axes, chart: Chart, legends: Sequence[Legend]) -> None:
-    """Draw the first plot of a chart into axes of somebody's own figure."""
+    """Draw the first plot of a chart into given axes."""
     plot = chart.plots[0]
     draw_plot(axes, plot, chart, _POINTS_PER_PIXEL)
     axes.set_title(chart.caption.title)

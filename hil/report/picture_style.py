@@ -21,7 +21,7 @@ LIMIT = "#b3261e"
 POSITION = "#0072b2"
 VELOCITY = "#00795a"
 ACCELERATION = "#b0530b"
-"""Colours of what only pictures have; charts have those of the pages, see :func:`colour`."""
+"""Colours that only pictures have; charts use the colours of the pages, see :func:`colour`."""
 SMALL_FONT_SIZE = 7.5
 FONT_SIZE = 9.0
 TITLE_FONT_SIZE = 12.0

@@ -37,7 +37,7 @@ _FORMATS: Final = (
 _STEERING: Final = re.compile(
     r"[\0-\x08\x0b-\x1f\x7f-\x9f\u061c\u200e\u200f\u202a-\u202e\u2066-\u2069]"
 )
-"""Control characters, and those that change the text direction (Unicode Annex 9)."""
+"""Control characters, and characters that change the text direction (Unicode Annex 9)."""
 
 
 def environment(*scripts: str) -> Environment:

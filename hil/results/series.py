@@ -22,7 +22,7 @@ from identification.validation.prediction import for_figure
 SERIES: Final = "report_series.npz"
 """File of the series in a folder of results."""
 _MAX_BYTES: Final = 1 << 30
-"""Most bytes of the series in a file, a hundred times those of a campaign of 30 repetitions."""
+"""Most bytes of the series in a file, a hundred times the size for a campaign of 30 repetitions."""
 _MAX_MAGNITUDE: Final = 1e100
 _MAX_ROWS: Final = 30_000
 """Most rows of the example that a file holds."""
@@ -205,7 +205,7 @@ def _step(samples: Samples) -> int:
 
 
 def _means(torque: Array, step: int) -> Array:
-    """Return means of torques (m, n) over `step` rows about those of :meth:`Samples.thinned`."""
+    """Return means of torques (m, n) over `step` rows about the rows of :meth:`Samples.thinned`."""
     if step == 1:
         return torque
     starts = np.arange(0, len(torque), step)

@@ -309,7 +309,7 @@ def _errors(series: ServoSeries, positions: Array, rows: NDArray[np.bool_]) -> l
 
 
 def _overall(errors: Sequence[float], series: ServoSeries) -> float:
-    """Return the root mean square of the errors of all joints but those that are stuck."""
+    """Return the root mean square of the errors of all joints that are not stuck."""
     moving = ~series.stuck if not series.stuck.all() else np.ones(len(errors), np.bool_)
     return float(np.sqrt(np.mean(np.square(errors)[moving])))
 

@@ -126,7 +126,7 @@ def _is_missed(prediction: ServoPrediction) -> bool:
 
 
 def _share(prediction: ServoPrediction) -> float:
-    """Return the error of the model over that of the command."""
+    """Return the ratio of the model's error to the command's."""
     own, command = _judged(prediction)
     return own / max(command, 1e-9)
 

@@ -28,7 +28,7 @@ from .settings import StudyFolder, StudySettings
 FLY_BY: Final = "fly-by"
 SINES: Final = "sines"
 MOTION_CLASSES: Final = (FLY_BY, SINES)
-"""Classes of held-out motions: that of method B, and that of method A."""
+"""Classes of held-out motions: as of method B, and as of method A."""
 _CAMPAIGN: Final = {
     "campaign.approach_speed": 1.0,
     "campaign.settle_s": 0.2,

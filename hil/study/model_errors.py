@@ -50,7 +50,7 @@ LOAD_FRICTION_SHARE: Final = 0.05
 LENGTH_ERROR: Final = 0.001  #: Relative error of each coordinate of a joint's origin, random sign
 TORQUE_CONSTANT_ERROR: Final = 0.03  #: Relative error of each torque constant, of random sign
 ERROR_SIZES: Final = (1, 2)
-"""Sizes of each error, times those above and in the cell file."""
+"""Sizes of each error, as multiples of the values above and in the cell file."""
 _SUBSTEPS: Final = 2  # of a cycle, for the oscillations of elastic gears
 _SIGN_STREAM: Final = 4  # first number of the random stream of signs and phases
 

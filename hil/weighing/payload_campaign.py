@@ -56,11 +56,11 @@ _NAME: Final = re.compile(r"[A-Za-z0-9][\w.-]{0,63}")
 Execute = Callable[[Campaign, Mapping[str, Any]], RunResult]
 """Runs a side with further arguments of `Campaign.run`."""
 Links = Callable[[Campaign, int], MotionLink | None]
-"""Returns the link of a side in a session of the controller, None for that of its cell."""
+"""Returns the link of a side in a session of the controller, None for the link of its cell."""
 
 
 class MountingError(UnsafeError):
-    """The payload has to be mounted or removed, and there is nobody to confirm it."""
+    """The payload has to be mounted or removed, with no operator to confirm it."""
 
 
 class PayloadMounting:

@@ -27,8 +27,8 @@ JOINT_ZERO_STD: Final = 0.03
 """Standard deviation of the error of an encoder's zero [rad, m]: marks that are aligned by eye, or
 a mechanical stop, are good to a degree or two."""
 FRICTION_DRIFT_STD: Final = 0.2
-"""Relative standard deviation of friction over the recording, of its slowest change: that of gears
-falls by some tens of per cent while they warm (Bittencourt and Gunnarsson 2012)."""
+"""Relative standard deviation of friction over the recording, of its slowest change: friction of
+gears falls by some tens of per cent while they warm (Bittencourt and Gunnarsson 2012)."""
 STATIC_FRICTION_STD: Final = 0.5
 """Standard deviation of static friction beyond that in motion, over the RMS of friction."""
 QUADRATIC_FRICTION_STD: Final = 0.3

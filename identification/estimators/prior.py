@@ -68,7 +68,7 @@ _NOISE_TOLERANCE: Final = 1e-3  # relative change of the noise
 # together are the torque of a light wrist, and a fifth of that of a heavy arm.
 _FRICTION_SHARE: Final = 0.5
 OFFSET_STD_SHARE: Final = 0.4
-"""Deviation of an offset over that of Coulomb friction of a joint that moves one way. Both are one
+"""Deviation of an offset relative to Coulomb friction, for a joint that moves one way. Both are one
 column then, and what opposes its motion is friction rather than an offset. In recordings of six
 arms of the board the median ratio of the two is 0.31, which is that of a Gaussian of 0.46; from 0.2
 to 0.5 the errors of these recordings differ by 0.2 % at most, at 1.0 one is 1.4 % larger

@@ -46,7 +46,7 @@ SIZED: Final[tuple[Meaning, ...]] = ("zero", "scale")
 UNITS: Final[tuple[Meaning, ...]] = ("degrees", "radians")
 GRAVITIES: Final[tuple[Meaning, ...]] = ("mounting", "no gravity")
 COUPLED: Final[tuple[Coupled, ...]] = get_args(Coupled)
-"""The recorded angle of the first joint contains that of the second, added or taken off."""
+"""The recorded angle of the first joint contains the second's, added or subtracted."""
 DISCRETE_MEANINGS: Final[tuple[Meaning, ...]] = (*SIGNS, *ORDERS, *COUPLED)
 """Changes without a size."""
 # An angle contains that of one of these joints before it: parallel axes are neighbours, or have one
@@ -84,7 +84,7 @@ class Change(NamedTuple):
 
     @property
     def places(self) -> tuple[int, ...]:
-        """The joints in whose place those of `joints` are read, for an order."""
+        """For an order: the joints whose columns the `joints` are read from."""
         return self.order or self.joints[::-1]
 
 

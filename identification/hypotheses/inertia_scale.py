@@ -145,7 +145,7 @@ def retimed(model: RobotModel, samples: Samples, factor: float) -> Samples:
 
 
 def _narrowed(ratio: Callable[[float], float], best: float) -> float:
-    """Return the factor of least error beyond or between those that were tried."""
+    """Return the factor of least error beyond or between the tried ones."""
     step = _FURTHER if best > 1.0 else 1.0 / _FURTHER
     while best in (_TRIED[0], _TRIED[-1]) or best not in _TRIED:
         if not 1.0 / _MOST < best * step < _MOST or ratio(best * step) >= ratio(best):
@@ -171,7 +171,7 @@ def _lighter(model: RobotModel, factor: float) -> RobotModel:
 
 
 def _weight(model: RobotModel, samples: Samples, factor: float) -> float:
-    """Return the weight in a torque over that of the described masses."""
+    """Return the weight in a torque over the weight of the described masses."""
     if without_masses(model):
         return float("nan")
     lighter = _lighter(model, factor)

@@ -30,7 +30,7 @@ from identification.signals.samples import Samples
 Mask = NDArray[np.bool_]
 
 ROWS_PER_FACT: Final = 10.0
-"""Rows that count as one beside the prior: residuals are coloured, and friction is not as its
+"""Rows that count as one against the prior: residuals are coloured, and friction deviates from its
 law."""
 ZERO_SPREAD: Final = np.radians(45.0)
 """Standard deviation of the zero of a joint that is off [rad]."""
@@ -43,9 +43,9 @@ _COMMON_SCALE_SPREAD: Final = 3.0  # relative deviation of a scale that all torq
 # twice the loss of log posterior of what is kept: 3.5 deviations
 _MIN_LIKELIHOOD_LOSS: Final = 12.0
 MIN_ZERO: Final = np.radians(1.0)
-"""Zeros up to which an arm is as stated [rad]: those of its assembly."""
+"""Errors of zeros that assembly leaves [rad]: smaller ones are not named."""
 MIN_GAIN: Final = 0.15
-"""Relative errors up to which a torque is as stated: those of torque constants."""
+"""Relative errors of torque constants: smaller ones are not named."""
 _DERIVATIVE_STEP: Final = 1e-5  # rad, of a numerical derivative
 _MAX_STEP: Final = (0.5, 0.3)  # rad, and share, of one iteration
 _MAX_ROUNDS: Final = 12
@@ -376,7 +376,7 @@ def _fitted(problem: _Problem, free: Mask, point: _Point) -> JointFit:
 
 
 def _tied(problem: _Problem, fit: JointFit) -> tuple[int, ...]:
-    """Return the joints whose scales are known beside that of one of them, of which there are most.
+    """Return the largest set of joints whose scales are known relative to one of them.
 
     The scale that all torques have in common is open.
     """

@@ -12,7 +12,7 @@ from identification.arrays import Array
 Mask = NDArray[np.bool_]
 
 LITTLE_TORQUE_SHARE: Final = 0.015
-"""Torque of such an axis as a share of that of all axes: an eighth of the error up to which a model
+"""Torque of such an axis as a share of all axes' torque: an eighth of the error up to which a model
 is good, so that losing it entirely adds 0.1 points to the error over all axes."""
 
 

@@ -96,7 +96,7 @@ def widened(
 
 
 def _excess(estimate: Estimate, total: Reduction, values: Array) -> Array:
-    """Return the scores (p,) of rows with unmodelled effects beyond their share of those of all."""
+    """Return the scores (p,) of rows with unmodelled effects beyond their share of all scores."""
     assert total.unmodelled is not None
     forms = total.unmodelled.forms
     weights = inverse_variance(estimate.noise_std**2)

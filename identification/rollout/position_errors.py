@@ -150,7 +150,7 @@ def _late(stretch: Stretch, arm: ExportedArm) -> Array:
 
 @lru_cache(maxsize=64)
 def _late_of_links(model: RobotModel, links: bytes, stretch: Stretch) -> Array:
-    """Return that of links without payload; a polish changes none of them in hundreds of arms."""
+    """Return the inertia of links without payload, which a polish never changes."""
     plan = RegressorPlan.of_bodies(model.chain, model.gravity)
     parameters = np.frombuffer(links)
     motion = stretch.motion.kinematics()

@@ -124,4 +124,4 @@ class Folds:
 
 
 PredictedRows = Literal["all", "fitted", "moving"]
-"""Rows that are predicted; moving ones are those that slide, whichever are fitted."""
+"""Rows that are predicted; moving rows are the sliding ones, whichever are fitted."""

@@ -472,7 +472,7 @@ class SettingsTrial:
         return [each.with_load(self.model(without), values) for each in samples]
 
     def _retain_samples(self, settings: Settings) -> None:
-        """Give up the samples of all other settings: those of a long recording are large."""
+        """Release the samples of all other settings, which are large for a long recording."""
         how = settings.preprocessing
         self._samples = {key: value for key, value in self._samples.items() if key == how}
         self._directed = {key: value for key, value in self._directed.items() if key[0] == how}

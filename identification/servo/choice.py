@@ -1,4 +1,4 @@
-"""Terms of a servo's model: all except those that make the prediction of windows worse.
+"""Terms of a servo's model: all that do not make the prediction of windows worse.
 
 A term that neither helps nor harms stays, with the interval that its prior and the motion give it.
 It is shown where other windows are predicted worse without it.

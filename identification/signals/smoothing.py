@@ -35,8 +35,8 @@ SPLINE_ORDER: Final = SPLINE_DEGREE + 1  # non-zero basis functions per knot int
 _MIN_PENALTY: Final = 1e-9
 _MAX_PENALTY: Final = 1e11
 _MAX_ACCURATE_PENALTY: Final = 1e4
-"""Penalty, per samples of a knot, above which the normal equations lose digits: their solution is
-then that of the lightest penalty and a correction."""
+"""Penalty, per samples of a knot, above which the normal equations lose digits: the solution is
+then the one for the lightest penalty plus a correction."""
 _LOG_PENALTY_TOLERANCE: Final = 1e-2  # of its logarithm; 0.2 % of the bandwidth
 _MIN_SLOPE: Final = 1e-6  # slope of the residual over the penalty that is none
 _RADIANS_PER_KNOT: Final = 0.5  # radians of the cutoff frequency per knot

@@ -10,7 +10,7 @@ from identification.arrays import Array
 
 HANN: Final = (0.5, -0.5)
 HARRIS: Final = (0.35875, -0.48829, 0.14128, -0.01168)
-"""Cosine sums of windows; that of four terms leaks least (Harris 1978)."""
+"""Cosine sums of windows; four terms leak least (Harris 1978)."""
 
 
 def power_density(

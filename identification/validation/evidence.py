@@ -297,7 +297,7 @@ def gather(
 def _with_unseen(
     found: TorqueDiagnosis, model: RobotModel, unseen: Sequence[Samples], error: float
 ) -> TorqueDiagnosis:
-    """Return a diagnosis with that of unseen recordings by themselves, if a fit is far off."""
+    """Return a diagnosis, with a separate one of unseen recordings if a fit is far off."""
     if not unseen or error < UNEXPLAINED:
         return found
     return replace(found, unseen_error=score_of(model, few_rows(unseen)).overall)

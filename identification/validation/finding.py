@@ -220,7 +220,7 @@ RemedyKey = Literal[
     "check the geometry",
     "average the ripple",
 ]
-"""What to do about a finding; likewise."""
+"""What to do about a finding, in the same form."""
 
 Figure = float | str
 

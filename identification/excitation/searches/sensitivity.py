@@ -225,7 +225,7 @@ def _steps(states: Array) -> Array:
 
 
 def _velocity_change(velocity: Array) -> Array:
-    """Return the larger change of each velocity (N, n) to one of the samples beside it.
+    """Return the larger change of each velocity (N, n) to one of its neighbours.
 
     sgn(qd) jumps between two samples. Steps of this width find each jump near it; wider ones would
     find it in slow moves as well, which do not reverse. Where a law has no standstill speed, the

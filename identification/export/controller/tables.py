@@ -163,7 +163,7 @@ def control_tables(arm: ExportedArm) -> ControlTables:
 
 
 def _separate_rotors(model: RobotModel, values: Array) -> Array:
-    """Return the rotor matrix (n, n) of those that are base parameters of their own.
+    """Return the rotor matrix (n, n) of rotors that are base parameters by themselves.
 
     These do not load a gear, see :meth:`RobotModel.gear_torque`.
     """

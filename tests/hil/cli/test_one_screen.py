@@ -224,7 +224,6 @@ def test_a_campaign_that_fails_fills_one_screen(name: str, tmp_path: Path) -> No
         ("run", folder, "--dry-run"),
         ("run", folder, "--accept-dry-run", "--no-identify"),
         ("status", folder),
-        ("doctor", cell.path, "--quick", "--duration", "1"),
     ):
         require_one_screen(printed(*words))
 
