@@ -16,6 +16,7 @@ from hil.archive import Archive
 from hil.base.arrays import Array
 from hil.base.errors import ArchiveError
 from hil.base.files import json_digest
+from hil.pipeline.carried_weight import other_meanings
 from hil.pipeline.prepared import known_parameters, reduction_of, versions_of
 from hil.pipeline.sources import Source, known_warnings, source_of
 from identification.estimators.elasticity import ElasticTorque
@@ -24,8 +25,12 @@ from identification.estimators.least_squares import fit_least_squares
 from identification.estimators.prior import ScoreScatter, body_prior
 from identification.factor.estimate import Estimate
 from identification.factor.factor import Factor
+from identification.hypotheses.diagnosis import few_rows, torque_of
+from identification.hypotheses.scores import score_of
+from identification.model.robot import RobotModel
 from identification.reduction.reduction import MAX_UNMODELLED_REPETITIONS, Reduction, Unmodelled
 from identification.selection.settings import Settings
+from identification.signals.samples import Samples
 
 from .archive_discovery import JOINT_TEMPERATURE, ArchiveRef, cell_in, errors_of_origin, open_ref
 from .cache import Arrays, CacheLocation, code_digest
@@ -149,11 +154,21 @@ def reduced_archive(wanted: ToReduce, settings: Settings) -> tuple[Summary, Redu
     warnings = [*known_warnings(cell, archive), *archive.header.findings.warnings]
     if source.merged:
         warnings.append(source.merged)
+    if is_fitted and archive.kind == "imported":
+        warnings += _of_torque(model, versions[0])
     if archive.outcome is not None and archive.outcome.repaired:
         warnings.append("it was repaired with loss")
     parts = factor.parts(wanted.parts)
     summary = Summary(ref, parts, fit, scatter, tuple(warnings), _temperatures(archive))
     return summary, reduction
+
+
+def _of_torque(model: RobotModel, samples: Samples) -> tuple[str, ...]:
+    """Return what the torque of a log is as a whole, other than stated, as its import asks it."""
+    rows = few_rows([samples])
+    if not rows.usable.any():
+        return ()
+    return other_meanings(model, torque_of(model, [samples], rows, score_of(model, rows)))
 
 
 def _temperatures(archive: Archive) -> dict[str, float]:

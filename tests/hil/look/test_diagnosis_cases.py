@@ -8,9 +8,11 @@ from typing import Any
 
 import numpy as np
 import pytest
+from typer.testing import CliRunner
 
 from hil.base.errors import InputError, SourceError
 from hil.base.progress import Silent
+from hil.cli import app
 from hil.importers.conclusions import Certainty
 from hil.importers.imported_robot import Robot
 from hil.importers.recording_import import ImportOptions, RobotOf, import_recording
@@ -89,6 +91,14 @@ def test_no_load_is_weighed_without_gravity(tmp_path: Path) -> None:
     bare, loaded = (archived(folder / f"{name}.csv", tmp_path) for name in ("bare_g", "full_g"))
     with pytest.raises(InputError, match="gravity was removed from the torque"):
         find_payload([bare], [loaded], Silent())
+
+
+def test_a_batch_is_told_the_same_of_a_log_and_of_its_archive(tmp_path: Path) -> None:
+    archive = archived(SUBTRACTED, tmp_path)
+    for words in ((archive,), (SUBTRACTED, "--urdf", URDF)):
+        result = CliRunner().invoke(app, ["batch", *map(str, words)])
+        shown = " ".join(f"{result.output} {result.exception or ''}".split())
+        assert "a model of the arm was subtracted from it" in shown
 
 
 @pytest.mark.parametrize(
