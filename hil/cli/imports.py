@@ -267,7 +267,7 @@ class Reading:
         EpisodeUnit | None,
         typer.Option(
             metavar="UNIT",
-            help="Unit of a LeRobot data set: deg, or range for -100 to 100.",
+            help="Unit of a LeRobot data set: deg, rad, or range for -100 to 100.",
             rich_help_panel=CHANNELS,
         ),
     ] = None

@@ -105,7 +105,8 @@ class UnitsFrom(Enum):
     """From what the units of a data set of LeRobot are known."""
 
     OPTION = auto()
-    CALIBRATION = auto()
+    ENCODER = auto()  #: the numbers are in steps of an encoder
+    CALIBRATION = auto()  #: a number would be outside the calibrated range in degrees
     BEYOND_RANGE = auto()  #: a number is above 100
     BEYOND_LIMITS = auto()  #: a number would be outside the limits of the URDF in degrees
 
@@ -115,11 +116,11 @@ class EpisodeUnits(Conclusion):
     """Units of the joints of a data set of LeRobot.
 
     Attributes:
-        unit: degrees, or -100 to 100 of the calibrated range.
+        unit: degrees, radians, or -100 to 100 of the calibrated range.
         basis: from what that is known.
     """
 
-    unit: Literal["deg", "range"]
+    unit: Literal["deg", "rad", "range"]
     basis: UnitsFrom
 
 

@@ -2,7 +2,7 @@
 
 A data set is a folder with ``meta/info.json`` and Parquet tables in ``data``, one for each episode
 (2.x) or several episodes in one (3.0). Joints are in degrees, or -100 to 100 between the ends of
-the range that was calibrated; a gripper is 0 (closed) to 100.
+the range that was calibrated; a gripper is 0 (closed) to 100. Simulators write radians.
 """
 
 from __future__ import annotations
@@ -27,8 +27,8 @@ from hil.importers.conclusions import EpisodeUnits, UnitsFrom
 from hil.importers.imported_robot import Robot
 from hil.importers.log_files import LogFiles
 
-EpisodeUnit = Literal["deg", "range"]
-"""Of the joints of a data set: degrees, or -100 to 100 of the calibrated range."""
+EpisodeUnit = Literal["deg", "rad", "range"]
+"""Of the joints of a data set: degrees, radians, or -100 to 100 of the calibrated range."""
 
 INFO: Final = Path("meta") / "info.json"
 _FORMER_INFO: Final = Path("meta_data") / "info.json"  # of versions 1
@@ -43,6 +43,11 @@ _GRIPPER: Final = ("gripper", "jaw")
 _FULL_RANGE: Final = 100.0
 _RANGE_ROUNDING: Final = 0.5  # beyond 100 that is still a rounded value of the range
 _STEPS_PER_TURN: Final = 4095  # of a turn, as LeRobot converts steps of a servo to degrees
+_STEP_TOLERANCE: Final = 5e-3  # relative, between encoders of 4095 and 4096 steps
+_FEWEST_STEPS: Final = 16  # different positions of a joint whose step is known
+_FEWEST_ENCODERS: Final = 2  # joints whose steps say the unit
+_LEAST_STEP: Final = 5e-4  # in any unit: less is rounding
+_LARGEST_REMAINDER: Final = 0.1  # of a step, of differences that are whole steps
 # outside the URDF's limits that no calibration explains
 _MAX_LIMIT_EXCESS: Final = math.radians(10.0)
 _SUFFIXES: Final = re.compile(r"\.(?:pos|position|angle)\Z|_(?:pos|position|joint)\Z")
@@ -76,6 +81,7 @@ class DataSet:
         commanded: indices of the numbers of an action that command these (n,).
         episodes: in their order.
         largest: largest size of each joint in all episodes (n,), in its own units.
+        steps: of the positions of each joint (n,), in its own units; nan where there are none.
     """
 
     folder: Path
@@ -83,6 +89,7 @@ class DataSet:
     commanded: tuple[int, ...]
     episodes: tuple[Episode, ...]
     largest: Array
+    steps: Array
 
     @property
     def longest(self) -> Episode:
@@ -111,7 +118,8 @@ class DataSet:
         states = [each.files.arrays(each.path).matrix(STATE, STATE) for each in episodes]
         largest = np.max([np.abs(state).max(axis=0) for state in states], axis=0)
         episodes.sort(key=lambda each: each.number)
-        return cls(folder, joints, tuple(by_name), tuple(episodes), largest)
+        steps = np.array([_step(column) for column in np.concatenate(states).T])
+        return cls(folder, joints, tuple(by_name), tuple(episodes), largest, steps)
 
     def map_for(
         self, robot: Robot, calibration: Path | None, unit: EpisodeUnit | None
@@ -137,7 +145,9 @@ class DataSet:
             if calibration is not None and ranges is not None:
                 _require_like(calibration, name, ranges[j], span)
                 span = ranges[j]
-            if _is_gripper(name):  # closed is the lower end
+            if units.unit == "rad" and (not _is_gripper(name) or self.largest[j] <= 2.0 * np.pi):
+                scale[j] = 1.0
+            elif _is_gripper(name):  # closed is the lower end
                 scale[j] = span / _FULL_RANGE
                 offset[j] = limits.lower[j] / scale[j]
             elif units.unit == "range":
@@ -180,18 +190,37 @@ class DataSet:
         largest = float(np.max(self.largest, where=arm, initial=0.0))
         if largest > _FULL_RANGE + _RANGE_ROUNDING:
             return EpisodeUnits("deg", UnitsFrom.BEYOND_RANGE)
-        if ranges is not None:
+        if (unit := self._unit_of_steps(arm, ranges)) is not None:
+            return EpisodeUnits(unit, UnitsFrom.ENCODER)
+        if ranges is not None and (arm & (np.radians(self.largest) > 0.5 * ranges)).any():
             return EpisodeUnits("range", UnitsFrom.CALIBRATION)
         reach = np.maximum(np.abs(lower), np.abs(upper)) + _MAX_LIMIT_EXCESS
         if (arm & (np.radians(self.largest) > reach)).any():
             return EpisodeUnits("range", UnitsFrom.BEYOND_LIMITS)
-        problem = "its joints may be in degrees, or -100 to 100 of their calibrated range"
+        small = ", in radians" if np.max(self.largest, where=arm, initial=0.0) <= np.pi else ""
+        problem = f"its joints may be in degrees{small}, or -100 to 100 of their calibrated range"
         raise SourceError(self.folder, problem, field=STATE, remedy=_CALIBRATE)
+
+    def _unit_of_steps(self, arm: NDArray[np.bool_], ranges: Array | None) -> EpisodeUnit | None:
+        """Return the unit in which positions are steps of encoders; None if they are of none."""
+        known = arm & np.isfinite(self.steps)
+        if np.count_nonzero(known) < _FEWEST_ENCODERS:
+            return None
+        turn = 2.0 * np.pi / _STEPS_PER_TURN
+        units: dict[EpisodeUnit, Array | float] = {"deg": np.degrees(turn), "rad": turn}
+        if ranges is not None:
+            units["range"] = (2.0 * _FULL_RANGE * turn / ranges)[known]
+        alike: list[EpisodeUnit] = [
+            unit
+            for unit, step in units.items()
+            if (np.abs(self.steps[known] / step - 1.0) < _STEP_TOLERANCE).all()
+        ]
+        return alike[0] if len(alike) == 1 else None
 
 
 _CALIBRATE: Final = (
-    "state --units deg, or give LeRobot's calibration of the arm (--calibration FILE.json), or"
-    " state --units range, which is then the range of the URDF"
+    "state --units deg or --units rad; or --units range, of LeRobot's calibration of the arm"
+    " (--calibration FILE.json), without one of the URDF"
 )
 
 
@@ -275,6 +304,19 @@ def _episodes(folder: Path, table: Path) -> list[Episode]:
 
 def _matrix(lists: NDArray[Any]) -> Array:
     return np.stack([np.asarray(row, np.float64) for row in lists])
+
+
+def _step(positions: Array) -> float:
+    """Return the step that positions are whole multiples apart by; nan if there is none."""
+    places = np.unique(np.round(positions, 5))
+    apart = np.diff(places)
+    apart = apart[apart > _LEAST_STEP]
+    if len(apart) < _FEWEST_STEPS:
+        return math.nan
+    count = np.rint(apart / apart.min())
+    if np.abs(apart / apart.min() - count).max() > _LARGEST_REMAINDER:
+        return math.nan
+    return float(apart.sum() / count.sum())
 
 
 def _calibrated(path: Path, joints: Sequence[str]) -> Array:

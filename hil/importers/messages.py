@@ -149,7 +149,8 @@ def _(order: JointOrder) -> str:
 
 _UNITS_FROM: Final[Mapping[UnitsFrom, str]] = {
     UnitsFrom.OPTION: "as stated (--units)",
-    UnitsFrom.CALIBRATION: "by the calibration",
+    UnitsFrom.ENCODER: "by the steps of the encoders",
+    UnitsFrom.CALIBRATION: "as degrees would be outside the calibrated range",
     UnitsFrom.BEYOND_RANGE: "as numbers beyond 100 occur",
     UnitsFrom.BEYOND_LIMITS: "as degrees would be outside the limits of the URDF",
 }
@@ -157,9 +158,13 @@ _UNITS_FROM: Final[Mapping[UnitsFrom, str]] = {
 
 @worded.register
 def _(units: EpisodeUnits) -> str:
-    ranges = "-100 to 100 of the calibrated range"
-    unit = "in degrees" if units.unit == "deg" else ranges
-    return f"joints {unit}, {_UNITS_FROM[units.basis]}; a gripper 0 to 100"
+    names = {
+        "deg": "in degrees",
+        "rad": "in radians",
+        "range": "-100 to 100 of the calibrated range",
+    }
+    gripper = "" if units.unit == "rad" else "; a gripper 0 to 100"
+    return f"joints {names[units.unit]}, {_UNITS_FROM[units.basis]}{gripper}"
 
 
 @worded.register

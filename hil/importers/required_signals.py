@@ -8,12 +8,15 @@ from typing import Final
 import numpy as np
 
 from hil.archive import Archive
+from hil.base.arrays import Array
 from hil.base.errors import SourceError
 from hil.importers.plausibility import command_size
 from identification.text import duration_text
 
 _MIN_RECORDING_SECONDS: Final = 1.0  # s
 _COPIED: Final = 0.999  # of the rows
+_COPIED_LATER: Final = 0.98  # of the rows in which commands change
+_MOST_SAMPLES_LATER: Final = 3
 _FARTHEST: Final = 10.0  # factor between the travels of joints and of their commands
 
 
@@ -82,11 +85,29 @@ def require_commands(archive: Archive, recording: Path, *, fitted: bool) -> None
         problem = "the positions are the commands, bit for bit: they were not measured"
         remedy = "record or name measured positions (--columns 'position=NAME{}')"
         raise SourceError(recording, problem, field="position", remedy=remedy)
+    if (later := _samples_later(position, commanded)) is not None:
+        samples = "the next sample" if later == 1 else f"{later} samples later"
+        problem = f"the commands are the positions of {samples}, bit for bit: nobody commanded them"
+        remedy = "record the commands themselves (of LeRobot: what was sent to the motors)"
+        raise SourceError(recording, problem, field=field, remedy=remedy)
     size = command_size(position, commanded)
     if fitted and size is not None and not 1.0 / _FARTHEST < size < _FARTHEST:
         problem = f"the commands move {size:.3g} times as far as the positions"
         remedy = "check channels and units of both (--columns, or a map with units: --map)"
         raise SourceError(recording, problem, field=field, remedy=remedy)
+
+
+def _samples_later(position: Array, commanded: Array) -> int | None:
+    """Return how many samples later the positions (m, n) are the commands; None: they never are.
+
+    As in data sets whose actions were made of the states.
+    """
+    for later in range(1, _MOST_SAMPLES_LATER + 1):
+        before, after = commanded[:-later], position[later:]
+        moving = np.append(False, (np.diff(before, axis=0) != 0.0).any(axis=1))
+        if moving.any() and np.mean((before == after).all(axis=1)[moving]) >= _COPIED_LATER:
+            return later
+    return None
 
 
 def require_torque(archive: Archive, recording: Path) -> None:

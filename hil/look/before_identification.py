@@ -2,67 +2,46 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Final, NamedTuple
 
 import numpy as np
-import tomlkit
 
 from hil.archive import Archive
 from hil.base.errors import SourceError
 from hil.base.terminal_text import typed
 from hil.cell import Cell
-from hil.importers.conclusions import Certainty, ChannelMeaning
+from hil.importers.conclusions import Certainty
 from hil.importers.imported_robot import Robot
 from hil.importers.messages import sentence
-from hil.importers.name_words import words_of
 from hil.importers.plausibility import constant_torques
 from hil.importers.recording_content import Use
 from hil.importers.recording_import import ImportedRecording, ImportOptions, RobotOf, read_again
-from hil.look.look import SETTINGS, look_at_joints, mountings
+from hil.look.look import look_at_joints, mountings
 from hil.look.messages import choice_text, fit_alike, sentences, setting_text
 from hil.look.other_arm import Contradictions
-from hil.look.physics import Size
 from hil.look.readings import (
     DoubtfulArm,
     DoubtfulTime,
-    ExplainedTorque,
     GravityOption,
     NoJointTorque,
 )
 from hil.look.result import ChangedReading, Look, Row, TiedReading
-from hil.pipeline.sources import cell_of, source_of
-from identification.errors import IdentificationError
-from identification.estimators.torque_channel import possible_low_passes
-from identification.hypotheses.diagnosis import (
-    UNEXPLAINED,
-    TorqueDiagnosis,
-    few_rows,
-    torque_of,
-    with_readings,
-)
+from hil.look.servo_load import may_be_load, servo_load, torques_without_sign, without_torque
+from hil.look.torque_sample import SUSPECT_ERROR, TorqueSample, explained
+from hil.pipeline.sources import cell_of
+from identification.hypotheses.diagnosis import UNEXPLAINED, TorqueDiagnosis
 from identification.hypotheses.scores import Score, compare, score_of
 from identification.hypotheses.search import SURE_SIGMAS
-from identification.signals.position_steps import PositionJump, position_steps
-from identification.signals.recording import MIN_MOVEMENT
-from identification.signals.samples import Samples, prepare
+from identification.signals.samples import Samples
 from identification.text import percentage
 from identification.validation.finding import Finding
 from identification.validation.finding_messages import Naming, worded
 from identification.validation.findings.diagnosis import rate_of_torque, without_bodies
 
-_SUSPECT_ERROR: Final = 0.15
-"""Error of the torque, predicted from other parts, above which a log is looked at closely. Right
-logs of four real arms have 0.04 to 0.11, with URDFs of other arms 0.09 to 1.1."""
 # error ratio of another mounting that chance alone does not make
 _MAX_MOUNTING_ERROR_RATIO: Final = 0.85
-# of the error, that a low-pass or heavy rotors leave where they are there
-_EXPLAINED_ERROR_RATIO: Final = 0.5
-_DRIVING_FRICTION_SIGMAS: Final = -4.0  # standard errors of a friction that drives a joint
-# joints whose torque may be positive throughout, by the weight they hold
-_MAX_UNSIGNED_JOINTS: Final = 2
 # contradictions: a wrong limit of a right URDF explains one, more are refused
 _MAX_WARNED_CONTRADICTIONS: Final = 2
 _OF_AXES: Final = ("order", "signs", "zero", "coupling")
@@ -103,24 +82,15 @@ def concluded(
     """
     if imported.is_stated or "torque" not in imported.archive.columns:
         return Concluded(imported)
-    may_be_load = (
-        "commanded_position" in imported.archive.columns and "torque" not in options.chosen
-    )
-    if not may_be_load:
+    is_open = may_be_load(imported, options)
+    asked = TorqueSample.of(imported.archive)
+    if is_open:
+        if reason := servo_load(imported, lambda: asked):
+            return Concluded(without_torque(imported, source, robot_of, use, reason))
+    else:
         _require_measured(imported.archive, source)
-    asked = _asked(imported.archive)
-    if unsigned := _unsigned_torques(imported.archive):
-        if may_be_load:
-            return Concluded(_without_torque(imported, source, robot_of, use, NoJointTorque()))
-        if unsigned > _MAX_UNSIGNED_JOINTS and (
-            asked is None or asked.score.overall > _SUSPECT_ERROR
-        ):
+        if unsigned := torques_without_sign(imported.archive, lambda: asked):
             raise _without_sign(source, unsigned)
-    if may_be_load and _is_named_load(imported):
-        size = None if asked is None else Size.of(asked.cell, asked.cell.model, asked.rows)
-        ratio = size.factor if size is not None and size.by_masses else None
-        reason = NoJointTorque(is_load=True, ratio=ratio)
-        return Concluded(_without_torque(imported, source, robot_of, use, reason))
     if asked is None or asked.is_unexplained_by_jumps:
         return Concluded(imported)
     found = asked.diagnosis()
@@ -133,10 +103,10 @@ def concluded(
     if is_bag or not (suspect or _hangs_otherwise(asked.cell, asked.rows, asked.score)):
         imported = _of_this_arm(imported, source, asked.contradictions())
         return Concluded(imported, found if found.is_complete else None)
-    if asked.score.overall > _SUSPECT_ERROR and (explained := _explained(imported.archive)):
-        imported = replace(imported, concluded=(*imported.concluded, explained.how))
-        return Concluded(_of_this_arm(imported, source, asked.contradictions(explained.score)))
-    return Concluded(_as_a_look_says(imported, source, robot_of, use, asked, may_be_load))
+    if asked.score.overall > SUSPECT_ERROR and (how := explained(imported.archive)):
+        imported = replace(imported, concluded=(*imported.concluded, how.how))
+        return Concluded(_of_this_arm(imported, source, asked.contradictions(how.score)))
+    return Concluded(_as_a_look_says(imported, source, robot_of, use, asked, is_open))
 
 
 def _as_a_look_says(
@@ -144,16 +114,15 @@ def _as_a_look_says(
     source: Path,
     robot_of: RobotOf,
     use: Use,
-    asked: _Asked,
-    may_be_load: bool,
+    asked: TorqueSample,
+    is_open: bool,
 ) -> ImportedRecording:
     """Return a log read again where a look is certain that it is other than recorded."""
     look = look_at_joints(source, imported)
     error = asked.score.overall if look.error is None else look.error
     if error > UNEXPLAINED:
-        if may_be_load:
-            reason = NoJointTorque(error)
-            return _without_torque(imported, source, robot_of, use, reason)
+        if is_open:
+            return without_torque(imported, source, robot_of, use, NoJointTorque(error))
         raise _other_arm(source, error)
     changed = _changed(look)
     if look.questions or not changed:
@@ -164,7 +133,7 @@ def _as_a_look_says(
             raise undecided(source, look.questions[0], contradictions)
     if look.map_text != imported.map_text or look.gravity is not None:
         again = _again(imported, source, robot_of, look, use)
-        if (read := _asked(again.archive)) is not None:
+        if (read := TorqueSample.of(again.archive)) is not None:
             axes = [row.aspect for row in changed if row.aspect in _OF_AXES]
             contradictions = read.contradictions(error=error, changed=axes)
             return _of_this_arm(again, source, contradictions)
@@ -210,155 +179,12 @@ def _require_measured(archive: Archive, source: Path) -> None:
         raise SourceError(source, sentence(constant[0]), field="torque", remedy=remedy)
 
 
-@dataclass(frozen=True, eq=False)
-class _Asked:
-    """Rows of a recording of which something is asked.
-
-    Attributes:
-        cell: of the arm.
-        samples: of the recording.
-        rows: some of them.
-        score: of these.
-        jumps: steps of the positions that no arm makes.
-    """
-
-    cell: Cell
-    samples: Samples
-    rows: Samples
-    score: Score
-    jumps: tuple[PositionJump, ...] = ()
-
-    def diagnosis(self) -> TorqueDiagnosis:
-        """Return what the torque is as a whole, and the joints where it follows the arm."""
-        model = self.cell.model
-        found = torque_of(model, [self.samples], self.rows, self.score)
-        if self._is_far:
-            return found
-        return with_readings(found, model, self.rows, self.score)
-
-    @property
-    def _is_far(self) -> bool:
-        return self.score.overall > _SUSPECT_ERROR or bool(
-            np.any(self.score.friction < _DRIVING_FRICTION_SIGMAS)
-        )
-
-    @property
-    def is_unexplained_by_jumps(self) -> bool:
-        """Whether positions jump, so that torque that does not follow them says nothing more."""
-        return bool(self.jumps) and self._is_far
-
-    def is_suspect(self, found: TorqueDiagnosis) -> bool:
-        """Return whether the torque does not follow the arm as it is read."""
-        return self._is_far or any(step.sure for step in found.zeros)
-
-    def contradictions(
-        self,
-        score: Score | None = None,
-        error: float | None = None,
-        changed: Sequence[str] = (),
-    ) -> Contradictions:
-        """Return what contradicts the arm, by default with the score as read and its error."""
-        score = self.score if score is None else score
-        error = score.overall if error is None else error
-        return Contradictions.of(self.cell, self.cell.model, self.rows, score, error, changed)
-
-
 def _require_torque_of_arm(source: Path, found: TorqueDiagnosis) -> None:
     """Raise SourceError if there is nothing of bodies in a torque, or it is the rate of one."""
     if found.rigid.is_nothing:
         raise _not_of_arm(source, without_bodies(found.rigid))
     if found.is_rate:
         raise _not_of_arm(source, rate_of_torque())
-
-
-def _unsigned_torques(archive: Archive) -> int:
-    """Return the number of joints that move, if no torque is ever negative; else, or of one, 0."""
-    torque = np.asarray(archive.columns["torque"])
-    moving = np.ptp(np.asarray(archive.columns["position"]), axis=0) > MIN_MOVEMENT
-    count = int(np.count_nonzero(moving))
-    return count if count > 1 and (torque >= 0.0).all() and torque.any() else 0
-
-
-def _is_named_load(imported: ImportedRecording) -> bool:
-    """Return whether the channels of the torque are named as the load of a servo."""
-    return any(
-        isinstance(each, ChannelMeaning)
-        and each.kind == "torque"
-        and "load" in words_of(each.channels)
-        for each in imported.concluded
-    )
-
-
-def _without_torque(
-    imported: ImportedRecording,
-    source: Path,
-    robot_of: RobotOf,
-    use: Use,
-    reason: NoJointTorque,
-) -> ImportedRecording:
-    """Return a recording without its torque, and why."""
-    if imported.map_text is None:
-        columns = {
-            name: column for name, column in imported.archive.columns.items() if name != "torque"
-        }
-        without = replace(imported, archive=replace(imported.archive, columns=columns))
-    else:
-        entries = tomlkit.parse(imported.map_text)
-        del entries["torque"]
-        without = read_again(imported, source, robot_of, tomlkit.dumps(entries), use)
-    others = [
-        each
-        for each in imported.concluded
-        if not (isinstance(each, ChannelMeaning) and each.kind == "torque")
-    ]
-    return replace(without, concluded=(*others, reason))
-
-
-def _asked(archive: Archive) -> _Asked | None:
-    """Return the rows of an archive of which something is asked; None if they cannot be used."""
-    cell = cell_of(archive)
-    try:
-        source = source_of(archive, cell)
-        samples = prepare(source.recording, cell.model, options=SETTINGS)
-        rows = few_rows([samples])
-        if not rows.usable.any():
-            return None  # nothing moves
-        jumps = position_steps(source.recording, source.name).jumps
-        return _Asked(cell, samples, rows, score_of(cell.model, rows), jumps)
-    except (IdentificationError, ValueError):
-        return None  # the identification says what is wrong
-
-
-class _Explained(NamedTuple):
-    """Score of a torque through a low-pass or with heavy rotors."""
-
-    score: Score
-    how: ExplainedTorque
-
-
-def _explained(archive: Archive) -> _Explained | None:
-    """Return how a low-pass or heavy rotors explain the torque as it is read; None: they do not.
-
-    They explain it if they halve the error of the same rows, and no friction drives a joint. Other
-    units, signs and orders are searched without them, and may then seem to fit.
-    """
-    cell = cell_of(archive)
-    model = cell.model
-    try:
-        recording = source_of(archive, cell).recording
-        unfiltered = prepare(recording, model, options=SETTINGS)
-        least = min(UNEXPLAINED, _EXPLAINED_ERROR_RATIO * score_of(model, unfiltered).overall)
-        low_passes = possible_low_passes(recording, model, options=SETTINGS)
-        for how in (*low_passes, SETTINGS):
-            samples = unfiltered if how is SETTINGS else prepare(recording, model, options=how)
-            for wide_rotors in (False, True) if how is not SETTINGS else (True,):
-                score = score_of(model, samples, wide_rotors=wide_rotors)
-                if 0.0 < score.overall < least and not score.driven.any():
-                    found = ExplainedTorque(how.torque_bandwidth, heavy_rotors=wide_rotors)
-                    return _Explained(score, found)
-    except (IdentificationError, ValueError):
-        pass  # the identification says what is wrong
-    return None
 
 
 def _hangs_otherwise(cell: Cell, samples: Samples, score: Score) -> bool:

@@ -29,24 +29,24 @@ from hil.importers.units import Kind
 from hil.look import physics, signals
 from hil.look.corrected_map import with_entries
 from hil.look.other_arm import Contradictions
-from hil.look.readings import Basis, Fact, NextStep
+from hil.look.readings import Basis, Fact, NextStep, NoJointTorque
 from hil.look.result import Aspect, Look, ParameterGroup, Row
+from hil.look.servo_load import may_be_load, servo_load, torques_without_sign, without_torque
+from hil.look.torque_sample import SETTINGS, TorqueSample, explained
 from hil.look.undescribed import undescribed_robot
 from hil.pipeline.sources import Source, cell_of, source_of
 from identification.errors import IdentificationError
 from identification.estimators.delay import DelayEstimate, estimate_delay
 from identification.hypotheses.changes import Axes
-from identification.hypotheses.diagnosis import few_rows, torque_of
+from identification.hypotheses.diagnosis import UNEXPLAINED, few_rows, torque_of
 from identification.hypotheses.inertia_scale import retimed
 from identification.hypotheses.scores import score_of
 from identification.hypotheses.search import EXPLAINED_ERROR, Readings, find_readings
 from identification.hypotheses.torque_low_pass import TorqueLowPass, torque_low_pass
 from identification.model.robot import RobotModel
 from identification.signals.recording import Recording, RecordingError
-from identification.signals.samples import Preprocessing, Samples, prepare
+from identification.signals.samples import Samples, prepare
 
-SETTINGS: Final = Preprocessing(14.0, exclude_rows="rests")
-"""Preparation of a recording whose readings are compared."""
 _DELAY_SAMPLES: Final = 20_000
 _COLUMNS: Final[tuple[tuple[str, Kind, str], ...]] = (
     ("position", "position", "rad"),
@@ -66,11 +66,41 @@ def look_at(source: Path, robot_of: RobotOf | None, options: ImportOptions) -> L
     """
     imported = None if robot_of is not None else _archived(source)
     described = robot_of is not None or imported is not None
-    if imported is None:
-        files = LogFiles(longest=MAX_EXCERPT_ROWS)
-        robot = robot_of or (lambda _: undescribed_robot(source, options, files))
-        lenient = replace(options, outside_limits=True)
-        imported = read_recording(source, robot, lenient, files=files)
+    if imported is not None:
+        return _look(source, imported, described=True)
+    files = LogFiles(longest=MAX_EXCERPT_ROWS)
+    robot = robot_of or (lambda _: undescribed_robot(source, options, files))
+    lenient = replace(options, outside_limits=True)
+    imported = read_recording(source, robot, lenient, files=files)
+    require_motion(imported.archive, source)
+    reason = _load(imported, options, described=described)
+    if reason is None:
+        look = _look(source, imported, described=described)
+        is_open = may_be_load(imported, options)
+        if not is_open or (look.error or 0.0) <= UNEXPLAINED or explained(imported.archive):
+            return look
+        reason = NoJointTorque(look.error)
+    without = without_torque(imported, source, robot, "excitation", reason)
+    return _look(source, without, described=described)
+
+
+def _load(
+    imported: ImportedRecording, options: ImportOptions, *, described: bool
+) -> NoJointTorque | None:
+    """Return why a torque is none of the joints by sign or name, as an identification concludes."""
+
+    def sample() -> TorqueSample | None:
+        return TorqueSample.of(imported.archive) if described else None
+
+    if may_be_load(imported, options):
+        return servo_load(imported, sample)
+    if imported.is_stated or "torque" in options.chosen:
+        return None
+    return NoJointTorque() if torques_without_sign(imported.archive, sample) else None
+
+
+def _look(source: Path, imported: ImportedRecording, *, described: bool) -> Look:
+    """Return what a recording contains, of a described robot or not."""
     require_motion(imported.archive, source)
     cell = cell_of(imported.archive)
     try:
@@ -79,10 +109,15 @@ def look_at(source: Path, robot_of: RobotOf | None, options: ImportOptions) -> L
     except (RecordingError, SourceError) as error:
         raise SourceError(source, str(error)) from error
     rows = signals.rows(recorded, imported, cell if described else None)
-    if described:
+    loads = (each for each in imported.concluded if isinstance(each, NoJointTorque))
+    load = next(loads, None)
+    if described and recorded.recording.torque is None:
+        rows.append(physics.without_torque(recorded.recording, load))
+        look = Look(source.name, tuple(rows), (), (), imported.map_text)
+    elif described:
         look = _with_torque(source, recorded, imported, cell, rows)
     else:
-        rows.append(_without_robot(recorded.recording))
+        rows.append(_without_robot(recorded.recording, load))
         look = Look(source.name, tuple(rows), (), (), imported.map_text)
     return replace(look, bag_text=None if imported.bag is None else imported.bag.text)
 
@@ -114,9 +149,9 @@ def _archived(source: Path) -> ImportedRecording | None:
     return ImportedRecording(archive, (source,), None, concluded, Examined((), ()))
 
 
-def _without_robot(recording: Recording) -> Row:
+def _without_robot(recording: Recording, load: NoJointTorque | None) -> Row:
     if recording.torque is None and recording.motor_current is None:
-        return physics.without_torque(recording)
+        return physics.without_torque(recording, load)
     quantity: Aspect = "torque" if recording.torque is not None else "motor current"
     evidence = (Basis.NO_GEOMETRY,)
     open_ = Certainty.UNDETERMINED
@@ -127,9 +162,6 @@ def _with_torque(
     source: Path, recorded: Source, imported: ImportedRecording, cell: Cell, rows: list[Row]
 ) -> Look:
     recording = recorded.recording
-    if recording.torque is None:
-        rows.append(physics.without_torque(recording))
-        return Look(source.name, tuple(rows), (), (), imported.map_text)
     finding = _finding(source, imported, cell, recording)
     delay, low_pass = _channel(finding.axes.read(recording), finding.readings.model)
     channel = list(physics.channel_rows(delay, low_pass))

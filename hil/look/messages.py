@@ -14,6 +14,7 @@ from hil.importers.conclusions import (
     ChannelMeaning,
     ConcludedUnit,
     Conclusion,
+    EpisodeUnits,
     FixedFingers,
     JointOrder,
     OutsideLimits,
@@ -120,6 +121,7 @@ _FACTS: Final[Mapping[Fact, str]] = {
     Fact.PAYLOAD_UNDETERMINED: "none stated; not determined",
     Fact.PAYLOAD_IN_LAST_BODY: "none stated; part of the last body",
     Fact.NO_TORQUE: "none, and no motor current",
+    Fact.SERVO_LOAD: "none; the load or the duty of a servo",
     Fact.MOTOR_CURRENT: "none; motor currents",
     Fact.TORQUE_UNEXAMINED: "side, gravity, signs and order of the joints not examined",
     Fact.DELAY_UNDETERMINED: "not determined",
@@ -134,6 +136,7 @@ _FACTS: Final[Mapping[Fact, str]] = {
 _BASES: Final[Mapping[Basis, str]] = {
     Basis.GIVEN_RATE: "at the rate that was given",
     Basis.MESSAGE_TYPE: "by the message type",
+    Basis.DATA_SET: "as of every data set of LeRobot",
     Basis.USUAL_RATE: "that unit gives a usual rate",
     Basis.STATED_UNIT: "by the name and the unit that is stated",
     Basis.NAME_AND_RATE: "by the name; a usual rate",
@@ -169,6 +172,7 @@ _BASES: Final[Mapping[Basis, str]] = {
 _STEPS: Final[Mapping[NextStep, str]] = {
     NextStep.STATE_UNIT_OR_GEARS: "state unit, sign or gears of both",
     NextStep.STATE_GRAVITY: "state --gravity X Y Z",
+    NextStep.STATE_UNITS: "state --units deg, rad or range",
     NextStep.STATE_DRIVE: "state gear ratios or torque constants ([drive] of a map) if not",
     NextStep.STATE_TORQUE_CONSTANT: (
         "[drive] torque_constant of a map (N·m/A), or `hil torque-constants`"
@@ -195,6 +199,9 @@ _STEPS: Final[Mapping[NextStep, str]] = {
     NextStep.RECORD_PAYLOAD: "record with and without it (`hil payload`)",
     NextStep.IMPORT_COMMANDS: "`hil identify` finds their servo and friction",
     NextStep.CHECK_ENCODER: "check encoder and cable, or cut the recording before the jump",
+    NextStep.RECORD_COMMANDS: (
+        "record the commanded positions as well: `hil identify` finds servo and friction by them"
+    ),
     NextStep.ASK_FOR_POSITIONS: "ask for the raw encoder positions",
     NextStep.ASK_FOR_UNIT: "ask for the unit of the channel",
     NextStep.ASK_FOR_FILTER: "ask for the filter of the channel",
@@ -385,6 +392,11 @@ def _(channels: Channels) -> str:
 @_worded.register
 def _(order: JointOrder) -> str:
     return ", ".join(order.joints)
+
+
+@_worded.register
+def _(units: EpisodeUnits) -> str:
+    return import_messages.worded(units)
 
 
 @_worded.register
@@ -720,19 +732,28 @@ def _(explained: ExplainedTorque) -> str:
 
 @import_messages.worded.register
 def _(none: NoJointTorque) -> str:
-    factor = "" if none.ratio is None else f"*{number(1.0 / none.ratio, 2)}"
+    reasons = f"{_why_no_torque(none)}; {_as_a_torque(none)}"
+    return f"torque: left out as the load or duty of a servo: {reasons}"
+
+
+@_worded.register
+def _(none: NoJointTorque) -> str:
+    return f"{_why_no_torque(none)}; {_as_a_torque(none)}"
+
+
+def _why_no_torque(none: NoJointTorque) -> str:
     if none.unexplained is not None:
-        reason = f"no masses explain {percentage(none.unexplained)} of it"
-    elif none.ratio is not None:
-        reason = f"it is {number(none.ratio, 2)} times the torque that the URDF's masses need"
-    elif none.is_load:
-        reason = "its name says so"
-    else:
-        reason = "it is never negative, although the joints move in both directions"
-    return (
-        f"torque: left out as the load or duty of a servo: {reason}; to use it anyway, name it:"
-        f" --columns 'torque=NAME{factor}'"
-    )
+        return f"no masses explain {percentage(none.unexplained)} of it"
+    if none.ratio is not None:
+        return f"it is {number(none.ratio, 2)} times the torque that the URDF's masses need"
+    if none.is_load:
+        return "its name says so"
+    return "it is never negative, although the joints move in both directions"
+
+
+def _as_a_torque(none: NoJointTorque) -> str:
+    factor = "" if none.ratio is None else f"*{number(1.0 / none.ratio, 2)}"
+    return f"to use it anyway, name it: --columns 'torque=NAME{factor}'"
 
 
 @import_messages.worded.register

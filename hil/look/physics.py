@@ -41,6 +41,7 @@ from hil.look.readings import (
     Mounting,
     NearestZero,
     NextBest,
+    NoJointTorque,
     OtherTimes,
     Reading,
     RigidShare,
@@ -570,12 +571,14 @@ def _repeats(change: Change, steps: list[Step]) -> bool:
     )
 
 
-def without_torque(recording: Recording) -> Row:
-    """Return the row of a log without torque."""
+def without_torque(recording: Recording, load: NoJointTorque | None = None) -> Row:
+    """Return the row of a log without torque, or with the load of a servo in its place."""
     if recording.motor_current is None:
-        decider = Decide.RECORD_TORQUE
+        decider = Decide.RECORD_TORQUE if load is None else Decide.RECORD_COMMANDS
         if recording.commanded_position is not None:
             decider = Decide.IMPORT_COMMANDS
+        if load is not None:
+            return Row("torque", Fact.SERVO_LOAD, Certainty.LIKELY, (load,), decider)
         return Row("torque", Fact.NO_TORQUE, Certainty.CERTAIN, (Basis.CHANNELS,), decider)
     decider = Decide.STATE_TORQUE_CONSTANT
     return Row("torque", Fact.MOTOR_CURRENT, Certainty.CERTAIN, (Basis.NAME_OR_UNIT,), decider)

@@ -12,6 +12,7 @@ from hil.importers.conclusions import (
     ConcludedUnit,
     Conclusion,
     CopiedCommands,
+    EpisodeUnits,
     FixedFingers,
     JointOrder,
     OutsideLimits,
@@ -60,6 +61,7 @@ class Fact(Enum):
     PAYLOAD_UNDETERMINED = auto()
     PAYLOAD_IN_LAST_BODY = auto()
     NO_TORQUE = auto()
+    SERVO_LOAD = auto()  #: in a channel that is named as a torque
     MOTOR_CURRENT = auto()
     TORQUE_UNEXAMINED = auto()
     DELAY_UNDETERMINED = auto()
@@ -253,6 +255,7 @@ class Basis(Enum):
     """Evidence without a figure."""
 
     GIVEN_RATE = auto()
+    DATA_SET = auto()
     MESSAGE_TYPE = auto()
     USUAL_RATE = auto()
     STATED_UNIT = auto()
@@ -488,10 +491,28 @@ Contradiction = (
 )
 """What contradicts the arm of the URDF."""
 
+
+@dataclass(frozen=True)
+class NoJointTorque(Conclusion):
+    """A channel named as a torque that is none, such as the load or the duty of a servo.
+
+    Attributes:
+        unexplained: share of it that no masses of the arm explain; None where that is not why.
+        is_load: whether its name says so. Without both it has no sign, although joints move in both
+            directions.
+        ratio: of a load to the torque that the URDF's masses need; None where it is not known.
+    """
+
+    unexplained: float | None = None
+    is_load: bool = False
+    ratio: float | None = None
+
+
 Evidence = (
     CopiedCommands
     | Basis
     | ChannelMeaning
+    | EpisodeUnits
     | ConcludedUnit
     | StatedUnit
     | FixedFingers
@@ -514,6 +535,7 @@ Evidence = (
     | DelayProblem
     | FilterShape
     | Contradiction
+    | NoJointTorque
 )
 """From what a row concludes."""
 
@@ -523,6 +545,7 @@ class NextStep(Enum):
 
     STATE_UNIT_OR_GEARS = auto()
     STATE_GRAVITY = auto()
+    STATE_UNITS = auto()
     STATE_DRIVE = auto()
     STATE_TORQUE_CONSTANT = auto()
     NAME_JOINTS = auto()
@@ -547,6 +570,7 @@ class NextStep(Enum):
     RECORD_PAYLOAD = auto()
     IMPORT_COMMANDS = auto()
     CHECK_ENCODER = auto()
+    RECORD_COMMANDS = auto()
     ASK_FOR_POSITIONS = auto()
     ASK_FOR_UNIT = auto()
     ASK_FOR_FILTER = auto()
@@ -615,22 +639,6 @@ class ExplainedTorque(Conclusion):
 
     low_pass: float | None
     heavy_rotors: bool
-
-
-@dataclass(frozen=True)
-class NoJointTorque(Conclusion):
-    """A channel named as a torque that is none, such as the load or the duty of a servo.
-
-    Attributes:
-        unexplained: share of it that no masses of the arm explain; None where that is not why.
-        is_load: whether its name says so. Without both it has no sign, although joints move in both
-            directions.
-        ratio: of a load to the torque that the URDF's masses need; None where it is not known.
-    """
-
-    unexplained: float | None = None
-    is_load: bool = False
-    ratio: float | None = None
 
 
 @dataclass(frozen=True)

@@ -6,7 +6,16 @@ from dataclasses import dataclass
 from typing import Any, Literal
 
 from hil.importers.conclusions import Certainty, Conclusion
-from hil.look.readings import ArmChange, Decider, Evidence, MapEntries, Reading, Setting, Vector
+from hil.look.readings import (
+    ArmChange,
+    Decider,
+    Evidence,
+    MapEntries,
+    NextStep,
+    Reading,
+    Setting,
+    Vector,
+)
 
 Aspect = Literal[
     "time",
@@ -68,6 +77,8 @@ class Row:
     @property
     def has_step(self) -> bool:
         """Whether a person has something to do: to decide it, or to mend what is wrong."""
+        if self.decider in (NextStep.IMPORT_COMMANDS, NextStep.RECORD_COMMANDS):
+            return True
         return self.decider is not None and (
             self.is_fault or self.certainty is Certainty.UNDETERMINED
         )

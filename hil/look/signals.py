@@ -17,13 +17,16 @@ from hil.importers.conclusions import (
     ConcludedUnit,
     Conclusion,
     CopiedCommands,
+    EpisodeUnits,
     FixedFingers,
     JointOrder,
     NameBasis,
     RecordedArm,
     StatedUnit,
     UnitBasis,
+    UnitsFrom,
 )
+from hil.importers.lerobot import STATE
 from hil.importers.plausibility import MIN_CORRELATION, against_position, outside_limits
 from hil.importers.recording_import import ImportedRecording
 from hil.importers.units import Kind
@@ -126,6 +129,8 @@ def _time(recording: Recording, concluded: Sequence[Conclusion], units: Sequence
     if any(each.basis is NameBasis.MESSAGE for each in meanings):
         clock = ClockReading(base, of_messages=True)
         return Row("time", clock, Certainty.CERTAIN, (Basis.MESSAGE_TYPE,))
+    if any(isinstance(each, EpisodeUnits) for each in concluded):
+        return Row("time", ClockReading(base, "s"), Certainty.CERTAIN, (Basis.DATA_SET,))
     if stated is None:
         return Row("time", ClockReading(base), Certainty.CERTAIN, (Basis.GIVEN_RATE,))
     basis = Basis.NAME_AND_RATE if stated.unit is None else Basis.STATED_UNIT
@@ -141,6 +146,11 @@ def _concluded(conclusion: Conclusion, units: Sequence[_Unit]) -> Row | None:
         return Row("fixed", joints, Certainty.LIKELY, (conclusion,))
     if isinstance(conclusion, RecordedArm):
         return Row("recorded arm", Channels(conclusion.arm), Certainty.LIKELY, (conclusion,))
+    if isinstance(conclusion, EpisodeUnits):
+        is_sure = conclusion.basis not in (UnitsFrom.CALIBRATION, UnitsFrom.BEYOND_LIMITS)
+        certainty = Certainty.CERTAIN if is_sure else Certainty.LIKELY
+        decider = None if is_sure else NextStep.STATE_UNITS
+        return Row("position", Channels(STATE, conclusion.unit), certainty, (conclusion,), decider)
     if not isinstance(conclusion, ChannelMeaning) or conclusion.kind == "time":
         return None
     kind = conclusion.kind

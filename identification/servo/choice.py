@@ -15,15 +15,24 @@ from numpy.typing import NDArray
 
 from identification.arrays import Array
 from identification.servo.fit import ServoEstimate, ServoWindows, fit
-from identification.servo.parameters import OPTIONAL, PLACE, TERMS
+from identification.servo.parameters import OPTIONAL, PLACE, TERMS, natural
 from identification.servo.recorded_motion import Grid, ServoMotion
-from identification.servo.start import STARTS, prior_of, start_of
+from identification.servo.start import (
+    STARTS,
+    moving_joints,
+    prior_of,
+    start_of,
+    with_moving_joints,
+)
 
 FIT_ITERATIONS: Final = 12
 _FINE_ITERATIONS: Final = 5  # iterations on the halved grid
 _ROUGH_ITERATIONS: Final = 12  # iterations of each start
+_BEST_START_ITERATIONS: Final = 6  # after the start that fits best
 _TRIAL_ITERATIONS: Final = 4  # of each fit of a fold
 _FOLDS: Final = 2
+_ACCELERATION_RATIOS: Final = np.exp([0.0, -1.5, -1.0, -0.6, -0.3, -0.15, 0.15, 0.3, 0.6, 1.0])
+"""Accelerations of a set-point that are tried, over that of a fit."""
 _MIN_WINDOWS: Final = 4  # of which one half is predicted from the other
 _LOG_LIKELIHOOD_95: Final = 1.92  # of a log-likelihood with one parameter more, 95 %
 _HARM_SIGMAS: Final = 2.0  # of the mean over windows, from which on a term harms
@@ -72,6 +81,7 @@ def steps_of_a_fit() -> int:
     """Return the number of iterations that `fit_servos` reports at most."""
     return (
         len(STARTS) * _ROUGH_ITERATIONS
+        + _BEST_START_ITERATIONS
         + (1 + len(OPTIONAL)) * _FOLDS * _TRIAL_ITERATIONS
         + FIT_ITERATIONS
         + _FINE_ITERATIONS
@@ -100,18 +110,14 @@ def fit_servos(
     present = np.ones((windows.n_joints, len(TERMS)), np.bool_)
     starts = [
         fit(
-            windows,
-            prior,
-            present,
-            start_of(prior, start),
-            resolution,
-            iterations=_ROUGH_ITERATIONS,
-            rough=True,
-            done=done,
+            windows, prior, present, start_of(prior, start), resolution,
+            iterations=_ROUGH_ITERATIONS, rough=True, done=done,
         )
         for start in STARTS
-    ]
-    best = min(starts, key=lambda each: float(_errors(windows, each, resolution).sum()))
+    ]  # fmt: skip
+    alike = np.max([each.alike for each in starts], axis=0)
+    best = min(starts, key=lambda each: _cost(windows, each, resolution, alike))
+    best = _settled(windows, best, moving_joints(rough), resolution, done)
     enough = windows.count >= _MIN_WINDOWS
     choices = _choices(windows, best, resolution, done) if enough else ()
     chosen = present.copy()
@@ -121,7 +127,7 @@ def fit_servos(
     for on, iterations in ((grid, FIT_ITERATIONS), (grid.halved, _FINE_ITERATIONS)):
         scales = (final.scatter, final.alike)
         final = fit(
-            ServoWindows.of(motions(on)), prior, chosen, final.coordinates, resolution,
+            ServoWindows.of(motions(on)), best.prior, chosen, final.coordinates, resolution,
             iterations=iterations, scales=scales, bus=final.bus_delay, rough=on == grid, done=done,
         )  # fmt: skip
     return ServoFit(final, choices, windows.count, _shown(choices, chosen))
@@ -133,6 +139,67 @@ def _shown(choices: Sequence[TermChoice], present: NDArray[np.bool_]) -> NDArray
     for choice in choices:
         shown[choice.joint, [PLACE[name] for name in choice.terms]] = choice.shown
     return shown & present
+
+
+def _with_best_acceleration(
+    windows: ServoWindows, found: ServoEstimate, resolution: Array
+) -> Array:
+    """Return coordinates (n, P) with the acceleration of each joint that fits best of several.
+
+    Of commands far beyond it, whole oscillations are lost: no slope leads to it.
+    """
+    place = PLACE["acceleration"]
+    tried = np.repeat(found.coordinates[None], len(_ACCELERATION_RATIOS), axis=0)
+    tried[..., place] += np.log(_ACCELERATION_RATIOS)[:, None]
+    squares = (windows.residuals(natural(tried)) ** 2).mean(axis=0)
+    errors = np.log(np.minimum(squares, _MAX_POSITION_ERROR**2) + 12.0 * resolution**2)
+    fitted = (len(windows.measured) / found.alike * errors).sum(axis=1)
+    distance = (tried[..., place] - found.prior.mean[:, place]) / found.prior.spread[:, place]
+    best = np.argmin(fitted + distance**2, axis=0)
+    return np.asarray(tried[best, np.arange(len(best))])
+
+
+def _cost(windows: ServoWindows, estimate: ServoEstimate, resolution: Array, alike: Array) -> float:
+    """Return minus twice the logarithm of the posterior of an estimate.
+
+    Args:
+        windows: that were fitted.
+        estimate: of them.
+        resolution: standard deviation of the measured positions (n,).
+        alike: residuals that count as one (n,).
+    """
+    independent = len(windows.measured) / alike
+    fitted = float((independent * _errors(windows, estimate, resolution)).sum())
+    return fitted + estimate.from_prior
+
+
+def _settled(
+    windows: ServoWindows,
+    found: ServoEstimate,
+    moving: NDArray[np.bool_],
+    resolution: Array,
+    done: Callable[[], None],
+) -> ServoEstimate:
+    """Return an estimate from one that no slope leads on from.
+
+    With the best of several accelerations, and with joints that stood as the others are, as far as
+    they say.
+
+    Args:
+        windows: that were fitted.
+        found: estimate of them.
+        moving: joints that moved (n,).
+        resolution: standard deviation of the measured positions (n,).
+        done: called after each iteration.
+    """
+    start = _with_best_acceleration(windows, found, resolution)
+    prior = with_moving_joints(found.prior, start, moving)
+    if moving.any():
+        start = np.where(moving[:, None], start, prior.mean)
+    return fit(
+        windows, prior, found.present, start, resolution, iterations=_BEST_START_ITERATIONS,
+        scales=(found.scatter, found.alike), bus=found.bus_delay, rough=True, done=done,
+    )  # fmt: skip
 
 
 def _errors(windows: ServoWindows, estimate: ServoEstimate, resolution: Array) -> Array:

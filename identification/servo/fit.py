@@ -139,6 +139,14 @@ class ServoEstimate:
         return without_absent(natural(self.coordinates), self.present)
 
     @property
+    def from_prior(self) -> float:
+        """Square of the distance from the prior in its deviations, of delays to that of the bus."""
+        distance = self.coordinates - self.prior.mean
+        distance[:, PLACE["delay"]] = self.coordinates[:, PLACE["delay"]] - self.bus_delay
+        squares = np.where(self.present, distance / self.prior.spread, 0.0) ** 2
+        return float(squares.sum()) + (self.bus_delay / BUS_DELAY_SPREAD) ** 2
+
+    @property
     def deviations(self) -> Array:
         """Standard deviations of the coordinates (n, P)."""
         variances = np.diag(self.covariance)[:-1]

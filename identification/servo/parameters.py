@@ -45,7 +45,7 @@ class Term(NamedTuple):
 
 
 TERMS: Final = (
-    Term("kp", "N·m/rad", "N/m", -1, True, 1.5, True),
+    Term("kp", "N·m/rad", "N/m", -1, True, 1.0, True),
     Term("armature", "kg·m²", "kg", 1, True, 2.0, True),
     Term("viscous", "N·m·s/rad", "N·s/m", 1, True, 2.0, True),
     Term("coulomb", "N·m", "N", 1, True, 1.5, True),

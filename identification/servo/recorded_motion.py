@@ -8,6 +8,7 @@ from typing import Final, NamedTuple
 
 import numpy as np
 import scipy
+from numpy.typing import NDArray
 
 from identification.arrays import Array
 from identification.model.motion import Motion
@@ -128,6 +129,7 @@ class ServoMotion:
         position: measured positions, as recorded (g, n).
         velocity: smoothed (g, n).
         bodies: along the measured motion.
+        turning: joints (n,) that turn, the others slide.
     """
 
     step: float
@@ -136,6 +138,7 @@ class ServoMotion:
     position: Array
     velocity: Array
     bodies: Bodies
+    turning: NDArray[np.bool_]
 
     @property
     def duration(self) -> float:
@@ -232,4 +235,5 @@ def _motion(
         measured,
         velocity,
         Bodies.every(model, bodies, Motion.of_states(smooth, velocity, acceleration)),
+        np.asarray(model.chain.revolute, np.bool_),
     )

@@ -16,6 +16,7 @@ from identification.servo.prediction import predicted
 from identification.servo.pushes import pushes_of
 from identification.servo.recorded_motion import Grid, motions_of
 from identification.servo.servo_simulation import JointInputs, simulate
+from identification.servo.start import moving_joints, prior_of, with_moving_joints
 from identification.signals.recording import Recording
 
 STEP = 5e-3
@@ -329,3 +330,56 @@ def test_a_floor_is_found_where_the_arm_stands_on_it(planted):
         inside = (instants > contact.start + 0.1) & (instants < contact.end - 0.1)
         assert on[inside].mean() > 0.95
         assert contact.torque < 0.0  # the floor lifts the arm, against both axes
+
+
+@pytest.mark.long
+def test_a_joint_that_stood_is_predicted_by_the_servo_of_the_others():
+    """It moves about as far as it is commanded, and nothing of it is called determined."""
+    model, bodies = model_of_arm()
+    rng = np.random.default_rng(7)
+    truth = arm.Planted.drawn(rng)
+    grids, parts = [], []
+    for stands in (True, False):
+        time, command = arm.commands(rng, 15.0)
+        if stands:
+            command[:, 2] = command[0, 2]
+        position = arm.simulated(truth, time, command)
+        recording = Recording(
+            time=time, position=position, joint_names=arm.NAMES, commanded_position=command
+        )
+        grids.append(Grid.of(recording))
+        parts.append(recording)
+    fit = fit_servos(
+        lambda on: motions_of(parts[0], model, bodies, on),
+        grids[0],
+        np.full(3, arm.COUNT / np.sqrt(12.0)),
+    )
+    (unseen,) = motions_of(parts[1], model, bodies, grids[0])
+    intervals = intervals_of(fit)
+    (simulated,) = predicted(model, bodies, unseen, [intervals.values])
+    error, late = (
+        np.sqrt(np.mean((each - unseen.position) ** 2, axis=0))
+        for each in (simulated, unseen.command)
+    )
+    assert error[2] < late[2]
+    assert not intervals.determined[2, [PLACE[name] for name in ("kp", "armature", "limit")]].any()
+
+
+def test_limits_are_sought_beyond_the_fitted_motion():
+    """A slow motion says nothing of the largest torque and acceleration."""
+    model, bodies = model_of_arm()
+    time = np.arange(0.0, 6.0, 0.02)
+    command = np.column_stack([0.1 * np.sin(time), 0.1 * np.cos(time), np.zeros_like(time)])
+    recording = Recording(
+        time=time, position=0.9 * command, joint_names=arm.NAMES, commanded_position=command
+    )
+    motions = motions_of(recording, model, bodies, Grid.of(recording))
+    prior = prior_of(motions, np.full(3, 1e-4))
+    natural = np.exp(prior.mean)
+    assert (natural[:, PLACE["acceleration"]] > 10.0).all()
+    assert (natural[:, PLACE["limit"]] > 2.0 * np.abs(0.1 * command).max()).all()
+    assert np.ptp(natural[:, PLACE["kp"]]) == pytest.approx(0.0)
+    stood = with_moving_joints(prior, prior.mean + 1.0, moving_joints(motions)).mean
+    np.testing.assert_array_equal(stood[:2], prior.mean[:2])
+    assert stood[2, PLACE["kp"]] == pytest.approx(prior.mean[0, PLACE["kp"]] + 1.0)
+    assert stood[2, PLACE["offset"]] == prior.mean[2, PLACE["offset"]]

@@ -18,6 +18,8 @@ from hil.importers.conclusions import EpisodeUnits, UnitsFrom
 from hil.importers.imported_robot import Robot
 from hil.importers.lerobot import DataSet, is_data_set
 from hil.importers.recording_import import ImportOptions, read_episodes, read_recording
+from hil.look import look_at
+from hil.look.readings import Channels
 from hil.pipeline.sources import refuse_duplicates
 from tests.hil.importers.lerobot_set import (
     FPS,
@@ -283,3 +285,62 @@ def test_a_look_reads_the_longest_episode(tmp_path: Path, urdf: Path) -> None:
     folder = written(tmp_path / "pick", episodes, version="v3.0")
     done = CliRunner().invoke(app, ["look", str(folder), "--urdf", str(urdf), "--units", "deg"])
     assert "250 samples" in done.output
+
+
+TURN = 2.0 * np.pi / 4095.0
+
+
+def calibrated(folder: Path, reach: float) -> Path:
+    """Write LeRobot's calibration of the arm."""
+    spans = {"pan": 2.0 * reach, "lift": 2.0 * reach, "gripper": UPPER - LOWER}
+    path = folder / "arm.json"
+    ends = {name: {"range_min": 900.0, "range_max": 900.0 + s / TURN} for name, s in spans.items()}
+    path.write_text(json.dumps(ends))
+    return path
+
+
+@pytest.mark.parametrize(
+    ("unit", "recorded", "with_calibration"),
+    [
+        ("deg", in_degrees, False),
+        ("deg", in_degrees, True),
+        ("range", in_range, True),
+        ("rad", lambda position: position, False),
+    ],
+)
+def test_steps_of_the_encoders_say_the_unit(
+    tmp_path: Path, urdf: Path, unit: Any, recorded: Any, with_calibration: bool
+) -> None:
+    """Small motion, which would fit each of them."""
+    position = TURN * np.round(0.3 * motion(4.0, 0.0) / TURN)
+    folder = written(tmp_path / "pick", [(recorded(position), recorded(position))])
+    calibration = calibrated(tmp_path, REACH) if with_calibration else None
+    ((_, columns, concluded),) = recordings(folder, urdf, calibration=calibration)
+    assert EpisodeUnits(unit, UnitsFrom.ENCODER) in concluded
+    np.testing.assert_allclose(columns["position"][:, :2], position[:, :2], atol=1e-3)
+
+
+def test_a_calibration_does_not_say_the_unit(tmp_path: Path, urdf: Path) -> None:
+    """LeRobot writes degrees or the range, with one calibration."""
+    data = in_degrees(0.5 * motion(4.0, 0.0))
+    folder = written(tmp_path / "pick", [(data, data)])
+    with pytest.raises(SourceError, match="degrees, or -100 to 100"):
+        recordings(folder, urdf, calibration=calibrated(tmp_path, REACH))
+
+
+def test_radians_are_stated(tmp_path: Path, urdf: Path) -> None:
+    position = 0.5 * motion(4.0, 0.0)
+    folder = written(tmp_path / "pick", [(position, position)])
+    with pytest.raises(SourceError, match="in radians"):
+        recordings(folder, urdf)
+    ((_, columns, _),) = recordings(folder, urdf, units="rad")
+    np.testing.assert_allclose(columns["position"], position, atol=1e-5)
+
+
+def test_a_look_names_the_units_and_why(tmp_path: Path, urdf: Path) -> None:
+    position = TURN * np.round(0.3 * motion(4.0, 0.0) / TURN)
+    folder = written(tmp_path / "pick", [(in_degrees(position), in_degrees(position))])
+    robot = Robot.from_urdf(urdf)
+    rows = {row.aspect: row for row in look_at(folder, lambda _: robot, ImportOptions()).rows}
+    assert rows["position"].reading == Channels("observation.state", "deg")
+    assert rows["position"].evidence == (EpisodeUnits("deg", UnitsFrom.ENCODER),)

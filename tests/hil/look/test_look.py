@@ -30,7 +30,6 @@ from hil.importers.recording_import import ImportOptions, import_recording
 from hil.look import Look, look_at
 from hil.look.before_identification import concluded, undecided
 from hil.look.corrected_map import entries_of
-from hil.look.look import SETTINGS
 from hil.look.messages import row_text
 from hil.look.other_arm import Contradictions
 from hil.look.physics import channel_rows
@@ -45,6 +44,7 @@ from hil.look.readings import (
     TorqueDelay,
 )
 from hil.look.result import Aspect, TiedReading
+from hil.look.torque_sample import SETTINGS
 from hil.pipeline.sources import cell_of, source_of
 from identification.estimators.delay import DelayEstimate, UndeterminedDelay
 from identification.hypotheses.changes import Axes, Change

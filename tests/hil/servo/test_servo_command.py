@@ -20,6 +20,12 @@ from hil.archive import open_archive
 from hil.base.errors import InputError, SourceError
 from hil.base.one_screen import one_screen
 from hil.cli import app
+from hil.importers.conclusions import Certainty
+from hil.importers.imported_robot import Robot
+from hil.importers.recording_import import ImportOptions
+from hil.look import look_at
+from hil.look.readings import Fact, NextStep, NoJointTorque
+from hil.look.result import Row
 from hil.results.servo_result import (
     ServoContact,
     ServoFree,
@@ -97,7 +103,7 @@ class TestCommand:
     ) -> None:
         _, output, _ = identified
         lines = " ".join(output.split())
-        assert "torque: left out, it is never negative" in lines
+        assert "torque: left out as the load or duty of a servo: it is never negative" in lines
         assert "--columns 'torque=NAME'" in lines
 
     def test_files_are_written(self, identified: tuple[Path, str, int]) -> None:
@@ -574,11 +580,12 @@ class TestNonsense:
             (lambda q, c: (q, np.full_like(c, np.nan)), "commanded_position", "known"),
             (lambda q, c: (q, constant(c)), "commanded_position", "no command changes"),
             (lambda q, c: (c, c), "position", "bit for bit"),
+            (lambda q, c: (q[:-1], q[1:]), "commanded_position", "of the next sample"),
             (lambda q, c: (q, 1000.0 * c), "commanded_position", "times as far"),
             (lambda q, c: (constant(q), c), "position", "no joint moves"),
             (lambda q, c: (1e6 * q, 1e6 * c), "position", "leaves the limits"),
         ],
-        ids=["empty", "constant", "copied", "millimetres", "still", "no angles"],
+        ids=["empty", "constant", "copied", "next state", "millimetres", "still", "no angles"],
     )
     def test_commands_that_are_none_are_refused(self, tmp_path, motion, change, field, problem):
         log = servo_log(tmp_path, *change(*motion))
@@ -684,3 +691,39 @@ class TestLoad:
         assert torque is not None and "left out" not in output
         as_logged, _ = imported_torque(lerobot_log, "--columns", "torque={}.load")
         np.testing.assert_allclose(torque, 0.002941 * as_logged)
+
+    def test_a_look_leaves_it_out_with_its_factor_as_well(self, lerobot_log: Path) -> None:
+        _, output = imported_torque(lerobot_log)
+        (ratio,) = re.findall(r"it is ([\d.e+]+) times the torque", output)
+        (row,) = torque_rows(lerobot_log)
+        assert row.reading is Fact.SERVO_LOAD
+        assert row.certainty is not Certainty.CERTAIN
+        (load,) = row.evidence
+        assert isinstance(load, NoJointTorque)
+        assert load.ratio == pytest.approx(float(ratio), rel=0.01)
+
+    @pytest.mark.long
+    def test_a_look_takes_as_a_torque_what_is_stated(self, lerobot_log: Path) -> None:
+        rows = torque_rows(lerobot_log, torque="{}.load")
+        assert rows and all(row.reading is not Fact.SERVO_LOAD for row in rows)
+
+    @pytest.mark.parametrize("with_commands", [True, False])
+    def test_a_look_leaves_out_a_load_without_sign(
+        self, tmp_path: Path, with_commands: bool
+    ) -> None:
+        rng = np.random.default_rng(5)
+        folder = written(tmp_path / "motion", arm.Planted.drawn(rng), rng, 6.0)
+        (tmp_path / "arm.urdf").write_text(arm.urdf())
+        if not with_commands:
+            (folder / "control.csv").unlink()
+        (row,) = torque_rows(folder)
+        assert row.reading is Fact.SERVO_LOAD
+        step = NextStep.IMPORT_COMMANDS if with_commands else NextStep.RECORD_COMMANDS
+        assert row.decider is step
+
+
+def torque_rows(log: Path, **chosen: str) -> list[Row]:
+    """Return what a look says of the torque of a log, whose arm is next to it."""
+    robot = Robot.from_urdf(log.with_name("arm.urdf"))
+    look = look_at(log, lambda _: robot, ImportOptions(chosen=chosen))
+    return [row for row in look.rows if row.aspect == "torque"]
