@@ -333,7 +333,7 @@ def test_a_floor_is_found_where_the_arm_stands_on_it(planted):
 
 
 @pytest.mark.long
-def test_a_joint_that_stood_is_predicted_by_the_servo_of_the_others():
+def test_a_joint_that_stood_moves_like_the_others():
     """It moves about as far as it is commanded, and nothing of it is called determined."""
     model, bodies = model_of_arm()
     rng = np.random.default_rng(7)
