@@ -87,7 +87,7 @@ def joints_between(path: Path | None, text: str, links: Links) -> list[str]:
         if links.base is None or link == links.base:
             joints |= dict.fromkeys(way)
         elif links.tip is not None:
-            problem = f"link {links.tip!r} does not hang on link {links.base!r}"
+            problem = f"link {links.tip!r} is not a descendant of link {links.base!r}"
             raise InputError(path, problem, field="--tip", remedy=LINKS_REMEDY)
     return list(joints)
 

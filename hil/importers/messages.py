@@ -169,13 +169,13 @@ def _(units: EpisodeUnits) -> str:
 
 @worded.register
 def _(fixed: FixedFingers) -> str:
-    return f"{', '.join(fixed.positions)}: fixed, {places_of(fixed)}"
+    return f"{', '.join(fixed.positions)}: fixed {places_of(fixed)}"
 
 
 def places_of(fixed: FixedFingers) -> str:
     """Return where the joints of a gripper are fixed, and why."""
     places = ", ".join(number(place) for place in fixed.positions.values())
-    return f"at {places} (rad or m), as of an unrecorded gripper"
+    return f"at {places} (rad or m): a gripper that was not recorded"
 
 
 @worded.register
@@ -450,7 +450,7 @@ def _(fast: FastJoint) -> str:
 def _(other: VelocityOrder) -> str:
     return (
         "the velocities are in another order than the positions: as mapped they differ from the "
-        "slopes by {other.deviation:.0f} %, in the order {', '.join(other.order)} by "
+        f"slopes by {other.deviation:.0f} %, in the order {', '.join(other.order)} by "
         f"{other.least:.0f} %: list the columns of both in the same order"
     )
 

@@ -253,7 +253,7 @@ class TestLosses:
         assert "another recording" in str(archive.missing)
         assert archive.n_samples == 0
         assert "another recording" in " ".join(check_archive(path).faults)
-        with pytest.raises(ArchiveError, match=r"two recordings.*copy"):
+        with pytest.raises(ArchiveError, match=r"different recordings.*copy"):
             repair(path)
 
     def test_imported_recording(self, tmp_path):

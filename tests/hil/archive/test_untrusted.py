@@ -164,7 +164,7 @@ class TestEntries:
         path.write_bytes(written.data[:end] + second + written.data[end:])
         archive = open_archive(path)
         assert archive.joint_names == ("a", "b")
-        assert "second time" in str(archive.damage)
+        assert "occurs twice" in str(archive.damage)
 
     def test_texts_are_escaped_and_nested_data_stay_text(self, written, path):
         def nested(chunk: bytes) -> bytes:

@@ -468,7 +468,7 @@ class TestGripperThatWasNotRecorded:
         imported = import_recording(path, tmp_path / "a.mcap", lambda _: Robot.from_urdf(urdf))
         locked = cell_of(imported.archive).file.robot.locked
         assert locked == {"finger_joint": pytest.approx(0.03)}
-        said = "finger_joint: fixed, at 0.03 (rad or m), as of an unrecorded gripper"
+        said = "finger_joint: fixed at 0.03 (rad or m): a gripper that was not recorded"
         assert said in map(sentence, imported.concluded)
 
     def test_the_map_reads_the_log_again(self, tmp_path: Path, urdf: Path) -> None:
