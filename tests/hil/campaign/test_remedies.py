@@ -88,6 +88,7 @@ ELSEWHERE = {  # files below tests/hil, and what no test can type
     "free disk space": "tests/disk",
     "the FIELD joints form FIELD arms": "design/test_settings.py",
     "add --urdf ARM.urdf": "identified/test_one_command.py",
+    "describe the arm of logs and bags": "fleet/test_logs.py",
     "centre of mass of the payload (--payload-centre) may be": "weighing/test_payload_campaign.py",
     "weigh it under another name (--payload)": "weighing/test_payload_campaign.py",
     "add --for payload": "precision/test_precision.py",

@@ -281,6 +281,14 @@ class TestCommand:
         assert 'columns = "tau{}"' in (out / "map.toml").read_text()
         assert not list(folder.rglob(".hil-cache"))
 
+    def test_a_folder_of_logs_alone_names_the_option_that_reads_it(self, folder, tmp_path):
+        words = ["batch", str(folder), "--cache", "none", "-o", str(tmp_path / "tables")]
+        refused = CliRunner().invoke(app, words)
+        assert refused.exit_code == 2
+        assert "--urdf ARM.urdf" in refused.stderr
+        done = CliRunner().invoke(app, [*words, "--urdf", str(urdf()), *NOTHING_OPEN])
+        assert "4 logs read by the column map inferred from" in done.stdout
+
     def test_options_of_logs_need_the_arm(self, folder):
         done = CliRunner().invoke(app, ["batch", str(folder), "--drop-missing", "--json"])
         refusal = json.loads(done.stdout)

@@ -100,7 +100,7 @@ class TestObjectsOfDrives:
     ) -> None:
         source = write(tmp_path, (name, PARTS))
         refused = refusal(source, urdf)
-        assert "6077h: per mille of a rated one" in refused
+        assert "6077h: per mille of a rated value" in refused
         assert refusal(source, urdf, "--map", stated(refused, source)) == ""
         assert read(source).columns["torque"] == pytest.approx(TORQUE, abs=0.5 * RATED.max() / 1000)
 
