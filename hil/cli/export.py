@@ -96,7 +96,7 @@ def export(
             each field of the simulator, and whether data or prior decide.
         ensemble: Write N arms drawn from the posterior, all physically consistent;
             for isaaclab and genesis in NAME.ranges.json.
-        seed: Of the draws.
+        seed: Seed of the random draws.
         into: Your own MJCF or URDF: change its friction, armature and servos, in place or as
             --output.
         precision: Of the numbers in code for a controller.

@@ -30,8 +30,7 @@ def rehearse(
     passes if the estimate contains the simulated parameters, held-out motion is predicted down to
     the noise, no motion is refused and no motor comes near its limit. Everything is then run again
     with ripple, drift, elasticity and delay. `hil run` requires a rehearsal of the same cell, URDF
-    and plan. It takes one to two minutes on an idle computer; five were measured
-    on a busy one.
+    and plan. It takes one to two minutes, on a busy computer up to five.
 
     Exit status: 0 passed, 5 failed.
 

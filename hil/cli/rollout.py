@@ -77,7 +77,7 @@ def rollout(
             single archives.
         predict: Archive to simulate instead of fit, of any kind (repeatable).
         samples: Arms drawn from the posterior.
-        seed: Of the draws.
+        seed: Seed of the random draws.
         feedback: Natural frequency of the feedback that keeps the simulated arm near the measured
             motion; 0 for none.
         servo: A servo in place of the recorded torque: gains in N·m/rad and N·m·s/rad and delay
