@@ -62,8 +62,8 @@ def late(torque: Floats) -> Floats:
     ("bandwidth", "shape"),
     [
         (8.0, LowPassShape(1, causal=True)),
-        (5.0, LowPassShape(2, causal=True)),
-        (6.0, LowPassShape(2)),
+        pytest.param(5.0, LowPassShape(2, causal=True), marks=pytest.mark.long),
+        pytest.param(6.0, LowPassShape(2), marks=pytest.mark.long),
     ],
 )
 def test_a_low_pass_is_found(bandwidth: float, shape: LowPassShape) -> None:

@@ -191,7 +191,12 @@ ACCEPTED = {
     "import log": "its torque|the torque|no joint moves|has 1 sample|has 99 samples",
 }
 TYPED = [
-    pytest.param(command, *case, id=f"{command}-{case[0].__name__}")
+    pytest.param(
+        command,
+        *case,
+        id=f"{command}-{case[0].__name__}",
+        marks=[pytest.mark.long] if (command, case[0]) == ("identify", of_another_motion) else [],
+    )
     for case in CASES
     for command in ("identify", "look", "import log")
     if command not in ACCEPTED or not re.match(ACCEPTED[command], case[1])
