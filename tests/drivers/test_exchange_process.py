@@ -429,6 +429,7 @@ def test_backlog_after_a_stall_is_dropped():
             time.sleep(0.001)
         for _ in range(90):
             controller.post()
+            time.sleep(PERIOD)  # packets at once would be the fault of the link
         time.sleep(10 * PERIOD)
         os.kill(exchange.pid, signal.SIGCONT)
         assert controller.silent(0.1)

@@ -167,7 +167,7 @@ def test_wider_limits_change_nothing_and_narrower_ones_are_noted(copied: Campaig
     assert active_checks(copied.cell, wider.connection, checks) is checks
     narrower = link_to_controller_with(copied, drive_train__current_limit=[19.5, 12.0])
     (note,) = [run_note for run_note in copied.run(narrower).notes if "limits" in run_note]
-    assert "counted (shoulder: 19.5 A in the controller, 20 in the cell file)" in note
+    assert "were used (shoulder: 19.5 A in the controller, 20 in the cell file)" in note
 
 
 def test_a_single_move_respects_the_controllers_current_limit(
