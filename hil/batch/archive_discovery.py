@@ -204,7 +204,7 @@ def discover(
             f"there is no archive (*{SUFFIX}){'' if importing is None else ', log or bag'} in it",
             *(f"{unused.path} {unused.message}" for unused in found.refused[:1]),
         ]
-        remedy = "name others" + (
+        remedy = "give other files or folders" + (
             ""
             if importing is not None
             else ", or describe the arm of logs and bags: --urdf ARM.urdf"
