@@ -144,7 +144,7 @@ class Watched:
 
 
 class Ratios(NamedTuple):
-    """Errors over those of an ordinary fit, over rows of the board."""
+    """Error ratios to a plain fit, over the rows of the board."""
 
     mean: float  # geometric
     worst: float

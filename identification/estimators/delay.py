@@ -579,7 +579,7 @@ class _Reader:
         return _ShiftedRows(samples.regressor(self.model).blocks, samples.torque, samples.usable)
 
     def rows_behind(self, shift: float) -> _ShiftedRows:
-        """Return the rows at a shift by whole bins: the unshifted rows, so many bins earlier.
+        """Return the rows at a shift by whole bins: the unshifted rows, earlier by that many bins.
 
         The low-pass of the torque, which both have, does not depend on time.
         """

@@ -25,7 +25,7 @@ class TorqueLowPass:
 
     Attributes:
         settings: of the preparation, with the low-pass.
-        confirmed: it also predicts them better than a delay by its lag, and than dry friction that
+        confirmed: certainly so, and better than a delay by its lag, and than dry friction that
             reverses smoothly, both of which resemble it.
     """
 
@@ -56,10 +56,12 @@ def torque_low_pass(
     best = min(range(len(scores)), key=lambda index: scores[index].overall)
     settings, filtered = candidates[best], scores[best]
     as_recorded = compare(filtered, _score(recording, model, options), model)
-    if not (as_recorded.ratio < 1.0 and as_recorded.sigmas < -SURE_SIGMAS):
+    if not (as_recorded.ratio < 1.0 and as_recorded.sigmas < -SEPARATE_SIGMAS):
         return None
     rivals = (compare(filtered, rival, model) for rival in _rivals(recording, model, settings))
-    confirmed = all(rival.ratio < 1.0 and rival.sigmas < -SEPARATE_SIGMAS for rival in rivals)
+    confirmed = as_recorded.sigmas < -SURE_SIGMAS and all(
+        rival.ratio < 1.0 and rival.sigmas < -SEPARATE_SIGMAS for rival in rivals
+    )
     return TorqueLowPass(settings, confirmed)
 
 

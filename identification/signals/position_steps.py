@@ -114,7 +114,7 @@ class _Departures:
 
     @classmethod
     def of(cls, recording: Recording, parts: Sequence[slice], rounded: Array) -> _Departures:
-        """Compare the steps of stretches; rounding moves those of each joint by (n,)."""
+        """Compare the steps of stretches; rounding changes the step of each joint by up to (n,)."""
         time = recording.time
         position = recording.position
         pieces = [_departures(time[part], position[part]) for part in parts]

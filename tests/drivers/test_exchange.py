@@ -579,7 +579,7 @@ class TestPacketsThatComeLate:
     """A rig's controller sends in its cycle, and the link delays what it sends."""
 
     def serve(self, delays, *, skipped=0, away=0.0):
-        """Packets come so many cycles late; `skipped` ones before the last are lost."""
+        """Packets arrive a number of cycles late; `skipped` packets before the last are lost."""
         rig = closed()
         times, packets = [], []
         for cycle, delay in enumerate(delays, 1):

@@ -1,4 +1,4 @@
-"""A low-pass of the recorded torque is told from what resembles one. The motion is simulated."""
+"""A low-pass of the recorded torque, and what resembles one. The motion is simulated."""
 
 from __future__ import annotations
 
