@@ -19,6 +19,7 @@ from unittest.mock import patch
 
 import numpy as np
 
+from benchmarks.choices import Usual, decided_by
 from hil.base.arrays import Array
 from hil.pipeline.estimating import Estimation, estimate_with
 from hil.pipeline.prepared import Prepared
@@ -166,27 +167,16 @@ def watched() -> Iterator[Watched]:
     """Collect the candidates of all questions of an identification, and what it prepared."""
     seen = Watched()
 
-    def noting(decide: Callable[..., SettingDecision]) -> Callable[..., SettingDecision]:
-        def noted(
-            trial: SettingsTrial,
-            name: str,
-            candidates: Sequence[Settings],
-            *others: Any,
-            **more: Any,
-        ) -> SettingDecision:
-            seen.trial = trial
-            seen.weighed.setdefault(name, []).extend(candidates)
-            return decide(trial, name, candidates, *others, **more)
-
-        return noted
+    def noted(
+        usual: Usual, trial: SettingsTrial, name: str, candidates: Sequence[Settings]
+    ) -> SettingDecision:
+        seen.trial = trial
+        seen.weighed.setdefault(name, []).extend(candidates)
+        return usual()
 
     def estimated(prepared: Prepared, *others: Any, **more: Any) -> Estimation:
         seen.prepared = prepared
         return estimate_with(prepared, *others, **more)
 
-    with (
-        patch.object(SettingsTrial, "decide", noting(SettingsTrial.decide)),
-        patch.object(SettingsTrial, "decide_last", noting(SettingsTrial.decide_last)),
-        patch("hil.pipeline.identification.estimate_with", estimated),
-    ):
+    with decided_by(noted), patch("hil.pipeline.identification.estimate_with", estimated):
         yield seen

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
+from functools import partial
 from typing import Any, Final
 from unittest.mock import patch
 
@@ -37,6 +38,36 @@ CHOICES: Final[Mapping[str, tuple[str, ...]]] = {
 """Names of the decisions of each choice; none of a chosen bandwidth averaged with the usual one."""
 
 
+Usual = Callable[[], SettingDecision]
+"""Makes the decision that an identification would make."""
+
+
+@contextmanager
+def decided_by(
+    rule: Callable[[Usual, SettingsTrial, str, Sequence[Settings]], SettingDecision],
+) -> Iterator[None]:
+    """Have a rule make all decisions, of the usual one, the trial, the name and candidates."""
+
+    def replaced(decide: Callable[..., SettingDecision]) -> Callable[..., SettingDecision]:
+        def decided(
+            trial: SettingsTrial,
+            name: str,
+            candidates: Sequence[Settings],
+            *others: Any,
+            **more: Any,
+        ) -> SettingDecision:
+            usual = partial(decide, trial, name, candidates, *others, **more)
+            return rule(usual, trial, name, candidates)
+
+        return decided
+
+    with (
+        patch.object(SettingsTrial, "decide", replaced(SettingsTrial.decide)),
+        patch.object(SettingsTrial, "decide_last", replaced(SettingsTrial.decide_last)),
+    ):
+        yield
+
+
 @contextmanager
 def without(choice: str) -> Iterator[None]:
     """Leave out a choice: its decisions return the first candidate, a delay the stated one."""
@@ -46,27 +77,14 @@ def without(choice: str) -> Iterator[None]:
         return
     left_out = CHOICES[choice]
 
-    def deciding(decide: Callable[..., SettingDecision]) -> Callable[..., SettingDecision]:
-        def decided(
-            trial: SettingsTrial,
-            name: str,
-            candidates: Sequence[Settings],
-            *others: Any,
-            **more: Any,
-        ) -> SettingDecision:
-            if name not in left_out:
-                return decide(trial, name, candidates, *others, **more)
-            kept = candidates[0]
-            if name == names.DELAY:
-                kept = min(candidates, key=_added_delay)
-            return SettingDecision(kept, Choice(name, ("left out",), (), 0))
+    def first(
+        usual: Usual, _: SettingsTrial, name: str, candidates: Sequence[Settings]
+    ) -> SettingDecision:
+        if name not in left_out:
+            return usual()
+        return SettingDecision(_first(name, candidates), Choice(name, ("left out",), (), 0))
 
-        return decided
-
-    with (
-        patch.object(SettingsTrial, "decide", deciding(SettingsTrial.decide)),
-        patch.object(SettingsTrial, "decide_last", deciding(SettingsTrial.decide_last)),
-    ):
+    with decided_by(first):
         yield
 
 
@@ -78,23 +96,13 @@ def taken() -> Iterator[set[str]]:
     """
     found = set[str]()
 
-    def noting(decide: Callable[..., SettingDecision]) -> Callable[..., SettingDecision]:
-        def noted(
-            trial: SettingsTrial,
-            name: str,
-            candidates: Sequence[Settings],
-            *others: Any,
-            **more: Any,
-        ) -> SettingDecision:
-            decision = decide(trial, name, candidates, *others, **more)
-            kept = candidates[0]
-            if name == names.DELAY:
-                kept = min(candidates, key=_added_delay)
-            if trial.key(decision.settings) != trial.key(kept):
-                found.update(choice for choice, decisions in CHOICES.items() if name in decisions)
-            return decision
-
-        return noted
+    def noted(
+        usual: Usual, trial: SettingsTrial, name: str, candidates: Sequence[Settings]
+    ) -> SettingDecision:
+        decision = usual()
+        if trial.key(decision.settings) != trial.key(_first(name, candidates)):
+            found.update(choice for choice, decisions in CHOICES.items() if name in decisions)
+        return decision
 
     def hedged(odds: Callable[..., float]) -> Callable[..., float]:
         def measured(trial: SettingsTrial, *others: Any) -> float:
@@ -105,12 +113,14 @@ def taken() -> Iterator[set[str]]:
 
         return measured
 
-    with (
-        patch.object(SettingsTrial, "decide", noting(SettingsTrial.decide)),
-        patch.object(SettingsTrial, "decide_last", noting(SettingsTrial.decide_last)),
-        patch.object(SettingsTrial, "odds", hedged(SettingsTrial.odds)),
-    ):
+    odds = patch.object(SettingsTrial, "odds", hedged(SettingsTrial.odds))
+    with decided_by(noted), odds:
         yield found
+
+
+def _first(name: str, candidates: Sequence[Settings]) -> Settings:
+    """Return the candidate where nothing is known: of delays the stated one."""
+    return min(candidates, key=_added_delay) if name == names.DELAY else candidates[0]
 
 
 def _added_delay(settings: Settings) -> float:
