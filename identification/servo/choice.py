@@ -152,7 +152,7 @@ def _with_best_acceleration(
     tried = np.repeat(found.coordinates[None], len(_ACCELERATION_RATIOS), axis=0)
     tried[..., place] += np.log(_ACCELERATION_RATIOS)[:, None]
     squares = (windows.residuals(natural(tried)) ** 2).mean(axis=0)
-    errors = np.log(np.minimum(squares, _MAX_POSITION_ERROR**2) + 12.0 * resolution**2)
+    errors = _log_errors(squares, resolution)
     fitted = (len(windows.measured) / found.alike * errors).sum(axis=1)
     distance = (tried[..., place] - found.prior.mean[:, place]) / found.prior.spread[:, place]
     best = np.argmin(fitted + distance**2, axis=0)
@@ -203,13 +203,14 @@ def _settled(
 
 
 def _errors(windows: ServoWindows, estimate: ServoEstimate, resolution: Array) -> Array:
-    """Return the logarithms of mean squared errors of windows and joints (w, n).
-
-    Errors below the step of the encoder count as that.
-    """
+    """Return the logarithms of mean squared errors of windows and joints (w, n)."""
     residuals = windows.residuals(estimate.values[None])[:, 0]
-    squares = np.minimum((residuals**2).mean(axis=0), _MAX_POSITION_ERROR**2)
-    return np.asarray(np.log(squares + 12.0 * resolution**2))
+    return _log_errors((residuals**2).mean(axis=0), resolution)
+
+
+def _log_errors(squares: Array, resolution: Array) -> Array:
+    """Return logarithms of mean squared errors; errors below an encoder step count as one."""
+    return np.asarray(np.log(np.minimum(squares, _MAX_POSITION_ERROR**2) + 12.0 * resolution**2))
 
 
 def _choices(
