@@ -133,10 +133,12 @@ class Size:
         nominal = nominal_of(mounted(cell, tuple(model.gravity)))
         if nominal is None:
             return cls(_by_reach(model, samples), by_masses=False)
-        scale = nominal_scale(model, nominal.values, [samples]).scale
+        nominal_torque = nominal_scale(model, nominal.values, [samples])
+        scale = nominal_torque.scale
         if not np.isfinite(scale).any():
             return cls(_by_reach(model, samples), by_masses=True)
-        known = np.isfinite(scale) & (scale != 0.0)
+        # A scale that may be zero has no order of magnitude.
+        known = nominal_torque.nonzero
         if not known.any():
             return cls(None, by_masses=True)
         factor = float(np.median(np.abs(scale[known])))

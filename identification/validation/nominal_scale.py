@@ -37,6 +37,12 @@ class NominalScale(NamedTuple):
     scale: Array  # (n,), NaN where the nominal torque is too small
     # half a 95 % interval with errors of nominal torque and friction law (n,); infinite likewise
     tolerance: Array
+    noise: Array  # the same with errors of noise and friction law alone (n,)
+
+    @property
+    def nonzero(self) -> NDArray[np.bool_]:
+        """Whether each axis shows any torque of the nominal bodies, whatever its unit (n,)."""
+        return np.asarray(np.abs(self.scale) > self.noise)
 
     @property
     def off(self) -> NDArray[np.bool_]:
@@ -119,22 +125,24 @@ def nominal_scale(
     return NominalScale(*np.array(scales).T)
 
 
-def _scale(table: Array, torque: Array, deviations: Array, *, share: float) -> tuple[float, float]:
-    """Return the coefficient of the first column and its tolerance; NaN if uncertain.
+def _scale(
+    table: Array, torque: Array, deviations: Array, *, share: float
+) -> tuple[float, float, float]:
+    """Return the coefficient of the first column, tolerance and noise; NaN if uncertain.
 
     The first column deviates by a share of itself and by each of `deviations`.
     """
     rigid = table[:, 0]
     others = table[:, 1:]
     if len(torque) < 10 * _BLOCKS or not rigid.any():
-        return np.nan, np.inf
+        return np.nan, np.inf, np.inf
     length = np.linalg.norm(others, axis=0)
     basis, _ = np.linalg.qr(others[:, length > 0.0] / length[length > 0.0])
     # Part of the nominal torque that friction does not explain.
     alone = rigid - basis @ (basis.T @ rigid)
     power = float(alone @ alone)
     if not power > 1e-12 * float(rigid @ rigid):
-        return np.nan, np.inf
+        return np.nan, np.inf, np.inf
     scale = float(alone @ torque) / power
     friction = basis @ (basis.T @ (torque - scale * rigid))
     residuals = np.array_split(alone * (torque - scale * rigid - friction), _BLOCKS)
@@ -146,8 +154,10 @@ def _scale(table: Array, torque: Array, deviations: Array, *, share: float) -> t
     of_torque = share**2 * (1.0 + _LINK_ERROR_WEIGHT * lost)
     model_error = _SIGMAS_OF_SCALE * float(np.sqrt(of_torque + bodies**2 + misfit**2))
     noise = student_limit(0.025, _BLOCKS - 1) * std
+    of_friction = noise + _SIGMAS_OF_SCALE * misfit
     tolerance = noise + model_error
     # Tolerances scale with the unit of the torque. Uncertain bodies alone leave a scale known.
     unit = max(1.0, abs(scale))
-    is_certain = noise + _SIGMAS_OF_SCALE * misfit < _MAX_TOLERANCE * unit and tolerance < unit
-    return (scale, float(tolerance)) if is_certain else (np.nan, np.inf)
+    if not (of_friction < _MAX_TOLERANCE * unit and tolerance < unit):
+        return np.nan, np.inf, np.inf
+    return scale, float(tolerance), float(of_friction)

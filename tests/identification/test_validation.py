@@ -930,6 +930,17 @@ class TestNominalScale:
         assert (finding.key, finding.level) == ("scale of the torque", "doubtful")
         assert finding.joints == (axis,)
 
+    @pytest.mark.parametrize("factor", [1e-3, 1.0, 1e3])
+    def test_only_torques_of_bodies_show_their_unit(self, model, factor):
+        """Of a scale that is zero but for noise none is a thousandth."""
+        runs = runs_of(model, standard(model, 0.05, 1), 1)
+        in_unit = [replace(run, torque=factor * run.torque) for run in runs]
+        scale = nominal_scale(model, nominal(model), in_unit)
+        assert scale.nonzero[2]
+        friction = runs_of(model, 0.0 * standard(model, 0.05, 1), 1)
+        without = [replace(run, torque=factor * run.torque) for run in friction]
+        assert not nominal_scale(model, nominal(model), without).nonzero[2]
+
     @pytest.mark.parametrize("factor", [0.01, 1000.0, -1.0])
     def test_torques_with_another_factor_are_wrong(self, model, factor):
         """Another unit, motor torques, or all of them negated; nothing is known without masses."""

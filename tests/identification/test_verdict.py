@@ -625,7 +625,7 @@ class TestJudgement:
     def test_all_negated_torques_are_one_cause(self):
         """By the nominal model, or by friction that would drive every axis."""
         signs = Implausible((negative("m1"), negative("I2m")), ())
-        nominal = NominalScale(np.full(2, -1.0), np.full(2, 0.1))
+        nominal = NominalScale(np.full(2, -1.0), np.full(2, 0.1), np.zeros(2))
         driving = TopSpeedFriction(np.full(2, -3.0), np.full(2, 0.1))
         for symptom, key in (
             ({"nominal_scale": nominal}, "all torques opposite"),
@@ -636,7 +636,7 @@ class TestJudgement:
             assert (wrong.key, wrong.remedy) == (key, "negate all torques")
 
     def test_one_negated_torque_is_named_by_the_nominal_model(self):
-        scale = NominalScale(np.array([1.0, -1.0]), np.full(2, 0.1))
+        scale = NominalScale(np.array([1.0, -1.0]), np.full(2, 0.1), np.zeros(2))
         findings = found(nominal_scale=scale)
         (wrong,) = (each for each in findings.values() if each.level == "wrong")
         assert (wrong.key, wrong.joints) == ("torque opposite", (1,))
