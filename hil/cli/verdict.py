@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json as json_module
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Final
 
@@ -13,7 +13,8 @@ import typer
 from hil.base.one_screen import MAX_JOINT_ROWS, Paragraph, Part, columns, one_screen
 from hil.base.progress import say
 from hil.base.terminal_text import printable, typed
-from hil.results.results import JointJudgement, OverallJudgement, Results
+from hil.results.error_columns import RMS_MEANING, RMS_TITLE, error_columns
+from hil.results.results import JointJudgement, JudgementResult, Results
 from identification.text import number, percentage
 from identification.validation.purpose_messages import TITLES, figure, requirement
 from identification.validation.verdict import fault_of
@@ -29,16 +30,6 @@ _MISSING: Final = "-"
 _LEVELS: Final = {"wrong": "wrong", "doubtful": "doubtful", "information": "info", "good": "ok"}
 LABEL_COLUMNS: Final = 10
 """Columns before a finding."""
-_LEGEND: Final = (
-    ("RMS error", "root mean square of measured minus predicted torque, on unseen motion"),
-    ("of limit", "RMS error over the torque limit of the joint"),
-    ("relative", "RMS error over the root mean square of the measured torque"),
-    ("training", "relative error on the motion that was fitted"),
-    ("noise", "relative error that the noise of the torque alone would cause"),
-    ("nominal", "relative error of the nominal model (URDF or [nominal])"),
-    ("controller", "relative error of the controller's own dynamic model"),
-    ("R²", "share of the torque's variance that the model explains; 1 is all of it"),
-)
 
 
 def finish(
@@ -126,7 +117,9 @@ def whole(results: Results, written: tuple[Path, Path] | None = None) -> list[st
     """Return everything: the table with its legend, purposes, every check, notes and files."""
     rows = table(results, everything=True)
     lines = [results.verdict.line, "", *rows, ""]
-    lines += [f"{name:10}  {text}" for name, text in _LEGEND if f" {name}" in rows[0]]
+    legend = [(RMS_TITLE, RMS_MEANING)]
+    legend += [(one.title, one.meaning) for one in error_columns(results.judgement, limits=True)]
+    lines += [f"{title:10}  {meaning}" for title, meaning in legend]
     lines += ["", *purposes(results), ""]
     lines.append(f"{results.fitted.message}")
     if results.calibration is not None:
@@ -140,45 +133,25 @@ def whole(results: Results, written: tuple[Path, Path] | None = None) -> list[st
 
 def table(results: Results, *, everything: bool = False) -> list[str]:
     """Format one row per joint, and one of all: errors on unseen motion, with references."""
-    joints = results.judgement.joints
-    rows: list[JointJudgement | OverallJudgement] = [*joints]
-    if results.judgement.all_joints is not None and len(joints) > 1:
-        rows.append(results.judgement.all_joints)
-    return _table(rows, in_sample=results.judgement.in_sample, everything=everything)
+    judgement = results.judgement
+    return _table(judgement.joints, judgement, everything=everything)
 
 
 def _table(
-    rows: Sequence[JointJudgement | OverallJudgement], *, in_sample: bool, everything: bool
+    joints: Sequence[JointJudgement], judgement: JudgementResult, *, everything: bool = False
 ) -> list[str]:
-    of_joint: list[tuple[str, Callable[[JointJudgement], str]]] = [
-        ("joint", lambda joint: joint.joint),
-        ("RMS error", lambda joint: f"{number(joint.rms)} {joint.unit}"),
-        ("of limit", lambda joint: _percent(joint.share_of_limit) if everything else _MISSING),
+    """Format some of the joints, and the row of all unless the arm has one joint."""
+    overall = judgement.all_joints if len(judgement.joints) > 1 else None
+    rows = [
+        ["joint", *(joint.joint for joint in joints), "all"],
+        [RMS_TITLE, *(f"{number(joint.rms)} {joint.unit}" for joint in joints), ""],
     ]
-    of_both: list[tuple[str, Callable[[JointJudgement | OverallJudgement], str]]] = [
-        ("training" if in_sample else "relative", lambda row: _percent(row.relative)),
-        ("training", lambda row: _MISSING if in_sample else _percent(row.fitted_relative)),
-        ("noise", lambda row: _percent(row.noise_relative)),
-        ("nominal", lambda row: _percent(row.nominal_relative)),
-        ("controller", lambda row: _percent(row.controller_relative)),
-    ]
-    cells = [
-        [title, *(text(row) if isinstance(row, JointJudgement) else _OF_ALL[title] for row in rows)]
-        for title, text in of_joint
-    ]
-    cells += [[title, *map(text, rows)] for title, text in of_both]
-    explained = [
-        _MISSING
-        if not isinstance(row, JointJudgement) or row.explained is None
-        else f"{row.explained:.3f}"
-        for row in rows
-    ]
-    cells.append(["R²", *explained])
-    shown = [column for column in cells if set(column[1:]) - {_MISSING, ""}]
-    return columns([*zip(*shown, strict=True)])
-
-
-_OF_ALL: Final = {"joint": "all", "RMS error": "", "of limit": ""}
+    for column in error_columns(judgement, limits=everything):
+        show = _percent if column.is_share else _three_decimals
+        of_all = getattr(overall, column.field, None) if column.of_all else None
+        cells = [show(getattr(joint, column.field)) for joint in joints]
+        rows.append([column.title, *cells, show(of_all) if column.of_all else ""])
+    return columns([*zip(*(row if overall else row[:-1] for row in rows), strict=True)])
 
 
 def _some_joints(results: Results) -> list[str]:
@@ -186,10 +159,7 @@ def _some_joints(results: Results) -> list[str]:
     judgement = results.judgement
     worst = sorted(judgement.joints, key=lambda joint: -(joint.relative or 0.0))[:MAX_JOINT_ROWS]
     shown = [joint for joint in judgement.joints if joint in worst]
-    rows: list[JointJudgement | OverallJudgement] = [*shown]
-    if judgement.all_joints is not None:
-        rows.append(judgement.all_joints)
-    lines = _table(rows, in_sample=judgement.in_sample, everything=False)
+    lines = _table(shown, judgement)
     more = len(judgement.joints) - len(shown)
     return [*lines[:-1], f"{lines[-1]}   ({more} more joints, with smaller errors)"]
 
@@ -229,6 +199,10 @@ def _files(results: Results, written: tuple[Path, Path] | None) -> list[Part]:
         return [f"results in {folder}; no model for simulators: see -v"]
     use = f"for pinocchio, MuJoCo, Gazebo; `hil export {typed(folder)} --to mjcf`"
     return [Paragraph(f"{folder / model}: {use}")]
+
+
+def _three_decimals(value: float | None) -> str:
+    return _MISSING if value is None else f"{value:.3f}"
 
 
 def _percent(share: float | None) -> str:

@@ -48,6 +48,7 @@ from hil.pipeline.stored_identification import (
     stored_identification,
 )
 from hil.report.output_files import copy_outcome, write_outcome
+from hil.results.error_columns import RMS_TITLE, error_columns
 from hil.results.results import Results
 from hil.rollout.servo_rollout import without_torque
 from identification.errors import ModelError
@@ -231,20 +232,19 @@ class IdentifiedArm:
         """Return what a notebook shows."""
         import pandas  # only for this table
 
+        judgement = self.results.judgement
+        shares = [column for column in error_columns(judgement) if column.is_share]
         joints = pandas.DataFrame(
-            [
-                (
-                    joint.joint,
-                    f"{number(joint.rms)} {joint.unit}",
-                    joint.relative,
-                    joint.nominal_relative,
-                )
-                for joint in self.results.judgement.joints
-            ],
-            columns=["joint", "RMS error", "relative error", "error of the nominal model"],
+            {
+                "joint": [joint.joint for joint in judgement.joints],
+                RMS_TITLE: [f"{number(joint.rms)} {joint.unit}" for joint in judgement.joints],
+                **{
+                    column.title: [getattr(joint, column.field) for joint in judgement.joints]
+                    for column in shares
+                },
+            }
         )
-        shown = joints.dropna(axis="columns", how="all")
-        table = shown.to_html(
+        table = joints.to_html(
             index=False, border=0, float_format=partial(percentage, decimals=1), na_rep="-"
         )
         source = base64.b64encode(self.plot().png()).decode("ascii")

@@ -5,7 +5,7 @@ from __future__ import annotations
 import re
 from collections.abc import Sequence
 from functools import partial
-from typing import TYPE_CHECKING, Final, NamedTuple
+from typing import Final, NamedTuple
 
 import numpy as np
 
@@ -16,6 +16,7 @@ from hil.report.interactive import chart_data, library
 from hil.report.numbers import capitalised
 from hil.report.rendering import environment, page_bytes, template_text
 from hil.report.rollout_section import ROLLOUT_LEGENDS, rollout_charts
+from hil.results.error_columns import RMS_TITLE, error_columns
 from hil.results.provenance import RESULTS
 from hil.results.results import ParameterResult, Results, by_id, outside_mark
 from hil.results.rollout_result import RolloutResult
@@ -24,9 +25,6 @@ from identification.excitation import CRITERIA, METHODS
 from identification.selection.settings import Choice
 from identification.validation.purpose_messages import TITLES, figure, requirement
 from identification.validation.verdict import fault_of
-
-if TYPE_CHECKING:
-    pass
 
 _MAX_CANDIDATES: Final = 6
 """Candidates shown of one choice: the first, and the best of the others."""
@@ -80,19 +78,17 @@ def report_bytes(
         "rollout_legends": ROLLOUT_LEGENDS,
         "series": series,
         "shown_candidates": shown_candidates,
-        "has_truth": any(p.truth is not None for p in results.parameters),
-        "has_ids": any(p.table2_id is not None for p in results.parameters),
-        "has_prior": any(p.data_share is not None for p in results.parameters),
+        **_columns_of_parameters(results),
         "found": found_rows(results, series, joints, charts, draw),
         "passed": [
             finding
             for finding in results.judgement.worst_first
             if finding.level in ("information", "good")
         ],
-        "has_absolute": any(p.absolute_std not in (None, p.std) for p in results.parameters),
-        "has_repetitions": any(p.repetition_std is not None for p in results.parameters),
         "by_id": by_id,
         "purposes": purpose_rows(results),
+        "error_columns": error_columns(results.judgement),
+        "rms_title": RMS_TITLE,
         "files": files_of(results),
         "other_reasons": other_reasons(results),
         "offset_parameters": [p for p in results.parameters if _OFFSET.fullmatch(p.name)],
@@ -113,6 +109,18 @@ def report_bytes(
     }
     scripts = (*library(), template_text("charts.js"))
     return page_bytes(environment(*scripts).get_template("report.html.j2").render(**context))
+
+
+def _columns_of_parameters(results: Results) -> dict[str, bool]:
+    """Return which columns the table of parameters has."""
+    parameters = results.parameters
+    return {
+        "has_truth": any(p.truth is not None for p in parameters),
+        "has_ids": any(p.table2_id is not None for p in parameters),
+        "has_prior": any(p.data_share is not None for p in parameters),
+        "has_absolute": any(p.absolute_std not in (None, p.std) for p in parameters),
+        "has_repetitions": any(p.repetition_std is not None for p in parameters),
+    }
 
 
 class PurposeRow(NamedTuple):

@@ -161,6 +161,28 @@ class TestCharts:
         assert heights(page)[1] < 0.5 * before[1]  # the error alone fills its plot
 
 
+class TestPage:
+    @pytest.mark.parametrize("width", [1200, 800, 380])
+    def test_does_not_scroll_sideways(self, browser, tmp_path, width):
+        """Not with every column of the table of parameters; on narrow pages tables scroll alone."""
+        parameters = [p.model_dump() for p in make_results().parameters]
+        for parameter in parameters:
+            parameter |= {"prior_std": 1.0, "prior_ratio": 0.5, "unit": "N·m·s²/rad²"}
+            parameter |= {"estimate": -3.2e-5, "std": 4.2e-5, "truth": -1.17e-4}
+            parameter |= {"repetition_mean": -3.1e-5, "repetition_std": 1.8e-4}
+            parameter |= {"expression": "I3xx - I3zz + I4zz - 0.034225 m4 + 0.355151 m5"}
+        results = make_results(parameters=parameters)
+        path = tmp_path / "report.html"
+        path.write_bytes(report_bytes(results, make_series(samples=300)))
+        opened = OpenedPage(browser, path)
+        page = opened.page
+        page.evaluate("document.querySelectorAll('details').forEach(part => part.open = true)")
+        page.set_viewport_size({"width": width, "height": 900})
+        page.wait_for_timeout(200)
+        assert page.evaluate("document.documentElement.scrollWidth") <= width
+        opened.close()
+
+
 class TestWithoutScript:
     def test_has_the_pictures_and_the_views(self, browser, path):
         opened = OpenedPage(browser, path, java_script_enabled=False)
@@ -182,6 +204,9 @@ class TestPaper:
         for chart in ("t0", "k0"):
             assert page.locator(f'[data-chart="{chart}"] > svg').is_visible()
         assert not page.locator(".live, .tools, .tabs").locator("visible=true").count()
+
+    def test_has_six_sheets_at_most(self, opened):
+        assert page_count(opened.page.pdf(prefer_css_page_size=True)) <= 6
 
     @pytest.mark.parametrize("joints", [1, 6, 7, 12, 15])
     def test_of_the_summary_is_one_sheet(self, browser, tmp_path, joints):
