@@ -6,11 +6,15 @@ run`, while an ordinary process drains its ring.
 
     python -m benchmarks.turnaround_ur [--minutes N] [--busy] [--json]
 
-A set-point is late if it comes more than one cycle after its frame was sent; the output says where
-the time of each went. `packets_late`, `replies_late` and `not_accepted` are the counts of
-`drivers.punctuality` during the motion: only the second are this program's. `machine_busy` is
-the share of all processors in use, ours and others'. With `--busy` every processor is kept busy by
-an ordinary process.
+A set-point is late if it comes more than one cycle after its frame was sent, or never; the output
+says where the time of each went. A bare process on each processor notes meanwhile when the machine
+itself stalls (`benchmarks.machine_stalls`): `late_by_stalls` are late set-points that would have
+come in time without these stalls, `late_otherwise` are the program's own, and
+`latest_otherwise_ms` is the longest time of these from a frame to its set-point without stalls.
+`packets_late`, `replies_late` and `not_accepted` are the counts of `drivers.punctuality` during the
+motion, `exchange_page_faults` those of the exchange process then. `machine_busy` is the share of
+all processors in use, ours and others'. With `--busy` every processor is kept busy by an ordinary
+process.
 """
 
 from __future__ import annotations
@@ -26,7 +30,7 @@ from typing import Any, Final
 
 import numpy as np
 
-from benchmarks import parser_of, show
+from benchmarks import machine_stalls, parser_of, show
 from benchmarks.session import FADE, LOOP, Sinusoids
 from benchmarks.turnaround import Array, figures, steal_ticks
 from benchmarks.turnaround_ends import WARM_UP, drain, spin
@@ -207,17 +211,21 @@ def measure(cycles: int, folder: Path) -> dict[str, Any]:
         reader.start()
         time.sleep(_SETTLING_SECONDS)
         before = exchange.status()
-        exchange.submit(Sinusoids(LOOP + FADE, PERIOD, loop=LOOP))
-        while controller.is_alive():
-            exchange.send_heartbeat()
-            controller.join(0.1)
+        with machine_stalls.watched(folder) as stalls:
+            exchange.submit(Sinusoids(LOOP + FADE, PERIOD, loop=LOOP))
+            faults = latest = page_faults(exchange.pid)
+            while controller.is_alive():
+                exchange.send_heartbeat()
+                if exchange.alive:
+                    latest = page_faults(exchange.pid)
+                controller.join(0.1)
         arrivals.with_suffix(".end").touch()
         while reader.is_alive():
             exchange.send_heartbeat()
             reader.join(0.1)
         status, log = exchange.status(), exchange.log
         endings = [event.reason for event in exchange.events() if isinstance(event, MotionEnded)]
-        realtime = exchange.realtime.scheduling
+        realtime = exchange.realtime
     finally:
         for process in (reader, controller):
             if process.is_alive():
@@ -231,6 +239,7 @@ def measure(cycles: int, folder: Path) -> dict[str, Any]:
         times |= {f"exchange_{name}": array for name, array in file.items()}
     return times | {
         "status": status, "before": before, "log": log, "endings": endings, "realtime": realtime,
+        "stalls": stalls, "page_faults": latest - faults,
         "steal": steal_ticks() - stolen, "busy": busy_share(ticks), "load": os.getloadavg(),
     }  # fmt: skip
 
@@ -245,6 +254,13 @@ def busy_share(before: Array) -> float:
     passed = processor_ticks() - before
     idle = passed[3] + passed[4]  # idle, and waiting for a disk
     return float(1.0 - idle / max(passed.sum(), 1.0))
+
+
+def page_faults(process: int) -> int:
+    """Return the page faults of a process so far."""
+    # The name, in parentheses, may contain spaces.
+    fields = Path("/proc", str(process), "stat").read_text().rpartition(")")[2].split()
+    return int(fields[7]) + int(fields[9])
 
 
 def _started(settings: ExchangeSettings) -> ExchangeProcess:
@@ -274,6 +290,12 @@ def summary(times: Mapping[str, Any], cycles: int) -> dict[str, Any]:
     sent, came, due, arrival = (values[rows] for values in (sent, came, due, arrival))
     result = figures_of(came - sent)
     late = ~(came - sent <= PERIOD)
+    # A frame without a set-point was left out for a newer one, whose set-point came instead.
+    answered_by = np.where(np.isnan(came), np.fmin.accumulate(came[::-1])[::-1], came)
+    union = machine_stalls.merged(times["stalls"])
+    stalled = machine_stalls.stalled_within(union, sent[late], answered_by[late])
+    otherwise = answered_by[late] - sent[late] - stalled
+    own = ~(otherwise <= PERIOD)
     to_exchange = (arrival - sent)[late]
     answered = (came - arrival)[late]
     parts = (("to_exchange", arrival - sent), ("in_exchange_and_back", came - arrival))
@@ -282,6 +304,10 @@ def summary(times: Mapping[str, Any], cycles: int) -> dict[str, Any]:
             round(1e6 * float(value), 1) for value in np.nanpercentile(part, (50.0, 99.0))
         )
     result |= {
+        "late_by_stalls": int(late.sum() - own.sum()),
+        "late_otherwise": int(own.sum()),
+        "latest_otherwise_ms": round(1e3 * float(otherwise.max(initial=0.0)), 3),
+        **machine_stalls.figures(times["stalls"], PERIOD),
         "cycles": len(sent),
         "wanted": cycles,
         "late_on_the_way_or_in_the_controller": int((to_exchange > 0.5 * PERIOD).sum()),
@@ -289,7 +315,11 @@ def summary(times: Mapping[str, Any], cycles: int) -> dict[str, Any]:
         "late_in_the_exchange": int((answered > 0.5 * PERIOD).sum()),
         "frames_sent_late": int((sent - due > 0.5 * PERIOD).sum()),
         "frame_latest_ms": round(1e3 * float(np.nanmax(sent - due)), 3),
-        "exchange_scheduling": times["realtime"],
+        "exchange_scheduling": times["realtime"].scheduling,
+        "exchange_memory_locked": times["realtime"].memory_locked,
+        "exchange_cpu_awake": times["realtime"].cpu_awake,
+        "exchange_refused": "; ".join(times["realtime"].refused),
+        "exchange_page_faults": times["page_faults"],
         "controller_scheduling": str(times["scheduling"]),
         **{
             name: getattr(times["status"], field) - getattr(times["before"], field)
