@@ -156,21 +156,24 @@ def move(
             "duration": move.duration,
             "target_deg": AngleFrame.of(cell).shown(move.target).tolist(),
         }
-        message = f"{ended.outcome}: {ended.reason or 'the arm has arrived'}; archived in {path}"
+        completed = ended.outcome == "completed"
+        message = f"archived in {path}"
+        if completed:
+            message = f"completed: {ended.reason or 'the arm has arrived'}; {message}"
         if not json:
             typer.echo(printable(message))
         try:
             link.close()
         except ControllerError as fault:
             raise fault.beside(figures) from None
-        if json and ended.outcome == "completed":
+        if json and completed:
             _print(message, figures, json=json)
     if ended.outcome == "stopped" and stopped:
-        how = f"the arm was stopped on its path; {path} is complete."
-        raise OperatorStopError(how).beside(figures)
-    if ended.outcome != "completed":
-        why = f"the motion ended {ended.outcome}: {ended.reason}; {path} is complete."
-        raise ExecutionError(why).beside(figures)
+        raise OperatorStopError("the arm was stopped on its path.").beside(figures)
+    if not completed:
+        # On a terminal a refusal was reported with its reason and remedy when it happened.
+        why = "" if ended.outcome == "refused" and not json else f": {ended.reason}"
+        raise ExecutionError(f"the motion ended {ended.outcome}{why}.").beside(figures)
 
 
 class _Shown:

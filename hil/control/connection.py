@@ -158,6 +158,7 @@ class ControllerWords:
         no_drive: that the arm has no drive.
         drive_on: the state that it lacks then.
         switch_on: what an operator does about it.
+        not_ended: why replies are still needed after a motion, and until when.
     """
 
     begin: str
@@ -166,6 +167,7 @@ class ControllerWords:
     no_drive: str
     drive_on: str
     switch_on: str
+    not_ended: str
 
     def waiting(self, state: State, received: str) -> str:
         """Return what keeps the controller from moving, with a remedy; "" while it gets ready.
@@ -211,6 +213,7 @@ C4G_WORDS: Final = ControllerWords(
     no_drive="its drive is off",
     drive_on="drive was on",
     switch_on="switch it on",
+    not_ended="an axis is open; it ends when the axes are closed",
 )
 UR_WORDS: Final = ControllerWords(
     begin="make sure that it is on and its RTDE enabled (Settings, Security, Services)",
@@ -219,7 +222,14 @@ UR_WORDS: Final = ControllerWords(
     no_drive="the arm is off, held by its brakes, or stopped",
     drive_on="arm ran",
     switch_on="end the stop, switch the arm on, release its brakes at the pendant (hil does not)",
+    not_ended="its program on the controller is paused; both end, without moving the arm, when an "
+    "operator ends the stop and resumes the program, or stops it",
 )
+
+
+def words_of(cell: Cell) -> ControllerWords:
+    """Return the words for the controller of a cell."""
+    return UR_WORDS if cell.is_ur else C4G_WORDS
 
 
 def described(spec: ArchiveSpec, connection: Connection) -> ArchiveSpec:

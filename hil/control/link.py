@@ -36,14 +36,12 @@ from hil.control.errors import refusal_text
 from hil.control.motion_watch import MotionWatch, Stop, unwatched_motion
 
 from .connection import (
-    C4G_WORDS,
     READY_STATES,
-    UR_WORDS,
     Connection,
-    ControllerWords,
     StartTimeout,
     active_guard,
     described,
+    words_of,
 )
 from .operator_control import REQUEST_PERIOD, OperatorControl
 from .port import ControllerPort
@@ -160,17 +158,13 @@ class MotionLink:
             raise ControllerError("ended by the operator before anything moved")
         if target is None or port.status().state not in READY_STATES:
             waited, why_off = port.now - began, self.connection.why_off
-            raise self._words.not_ready(port.status().state, waited, why_off)
+            raise words_of(self.cell).not_ready(port.status().state, waited, why_off)
         self._inits = self.connection.inits
         return target
 
-    @property
-    def _words(self) -> ControllerWords:
-        return UR_WORDS if self.cell.is_ur else C4G_WORDS
-
     def _report_waiting(self, state: State, timeout: float) -> None:
         """Report once why no motion can begin yet, and what the operator does about it."""
-        text = self._words.waiting(state, self._waiting() if state is State.SYNC else "")
+        text = words_of(self.cell).waiting(state, self._waiting() if state is State.SYNC else "")
         reported = state, self.connection.no_reply  # packets that are more are no other reason
         if text and reported != self._reported:
             self._reported = reported

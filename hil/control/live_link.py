@@ -52,6 +52,7 @@ from hil.archive.process_handle import (
 from hil.archive.recorder import Recorded
 from hil.base.errors import ArchiveWriteError, ControllerError
 from hil.cell import Cell
+from hil.control.connection import words_of
 from hil.control.link import SESSION_END_TIMEOUT
 from hil.control.motion_watch import Stop
 
@@ -362,7 +363,7 @@ class LivePort:
             if self.exchange.alive:
                 problem = (
                     f"the exchange process still replies {SESSION_END_TIMEOUT:g} s after it was "
-                    "asked to end (an axis is open); it ends when the axes are closed"
+                    f"asked to end: {words_of(self.cell).not_ended}"
                 )
         finally:
             failure = self.archive.end()

@@ -142,6 +142,22 @@ def test_an_infeasible_move_is_refused(target: str, reason: str, ns16: Cell) -> 
         plan_move(ns16, ns16.initial, posture(ns16, target))
 
 
+def test_a_refused_move_says_its_reason_once(tmp_path: Path) -> None:
+    cell = tmp_path / "cell.toml"
+    text = CELL_PATH.read_text().replace('urdf = "', f'urdf = "{CELL_PATH.parent}/')
+    bound = next(line for line in text.splitlines() if line.startswith("following_error"))
+    cell.write_text(text.replace(bound, f"following_error = {[1e-4] * 6}"))
+    words = ["move", str(cell), "--joint", "1", "--by", "5", "-o", str(tmp_path)]
+    result = CliRunner().invoke(app, words)
+    assert isinstance(result.exception, ExecutionError)
+    assert str(result.exception) == "the motion ended refused."
+    reason = open_archive(str(tmp_path / "move_000_a1.mcap")).outcome.entries["reason"]
+    said = f"{result.output}\nerror: {result.exception}"
+    assert said.count("allowed is 1e-05 motor revolutions") == said.count("allowed is") == 1
+    assert "allowed is" in reason
+    assert said.count("move_000_a1.mcap") == 1
+
+
 def test_the_path_is_checked_and_not_only_its_ends(ns16: Cell) -> None:
     """A wall between two free postures."""
     text = ns16.text.replace(
