@@ -151,6 +151,15 @@ WHERE: Final[Mapping[str, str]] = {
     "campaign.home_deg": "a posture with clearance in all directions",
 }
 """Source of the value of each field."""
+_AT_REST: Final = (
+    "the arm: hil new --controller ur, while it rests in a posture in which gravity loads every "
+    "joint but the first"
+)
+_WHERE_OF_UR: Final = {
+    "drive_train.torque_constant": f"{_AT_REST}; or hil torque-constants with a known payload",
+    "drive_train.current_limit": f"{_AT_REST}: largest torques of its type by torque constants",
+}
+"""The same of an arm of Universal Robots, where it differs."""
 
 
 class UnknownFieldsError(CellError):
@@ -166,10 +175,13 @@ class UnknownFieldsError(CellError):
 def require_known(path: Path, raw: Mapping[str, Any], schema: type[BaseModel]) -> None:
     """Refuse a file with unknown values (`"?"`): UnknownFieldsError with all of them."""
     fields: dict[str, str] = {}
+    controller = raw.get("controller")
+    is_ur = isinstance(controller, Mapping) and controller.get("transport") == "rtde"
+    sources = {**WHERE, **(_WHERE_OF_UR if is_ur else {})}
     for location, places in _unknown(raw, ()):
         name = ".".join(location)
         which = f" (entry {', '.join(map(str, places))})" if places else ""
-        where = f"; {WHERE[name]}" if name in WHERE else ""
+        where = f"; {sources[name]}" if name in sources else ""
         fields[name + which] = _place(schema, location).description + where
     if fields:
         raise UnknownFieldsError(path, fields)

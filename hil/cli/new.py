@@ -165,7 +165,14 @@ def _of_arm(address: str | None, described: NewCell | None) -> NewCell:
         problem = "is missing" if address is None else f"{address!r} is not HOST or HOST:PORT"
         raise InputError(None, problem, field="--host", remedy="e.g. --host 192.168.0.10")
     ports = RtdeTable(**fields["rtde"])
-    return cell_of_arm(ask_arm(RtdeSpec(fields["host"], ports.port), ports), described)
+    arm = ask_arm(
+        RtdeSpec(fields["host"], ports.port),
+        ports,
+        waits=lambda most: say(
+            f"the arm moves: waiting up to {most:g} s for a second at rest", err=True
+        ),
+    )
+    return cell_of_arm(arm, described)
 
 
 def _asked(

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from typing import Any, Final
 
@@ -38,7 +38,9 @@ JOINT_NAMES: Final = (
 CONVENTION: Final = "of every arm of this maker"
 """Origin of gears, signs and offsets: angles as in the URDF, torques scaled by the ratio."""
 _LISTENING_SECONDS: Final = 1.0
-"""Time for which outputs are read, s."""
+"""Time of which outputs are used, s."""
+REST_WAIT_SECONDS: Final = 20.0
+"""Longest wait for an arm that moves to rest for so long, s: a pause of its program will do."""
 _COULOMB_SHARE: Final = 0.05
 """Assumed Coulomb friction, as a share of the largest torque."""
 _JERK_TIME: Final = 0.1
@@ -79,8 +81,15 @@ class UrArmStatements:
         return self.identity.calibrated or self.identity.nominal
 
 
-def ask_arm(spec: RtdeSpec, ports: RtdeTable) -> UrArmStatements:
+def ask_arm(
+    spec: RtdeSpec, ports: RtdeTable, *, waits: Callable[[float], object] = float
+) -> UrArmStatements:
     """Return what an arm states of itself; nothing moves, and nothing is claimed.
+
+    Args:
+        spec: of its RTDE.
+        ports: of its other interfaces.
+        waits: called with the longest wait [s] if it moves.
 
     Raises:
         ControllerError: it cannot be reached, or sends nothing.
@@ -90,15 +99,33 @@ def ask_arm(spec: RtdeSpec, ports: RtdeTable) -> UrArmStatements:
         with RtdeReader.connect(spec) as reader:
             reader.start()
             cycle_ms = round(1000.0 / reader.frequency)
-            count = round(_LISTENING_SECONDS * reader.frequency)
-            parts: list[NDArray[np.void]] = []
-            deadline = time.monotonic() + 10.0 * _LISTENING_SECONDS
-            while sum(map(len, parts)) < count and time.monotonic() < deadline:
-                parts.append(reader.fetch(_LISTENING_SECONDS).values)
+            outputs = _at_rest(reader, waits)
             version = reader.version.major
     except DriverError as error:
         raise ControllerError(str(error)) from error
-    return UrArmStatements(spec, identity, version, cycle_ms, np.concatenate(parts))
+    return UrArmStatements(spec, identity, version, cycle_ms, outputs)
+
+
+def _at_rest(reader: RtdeReader, waits: Callable[[float], object]) -> NDArray[np.void]:
+    """Return the outputs of the first second at rest, else of the last one."""
+    count = round(_LISTENING_SECONDS * reader.frequency)
+    most = round(REST_WAIT_SECONDS * reader.frequency)
+    deadline = time.monotonic() + REST_WAIT_SECONDS
+    rows = reader.fetch(_LISTENING_SECONDS, count).values
+    received = len(rows)
+    while time.monotonic() < deadline:
+        rows = rows[-count:]
+        if len(rows) == count and (rows["target_qd"] == 0.0).all():
+            break
+        if received >= most:
+            break
+        if len(rows) == count:
+            waits(REST_WAIT_SECONDS)
+            waits = float
+        more = reader.fetch(_LISTENING_SECONDS, count // 10).values
+        received += len(more)
+        rows = np.concatenate((rows, more))
+    return rows
 
 
 def cell_of_arm(arm: UrArmStatements, described: NewCell | None) -> NewCell:

@@ -46,7 +46,7 @@ def test_a_punctual_run_has_no_late_set_point() -> None:
 
 
 @pytest.mark.parametrize("processor", [0, 1])
-def test_a_set_point_that_is_late_by_a_stall_of_any_processor_is_the_machines(
+def test_late_by_a_stall_of_any_processor(
     processor: int,
 ) -> None:
     run = times({0: NO_STALL, 1: NO_STALL})
@@ -56,7 +56,7 @@ def test_a_set_point_that_is_late_by_a_stall_of_any_processor_is_the_machines(
     assert found(run) == (1, 1, 0)
 
 
-def test_a_set_point_that_is_late_for_longer_than_the_machine_stalled_is_ours() -> None:
+def test_late_for_longer_than_the_machine_stalled() -> None:
     run = times({0: NO_STALL, 1: NO_STALL})
     begin = run["sent"][AT] + 1e-4
     run["stalls"][1] = np.array([[begin, begin + 0.0004]])
@@ -71,7 +71,7 @@ def test_a_stall_at_another_time_excuses_nothing() -> None:
     assert found(run) == (1, 0, 1)
 
 
-def test_a_frame_left_out_is_late_until_the_set_point_that_came_instead() -> None:
+def test_a_frame_left_out_is_late_until_the_next_set_point() -> None:
     run = times({0: NO_STALL, 1: NO_STALL})
     run["came"][AT] = np.nan
     run["came"][AT + 1] = run["sent"][AT + 1] + 5e-4

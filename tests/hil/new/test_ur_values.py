@@ -17,6 +17,7 @@ from hil.base.errors import InputError
 from hil.base.progress import Silent
 from hil.campaign.plan import design
 from hil.cell import Cell
+from hil.cell.errors import UnknownFieldsError
 from hil.cell.schema import RtdeTable
 from hil.cli import app, new
 from hil.control.motion_checks import MotionChecks
@@ -120,9 +121,24 @@ def test_a_moving_arm_states_no_constants(tmp_path: Path, monkeypatch: pytest.Mo
     with UrServer(robot, real_time=False).running() as server:
         for _ in range(100):
             robot.step()
-        said, _ = made_by(server, tmp_path, monkeypatch)
+        said, path = made_by(server, tmp_path, monkeypatch)
     assert said["unknown"] == ["drive_train.torque_constant", "drive_train.current_limit"]
     assert any("hold the arm still" in note for note in said["notes"])
+    with pytest.raises(UnknownFieldsError) as refused:
+        Cell.load(path)
+    assert str(refused.value).count("hil new --controller ur") == 2
+    assert "--from-controller" not in str(refused.value)
+
+
+def test_a_pause_of_its_program_is_waited_for(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    robot = SimulatedUr(program=UrProgram(rest=1.5, periods=1))
+    with UrServer(robot, real_time=False).running() as server:
+        for _ in range(round(5.0 / robot.period)):
+            robot.step()
+        said, _ = made_by(server, tmp_path, monkeypatch)
+    assert said["unknown"] == []
 
 
 @pytest.mark.long
