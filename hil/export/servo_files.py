@@ -85,12 +85,13 @@ SERVO_FORMATS: Final[Mapping[str, _Form]] = {
 
 
 class PlayedBack(NamedTuple):
-    """Errors of a held-out recording in MuJoCo, from its commands alone [mrad or mm]."""
+    """Errors of a held-out recording in MuJoCo, from its commands alone, in a unit."""
 
     archive: str
     error: float
     identified: float  #: of the model with all terms
     command: float
+    unit: str  #: mrad, or mm
 
 
 @dataclass(frozen=True)
@@ -105,7 +106,7 @@ class ExportedServo:
     def lines(self) -> list[str]:
         """Return the summary as lines of text."""
         rows = [
-            f"played back in MuJoCo, {each.archive}: {each.error:.3g} mrad or mm from its commands"
+            f"played back in MuJoCo, {each.archive}: {each.error:.3g} {each.unit} from its commands"
             f" with their offsets (identified model {each.identified:.3g}, command itself"
             f" {each.command:.3g})"
             for each in self.played
@@ -349,7 +350,13 @@ def _played(
         stated = by_archive[source.name]
         error = _MILLI * float(np.sqrt(np.mean((simulated - measured) ** 2)))
         played.append(
-            PlayedBack(source.name, error, stated.position_error_mrad, stated.command_error_mrad)
+            PlayedBack(
+                source.name,
+                error,
+                stated.position_error_mrad,
+                stated.command_error_mrad,
+                results.error_unit,
+            )
         )
     if folder is not None and played:
         checked = "read back: MuJoCo reads the file, its bodies stay"

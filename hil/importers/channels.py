@@ -19,7 +19,7 @@ from hil.base.errors import SourceError
 from hil.importers.array_files import READERS, ArrayFile, format_of
 from hil.importers.bags import SUFFIXES, open_bag
 from hil.importers.column_map import Format
-from hil.importers.commands import as_joint_state, measured_topics
+from hil.importers.commands import COMMANDED, as_joint_state, measured_topics
 from hil.importers.dialect import is_date
 from hil.importers.log_files import LogFiles, files_in, is_folder_of_logs
 from hil.importers.name_words import is_other, kind_by_words
@@ -178,7 +178,13 @@ def _of_folder(folder: Path, form: Format | None, files: LogFiles) -> Iterator[C
         kinds = kinds_of_file(path)
         for channel in channels:
             kind = channel.kind or (kinds[0] if kinds else None)
-            yield replace(channel, kind=kind)
+            yield replace(channel, kind=kind and kind_in_file(kind, path))
+
+
+def kind_in_file(kind: Kind, path: Path) -> Kind:
+    """Return the quantity of positions in a file that is named as one of commands."""
+    is_command = COMMANDED.search(path.stem) or path.stem.lower().startswith("control")
+    return "commanded_position" if kind == "position" and is_command else kind
 
 
 def _of_table(table: TextTable) -> Iterator[Channel]:

@@ -16,9 +16,8 @@ from hil.base.safe_input import parse_toml
 from hil.base.toml_text import to_text
 from hil.importers.array_files import ArrayFile
 from hil.importers.channel_groups import NUMBER, ChannelGroup, grouped
-from hil.importers.channels import channels_of, kinds_of_file
+from hil.importers.channels import channels_of, kind_in_file, kinds_of_file
 from hil.importers.column_map import ColumnMap, Format
-from hil.importers.commands import COMMANDED
 from hil.importers.conclusions import ChannelMeaning, NameBasis, UnitBasis, UnusedChannels
 from hil.importers.imported_robot import NOT_RECORDED, Robot
 from hil.importers.log_files import LogFiles, files_in
@@ -226,7 +225,7 @@ class _Search:
         is_nameless = len(file.names) == 1 if isinstance(file, ArrayFile) else not file.names
         if is_nameless and stem is not None and stem != "time":
             held = self._nameless(file, _width(file))
-            self._held.setdefault(_commanded(stem, path), []).append(held)
+            self._held.setdefault(kind_in_file(stem, path), []).append(held)
             return
         self._read_columns(path, grouped(channels, self._joints), stem)
 
@@ -250,7 +249,7 @@ class _Search:
                 path.name, group.columns(self._joints), group.size, group.names, group.unit, time,
                 by_file,
             )  # fmt: skip
-            self._held.setdefault(_commanded(kind, path), []).append(held)
+            self._held.setdefault(kind_in_file(kind, path), []).append(held)
 
     def _nameless(self, file: TextTable | ArrayFile, count: int) -> _Held:
         """Return the columns of a file without names; the first may be its times."""
@@ -301,12 +300,6 @@ def _meaning(kind: Kind, held: Sequence[_Held]) -> ChannelMeaning:
         unit_basis = UnitBasis.CUSTOM if by_custom else UnitBasis.NUMBERS
     basis = NameBasis.FILE if first.by_file else NameBasis.NAME
     return ChannelMeaning(files, kind_named(kind), basis, first.unit, unit_basis)
-
-
-def _commanded(kind: Kind, path: Path) -> Kind:
-    """Return the quantity of positions in a file that is named as one of commands."""
-    is_command = COMMANDED.search(path.stem) or path.stem.lower().startswith("control")
-    return "commanded_position" if kind == "position" and is_command else kind
 
 
 def _number(held: _Held) -> tuple[int, str]:

@@ -37,7 +37,7 @@ _ALONE: Final = frozenset(
 """Words that say a time where a name has no others: ``velocity_per_sec`` is none."""
 _COMMANDED: Final = frozenset(
     {"target", "targets", "cmd", "cmds", "command", "commands", "commanded", "desired", "des"}
-    | {"setpoint", "setpoints", "ref", "reference", "goal", "goals", "soll"}
+    | {"setpoint", "setpoints", "ref", "reference", "goal", "goals", "soll", "action", "actions"}
 )
 _WANTED: Final = """
 d planned plan model feedforward ff error err delta predicted estimated est nominal"""

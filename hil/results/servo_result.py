@@ -49,6 +49,13 @@ class ServoContact(Frozen):
     torque: float  #: beyond the friction [N·m or N]; as uncertain as `kp` of the joint
 
 
+class ServoSpan(Frozen):
+    """A stretch of a motion."""
+
+    start: float  #: from the start of the motion [s]
+    end: float
+
+
 class ServoFree(Frozen):
     """Errors of a motion without the stretches in which something held a joint."""
 
@@ -137,10 +144,18 @@ class ServoResults(Frozen):
     stuck: list[str] = Field(default_factory=list)  #: joints in no error over all joints
     #: of fitted motions, by archive
     fitted_contacts: dict[str, list[ServoContact]] = Field(default_factory=dict)
+    #: stretches of fitted motions in which something held or pushed the arm, not fitted, by archive
+    left_out: dict[str, list[ServoSpan]] = Field(default_factory=dict)
     split: float  #: fraction of a single recording that was fitted
     #: what was read of logs
     recordings: list[RecordingResult] = Field(default_factory=list)
     notes: list[str]
+
+    @property
+    def error_unit(self) -> str:
+        """Unit of position errors of all joints together."""
+        units = {"mrad" if unit == "rad" else "mm" for unit in self.joint_units}
+        return " or ".join(sorted(units))
 
     @classmethod
     def load(cls, path: Path) -> ServoResults:

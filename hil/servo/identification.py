@@ -27,6 +27,7 @@ from hil.results.servo_result import (
     ServoPrediction,
     ServoPush,
     ServoResults,
+    ServoSpan,
     ServoTermChoice,
     ServoValue,
     ServoVerdict,
@@ -35,13 +36,14 @@ from hil.results.servo_result import (
 from hil.results.servo_series import ServoSeries
 from hil.servo.maker_file import maker_parameters
 from hil.servo.messages import verdict_of
-from identification.servo.choice import FIT_ITERATIONS, ServoFit, fit_servos, steps_of_a_fit
+from identification.servo.choice import FIT_ITERATIONS, fit_servos, steps_of_a_fit
 from identification.servo.contacts import contacts_of
 from identification.servo.intervals import intervals_of, widened_covariance
 from identification.servo.parameters import TERMS, in_units
 from identification.servo.prediction import predicted
 from identification.servo.pushes import pushes_of
 from identification.servo.recorded_motion import Grid, ServoMotion, motions_of
+from identification.servo.servo_fit import ServoFit
 from identification.servo.simulator_terms import (
     ENGINES,
     Engine,
@@ -141,11 +143,7 @@ def identify_servos(
             motions = _motions(source, cell, bodies, grid)
             series += _series(source.name, motions, cell, bodies, found, compared)
             task.advance(1)
-    touched: dict[str, list[ServoContact]] = {}
-    for archive, motion in fitted:
-        if contacts := _contacts(motion, found, cell.joint_names):
-            touched.setdefault(archive, []).extend(contacts)
-    results = _results(name or first.stem, sources, found, series, touched, options)
+    results = _results(name or first.stem, sources, found, series, fitted, options)
     results = results.model_copy(update={"verdict": verdict_of(results)})
     paths = tuple(map(place_of, (*archives, *predict)))
     return ServoIdentification(paths, cell, fit, results, tuple(series))
@@ -262,6 +260,28 @@ def _contacts(motion: ServoMotion, found: _Found, names: Sequence[str]) -> tuple
     )
 
 
+def _fitted_contacts(
+    fitted: Sequence[tuple[str, ServoMotion]], found: _Found, names: Sequence[str]
+) -> dict[str, list[ServoContact]]:
+    """Return the joints that something held in fitted motions, by archive."""
+    by_archive: dict[str, list[ServoContact]] = {}
+    for archive, motion in fitted:
+        if contacts := _contacts(motion, found, names):
+            by_archive.setdefault(archive, []).extend(contacts)
+    return by_archive
+
+
+def _left_out(
+    fitted: Sequence[tuple[str, ServoMotion]], fit: ServoFit
+) -> dict[str, list[ServoSpan]]:
+    """Return the stretches that were not fitted, by archive."""
+    by_archive: dict[str, list[ServoSpan]] = {}
+    for touch in fit.left_out:
+        span = ServoSpan(start=touch.start, end=touch.end)
+        by_archive.setdefault(fitted[touch.motion][0], []).append(span)
+    return by_archive
+
+
 def _prediction(series: ServoSeries, engine: Engine | None = None) -> ServoPrediction:
     """Return the errors of a simulated motion, or with the terms of an engine."""
     simulated = series.identified if engine is None else series.simulators[engine]
@@ -329,7 +349,7 @@ def _results(
     sources: Sources,
     found: _Found,
     series: Sequence[ServoSeries],
-    touched: dict[str, list[ServoContact]],
+    fitted: Sequence[tuple[str, ServoMotion]],
     options: ServoOptions,
 ) -> ServoResults:
     """Return the results, without a verdict.
@@ -339,7 +359,7 @@ def _results(
         sources: its recordings.
         found: what was fitted.
         series: the motions that were predicted.
-        touched: joints that something held in fitted motions, by archive.
+        fitted: motions that were fitted, with their archives.
         options: of the identification.
     """
     cell = sources.cell
@@ -385,7 +405,8 @@ def _results(
             for engine, fit in found.simulators.items()
         },
         stuck=[name for name, is_stuck in zip(names, found.stuck, strict=True) if is_stuck],
-        fitted_contacts=touched,
+        fitted_contacts=_fitted_contacts(fitted, found, names),
+        left_out=_left_out(fitted, found.fit),
         split=options.split,
         notes=list(sources.warnings),
     )

@@ -39,15 +39,9 @@ _MOSTLY: Final = 0.5  # of a motion, from which on it is judged without what som
 _MAX_LINES: Final = 3  # recordings, warnings and next steps on a screen
 
 
-def unit_of(results: ServoResults) -> str:
-    """Return the unit of position errors of all joints together."""
-    units = {"mrad" if unit == "rad" else "mm" for unit in results.joint_units}
-    return " or ".join(sorted(units))
-
-
 def verdict_of(results: ServoResults) -> ServoVerdict:
     """Return whether the model predicts positions much better than the command itself."""
-    unit = unit_of(results)
+    unit = results.error_unit
     warnings: list[str] = []
     steps: list[str] = []
     if results.in_sample or not results.validation:
@@ -68,10 +62,7 @@ def verdict_of(results: ServoResults) -> ServoVerdict:
             f"{', '.join(results.stuck)} never moved in the fitted motions, although commanded "
             f"to: nothing is known about these servos, and errors over all joints exclude them"
         )
-    for archive, contacts in results.fitted_contacts.items():
-        warnings.append(
-            f"in {archive}, which was fitted, {_held(contacts)}: identify without this recording"
-        )
+    warnings += _touched_in_fit(results)
     for each in results.validation:
         own, commands = each.joint_errors_mrad, each.command_joint_errors_mrad
         pairs = zip(results.joint_names, own, commands, strict=True)
@@ -139,6 +130,23 @@ def _figure(prediction: ServoPrediction) -> str:
     return f"{text}, {prediction.free.position_error_mrad:.3g} where nothing held it"
 
 
+def _touched_in_fit(results: ServoResults) -> list[str]:
+    """Return what held or pushed the arm in motions that were fitted."""
+    texts = []
+    for archive, spans in results.left_out.items():
+        times = _times([(span.start, span.end) for span in spans])
+        texts.append(
+            f"in {archive}, something held or pushed the arm from {times}: this part was not fitted"
+        )
+    for archive, contacts in results.fitted_contacts.items():
+        if archive not in results.left_out:
+            texts.append(
+                f"in {archive}, which was fitted, {_held(contacts)}: identify without this"
+                " recording"
+            )
+    return texts
+
+
 def _touched(prediction: ServoPrediction, unit: str) -> str:
     """Return what something did to an arm, and the errors with it and without."""
     parts = []
@@ -163,8 +171,12 @@ def _touched(prediction: ServoPrediction, unit: str) -> str:
 def _held(contacts: Sequence[ServoContact]) -> str:
     """Return when something held the arm, and which joints."""
     joints = ", ".join(dict.fromkeys(contact.joint for contact in contacts))
-    spans = ", ".join(f"{start:.1f} to {end:.1f} s" for start, end in held_spans(contacts))
+    spans = _times(held_spans(contacts))
     return f"something held the arm from {spans} (beyond all friction of {joints})"
+
+
+def _times(spans: Sequence[tuple[float, float]]) -> str:
+    return ", ".join(f"{start:.1f} to {end:.1f} s" for start, end in spans)
 
 
 def held_spans(contacts: Sequence[ServoContact]) -> list[tuple[float, float]]:
@@ -228,7 +240,7 @@ def _errors(results: ServoResults, shown: Sequence[ServoPrediction]) -> list[lis
     if not shown:
         return [["no motion was held out"]]
     other = [] if results.compared is None else [results.compared]
-    unit = f"rms [{unit_of(results)}]"
+    unit = f"rms [{results.error_unit}]"
     rows = [[unit, "all", "MuJoCo's terms", "command", *other]]
     for each, simple in zip(shown, results.simulators["mujoco"].validation, strict=False):
         overall = [each.position_error_mrad, simple.position_error_mrad, each.command_error_mrad]

@@ -7,7 +7,6 @@ It is shown where other windows are predicted worse without it.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
@@ -17,6 +16,7 @@ from identification.arrays import Array
 from identification.servo.fit import ServoEstimate, ServoWindows, fit
 from identification.servo.parameters import OPTIONAL, PLACE, TERMS, natural
 from identification.servo.recorded_motion import Grid, ServoMotion
+from identification.servo.servo_fit import ServoFit, TermChoice
 from identification.servo.start import (
     STARTS,
     moving_joints,
@@ -24,64 +24,28 @@ from identification.servo.start import (
     start_of,
     with_moving_joints,
 )
+from identification.servo.touches import touches_of, untouched, windows_without
 
 FIT_ITERATIONS: Final = 12
 _FINE_ITERATIONS: Final = 5  # iterations on the halved grid
 _ROUGH_ITERATIONS: Final = 12  # iterations of each start
-_BEST_START_ITERATIONS: Final = 6  # after the start that fits best
+_BEST_START_ITERATIONS: Final = 6  # after the start that fits best, and without touched windows
 _TRIAL_ITERATIONS: Final = 4  # of each fit of a fold
 _FOLDS: Final = 2
 _ACCELERATION_RATIOS: Final = np.exp([0.0, -1.5, -1.0, -0.6, -0.3, -0.15, 0.15, 0.3, 0.6, 1.0])
 """Accelerations of a set-point that are tried, over that of a fit."""
 _MIN_WINDOWS: Final = 4  # of which one half is predicted from the other
+_MOSTLY: Final = 0.5  # of the windows, without which none is left out
 _LOG_LIKELIHOOD_95: Final = 1.92  # of a log-likelihood with one parameter more, 95 %
 _HARM_SIGMAS: Final = 2.0  # of the mean over windows, from which on a term harms
 _MAX_POSITION_ERROR: Final = 1.0  # rad or m of an error, as of a model that falls over
-
-
-@dataclass(frozen=True)
-class TermChoice:
-    """Whether a model of one joint has some terms, and what prediction says.
-
-    Attributes:
-        terms: names.
-        joint: index.
-        present: whether they are in the model.
-        gain: by which they lower the root mean square of the prediction error, as a fraction of
-            that without them.
-        shown: whether windows that were not fitted are predicted better with them by more than
-            chance, and not in one window alone.
-    """
-
-    terms: tuple[str, ...]
-    joint: int
-    present: bool
-    gain: float
-    shown: bool
-
-
-@dataclass(frozen=True, eq=False)
-class ServoFit:
-    """An estimate, and how its terms were chosen.
-
-    Attributes:
-        estimate: of all windows.
-        choices: of terms.
-        windows: number of windows.
-        shown: whether a term is shown by prediction; those of every model are (n, P).
-    """
-
-    estimate: ServoEstimate
-    choices: tuple[TermChoice, ...]
-    windows: int
-    shown: NDArray[np.bool_]
 
 
 def steps_of_a_fit() -> int:
     """Return the number of iterations that `fit_servos` reports at most."""
     return (
         len(STARTS) * _ROUGH_ITERATIONS
-        + _BEST_START_ITERATIONS
+        + 2 * _BEST_START_ITERATIONS
         + (1 + len(OPTIONAL)) * _FOLDS * _TRIAL_ITERATIONS
         + FIT_ITERATIONS
         + _FINE_ITERATIONS
@@ -118,6 +82,18 @@ def fit_servos(
     alike = np.max([each.alike for each in starts], axis=0)
     best = min(starts, key=lambda each: _cost(windows, each, resolution, alike))
     best = _settled(windows, best, moving_joints(rough), resolution, done)
+    first = ServoFit(best, (), windows.count, _shown((), present), ())
+    touches = touches_of(rough, first, resolution)
+    free = untouched(windows, touches)
+    if np.count_nonzero(free) < max(_MIN_WINDOWS, _MOSTLY * windows.count):
+        touches = []
+    if touches:
+        windows = windows_without(windows, touches)
+        best = fit(
+            windows, best.prior, present, best.coordinates, resolution,
+            iterations=_BEST_START_ITERATIONS, scales=(best.scatter[free], best.alike),
+            bus=best.bus_delay, rough=True, done=done,
+        )  # fmt: skip
     enough = windows.count >= _MIN_WINDOWS
     choices = _choices(windows, best, resolution, done) if enough else ()
     chosen = present.copy()
@@ -126,11 +102,13 @@ def fit_servos(
     final = best
     for on, iterations in ((grid, FIT_ITERATIONS), (grid.halved, _FINE_ITERATIONS)):
         scales = (final.scatter, final.alike)
+        windows = windows_without(ServoWindows.of(motions(on)), touches)
         final = fit(
-            ServoWindows.of(motions(on)), best.prior, chosen, final.coordinates, resolution,
-            iterations=iterations, scales=scales, bus=final.bus_delay, rough=on == grid, done=done,
+            windows, best.prior, chosen, final.coordinates, resolution, iterations=iterations,
+            scales=scales, bus=final.bus_delay, rough=on == grid, done=done,
         )  # fmt: skip
-    return ServoFit(final, choices, windows.count, _shown(choices, chosen))
+    shown = _shown(choices, chosen)
+    return ServoFit(final, choices, windows.count, shown, tuple(touches))
 
 
 def _shown(choices: Sequence[TermChoice], present: NDArray[np.bool_]) -> NDArray[np.bool_]:

@@ -6,7 +6,10 @@ Where a joint stands, dry friction holds the rest of its servo's torque and that
     \le f_0 + f_s + \mu |\tau_{bodies}|,
 
 and what is beyond is the torque of something else: a table, an object in a gripper, an end stop.
-Weaker contacts are within the friction, and cannot be distinguished from it.
+Friction itself changes with place and time, by up to a factor of two in motions unlike the fitted
+ones (an SO-101 with nothing near it: by 1.97). So something held the arm where a joint is beyond
+twice its friction; joints that are beyond their friction at that time were held as well. Weaker
+contacts cannot be distinguished from friction.
 """
 
 from __future__ import annotations
@@ -18,16 +21,17 @@ import scipy
 from numpy.typing import NDArray
 
 from identification.arrays import Array
-from identification.servo.choice import ServoFit
 from identification.servo.fit import ROBUST
 from identification.servo.intervals import reach_of, widened_covariance
 from identification.servo.parameters import PLACE, POSITIVE, natural, without_absent
 from identification.servo.recorded_motion import ServoMotion
+from identification.servo.servo_fit import ServoFit
 from identification.signals.masks import runs_of
 
 _OVER: Final = 1.0  # s that a joint stands, longer than any answer to a command takes
 _PERIOD: Final = 0.05  # s between rows that are judged
 _RESTING: Final = 2.0  # steps of the encoder that a joint at rest may move
+_TIMES_FRICTION: Final = 2.0  # that no friction of one joint reaches
 _DIFFERENCE: Final = np.where(POSITIVE, 1e-3, 1e-5)  # of the coordinates, for derivatives
 
 
@@ -50,7 +54,8 @@ def contacts_of(motion: ServoMotion, fit: ServoFit, resolution: Array) -> list[C
     """Return the contacts of a motion, by joint and time.
 
     Friction is exceeded for a second, in one direction, by more than the 95 % interval of the
-    servo's parameters and three times the scatter of the positions that they were fitted to.
+    servo's parameters and three times the scatter of the positions that they were fitted to; that
+    of one joint is by then exceeded twofold.
 
     Args:
         motion: as it was measured.
@@ -67,21 +72,32 @@ def contacts_of(motion: ServoMotion, fit: ServoFit, resolution: Array) -> list[C
     scatter = np.sqrt(np.mean(fit.estimate.scatter**2, axis=0))
     least = ROBUST * np.maximum(scatter, resolution)
     compliance = fit.estimate.values[:, PLACE["kp"]]
-    beyond, deviation = _beyond(motion, every, fit)
+    beyond, deviation, friction = _beyond(motion, every, fit)
+    surely = [sign * beyond - reach_of(fit) * deviation - least for sign in (1.0, -1.0)]
+
+    def held(excess: Array) -> NDArray[np.bool_]:
+        """Return the rows (m, n) of stretches in which joints stand beyond something."""
+        marked = np.zeros(excess.shape, np.bool_)
+        resting = still & (scipy.ndimage.minimum_filter(excess, (over, 1)) > 0.0)
+        for joint in np.flatnonzero(resting.any(axis=0)).tolist():
+            for first, end in runs_of(excess[:, joint] > 0.0):
+                marked[first:end, joint] = resting[first:end, joint].any()
+        return marked
+
+    twofold = [held(excess - (_TIMES_FRICTION - 1.0) * friction) for excess in surely]
+    arm = np.any(twofold, axis=(0, 2))
     contacts = []
-    for sign in (1.0, -1.0):
-        surely = sign * beyond - reach_of(fit) * deviation - least
-        held = still & (scipy.ndimage.minimum_filter(surely, (over, 1)) > 0.0)
-        for joint in np.flatnonzero(held.any(axis=0)).tolist():
-            for first, end in runs_of(surely[:, joint] > 0.0):
-                if held[first:end, joint].any():
-                    torque = float(np.median(beyond[first:end, joint])) / compliance[joint]
-                    contacts.append(Contact(joint, first * period, (end - 1) * period, -torque))
+    for excess in surely:
+        rows = held(excess) & arm[:, None]
+        for joint in np.flatnonzero(rows.any(axis=0)).tolist():
+            for first, end in runs_of(rows[:, joint]):
+                torque = float(np.median(beyond[first:end, joint])) / compliance[joint]
+                contacts.append(Contact(joint, first * period, (end - 1) * period, -torque))
     return sorted(contacts, key=lambda each: (each.joint, each.start))
 
 
-def _beyond(motion: ServoMotion, every: int, fit: ServoFit) -> tuple[Array, Array]:
-    """Return the unexplained position error of the servo (m, n) and its standard deviation (m, n).
+def _beyond(motion: ServoMotion, every: int, fit: ServoFit) -> tuple[Array, Array, Array]:
+    """Return the unexplained position error of the servo, its deviation, and friction (m, n) each.
 
     At every `every`-th sample, beyond what motion and static friction, the largest, explain.
     """
@@ -120,7 +136,8 @@ def _beyond(motion: ServoMotion, every: int, fit: ServoFit) -> tuple[Array, Arra
         part = slice(joint * count, (joint + 1) * count)
         own = slopes[..., joint]
         variance[:, joint] = np.einsum("pm,pq,qm->m", own, covariance[part, part], own)
-    return direction * np.maximum(over[0], 0.0), np.sqrt(np.maximum(variance, 0.0))
+    beyond = direction * np.maximum(over[0], 0.0)
+    return beyond, np.sqrt(np.maximum(variance, 0.0)), friction[0]
 
 
 def _at_rest(position: Array, most: Array, over: int) -> NDArray[np.bool_]:

@@ -50,12 +50,17 @@ class ServoWindows:
         measured: positions (K, w, n).
         count: number w.
         every: steps between samples.
+        motion: index of the motion of each window (w,).
+        start, end: of each window in its motion (w,) [s].
     """
 
     inputs: JointInputs
     measured: Array
     count: int
     every: int
+    motion: NDArray[np.intp]
+    start: Array
+    end: Array
 
     @classmethod
     def of(cls, motions: Sequence[ServoMotion]) -> ServoWindows:
@@ -66,15 +71,19 @@ class ServoWindows:
         longest = min(duration, *(motion.duration for motion in motions))
         steps = every * max(1, int(longest / (every * motions[0].step)))
         places = [
-            (motion, first)
-            for motion in motions
+            (number, first)
+            for number, motion in enumerate(motions)
             for first in range(0, len(motion.position) - steps + 1, steps)
         ]
-        parts = [motion.inputs(first, steps) for motion, first in places]
+        parts = [motions[number].inputs(first, steps) for number, first in places]
         measured = np.stack(
-            [motion.position[first : first + steps : every] for motion, first in places], axis=1
+            [motions[number].position[first : first + steps : every] for number, first in places],
+            axis=1,
         )
-        return cls(side_by_side(parts), measured, len(places), every)
+        numbers, firsts = np.array(places, np.intp).T
+        start = motions[0].step * firsts
+        end = start + motions[0].step * steps
+        return cls(side_by_side(parts), measured, len(places), every, numbers, start, end)
 
     @property
     def n_joints(self) -> int:
@@ -88,8 +97,15 @@ class ServoWindows:
         def cut(name: str) -> Array:
             return np.ascontiguousarray(getattr(self.inputs, name)[..., columns])
 
-        measured = self.measured[:, chosen]
-        return ServoWindows(self.inputs.mapped(cut), measured, len(chosen), self.every)
+        return ServoWindows(
+            self.inputs.mapped(cut),
+            self.measured[:, chosen],
+            len(chosen),
+            self.every,
+            self.motion[chosen],
+            self.start[chosen],
+            self.end[chosen],
+        )
 
     def residuals(self, values: Array) -> Array:
         """Return simulated less measured positions (K, V, w, n) at values (V, n, P)."""

@@ -11,7 +11,6 @@ from numpy.typing import NDArray
 from identification.arrays import Array
 from identification.distributions import student_limit
 from identification.estimators.prior import DETERMINED_STD_RATIO
-from identification.servo.choice import ServoFit
 from identification.servo.fit import ServoEstimate
 from identification.servo.parameters import (
     ABSENT,
@@ -23,9 +22,11 @@ from identification.servo.parameters import (
     natural,
     without_absent,
 )
+from identification.servo.servo_fit import ServoFit
 
 _MAX_INTERVAL_FACTOR: Final = 2.0  # upper end over value, above which a parameter is not determined
 _VANISHES: Final = np.array([name not in ABSENT for name in NAMES])  # without effect at zero
+_NOT_NEGATIVE: Final = np.array([name != "offset" for name in NAMES])
 _POWER: Final = np.array([term.torque for term in TERMS])
 
 
@@ -69,6 +70,7 @@ def intervals_of(fit: ServoFit) -> ServoIntervals:
     unseen = estimate.present & ~fit.shown
     without = without_absent(natural(estimate.coordinates), ~unseen)
     lower = np.where(_unseen(fit), 0.0, lower)
+    lower = np.where(_NOT_NEGATIVE, np.maximum(lower, 0.0), lower)
     upper = np.where(unseen & np.isinf(without), np.inf, upper)
     return ServoIntervals(values, lower, upper, determined)
 

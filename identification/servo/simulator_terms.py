@@ -7,15 +7,18 @@ the values with which it comes closest to the motion, not those of a model that 
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
 from typing import Final, Literal, get_args
 
 import numpy as np
 
 from identification.arrays import Array
-from identification.servo.choice import FIT_ITERATIONS, ServoFit
+from identification.servo.choice import FIT_ITERATIONS
 from identification.servo.fit import ServoWindows, fit
 from identification.servo.parameters import NAMES
 from identification.servo.recorded_motion import ServoMotion
+from identification.servo.servo_fit import ServoFit
+from identification.servo.touches import windows_without
 
 Engine = Literal["mujoco", "physx"]
 ENGINES: Final[tuple[Engine, ...]] = get_args(Engine)
@@ -44,7 +47,7 @@ def fits_in_simulators(
         resolution: standard deviation of the measured positions (n,).
         done: called after each iteration.
     """
-    windows = ServoWindows.of(motions)
+    windows = windows_without(ServoWindows.of(motions), found.left_out)
     best = found.estimate
     fits = dict[Engine, ServoFit]()
     for engine in ENGINES:
@@ -56,5 +59,5 @@ def fits_in_simulators(
             windows, best.prior, present, best.coordinates, resolution, iterations=FIT_ITERATIONS,
             bus=best.bus_delay, done=done,
         )  # fmt: skip
-        fits[engine] = ServoFit(estimate, (), found.windows, found.shown & present)
+        fits[engine] = replace(found, estimate=estimate, choices=(), shown=found.shown & present)
     return fits

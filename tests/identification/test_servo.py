@@ -10,13 +10,16 @@ from benchmarks import servo_arm as arm
 from identification import RobotModel
 from identification.servo.choice import fit_servos
 from identification.servo.contacts import contacts_of
+from identification.servo.fit import ServoWindows
 from identification.servo.intervals import intervals_of, sampled, widened_covariance
 from identification.servo.parameters import ABSENT, NAMES, PLACE, TERMS, in_errors, in_units
 from identification.servo.prediction import predicted
 from identification.servo.pushes import pushes_of
 from identification.servo.recorded_motion import Grid, motions_of
+from identification.servo.servo_fit import Touch
 from identification.servo.servo_simulation import JointInputs, simulate
 from identification.servo.start import moving_joints, prior_of, with_moving_joints
+from identification.servo.touches import windows_without
 from identification.signals.recording import Recording
 
 STEP = 5e-3
@@ -296,8 +299,33 @@ def test_a_joint_that_moves_while_its_command_rests_was_pushed():
     simulated[:, 0] = 0.0
     (push,) = pushes_of(step, command, measured, simulated)
     assert push.joint == 0
-    assert push.change == pytest.approx(-0.06)
+    assert push.change == pytest.approx(-0.06, rel=0.01)
     assert push.time == pytest.approx(6.0, abs=0.6)
+    assert push.end == pytest.approx(step * len(time), abs=step)  # no command moves again
+
+
+def test_an_arm_may_be_held_until_its_commands_move_again():
+    step = 0.01
+    time = step * np.arange(1000)
+    command = np.zeros((1000, 2))
+    command[:, 0] = np.clip(time - 2.0, 0.0, 0.5)  # drives the arm into something
+    command[:, 1] = np.clip(time - 8.0, 0.0, 0.5)
+    measured = command.copy()
+    measured[:, 1] -= 0.05 * np.clip(time - 2.2, 0.0, 1.0) * (time < 8.0)
+    simulated = command.copy()
+    (push,) = pushes_of(step, command, measured, simulated)
+    assert push.joint == 1
+    assert push.time == pytest.approx(2.2, abs=0.3)
+    assert push.end == pytest.approx(8.0, abs=0.05)
+
+
+def test_noise_pushes_nothing():
+    """Of 2 mrad at 50 samples a second, of which single samples differ by 15 mrad."""
+    rng = np.random.default_rng(2)
+    command = np.zeros((6000, 6))
+    measured = 2e-3 * rng.standard_normal(command.shape)
+    assert np.ptp(measured) > 0.015
+    assert pushes_of(0.02, command, measured, command) == []
 
 
 def poses_of(truth, rng, floor=-np.inf):
@@ -330,6 +358,58 @@ def test_a_floor_is_found_where_the_arm_stands_on_it(planted):
         inside = (instants > contact.start + 0.1) & (instants < contact.end - 0.1)
         assert on[inside].mean() > 0.95
         assert contact.torque < 0.0  # the floor lifts the arm, against both axes
+
+
+def test_windows_around_a_stretch_are_left_out():
+    """Of its motion alone."""
+    model, bodies = model_of_arm()
+    parts = []
+    for seconds in (30.0, 20.0):
+        time, command = arm.commands(np.random.default_rng(1), seconds)
+        recording = Recording(
+            time=time, position=command, joint_names=arm.NAMES, commanded_position=command
+        )
+        parts += motions_of(recording, model, bodies, Grid.of(recording))
+    windows = ServoWindows.of(parts)
+    left = windows_without(windows, [Touch(1, 9.0, 10.5)])
+    removed = {*zip(windows.motion, windows.start, strict=True)} - {
+        *zip(left.motion, left.start, strict=True)
+    }
+    assert {motion for motion, _ in removed} == {1}
+    assert {round(start) for _, start in removed} == {8}  # of 4 s each; 1 s before and after
+    assert left.measured.shape[1] == left.count == windows.count - len(removed)
+
+
+@pytest.mark.long
+def test_what_stood_on_a_floor_is_not_fitted(planted):
+    truth, *_, unseen, _ = planted
+    model, bodies = model_of_arm()
+    resolution = np.full(3, arm.COUNT / np.sqrt(12.0))
+    floor = np.quantile(arm.tip_heights(poses_of(truth, np.random.default_rng(3)).position), 0.2)
+    recordings = []
+    for height in (-np.inf, floor):
+        rng = np.random.default_rng(3)
+        time, command = arm.commands(rng, 30.0) if np.isinf(height) else arm.poses(rng, 40.0)
+        position = arm.simulated(truth, time, command, height)
+        recordings.append(
+            Recording(
+                time=time, position=position, joint_names=arm.NAMES, commanded_position=command
+            )
+        )
+    grid = Grid.of(recordings[0])
+
+    def both(on):
+        return [part for each in recordings for part in motions_of(each, model, bodies, on)]
+
+    fit = fit_servos(both, grid, resolution)
+    assert fit.left_out
+    assert {touch.motion for touch in fit.left_out} == {1}
+    on = arm.tip_heights(recordings[1].position) < floor + 1e-3
+    for touch in fit.left_out:
+        assert on[(recordings[1].time > touch.start) & (recordings[1].time < touch.end)].any()
+    assert fit.windows < ServoWindows.of(both(grid)).count
+    (simulated,) = predicted(model, bodies, unseen, [intervals_of(fit).values])
+    assert np.sqrt(np.mean((simulated - unseen.position) ** 2)) < 2.0 * arm.COUNT
 
 
 @pytest.mark.long

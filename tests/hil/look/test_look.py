@@ -258,6 +258,18 @@ class TestCommand:
         assert "slope of the position" in result.output
         assert "add --urdf ARM.urdf" in result.output
 
+    def test_commands_in_a_file_of_their_own_are_no_joints(
+        self, tmp_path: Path, table: Mapping[str, Floats]
+    ) -> None:
+        folder = tmp_path / "so"
+        folder.mkdir()
+        names = ["t", "q{}"]
+        write_log(folder / "state.csv", names, table["t"], table["q"])
+        write_log(folder / "control.csv", names, table["t"], table["q"] + 0.01)
+        result = hil("look", folder)
+        assert result.exit_code == 0, (result.output, result.exception)
+        assert "commanded position  control.csv" in result.output
+
 
 class TestConclusions:
     def test_an_identification_uses_what_is_sure(

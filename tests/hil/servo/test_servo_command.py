@@ -31,6 +31,7 @@ from hil.results.servo_result import (
     ServoFree,
     ServoPush,
     ServoResults,
+    ServoSpan,
     is_servo_result,
 )
 from hil.servo.maker_file import maker_parameters
@@ -192,6 +193,10 @@ class TestCommand:
         contact = ServoContact(joint="lift", start=3.5, end=6.5, torque=-1.0)
         held = results.model_copy(update={"fitted_contacts": {"fast.mcap": [contact]}})
         assert any("fast.mcap, which was fitted" in text for text in verdict_of(held).warnings)
+        span = ServoSpan(start=3.0, end=7.0)
+        apart = verdict_of(held.model_copy(update={"left_out": {"fast.mcap": [span]}}))
+        (told,) = [text for text in apart.warnings if "fast.mcap" in text]
+        assert "from 3.0 to 7.0 s: this part was not fitted" in told
 
     def test_results_and_report_say_what_was_read(self, identified: tuple[Path, str, int]) -> None:
         folder, _, _ = identified
