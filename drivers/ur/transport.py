@@ -92,7 +92,7 @@ class RtdeSpec(TransportSpec):
             raise TransportError(self.address, str(error), remedy) from error
         except rtde.RtdeError as error:
             connection.close()
-            remedy = "motions need PolyScope 5.10 or newer; `hil record` may work nevertheless"
+            remedy = "motions need newer software; `hil record` may work nevertheless"
             raise TransportError(self.address, str(error), remedy) from error
         except BaseException:
             connection.close()

@@ -87,11 +87,13 @@ OPTIONAL: Final = tuple(
     name for name in (*outputs.REQUIRED, *outputs.OPTIONAL) if name not in REQUIRED
 )
 """Further outputs, that are recorded where this version has them."""
-OLDEST_VERSION: Final = (5, 10)
-"""Oldest software, major and minor, on which motions run."""
-NEWEST_MAJOR: Final = 5
 CB3: Final = 3
-"""Newest major version of the software of CB3 controllers."""
+"""Major version of the software of CB3 controllers."""
+CB3_PERIOD: Final = 0.008
+"""Their cycle [s]."""
+OLDEST_MINOR: Final = {CB3: 11, 5: 10}
+"""Oldest software on which motions run: minor by major version. From 3.11 on a CB3 states its
+payload."""
 FULL_SPEED_TOLERANCE: Final = 1e-3
 """Largest distance of speed slider and scaling from 1."""
 MAX_DEVIATION: Final = 0.8
@@ -165,20 +167,27 @@ class UrProtocol:
         return _OwnPackets(self, drive_train, position, period)
 
 
+def version_problem(version: ControllerVersion) -> str:
+    """Return why no motion runs on this software, or ""."""
+    oldest = OLDEST_MINOR.get(version.major)
+    if oldest is not None and version.minor >= oldest:
+        return ""
+    names = {CB3: "a CB3", 5: "PolyScope 5"}
+    needed = [f"{major}.{minor} or newer of {names[major]}" for major, minor in _BY_NEWEST]
+    return f"motions need {', or '.join(needed)}"
+
+
+_BY_NEWEST: Final = sorted(OLDEST_MINOR.items(), reverse=True)
+
+
 def reasons_not_to_move(
     expected: ExpectedArm, description: UrDescription, period: float
 ) -> tuple[str, ...]:
     """Return why this arm is not moved by this cell, a sentence each."""
     version, identity = description.version, description.identity
     found = [*expected.differences(identity, version.major)]
-    oldest = ".".join(map(str, OLDEST_VERSION))
-    if version.major <= CB3:
-        found.append(
-            f"it is a CB3 controller (software {version}), which is only recorded: motions "
-            f"need an e-Series controller with PolyScope {oldest} or newer"
-        )
-    elif (version.major, version.minor) < OLDEST_VERSION or version.major > NEWEST_MAJOR:
-        found.append(f"its software is {version}; motions need {oldest} or newer of PolyScope 5")
+    if problem := version_problem(version):
+        found.append(f"its software is {version}; {problem}")
     if abs(description.period - period) > 1e-9:
         ours = f"{1e3 * period:g} ms in the cell"
         found.append(f"cycle is {1e3 * description.period:g} ms in the controller, {ours}")
@@ -627,9 +636,9 @@ class _OwnPackets:
             calibration=expected.calibration or None,
         )
         recipe = OutputRecipe(1, names, types)
-        self._description = UrDescription(
-            identity, ControllerVersion(*OLDEST_VERSION, 0, 0), 1.0 / period, recipe, 1
-        )
+        major = CB3 if abs(period - CB3_PERIOD) < 1e-9 else max(OLDEST_MINOR)
+        version = ControllerVersion(major, OLDEST_MINOR[major], 0, 0)
+        self._description = UrDescription(identity, version, 1.0 / period, recipe, 1)
         self._layout = _Layout(self._description.recipe)
         angles = drive_train.joint_sign * position + drive_train.joint_offset
         self._rest: dict[str, float | list[float]] = {

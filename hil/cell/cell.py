@@ -44,9 +44,10 @@ from .toml_edits import urdf_limits, with_values
 
 T = TypeVar("T")
 
-UR_MAX_GAP: Final = 4
-"""`max_gap` of Universal Robots controllers without another: a set-point is used some two cycles
-after it was sent, and a computer without a real-time system is late now and then."""
+UR_GAP_MS: Final = 8
+"""Time of the `max_gap` of Universal Robots controllers without another: a set-point is used some
+two cycles after it was sent, and a computer without a real-time system is late now and then. With
+one cycle more their program stops the arm, in any case within 20 ms of silence."""
 FLANGES: Final = ("tool0", "flange")
 """Links of URDFs that are the frame in which a controller states a payload."""
 ASSUMED_PAYLOAD: Final = "robot.payload"
@@ -325,7 +326,7 @@ class Cell:
         """Consecutive missed packets that a motion tolerates."""
         table = self.controller
         given = "max_gap" in table.model_fields_set
-        return UR_MAX_GAP if self.is_ur and not given else table.max_gap
+        return round(UR_GAP_MS / table.cycle_ms) if self.is_ur and not given else table.max_gap
 
     def session_settings(self, *, only_axis: int | None = None) -> dict[str, Any]:
         """Keyword arguments of `drivers.Session`."""

@@ -430,7 +430,8 @@ class ControllerTable(Table):
     rtde: RtdeTable = field("a table of the Universal Robots arm", RtdeTable())
     arm: Whole = field("arm of the controller, 1 to 4", 1, ge=1, le=4)
     max_gap: Whole = field(
-        "consecutive missed packets that a motion tolerates, 0 to 5; with rtde 4 by default",
+        "consecutive missed packets that a motion tolerates, 0 to 5; with rtde by default 4, or 1 "
+        "of a CB3",
         2,
         ge=0,
         le=5,
@@ -453,7 +454,8 @@ class ControllerTable(Table):
 
     @model_validator(mode="after")
     def _possible_cycle(self) -> ControllerTable:
-        possible = (2, 8) if self.transport == "rtde" else (1, 2, 4)
+        is_ur = self.transport == "rtde" or "rtde" in self.model_fields_set
+        possible = (2, 8) if is_ur else (1, 2, 4)
         if self.cycle_ms not in possible:
             problem = (
                 f'cycle_ms = {self.cycle_ms} is not possible with transport = "{self.transport}"'

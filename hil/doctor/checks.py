@@ -27,7 +27,7 @@ from drivers.transports.base import (
     TransportSpec,
 )
 from drivers.ur.connection import RtdeConnection, connected
-from drivers.ur.wire import NEWEST_MAJOR, OLDEST_VERSION
+from drivers.ur.wire import version_problem
 from hil.archive.process import STALL_LIMIT
 
 
@@ -391,8 +391,6 @@ def rtde_check(server: RtdeServer) -> DoctorCheck:
         remedy = "# make sure that this is the RTDE port (30004)"
         return DoctorCheck("RTDE", CheckStatus.BAD, f"{where}: {error}", (remedy,))
     facts = f"{where} replies: software {version}"
-    if (version.major, version.minor) < OLDEST_VERSION or version.major > NEWEST_MAJOR:
-        oldest = ".".join(map(str, OLDEST_VERSION))
-        note = f"recorded only; motions need {oldest} or newer of PolyScope 5"
-        return DoctorCheck("RTDE", CheckStatus.WARN, f"{facts} ({note})")
+    if problem := version_problem(version):
+        return DoctorCheck("RTDE", CheckStatus.WARN, f"{facts} (recorded only; {problem})")
     return DoctorCheck("RTDE", CheckStatus.OK, facts)

@@ -80,7 +80,8 @@ class SimulatedUrArm:
         period: of the controller [s].
         seed: of its noise.
         load: what its flange carries, and the controller does not know.
-        entered: the payload that the controller knows; the flange carries it as well.
+        entered: the payload that the controller knows; the flange carries it as well, unless
+            `truth` says what it carries.
         urdf: of the arm, six joints.
         effects: that a model of it leaves out.
     """
@@ -108,7 +109,7 @@ class SimulatedUrArm:
         # Without rotors: what the arm reports as its moment is that of rigid bodies alone.
         self._model = build_model(urdf, (0.0, 0.0, -9.81), np.zeros(6))
         carry(self.plant.model, load)
-        carry(self.plant.model, entered)
+        carry(self.plant.model, entered if truth.plant.carried is None else None)
         carry(self._model, entered)
         self._data = self._model.createData()
         self._period = period

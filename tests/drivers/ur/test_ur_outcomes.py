@@ -279,11 +279,8 @@ class TestBefore:
         [
             ({"remote_control": False}, "local mode"),
             ({"version": (5, 9, 4, 0)}, "5.10"),
-            (
-                {"version": (3, 15, 8, 0)},
-                "a CB3 controller .software 3.15.8.0., which is only recorded",
-            ),
-            ({"version": (3, 15, 8, 0)}, "8 ms in the controller"),
+            ({"version": (3, 10, 0, 0)}, "3.10.0.0; motions need .* or 3.11 or newer of a CB3"),
+            ({"version": (3, 15, 8, 0)}, "8 ms in the controller, 2 ms in the cell"),
             ({"version": (10, 7, 0, 0)}, "PolyScope 5"),
         ],
     )

@@ -26,7 +26,7 @@ from hil.cell import Cell
 from hil.cli import app
 from hil.control.motion_watch import Stop
 from hil.control.simulated_cell import with_simulation
-from hil.control.ur_simulation import UrPeer, served_arm, simulated_ur
+from hil.control.ur_simulation import UrPeer, arm_truth, served_arm, simulated_ur
 from hil.control.virtual_link import VirtualLink
 from sim_fixtures.ur import CELL_PATH, UR5E_URDF, UrArmTruth, UrFault
 from tests.tiers import quick_ones
@@ -153,3 +153,16 @@ def test_an_arm_without_power_is_switched_on_at_its_pendant() -> None:
         assert "release its brakes at the pendant (hil does not)" in text
         assert "drive" not in text.lower().replace("drive_off", "")
     assert not peer.controller.playing and peer.controller.robot_mode_name == "POWER_OFF"
+
+
+def test_the_payload_of_a_cell_is_carried_once_and_known_to_the_controller() -> None:
+    payload = {"frame": "flange", "mass": 3.0, "centre": [0.0, 0.0, 0.05]}
+    cell = Cell.load(CELL_PATH)
+    arms = [
+        simulated_ur(each, truth=arm_truth(each, exact=True)).arm
+        for each in (cell, cell.with_values({"robot.payload": payload}))
+    ]
+    masses = [sum(body.mass for body in arm.plant.model.inertias) for arm in arms]
+    assert masses[1] - masses[0] == pytest.approx(3.0)
+    model = [sum(body.mass for body in arm._model.inertias) for arm in arms]
+    assert model[1] - model[0] == pytest.approx(3.0)
