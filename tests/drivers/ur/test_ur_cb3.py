@@ -55,7 +55,7 @@ def test_the_plan_is_the_one_of_a_shorter_cycle() -> None:
     assert np.abs(moved[0][1 : n + 1] - short[:n]).max() <= rate
 
 
-def test_without_the_pc_the_program_stops_the_arm_within_20_ms() -> None:
+def test_without_the_pc_the_arm_stops_within_20_ms() -> None:
     bench = cb3_bench()
     bench.silent_from = MIDST
     bench.move()
@@ -68,9 +68,7 @@ def test_without_the_pc_the_program_stops_the_arm_within_20_ms() -> None:
 
 @pytest.mark.parametrize("direction", ["to_controller", "to_pc"])
 @pytest.mark.parametrize(("gap", "outcomes"), [(1, {"completed"}), (2, {"lost", "refused"})])
-def test_one_missing_set_point_is_bridged_two_end_the_motion(
-    gap: int, outcomes: set[str], direction: str
-) -> None:
+def test_one_missing_set_point_is_bridged(gap: int, outcomes: set[str], direction: str) -> None:
     bench = cb3_bench(link=[Lose(MIDST, direction, gap)]).move()
     assert bench.ended.outcome in outcomes, bench.ended
     assert bench.run(100).rests and not bench.robot.playing
@@ -111,7 +109,7 @@ def test_the_operator_slows_holds_and_releases_it() -> None:
     assert (bench.ended.outcome, bench.state) == ("completed", State.CLOSED)
 
 
-def test_the_cycle_before_each_packet_is_one_of_this_controller() -> None:
+def test_warm_up_cycles_are_of_this_controller() -> None:
     cell = cb3_cell()
     warm_up = WarmUp(cell.drive_train, cell.guard_limits, cell.period, protocol=cell.ur_protocol)
     warm_up.cycle()

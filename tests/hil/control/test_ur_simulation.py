@@ -155,7 +155,7 @@ def test_an_arm_without_power_is_switched_on_at_its_pendant() -> None:
     assert not peer.controller.playing and peer.controller.robot_mode_name == "POWER_OFF"
 
 
-def test_the_payload_of_a_cell_is_carried_once_and_known_to_the_controller() -> None:
+def test_the_payload_of_a_cell_is_carried_once() -> None:
     payload = {"frame": "flange", "mass": 3.0, "centre": [0.0, 0.0, 0.05]}
     cell = Cell.load(CELL_PATH)
     arms = [
