@@ -89,6 +89,17 @@ def _cut(line: str) -> str:
     return line[: SCREEN_COLUMNS - len(_ELLIPSIS)].rstrip() + _ELLIPSIS
 
 
+def wrapped(text: str) -> str:
+    """Return text whose long lines are broken between words, at `SCREEN_COLUMNS`."""
+    broken = (
+        [line]
+        if len(line) <= SCREEN_COLUMNS
+        else textwrap.wrap(line, SCREEN_COLUMNS, break_on_hyphens=False, break_long_words=False)
+        for line in text.split("\n")
+    )
+    return "\n".join(part for parts in broken for part in parts)
+
+
 def columns(rows: Sequence[Sequence[str]], *, left: int = 1) -> list[str]:
     """Return rows as lines with aligned columns, the first ones flush left, the others right."""
     widths = [max(map(len, column)) for column in zip(*rows, strict=True)]

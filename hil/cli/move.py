@@ -21,6 +21,7 @@ from hil.base.errors import (
     UnsafeError,
 )
 from hil.base.files import make_folder
+from hil.base.one_screen import wrapped
 from hil.base.progress import Task, say
 from hil.base.progress import reporter as make_reporter
 from hil.base.terminal_text import printable
@@ -242,7 +243,7 @@ def _described(move: CheckedMove, cell: Cell, link: MotionLink) -> str:
     )
     below = narrower_limits(cell, link.connection, "following_error")
     lines += [f"the smaller following-error threshold applies, {note}" for note in below]
-    return "\n".join(filter(None, [*lines, move.checks.not_checked]))
+    return wrapped("\n".join(filter(None, [*lines, move.checks.not_checked])))
 
 
 def _print(text: str, figures: dict[str, object], *, json: bool) -> None:

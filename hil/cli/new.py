@@ -12,6 +12,7 @@ from drivers.transports.udp import UdpSpec
 from drivers.ur.transport import RtdeSpec
 from hil.base.errors import InputError
 from hil.base.files import convert_write_errors, write_atomically
+from hil.base.one_screen import wrapped
 from hil.base.progress import say
 from hil.base.safe_input import parse_port
 from hil.base.terminal_text import typed
@@ -144,10 +145,10 @@ def new(
         print_json({"cell": str(output), **summary})
         return
     for note in made.values.notes:
-        say(f"note: {note}")
-    say(f"{output}: {len(made.joint_names)} joints ({', '.join(made.joint_names)})")
+        say(wrapped(f"note: {note}"))
+    say(wrapped(f"{output}: {len(made.joint_names)} joints ({', '.join(made.joint_names)})"))
     if unknown:
-        say(f'unknown, marked "?": {", ".join(unknown)}')
+        say(wrapped(f'unknown, marked "?": {", ".join(unknown)}'))
         after = "design" if design_only else "doctor"
         say(f"fill them in, then `hil {after} {typed(output)}`, which lists what is still missing")
     elif controller is not None:
@@ -185,9 +186,9 @@ def _asked(
         remedy = "e.g. 10.2.12.150:1000"
         raise InputError(None, f"{address!r} is not HOST or HOST:PORT", remedy=remedy)
     if not quiet:
-        typer.echo(
-            f"listening on {bind}:{port}; now start the controller's Open program at {host} "
-            f"(waiting {wait:g} s, Ctrl-C to stop). Nothing moves"
+        say(
+            f"listening on {bind}:{port} for {wait:g} s, Ctrl-C to stop; nothing moves.\n"
+            f"Now start the Open program of the controller at {host}"
         )
     with stop_on_interrupt() as stop:
         init = read_init(UdpSpec(host, port, bind), n_joints, arm=arm, wait=wait, stop=stop)

@@ -12,6 +12,7 @@ import typer
 
 from hil.base.arrays import Array
 from hil.base.errors import InputError
+from hil.base.one_screen import wrapped
 from hil.base.safe_input import read_input
 from hil.base.terminal_text import printable
 from hil.cell import AngleFrame, Cell
@@ -166,10 +167,10 @@ def _table(summary: Mapping[str, Any], start: Array, joint_names: Sequence[str])
         lines.append(
             f"{number:6d}{angles}{target['time']:9.3f}{target['distance_deg']:10.3f}  {how}{fly}"
         )
-    lines += [
+    closing = (
         "{duration:.3f} s; {duration_with_stops:.3f} s with a stop at every target; {reduced} "
-        "corners rounded less than requested, {stopped} not at all".format_map(summary),
+        "corners rounded less than requested, {stopped} not at all\n"
         "closest to its limit: {worst_limit}, {worst_limit_ratio:.6f} of it ({angles} angles; "
-        "floor, walls, currents and self-collision were not checked)".format_map(summary),
-    ]
-    return "\n".join(lines)
+        "floor, walls, currents and self-collision were not checked)"
+    )
+    return "\n".join([*lines, wrapped(closing.format_map(summary))])

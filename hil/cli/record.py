@@ -18,6 +18,7 @@ from hil.archive.live import LiveView
 from hil.archive.recorder import Recorded
 from hil.base.arrays import Array
 from hil.base.errors import ControllerError, HilError, InputError, OperatorStopError
+from hil.base.one_screen import wrapped
 from hil.base.progress import put, say
 from hil.base.progress_lines import LINE_PERIOD, STATUS_LINE_PERIOD, progress_console
 from hil.campaign import Progress, stop_on_interrupt
@@ -162,7 +163,7 @@ def record_listening(cell: Cell, how: RecordRequest, *, quiet: bool, json: bool)
         by_operator=stop.requested, line=HEARD_LINE, json=json, more=more,
     )  # fmt: skip
     if not json and not quiet and found.are_doubtful:
-        say("\n".join(constants_lines(found)))
+        say(wrapped("\n".join(constants_lines(found))))
 
 
 def constants_lines(found: ConstantsFound) -> Iterator[str]:
@@ -198,7 +199,7 @@ def _finish(
     early = _early_end(path, done, duration, by_operator=by_operator)
     figures = {**_figures(path, done, cell), **more}
     if not json:
-        say(line.format_map(figures))
+        say(wrapped(line.format_map(figures)))
     elif early is None:
         print_json(figures)
     if early is not None:
@@ -236,10 +237,9 @@ def _figures(path: Path, done: Recorded, cell: Cell) -> dict[str, object]:
 
 
 LINE: Final = (
-    "{archive}: {duration:.1f} s in {cycles} cycles, {missed} packets missed, {late_packets} "
-    "late, {late} replies late, {not_accepted} not accepted, {records_lost} records and "
-    "{events_lost} events lost; "
-    "{outcome}: {reason}"
+    "{archive}: {duration:.1f} s, cycles {cycles}, packets {missed} missed, {late_packets} late; "
+    "replies {late} late, {not_accepted} not accepted; lost {records_lost} records, "
+    "{events_lost} events; {outcome}: {reason}"
 )
 HEARD_LINE: Final = (
     "{archive}: {duration:.1f} s in {cycles} frames, {missed} missed; {outcome}: {reason}"

@@ -12,6 +12,7 @@ from typing import Annotated, Final, Literal
 import typer
 
 from hil.base.errors import InputError
+from hil.base.one_screen import wrapped
 from hil.base.progress import say_at_once
 from hil.base.terminal_text import plural, printable
 from hil.cell import Cell
@@ -333,14 +334,14 @@ def serve_rtde(cell: Cell, arm: ArmOnRtde, others: list[str], *, json: bool) -> 
             "{cycles} cycles, {late} of them late by a cycle; at most {clients} clients at a time, "
             "to which {skipped} frames were not sent because they did not read"
         )
-        typer.echo(text.format_map(figures))
+        typer.echo(wrapped(text.format_map(figures)))
 
 
 def _print_closing(served: Served, *, as_json: bool) -> None:
     if as_json:
         print_json(_figures(served))
     else:
-        typer.echo(printable("\n".join(_sentences(served))))
+        typer.echo(wrapped(printable("\n".join(_sentences(served)))))
 
 
 def _postures(cell: Cell) -> tuple[tuple[float, ...], ...]:

@@ -17,7 +17,7 @@ from typer.testing import CliRunner
 from benchmarks.fleet import Fault, Fleet, FleetPlan, write_fleet
 from benchmarks.fleet import urdf as fleet_urdf
 from hil.base.errors import HilError
-from hil.base.one_screen import SCREEN_COLUMNS, SCREEN_LINES, Paragraph, brief, one_screen
+from hil.base.one_screen import SCREEN_COLUMNS, SCREEN_LINES, Paragraph, brief, one_screen, wrapped
 from hil.cell import Cell
 from hil.cli import app
 from identification.errors import IdentificationError
@@ -53,6 +53,12 @@ class TestText:
         parts = [Paragraph("word " * 60), "", *["row"] * 21, ""]
         shown = one_screen(parts)
         assert len(shown) == SCREEN_LINES and "" not in shown
+
+    def test_long_lines_are_broken_between_words_and_long_words_stay(self) -> None:
+        path = "/" + "x" * 120
+        broken = wrapped(f"short\n{'word ' * 30}\n{path} is whole").split("\n")
+        assert broken[0] == "short" and path in broken
+        assert max(len(line) for line in broken if line != path) <= SCREEN_COLUMNS
 
     def test_of_too_many_lines_the_ends_stay(self) -> None:
         shown = brief([f"line {k}" for k in range(40)], last=2)
