@@ -394,6 +394,11 @@ def _remarks(results: ServoResults) -> tuple[str, ...]:
             if planned
             else []
         ),
+        *(
+            []
+            if results.delay_known
+            else ["The delay is not known: commands and positions had different clocks."]
+        ),
         "With these values this simulator's terms reproduce the motion best.",
         f"archives: {', '.join(results.archives)}",
     )

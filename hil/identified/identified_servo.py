@@ -15,7 +15,8 @@ from hil.base.output_folder import SOURCES, folder_beside, sources_text
 from hil.base.progress import Reporter, Silent
 from hil.identified.recordings_read import recording_results
 from hil.identified.staging import Staging
-from hil.importers.recording_import import is_archive
+from hil.importers.conclusions import OtherClock
+from hil.importers.recording_import import ImportedRecording, is_archive
 from hil.importers.required_signals import has_servo, require_commands
 from hil.pipeline.options import Options
 from hil.report.output_files import REPORT
@@ -108,9 +109,17 @@ def identified_servo(
         source for place, source in staging.sources.items() if place.name in predicted_names
     ]
     read = recording_results(staging, held_out)
-    results = identification.results.model_copy(update={"recordings": read})
+    known = not any(_has_other_clock(recording) for recording in staging.recordings.values())
+    update = {"recordings": read, "delay_known": known}
+    results = identification.results.model_copy(update=update)
     identification = replace(identification, results=results)
     return IdentifiedServo(tuple(recordings), tuple(predicted), identification, channels, staging)
+
+
+def _has_other_clock(recording: ImportedRecording) -> bool:
+    """Return whether the commands of a recording were moved from another clock."""
+    found = (*recording.concluded, *recording.examined.found)
+    return any(isinstance(each, OtherClock) for each in found)
 
 
 def write_servo(

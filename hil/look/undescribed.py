@@ -8,6 +8,7 @@ from tempfile import TemporaryDirectory
 from hil.base.errors import SourceError
 from hil.importers.channels import CHANNEL_NAMES, channels_of
 from hil.importers.imported_robot import Robot
+from hil.importers.lerobot import is_data_set
 from hil.importers.log_files import LogFiles
 from hil.importers.recording_import import ImportOptions
 
@@ -16,8 +17,11 @@ def undescribed_robot(source: Path, options: ImportOptions, files: LogFiles) -> 
     """Return a robot with as many joints as the recording has positions; `files` are parsed once.
 
     Raises:
-        SourceError: no channel is named as position.
+        SourceError: no channel is named as position, or its units need the arm.
     """
+    if is_data_set(source):
+        problem = "is a data set of LeRobot, in units that the ranges of the joints decide"
+        raise SourceError(source, problem, field="--urdf", remedy="add --urdf ARM.urdf")
     channels = channels_of(source, files=files)
     names = next((channel.joints for channel in channels if channel.joints), ())
     if not names:

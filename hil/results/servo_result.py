@@ -132,6 +132,7 @@ class ServoResults(Frozen):
     windows: int  #: that were fitted
     seconds: float  #: processor time of the fit
     delay: float  #: of commands, common to all joints [s]
+    delay_known: bool = True  #: if not, it contains what remains of the difference of two clocks
     servo: list[ServoValue]
     validation: list[ServoPrediction]
     in_sample: bool  #: whether nothing was held out

@@ -196,12 +196,16 @@ def screen(results: ServoResults, read: Sequence[Part] = ()) -> list[Part]:
     parts: list[Part] = [Paragraph(verdict.line), *read, ""]
     parts += columns(_errors(results, results.validation[:_MAX_LINES]))
     parts += ["", *columns(_parameters(results, [*results.joint_names][:MAX_JOINT_ROWS])), ""]
-    parts.append(
-        f"delay of commands {1e3 * results.delay:.0f} ms; ? = not determined by the motion"
-    )
+    parts.append(f"{_delay(results)}; ? = not determined by the motion")
     parts += [Paragraph(text, "doubtful  ", 2) for text in verdict.warnings[:_MAX_LINES]]
     parts += [Paragraph(text, "next      ", 2) for text in verdict.next_steps[:_MAX_LINES]]
     return parts
+
+
+def _delay(results: ServoResults) -> str:
+    if results.delay_known:
+        return f"delay of commands {1e3 * results.delay:.0f} ms"
+    return "delay of commands not known, as their clock is another"
 
 
 def whole(results: ServoResults) -> list[str]:
@@ -223,7 +227,7 @@ def whole(results: ServoResults) -> list[str]:
         if value.present
     ]
     lines += [*columns(rows, left=2), ""]
-    lines.append(f"delay of commands: {1e3 * results.delay:.3g} ms")
+    lines.append(_delay(results))
     lines += [
         f"{choice.joint}: {' and '.join(choice.terms)} left out, which predicts other windows "
         f"better"

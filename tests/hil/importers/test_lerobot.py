@@ -154,6 +154,13 @@ def test_a_missing_episode_is_named(tmp_path: Path) -> None:
         DataSet.read(folder)
 
 
+def test_a_look_needs_the_arm(tmp_path: Path) -> None:
+    folder = written(tmp_path / "pick", [(in_degrees(motion(4.0, 0.0)),) * 2])
+    with pytest.raises(SourceError, match="data set of LeRobot") as refused:
+        look_at(folder, None, ImportOptions())
+    assert refused.value.remedy == "add --urdf ARM.urdf"
+
+
 @pytest.mark.parametrize("version", ["v1.6", "v4.0"])
 def test_other_versions_are_refused(tmp_path: Path, version: str) -> None:
     data = in_degrees(motion(4.0, 0.0))

@@ -198,6 +198,15 @@ class TestCommand:
         (told,) = [text for text in apart.warnings if "fast.mcap" in text]
         assert "from 3.0 to 7.0 s: this part was not fitted" in told
 
+    def test_a_delay_between_two_clocks_is_not_known(
+        self, identified: tuple[Path, str, int]
+    ) -> None:
+        folder, _, _ = identified
+        results = ServoResults.load(folder / "results.json")
+        assert results.delay_known
+        apart = results.model_copy(update={"delay_known": False})
+        assert "delay of commands not known" in "\n".join(one_screen(screen(apart)))
+
     def test_results_and_report_say_what_was_read(self, identified: tuple[Path, str, int]) -> None:
         folder, _, _ = identified
         results = ServoResults.load(folder / "results.json")
