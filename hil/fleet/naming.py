@@ -117,7 +117,8 @@ class RobotNaming:
             # A clock that agrees has the time of day as well.
             if not ref.when.startswith(when[:10]):
                 ref = replace(ref, when=when, dated_by="name")
-        ref = ref if ref.when or not ref.source else dated(ref)
+        if not ref.when and (ref.source or ref.kind == "imported"):
+            ref = dated(ref)
         if not robot or not ref.arm:
             return ref
         return replace(ref, robot=robot, arm_type=ref.arm, arm=digest(f"{ref.arm} {robot}"))
@@ -191,12 +192,14 @@ def date_in(text: str) -> str | None:
 
 
 def dated(ref: ArchiveRef) -> ArchiveRef:
-    """Return a log with the date of its name, of its folders, or of its file."""
-    path = Path(ref.source)
+    """Return a log, or its archive, with the date of its name, of its folders, or of its file."""
+    path = Path(ref.origin)
     names: Iterator[str] = iter((path.stem, path.name, *(each.name for each in path.parents[:2])))
     for name in names:
         if (when := date_in(name)) is not None:
             return replace(ref, when=when, dated_by="name")
+    if not path.exists():  # a URL
+        return ref
     files = [path] if path.is_file() else [each for each in path.iterdir() if each.is_file()]
     changed = max(each.stat().st_mtime for each in files)
     when = datetime.fromtimestamp(int(changed), UTC).isoformat()

@@ -109,6 +109,7 @@ _FACTS: Final[Mapping[Fact, str]] = {
     Fact.SIGNS_OF_URDF: "as the URDF's axes",
     Fact.UNIT_AS_READ: "unit as read",
     Fact.ZERO_OF_URDF: "as the URDF",
+    Fact.ZERO_STATED: "as the map states where the torque does not show it",
     Fact.UNCOUPLED: "no angle contains another's",
     Fact.WITH_GRAVITY: "torque with gravity",
     Fact.WITHOUT_GRAVITY: "torque without gravity",
@@ -150,6 +151,7 @@ _BASES: Final[Mapping[Basis, str]] = {
     Basis.NAME_OR_UNIT: "by name or unit",
     Basis.CHANNELS: "by the channels",
     Basis.ENCODER_NOISE: "noise of an encoder at all frequencies",
+    Basis.SMALL_NOISE: "small noise at all frequencies, more than rounding",
     Basis.NO_NOISE: "no noise above that frequency",
     Basis.NO_MOTION: "no joint moves",
     Basis.DRIVING_FRICTION: "otherwise friction would add energy to the joint",
@@ -187,7 +189,9 @@ _STEPS: Final[Mapping[NextStep, str]] = {
     NextStep.REVERSE_THE_ROWS: "reverse the order of the rows, but not the times",
     NextStep.STATE_RATE: "state the rate of the controller (--sample-rate HZ)",
     NextStep.PUSH_A_JOINT: "push one joint by hand and watch its torque",
-    NextStep.COMPARE_A_POSTURE: "compare a posture with the URDF's (viewer)",
+    NextStep.COMPARE_A_POSTURE: (
+        "compare a posture with the URDF's (viewer); [position] offset states it"
+    ),
     NextStep.RECORD_ALL_TORQUE: "record the torque before a model is subtracted from it",
     NextStep.WEIGH_A_LOAD: "hold a known load with and without it (`hil torque-constants`)",
     NextStep.TURN_ONE_JOINT: "turn one joint alone and watch which angles change",

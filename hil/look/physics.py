@@ -10,6 +10,7 @@ from typing import Any, Final, Literal
 
 import numpy as np
 
+from hil.base.safe_input import parse_toml
 from hil.cell import Cell
 from hil.cell.nominal import nominal_of
 from hil.importers.channels import channels_of
@@ -379,7 +380,15 @@ class TorqueFindings:
             return row
         change, against = self.readings.nearest["zero"]
         nearest = NearestZero(self._of_arm(change), against.ratio)
+        if self._states_zeros:
+            return Row("zero", Fact.ZERO_STATED, Certainty.LIKELY, (nearest,))
         return Row("zero", UnseenZeros(unseen), Certainty.UNDETERMINED, (nearest,), decider)
+
+    @property
+    def _states_zeros(self) -> bool:
+        """Whether the column map states what is added to positions."""
+        entries = parse_toml(self.map_text or "")
+        return "offset" in entries.get("position", {})
 
     def _no_bodies(self) -> Row:
         share = RigidShare(float(self.rigid.over_friction.max()), self.rigid.scale)

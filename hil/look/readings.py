@@ -49,6 +49,7 @@ class Fact(Enum):
     SIGNS_OF_URDF = auto()
     UNIT_AS_READ = auto()
     ZERO_OF_URDF = auto()
+    ZERO_STATED = auto()  #: by a column map, where the torque does not show it
     UNCOUPLED = auto()
     WITH_GRAVITY = auto()
     WITHOUT_GRAVITY = auto()
@@ -270,6 +271,7 @@ class Basis(Enum):
     NAME_OR_UNIT = auto()
     CHANNELS = auto()
     ENCODER_NOISE = auto()
+    SMALL_NOISE = auto()
     NO_NOISE = auto()
     NO_MOTION = auto()
     DRIVING_FRICTION = auto()  #: of the reading as recorded

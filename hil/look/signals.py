@@ -54,7 +54,7 @@ from identification.signals.angle_wraps import (
     UNWRAPPED,
 )
 from identification.signals.clock import time_base
-from identification.signals.noise import noiseless_above
+from identification.signals.noise import has_small_noise, noiseless_above
 from identification.signals.position_steps import position_steps
 from identification.signals.recording import (
     MIN_MOVEMENT,
@@ -251,6 +251,9 @@ def _measured(
         return Row("positions", Fact.COMMANDED, likely, evidence, decider, is_fault=True)
     if quiet is None:
         return Row("positions", Fact.MEASURED, Certainty.CERTAIN, (Basis.ENCODER_NOISE,))
+    joints = recording.position[:, np.ptp(recording.position, axis=0) > MIN_MOVEMENT]
+    if has_small_noise(recording.time, joints, recording.segments(), quiet):
+        return Row("positions", Fact.MEASURED, Certainty.LIKELY, (Basis.SMALL_NOISE,))
     reading = SmoothPositions(quiet)
     open_ = Certainty.UNDETERMINED
     return Row("positions", reading, open_, (Basis.NO_NOISE,), NextStep.ASK_FOR_POSITIONS)

@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from typing import Final
 
 import numpy as np
+from numpy.typing import NDArray
 
 from identification.arrays import Array
 from identification.signals.recording import RecordingError
@@ -100,6 +101,9 @@ _MIN_SAMPLES: Final = 32  # samples
 _SILENT_POWER_SHARE: Final = 1e-6  # share of a signal's power; noise of 0.1 % of the amplitude
 # share of half the sampling rate; anti-alias filters cut at about 0.8
 _MAX_EDGE_SHARE: Final = 0.75
+_MIN_ROUNDING_STD_RATIO: Final = 2.0  # noise over that of rounding to the smallest step
+_MIN_WHITE_SHARE: Final = 0.5  # of the power above a frequency, in noise that reaches all of them
+_DECIMAL_TOLERANCE: Final = 1e-3  # of a step, as a power of ten
 
 
 def noiseless_above(time: Array, signals: Array, segments: Sequence[slice]) -> float | None:
@@ -112,6 +116,47 @@ def noiseless_above(time: Array, signals: Array, segments: Sequence[slice]) -> f
     silent = np.all(above < _SILENT_POWER_SHARE * above[0], axis=1)
     edge = float(frequency[np.argmax(silent)])
     return edge if silent.any() and edge < _MAX_EDGE_SHARE * frequency[-1] else None
+
+
+def has_small_noise(time: Array, signals: Array, segments: Sequence[slice], above: float) -> bool:
+    """Return whether angles (m, c) [rad] have white noise of a sensor, small beside their motion.
+
+    It is larger than that of rounding to the digits of a log, or the steps are those of an encoder,
+    no decimal number of degrees or radians; and there is as much of it at the highest frequencies.
+
+    Args:
+        time: of the samples (m,) [s].
+        signals: that move.
+        segments: without gaps.
+        above: frequency [Hz] above which the noise is all there is.
+    """
+    frequency, power = _power(time, signals, segments)
+    longest = max(segments, key=lambda segment: int(segment.stop - segment.start))
+    moving = power.sum(axis=0) > 0.0
+    time, signals = time[longest], signals[longest][:, moving]
+    variance = difference_variance(time, signals)
+    step = smallest_steps(signals)
+    rounding = step**2 / 12.0
+    beyond = variance > _MIN_ROUNDING_STD_RATIO**2 * rounding
+    counted = (variance > rounding / _MIN_ROUNDING_STD_RATIO**2) & ~_is_decimal(step)
+    here = frequency >= above
+    of_band = power[here][:, moving].sum(axis=0) * (frequency[1] - frequency[0])
+    white = variance >= _MIN_WHITE_SHARE * of_band
+    return bool(np.mean((beyond | counted) & white) > 0.5)
+
+
+def smallest_steps(signals: Array) -> Array:
+    """Return the smallest change of each signal between samples (c,), zero if it never moves."""
+    steps = np.abs(np.diff(signals, axis=0))
+    least = np.min(steps, axis=0, where=steps > 0.0, initial=np.inf)
+    return np.where(np.isfinite(least), least, 0.0)
+
+
+def _is_decimal(steps: Array) -> NDArray[np.bool_]:
+    """Return which steps [rad] are a power of ten, in radians or in degrees (c,)."""
+    exponents = np.log10(np.maximum([steps, np.degrees(steps)], np.finfo(np.float64).tiny))
+    is_power = np.abs(exponents - np.rint(exponents)) < _DECIMAL_TOLERANCE
+    return np.asarray(is_power.any(axis=0))
 
 
 def _power(time: Array, signals: Array, segments: Sequence[slice]) -> tuple[Array, Array]:

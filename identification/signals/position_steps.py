@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 
 from identification.arrays import Array
 from identification.distributions import MAD_TO_STD
+from identification.signals.noise import smallest_steps
 from identification.signals.recording import GAP_STEPS, Recording
 
 # Acceleration within one step of the clock; robots reach a fifth of it.
@@ -244,19 +245,13 @@ class _Step(NamedTuple):
 
 def _rounding(recording: Recording) -> Array:
     """Return by how much rounding may move a step of each joint (n,)."""
-    return _ROUNDING_RESOLUTIONS * np.array([_resolution(each) for each in recording.position.T])
+    return _ROUNDING_RESOLUTIONS * smallest_steps(recording.position)
 
 
 def _nearby(marked: NDArray[np.bool_]) -> NDArray[np.bool_]:
     """Return where a row or a neighbour is marked (m, n)."""
     padded = np.pad(marked, ((1, 1), (0, 0)))
     return np.asarray(padded[:-2] | padded[1:-1] | padded[2:])
-
-
-def _resolution(position: Array) -> float:
-    """Return the smallest step of a position (m,), zero if it never moves."""
-    steps = np.abs(np.diff(position))
-    return float(np.min(steps, where=steps > 0.0, initial=np.inf)) if steps.any() else 0.0
 
 
 def _on_path(time: Array, position: Array, row: int, tolerance: float) -> bool:

@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from identification.arrays import Array
+from identification.signals.noise import smallest_steps
 from identification.signals.position_steps import MAX_ACCELERATION, Excursion, excursions
 from identification.signals.recording import GAP_STEPS, Recording
 
@@ -166,7 +167,7 @@ def _frozen(recording: Recording) -> Iterator[tuple[int, int]]:
             beside.append(np.abs(position[start] - position[start - 1]))
         if stop + 1 < len(position):
             beside.append(np.abs(position[stop + 1] - position[stop]))
-        resolution = _resolution(position)
+        resolution = smallest_steps(position)
         if any((size > np.maximum(least, 3.0 * resolution)).any() for size in beside):
             yield start + 1, stop + 1
 
@@ -187,7 +188,7 @@ def _jumps(recording: Recording, gap: Rows) -> Iterator[tuple[int, NDArray[np.in
         return
     step = np.diff(position, axis=0)
     passed = np.maximum(np.diff(recording.time[places]) / median, 1.0)[:, None] + GAP_STEPS
-    possible = MAX_ACCELERATION * (passed * median) ** 2 + 3.0 * _resolution(position)
+    possible = MAX_ACCELERATION * (passed * median) ** 2 + 3.0 * smallest_steps(position)
     # Medians of a neighbourhood take their time, and few steps are beyond a joint that stands.
     beyond = np.abs(step) > possible
     some = np.flatnonzero(beyond.any(axis=1))
@@ -235,10 +236,3 @@ def _written_before(recording: Recording, row: int) -> int:
         return 0
     moves = np.ptp(recording.position[row : row + longest], axis=0).any()
     return longest if moves else 0
-
-
-def _resolution(position: Array) -> Array:
-    """Return the smallest step of each position (n,), zero if it never moves."""
-    steps = np.abs(np.diff(position, axis=0))
-    least = np.min(steps, axis=0, where=steps > 0.0, initial=np.inf)
-    return np.where(np.isfinite(least), least, 0.0)

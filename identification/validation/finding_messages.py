@@ -923,7 +923,7 @@ REMEDIES: Final[Mapping[RemedyKey, str]] = {
         "check for effects that the model lacks: friction curves of the report, elasticity, springs"
         " or balancers ([[robot.elements]] of the cell file), temperature"
     ),
-    "repeat the motion": "record the same motion several times",
+    "repeat the motion": "record the same motion three times or more (one of them is held out)",
     "check the coupling": "check sign, gear ratio, coupling and torque constant of {joints}",
     "check the constant with a payload": (
         "check the torque constant of {joints} with a known payload (`hil torque-constants`), or"

@@ -57,7 +57,7 @@ def urdf_path(name: str) -> Path:
 
 
 def simulate(
-    name: str,
+    name: str | Path,
     time: Array,
     *,
     locked: tuple[str, ...] = (),
@@ -69,9 +69,10 @@ def simulate(
 ) -> Simulated:
     """A motion of sines within the joint limits, torques by recursive Newton-Euler and friction.
 
-    The load is fixed to the last joint, in its frame; friction is that of the robot without it.
+    The name is of a description of example-robot-data, or the path of another. The load is fixed
+    to the last joint, in its frame; friction is that of the robot without it.
     """
-    path = urdf_path(name)
+    path = name if isinstance(name, Path) else urdf_path(name)
     model = pin.buildModelFromUrdf(str(path))
     model = pin.buildReducedModel(model, [model.getJointId(j) for j in locked], pin.neutral(model))
     model.gravity.linear = np.array(gravity)
