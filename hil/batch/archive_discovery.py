@@ -333,14 +333,24 @@ def cell_in(archive: Archive, settings: Settings | None = None) -> Cell:
         CellError: the cell is invalid.
     """
     friction = {} if settings is None else settings.friction
-    return cell_from(archive.text("cell.toml"), archive.text("robot.urdf"), *friction.items())
+    return cell_from(archive.text("cell.toml"), archive.text("robot.urdf"), friction)
+
+
+def cell_from(text: str, urdf: str, friction: Mapping[str, Any]) -> Cell:
+    """Return the cell of these texts, with a friction law of these entries if there are any."""
+    return _cell_from(text, urdf, json.dumps(dict(friction), sort_keys=True))
 
 
 @lru_cache(maxsize=8)
-def cell_from(text: str, urdf: str, *friction: tuple[str, Any]) -> Cell:
-    """Return the cell of these texts, with a friction law of these entries if given."""
+def _cell_from(text: str, urdf: str, friction: str) -> Cell:
     cell = Cell.from_texts(text, urdf, Path("cell.toml"))
-    return cell.with_friction(**dict(friction))
+    entries = json.loads(friction)
+    return cell.with_friction(
+        **{
+            key: tuple(value) if isinstance(value, list) else value
+            for key, value in entries.items()
+        }
+    )
 
 
 def arm_digest(cell: Cell, drive_train: bytes | None, *, simulated: bool = False) -> str:

@@ -16,7 +16,7 @@ from hil.archive import Archive
 from hil.base.arrays import Array
 from hil.base.errors import ArchiveError
 from hil.base.files import json_digest
-from hil.pipeline.carried_weight import other_meanings
+from hil.pipeline.other_meanings import in_a_sentence, other_meanings
 from hil.pipeline.prepared import known_parameters, reduction_of, versions_of
 from hil.pipeline.sources import Source, known_warnings, source_of
 from identification.estimators.elasticity import ElasticTorque
@@ -25,12 +25,13 @@ from identification.estimators.least_squares import fit_least_squares
 from identification.estimators.prior import ScoreScatter, body_prior
 from identification.factor.estimate import Estimate
 from identification.factor.factor import Factor
-from identification.hypotheses.diagnosis import few_rows, torque_of
-from identification.hypotheses.scores import score_of
+from identification.hypotheses.diagnosis import diagnose
 from identification.model.robot import RobotModel
 from identification.reduction.reduction import MAX_UNMODELLED_REPETITIONS, Reduction, Unmodelled
 from identification.selection.settings import Settings
 from identification.signals.samples import Samples
+from identification.validation.finding_messages import Naming, worded
+from identification.validation.findings.diagnosis import of_diagnosis
 
 from .archive_discovery import JOINT_TEMPERATURE, ArchiveRef, cell_in, errors_of_origin, open_ref
 from .cache import Arrays, CacheLocation, code_digest
@@ -154,8 +155,8 @@ def reduced_archive(wanted: ToReduce, settings: Settings) -> tuple[Summary, Redu
     warnings = [*known_warnings(cell, archive), *archive.header.findings.warnings]
     if source.merged:
         warnings.append(source.merged)
-    if is_fitted and archive.kind == "imported":
-        warnings += _of_torque(model, versions[0])
+    if is_fitted and (archive.kind == "imported" or wanted.unmodelled):
+        warnings += _other_meanings(model, versions[0], source, ref.origin)
     if archive.outcome is not None and archive.outcome.repaired:
         warnings.append("it was repaired with loss")
     parts = factor.parts(wanted.parts)
@@ -163,12 +164,21 @@ def reduced_archive(wanted: ToReduce, settings: Settings) -> tuple[Summary, Redu
     return summary, reduction
 
 
-def _of_torque(model: RobotModel, samples: Samples) -> tuple[str, ...]:
-    """Return what the torque of a log is as a whole, other than stated, as its import asks it."""
-    rows = few_rows([samples])
-    if not rows.usable.any():
+def _other_meanings(
+    model: RobotModel, samples: Samples, source: Source, origin: str
+) -> tuple[str, ...]:
+    """Return what a recording is other than stated, as a verdict and an import ask it.
+
+    Raises:
+        ArchiveError: its torque as a whole is, so that no parameter follows from it.
+    """
+    if not samples.usable.any():
         return ()
-    return other_meanings(model, torque_of(model, [samples], rows, score_of(model, rows)))
+    found = diagnose(model, [samples])
+    if found.is_otherwise:
+        finding = worded(of_diagnosis(found)[0], Naming(tuple(model.joint_names)))
+        raise ArchiveError(origin, finding.words, field="torque", remedy=finding.next_step)
+    return tuple(map(in_a_sentence, other_meanings(model, found, [source])))
 
 
 def _temperatures(archive: Archive) -> dict[str, float]:

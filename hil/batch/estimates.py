@@ -270,7 +270,7 @@ class Estimator:
     def __init__(self, arm: ArmModel) -> None:
         settings = arm.settings
         self.name = arm.estimator
-        self.cell = cell_from(arm.cell, arm.urdf, *settings.friction.items())
+        self.cell = cell_from(arm.cell, arm.urdf, settings.friction)
         self.model = self.cell.model
         self._delay_variance = settings.delay_variance
         self._strength = settings.strength

@@ -542,7 +542,7 @@ def _by_arm(campaigns: Sequence[_Campaign]) -> list[tuple[str, list[_Campaign]]]
 
 def _arm_of(model: ArmModel) -> BatchArm:
     """Return an arm with its cell."""
-    cell = cell_from(model.cell, model.urdf, *model.settings.friction.items())
+    cell = cell_from(model.cell, model.urdf, model.settings.friction)
     return BatchArm(model.digest, cell, model.robot, model.arm_type)
 
 

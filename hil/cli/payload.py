@@ -34,8 +34,8 @@ def payload(
     Fits the difference between recordings without and with the payload, on one model of the arm.
     With -v prints the values in the form that controllers of COMAU, UR, Franka, KUKA, ABB and FANUC
     expect.
-    Exit status 5 if a value of --check lies outside its interval, or if another mounting of the arm
-    explains the bare recordings much better.
+    Exit status 5 if a value of --check lies outside its interval, or if the bare recordings are
+    certainly other than described, such as of another mounting of the arm or with other zeros.
 
     **Examples:**
 
@@ -68,5 +68,5 @@ def payload(
     text = json_module.dumps(fields, indent=1, ensure_ascii=False)
     lines = result.lines(wanted, outside, settings=verbose)
     typer.echo(text if json else "\n".join(lines if verbose else brief(lines)))
-    if outside or result.mounting is not None:
+    if outside or result.is_doubtful:
         raise typer.Exit(EXIT_NOT_GOOD)

@@ -150,6 +150,6 @@ def weigh(
         print_json(result.as_json())
     else:
         typer.echo("\n".join(result.lines if verbose else brief(result.summary)))
-    if result.payload.mounting is not None:
+    if result.payload.is_doubtful:
         raise typer.Exit(EXIT_NOT_GOOD)
     return None

@@ -34,6 +34,7 @@ def as_dict(fleet: FleetTrend) -> dict[str, Any]:
         "all_robots": [_together(robot) for robot in fleet.together],
         "broken": [each.as_json() for each in fleet.broken],
         "skipped": [each.as_json() for each in fleet.skipped],
+        "warnings": list(fleet.warnings),
     }
 
 

@@ -140,3 +140,4 @@ def notes(fleet: FleetTrend) -> Iterator[str]:
     if fleet.dated_by_file:
         recordings = plural(fleet.dated_by_file, "recording")
         yield f"{recordings} dated by the file alone, which a copy changes; see --robot"
+    yield from fleet.warnings

@@ -165,6 +165,7 @@ class FleetTrend:
         twice: places of names that are in several at the same time, maybe of several robots.
         simulated: whether no robot moved.
         broken, skipped: what could not be used, and what is not for it.
+        warnings: about recordings that were used.
     """
 
     robots: tuple[RobotTrend, ...]
@@ -177,6 +178,7 @@ class FleetTrend:
     simulated: bool = False
     broken: tuple[SkippedArchive, ...] = ()
     skipped: tuple[SkippedArchive, ...] = ()
+    warnings: tuple[str, ...] = ()
 
     @property
     def recordings(self) -> int:

@@ -135,6 +135,7 @@ _FACTS: Final[Mapping[Fact, str]] = {
     Fact.OTHER_ARM: "may not be the arm of the URDF",
 }
 _BASES: Final[Mapping[Basis, str]] = {
+    Basis.MAP: "by the column map",
     Basis.GIVEN_RATE: "at the rate that was given",
     Basis.MESSAGE_TYPE: "by the message type",
     Basis.DATA_SET: "as of every data set of LeRobot",

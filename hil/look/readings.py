@@ -256,6 +256,7 @@ class Basis(Enum):
     """Evidence without a figure."""
 
     GIVEN_RATE = auto()
+    MAP = auto()
     DATA_SET = auto()
     MESSAGE_TYPE = auto()
     USUAL_RATE = auto()

@@ -8,7 +8,9 @@ from typing import Final
 
 import numpy as np
 
+from hil.archive.imported import COPIED_COMMANDS
 from hil.base.arrays import Array
+from hil.base.safe_input import parse_toml
 from hil.cell import Cell
 from hil.importers.commands import COMMANDED
 from hil.importers.conclusions import (
@@ -49,7 +51,7 @@ from hil.look.readings import (
     Wrapped,
 )
 from hil.look.result import Aspect, Row
-from hil.pipeline.sources import Source
+from hil.pipeline.sources import Source, has_commands_as_positions
 from identification.signals.angle_wraps import (
     UNWRAPPED,
 )
@@ -81,6 +83,7 @@ _SLOPES: Final[Mapping[float, Fact]] = {
     9.5493: Fact.SLOPE_IN_REVOLUTIONS,
 }
 """What a velocity is whose factor to the slope of the position is this."""
+_COMMANDS: Final = "the commanded positions"  # of an archive, whose columns have no names
 
 
 def rows(source: Source, imported: ImportedRecording, arm: Cell | None) -> list[Row]:
@@ -88,7 +91,8 @@ def rows(source: Source, imported: ImportedRecording, arm: Cell | None) -> list[
     recording = source.recording
     concluded = imported.concluded
     units = [each for each in imported.examined.found if isinstance(each, _UNIT_CONCLUSIONS)]
-    table = [_time(recording, concluded, units)]
+    by_map = "time" in parse_toml(imported.map_text or "")
+    table = [_time(recording, concluded, units, by_map=by_map)]
     jumps = position_steps(recording, source.name).jumps
     if source.faults or source.retimed or jumps:
         found = RowsReading(source.faults, source.times if source.retimed else None, jumps)
@@ -116,7 +120,9 @@ def rows(source: Source, imported: ImportedRecording, arm: Cell | None) -> list[
     return table
 
 
-def _time(recording: Recording, concluded: Sequence[Conclusion], units: Sequence[_Unit]) -> Row:
+def _time(
+    recording: Recording, concluded: Sequence[Conclusion], units: Sequence[_Unit], *, by_map: bool
+) -> Row:
     base = time_base(recording.time, recording.gap_before)
     meanings = [each for each in concluded if isinstance(each, ChannelMeaning)]
     stated = next((each for each in meanings if each.kind == "time"), None)
@@ -132,7 +138,8 @@ def _time(recording: Recording, concluded: Sequence[Conclusion], units: Sequence
     if any(isinstance(each, EpisodeUnits) for each in concluded):
         return Row("time", ClockReading(base, "s"), Certainty.CERTAIN, (Basis.DATA_SET,))
     if stated is None:
-        return Row("time", ClockReading(base), Certainty.CERTAIN, (Basis.GIVEN_RATE,))
+        basis = Basis.MAP if by_map else Basis.GIVEN_RATE
+        return Row("time", ClockReading(base), Certainty.CERTAIN, (basis,))
     basis = Basis.NAME_AND_RATE if stated.unit is None else Basis.STATED_UNIT
     return Row("time", ClockReading(base, stated.unit or "s"), Certainty.CERTAIN, (basis,))
 
@@ -228,8 +235,10 @@ def _measured(
     recording: Recording, concluded: Sequence[Conclusion], found: Sequence[Conclusion]
 ) -> Row:
     """Return whether positions are measured, by their noise and the lag of the velocity."""
-    copied = next((each for each in found if isinstance(each, CopiedCommands)), None)
-    if copied is not None:
+    if has_commands_as_positions(recording):
+        commands = recording.provenance.get(COPIED_COMMANDS, _COMMANDS)
+        said = (each for each in found if isinstance(each, CopiedCommands))
+        copied = next(said, CopiedCommands(commands, ()))
         decider = NextStep.RECORD_MEASURED
         return Row(
             "positions", Fact.COMMANDED, Certainty.CERTAIN, (copied,), decider, is_fault=True

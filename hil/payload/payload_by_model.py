@@ -6,14 +6,13 @@ from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
-import numpy as np
-
 from hil.archive import open_archive
 from hil.base.errors import ArchiveError, InputError
 from hil.base.progress import Reporter
 from hil.pipeline.cell_context import torque_scale
 from hil.pipeline.estimating import Estimation, estimate_with
 from hil.pipeline.options import Options
+from hil.pipeline.other_meanings import in_a_sentence, require_weight
 from hil.pipeline.prepared import Prepared, prepare_sources, samples_of
 from hil.pipeline.sources import (
     Source,
@@ -24,7 +23,14 @@ from hil.pipeline.sources import (
 )
 from identification.estimators.payload_problem import KnownArm, Run
 
-from .payload_run import PayloadFound, doubtful_mounting, flange_of, weighed
+from .payload_run import (
+    PayloadDoubts,
+    PayloadFound,
+    doubtful_mounting,
+    flange_of,
+    weighed,
+    weight_per_mass,
+)
 
 
 def weigh_by_model(
@@ -75,22 +81,28 @@ def weigh_by_model(
     simulated = sources.header.only_simulated and others.header.only_simulated
     scale = torque_scale(cell, recordings, simulated=simulated)
     sides = {False: of_arm, True: paths}
+    of_both = (*prepared.sources.training, *others.training)
+    meanings = require_weight(cell.model, prepared.fitted, of_both, of_arm[0])
+    otherwise = tuple(in_a_sentence(each) for each in meanings if each.level == "wrong")
+    doubtful = [in_a_sentence(each) for each in meanings if each.level != "wrong"]
     mounting = doubtful_mounting(cell.model, prepared.fitted)
+    doubts = PayloadDoubts(mounting, otherwise)
     estimate, body = weighed(
-        cell.model, runs, scale, frame, sides, others.training, mounting, known_arm
+        cell.model, runs, scale, frame, sides, others.training, doubts, known_arm
     )
     return PayloadFound(
         estimate=replace(estimate, method=f"{estimate.method}, against the model of the arm"),
         body=body,
         frame=frame,
-        gravity=float(np.linalg.norm(cell.model.gravity)),
+        gravity=weight_per_mass(cell.model),
         bare=(),
         loaded=tuple(source.name for source in others.training),
         scale=scale,
         mounting=mounting,
+        otherwise=otherwise,
         typed=((), tuple(loaded)),
         with_currents=all(recording.motor_current is not None for recording in recordings),
-        warnings=tuple(dict.fromkeys((*prepared.sources.warnings, *others.warnings))),
+        warnings=tuple(dict.fromkeys((*prepared.sources.warnings, *others.warnings, *doubtful))),
     )
 
 

@@ -7,7 +7,7 @@ import shlex
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, Final
+from typing import Any, Final, NamedTuple
 
 import numpy as np
 
@@ -16,9 +16,9 @@ from hil.base.errors import ArchiveError, InputError
 from hil.base.one_screen import columns
 from hil.base.progress import Reporter
 from hil.cell.cell import FLANGES
-from hil.pipeline.carried_weight import require_weight
 from hil.pipeline.cell_context import TorqueScale, torque_scale
 from hil.pipeline.options import Options
+from hil.pipeline.other_meanings import in_a_sentence, require_weight
 from hil.pipeline.prepared import Prepared, prepare_sources, samples_of
 from hil.pipeline.sources import (
     Source,
@@ -41,7 +41,7 @@ from identification.estimators.payload_problem import KnownArm, Run
 from identification.factor.columns import standard_factor
 from identification.hypotheses.gravity_direction import find_gravity
 from identification.model.pseudo_inertia import Body
-from identification.model.robot import RobotModel
+from identification.model.robot import STANDARD_GRAVITY, RobotModel
 from identification.signals.samples import Samples
 from identification.validation.finding import Thresholds
 from identification.validation.finding_messages import MOUNTING_STEP
@@ -52,6 +52,11 @@ _MIN_CENTRE_LIMIT: Final = 0.5  # m, of a hand tool on an arm that is shorter it
 _FITTED_SHARE: Final = 0.7  # of each bare recording, when the direction of gravity is tried
 _MAX_BARE_RECORDINGS: Final = 3  # enough to determine gravity
 _UNITS: Final = dict(zip(NAMES, ["kg", *["m"] * 3, *["kg·m²"] * 6], strict=True))
+
+
+def weight_per_mass(model: RobotModel) -> float:
+    """Return the gravity [m/s²] that loads the flange, also where the torque is without it."""
+    return float(np.linalg.norm(model.gravity if np.any(model.gravity) else STANDARD_GRAVITY))
 
 
 @dataclass(frozen=True, eq=False)
@@ -66,6 +71,8 @@ class PayloadFound:
     loaded: tuple[str, ...]  #: names of the archives with payload
     scale: TorqueScale  #: how well the torques are known
     mounting: str | None  #: why the stated direction of gravity is unlikely, with a remedy
+    #: what the recordings certainly are other than described, with a remedy each
+    otherwise: tuple[str, ...]
     #: as typed: archives or folders without and with payload
     typed: tuple[tuple[Path, ...], tuple[Path, ...]]
     with_currents: bool  #: whether all archives hold motor currents
@@ -81,6 +88,11 @@ class PayloadFound:
         """Maximum torque of its weight about the frame's origin and its interval [N·m]."""
         value, low, high = (self.gravity * part for part in self.estimate.moment)
         return value, low, high
+
+    @property
+    def is_doubtful(self) -> bool:
+        """Whether the recordings are other than described, so that nothing should be set."""
+        return self.mounting is not None or bool(self.otherwise)
 
     def outside(self, expected: Mapping[str, float]) -> list[str]:
         """Return a sentence about each expected value outside its interval.
@@ -198,6 +210,7 @@ class PayloadFound:
             )
         if self.mounting is not None:
             lines.append(f"The mounting is doubtful: {self.mounting}. No controller settings.")
+        lines += [f"Doubtful: {each}. No controller settings." for each in self.otherwise]
         return lines
 
     @property
@@ -213,9 +226,10 @@ class PayloadFound:
     def controllers(self) -> dict[str, str]:
         """Commands that set the payload, by controller; units and frames as in its manual.
 
-        What is not determined has a comment instead of its command. Empty if the mounting is wrong.
+        What is not determined has a comment instead of its command. Empty if the recordings are
+        other than described.
         """
-        if self.mounting is not None:
+        if self.is_doubtful:
             return {}
         with_centre = self.determines(*NAMES[1:4])
         with_inertia = self.determines(*NAMES[4:])
@@ -272,6 +286,7 @@ class PayloadFound:
                 "source": self.scale.source,
             },
             "mounting": self.mounting,
+            "otherwise": list(self.otherwise),
             "least_squares": estimate.parameters.tolist(),
             "method": estimate.method,
             "controllers": self.controllers,
@@ -331,7 +346,8 @@ def find_payload(
     sources = replace(by_side[False], cell=cell, training=first, held_out=first)
     prepared = prepare_sources(sources, options, reporter)
     cell = prepared.sources.cell
-    other_meanings = require_weight(cell.model, prepared.fitted, first[0].path)
+    meanings = require_weight(cell.model, prepared.fitted, training, first[0].path)
+    otherwise = tuple(in_a_sentence(each) for each in meanings if each.level == "wrong")
     frame = frame or flange_of(cell.model)
     runs = _runs(prepared, last, frame, reporter)
     simulated = all(side.header.only_simulated for side in by_side.values())
@@ -340,18 +356,21 @@ def find_payload(
     with reporter.task("weighing", 2) as task:
         mounting = doubtful_mounting(cell.model, prepared.fitted)
         task.advance(1)
-        estimate, body = weighed(cell.model, runs, scale, frame, sides, training, mounting)
+        doubts = PayloadDoubts(mounting, otherwise)
+        estimate, body = weighed(cell.model, runs, scale, frame, sides, training, doubts)
         task.advance(1)
-    warnings = (*prepared.sources.warnings, *by_side[True].warnings, *other_meanings)
+    doubtful = [in_a_sentence(each) for each in meanings if each.level != "wrong"]
+    warnings = (*prepared.sources.warnings, *by_side[True].warnings, *doubtful)
     return PayloadFound(
         estimate=estimate,
         body=body,
         frame=frame,
-        gravity=float(np.linalg.norm(cell.model.gravity)),
+        gravity=weight_per_mass(cell.model),
         bare=tuple(source.name for source in first),
         loaded=tuple(source.name for source in last),
         scale=scale,
         mounting=mounting,
+        otherwise=otherwise,
         typed=(tuple(bare), tuple(loaded)),
         with_currents=all(recording.motor_current is not None for recording in recordings),
         warnings=tuple(dict.fromkeys(warnings)),
@@ -362,15 +381,25 @@ class NoPayloadError(InputError):
     """The recordings show no payload; more of them may."""
 
 
-def _no_payload(estimate: PayloadEstimate, mounting: str | None) -> NoPayloadError:
+class PayloadDoubts(NamedTuple):
+    """Why recordings may be other than described, with a remedy each."""
+
+    mounting: str | None
+    otherwise: tuple[str, ...]
+
+
+def _no_payload(estimate: PayloadEstimate, doubts: PayloadDoubts) -> NoPayloadError:
     low, high = estimate.intervals[0]
     problem = (
         f"the loaded archives show no payload: its mass is between {low:.3g} and {high:.3g} kg"
     )
     remedy = "give recordings that were made with the payload"
-    if mounting is not None:
+    if doubts.mounting is not None:
         problem += ", as the arm is stated to be mounted"
-        remedy = f"the mounting is doubtful: {mounting}; then {remedy}"
+        remedy = f"the mounting is doubtful: {doubts.mounting}; then {remedy}"
+    if doubts.otherwise:
+        problem += ", with the recordings as described"
+        remedy = "; ".join([*doubts.otherwise, f"then {remedy}"])
     return NoPayloadError(None, problem, field="--loaded", remedy=remedy)
 
 
@@ -430,7 +459,7 @@ def weighed(
     frame: str,
     sides: Mapping[bool, Sequence[Path]],
     training: Sequence[Source],
-    mounting: str | None,
+    doubts: PayloadDoubts,
     arm: KnownArm | None = None,
 ) -> tuple[PayloadEstimate, Body]:
     """Return the payload of reduced recordings.
@@ -442,7 +471,7 @@ def weighed(
         frame: of the payload.
         sides: the bare and the loaded archives.
         training: their recordings.
-        mounting: why another mounting of the arm is likely.
+        doubts: about the bare recordings.
         arm: what is known of it.
 
     Raises:
@@ -452,7 +481,7 @@ def weighed(
     """
     estimate = identify_payload(model, runs, scale.std, arm)
     if estimate.body is None:
-        raise _no_payload(estimate, mounting)
+        raise _no_payload(estimate, doubts)
     _require_agreement(model, runs, estimate, frame, sides, training, arm)
     positions = [np.abs(source.recording.position).max(axis=0) for source in training]
     travel = np.max(positions, axis=0)

@@ -11,7 +11,7 @@ from typing import Final
 import numpy as np
 
 from hil.archive import open_archive
-from hil.archive.imported import COPIED_COMMANDS, ROW_COUNTER
+from hil.archive.imported import ROW_COUNTER
 from hil.base.arrays import Array
 from hil.cell import Cell
 from hil.cell.nominal import nominal_of
@@ -46,8 +46,9 @@ from identification.validation.prediction import PredictionError, pooled_error
 from identification.validation.residuals import folded_noise
 from planner.arrays import numbers
 
+from .other_meanings import commanded_positions
 from .prepared import Prepared
-from .sources import Source, Sources
+from .sources import Source, Sources, has_commands_as_positions
 
 _MAX_POSTURES = 500
 _TIME_TOLERANCE = 1e-6  # s
@@ -160,7 +161,7 @@ def cell_context_of(prepared: Prepared, estimate: Estimate) -> CellContext:
             *_resolution(prepared),
             *_sampling_rate(prepared, estimate),
         ),
-        commanded_positions=any(map(_are_commands, recorded)),
+        commanded_positions=any(has_commands_as_positions(each.recording) for each in recorded),
         added_friction=_added_friction(prepared),
         scale_std=torque_scale_of(sources).std,
     )
@@ -219,28 +220,11 @@ def _spikes(prepared: Prepared) -> Iterator[Finding]:
     yield found.about(counts > 0, count=counts)
 
 
-def _are_commands(source: Source) -> bool:
-    """Return whether the positions of a recording are commands, bit for bit."""
-    recording = source.recording
-    if COPIED_COMMANDS in recording.provenance:
-        return True
-    commands = recording.commanded_position
-    if commands is None or not np.ptp(recording.position, axis=0).any():
-        return False
-    return bool(np.array_equal(commands, recording.position))
-
-
 def _commanded(sources: Sequence[Source], prepared: Prepared) -> Iterator[Finding]:
     """Yield a finding about positions that are commands."""
-    copies = [source for source in sources if _are_commands(source)]
-    if not copies:
-        return
-    names = tuple(dict.fromkeys(source.path.name for source in copies))
-    values: dict[str, Value] = {"recordings": names}
     delays = prepared.delays
-    if delays is not None and delays.significant:
-        values["delay"] = 1e3 * delays.delay
-    yield Finding("commanded positions", "wrong", "record the positions", "cause", values)
+    significant = delays is not None and delays.significant
+    yield from commanded_positions(sources, delays.delay if delays and significant else None)
 
 
 def _row_counters(sources: Sequence[Source]) -> Iterator[Finding]:

@@ -16,6 +16,7 @@ from drivers.packets import DRIVE_ON
 from hil.archive import Archive, ArchiveHeader, ArchiveName, open_archive, opened, place_of
 from hil.archive.campaign_archives import RecordedCampaign
 from hil.archive.header import EPISODE, REJECTED
+from hil.archive.imported import COPIED_COMMANDS
 from hil.archive.recording_of_archive import recording_of
 from hil.base.arrays import Array
 from hil.base.errors import ArchiveError, CampaignFolderError, InputError
@@ -281,6 +282,16 @@ def aligned(sources: tuple[Source, ...]) -> tuple[tuple[Source, ...], bool]:
     both = list(zip(sources, offsets, strict=True))
     latest = max(source.recording.time[0] - offset for source, offset in both)
     return tuple(replace(source, origin=float(latest + offset)) for source, offset in both), True
+
+
+def has_commands_as_positions(recording: Recording) -> bool:
+    """Return whether the positions of a recording are commands, bit for bit."""
+    if COPIED_COMMANDS in recording.provenance:
+        return True
+    commands = recording.commanded_position
+    if commands is None or not np.ptp(recording.position, axis=0).any():
+        return False
+    return bool(np.array_equal(commands, recording.position))
 
 
 def archives_in(paths: Sequence[Path]) -> Iterator[Path]:

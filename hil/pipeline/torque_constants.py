@@ -25,8 +25,8 @@ from identification.selection.settings import Settings
 from identification.signals.recording import RecordingError
 from identification.signals.samples import Samples
 
-from .carried_weight import other_meanings
 from .options import FIXED
+from .other_meanings import in_a_sentence, other_meanings
 from .prepared import motor_from_joint, samples_of, stated_settings
 from .sources import Source, aligned, cell_of, source_of
 
@@ -103,7 +103,7 @@ def find_gains(
     prepared = _prepared([*zip(sources, cells, lags, carried, strict=True)], model)
     gains = identify_gains(model, _reduced(prepared, model, turns, reporter))
     has_gears = not np.array_equal(turns, np.eye(len(turns)))
-    return GainsFound(gains, loads, has_gears, _warnings(prepared, model, turns, gains))
+    return GainsFound(gains, loads, has_gears, _warnings(prepared, model, turns, gains, sources))
 
 
 class _Prepared(NamedTuple):
@@ -150,7 +150,11 @@ def _reduced(
 
 
 def _warnings(
-    prepared: Sequence[_Prepared], model: RobotModel, turns: Array, gains: Gains
+    prepared: Sequence[_Prepared],
+    model: RobotModel,
+    turns: Array,
+    gains: Gains,
+    sources: Sequence[Source],
 ) -> tuple[str, ...]:
     """Return what recordings without a load are other than described, by the torque found."""
     bare = [each for each in prepared if each.load is None]
@@ -160,7 +164,8 @@ def _warnings(
     samples = [
         replace(each.samples, torque=torque) for each, torque in zip(bare, torques, strict=True)
     ]
-    return other_meanings(model, diagnose(model, samples))
+    found = other_meanings(model, diagnose(model, samples), sources)
+    return tuple(map(in_a_sentence, found))
 
 
 def _name_in(path: Path, paths: Sequence[Path]) -> str:

@@ -93,6 +93,21 @@ def test_no_load_is_weighed_without_gravity(tmp_path: Path) -> None:
         find_payload([bare], [loaded], Silent())
 
 
+def test_a_load_is_weighed_by_its_inertia_where_an_import_finds_no_gravity(tmp_path: Path) -> None:
+    """3.0 kg, of which the flange bears the weight."""
+    folder = CASES / "06-torque-already-compensated"
+    archives = [tmp_path / f"{name}.mcap" for name in ("bare_g", "full_g")]
+    for archive in archives:
+        log = folder / f"{archive.stem}.csv"
+        line = ["import", "log", str(log), "--urdf", str(URDF), "-o", str(archive)]
+        assert CliRunner().invoke(app, line).exit_code == 0
+    found = find_payload(archives[:1], archives[1:], Silent())
+    low, high = found.estimate.intervals[0]
+    assert low < 3.0 < high
+    assert high - low < 0.5
+    assert found.wrist_torque[0] == pytest.approx(9.81 * 3.0 * 0.092, rel=0.1)
+
+
 def test_a_batch_is_told_the_same_of_a_log_and_of_its_archive(tmp_path: Path) -> None:
     archive = archived(SUBTRACTED, tmp_path)
     for words in ((archive,), (SUBTRACTED, "--urdf", URDF)):

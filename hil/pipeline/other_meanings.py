@@ -7,24 +7,44 @@ from pathlib import Path
 from typing import Final
 
 from hil.base.errors import InputError
+from hil.pipeline.sources import Source, has_commands_as_positions
 from identification.hypotheses.changes import Change
 from identification.hypotheses.diagnosis import TorqueDiagnosis, diagnose
 from identification.model.robot import RobotModel
 from identification.signals.samples import Samples
 from identification.validation.finding import Finding
-from identification.validation.finding_messages import Naming, worded
+from identification.validation.finding_messages import Naming, WordedFinding, worded
 from identification.validation.findings.diagnosis import of_diagnosis, without_bodies
 from identification.validation.findings.faults import fault_keys
 
 _MOTION: Final = "the recordings"
 
 
-def other_meanings(model: RobotModel, found: TorqueDiagnosis) -> tuple[str, ...]:
-    """Return what recordings are other than described, as sentences with what to do about each."""
+def other_meanings(
+    model: RobotModel, found: TorqueDiagnosis, sources: Sequence[Source]
+) -> tuple[WordedFinding, ...]:
+    """Return what recordings are other than described, and what to do about each."""
     naming = Naming(tuple(model.joint_names), _MOTION)
     certain = [_certain(step.change) for step in found.discrete if step.sure]
-    findings = [worded(each, naming) for each in (*certain, *of_diagnosis(found))]
-    return tuple(f"{each.words}: {each.next_step}" for each in findings)
+    findings = (*commanded_positions(sources), *certain, *of_diagnosis(found))
+    return tuple(worded(each, naming) for each in findings)
+
+
+def in_a_sentence(finding: WordedFinding) -> str:
+    """Return a finding with what to do about it."""
+    return f"{finding.words}: {finding.next_step}"
+
+
+def commanded_positions(
+    sources: Sequence[Source], delay: float | None = None
+) -> tuple[Finding, ...]:
+    """Return that positions are commands; `delay` of the torque [s], where one was found."""
+    copies = [source for source in sources if has_commands_as_positions(source.recording)]
+    names = tuple(dict.fromkeys(source.path.name for source in copies))
+    if not names:
+        return ()
+    values = {"recordings": names} | ({} if delay is None else {"delay": 1e3 * delay})
+    return (Finding("commanded positions", "wrong", "record the positions", "cause", values),)
 
 
 def _certain(change: Change) -> Finding:
@@ -34,8 +54,8 @@ def _certain(change: Change) -> Finding:
 
 
 def require_weight(
-    model: RobotModel, recordings: Sequence[Samples], path: Path | None
-) -> tuple[str, ...]:
+    model: RobotModel, recordings: Sequence[Samples], sources: Sequence[Source], path: Path | None
+) -> tuple[WordedFinding, ...]:
     """Return what bare recordings are other than described; gravity must be in their torque.
 
     A controller that removes the weight of its arm may remove that of the load it knows as well,
@@ -44,6 +64,7 @@ def require_weight(
     Args:
         model: of the arm.
         recordings: prepared, of the bare arm.
+        sources: bare and loaded, as recorded.
         path: of the first of them.
 
     Raises:
@@ -62,4 +83,4 @@ def require_weight(
         )
         remedy = "record the torque before gravity is removed from it"
         raise InputError(path, problem, field="torque", remedy=remedy)
-    return other_meanings(model, found)
+    return other_meanings(model, found, sources)
