@@ -4,14 +4,13 @@ from __future__ import annotations
 
 import json
 from collections import Counter
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
 
 from hil.archive import open_archive
-from hil.archive.imported import ROW_COUNTER
 from hil.base.arrays import Array
 from hil.cell import Cell
 from hil.cell.nominal import nominal_of
@@ -29,7 +28,6 @@ from identification.signals.position_steps import PositionJump, position_steps
 from identification.signals.recording import (
     Recording,
 )
-from identification.signals.row_faults import RowFaultKind
 from identification.signals.samples import Samples
 from identification.validation.controller_inertia import InertiaRatio, inertia_ratio
 from identification.validation.evidence import CellContext
@@ -46,8 +44,8 @@ from identification.validation.prediction import PredictionError, pooled_error
 from identification.validation.residuals import folded_noise
 from planner.arrays import numbers
 
-from .other_meanings import commanded_positions
 from .prepared import Prepared
+from .recorded_rows import commanded_positions, faulty_rows, retimed, row_counters
 from .sources import Source, Sources, has_commands_as_positions
 
 _MAX_POSTURES = 500
@@ -149,11 +147,11 @@ def cell_context_of(prepared: Prepared, estimate: Estimate) -> CellContext:
         delays=prepared.delays,
         assumed_delay=prepared.assumed_delay,
         corrections=(
-            *_rows(recorded),
+            *faulty_rows(recorded),
             *_spikes(prepared),
             *_commanded(recorded, prepared),
-            *_row_counters(recorded),
-            *_clock(prepared),
+            *row_counters(recorded),
+            *retimed(prepared.sources.training),
             *_log([jump for source_steps in steps for jump in source_steps.logged]),
             *_wrapped(recorded),
             *_torque_channel(prepared),
@@ -190,25 +188,8 @@ def joint_ranges(sources: Sources) -> tuple[Array, Array]:
     return np.where(bounded, stated.lower, ends[0]), np.where(bounded, stated.upper, ends[1])
 
 
-_ROW_REMEDIES: Final[Mapping[RowFaultKind, RemedyKey]] = {
-    RowFaultKind.FROZEN: "find why the logger stopped",
-    RowFaultKind.WRITTEN_TWICE: "check what wrote rows twice",
-    RowFaultKind.DISPLACED: "check what displaced rows",
-    RowFaultKind.JUMP: "separate the motions",
-}
-
-
 def _doubtful(key: FindingKey, remedy: RemedyKey, **values: Value) -> Finding:
     return Finding(key, "doubtful", remedy, values=values)
-
-
-def _rows(sources: Sequence[Source]) -> Iterator[Finding]:
-    """Yield findings about rows that are not of one motion, once for both parts of a recording."""
-    for source in {source.path: source for source in sources}.values():
-        for fault in source.faults:
-            name = source.path.name
-            remedy = _ROW_REMEDIES[fault.kind]
-            yield _doubtful("faulty rows", remedy, recording=name, fault=fault)
 
 
 def _spikes(prepared: Prepared) -> Iterator[Finding]:
@@ -225,22 +206,6 @@ def _commanded(sources: Sequence[Source], prepared: Prepared) -> Iterator[Findin
     delays = prepared.delays
     significant = delays is not None and delays.significant
     yield from commanded_positions(sources, delays.delay if delays and significant else None)
-
-
-def _row_counters(sources: Sequence[Source]) -> Iterator[Finding]:
-    """Yield a finding about times that count rows, and are read in a unit that a map states."""
-    for source in {source.path: source for source in sources}.values():
-        unit = source.recording.provenance.get(ROW_COUNTER)
-        if unit is not None:
-            values: dict[str, Value] = {"recording": source.path.name, "unit": unit}
-            yield Finding("counted rows", "doubtful", "state the sampling rate", "cause", values)
-
-
-def _clock(prepared: Prepared) -> Iterator[Finding]:
-    retimed = [source for source in prepared.sources.training if source.retimed]
-    if retimed and (times := retimed[0].times) is not None:
-        names = tuple(source.name for source in retimed)
-        yield _doubtful("retimed", "log the time", recordings=names, times=times)
 
 
 def _log(steps: Sequence[PositionJump]) -> Iterator[Finding]:

@@ -7,7 +7,8 @@ from pathlib import Path
 from typing import Final
 
 from hil.base.errors import InputError
-from hil.pipeline.sources import Source, has_commands_as_positions
+from hil.pipeline.recorded_rows import row_findings
+from hil.pipeline.sources import Source
 from identification.hypotheses.changes import Change
 from identification.hypotheses.diagnosis import TorqueDiagnosis, diagnose
 from identification.model.robot import RobotModel
@@ -26,25 +27,13 @@ def other_meanings(
     """Return what recordings are other than described, and what to do about each."""
     naming = Naming(tuple(model.joint_names), _MOTION)
     certain = [_certain(step.change) for step in found.discrete if step.sure]
-    findings = (*commanded_positions(sources), *certain, *of_diagnosis(found))
+    findings = (*row_findings(sources), *certain, *of_diagnosis(found))
     return tuple(worded(each, naming) for each in findings)
 
 
 def in_a_sentence(finding: WordedFinding) -> str:
     """Return a finding with what to do about it."""
     return f"{finding.words}: {finding.next_step}"
-
-
-def commanded_positions(
-    sources: Sequence[Source], delay: float | None = None
-) -> tuple[Finding, ...]:
-    """Return that positions are commands; `delay` of the torque [s], where one was found."""
-    copies = [source for source in sources if has_commands_as_positions(source.recording)]
-    names = tuple(dict.fromkeys(source.path.name for source in copies))
-    if not names:
-        return ()
-    values = {"recordings": names} | ({} if delay is None else {"delay": 1e3 * delay})
-    return (Finding("commanded positions", "wrong", "record the positions", "cause", values),)
 
 
 def _certain(change: Change) -> Finding:

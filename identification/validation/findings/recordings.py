@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 
 from identification.distributions import SIGNIFICANT_SIGMAS
+from identification.signals.position_steps import PositionJump
 from identification.validation.evidence import Evidence
 from identification.validation.finding import Finding, Thresholds, Value
 
@@ -36,8 +39,13 @@ def no_torque(evidence: Evidence, _: Thresholds) -> Finding | None:
 
 
 def position_jumps(evidence: Evidence, _: Thresholds) -> Finding | None:
-    """Return steps of measured positions that an arm cannot make, the largest first."""
-    jumps = tuple(sorted(evidence.context.jumps, key=lambda jump: -abs(jump.size)))
+    """Return steps of measured positions that an arm cannot make."""
+    return of_jumps(evidence.context.jumps)
+
+
+def of_jumps(found: Sequence[PositionJump]) -> Finding | None:
+    """Return steps that an arm cannot make as a finding, the largest first; None without any."""
+    jumps = tuple(sorted(found, key=lambda jump: -abs(jump.size)))
     if not jumps:
         return None
     jumping = tuple(dict.fromkeys(jump.joint for jump in jumps))
