@@ -11,9 +11,9 @@ from hil.archive import Archive
 from hil.base.arrays import Array
 from hil.base.errors import SourceError
 from hil.importers.plausibility import command_size
+from hil.importers.stamps import MIN_SECONDS
 from identification.text import duration_text
 
-_MIN_RECORDING_SECONDS: Final = 1.0  # s
 _COPIED: Final = 0.999  # of the rows
 _COPIED_LATER: Final = 0.98  # of the rows in which commands change
 _MOST_SAMPLES_LATER: Final = 3
@@ -29,7 +29,7 @@ def require_motion(archive: Archive, recording: Path) -> None:
     columns = archive.columns
     stamp = columns["stamp"]
     duration = float(stamp[-1] - stamp[0]) * 1e-9
-    if duration < _MIN_RECORDING_SECONDS:
+    if duration < MIN_SECONDS:
         samples = f"{len(stamp)} {'sample' if len(stamp) == 1 else 'samples'}"
         problem = f"has {samples} in {duration_text(duration)}, too few to identify from"
         remedy = "record a motion of all joints, of 10 s or more"

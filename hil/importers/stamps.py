@@ -22,6 +22,8 @@ Stamps = NDArray[np.int64]
 MIN_SAMPLING_RATE: Final = 20.0  # Hz; a robot's dynamics need faster sampling
 MAX_SAMPLING_RATE: Final = 20_000.0  # Hz
 _MAX_TIME_NS: Final = 10**40  # ns; more is no time in any unit
+MIN_SECONDS: Final = 1.0
+"""Of a recording [s]."""
 _MIN_PLAUSIBLE_RATE: Final = 10.0  # Hz; 5 kHz in ms, read as s, are 5 Hz
 _MAX_WRAP_STEPS: Final = 10  # median steps that a counter may pass where it wraps
 _MIN_PART_NS: Final = 10**9  # ns of a motion that was recorded after another one
@@ -48,8 +50,9 @@ _WRAPS: Final[dict[str, int]] = {
 def concluded_unit(times: Sequence[int | None]) -> str:
     """Return the unit of times that nothing states, given as nanoseconds of seconds.
 
-    It is the longest that gives a rate of sampling at which robots are recorded: in seconds where
-    none does, and for a column that only counts the samples.
+    It is the longest that gives a rate of sampling at which robots are recorded, of a second or
+    more: seconds where none does, and for a column that only counts the samples. Of a few rows,
+    which are no second in any unit, the rate decides alone, unless they are several in a second.
     """
     stamps = np.array(
         [time / 1e9 for time in times if time is not None and abs(time) < _MAX_TIME_NS]
@@ -59,10 +62,15 @@ def concluded_unit(times: Sequence[int | None]) -> str:
     if not steps.size or (bool(np.all(np.abs(steps - 1.0) < 1e-9)) and stamps[0] in (0.0, 1.0)):
         return "s"
     step = float(np.median(steps))
-    for unit, places in TIMES.items():
-        if _MIN_PLAUSIBLE_RATE <= 10.0**places / step <= MAX_SAMPLING_RATE:
-            return unit
-    return "s"
+    possible = [
+        unit
+        for unit, places in TIMES.items()
+        if _MIN_PLAUSIBLE_RATE <= 10.0**places / step <= MAX_SAMPLING_RATE
+    ]
+    lasting = [unit for unit in possible if steps.sum() >= MIN_SECONDS * 10.0 ** TIMES[unit]]
+    if not lasting and step < 1.0:
+        return "s"
+    return next(iter((*lasting, *possible)), "s")
 
 
 class Continued(NamedTuple):

@@ -83,6 +83,7 @@ from hil.look.readings import (
     UnseenZeros,
     Vector,
     Wrapped,
+    ZeroTorques,
 )
 from hil.look.result import ChangedReading, Look, Row, TiedReading
 from identification.estimators.delay_messages import undetermined_words
@@ -402,6 +403,11 @@ def _(order: JointOrder) -> str:
 @_worded.register
 def _(units: EpisodeUnits) -> str:
     return import_messages.worded(units)
+
+
+@_worded.register
+def _(joints: ZeroTorques) -> str:
+    return f"zero throughout: {', '.join(joints.joints)}"
 
 
 @_worded.register

@@ -109,6 +109,13 @@ class Channels:
 
 
 @dataclass(frozen=True)
+class ZeroTorques:
+    """Joints that move, and whose torque is zero throughout."""
+
+    joints: tuple[str, ...]
+
+
+@dataclass(frozen=True)
 class NotSlopes:
     """Joints whose velocity is not the slope of their position."""
 
@@ -232,6 +239,7 @@ Reading = (
     | Channels
     | JointOrder
     | NotSlopes
+    | ZeroTorques
     | StillJoints
     | Wrapped
     | OutsideLimits

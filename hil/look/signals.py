@@ -49,6 +49,7 @@ from hil.look.readings import (
     StillJoints,
     Travel,
     Wrapped,
+    ZeroTorques,
 )
 from hil.look.result import Aspect, Row
 from hil.pipeline.sources import Source, has_commands_as_positions
@@ -108,6 +109,7 @@ def rows(source: Source, imported: ImportedRecording, arm: Cell | None) -> list[
             )
         )
     table += [row for each in concluded if (row := _concluded(each, units)) is not None]
+    table += _silent(recording)
     if recording.velocity is not None:
         table.append(_velocity(recording))
     table += [
@@ -200,6 +202,19 @@ def _velocity(recording: Recording) -> Row:
     reading = explanations[0] if explanations else Fact.SCALED_SLOPE
     decider = NextStep.STATE_UNIT_OR_GEARS
     return Row("velocity", reading, Certainty.CERTAIN, (factors,), decider)
+
+
+def _silent(recording: Recording) -> list[Row]:
+    """Return the row of joints that move and whose torque is zero, none if there are none."""
+    if recording.torque is None:
+        return []
+    silent = (np.ptp(recording.position, axis=0) > MIN_MOVEMENT) & ~recording.torque.any(axis=0)
+    zero = tuple(np.array(recording.joint_names)[silent].tolist())
+    if not zero:
+        return []
+    certain = Certainty.CERTAIN
+    step = NextStep.RECORD_TORQUE
+    return [Row("torque", ZeroTorques(zero), certain, (Basis.CHANNELS,), step, is_fault=True)]
 
 
 def _rests(recording: Recording) -> Row:

@@ -23,11 +23,9 @@ from identification.selection.questions import FRICTION_AT_SPEED, LOAD, LOW_PASS
 from identification.signals.angle_wraps import (
     UNWRAPPED,
 )
-from identification.signals.masks import SATURATED, SPIKE
+from identification.signals.masks import SATURATED, SPIKE, UNMEASURED
 from identification.signals.position_steps import PositionJump, position_steps
-from identification.signals.recording import (
-    Recording,
-)
+from identification.signals.recording import MIN_MOVEMENT, Recording
 from identification.signals.samples import Samples
 from identification.validation.controller_inertia import InertiaRatio, inertia_ratio
 from identification.validation.evidence import CellContext
@@ -149,6 +147,7 @@ def cell_context_of(prepared: Prepared, estimate: Estimate) -> CellContext:
         corrections=(
             *faulty_rows(recorded),
             *_spikes(prepared),
+            *_unmeasured(prepared),
             *_commanded(recorded, prepared),
             *row_counters(recorded),
             *retimed(prepared.sources.training),
@@ -199,6 +198,18 @@ def _spikes(prepared: Prepared) -> Iterator[Finding]:
         return
     found = _doubtful("spikes", "check for damaged packets", rows=prepared.rows)
     yield found.about(counts > 0, count=counts)
+
+
+def _unmeasured(prepared: Prepared) -> Iterator[Finding]:
+    """Yield a finding about joints that move, and whose torque is zero throughout."""
+    counts = prepared.masked.get(UNMEASURED)
+    if counts is None or not counts.any():
+        return
+    recorded = (*prepared.sources.training, *prepared.sources.held_out)
+    moved = np.max([np.ptp(each.recording.position, axis=0) for each in recorded], axis=0)
+    silent = (counts > 0) & (moved > MIN_MOVEMENT)
+    if silent.any():
+        yield Finding("no torque", "wrong", "resolve the torque", "cause").about(silent)
 
 
 def _commanded(sources: Sequence[Source], prepared: Prepared) -> Iterator[Finding]:

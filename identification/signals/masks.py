@@ -55,6 +55,7 @@ _MAX_SPIKE_SAMPLES: Final = 2  # samples
 ExcludedRows = Literal["rests", "halts", "slow", "none"]
 
 EDGE: Final = "next to a gap or an end of the recording"
+UNMEASURED: Final = "torque of the joint zero throughout"
 SATURATED: Final = "torque or current saturated"
 REST: Final = "at rest"
 STANDSTILL: Final = "slower than standstill"
@@ -155,10 +156,19 @@ def mask_rows(
         reasons |= {REST: halts, REVERSAL: turning}
     elif exclude_rows == "slow":
         reasons |= {STANDSTILL: still, REVERSAL: reversal}
+    reasons[UNMEASURED] = np.broadcast_to(_unmeasured(recording), shape)
     reasons[SATURATED] = saturated
     reasons[SPIKE] = spikes
     moving = ~(reasons[EDGE] | saturated | spikes | still | reversal)
     return RowMask(reasons, (shape[0], shape[1]), moving)
+
+
+def _unmeasured(recording: Recording) -> NDArray[np.bool_]:
+    """Return the joints whose torque is zero throughout while others have one (n,)."""
+    if recording.torque is None:
+        return np.zeros(recording.position.shape[1], dtype=np.bool_)
+    zero = ~recording.torque.any(axis=0)
+    return np.asarray(zero & ~zero.all())
 
 
 def long_rests(time: Array, still: Rows) -> Rows:
