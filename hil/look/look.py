@@ -165,6 +165,8 @@ def _with_torque(
     finding = _finding(source, imported, cell, recording)
     delay, low_pass = _channel(finding.axes.read(recording), finding.readings.model)
     channel = list(physics.channel_rows(delay, low_pass))
+    if recorded.retimed:
+        channel = [physics.by_estimated_times(row) for row in channel]
     groups = physics.determined(finding.readings)
     score = finding.readings.score
     if score.overall > EXPLAINED_ERROR:

@@ -136,6 +136,7 @@ _FACTS: Final[Mapping[Fact, str]] = {
     Fact.OTHER_ARM: "may not be the arm of the URDF",
 }
 _BASES: Final[Mapping[Basis, str]] = {
+    Basis.ESTIMATED_TIMES: "the stamps are not the times of the samples, which were estimated",
     Basis.MAP: "by the column map",
     Basis.GIVEN_RATE: "at the rate that was given",
     Basis.MESSAGE_TYPE: "by the message type",

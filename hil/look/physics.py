@@ -611,6 +611,14 @@ def channel_rows(delay: DelayEstimate | None, low_pass: TorqueLowPass | None) ->
     yield Row("low-pass", reading, certainty, evidence, Decide.ASK_FOR_FILTER)
 
 
+def by_estimated_times(row: Row) -> Row:
+    """Return a row that is not certain, as the times of the samples were estimated."""
+    if row.certainty is not Certainty.CERTAIN:
+        return row
+    evidence = (*row.evidence, Basis.ESTIMATED_TIMES)
+    return replace(row, certainty=Certainty.LIKELY, evidence=evidence)
+
+
 def _delay_row(delay: DelayEstimate | None) -> Row:
     if delay is None:
         none = (Basis.NO_ROW,)

@@ -264,6 +264,7 @@ class Basis(Enum):
     """Evidence without a figure."""
 
     GIVEN_RATE = auto()
+    ESTIMATED_TIMES = auto()
     MAP = auto()
     DATA_SET = auto()
     MESSAGE_TYPE = auto()

@@ -159,7 +159,7 @@ def mask_rows(
     reasons[UNMEASURED] = np.broadcast_to(_unmeasured(recording), shape)
     reasons[SATURATED] = saturated
     reasons[SPIKE] = spikes
-    moving = ~(reasons[EDGE] | saturated | spikes | still | reversal)
+    moving = ~(reasons[EDGE] | reasons[UNMEASURED] | saturated | spikes | still | reversal)
     return RowMask(reasons, (shape[0], shape[1]), moving)
 
 

@@ -23,6 +23,8 @@ def joints_at_rest(evidence: Evidence, limits: Thresholds) -> Finding | None:
     """Return the joints that hardly moved on held-out motion."""
     moved = evidence.moved
     still = evidence.held_out.rows == 0 if moved is None else moved < limits.moved
+    unmeasured = [each for each in evidence.context.corrections if each.key == "no torque"]
+    still[[joint for each in unmeasured for joint in each.joints]] = False
     if not still.any():
         return None
     least = {"least": limits.moved}

@@ -1,0 +1,92 @@
+"""Logs of which nothing certain follows: rounded stamps, a torque of zeros, rows at 5 Hz."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from hil.base.errors import SourceError
+from hil.identified.identified_arm import arm_from
+from hil.importers.conclusions import Certainty
+from hil.importers.imported_robot import Robot
+from hil.importers.recording_import import ImportOptions
+from hil.importers.stamps import concluded_unit
+from hil.look import look_at
+from hil.look.readings import ZeroTorques
+from hil.look.result import Look
+from tests.hil.simulated_logs import Simulated, simulate, urdf_path, write_log
+
+URDF = urdf_path("ur5_robot.urdf")
+TIME = np.arange(0.0, 12.0, 0.008)
+
+
+@pytest.fixture(scope="module")
+def simulated() -> Simulated:
+    return simulate(URDF, TIME, seed=2, pace=1.5)
+
+
+def log_of(folder: Path, simulated: Simulated, **changed: Any) -> Path:
+    columns = {"time": simulated.time, "torque": simulated.torque} | changed
+    path = folder / "log.csv"
+    names = ["t", "q{}", "tau{}"]
+    return write_log(path, names, columns["time"], simulated.position, columns["torque"])
+
+
+def look(log: Path) -> Look:
+    robot = Robot.from_urdf(URDF)
+    return look_at(log, lambda _: robot, ImportOptions())
+
+
+@pytest.mark.long
+def test_no_delay_is_certain_by_rounded_stamps(tmp_path: Path, simulated: Simulated) -> None:
+    """To 0.1 s: the times are those of even steps, by an estimated rate."""
+    found = look(log_of(tmp_path, simulated, time=np.round(TIME, 1)))
+    (row,) = [row for row in found.rows if row.aspect == "delay"]
+    assert row.certainty is not Certainty.CERTAIN
+
+
+class TestTorqueOfZeros:
+    """Of one joint that moves: it is named, and counts as no error of the others."""
+
+    @pytest.fixture
+    def log(self, tmp_path: Path, simulated: Simulated) -> Path:
+        torque = simulated.torque.copy()
+        torque[:, 1] = 0.0
+        return log_of(tmp_path, simulated, torque=torque)
+
+    @pytest.mark.long
+    def test_a_look_names_it(self, log: Path, simulated: Simulated) -> None:
+        found = look(log)
+        assert ZeroTorques((simulated.joint_names[1],)) in [row.reading for row in found.rows]
+        assert found.error is not None
+        assert found.error < 0.05
+
+    @pytest.mark.long
+    def test_a_verdict_says_no_more_of_it(self, log: Path) -> None:
+        arm = arm_from(log, URDF, None, (), None, None, None)
+        assert not arm.verdict.good
+        wrong = [each for each in arm.verdict.findings if each.level == "wrong"]
+        (cause,) = [each for each in wrong if each.role == "cause"]
+        assert (cause.key, cause.joints) == ("no torque", (1,))
+        assert arm.results.judgement.overall < 0.05
+
+
+@pytest.mark.parametrize(
+    ("step", "count", "unit"),
+    [(0.2, 70, "s"), (0.2, 10_000, "ms"), (4.0, 20, "ms"), (0.004, 500, "s"), (4000.0, 500, "us")],
+)
+def test_a_unit_of_time_gives_a_second_of_motion(step: float, count: int, unit: str) -> None:
+    """5 Hz for 14 s, or 5 kHz in ms for 2 s; of a few rows the rate decides."""
+    assert concluded_unit([round(1e9 * step * row) for row in range(count)]) == unit
+
+
+def test_a_slow_log_is_refused_by_its_rate(tmp_path: Path, simulated: Simulated) -> None:
+    rows = slice(None, None, 25)
+    path = tmp_path / "log.csv"
+    signals = [each[rows] for each in (simulated.time, simulated.position, simulated.torque)]
+    log = write_log(path, ["t", "q{}", "tau{}"], *signals)
+    with pytest.raises(SourceError, match="has 5 samples per second"):
+        look(log)
