@@ -252,8 +252,8 @@ def _measured(
     """Return whether positions are measured, by their noise and the lag of the velocity."""
     if has_commands_as_positions(recording):
         commands = recording.provenance.get(COPIED_COMMANDS, _COMMANDS)
-        said = (each for each in found if isinstance(each, CopiedCommands))
-        copied = next(said, CopiedCommands(commands, ()))
+        copies = (each for each in found if isinstance(each, CopiedCommands))
+        copied = next(copies, CopiedCommands(commands, ()))
         decider = NextStep.RECORD_MEASURED
         return Row(
             "positions", Fact.COMMANDED, Certainty.CERTAIN, (copied,), decider, is_fault=True

@@ -24,7 +24,7 @@ from hil.pipeline.sources import (
 from identification.estimators.payload_problem import KnownArm, Run
 
 from .payload_run import (
-    PayloadDoubts,
+    PayloadContradictions,
     PayloadFound,
     doubtful_mounting,
     flange_of,
@@ -86,9 +86,9 @@ def weigh_by_model(
     otherwise = tuple(in_a_sentence(each) for each in meanings if each.level == "wrong")
     doubtful = [in_a_sentence(each) for each in meanings if each.level != "wrong"]
     mounting = doubtful_mounting(cell.model, prepared.fitted)
-    doubts = PayloadDoubts(mounting, otherwise)
+    contradictions = PayloadContradictions(mounting, otherwise)
     estimate, body = weighed(
-        cell.model, runs, scale, frame, sides, others.training, doubts, known_arm
+        cell.model, runs, scale, frame, sides, others.training, contradictions, known_arm
     )
     return PayloadFound(
         estimate=replace(estimate, method=f"{estimate.method}, against the model of the arm"),

@@ -356,8 +356,8 @@ def find_payload(
     with reporter.task("weighing", 2) as task:
         mounting = doubtful_mounting(cell.model, prepared.fitted)
         task.advance(1)
-        doubts = PayloadDoubts(mounting, otherwise)
-        estimate, body = weighed(cell.model, runs, scale, frame, sides, training, doubts)
+        contradictions = PayloadContradictions(mounting, otherwise)
+        estimate, body = weighed(cell.model, runs, scale, frame, sides, training, contradictions)
         task.advance(1)
     doubtful = [in_a_sentence(each) for each in meanings if each.level != "wrong"]
     warnings = (*prepared.sources.warnings, *by_side[True].warnings, *doubtful)
@@ -381,25 +381,25 @@ class NoPayloadError(InputError):
     """The recordings show no payload; more of them may."""
 
 
-class PayloadDoubts(NamedTuple):
+class PayloadContradictions(NamedTuple):
     """Why recordings may be other than described, with a remedy each."""
 
     mounting: str | None
     otherwise: tuple[str, ...]
 
 
-def _no_payload(estimate: PayloadEstimate, doubts: PayloadDoubts) -> NoPayloadError:
+def _no_payload(estimate: PayloadEstimate, contradictions: PayloadContradictions) -> NoPayloadError:
     low, high = estimate.intervals[0]
     problem = (
         f"the loaded archives show no payload: its mass is between {low:.3g} and {high:.3g} kg"
     )
     remedy = "give recordings that were made with the payload"
-    if doubts.mounting is not None:
+    if contradictions.mounting is not None:
         problem += ", as the arm is stated to be mounted"
-        remedy = f"the mounting is doubtful: {doubts.mounting}; then {remedy}"
-    if doubts.otherwise:
+        remedy = f"the mounting is doubtful: {contradictions.mounting}; then {remedy}"
+    if contradictions.otherwise:
         problem += ", with the recordings as described"
-        remedy = "; ".join([*doubts.otherwise, f"then {remedy}"])
+        remedy = "; ".join([*contradictions.otherwise, f"then {remedy}"])
     return NoPayloadError(None, problem, field="--loaded", remedy=remedy)
 
 
@@ -459,7 +459,7 @@ def weighed(
     frame: str,
     sides: Mapping[bool, Sequence[Path]],
     training: Sequence[Source],
-    doubts: PayloadDoubts,
+    contradictions: PayloadContradictions,
     arm: KnownArm | None = None,
 ) -> tuple[PayloadEstimate, Body]:
     """Return the payload of reduced recordings.
@@ -471,7 +471,7 @@ def weighed(
         frame: of the payload.
         sides: the bare and the loaded archives.
         training: their recordings.
-        doubts: about the bare recordings.
+        contradictions: of the bare recordings.
         arm: what is known of it.
 
     Raises:
@@ -481,7 +481,7 @@ def weighed(
     """
     estimate = identify_payload(model, runs, scale.std, arm)
     if estimate.body is None:
-        raise _no_payload(estimate, doubts)
+        raise _no_payload(estimate, contradictions)
     _require_agreement(model, runs, estimate, frame, sides, training, arm)
     positions = [np.abs(source.recording.position).max(axis=0) for source in training]
     travel = np.max(positions, axis=0)
