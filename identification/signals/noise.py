@@ -138,11 +138,11 @@ def has_small_noise(time: Array, signals: Array, segments: Sequence[slice], abov
     step = smallest_steps(signals)
     rounding = step**2 / 12.0
     beyond = variance > _MIN_ROUNDING_STD_RATIO**2 * rounding
-    counted = (variance > rounding / _MIN_ROUNDING_STD_RATIO**2) & ~_is_decimal(step)
+    of_encoder = (variance > rounding / _MIN_ROUNDING_STD_RATIO**2) & ~_is_decimal(step)
     here = frequency >= above
     of_band = power[here][:, moving].sum(axis=0) * (frequency[1] - frequency[0])
     white = variance >= _MIN_WHITE_SHARE * of_band
-    return bool(np.mean((beyond | counted) & white) > 0.5)
+    return bool(np.mean((beyond | of_encoder) & white) > 0.5)
 
 
 def smallest_steps(signals: Array) -> Array:
