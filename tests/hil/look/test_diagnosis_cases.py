@@ -93,7 +93,7 @@ def test_no_load_is_weighed_without_gravity(tmp_path: Path) -> None:
         find_payload([bare], [loaded], Silent())
 
 
-def test_a_load_is_weighed_by_its_inertia_where_an_import_finds_no_gravity(tmp_path: Path) -> None:
+def test_a_load_without_gravity_is_weighed_by_inertia(tmp_path: Path) -> None:
     """3.0 kg, of which the flange bears the weight."""
     folder = CASES / "06-torque-already-compensated"
     archives = [tmp_path / f"{name}.mcap" for name in ("bare_g", "full_g")]
