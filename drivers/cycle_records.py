@@ -122,7 +122,7 @@ _TAG: Final = 0x31474E4952434948
 _HEADER_BYTES: Final = 4096
 _STATE_AT: Final = 256
 """Where in the header the layout of the arm's state is, as JSON; the words are before it."""
-# Indices of 8-byte words, those of different writers on different cache lines.
+# Indices of 8-byte words; different writers have different cache lines.
 _KIND_WORD = 0
 _JOINTS_WORD = 1
 _CAPACITY_WORD = 2

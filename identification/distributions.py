@@ -22,12 +22,12 @@ def normal_limit(share: ArrayLike) -> Any:
 
 
 def student_limit(share: ArrayLike, freedom: ArrayLike) -> Any:
-    """Value that Student's t of so many degrees of freedom exceeds with probability `share`."""
+    """Value that Student's t with `freedom` degrees exceeds with probability `share`."""
     return -scipy.special.stdtrit(freedom, share)
 
 
 def chi_squared_limit(share: ArrayLike, freedom: ArrayLike) -> Any:
-    """Value that chi-squared of so many degrees of freedom exceeds with probability `share`."""
+    """Value that chi-squared with `freedom` degrees exceeds with probability `share`."""
     return scipy.special.chdtri(freedom, share)
 
 
@@ -40,7 +40,7 @@ def fisher_limit(share: ArrayLike, freedom: ArrayLike, of_variance: ArrayLike) -
 
 
 def student_tail(value: ArrayLike, freedom: ArrayLike) -> Any:
-    """Probability that Student's t of so many degrees of freedom exceeds a value."""
+    """Probability that Student's t with `freedom` degrees exceeds a value."""
     return scipy.special.stdtr(freedom, -np.asarray(value))
 
 

@@ -45,7 +45,7 @@ def strict(kind: Any, value: Any) -> Any:
 
 
 def numbers(values: Any, dimensions: int) -> Array:
-    """Return nested lists of numbers as a read-only array with so many dimensions.
+    """Return nested lists of numbers as a read-only array with `dimensions` dimensions.
 
     Raises:
         ValueError: an entry is not a number, or the lists differ in length.

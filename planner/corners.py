@@ -489,7 +489,7 @@ def _in_units(starts: Array, ends: Array, times: Array, bounds: Allowance) -> Se
 
     ruckig reads lists three times as fast as arrays.
     """
-    # Powers of floats: those of arrays may differ in the last digit.
+    # Powers of floats: powers of arrays may differ in the last digit.
     square, cube = np.array([(time**2, time**3) for time in times.tolist()]).reshape(-1, 2).T
     way = bounds.jerk / SOLVER_JERK * cube[:, None]
     units = np.stack((way, way / times[:, None], way / square[:, None]), axis=2)

@@ -174,7 +174,7 @@ class TrajectoryPlayer:
         if isinstance(trajectory, PiecewiseCubic) and not extendable:
             extrema = trajectory.extrema()
         stopping = slowing_bounds(limits, stop_acceleration, stop_jerk, extrema)
-        # Rate at which the accelerations of the path are those of a stop.
+        # Rate at which the path has the accelerations of a stop.
         self._fastest = sqrt(stop_acceleration)
         overriding = slowing_bounds(limits, override_acceleration, override_jerk, extrema)
         self._allowed: dict[Literal["override", "stop"], RateBounds] = {

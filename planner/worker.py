@@ -187,7 +187,7 @@ class WorkerProcess:
             raise
 
     def wait(self, seconds: float) -> bool:
-        """Return whether `receive` can return or raise within so many seconds."""
+        """Return whether `receive` can return or raise within a number of seconds."""
         if not self._ready:
             if not self.connection.poll(seconds):
                 return False

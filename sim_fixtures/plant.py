@@ -393,7 +393,7 @@ class ElasticPlant(Plant):
     """A plant with springs behind the gears of some axes, initially loaded by gravity.
 
     `elasticity` is the compliance of each gear (n,) [rad/(N m)], 0 for a rigid one; `step` that of
-    the simulation [s]. The other arguments are those of `Plant`.
+    the simulation [s]. The other arguments are as of `Plant`.
 
     Raises:
         SettingError: an elastic axis without a rotor, or a resonance too fast for `step`.

@@ -91,7 +91,7 @@ _KINDS: Final[dict[str, Any]] = {
 class SharedState(ctypes.Structure):
     """The fields of supervisor, exchange and archive, for readers and writers.
 
-    Counts of packets are those of `drivers.events.Counters`.
+    Counts of packets are as in `drivers.events.Counters`.
 
     Attributes:
         supervisor_heartbeat, exchange_heartbeat, archive_heartbeat: s.

@@ -55,7 +55,7 @@ class ArmIdentity:
         lower, upper: limits of position (6,) [rad].
         velocity, acceleration: largest ones of its joints (6,) [rad/s, rad/s²].
         nominal: DH parameters of its type.
-        calibrated: those of this arm.
+        calibrated: DH parameters of this arm.
         calibration: checksum of the calibration, hexadecimal.
         serial_number, model, polyscope: as its dashboard states them.
         remote_control: whether it accepts programs of other computers.
@@ -109,7 +109,7 @@ def with_state(identity: ArmIdentity, state: bytes) -> ArmIdentity:
     `state` is the payload of the package: parts, each with its length and type.
 
     Raises:
-        ValueError: the parts are not those of this interface.
+        ValueError: the parts do not belong to this interface.
     """
     parts = dict(_parts(state))
     if (data := parts.get(_CONFIGURATION_PART)) is not None:

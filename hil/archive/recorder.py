@@ -152,7 +152,7 @@ class Recorder:
 
     It adds the joint torque that the drive train makes of the target current.
 
-    It contains cycles of one session with the controller; those of a later one are left out.
+    It contains cycles of one session with the controller; later sessions are left out.
 
     Attributes:
         ended: end of the motion, None before.

@@ -44,7 +44,7 @@ def open_recording(
 
     Args:
         path: the archive.
-        channels: wanted beside the position, of ``velocity``, ``torque``, ``motor_current`` and
+        channels: wanted besides the position: ``velocity``, ``torque``, ``motor_current`` and
             ``commanded_position``; None for all that were recorded.
         start: first time wanted [s], on the archive's clock; time in the recording begins at zero.
         stop: end of the times wanted [s], exclusive.

@@ -70,7 +70,7 @@ class Scan:
             (`header_error`) or of another version.
         outcome: the ``hil.outcome`` record, None if it is lost or of another recording.
         mixed: whether begin and end are of two recordings; the samples may be of either.
-        events: those of the times wanted.
+        events: within the times wanted.
         counts: verified messages by topic.
         chunks: number of valid chunks.
         damages: what is wrong, by the place of the record.
@@ -470,7 +470,7 @@ class Scan:
             The newest stamp [ns], -1 without cycles.
         """
         samples = [topic for topic in by_topic if topic in NUMERIC_TOPICS]
-        # Those of viewers are not read, and need no check.
+        # Channels for viewers are not read, and need no check.
         cycles = (schema.CYCLE, *schema.STATE_TOPICS)
         timed = [t for t in cycles if t in samples] if schema.CYCLE in samples else samples
         if not timed:

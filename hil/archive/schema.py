@@ -270,7 +270,7 @@ def joint_states(
 ) -> Rows:
     """Return messages sensor_msgs/JointState at `stamp` (k,) [ns].
 
-    `values` are those of ``position``, ``velocity`` and ``effort`` that are known, (k, n).
+    `values` are the known ones of ``position``, ``velocity`` and ``effort``, (k, n).
     """
     position, velocity, effort = (
         len(names) * (word in values) for word in ("position", "velocity", "effort")

@@ -7,7 +7,7 @@ HilError                   exit status 1
 │   ├── NoExcitationError       every motion of a design would be refused
 │   ├── NotRehearsedError       the plan did not pass its rehearsal
 │   ├── DryRunError             the slow dry run of the plan was not accepted
-│   └── MountingError           a payload has to be mounted or removed, and nobody confirms it
+│   └── MountingError           a payload has to be mounted or removed, without confirmation
 ├── ExecutionError         4: a motion did not begin, or ended otherwise than planned
 │   ├── ControllerError         the controller or the link was not ready, or failed
 │   └── MotionFailedError       stopped, refused by this PC, or lost; with its archive

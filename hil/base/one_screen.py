@@ -25,7 +25,7 @@ class Paragraph:
     most: int = 4  #: lines
 
     def lines(self, count: int) -> list[str]:
-        """Return the text on at most so many lines, cut at the end of a word."""
+        """Return the text on at most `count` lines, cut at the end of a word."""
         return textwrap.wrap(
             " ".join(self.text.split()),
             SCREEN_COLUMNS,
@@ -47,9 +47,9 @@ Part = str | Paragraph
 
 
 def one_screen(parts: Sequence[Part], lines: int = SCREEN_LINES) -> list[str]:
-    """Return parts on at most so many lines: a line each, the rest of the room to the first ones.
+    """Return parts on at most `lines` lines: one each, and the first parts get the remaining ones.
 
-    Empty lines are dropped, from the end on, where text needs their room.
+    Empty lines are dropped, the last one first, if text needs the space.
     """
     chosen = list(parts)
     wanted = len(chosen) + sum(part.whole - 1 for part in chosen if isinstance(part, Paragraph))

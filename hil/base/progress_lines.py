@@ -129,7 +129,7 @@ class ProgressLines:
 
 
 PROGRESS_LINES: Final = ProgressLines()
-"""Those of this program: standard error is one, too."""
+"""Progress lines of this program: one object, as there is one standard error."""
 
 
 @contextmanager

@@ -26,7 +26,7 @@ MAX_PORT: Final = 65535
 _MAX_INTEGER_DIGITS: Final = 18  # of a number that fits into 64 bits
 MAX_TEXT_BYTES: Final = 1 << 28  # bytes of the longest text that is read
 _MAX_NESTING_DEPTH: Final = 32  # nesting of tables and lists
-_MARKS: Final = {  # those of UTF-32 begin as those of UTF-16
+_MARKS: Final = {  # marks of UTF-32 begin like marks of UTF-16
     codecs.BOM_UTF8: "utf-8-sig",
     codecs.BOM_UTF32_LE: "utf-32",
     codecs.BOM_UTF32_BE: "utf-32",

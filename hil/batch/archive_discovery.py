@@ -102,7 +102,7 @@ class ArchiveRef:
     arm_type: str = ""  #: digest that robots of one type share; "" without a robot
     dated_by: DatedBy = ""
     content: str = ""  #: digest of the bytes of the log; "" of an archive
-    #: what a log has beside its motion: means of columns, and texts, by name
+    #: what a log has in addition to its motion: means of columns, and texts, by name
     facts: Mapping[str, float | str] = field(default_factory=dict, hash=False)
 
     @property

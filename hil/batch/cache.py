@@ -36,7 +36,7 @@ from .places import folder_of, is_url
 T = TypeVar("T")
 Arrays = dict[str, NDArray[Any]]
 
-CACHE_FOLDER: Final = ".hil-cache"  # folder beside the archives
+CACHE_FOLDER: Final = ".hil-cache"  # folder next to the archives
 HEADER: Final = "header"  # array with the JSON text, as bytes
 NUMBERS: Final = "numbers"  # array of all others, one after the other, as bytes
 NPZ: Final = ".npz"  # suffix of entries with arrays
@@ -62,7 +62,7 @@ class CacheError(InputError):
 class CacheLocation:
     """Cache of the results of archives: one folder for all archives of a folder."""
 
-    #: folder of the whole cache; None: beside each archive, or in the user's cache folder (XDG)
+    #: folder of the whole cache; None: next to each archive, or in the user's cache folder (XDG)
     #: where that is not writable or not a folder, and for URLs
     root: str | None = None
     keep: bool = True  #: whether to cache at all

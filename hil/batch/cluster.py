@@ -152,7 +152,7 @@ class Cluster:
     # Clients
 
     def client(self, archives: int) -> Client | ThreadPoolExecutor:
-        """Return a client of Dask, or one thread, for work that reads so many archives.
+        """Return a client of Dask, or one thread for few archives.
 
         Raises:
             InputError: no scheduler answers at the address.
@@ -245,7 +245,7 @@ class Cluster:
     # Tasks
 
     def submit(self, task: ClusterTask[Any], *, archives: int) -> AnyFuture:
-        """Submit a task whose work reads so many archives."""
+        """Submit a task with the number of archives that it reads."""
         arguments = (code_digest(), task.path, task.function, *task.arguments)
         client = self.client(archives)
         if isinstance(client, ThreadPoolExecutor):

@@ -89,7 +89,7 @@ def archives_for_settings(
     Where the arm has settings only noise and cell are the campaign's own: one excitation is read.
     """
     ordered = sorted(refs, key=lambda ref: ref.order)
-    if all(ref.source for ref in refs):  # Those of a later month change no setting.
+    if all(ref.source for ref in refs):  # Recordings of a later month change no setting.
         ordered = sorted(refs, key=lambda ref: (ref.when, ref.order))[:LOGS_FOR_SETTINGS]
     standstill = [ref for ref in ordered if ref.use == "standstill"]
     fitted = [ref for ref in ordered if ref.use == "excitation"]

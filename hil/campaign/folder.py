@@ -102,7 +102,7 @@ class CampaignFolder(RecordedCampaign):
     """Paths below one campaign folder, and its manifest, which is written here.
 
     Attributes:
-        confirmed: options by which its command confirms what nobody can be asked; "" for none.
+        confirmed: options that replace an operator's confirmations in its command; "" for none.
         rehearsed: folder of the rehearsal's own campaigns.
         second_session: folder of a simulated session at the same time, while it runs.
     """

@@ -38,11 +38,11 @@ def require_gates(
         link: to the controller.
         plan_hash: of the plan.
         simulated: whether the arm is.
-        unrehearsed: whether a rehearsal is not asked for.
+        unrehearsed: whether no rehearsal is required.
 
     Raises:
         NotRehearsedError: with the remedy.
-        CampaignFolderError: folder, archives or link are not those of this campaign.
+        CampaignFolderError: folder, archives or link belong to another campaign.
     """
     _require_one_kind_of_arm(campaign.folder, simulated)
     _require_own_link(campaign, link)
@@ -73,7 +73,7 @@ def require_dry_run(
         dry_run: that was done, if any.
         options: of the run.
         simulated: whether the arm is.
-        can_answer: whether somebody can accept it.
+        can_answer: whether an operator can accept it.
 
     Raises:
         DryRunError: with the remedy.

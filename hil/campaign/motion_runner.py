@@ -158,7 +158,7 @@ class Runner:
         link: connected.
         archives: of this run.
         watch: operator and stop.
-        reporter: receives what is said.
+        reporter: receives messages.
         warmth: of the joints.
         straight: moves between motions.
         start: (n,) [rad], the first position of the arm, to which it returns.

@@ -52,7 +52,7 @@ class Reached:
         return self.half / self.wanted.value
 
     def message(self, repetitions: int) -> str:
-        """Return its state after so many, such as "I5yy 7.1 % of 5 %, about 6 more"."""
+        """Return the state after a number of repetitions: "I5yy 7.1 % of 5 %, about 6 more"."""
         wanted = self.wanted
         text = f"{self.worst} {wanted.shown(self.half)} of {wanted.shown(wanted.value)}"
         if self.ratio <= 1.0:

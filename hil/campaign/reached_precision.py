@@ -59,7 +59,7 @@ class MeasuredMotion:
     values: Array  #: (k,)
     half: Array  #: (k,)
     noise: Array  #: share of the variance that falls with repetitions (k,)
-    estimate: Estimate  #: of all parameters, those of chosen effects included
+    estimate: Estimate  #: of all parameters, including chosen effects
 
 
 class _Reduced(NamedTuple):

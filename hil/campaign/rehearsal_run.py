@@ -140,8 +140,8 @@ def _of_run(
 def run_with_effects(folder: Path, twin: Twin) -> tuple[str, int]:
     """Run a plan on the arm with what the model leaves out; return the failure, and the cycles.
 
-    In a process of its own, beside the run as modelled: each has its own link, seed and folder, so
-    that neither notices the other.
+    In a separate process, parallel to the run as modelled. Each has its own link, seed and
+    folder, so that neither affects the other.
     """
     rehearsal = CampaignState.open(folder)
     link = twin.link(_planned(rehearsal), effects=True)

@@ -161,7 +161,7 @@ def recorded_arms(
     Args:
         arms: of the URDF.
         count: of recorded joints.
-        joints: those of them that the recording names, by their names in the URDF.
+        joints: that the recording names, by their names in the URDF.
         names: of the recorded channels, which may say a side.
     """
     if joints:

@@ -132,7 +132,7 @@ class Cell:
     def with_friction_laws(self, laws: Sequence[Mapping[str, Any]]) -> Cell:
         """Return the cell with a table `[robot.friction]` for each joint, in their order.
 
-        Further tables, of coupled motors, are those of the joints.
+        Further tables, of coupled motors, are the same as those of their joints.
 
         Raises:
             ValueError: a table is invalid.
@@ -440,7 +440,7 @@ class Cell:
     ) -> Array:
         """Return the parameter vector (p,) of URDF inertias and joint-side values.
 
-        Springs and balancers are those of the file; other parameters (coupling inertia, offset,
+        Springs and balancers are as in the file; other parameters (coupling inertia, offset,
         Stribeck) are zero.
 
         Args:

@@ -64,7 +64,7 @@ class Table(BaseModel):
 class SimulatedDriveTable(Table):
     """`[simulation.drive_train]`: gears of the simulated robot, independent of `[drive_train]`.
 
-    Missing fields are those of `[drive_train]`, including their errors.
+    Missing fields are as in `[drive_train]`, including mistakes there.
     """
 
     gear_ratio: GearRatios | None = field(

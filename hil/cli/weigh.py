@@ -120,7 +120,7 @@ def weigh(
 ) -> RunResult | None:
     """Run a payload campaign and print what it found; return the result of a dry run alone.
 
-    `choices` are those of `Campaign.run` for both sides.
+    `choices` are passed to `Campaign.run` for both sides.
     """
     silent = quiet or json
     asks = can_read(sys.stdin) and not silent

@@ -196,7 +196,7 @@ def collision_checker(cell: Cell) -> CollisionChecker:
 def current_model(cell: Cell) -> CurrentModel:
     """Return motor currents and joint torques by the nominal model of a cell, with limits.
 
-    Without a drive train only torques have limits: those of `[limits] torque`.
+    Without a drive train only torques have limits, from `[limits] torque`.
     """
     n = cell.model.n_joints
     currents = CurrentModel(

@@ -56,7 +56,7 @@ def simulated_link(
         cell: with the true parameters in `[simulation]`.
         effects: whether to simulate unmodelled effects, with the sizes of the cell.
         drive: true drive train, by default that of the cell.
-        truth: true parameters, by default those of the cell.
+        truth: true parameters, by default of the cell.
         instead_of_hardware: also simulate a cell with a real link.
         only_axis: number, from 1, of the only axis that is opened; None for all.
         session: number of earlier sessions of the controller; each has noise of its own.

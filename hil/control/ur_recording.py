@@ -251,7 +251,7 @@ class ConstantsFound:
 
     Attributes:
         stated: joint torque by current (6,) [N·m/A], gears included; NaN where nothing says it.
-        in_cell: those of the cell (6,), likewise.
+        in_cell: constants of the cell (6,), likewise.
         uncertainty: of the cell's, the largest relative standard deviation.
     """
 

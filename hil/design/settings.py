@@ -315,7 +315,7 @@ def settings_of(raw: Mapping[str, Any], path: Path | None = None) -> DesignSetti
         size = {name: effort[name] for name in ("population", "generations")}
         base["search"] |= {**size, "gradient": 0, "starts": 1}
     given = [name for name in _MOTIONS if name in raw]
-    if given:  # defaults for a motion of another kind are those of the paper's method
+    if given:  # a motion of another kind has the defaults of the paper's method
         base = {
             name: table for name, table in base.items() if name not in _MOTIONS or name in given
         }

@@ -1,4 +1,4 @@
-"""What may explain a change of a joint: temperatures, the time since a start, and what is asked."""
+"""What may explain a change of a joint: temperatures, time since start, stated columns."""
 
 from __future__ import annotations
 
@@ -52,7 +52,7 @@ def chosen(
 
     Args:
         recordings: of each robot, their numbers by name.
-        stated: names that were asked for.
+        stated: requested names.
         joint: of which covariates are returned.
         joints: names of all, in their order.
     """

@@ -345,7 +345,7 @@ class LogsOfBatch:
     Attributes:
         reading: how they are read.
         cache: for archives; one that keeps nothing cannot be used.
-        others: files beside logs that are none, such as one of conditions.
+        others: files next to logs that are no logs, such as a file of conditions.
         maps: by which logs were read, with their number, after the import.
     """
 

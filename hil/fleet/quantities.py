@@ -95,7 +95,7 @@ def tracked_quantities(
     Args:
         model: of the type.
         fits: estimates that choose the speed of friction.
-        reference: parameters (p,) near those of all robots.
+        reference: parameters (p,) close to all robots.
 
     Friction is that at the speed at which the recordings determine it best; Coulomb friction that
     of a joint that begins to move, viscous friction what it gains up to that speed. Gravity load

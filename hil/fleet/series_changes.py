@@ -35,7 +35,7 @@ _NOISE_ROUNDS: Final = 3  # of models and noise
 _BEGIN_STEP_MONTHS: Final = 0.25  # of a month, between begins of a slope that are tried
 _OUTLIER_SIGMAS: Final = 4.0  # times the median deviation
 _NORMAL_MAD: Final = 0.6745
-# recordings that the noise of the type counts as beside that of a robot
+# recordings as which the noise of the type counts in addition to a robot's own
 _TYPE_NOISE_RECORDINGS: Final = 10.0
 _MAX_CORRELATION: Final = 0.9
 # twice the log-likelihood within which a begin is in its 95 % interval

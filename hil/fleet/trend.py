@@ -160,7 +160,7 @@ class FleetTrend:
         together: all robots of a type, of each type that has enough of them for a year.
         covariates: names of temperatures and other columns that were used.
         seasonal: whether the robots are enough to show what moves all of them at once.
-        unknown: covariates that were asked for, and that no recording has.
+        unknown: requested covariates that no recording has.
         dated_by_file: recordings that have only the date of their file.
         twice: places of names that are in several at the same time, maybe of several robots.
         simulated: whether no robot moved.

@@ -194,7 +194,7 @@ class IdentifiedArm:
         Args:
             joints: names, or numbers from 0; None: all.
             size: of the figure [inch]; None: by the number of joints.
-            axes: of somebody's own figure, one for each joint, for the torque without its error.
+            axes: of an existing figure, one for each joint, for the torque without its error.
 
         Returns:
             figure and series: `plot.figure`, `plot.savefig(...)`, `plot.series["measured"]`.
@@ -215,7 +215,7 @@ class IdentifiedArm:
 
         Args:
             folder: for the files. None: that of a campaign or of archives, else one named after
-                the first recording, beside it; see :func:`hil.base.output_folder.folder_beside`.
+                the first recording, next to it; see :func:`hil.base.output_folder.folder_beside`.
             annotate: also write copies of the archives with predicted torque and residual.
             reporter: receives the names of the files.
 

@@ -60,7 +60,7 @@ class IdentifiedServo:
         """Write results, report, picture, archives and column maps, and return their folder.
 
         Args:
-            folder: for the files; None for one named after the first recording, beside it.
+            folder: for the files; None for one named after the first recording, next to it.
             reporter: receives the names of the files.
 
         Raises:
@@ -91,7 +91,7 @@ def identified_servo(
         staging: the recordings in memory.
         recordings: files that are fitted.
         predicted: files that are predicted.
-        options: of any identification: those of torques have no meaning here.
+        options: of any identification; options about torques are ignored.
         compare: file whose parameters are compared, None for none.
         channels: a line for each group of channels.
         reporter: of progress.

@@ -25,7 +25,7 @@ class BagMap(BaseModel):
 
     Attributes:
         topic: of the joint states; None where the bag has only one.
-        clock: stamps that were used: ``header`` of the messages, or those of the ``bag``.
+        clock: stamps that were used: of the ``header`` of the messages, or of the ``bag``.
         effort: content of the effort field.
         command_topic: of the commanded positions, ``none`` for none; None to find it.
         rename: joint in the URDF by name in the bag, where they differ.

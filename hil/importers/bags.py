@@ -60,7 +60,7 @@ def bag_files(source: Path) -> list[Path]:
     if source.is_dir():
         _require_parts(source, {_unpacked_name(file) for file in files})
     unpacked = {file.name for file in files if file.suffix not in _PACKED}
-    # A part beside its compressed copy is one part.
+    # A part and its compressed copy are one part.
     return [file for file in files if file.name in unpacked or _unpacked_name(file) not in unpacked]
 
 

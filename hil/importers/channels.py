@@ -1,6 +1,6 @@
 """What a log records: its channels with name, unit, type and rate, and what their names say.
 
-`CHANNEL_NAMES` is the one table of names; a map that nobody wrote is made from it.
+`CHANNEL_NAMES` is the only table of names; maps are inferred from it.
 """
 
 from __future__ import annotations
@@ -86,7 +86,7 @@ class Channel:
         text: of the first and the last row of a table, where it is the same and no number.
         first: of the first row of a table, where it is no number.
         is_repeated: whether it is a time that a channel before has as well, as where a log has the
-            time beside each quantity.
+            time in addition to each quantity.
     """
 
     name: str

@@ -20,7 +20,7 @@ _POSSIBLE_LAGS_NS: Final = (-2 * _GRID_STEP_NS, 300_000_000)
 """Least and largest lag [ns] at which speeds agree best on one clock: positions follow commands, by
 the largest delay that is identified and what servo and friction add to it."""
 _MIN_AGREEMENT: Final = (
-    0.3  # correlation of speeds below which commands are those of something else
+    0.3  # correlation of speeds below which the commands do not belong to the motion
 )
 
 

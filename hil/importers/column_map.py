@@ -40,7 +40,7 @@ class TimeColumn(_Table):
 
     If there is a file of positions per joint, all must have the same times. No unit is the one that
     the file states, or else the one that gives a rate at which robots are sampled. With a column of
-    `nanoseconds` beside it the first is of whole seconds.
+    `nanoseconds` the first column is of whole seconds.
     """
 
     column: Column = Field(default=0, description="a name or an index from 0")

@@ -24,7 +24,7 @@ MAX_EXCERPT_SECONDS: Final = 800.0
 STRETCH_ROWS: Final = 8_192
 """Rows that are read together."""
 PROBE_STRIDE: Final = 64
-"""One row of so many shows whether anything moves in a stretch."""
+"""Distance in rows at which a stretch is probed for motion."""
 _MIN_ACTIVITY_SHARE: Final = 0.25  # of the activity of lively stretches
 _LIVELY_QUANTILE: Final = 0.9  # quantile of the stretches
 _GOLDEN_RATIO: Final = 0.5 * (5.0**0.5 - 1.0)

@@ -37,7 +37,7 @@ def is_folder_of_logs(path: Path) -> bool:
 class LogFiles:
     """Parsed files by path and format; a file is not read again when it changes.
 
-    Some `arrays` may be given, such as those of an episode that shares a file with others.
+    Some `arrays` may be given, such as an episode's that shares a file with others.
 
     Attributes:
         longest: rows that are read of a recording, see :mod:`hil.importers.excerpt`; None for all.

@@ -108,7 +108,7 @@ def examine(
     several = _of_one_stamp(time, position) or alternating_samples(position)
     warnings += [several] if several else []
     warnings += _positions(time, position, joint_names, limits, turning, has_speed=not several)
-    is_plausible = not warnings  # torques are compared with those of a plausible motion only
+    is_plausible = not warnings  # torques are compared only if the motion is plausible
     if samples.velocity is not None and not several:
         warnings += _velocities(time, position, samples.velocity, joint_names)
     warnings += _torques(samples, joint_names, limits.effort)
@@ -440,7 +440,7 @@ def _torque_size(
 ) -> Iterator[Conclusion]:
     """Yield a warning where torques have another order of magnitude than the arm needs.
 
-    Compared are root mean squares with those of the nominal inertias over the same motion, without
+    Compares root mean squares with nominal inertias over the same motion, without
     friction; without nominal inertias, the largest torques with the effort limits.
     """
     if samples.torque is None or not samples.torque.any():

@@ -195,7 +195,7 @@ class _Search:
         self._recorded = recorded
         self._columns_of = recorded or joints
         self.nanoseconds: str | int | None = None  #: column that is added to that of the time
-        self.of_arm = len(joints)  #: joints without those of a gripper
+        self.of_arm = len(joints)  #: joints except a gripper's
         self.file: Callable[[], TextTable | ArrayFile] | None = None  #: the log, parsed
         self.with_unit: Collection[str] = ()  #: quantities whose unit a map states
         self._groups = groups
@@ -305,7 +305,7 @@ class _Search:
         single = [g for g in named if g.size == 1]
         stamps = [g for g in single if {"header", "stamp"} <= set(words_of(g.pattern))]
         single = stamps or single
-        if len(single) > 1:  # a time of day beside its date, and without it where it wraps
+        if len(single) > 1:  # a time of day with its date, and without the date where it wraps
             single = [g for g in single if "date" not in words_of(g.pattern)] or single
         parts = [g for g in single if _NANO & set(words_of(g.pattern))]
         if len(single) == 2 and len(parts) == 1:

@@ -56,7 +56,7 @@ def typestore_of(kind: str, definition: str, encoding: str) -> Typestore:
         for _, described in read.values():
             for _, node in described:
                 _check_size(node)
-        # Names of the definition go before those of ROS 2, which may be of another version.
+        # Names of the definition take precedence over ROS 2's, which may be of another version.
         store = Typestore(max_sequence_length=_MAX_SEQUENCE_ELEMENTS)
         store.register({**ros2_store.fielddefs, **read})
     except Exception as error:  # rosbags does not document what it raises

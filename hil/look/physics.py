@@ -117,7 +117,7 @@ class Size:
 
     Attributes:
         factor: of the whole arm; None where neither masses nor weight say.
-        by_masses: whether it is by the URDF's masses, else by those of arms of its reach.
+        by_masses: whether from the masses of the URDF, else from usual masses for its reach.
         of_joints: the factor of each joint, with sign; None where the motion does not show it.
     """
 
@@ -505,7 +505,7 @@ class TorqueFindings:
         factor = self.size.factor or 1.0
         joints = self.cell.joint_names
         factors = self.size.of_joints or (None,) * len(joints)
-        # Of what was recorded: scales and signs that are not in the map are those of the gears.
+        # As recorded: scales and signs that are not in the map belong to the gears.
         gears = [step.change for step in self.readings.steps if not step.sure]
         axes = Axes.of(gears, len(joints))
         of_joints = axes.torque_sign / axes.torque_scale

@@ -128,7 +128,7 @@ class Look:
         questions: readings that fit alike, one tuple for each question.
         groups: parameters that the recording determines; empty without masses or geometry.
         map_text: the column map with the sure conclusions; None for a bag.
-        gravity: for `hil identify`, beside the map [m/s²]; None if it is as stated.
+        gravity: for `hil identify`, in addition to the map [m/s²]; None if it is as stated.
         error: of the torque as read, predicted from other parts of the recording, as a share of
             it; None without a torque or an arm.
         bag_text: how the joint states of a bag were read, as a map; None for other recordings.

@@ -25,7 +25,7 @@ _MAX_UNSIGNED_JOINTS: Final = 2
 
 
 def may_be_load(imported: ImportedRecording, options: ImportOptions) -> bool:
-    """Return whether a torque may be a servo's load: commands are there, and nobody stated it."""
+    """Return whether a torque may be a servo's load: with commands, and not stated as torque."""
     columns = imported.archive.columns
     if imported.is_stated or not {"torque", "commanded_position"} <= columns.keys():
         return False
@@ -39,7 +39,7 @@ def servo_load(
 
     Args:
         imported: a recording.
-        sample: returns rows of it, of which it is asked how large a named load is.
+        sample: returns rows of it, which show how large a named load is.
     """
     if _unsigned_torques(imported.archive):
         return NoJointTorque()
@@ -56,7 +56,7 @@ def torques_without_sign(archive: Archive, sample: Callable[[], TorqueSample | N
 
     Args:
         archive: a recording.
-        sample: returns rows of it, of which it is asked whether masses explain the torque.
+        sample: returns rows of it, which show whether masses explain the torque.
     """
     count = _unsigned_torques(archive)
     if count <= _MAX_UNSIGNED_JOINTS:

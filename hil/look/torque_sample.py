@@ -1,4 +1,4 @@
-"""Some rows of a recording with torque, of which it is asked whether the torque is of the arm."""
+"""Some rows of a recording, which show whether its torque is the torque of the arm."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ _DRIVING_FRICTION_SIGMAS: Final = -4.0  # standard errors of a friction that dri
 
 @dataclass(frozen=True, eq=False)
 class TorqueSample:
-    """Rows of a recording of which something is asked.
+    """Rows of a recording, with their score.
 
     Attributes:
         cell: of the arm.

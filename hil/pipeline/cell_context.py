@@ -167,7 +167,7 @@ def cell_context_of(prepared: Prepared, estimate: Estimate) -> CellContext:
 def joint_ranges(sources: Sources) -> tuple[Array, Array]:
     """Return the lower and upper ends (n,) of the workspace [rad or m].
 
-    The limits of the cell, else those of the URDF; without these a whole turn, or of a prismatic
+    The limits of the cell, else of the URDF; without these a whole turn, or of a prismatic
     joint what was recorded.
     """
     cell = sources.cell

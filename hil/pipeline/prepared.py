@@ -203,7 +203,7 @@ _DELAY_RATE: Final = 250.0  # Hz, to which it is averaged; both positions and to
 # cycles, by which a delay in use may differ from the stated one unsaid
 _DELAY_TOLERANCE_CYCLES: Final = 0.05
 _STEP_TOLERANCE: Final = 0.1  # of sampling intervals of recordings that are estimated together
-DELAY_SEARCH_SECONDS: Final = 64.0  # s, in which a delay that nobody asked for is looked for
+DELAY_SEARCH_SECONDS: Final = 64.0  # s of recordings, without an explicit request
 RIPPLE_ORDERS: Final = ((1,), (2,), (1, 2))
 """Periods of a torque ripple per motor turn: rotor eccentricity, wave generator, both."""
 
@@ -240,7 +240,7 @@ def decide(sources: Sources, options: Options, reporter: Reporter) -> Decided:
     estimate, notes = delay.confirmed_by(chosen.preprocessing)
     error = delay.errors.get(chosen.preprocessing.torque_delay, 0.0)
     if estimate is None and (sources.cell.file.controller is None or options.delay == "auto"):
-        error = 0.0  # the estimate may be the lag of a low-pass, and nothing is known beside it
+        error = 0.0  # the estimate may be the lag of a low-pass: its error is unknown
     return Decided(replace(chosen, delay_variance=error), estimate, notes)
 
 

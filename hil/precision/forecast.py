@@ -217,7 +217,7 @@ class PrecisionDesign:
         return made
 
     def precision(self, repetitions: float) -> Precision:
-        """Return the criterion of a search for so many repetitions of a motion."""
+        """Return the criterion of a search for a motion with that number of repetitions."""
         density = self.error + self.noise / repetitions
         return Precision(self.required.quantities, density, self.prior)
 
@@ -242,7 +242,7 @@ class PrecisionDesign:
         )
 
     def forecasts(self, excitation: Excitation, repetitions: int) -> list[Forecast]:
-        """Return what a motion promises for each requirement after so many repetitions."""
+        """Return what a motion promises for each requirement after a number of repetitions."""
         shown = self._shown(midpoints(excitation.trajectory))
         limits = self._of_scale(shown, repetitions, _ENDLESS_INFORMATION_FACTOR)
         forecasts = []

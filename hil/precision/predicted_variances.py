@@ -52,7 +52,7 @@ class PredictedRows:
     cell: Cell
     grams: Array  #: integrals of the products of the columns of each joint (n, q, q), q = p + 1 + n
     duration: float  #: of the motion [s]
-    rigid: bool  #: whether the gears are known to be rigid, as those of a simulated arm
+    rigid: bool  #: whether the gears are known to be rigid, as on a simulated arm
 
     @classmethod
     def of(cls, cell: Cell, motion: Motion, values: Array, *, rigid: bool) -> Self:
@@ -95,7 +95,7 @@ class PredictedRows:
     def variances(
         self, directions: Array, prior: Array, density: Array, motions: float = 1.0
     ) -> Variances:
-        """Return what so many such motions leave of the variances of functions (k, p).
+        """Return the variances of functions (k, p) after a number of such motions.
 
         Args:
             directions: linear functions of the parameters (k, p).

@@ -83,10 +83,10 @@ class Trace:
     colour: str  #: of the palette
     width: float  #: of the line, or diameter of a dot [px]
     dashed: bool = False
-    name: str = ""  #: in the legend, and beside its value
+    name: str = ""  #: in the legend, and next to its value
     x: Array | None = None  #: (m,) if not that of the chart
     dots: bool = False
-    #: may leave the plot, as the error of a poor model beside that of a good one
+    #: may leave the plot: a poor model's error is much larger than a good one's
     loose: bool = False
 
     def over(self, x: Array) -> Trace:

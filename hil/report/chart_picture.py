@@ -31,7 +31,7 @@ def draw_charts(
 ) -> Figure:
     """Draw columns of charts side by side, with the legends of the lines that they contain.
 
-    The legend of a single column is above it, those of several are in their charts.
+    A single column has its legend above it, several columns have legends in their charts.
 
     Args:
         columns: of charts.

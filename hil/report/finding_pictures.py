@@ -109,7 +109,7 @@ BY_CHECK: Final[Mapping[str, Picture]] = {
 """Pictures of all others."""
 
 _OUTLIER: Final = 6.0  # robust standard deviations
-_WIDTH: Final = 300.0  # of a picture beside its finding [px]
+_WIDTH: Final = 300.0  # of a picture next to its finding [px]
 _HEIGHT: Final = 150.0
 _LOWER: Final = 0.7  # of the height in the figure of all joints
 _WITHOUT_GAPS: Final = 99.5  # per cent of the intervals: a single gap would hide the others

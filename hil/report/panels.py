@@ -236,7 +236,7 @@ def _foot(axes: Axes, text: str) -> None:
 
 
 def _round_ticks(most: int, fewest: int = 1) -> MaxNLocator:
-    """Return a locator of round values, in at most so many intervals."""
+    """Return a locator of round values, with at most this number of intervals."""
     return MaxNLocator(most, steps=[1.0, 2.0, 5.0, 10.0], min_n_ticks=fewest)
 
 

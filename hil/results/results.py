@@ -149,7 +149,7 @@ class ProfileResult(Frozen):
 class JudgementResult(Frozen):
     """Checks of the verdict, errors per joint and analysis of the residual."""
 
-    in_sample: bool = False  #: Whether nothing was held out; errors are those of the fit then
+    in_sample: bool = False  #: Whether nothing was held out; errors are then on fitted motion
     nominal: str | None = None  #: Description of the nominal model
     findings: list[WordedFinding]
     next_steps: list[str]
@@ -484,7 +484,7 @@ class SettingsResult(Frozen):
     """What the identification used, so that exports and rollouts need no other one."""
 
     archives: list[str]  #: File names, in the order in which they were given
-    predicted: list[str]  #: Those of them that were held out as a whole
+    predicted: list[str]  #: Archives that were held out as a whole
     split: float  #: Fitted share of the first fitted recording
     in_sample: bool
     estimator: str
@@ -502,7 +502,7 @@ class SettingsResult(Frozen):
         """Return the settings.
 
         Raises:
-            ValueError: they are those of another version.
+            ValueError: they are from another version.
         """
         entries = {**self.settings}
         preprocessing = {**entries.get("preprocessing", {})}

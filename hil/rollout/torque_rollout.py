@@ -97,7 +97,7 @@ def roll_out(model: IdentifiedModel, options: RolloutOptions, reporter: Reporter
     """Simulate the held-out motion of an identification.
 
     Raises:
-        InputError: there are no consistent parameters, no window, or no servo where one is asked.
+        InputError: there are no consistent parameters, no window, or not the requested servo.
         NotSimulatedError: MuJoCo does not accept the identified arm.
     """
     arm = model.arm

@@ -36,7 +36,7 @@ PRINTED_ROWS: Final = 2000
 CAMPAIGN_TIME: Final = PRINTED_REPETITIONS * PRINTED_DURATION
 """Duration of the print's repetitions, in which the friction drifts, s.
 
-Those of a study are evenly spread over it; held-out motions come at its end.
+Repetitions of a study are evenly spread over it; held-out motions come at its end.
 """
 
 

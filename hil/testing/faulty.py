@@ -54,7 +54,7 @@ def run_campaign(root: Path, cell: Cell) -> Campaign:
 def faulty_controller(cell: Cell, *lines: str) -> SimulatedController:
     """Return a new simulated controller of a cell with a table [simulation].
 
-    `lines` are faults as for `hil simulate --fault`; those of the link are ignored.
+    `lines` are faults as for `hil simulate --fault`; faults of the link are ignored.
 
     Raises:
         FaultScriptError: a line is not a fault.

@@ -99,7 +99,7 @@ class PayloadMounting:
 
         Raises:
             NotRehearsedError: a side has not passed its rehearsal.
-            MountingError: nobody confirms it.
+            MountingError: it is not confirmed.
             OperatorStopError: the operator stopped instead.
         """
         if self._mounted is loaded:
@@ -267,11 +267,11 @@ class PayloadCampaign:
             reporter: receives the precision.
             requirements: one, on the mass, or none.
             choices: further arguments of `Campaign.run`, for both sides.
-            links: of the sides; by default those of their cells.
+            links: of the sides; by default as in their cells.
 
         Raises:
             InputError: a requirement is not on the mass, or the recordings show no payload.
-            MountingError: nobody confirms that the payload is mounted or removed.
+            MountingError: there is no confirmation that the payload is mounted or removed.
             OperatorStopError: the operator stopped instead of confirming it.
             HilError: of `Campaign.run`.
         """

@@ -109,7 +109,7 @@ def rate_products(model: RobotModel, samples: Samples) -> Array:
     length = m if samples.torque_bandwidth is not None else _ROWS_AT_ONCE
     for start in range(0, m, max(1, length)):
         stop = min(start + length, m)
-        first = max(start - 1, 0)  # a rate needs the rows beside
+        first = max(start - 1, 0)  # a rate needs the neighbouring rows
         part = samples.between(first, min(stop + 1, m))
         load = part.known_torque(model)
         inside = slice(start - first, stop - first)
@@ -275,7 +275,7 @@ def estimate_delay(
         RecordingError: see :func:`identification.signals.samples.prepare`.
         IdentificationError: no usable row.
     """
-    # Reversals are left out below, less widely than beside a smoother of this bandwidth.
+    # Reversals are left out below, less widely than a smoother of this bandwidth requires.
     options = replace(_narrow(options), exclude_rows="halts")
     estimate = _estimated(recording, model, noise_variance, options)
     is_far = not estimate.half_interval < _REACHABLE_HALF_INTERVAL

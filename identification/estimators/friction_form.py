@@ -169,7 +169,7 @@ def _trials(
     squares = gram.diagonal()[p:-1]
     information = squares - np.einsum("pk,pk->k", products, moved)
     possible = (squares > 0.0) & (information > _MIN_INDEPENDENT_SHARE * squares)
-    # What each further term leaves of itself beside the parameters.
+    # What remains of each further term after the parameters.
     beside = np.concatenate([-moved, np.eye(n * q)])
     scores = forms.scores(weights, np.append(estimate.values, np.zeros(n * q)))
     # Rows of some repetitions alone need not balance at the parameters of all, as when friction

@@ -43,7 +43,7 @@ class RobustEstimate:
 
     @property
     def doubtful(self) -> NDArray[np.bool_]:
-        """Joints with so many outlying rows that the model is wrong, not the data (n,)."""
+        """Joints (n,) whose many outlying rows show a wrong model, not wrong data."""
         return np.asarray(self.outlying > MAX_OUTLIER_SHARE)
 
 

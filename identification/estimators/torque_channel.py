@@ -47,7 +47,7 @@ _MIN_LOW_PASS_SHARE: Final = 0.5
 _MAX_RATE: Final = 250.0  # Hz; rows beyond it are averaged
 
 # Half a period of the lowest bandwidth: shorter stretches do not show it, and shorter rests between
-# stretches stay in, as leaving them out costs more rows beside them.
+# stretches stay in, because leaving them out would cost more neighbouring rows.
 _MIN_STRETCH_SECONDS: Final = 0.5 / LOWEST_BANDWIDTH  # s
 # Share of a stretch over which its weight rises and falls. Window and filter commute up to the
 # change of the window during the filter's lag; a window without a level part would be the most
@@ -57,7 +57,7 @@ _TAPER_SHARE: Final = 0.5
 _PADDING_SECONDS: Final = 1.0 / LOWEST_BANDWIDTH
 # s; longer segments are transformed in parts, whose tables stay small
 _MAX_SEGMENT_SECONDS: Final = 120.0
-# signals beside the columns: load and torque, and three made of the torque
+# signals in addition to the columns: load and torque, and three made of the torque
 _EXTRA_SIGNALS: Final = 5
 
 # Gains and phases are constant in a band. A delay of 50 ms turns the phase by 3 mrad in the lowest

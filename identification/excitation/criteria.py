@@ -321,9 +321,9 @@ class Objective:
 
     model: RobotModel  #: the robot, with p parameters
     parameters: NDArray[np.intp] | None = None  #: indices (e,) of those in the criteria; None: all
-    #: of earlier recordings: the criteria are those of all recordings and the motion together
+    #: of earlier recordings: the criteria describe all recordings and the motion together
     given: Given | None = None
-    precision: Precision | None = None  #: that is wanted; its criterion is beside the `CRITERIA`
+    precision: Precision | None = None  #: required; adds a criterion to the `CRITERIA`
 
     @property
     def n_parameters(self) -> int:

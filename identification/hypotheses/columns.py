@@ -37,7 +37,7 @@ class ColumnSums:
     recording: NDArray[np.intp]  # index of the recording of each block (B,)
     start: Array  # start time of each since its recording began (B,) [s]
     n_parameters: int  # p
-    step: int = 1  # of all rows only every so many are in the sums
+    step: int = 1  # only every `step`-th row is in the sums
 
     @property
     def width(self) -> int:

@@ -20,7 +20,7 @@ from identification.signals.samples import Samples
 DRIVING_FRICTION_SIGMAS: Final = 4.0  # standard errors of a friction that drives a joint
 _MIN_FRICTION_SHARE: Final = 0.02  # of the torque of a joint
 _BLOCKS: Final = 20
-# Rows that count as one beside the prior. Where other parts are predicted they are seven in all: a
+# Rows that count as one against the prior. Where other parts are predicted they are seven in all: a
 # wrong reading needs bodies that no arm has, which a weak prior would allow. Of few rows, all of
 # which are fitted, that would be too few to tell orders of a wrist apart.
 ROWS_PER_FACT: Final = 10.0

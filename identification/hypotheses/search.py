@@ -97,7 +97,7 @@ _ADEQUATE_JOINT_ERROR_RATIO: Final = 2.0
 # A joint turned by more than a right angle is nearer to its reverse, so that its sign and a nearer
 # zero may look alike.
 _FAR_ZERO: Final = 90.0 * DEGREE
-# signs of least error with zeros and scales beside them, which are compared
+# signs of least error, compared together with zeros and scales
 _COMPARED_SIGNS: Final = 3
 _FITS_AT_ONCE: Final = 24  # fits, so that their sums stay in the processor's cache
 # deg, near which a fit starts
@@ -244,12 +244,12 @@ def find_readings(
         adequacy = search.adequacy()
     nearest = search.nearest()
     score = score_of(search.model, search.samples, search.score.columns)
-    # What a change explains shows beside the others.
+    # What a change explains shows only together with the others.
     steps = [step if step.alike else replace(step, error=search.score.overall) for step in steps]
     if not adequacy.is_enough:
         steps = _doubted(steps, search, started())
     doubted = [step for step in steps if not step.sure]
-    steps = [  # each was chosen beside the others
+    steps = [  # each was chosen together with the others
         step if doubted in ([], [step]) else replace(step, is_adequate=False) for step in steps
     ]
     return Readings(

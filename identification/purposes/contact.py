@@ -20,7 +20,7 @@ from identification.purposes.quiet_torque import (
 
 FORCE_DIRECTIONS: Final = 100
 COVERED_SHARE: Final = 0.95
-"""Of directions and postures: the force is seen in so many."""
+"""Fraction of directions and postures in which the force is noticed."""
 _SEED: Final = 20140902
 _LEVER_ROUNDING: Final = 1e-9  # m, of a lever
 _MIN_LEVERAGE: Final = 0.1  # of the median; below it a mass is indistinguishable from the residual

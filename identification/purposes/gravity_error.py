@@ -18,7 +18,7 @@ from identification.model.robot import RobotModel
 RANDOM_POSTURES: Final = 500
 """Postures of a workspace."""
 COVERED_SHARE: Final = 0.95
-"""Of postures and of arms that the covariance allows: the error is smaller in so many."""
+"""Fraction of postures, and of arms that the covariance allows, with a smaller error."""
 _SEED: Final = 20140901
 
 

@@ -159,7 +159,7 @@ def _late_of_links(model: RobotModel, links: bytes, stretch: Stretch) -> Array:
 
 
 def _delayed(stretch: Stretch, delay: float) -> Array:
-    """Return the recorded torque (g, n) of so many seconds before."""
+    """Return the recorded torque (g, n), `delay` [s] earlier."""
     if delay == 0.0:
         return stretch.torque
     time = stretch.motion.time

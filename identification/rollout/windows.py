@@ -100,7 +100,7 @@ class Windows:
         return self.cut([stretch.torque for stretch in self.stretches])
 
     def some(self, most: int) -> Windows:
-        """Return at most so many windows, evenly distributed."""
+        """Return at most `most` windows, evenly distributed."""
         if len(self) <= most:
             return self
         chosen = np.linspace(0, len(self) - 1, most).round().astype(np.intp)

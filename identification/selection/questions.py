@@ -87,8 +87,8 @@ large ones are for recordings that determine little (``benchmarks.poor_recording
 board hardly depend on them (up to 4 instead of 1e4 changes their mean error by 0.1 %), but would
 lose with a first weight of 4 (``benchmarks.leave_one_out``).
 """
-# Terms beside Coulomb and viscous friction; they correlate, so one at most. The stated law comes
-# first.
+# Terms in addition to Coulomb and viscous friction; they correlate, so at most one. The stated law
+# comes first.
 FRICTION_TERMS: Final[tuple[Mapping[str, Any], ...]] = (
     {"third": "none", "stribeck": 0.0},
     {"third": "quadratic", "stribeck": 0.0},
@@ -351,7 +351,7 @@ def _compare_low_passes(
     if not possible:
         return now, choices
     candidates = [replace(start, preprocessing=how) for how in possible]
-    # A lag and a low-pass differ beside reversals, where friction is not quite as any law: one that
+    # A lag and a low-pass differ near reversals, where friction is not quite as any law: one that
     # replaces a delay is the best of many.
     delayed = now.preprocessing.torque_delay != now.stated_delay
     certainty = MIN_CERTAINTY if delayed else 1.0

@@ -43,7 +43,7 @@ Relative standard deviation, root mean square over eight real arms (60 splits, c
 10 % of the chosen one by inner prediction): 8 % for bandwidths (0 to 14 % by arm), 6 % for
 presliding displacements (1 to 12 %). Measured once, at ab6d0d94."""
 
-# Improvement required to replace the first, simpler candidate, beside its standard error.
+# Improvement required to replace the first, simpler candidate, besides its standard error.
 MIN_IMPROVEMENT: Final = 0.01
 # Bodies that cannot exist are of no use in a simulator, so they must predict better by more than
 # what is worthwhile elsewhere. 3 % in place of 5 % decides eight splits of three of eight real arms

@@ -1,7 +1,7 @@
 """Servos with the terms of a simulator alone, fitted to the same windows.
 
 A simulator without friction that grows with the load, static friction or a rate of the command gets
-the values with which it comes closest to the motion, not those of a model that has these terms.
+the values with which it comes closest to the motion, not the values of a model with these terms.
 """
 
 from __future__ import annotations

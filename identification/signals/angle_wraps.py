@@ -14,7 +14,7 @@ from identification.signals.recording import Recording
 UNWRAPPED: Final = "unwrapped"
 """Entry of the provenance: joints whose angles wrapped."""
 _TURN: Final = 2.0 * np.pi
-# Largest distance of an unwrapped step from the steps beside it [rad]; a glitch to zero or to
+# Largest distance of an unwrapped step from its neighbours [rad]; a glitch to zero or to
 # another joint's angle is no whole turn.
 _MAX_UNWRAP_DISTANCE: Final = 0.3
 
@@ -22,7 +22,7 @@ _MAX_UNWRAP_DISTANCE: Final = 0.3
 def unwrap(position: Array, gap_before: NDArray[np.bool_] | None = None) -> Array:
     """Return angles (m, n) [rad] without steps of whole turns; bit-identical without such a step.
 
-    A step counts as one if it continues the steps beside it apart from the turns. After a gap, the
+    A step is a wrap if it continues its neighbouring steps apart from the turns. After a gap, the
     nearest turn is used for a joint that has such steps.
     """
     steps = np.diff(position, axis=0)

@@ -35,13 +35,13 @@ _OUTLIER_SIGMAS: Final = 6.0  # limit of the influence of a row, standard deviat
 _ROWS_AT_ONCE: Final = 20_000
 _MIN_SAMPLES: Final = 32  # samples; shorter segments keep their stamps
 _NEIGHBOUR_STEPS: Final = 4  # steps to either side for the speed at one
-_SPEED_TIME: Final = 0.025  # s to either side for the speed beside a residual
+_SPEED_TIME: Final = 0.025  # s to either side for the speed next to a residual
 _MIN_BURST_SHARE: Final = 0.9  # of the pauses of stamps that are late, not of missing rows
 _MIN_CLARITY: Final = 8.0  # steps are counted by positions that resolve an eighth of a clock step
 _MOVING_NOISE_RATIO: Final = 3.0  # multiples of noise and resolution of a moving joint
 # Rounding noise of the distance from the cubic: sqrt((1 + 17 / 18) / 12).
 _CUBIC_ROUNDING: Final = 0.4  # steps of the encoder
-_CUBIC_OFFSETS: Final = np.array([-2, -1, 1, 2])  # samples beside
+_CUBIC_OFFSETS: Final = np.array([-2, -1, 1, 2])  # neighbouring samples
 
 
 @dataclass(frozen=True)

@@ -48,7 +48,7 @@ REVERSAL_SECONDS: Final = 0.016  # s
 # standard deviations, and by so much of its range.
 _SPIKE_SIGMAS: Final = 15.0
 _SPIKE_RANGE_SHARE: Final = 0.5
-_MAX_NEIGHBOUR_SHARE: Final = 0.1  # of it, that the samples beside it differ
+_MAX_NEIGHBOUR_SHARE: Final = 0.1  # of it, by which its neighbours differ
 _TAIL_QUANTILE: Final = 0.01  # of the samples at either end, which are no range
 _MAX_SPIKE_SAMPLES: Final = 2  # samples
 

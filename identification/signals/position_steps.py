@@ -103,7 +103,7 @@ def _pieces(recording: Recording) -> Iterator[list[slice]]:
 
 @dataclass(frozen=True, eq=False)
 class _Departures:
-    """Steps within stretches of a recording, and how they depart from the steps beside them."""
+    """Steps within stretches of a recording, and how they differ from their neighbours."""
 
     after: NDArray[np.intp]  # row after each step (k,)
     size: Array  # without the motion and errors of the clock (k, n)
@@ -159,7 +159,7 @@ def _steps_of(
     lasting = np.zeros_like(found.suspect)
     for joint, k in np.argwhere(found.suspect.T):
         around = found.size[max(0, k - _NEIGHBOUR_STEPS) : k + _NEIGHBOUR_STEPS + 1, joint]
-        # Otherwise the steps beside it reverse it.
+        # Otherwise its neighbouring steps reverse it.
         lasting[k, joint] = np.abs(around.sum()) > 0.5 * distance[k, joint]
     by_whole_steps = found.by_whole_steps
     often = np.count_nonzero(lasting & by_whole_steps) >= _MIN_REPEATED_DEPARTURES
@@ -257,7 +257,7 @@ def _nearby(marked: NDArray[np.bool_]) -> NDArray[np.bool_]:
 def _on_path(time: Array, position: Array, row: int, tolerance: float) -> bool:
     """Return whether a step to a row of a position (m,) begins or ends a frozen value, on its path.
 
-    A sample that repeats the one before it exactly, while the joint moves, was not measured anew.
+    A sample that exactly repeats the one before it while the joint moves is no new measurement.
     """
     if position[row] == position[row - 1]:
         return True

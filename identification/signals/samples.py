@@ -26,7 +26,7 @@ from identification.signals.smoothing import (
 # Default (see :mod:`identification.selection.questions`). Planned motion is below 10 Hz, the
 # first resonance of large arms at 10 to 30 Hz; on the simulated NS 16 20 to 60 Hz are equal.
 RIGID_BANDWIDTH: Final = 40.0  # Hz
-_MAX_PREDICTIONS: Final = 2  # in memory: those of the result and of the nominal model
+_MAX_PREDICTIONS: Final = 2  # in memory: predictions of the result and of the nominal model
 _MIN_SEGMENT_SAMPLES: Final = 12  # samples, twice the minimum of a quintic spline
 
 VelocitySource = Literal["position", "measured"]
@@ -203,7 +203,7 @@ class Samples:
         if of_model is not model:
             torque = self._torque_of(model, values, values)
             torque.flags.writeable = False
-            # The tests of a verdict ask for those of few estimates, again and again.
+            # The tests of a verdict request the predictions of few estimates repeatedly.
             if len(self._predictions) >= _MAX_PREDICTIONS:
                 del self._predictions[next(iter(self._predictions))]
             self._predictions[values.tobytes()] = model, torque

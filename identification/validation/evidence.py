@@ -112,7 +112,7 @@ class CellContext:
     corrections: tuple[Finding, ...] = ()  # faults of recordings that were corrected
     #: whether the positions are commands, which the arm follows late
     commanded_positions: bool = False
-    added_friction: tuple[str, ...] = ()  # symbols of friction terms that nobody stated
+    added_friction: tuple[str, ...] = ()  # symbols of friction terms that were chosen, not stated
     scale_std: Array | None = None  # relative uncertainty of each joint's torque scale (n,)
 
 
@@ -158,7 +158,7 @@ class Evidence:
     context: CellContext = CellContext()  #: data on the cell
     prismatic: tuple[int, ...] = ()  #: indices of the joints that slide
     moved: Array | None = None  #: time in which each joint moved in unseen motion (n,) [s]
-    #: whether nothing was held out, so that all errors are those of the fit
+    #: whether nothing was held out, so that all errors are on fitted motion
     in_sample: bool = False
 
     def revolute(self, joint: int) -> bool:

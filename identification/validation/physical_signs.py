@@ -52,7 +52,7 @@ class Implausible(NamedTuple):
 
     impossible: tuple[WrongSign, ...]  # with a torque above the prediction error
     doubtful: tuple[WrongSign, ...]  # with a smaller torque
-    added: tuple[WrongSign, ...] = ()  # friction that falls by a term that nobody stated
+    added: tuple[WrongSign, ...] = ()  # friction that falls because of a chosen term
 
 
 def implausibilities(

@@ -28,7 +28,7 @@ from identification.validation.purpose_messages import purposes_in_a_sentence
 class Verdict:
     """Whether a model may be used, with findings and next steps."""
 
-    good: bool  #: whether the model may be used, for the purposes that were asked for if any
+    good: bool  #: whether the model may be used, for the requested purposes if there are any
     line: str  #: what it is good for, or what is wrong; without purposes the error
     reasons: tuple[str, ...]  #: messages of wrong findings; empty if good
     warnings: tuple[str, ...] = ()  #: messages of doubtful findings
@@ -63,7 +63,7 @@ def judge(
     wrong = [finding for finding in findings if finding.level == "wrong"]
     doubtful = [finding for finding in findings if finding.level == "doubtful"]
     measure = _measure(naming.joints, evidence)
-    # Nothing is well without reserve where a parameter that was asked for is in doubt.
+    # A doubtful parameter that was requested is a reservation.
     reserve = "; ".join(finding.reservation for finding in findings if finding.reservation)
     but = f", but {reserve}" if reserve else ""
     line = f"The model predicts {tested_on} well{but}: {measure}."

@@ -228,7 +228,7 @@ class SimulatedUr:
         load: what the flange carries beyond the payload entered.
         repeats: whether the program begins again at its end.
         at: where it rests without a program (6,) [rad].
-        urdf: of the arm; its kinematics as the primary interface states them are those of a UR5e.
+        urdf: of the arm; the primary interface always states the kinematics of a UR5e.
         effects: that a model of the arm leaves out.
     """
 

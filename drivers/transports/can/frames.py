@@ -123,7 +123,7 @@ def payload_sizes(n_bytes: int) -> list[int]:
 
 
 def _padded(size: int) -> int:
-    """Return the smallest payload of a frame for so many bytes."""
+    """Return the size of the smallest frame payload that holds `size` bytes."""
     return next(payload for payload in PAYLOADS_FD if payload >= size)
 
 

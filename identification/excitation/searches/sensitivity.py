@@ -94,7 +94,7 @@ class Sensitivity:
     duration: float  #: of the motion [s]
     criterion: Array  #: slopes of the criterion by the states (3, N, n)
     values: Array  #: first-order share of each state in the criterion (N,)
-    #: of the criterion by the duration [1/s]: a longer motion counts for more beside what is given
+    #: of the criterion by the duration [1/s]: a longer motion weighs more against given recordings
     by_duration: float
     margins: Margins  #: of loads and distances
     left: Array  #: (1 + c,) to the longest duration [s], then of the margins; negative if violated
