@@ -25,6 +25,9 @@ def connection() -> tuple[socket.socket, socket.socket]:
         return ours, server.accept()[0]
 
 
+DATA = frame(FrameType.DATA, bytes(range(100)))
+
+
 @pytest.fixture
 def link() -> Iterator[tuple[UrTransport, socket.socket]]:
     """The transport of this computer, and the controller's end."""
@@ -38,21 +41,18 @@ def link() -> Iterator[tuple[UrTransport, socket.socket]]:
     transport = UrTransport(ours, primary, agreed, description)  # type: ignore[arg-type]
     with closing(transport), theirs, spare:
         assert transport.receive(1.0) == description.encode()
+        # Linux begins to note times of arrival some time after a first socket asked for them.
+        until = transport.now + 10.0
+        while transport.arrived is None and transport.now < until:
+            theirs.sendall(DATA)
+            assert transport.receive(1.0) == DATA
         yield transport, theirs
-
-
-DATA = frame(FrameType.DATA, bytes(range(100)))
 
 
 def test_a_frame_came_when_the_kernel_received_it(
     link: tuple[UrTransport, socket.socket],
 ) -> None:
     transport, theirs = link
-    # Linux begins to note times of arrival some time after a first socket asked for them.
-    until = transport.now + 10.0
-    while transport.arrived is None and transport.now < until:
-        theirs.sendall(DATA)
-        assert transport.receive(1.0) == DATA
     before = transport.now
     theirs.sendall(DATA)
     assert transport.wait(10.0)

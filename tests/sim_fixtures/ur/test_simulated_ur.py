@@ -354,5 +354,39 @@ def test_the_makers_client_reads_the_same(served: None) -> None:
         state = client.receive()
         assert state.robot_mode == 7 and state.joint_mode == [253] * 6
         assert np.all(np.abs(np.array(state.actual_q) - UrProgram().centre) < 2.0)
+        # Every cycle while it keeps up; `receive` itself keeps the newest alone.
+        stamps = [state.timestamp]
+        until = time.monotonic() + 20.0
+        while len(stamps) < 200 and time.monotonic() < until:
+            state = client.receive_buffered()
+            if state is not None:
+                stamps.append(state.timestamp)
+        assert np.diff(stamps[1:]) == pytest.approx(0.002, abs=1e-6)
+        assert client.send_pause()
     finally:
         client.disconnect()
+
+
+def test_the_makers_client_claims_and_writes_registers() -> None:
+    rtde = pytest.importorskip("rtde.rtde", reason="UR's RTDE_Python_Client_Library is not there")
+    robot = SimulatedUr(program=UrProgram(), repeats=True)
+    names, types = ["input_int_register_30", "input_double_register_30"], ["INT32", "DOUBLE"]
+    with UrServer(robot).running() as server:
+        client, other = (rtde.RTDE("127.0.0.1", server.ports["rtde"]) for _ in range(2))
+        try:
+            for each in (client, other):
+                each.connect()
+                assert each.send_output_setup(["timestamp"], ["DOUBLE"], frequency=500)
+                assert each.send_start()
+            written = client.send_input_setup(names, types)
+            with pytest.raises(ValueError, match="already in use"):
+                other.send_input_setup(names, types)
+            written.input_int_register_30, written.input_double_register_30 = 7, 0.25
+            assert client.send(written)
+            until = time.monotonic() + 10.0
+            while robot.inputs.ints.get(30) != 7 and time.monotonic() < until:
+                time.sleep(0.01)
+            assert (robot.inputs.ints[30], robot.inputs.floats[30]) == (7, 0.25)
+        finally:
+            client.disconnect()
+            other.disconnect()
