@@ -239,7 +239,8 @@ def of_estimate(twin: Twin, folder: CampaignFolder, reporter: Reporter) -> list[
             MAX_PARAMETER_SIGMAS,
             f"the errors of {finite.sum()} parameters are at most {apart[farthest]:.3g} standard "
             f"deviations ({estimate.names[farthest]}), {MAX_PARAMETER_SIGMAS:g} are allowed",
-            "drive train or model in the cell file do not match the arm",
+            "drive train or model in the cell file do not match the arm, or, just above the limit, "
+            "by chance: `--again --seed 2` shows which",
         ),
         criterion(
             "unseen motion",

@@ -295,10 +295,7 @@ def show(diagnosis: Diagnosis, console: Console) -> None:
         )
         for latency in diagnosis.latencies
     ]
-    lines += [
-        f"{verdict.cycle_ms} ms: {'fit' if verdict.fit else 'not fit'}; {verdict.reason}"
-        for verdict in diagnosis.cycles
-    ]
+    lines += fitness_lines(diagnosis.cycles)
     first = [*remedies(diagnosis.checks)]
     lines += [f"({CRITERIA})", *first]
     if not diagnosis.cycle_fit:
@@ -309,6 +306,17 @@ def show(diagnosis: Diagnosis, console: Console) -> None:
         console.print(printable(line), markup=False, highlight=False, soft_wrap=True)
     style = "bold green" if diagnosis.fit else "bold red"
     console.print(Text(printable(diagnosis.line), style=style), soft_wrap=True)
+
+
+def fitness_lines(verdicts: Sequence[Fitness]) -> list[str]:
+    """Return a line for each verdict; cycles with the same verdict and reason share one."""
+    cycles: dict[tuple[bool, str], list[str]] = {}
+    for verdict in verdicts:
+        cycles.setdefault((verdict.fit, verdict.reason), []).append(str(verdict.cycle_ms))
+    return [
+        f"{' and '.join(alike)} ms: {'fit' if fit else 'not fit'}; {reason}"
+        for (fit, reason), alike in cycles.items()
+    ]
 
 
 def summary(diagnosis: Diagnosis) -> list[str]:
@@ -325,10 +333,7 @@ def summary(diagnosis: Diagnosis) -> list[str]:
             f"{latency.name}: half within {half:.0f} µs, 99.9 % within {most:.0f} µs, all within"
             f" {longest:.0f} µs"
         )
-    lines += [
-        f"{verdict.cycle_ms} ms: {'fit' if verdict.fit else 'not fit'}; {verdict.reason}"
-        for verdict in diagnosis.cycles
-    ]
+    lines += fitness_lines(diagnosis.cycles)
     passed = [check.name for check in diagnosis.checks if check.status is CheckStatus.OK]
     return [*lines, *([f"ok: {', '.join(passed)}"] if passed else [])]
 

@@ -937,9 +937,11 @@ REMEDIES: Final[Mapping[RemedyKey, str]] = {
     "check the constant and the payload": (
         "check torque constant and gear ratio of {joints}, and the payload"
     ),
-    "state the delay": ("state it (`hil identify --delay SECONDS`), or correct it at its source"),
+    "state the delay": (
+        "state the delay (`hil identify --delay SECONDS`), or correct it at its source"
+    ),
     "state the delay, or correct the program": (
-        "state it (`hil identify --delay SECONDS`), or correct it in the recording program"
+        "state the delay (`hil identify --delay SECONDS`), or correct it in the recording program"
     ),
     "compare with the delay found": (
         "compare with `hil identify --delay auto`, or state the delay if it is known (`--delay"

@@ -174,7 +174,7 @@ def test_what_follows_an_identification_fills_one_screen(
     printed("identify", written(tmp_path, name, arm), "--urdf", urdf, "-o", folder)
     archive = folder / "log.mcap"
     for words in (
-        ("rollout", folder, "--samples", "2"),
+        ("rollout", folder, "--samples", "3"),
         ("export", folder, "--to", "mjcf", "-o", tmp_path / "arm.xml"),
         ("report", folder),
         ("batch", folder, "-o", tmp_path / "batch"),

@@ -45,6 +45,7 @@ from hil.doctor.diagnosis import (
     as_json,
     disk_trial,
     examine,
+    fitness_lines,
     judge,
     measure,
     run_probe,
@@ -419,3 +420,11 @@ def test_missing_and_hanging_commands_give_none(monkeypatch: pytest.MonkeyPatch)
 def test_ports_are_tried() -> None:
     errors = [try_port(FreePort(host, 0, "UDP")) for host in ("127.0.0.1", "192.0.2.77")]
     assert errors == [0, errno.EADDRNOTAVAIL]
+
+
+def test_a_reason_of_both_cycles_is_printed_once() -> None:
+    apart = [latency(20e-6, 1.5e-3)]
+    lines = fitness_lines([judge(apart, 1), judge(apart, 2)])
+    assert [line.split(":")[0] for line in lines] == ["1 ms", "2 ms"]
+    (unmeasured,) = fitness_lines([judge([], 1), judge([], 2)])
+    assert unmeasured == "1 and 2 ms: not fit; nothing was measured"
