@@ -32,7 +32,7 @@ from identification.signals.recording import (
     offsets_of_repetitions,
     without_repeats,
 )
-from identification.signals.row_faults import RowFault, without_faulty_rows
+from identification.signals.row_faults import RowFault, RowFaultKind, without_faulty_rows
 from identification.text import percentage
 
 FLOAT32_STEP = 2.0**-24
@@ -426,15 +426,13 @@ def _usable(archive: Archive, cell: Cell, recording: Recording) -> Source:
     useful = useful_part(archive, recording)
     if useful is not None:
         recording = recording.between(useful.start, useful.stop)
-    sound = recording
     timed = recording
-    times = None
+    times = stamps = None
     faults: tuple[RowFault, ...] = ()
     try:
         if archive.kind == "imported":  # other archives have the cycle counter of the controller
             recording.check_finite()
-            sound, faults = without_faulty_rows(recording)
-            timed, times = true_times(sound)
+            timed, times, faults, stamps = _true_rows(recording)
             timed = cut_at_pauses(timed)
         single = without_repeats(timed).checked(cell.joint_names)
     except RecordingError as error:
@@ -451,8 +449,27 @@ def _usable(archive: Archive, cell: Cell, recording: Recording) -> Source:
         averaged if merged else "",
         times,
         faults,
-        None if times is None else sound.time,
+        stamps,
     )
+
+
+def _true_rows(
+    recording: Recording,
+) -> tuple[Recording, SampleTimes, tuple[RowFault, ...], Array]:
+    """Return the rows of one motion at their times, how these were decided, faults and stamps.
+
+    By stamps that are not the times of the samples, rows may seem displaced that are not.
+    """
+    sound, faults = without_faulty_rows(recording)
+    timed, times = true_times(sound)
+    if times.even and any(fault.kind is RowFaultKind.DISPLACED for fault in faults):
+        even, even_times = true_times(recording)
+        if even_times.even and not even_times.removed:
+            again, remaining = without_faulty_rows(even)
+            if len(remaining) < len(faults):
+                rows = np.isin(even.time, again.time)
+                return again, even_times, remaining, recording.time[rows]
+    return timed, times, faults, sound.time
 
 
 def useful_part(archive: Archive, recording: Recording) -> range | None:

@@ -15,7 +15,7 @@ from hil.importers.imported_robot import Robot
 from hil.importers.recording_import import ImportOptions
 from hil.importers.stamps import concluded_unit
 from hil.look import look_at
-from hil.look.readings import ZeroTorques
+from hil.look.readings import RowsReading, ZeroTorques
 from hil.look.result import Look
 from tests.hil.simulated_logs import Simulated, simulate, urdf_path, write_log
 
@@ -46,6 +46,19 @@ def test_no_delay_is_certain_by_rounded_stamps(tmp_path: Path, simulated: Simula
     found = look(log_of(tmp_path, simulated, time=np.round(TIME, 1)))
     (row,) = [row for row in found.rows if row.aspect == "delay"]
     assert row.certainty is not Certainty.CERTAIN
+
+
+@pytest.mark.long
+def test_no_row_is_displaced_by_late_stamps_alone(tmp_path: Path) -> None:
+    random = np.random.default_rng(0)
+    time = np.arange(0.0, 14.0, 0.008)
+    simulated = simulate(URDF, time, seed=3, pace=1.5)
+    late = np.sort(time + random.uniform(0.0, 0.007, len(time)))
+    found = look(log_of(tmp_path, simulated, time=late))
+    (rows,) = [row.reading for row in found.rows if isinstance(row.reading, RowsReading)]
+    assert rows.times is not None
+    assert rows.times.even
+    assert rows.faults == ()
 
 
 class TestTorqueOfZeros:
