@@ -29,7 +29,7 @@ from hil.importers.recording_import import (
     read_recording,
 )
 from hil.importers.required_signals import has_servo, require_motion, require_torque
-from hil.look.before_identification import Concluded, concluded
+from hil.look.before_identification import Concluded, LayoutReading, concluded
 from identification.hypotheses.diagnosis import TorqueDiagnosis
 
 MAP: Final = "map.toml"
@@ -47,6 +47,7 @@ class Staging:
         recordings: those that were imported, by the path of their archive.
         sources: the files that those are from, likewise.
         diagnoses: what their torques are, likewise, where that was asked.
+        layouts: how others with the columns of one that was examined are read, by that map.
     """
 
     fitted: list[Path | Archive] = field(default_factory=list)
@@ -54,6 +55,7 @@ class Staging:
     recordings: dict[Path, ImportedRecording] = field(default_factory=dict)
     sources: dict[Path, Path] = field(default_factory=dict)
     diagnoses: dict[Path, TorqueDiagnosis] = field(default_factory=dict)
+    layouts: dict[str, LayoutReading] = field(default_factory=dict)
 
     def check_places(self, folder: Path) -> None:
         """Raise InputError if an archive in this folder would replace a recording."""
@@ -128,7 +130,9 @@ def staged(
                     archives.append(path)
                     continue
                 for source, place, recording in _read(path, robot_of, options, use, staging):
-                    found = _concluded(recording, source, robot_of, options, use, reporter)
+                    found = _concluded(
+                        recording, source, robot_of, options, use, reporter, staging.layouts
+                    )
                     archives.append(found.recording.archive)
                     staging.recordings[place] = found.recording
                     if found.diagnosis is not None:
@@ -174,6 +178,7 @@ def _concluded(
     options: ImportOptions,
     use: Use,
     reporter: Reporter,
+    layouts: dict[str, LayoutReading],
 ) -> Concluded:
     """Report what is concluded of a recording, and return it without the text of its log.
 
@@ -181,7 +186,13 @@ def _concluded(
     """
     require_motion(recording.archive, source)
     require_torque(recording.archive, source)
-    found = concluded(recording, source, robot_of, options, use)
+    layout = layouts.get(recording.map_text or "")
+    if layout is not None:
+        found = Concluded(layout.read(recording, source, robot_of, use))
+    else:
+        found = concluded(recording, source, robot_of, options, use)
+        if (layout := LayoutReading.of(recording, source, found)) is not None:
+            layouts[layout.proposed] = layout
     _report(found.recording, source, reporter)
     return found._replace(recording=replace(found.recording, files=LogFiles()))
 

@@ -56,6 +56,55 @@ class Concluded(NamedTuple):
 
     recording: ImportedRecording
     diagnosis: TorqueDiagnosis | None = None
+    look: Look | None = None  #: that changed how it is read
+
+
+@dataclass(frozen=True)
+class LayoutReading:
+    """How recordings with the columns of one that was examined are read.
+
+    Attributes:
+        proposed: column map by names and units of these columns.
+        source: name of the recording that was examined.
+        look: that changed how it is read, if any.
+    """
+
+    proposed: str
+    source: str
+    look: Look | None
+
+    @classmethod
+    def of(
+        cls, imported: ImportedRecording, source: Path, found: Concluded
+    ) -> LayoutReading | None:
+        """Return how others are read; None where this recording has no torque or no columns."""
+        if imported.map_text is None or imported.is_stated:
+            return None
+        if "torque" not in found.recording.archive.columns:
+            return None
+        return cls(imported.map_text, source.name, found.look)
+
+    def read(
+        self, imported: ImportedRecording, source: Path, robot_of: RobotOf, use: Use
+    ) -> ImportedRecording:
+        """Return a recording of the same columns as the examined one is read.
+
+        An arm and its logger have one layout: a recording of a poorer motion, or one that is held
+        out, does not decide anew what its columns mean.
+
+        Args:
+            imported: the recording as its names and units say it is.
+            source: its file or folder.
+            robot_of: reads the robot's cell or URDF.
+            use: what the recording is for.
+
+        Raises:
+            SourceError: a joint moves under a constant torque.
+        """
+        _require_measured(imported.archive, source)
+        if self.look is None:
+            return imported
+        return _again(imported, source, robot_of, self.look, use, self.source)
 
 
 def concluded(
@@ -106,7 +155,7 @@ def concluded(
     if asked.score.overall > SUSPECT_ERROR and (how := explained(imported.archive)):
         imported = replace(imported, concluded=(*imported.concluded, how.how))
         return Concluded(_of_this_arm(imported, source, asked.contradictions(how.score)))
-    return Concluded(_as_a_look_says(imported, source, robot_of, use, asked, is_open))
+    return _as_a_look_says(imported, source, robot_of, use, asked, is_open)
 
 
 def _as_a_look_says(
@@ -116,13 +165,14 @@ def _as_a_look_says(
     use: Use,
     asked: TorqueSample,
     is_open: bool,
-) -> ImportedRecording:
+) -> Concluded:
     """Return a log read again where a look is certain that it is other than recorded."""
     look = look_at_joints(source, imported)
     error = asked.score.overall if look.error is None else look.error
     if error > UNEXPLAINED:
         if is_open:
-            return without_torque(imported, source, robot_of, use, NoJointTorque(error))
+            servo = without_torque(imported, source, robot_of, use, NoJointTorque(error))
+            return Concluded(servo)
         raise _other_arm(source, error)
     changed = _changed(look)
     if look.questions or not changed:
@@ -136,9 +186,9 @@ def _as_a_look_says(
         if (read := TorqueSample.of(again.archive)) is not None:
             axes = [row.aspect for row in changed if row.aspect in _OF_AXES]
             contradictions = read.contradictions(error=error, changed=axes)
-            return _of_this_arm(again, source, contradictions)
-        return again
-    return imported
+            again = _of_this_arm(again, source, contradictions)
+        return Concluded(again, look=look)
+    return Concluded(imported)
 
 
 @dataclass
@@ -221,9 +271,14 @@ def _changed(look: Look) -> list[Row]:
 
 
 def _again(
-    imported: ImportedRecording, source: Path, robot_of: RobotOf, look: Look, use: Use
+    imported: ImportedRecording,
+    source: Path,
+    robot_of: RobotOf,
+    look: Look,
+    use: Use,
+    looked_at: str = "",
 ) -> ImportedRecording:
-    """Read a log again with a map and the gravity that were found."""
+    """Read a log again with a map and the gravity that were found, perhaps of another log."""
     assert look.map_text is not None
     gravity = look.gravity
 
@@ -232,7 +287,8 @@ def _again(
         return described if gravity is None else described.with_gravity(gravity)
 
     again = read_again(imported, source, robot, look.map_text, use)
-    return replace(again, concluded=(*imported.concluded, *map(ChangedReading, _changed(look))))
+    changes = [ChangedReading(row, looked_at) for row in _changed(look)]
+    return replace(again, concluded=(*imported.concluded, *changes))
 
 
 def undecided(

@@ -776,7 +776,10 @@ def _(arm: DoubtfulArm) -> str:
 @import_messages.worded.register
 def _(changed: ChangedReading) -> str:
     text = row_text(changed.row)
-    return f"{changed.row.aspect}: {text.reading}, inferred; {text.reason}"
+    reason = (
+        f"as in {changed.source}, which has the same columns" if changed.source else text.reason
+    )
+    return f"{changed.row.aspect}: {text.reading}, inferred; {reason}"
 
 
 @import_messages.worded.register

@@ -146,6 +146,12 @@ class Look:
 
 @dataclass(frozen=True)
 class ChangedReading(Conclusion):
-    """A row of a look whose conclusion an identification uses."""
+    """A row of a look whose conclusion an identification uses.
+
+    Attributes:
+        row: of the look.
+        source: name of the recording with the same columns that was looked at; "": this one.
+    """
 
     row: Row
+    source: str = ""
