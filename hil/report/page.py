@@ -37,7 +37,7 @@ _MAX_BINS = 300
 _OFFSET: Final = re.compile(r"fo_\d+")  # constant part of a torque, which may be a sensor's
 _USES: Final = {
     "identified.urdf": "the arm for pinocchio, MuJoCo, Gazebo and controllers; other formats:"
-    " hil export FOLDER --to mjcf",
+    " `hil export FOLDER --to mjcf`",
     "parameters.json": "parameters with covariance and the bodies of the links, for programs",
     "parameters.csv": "a row for each parameter, for spreadsheets, MATLAB and R",
     "parameters_covariance.csv": "their covariance",

@@ -21,6 +21,7 @@ from jinja2 import (
     StrictUndefined,
 )
 from markupsafe import Markup
+from markupsafe import escape as escape_html
 
 from hil.base.files import digest, user_cache
 from hil.base.terminal_text import escape
@@ -32,7 +33,7 @@ _STYLE: Final = "report.css"
 _SCRIPT: Final = "page.js"
 _FORMATS: Final = (
     *("significant", "fixed", "beside", "percent", "with_std"),
-    *("capitalised", "moments", "prose"),
+    *("capitalised", "moments"),
 )
 _STEERING: Final = re.compile(
     r"[\0-\x08\x0b-\x1f\x7f-\x9f\u061c\u200e\u200f\u202a-\u202e\u2066-\u2069]"
@@ -68,7 +69,7 @@ def environment(*scripts: str) -> Environment:
     environment.globals |= {"numbers": numbers, "numbering": numbering}
     for name in _FORMATS:
         environment.filters[name] = getattr(numbers, name)
-    environment.filters["unit_text"] = unit_text
+    environment.filters |= {"unit_text": unit_text, "prose": _prose}
     return environment
 
 
@@ -87,6 +88,12 @@ def _compiled_templates() -> BytecodeCache | None:
     except (OSError, RuntimeError):  # no home
         return None
     return FileSystemBytecodeCache(str(folder))
+
+
+def _prose(text: str) -> Markup:
+    """Return a message as HTML: `commands` as code, per cent signs on the line of their numbers."""
+    safe = str(escape_html(_STEERING.sub(lambda match: escape(match[0]), numbers.prose(text))))
+    return Markup(re.sub(r"`([^`]+)`", r"<code>\1</code>", safe))
 
 
 def _shown(value: object) -> object:

@@ -228,10 +228,12 @@ class TestFirstHour:
     STEPS = commands(PAGE, TEXT)
 
     def edit(self, path: Path, **instead: int) -> None:
-        """What the page asks to write into `[controller]` of the copy."""
+        """What the page asks to write into `[controller]` and `[campaign]` of the copy."""
         (block,) = re.findall(r"```toml\n(.*?)```", self.TEXT, re.DOTALL)
         link = tomllib.loads(block) | instead
         values = {f"controller.{key}": value for key, value in link.items()}
+        counts = re.findall(r"`(repetitions|validation_runs) = (\d+)`", self.TEXT)
+        values |= {f"campaign.{key}": int(count) for key, count in counts}
         path.write_text(with_values(path.read_text("utf-8"), values))
 
     def hil(self, arguments: list[str]) -> subprocess.Popen[str]:
@@ -246,7 +248,8 @@ class TestFirstHour:
         """Against a simulated controller, which waits for this computer."""
         simulate, *steps = self.STEPS
         assert [step[1] for step in steps] == [
-            "new", "sim_fixtures/ns16/cell.toml", "doctor", "record", "plot", "move", "plot", "move"
+            "new", "sim_fixtures/ns16/cell.toml", "doctor", "record", "plot", "move", "plot",
+            "move", "design", "rehearse", "run", "run",
         ]  # fmt: skip
         port = str(free_port())
         for step in steps:
@@ -256,11 +259,11 @@ class TestFirstHour:
                 self.edit(Path("cell.toml"), port=int(port))
                 continue
             controller = None
-            if step[1] in {"new", "record", "move"}:
+            if step[1] in {"new", "record", "move", "run"}:
                 far = [part.replace("2001", port) for part in simulate]
                 controller = self.hil([*far, "--patience", "0.5"])
             done = self.hil([part.replace("2001", port) for part in step])
-            printed, _ = done.communicate(timeout=180)
+            printed, _ = done.communicate(timeout=900 if step[1] == "run" else 180)
             if controller is not None:
                 controller.terminate()
                 controller.communicate(timeout=60)
@@ -276,6 +279,7 @@ class TestFirstHour:
         assert [(move.kind, move.complete) for move in moves] == [("move", True)] * 2
         assert open_archive("archives/standstill_000_a1.mcap").complete
         assert Path("standstill.png").exists() and Path("first_move.png").exists()
+        assert Path("runs/small/report.html").exists()
 
 
 ROOT = Path(__file__).resolve().parents[2]
