@@ -36,6 +36,7 @@ _MAX_STEP: Final = np.where(POSITIVE, 0.7, 0.01)  # of a coordinate in an iterat
 _COST_TOLERANCE: Final = 3e-4  # relative decrease of the cost at which a fit ends
 _INITIAL_CORRELATION_TIME: Final = 0.5  # s that residuals are correlated over, before a fit says it
 _CENTRAL_DIFFERENCE_ROUNDS: Final = 2  # last iterations with differences to both sides
+_QUARTERS: Final = 4  # parts of all windows, each of windows that follow each other
 _P: Final = len(TERMS)
 
 Done = Callable[[], None]
@@ -135,8 +136,9 @@ class ServoEstimate:
         alike: residuals that count as one (n,).
         bus_delay: delay of the bus [s].
         cost: of each joint (n,).
-        between: covariance of the coordinates of each joint by leaving out a window each
-            (n, P, P), for the windows alone, without the prior.
+        between: covariances of the coordinates of each joint, for the windows alone without the
+            prior, by leaving out a window each, and a quarter of the windows each (2, n, P, P):
+            what a model lacks may be alike in all windows of a motion.
     """
 
     coordinates: Array
@@ -176,6 +178,19 @@ def _weights(relative: Array) -> Array:
 def losses(relative: Array) -> Array:
     """Return the robust squares of residuals over their scatter, about r² where these are small."""
     return np.asarray(2.0 * ROBUST**2 * (np.sqrt(1.0 + (relative / ROBUST) ** 2) - 1.0))
+
+
+def _jackknife(whole: Array, parts: Array, scores: Array) -> Array:
+    """Return the covariance (k, k) by estimates that leave out a part each, to first order.
+
+    Args:
+        whole: normal matrix with the prior (k, k).
+        parts: share of each part in it (p, k, k).
+        scores: gradient of each part (p, k).
+    """
+    shifts = np.linalg.solve(whole - parts, scores[..., None])[..., 0]
+    count = len(shifts)
+    return np.asarray(shifts.T @ shifts * (count - 1) / count)
 
 
 @dataclass(eq=False)
@@ -308,7 +323,8 @@ class _Fit:
         residuals would give, the median of the terms: one at a limit may scatter anyhow.
         """
         self._alike = self.alike.copy()
-        self._between = np.zeros((self.windows.n_joints, _P, _P))
+        self._between = np.zeros((2, self.windows.n_joints, _P, _P))
+        quarters = np.array_split(np.arange(self.windows.count), _QUARTERS)
         weights = _weights(here / self.scatter)
         for joint in range(self.windows.n_joints):
             inside = self.present[joint, terms]
@@ -319,11 +335,13 @@ class _Fit:
             by_window = np.einsum("kpw,kqw->wpq", weighted, columns)
             of_data = by_window.sum(axis=0)
             whole = of_data + np.diag(self.prior.spread[joint, terms[inside]] ** -2.0)
-            shifts = np.linalg.solve(whole - by_window, scores[..., None])[..., 0]
-            count = len(shifts)
-            between = shifts.T @ shifts * (count - 1) / count
-            places = terms[inside]
-            self._between[joint][np.ix_(places, places)] = between
+            between = _jackknife(whole, by_window, scores)
+            parts = [rows for rows in quarters if len(rows)]
+            by_part = np.stack([by_window[rows].sum(axis=0) for rows in parts])
+            scores_of_parts = np.stack([scores[rows].sum(axis=0) for rows in parts])
+            places = np.ix_(terms[inside], terms[inside])
+            self._between[0, joint][places] = between
+            self._between[1, joint][places] = _jackknife(whole, by_part, scores_of_parts)
             scatter = np.diag(between)
             inverse = np.linalg.inv(whole)
             expected = np.diag(inverse @ of_data @ inverse)

@@ -117,8 +117,9 @@ def reach_of(fit: ServoFit) -> float:
 def widened_covariance(fit: ServoFit) -> Array:
     """Return the covariance of the coordinates and of the delay of the bus (n P + 1, n P + 1).
 
-    Residuals of a window are alike for longer in some directions than in others. So what they add
-    to the variance is in no direction less than its scatter when a window each is left out. And a
+    Residuals of a window are alike for longer in some directions than in others, and what a model
+    lacks may be alike in all windows of a motion. So what they add to the variance is in no
+    direction less than its scatter when a window each is left out, or a quarter of all. And a
     term that is not shown may as well have no effect: other terms then take its place, as far as
     the fit lets them.
     """
@@ -133,7 +134,10 @@ def widened_covariance(fit: ServoFit) -> Array:
         whole = estimate.covariance[inside]
         spread = estimate.prior.spread[joint, own]
         of_residuals = whole - (whole * spread**-2.0) @ whole
-        widened[inside] += _excess(of_residuals, estimate.between[joint][np.ix_(own, own)])
+        for between in estimate.between[:, joint]:
+            excess = _excess(of_residuals, between[np.ix_(own, own)])
+            of_residuals = of_residuals + excess
+            widened[inside] += excess
         for place in places[unseen[joint, own]]:
             # Of a logarithm, 1 is the whole effect, to first order.
             variance = widened[place, place]

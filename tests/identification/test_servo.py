@@ -260,13 +260,39 @@ def test_intervals_are_as_wide_as_the_scatter_of_windows(planted):
     count = len(NAMES)
     for joint in range(3):
         own = slice(joint * count, (joint + 1) * count)
-        for least in (estimate.between[joint], estimate.covariance[own, own]):
+        for least in (*estimate.between[:, joint], estimate.covariance[own, own]):
             present = np.outer(estimate.present[joint], estimate.present[joint])
             scale = np.sqrt(np.diag(covariance[own, own]))
             learnt = scale < (1.0 - 1e-9) * estimate.prior.spread[joint]
             present &= np.outer(learnt, learnt)
             excess = np.where(present, covariance[own, own] - least, 0.0)
             assert np.linalg.eigvalsh(excess / np.outer(scale, scale)).min() > -1e-6
+
+
+@pytest.mark.long
+def test_what_differs_between_motions_widens_its_interval():
+    """Such as a zero of the encoder: windows of one motion all show the same."""
+    rng = np.random.default_rng(4)
+    truth = arm.Planted.drawn(rng)
+    model, bodies = model_of_arm()
+    difference = 0.008
+    recordings = []
+    for zero in (0.0, difference):
+        time, command = arm.commands(rng, 24.0)
+        position = arm.simulated(truth, time, command) + zero
+        recordings.append(
+            Recording(
+                time=time, position=position, joint_names=arm.NAMES, commanded_position=command
+            )
+        )
+    fit = fit_servos(
+        lambda on: [part for each in recordings for part in motions_of(each, model, bodies, on)],
+        Grid.of(recordings[0]),
+        np.full(3, arm.COUNT / np.sqrt(12.0)),
+    )
+    intervals = intervals_of(fit)
+    place = PLACE["offset"]
+    assert (intervals.upper[:, place] - intervals.lower[:, place] > difference).all()
 
 
 @pytest.mark.long
