@@ -21,6 +21,10 @@ all that is compared, and medians are printed, with smallest and largest.
 - ``whole_1000_hz_s``, ``whole_250_hz_s``: all of `hil identify` of 30 s of six axes, report
   included, in a fresh process; ``..._plain_s``: `benchmarks.plain_fit` on the same log, likewise;
   ``..._ratio_to_plain``: the first over the second.
+- ``log_look_s``, ``log_identify_s``, ``log_identify_halves_s``: `hil look` and `hil identify` of
+  30 s of seven axes at 1 kHz in columns of text, with a URDF, whole and as two logs, likewise;
+  ``log_help_s``, ``log_help_of_look_s``: `hil --help`, `hil look --help`. ``..._units``: these over
+  ``log_unit``, the slowness of the machine by `benchmarks.whole_run`.
 - ``memory_1_min_mb`` and so on: largest memory of `hil identify` of as many minutes of six axes at
   1 kHz, in a fresh process, and its processor time.
 
@@ -80,7 +84,7 @@ WRIST: Final = Coupling(
     ])
 )  # fmt: skip
 """Joint 4 turns motors 5 and 6 along, joint 5 motor 6."""
-PARTS: Final = ("fits", "models", "whole", "memory")
+PARTS: Final = ("fits", "models", "whole", "log", "memory")
 _POSITION_NOISE: Final = 1e-6  # rad
 _TORQUE_NOISE: Final = 1.0  # N·m
 
@@ -280,6 +284,8 @@ def main(arguments: Sequence[str] | None = None) -> None:
         result |= time_models(options.repetitions)
     if "whole" in options.only:
         result |= whole_run.times()
+    if "log" in options.only:
+        result |= whole_run.raw_log()
     if "memory" in options.only:
         result |= whole_run.memory()
     result |= {

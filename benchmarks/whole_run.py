@@ -4,6 +4,10 @@
 imports of Python included: ``hil identify ARCHIVE --output FOLDER`` with default settings, which
 writes the report and all files, and ``benchmarks.plain_fit``, on the same log. Both fit the first
 70 % and predict the rest. The log is one of the NS 16 of `benchmarks.coverage`.
+
+Raw logs are of a Panda, seven axes in columns of text. Their times are also given in units of the
+machine's slowness: of what the ordinary fit of the NS 16 at 1 kHz takes, over the 5.5 s that it
+took on the machine of `performance.md`.
 """
 
 from __future__ import annotations
@@ -13,6 +17,8 @@ import tempfile
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Final
+
+import numpy as np
 
 from benchmarks.arms import ARMS, urdf
 from benchmarks.coverage import ARM_TYPES, Conditions, drawn_arm, logged
@@ -26,6 +32,9 @@ MINUTES: Final = (1.0, 2.0, 4.0, 8.0)
 MEMORY_RATE: Final = 1000.0  # Hz
 URDF: Final = ARMS["ns16"]
 _ARM: Final = ARM_TYPES["ns16"]
+_LOG_ARM: Final = ARM_TYPES["panda"]
+_LOG_RATE: Final = 1000.0  # Hz
+_FIT_SECONDS: Final = 5.5  # s, of the ordinary fit on the machine of `performance.md`
 _NOT_GOOD: Final = 5  # exit status of `hil identify` where the model is not good
 _DELAY: Final = 0.0  # s
 
@@ -75,3 +84,44 @@ def memory(minutes: Sequence[float] = MINUTES, rate: float = MEMORY_RATE) -> dic
         result[f"memory_{duration:g}_min_mb"] = round(ours.peak_mb, 1)
         result[f"memory_{duration:g}_min_s"] = round(ours.seconds, 2)
     return result
+
+
+def written_logs(folder: Path, duration: float = DURATION, rate: float = _LOG_RATE) -> list[Path]:
+    """Write a simulated log of seven axes as columns of text, whole and in two halves."""
+    log = logged(drawn_arm(_LOG_ARM, 1), 1, 0, duration, _DELAY, Conditions(rate=rate, scale=0.0))
+    joints = range(1, log.position.shape[1] + 1)
+    names = ["time_s", *(f"q{j}_rad" for j in joints), *(f"tau{j}_Nm" for j in joints)]
+    rows = np.column_stack([log.time, log.position, log.torque])
+    middle = len(rows) // 2
+    parts = {"whole": rows, "first": rows[:middle], "second": rows[middle:]}
+    for name, part in parts.items():
+        place = folder / f"{name}.csv"
+        np.savetxt(place, part, fmt="%.8g", delimiter=",", header=",".join(names), comments="")
+    return [folder / f"{name}.csv" for name in parts]
+
+
+def raw_log(duration: float = DURATION, rate: float = _LOG_RATE) -> dict[str, float]:
+    """Processor times [s] from a log in columns of text, and in units of the machine's slowness."""
+    hil = [sys.executable, "-m", "hil"]
+    with tempfile.TemporaryDirectory() as scratch:
+        folder = Path(scratch)
+        log, *halves = written_logs(folder, duration, rate)
+        fit = fitted(simulated_archive(folder, duration, rate)).seconds
+        arm = ["--urdf", str(urdf(_LOG_ARM.urdf))]
+        commands = {
+            "help": ["--help"],
+            "help_of_look": ["look", "--help"],
+            "look": ["look", str(log), *arm],
+            "identify": ["identify", str(log), *arm, "-o", str(folder / "whole")],
+            "identify_halves": ["identify", *map(str, halves), *arm, "-o", str(folder / "halves")],
+        }
+        seconds = {
+            name: usage([*hil, *command], accepted=(0, _NOT_GOOD)).seconds
+            for name, command in commands.items()
+        }
+    unit = fit / _FIT_SECONDS
+    figures = {"log_unit": round(unit, 2)}
+    for name, used in seconds.items():
+        figures[f"log_{name}_s"] = round(used, 2)
+        figures[f"log_{name}_units"] = round(used / unit, 2)
+    return figures

@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property
+from functools import cached_property, lru_cache
 from pathlib import Path
 from typing import Any, Final, Literal, TypeVar
 
@@ -82,11 +82,11 @@ class Cell:
 
     @classmethod
     def from_texts(cls, text: str, urdf: str, path: Path) -> Cell:
-        """Create a cell from its texts (as in an archive); `path` is for errors."""
-        cell = cls(path, text, urdf, _parse(path, text))
-        _ = cell.model
-        _check(cell)
-        return cell
+        """Create a cell from its texts (as in an archive); `path` is for errors.
+
+        Equal texts give the same cell, with the model that was built for it.
+        """
+        return _checked_cell(text, urdf, path)
 
     @property
     def name(self) -> str:
@@ -582,6 +582,14 @@ _MAY_BE_EMPTY = {"nominal.third", "limits.torque"} | {
     f"simulation.{name}" for name in ("elasticity", "inertia_scale")
 }
 _TURNING_ONLY = ("limits", "drive_train", "campaign", "simulation")
+
+
+@lru_cache(maxsize=16)  # every step from a log to its results asks for the cell of a recording
+def _checked_cell(text: str, urdf: str, path: Path) -> Cell:
+    cell = Cell(path, text, urdf, _parse(path, text))
+    _ = cell.model
+    _check(cell)
+    return cell
 
 
 def _check(cell: Cell) -> None:

@@ -243,7 +243,7 @@ def _readings(cell: Cell, samples: Samples, imported: ImportedRecording) -> Read
 def mountings(cell: Cell) -> dict[str, RobotModel]:
     """Return models of a cell with another gravity, by the mounting."""
     return {
-        name: physics.mounted(cell, gravity).model
+        name: cell.model.under_gravity(gravity)
         for name, gravity in physics.MOUNTINGS.items()
         if not np.allclose(gravity, cell.model.gravity)
     }

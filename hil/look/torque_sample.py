@@ -24,7 +24,7 @@ from identification.hypotheses.diagnosis import (
 )
 from identification.hypotheses.scores import Score, score_of
 from identification.signals.position_steps import PositionJump, position_steps
-from identification.signals.samples import Preprocessing, Samples, prepare
+from identification.signals.samples import Preprocessing, Samples, Smoothed, prepare
 
 SETTINGS: Final = Preprocessing(14.0, exclude_rows="rests")
 """Preparation of a recording whose readings are compared."""
@@ -121,11 +121,12 @@ def explained(archive: Archive) -> Explained | None:
     model = cell.model
     try:
         recording = source_of(archive, cell).recording
-        unfiltered = prepare(recording, model, options=SETTINGS)
+        motions: dict[Preprocessing, Smoothed] = {}
+        unfiltered = prepare(recording, model, options=SETTINGS, motions=motions)
         least = min(UNEXPLAINED, _EXPLAINED_ERROR_RATIO * score_of(model, unfiltered).overall)
         low_passes = possible_low_passes(recording, model, options=SETTINGS)
         for how in (*low_passes, SETTINGS):
-            samples = unfiltered if how is SETTINGS else prepare(recording, model, options=how)
+            samples = prepare(recording, model, options=how, motions=motions)
             for wide_rotors in (False, True) if how is not SETTINGS else (True,):
                 score = score_of(model, samples, wide_rotors=wide_rotors)
                 if 0.0 < score.overall < least and not score.driven.any():

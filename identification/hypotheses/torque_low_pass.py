@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from typing import Final
 
@@ -11,7 +11,7 @@ from identification.hypotheses.scores import Score, compare, score_of
 from identification.hypotheses.search import SEPARATE_SIGMAS, SURE_SIGMAS
 from identification.model.robot import RobotModel
 from identification.signals.recording import Recording
-from identification.signals.samples import Preprocessing, prepare
+from identification.signals.samples import Preprocessing, Smoothed, prepare
 
 _REVERSAL_SPEEDS: Final = (0.02, 0.08, 0.3)
 """Speeds of ``tanh(v / speed)`` that are tried first, rad/s or m/s."""
@@ -52,34 +52,43 @@ def torque_low_pass(
     candidates = possible_low_passes(recording, model, options=options)
     if not candidates:
         return None
-    scores = [_score(recording, model, how) for how in candidates]
+    motions: dict[Preprocessing, Smoothed] = {}
+
+    def score(options: Preprocessing, model: RobotModel = model) -> Score:
+        return score_of(model, prepare(recording, model, options=options, motions=motions))
+
+    scores = [score(how) for how in candidates]
     best = min(range(len(scores)), key=lambda index: scores[index].overall)
     settings, filtered = candidates[best], scores[best]
-    as_recorded = compare(filtered, _score(recording, model, options), model)
+    as_recorded = compare(filtered, score(options), model)
     if not (as_recorded.ratio < 1.0 and as_recorded.sigmas < -SEPARATE_SIGMAS):
         return None
-    rivals = (compare(filtered, rival, model) for rival in _rivals(recording, model, settings))
+    rivals = (compare(filtered, rival, model) for rival in _rivals(score, model, settings))
     confirmed = as_recorded.sigmas < -SURE_SIGMAS and all(
         rival.ratio < 1.0 and rival.sigmas < -SEPARATE_SIGMAS for rival in rivals
     )
     return TorqueLowPass(settings, confirmed)
 
 
-def _score(recording: Recording, model: RobotModel, options: Preprocessing) -> Score:
-    return score_of(model, prepare(recording, model, options=options))
+def _rivals(
+    score: Callable[..., Score], model: RobotModel, settings: Preprocessing
+) -> Iterator[Score]:
+    """Yield the scores of the lag alone, and of smooth reversals.
 
-
-def _rivals(recording: Recording, model: RobotModel, settings: Preprocessing) -> Iterator[Score]:
-    """Yield the scores of the lag alone, and of smooth reversals."""
+    Args:
+        score: of settings and, where it is not that of the arm, a model.
+        model: of the arm.
+        settings: with the low-pass.
+    """
     shape, bandwidth = settings.torque_shape, settings.torque_bandwidth
     assert bandwidth is not None
     unfiltered = replace(settings, torque_bandwidth=None)
     if shape.causal:
         late = settings.torque_delay + shape.lag(bandwidth)
-        yield _score(recording, model, replace(unfiltered, torque_delay=late))
+        yield score(replace(unfiltered, torque_delay=late))
 
     def reversing(speed: float) -> Score:
-        return _score(recording, model.with_friction(tanh=speed), unfiltered)
+        return score(unfiltered, model.with_friction(tanh=speed))
 
     scores = {speed: reversing(speed) for speed in _REVERSAL_SPEEDS}
     best = min(scores, key=lambda speed: scores[speed].overall)

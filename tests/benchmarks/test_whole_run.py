@@ -51,6 +51,16 @@ def test_the_whole_run_is_timed_against_the_ordinary_fit() -> None:
     assert min(figures.values()) > 0.0
 
 
+@pytest.mark.slow
+def test_a_raw_log_is_timed_in_units_of_the_machine() -> None:
+    figures = whole_run.raw_log(10.0, 100.0)
+    names = ("help", "help_of_look", "look", "identify", "identify_halves")
+    units = {f"log_{name}_units" for name in names}
+    assert figures.keys() == {"log_unit", *units, *(f"log_{name}_s" for name in names)}
+    assert min(figures.values()) > 0.0
+    assert figures["log_help_s"] < figures["log_look_s"] < figures["log_identify_s"]
+
+
 def test_the_ordinary_fit_as_a_program(tmp_path: Path) -> None:
     """Both parts of a log are predicted to a few times its noise, 1.4 % of the scatter."""
     archive = whole_run.simulated_archive(tmp_path, 10.0, 100.0)
