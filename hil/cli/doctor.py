@@ -13,7 +13,8 @@ from hil.base.progress import reporter, say
 from hil.cell import Cell
 from hil.cli.arguments import JsonOption, VerboseOption, print_json
 from hil.cli.verdict import EXIT_NOT_GOOD
-from hil.doctor.diagnosis import as_json, examine, show, summary
+from hil.doctor.diagnosis import examine
+from hil.doctor.messages import as_json, show, summary
 
 QUICK_SECONDS = 5.0
 

@@ -1,36 +1,25 @@
-"""All checks and measurements of a PC; output as text and as JSON."""
+"""All checks and measurements of a PC."""
 
 from __future__ import annotations
 
 import json
 import tempfile
 import time
-from collections.abc import Callable, Iterator, Sequence
-from dataclasses import asdict, dataclass
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 from numpy.typing import NDArray
-from rich.console import Console
-from rich.table import Table
-from rich.text import Text
 from scipy.special import gammaincinv
 
 from drivers.child_process import ChildProcess
 from drivers.exchange.realtime import RealTimeReport
 from hil.base.progress import Reporter
-from hil.base.terminal_text import printable
 
-from .checks import (
-    CheckStatus,
-    DiskTrial,
-    DoctorCheck,
-    System,
-    computer_checks,
-    disk_checks,
-    link_checks,
-)
+from .checks import DiskTrial, System, computer_checks, disk_checks, link_checks
+from .findings import CheckStatus, DoctorCheck, ProbeFailed
 
 if TYPE_CHECKING:
     from drivers.transports.base import TransportSpec
@@ -70,36 +59,43 @@ class Latency:
 
 
 JUDGED_CYCLES_MS: Final = (1, 2)
-CRITERIA: Final = (
-    "a cycle is fit if no cycle of the measurement was late, with"
-    f" {1e6 * REPLY_RESERVE_SECONDS:.0f} µs reserved for packet work and wire, and 99.9 % of the"
-    " latencies used at most half of this time"
-)
+MAX_SHARE_USED: Final = 0.5
+"""A cycle is fit if none of the measurement was late, with `REPLY_RESERVE_SECONDS` reserved for
+packet work and wire, and 99.9 % of the latencies used at most this share of it."""
 MIN_MEASURED_SECONDS: Final = 60.0
 """Time of measurement below which a verdict is provisional, s."""
 _CONFIDENCE: Final = 0.95
 
 
 @dataclass(frozen=True)
-class Fitness:
-    """The verdict on one cycle by `CRITERIA`; numbers are None if nothing was measured.
+class CycleEvidence:
+    """The latencies that decide on a cycle."""
 
-    `share_used` is the largest 99.9 % latency plus reserve over the cycle; `late_per_hour_upper_95`
-    is a one-sided 95 % bound for independent late cycles (Poisson).
+    worst: str  #: latency with the most late cycles
+    seconds: float  #: of its measurement [s]
+    longest: float  #: of its samples [s]
+    slow: str  #: latency with the largest 99.9 %
+    share_used: float  #: by that, plus reserve, of the cycle
+
+
+@dataclass(frozen=True)
+class Fitness:
+    """The verdict on one cycle; evidence and bound are None if nothing was measured.
+
+    `late_per_hour_upper_95` is a one-sided 95 % bound for independent late cycles (Poisson).
     """
 
     cycle_ms: int
     fit: bool
     late_cycles: int
-    share_used: float | None
     late_per_hour_upper_95: float | None
-    reason: str
+    evidence: CycleEvidence | None
 
 
 def judge(latencies: Sequence[Latency], cycle_ms: int) -> Fitness:
     """Return the verdict by the worst of the latencies; without any the cycle is not fit."""
     if not latencies:
-        return Fitness(cycle_ms, False, 0, None, None, "nothing was measured")
+        return Fitness(cycle_ms, False, 0, None, None)
     period = cycle_ms / 1000
     worst = max(latencies, key=lambda each: (each.late_cycles(period), each.percentile(100)))
     slow = max(latencies, key=lambda each: each.percentile(99.9))
@@ -108,20 +104,9 @@ def judge(latencies: Sequence[Latency], cycle_ms: int) -> Fitness:
     hours = worst.seconds / 3600.0
     # The mean at which a Poisson distribution gives `late` or fewer with 5 % probability.
     bound = float(gammaincinv(late + 1, _CONFIDENCE)) / hours
-    if late:
-        reason = (
-            f"{late} cycles late in {worst.seconds:.0f} s of {worst.name} (some "
-            f"{late / hours:.0f} an hour), the longest {1e3 * worst.samples.max():.1f} ms"
-        )
-    elif used > 0.5:
-        reason = f"none late, but {slow.name} uses {100 * used:.0f} % of the cycle at 99.9 %"
-    else:
-        reason = (
-            f"none late in {worst.seconds:.0f} s (fewer than {bound:.0f} an hour, with 95 % "
-            f"confidence); {100 * used:.0f} % of the cycle used at 99.9 %"
-        )
-    fit = not late and used <= 0.5
-    return Fitness(cycle_ms, fit, late, round(used, 4), round(bound, 4), reason)
+    longest = float(worst.samples.max())
+    evidence = CycleEvidence(worst.name, worst.seconds, longest, slow.name, used)
+    return Fitness(cycle_ms, not late and used <= MAX_SHARE_USED, late, bound, evidence)
 
 
 TURNAROUND_PERIOD = 1e-3
@@ -202,33 +187,17 @@ class Diagnosis:
     @property
     def fit(self) -> bool:
         """Whether the cycle is fit and no check is bad."""
-        return self.cycle_fit and not self._bad
+        return self.cycle_fit and not self.bad
 
     @property
-    def _bad(self) -> list[str]:
-        return [check.name for check in self.checks if check.status is CheckStatus.BAD]
+    def bad(self) -> list[DoctorCheck]:
+        """Checks that failed."""
+        return [check for check in self.checks if check.status is CheckStatus.BAD]
 
     @property
     def provisional(self) -> bool:
         """Whether the measurement was too short for a reliable verdict."""
         return self.seconds < MIN_MEASURED_SECONDS
-
-    @property
-    def line(self) -> str:
-        """The verdict in one or two sentences."""
-        fit_at_1_ms, fit_at_2_ms = (verdict.fit for verdict in self.cycles[:2])
-        text = "2 ms is fit; 1 ms is not." if fit_at_2_ms else "Neither 1 ms nor 2 ms is fit."
-        if fit_at_1_ms:  # and then 2 ms is
-            text = "1 ms is fit, and so is 2 ms."
-        if self.fit:
-            text += f" This PC can answer a controller at {self.cycle_ms} ms."
-        elif self.cycle_fit:
-            text += f" But the link will not work: {', '.join(self._bad)}."
-        else:
-            text += f" Do not connect an arm at {self.cycle_ms} ms."
-        if self.provisional:
-            text += f" Provisional: measured for {self.seconds:g} s; at least 60 s are needed."
-        return text
 
 
 def examine(
@@ -256,112 +225,11 @@ def examine(
     ]
     periods = {"wake-up": cycle_ms / 1000, "turnaround": TURNAROUND_PERIOD}
     measured = {name: measure(name, each, seconds, reporter) for name, each in periods.items()}
-    command = ("python -m hil.doctor.probe permissions   # prints the error",)
     checks += [
-        DoctorCheck(f"{name} latency", CheckStatus.BAD, "the probe failed", command)
+        DoctorCheck(CheckStatus.BAD, ProbeFailed(name))
         for name, latency in measured.items()
         if latency is None
     ]
     latencies = tuple(latency for latency in measured.values() if latency is not None)
     cycles = tuple(judge(latencies, cycle) for cycle in sorted({*JUDGED_CYCLES_MS, cycle_ms}))
     return Diagnosis(tuple(checks), latencies, cycles, cycle_ms, seconds)
-
-
-_COLOUR = {
-    CheckStatus.OK: "green",
-    CheckStatus.WARN: "yellow",
-    CheckStatus.BAD: "red",
-    CheckStatus.UNKNOWN: "blue",
-}
-_OTHERWISE = (
-    "switch off C-states, frequency stepping and hyper-threading in the firmware set-up (BIOS); "
-    "isolate a processor; {}use another PC."
-)
-
-
-def show(diagnosis: Diagnosis, console: Console) -> None:
-    """Print checks, latencies, verdict and remedies."""
-    table = Table(box=None, pad_edge=False)
-    for title in ("check", "", "found"):
-        table.add_column(title, overflow="fold")
-    for check in diagnosis.checks:
-        status = Text(check.status, style=_COLOUR[check.status])
-        table.add_row(Text(check.name), status, Text(printable(check.facts)))
-    console.print(table)
-    lines = [
-        f"{latency.name} [µs]: "
-        + ", ".join(
-            f"{name.removesuffix('_us')} {value:g}" for name, value in latency.summary().items()
-        )
-        for latency in diagnosis.latencies
-    ]
-    lines += fitness_lines(diagnosis.cycles)
-    first = [*remedies(diagnosis.checks)]
-    lines += [f"({CRITERIA})", *first]
-    if not diagnosis.cycle_fit:
-        case = "If it is still not fit after that" if first else "To make it fit"
-        otherwise = _OTHERWISE.format("use 2 ms; " if diagnosis.cycles[1].fit else "")
-        lines.append(f"\n{case}: {otherwise}")
-    for line in (*lines, ""):
-        console.print(printable(line), markup=False, highlight=False, soft_wrap=True)
-    style = "bold green" if diagnosis.fit else "bold red"
-    console.print(Text(printable(diagnosis.line), style=style), soft_wrap=True)
-
-
-def fitness_lines(verdicts: Sequence[Fitness]) -> list[str]:
-    """Return a line for each verdict; cycles with the same verdict and reason share one."""
-    cycles: dict[tuple[bool, str], list[str]] = {}
-    for verdict in verdicts:
-        cycles.setdefault((verdict.fit, verdict.reason), []).append(str(verdict.cycle_ms))
-    return [
-        f"{' and '.join(alike)} ms: {'fit' if fit else 'not fit'}; {reason}"
-        for (fit, reason), alike in cycles.items()
-    ]
-
-
-def summary(diagnosis: Diagnosis) -> list[str]:
-    """Return the verdict, the checks that are not passed with their first remedy, and latencies."""
-    worst_first = sorted(diagnosis.checks, key=lambda check: _STATUS_ORDER.index(check.status))
-    failed = [check for check in worst_first if check.status is not CheckStatus.OK]
-    lines = [diagnosis.line]
-    for check in failed:
-        lines.append(f"{check.status}: {check.name}: {check.facts}")
-        lines += [f"    {command}" for command in check.remedy[:1]]
-    for latency in diagnosis.latencies:
-        half, most, longest = (1e6 * latency.percentile(p) for p in (50.0, 99.9, 100.0))
-        lines.append(
-            f"{latency.name}: half within {half:.0f} µs, 99.9 % within {most:.0f} µs, all within"
-            f" {longest:.0f} µs"
-        )
-    lines += fitness_lines(diagnosis.cycles)
-    passed = [check.name for check in diagnosis.checks if check.status is CheckStatus.OK]
-    return [*lines, *([f"ok: {', '.join(passed)}"] if passed else [])]
-
-
-_STATUS_ORDER: Final = (CheckStatus.BAD, CheckStatus.WARN, CheckStatus.UNKNOWN, CheckStatus.OK)
-
-
-def remedies(checks: Sequence[DoctorCheck]) -> Iterator[str]:
-    """Yield the commands of each check with a remedy, worst first, each command once."""
-    given: set[str] = set()
-    for status in (CheckStatus.BAD, CheckStatus.WARN, CheckStatus.UNKNOWN):
-        for check in checks:
-            if check.status is status and check.remedy:
-                yield f"\n{check.name} ({status}):"
-                yield from (f"    {command}" for command in check.remedy if command not in given)
-                given.update(check.remedy)
-
-
-def as_json(diagnosis: Diagnosis) -> dict[str, object]:
-    """Return all results; the keys are stable."""
-    return {
-        "fit": diagnosis.fit,
-        "provisional": diagnosis.provisional,
-        "cycle_ms": diagnosis.cycle_ms,
-        "verdict": diagnosis.line,
-        "criteria": CRITERIA,
-        "seconds": diagnosis.seconds,
-        "cycles": [asdict(verdict) for verdict in diagnosis.cycles],
-        "latency": {each.name: each.summary() for each in diagnosis.latencies},
-        "checks": [asdict(check) for check in diagnosis.checks],
-    }

@@ -27,7 +27,7 @@ NOT_OF_HIL = (
     "hil/study/page.py",
     "hil/fleet/trend_page.py",
     "hil/cli/suggestions.py",
-    "hil/doctor/checks.py",
+    "hil/doctor/messages.py",
 )
 """Variables of a style sheet, misspelt options, commands of the system."""
 

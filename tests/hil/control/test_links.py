@@ -15,7 +15,8 @@ from hil.cell import Cell
 from hil.cell.schema import LINKS, CanTable, ControllerTable
 from hil.control.simulated_cell import controller_settings
 from hil.control.simulator_on_link import open_controller_link
-from hil.doctor.checks import CheckStatus, DoctorCheck, System, link_checks
+from hil.doctor.checks import System, link_checks
+from hil.doctor.findings import CheckStatus, DoctorCheck, UncheckedLink
 from sim_fixtures.ns16 import CELL_PATH
 
 CELL = Cell.load(CELL_PATH).with_link(cycle_ms=2)
@@ -68,7 +69,7 @@ class TestLinks:
         monkeypatch.setitem(LINKS, "udp", link)
         cell = CELL.with_link(transport="udp", host="127.0.0.1")
         assert not cell.only_simulated
-        unknown = DoctorCheck("controller link", CheckStatus.UNKNOWN, "not checked: the controller")
+        unknown = DoctorCheck(CheckStatus.UNKNOWN, UncheckedLink("the controller"))
         assert link_checks(cell.link_spec, System()) == [unknown]
 
     @pytest.mark.parametrize(

@@ -23,7 +23,8 @@ from hil.control.live_link import LiveLink
 from hil.control.motion_watch import Stop
 from hil.control.move import plan_move, send
 from hil.control.ur_simulation import served_arm
-from hil.doctor.checks import CheckStatus, System, link_checks
+from hil.doctor.checks import System, link_checks
+from hil.doctor.findings import CheckStatus, RtdeReply
 from sim_fixtures.ur import CELL_PATH, UrServer
 
 pytestmark = pytest.mark.safety
@@ -108,8 +109,8 @@ def test_registers_of_another_program_are_not_taken(served) -> None:
 def test_the_doctor_asks_the_controller_for_its_version(served) -> None:
     cell, _ = served
     (check,) = link_checks(cell.link_spec, System())
-    assert (check.name, check.status) == ("RTDE", CheckStatus.OK)
-    assert "5.15.2.0" in check.facts
+    assert isinstance(check.found, RtdeReply) and check.status is CheckStatus.OK
+    assert check.found.version == "5.15.2.0"
     wrong = cell.with_values({"controller.rtde.port": cell.controller.rtde.dashboard_port})
     (check,) = link_checks(wrong.link_spec, System())
     assert check.status is CheckStatus.BAD

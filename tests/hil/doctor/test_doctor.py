@@ -28,29 +28,28 @@ from hil.base.progress import Silent
 from hil.cli import app
 from hil.doctor import checks as system_checks
 from hil.doctor import probe
-from hil.doctor.checks import (
-    CheckStatus,
-    DiskTrial,
-    DoctorCheck,
-    System,
-    disk_checks,
-    route_check,
-    try_port,
-)
+from hil.doctor.checks import DiskTrial, System, disk_checks, route_check, try_port
 from hil.doctor.diagnosis import (
     REPLY_RESERVE_SECONDS,
+    CycleEvidence,
     Diagnosis,
     Fitness,
     Latency,
-    as_json,
     disk_trial,
     examine,
-    fitness_lines,
     judge,
     measure,
     run_probe,
-    show,
 )
+from hil.doctor.findings import (
+    CheckStatus,
+    DiskRefused,
+    DoctorCheck,
+    Governors,
+    NoLink,
+    Port,
+)
+from hil.doctor.messages import as_json, check_words, fitness_lines, line_of, reason_of, show
 from sim_fixtures.ns16 import CELL_PATH
 
 samples = st.lists(st.floats(0.0, 0.01), min_size=1, max_size=50)
@@ -84,26 +83,29 @@ def test_cycles_are_judged_by_late_and_by_usual_latency() -> None:
     assert quiet.fit
     # A mean of ln 20 = 2.996 late cycles in 60 s shows none with 5 % probability.
     assert quiet.late_per_hour_upper_95 == pytest.approx(60 * np.log(20), abs=1e-4)
-    assert "fewer than 180 an hour" in quiet.reason
+    assert "fewer than 180 an hour" in reason_of(quiet)
     rare = judge([latency(*np.full(60_000, 60e-6), 1.2e-3)], 1)
     assert not rare.fit
     assert rare.late_cycles == 1
-    assert "some 60 an hour" in rare.reason
+    assert "some 60 an hour" in reason_of(rare)
     # (1 + m) exp(-m) = 5 % for m = 4.744: the bound lies well above what was seen.
     assert rare.late_per_hour_upper_95 == pytest.approx(60 * 4.744, rel=1e-3)
     slow = judge([latency(*np.full(1000, 450e-6))], 1)
     assert (slow.fit, slow.late_cycles) == (False, 0)
-    assert "55 % of the cycle" in slow.reason
+    assert slow.evidence.share_used == pytest.approx(0.55)
+    assert "55 % of the cycle" in reason_of(slow)
 
 
-PORT = DoctorCheck("UDP port 1000", CheckStatus.BAD, "in use [by] a", ("sudo ss -lunp",))
+PORT = DoctorCheck(CheckStatus.BAD, Port(FreePort("10.1.1.1", 1000, "UDP"), errno.EADDRINUSE))
 
 
 def diagnosis(
     *checks: DoctorCheck, fit: bool = True, fit_at_2: bool = True, seconds: float = 60.0
 ) -> Diagnosis:
     one_ms, two_ms = (
-        Fitness(cycle, is_fit, 0, 0.1, 0.0, "for a reason")
+        Fitness(
+            cycle, is_fit, 0, 0.0, CycleEvidence("turnaround", seconds, 3e-3, "turnaround", 0.1)
+        )
         for cycle, is_fit in ((1, fit), (2, fit_at_2))
     )
     measured = (latency(50e-6, 3e-3, length=seconds),)
@@ -125,7 +127,7 @@ def test_a_cycle_of_2_ms_is_advised_only_where_it_is_fit(fit_at_1: bool, fit_at_
 
 def test_the_last_remedy_follows_others_only_where_some_are() -> None:
     assert "If it is still not fit" not in page(diagnosis(fit=False))
-    bad = DoctorCheck("disk", CheckStatus.BAD, "slow", ("use another disk",))
+    bad = DoctorCheck(CheckStatus.BAD, DiskRefused("/d", ""))
     assert "If it is still not fit after that: switch off C-states" in page(
         diagnosis(bad, fit=False)
     )
@@ -133,11 +135,11 @@ def test_the_last_remedy_follows_others_only_where_some_are() -> None:
 
 def test_a_bad_check_makes_a_fast_pc_unfit_and_is_named() -> None:
     assert diagnosis(
-        *(DoctorCheck("x", status, "y") for status in CheckStatus if status is not CheckStatus.BAD)
+        *(DoctorCheck(status, NoLink()) for status in CheckStatus if status is not CheckStatus.BAD)
     ).fit
     unfit = diagnosis(PORT)
     assert not unfit.fit
-    assert "UDP port 1000" in unfit.line
+    assert "UDP port 1000" in line_of(unfit)
 
 
 @pytest.mark.parametrize(("fit", "seconds", "status"), [
@@ -155,16 +157,17 @@ def test_the_exit_status_is_0_only_for_a_reliable_fit(
 
 
 def test_page_and_json_agree_and_remedies_come_worst_first() -> None:
-    slow = DoctorCheck("slow", CheckStatus.WARN, "", ("make it fast",))
+    slow = DoctorCheck(CheckStatus.WARN, Governors(("[by] hand",)))
     made = diagnosis(slow, PORT, PORT)
     text = page(made)
     document = json.loads(json.dumps(as_json(made)))
-    assert "in use [by] a" in text
+    assert "[by] hand" in text
     assert "p50 50" in text and "max 3000" in text
     commands = [line.strip() for line in text.splitlines() if line.startswith("    ")]
-    assert commands == ["sudo ss -lunp", "make it fast"]  # each once
+    remedies = [command for check in (PORT, slow) for command in check_words(check).remedy]
+    assert commands == remedies  # each once
     assert document["fit"] is False
-    assert document["checks"][1]["remedy"] == ["sudo ss -lunp"]
+    assert document["checks"][1]["remedy"] == list(check_words(PORT).remedy)
     assert document["latency"]["turnaround"]["late_cycles_1ms"] == 3
     nothing = judge([], 1)
     assert (nothing.fit, nothing.late_per_hour_upper_95) == (False, None)
@@ -262,7 +265,7 @@ def test_the_command_sends_the_controller_nothing(tmp_path: Path) -> None:
 def test_every_remedy_is_valid_shell(tmp_path: Path) -> None:
     examined = examine(UdpSpec("10.99.99.99", 999), 1, 0.1, tmp_path, Silent())
     for check in examined.checks:
-        for command in check.remedy:
+        for command in check_words(check).remedy:
             checked = subprocess.run(["bash", "-n", "-c", command], capture_output=True, text=True)
             assert checked.returncode == 0, (command, checked.stderr)
 
@@ -392,7 +395,8 @@ def test_what_is_found_is_judged(
 ) -> None:
     check = judge(MadeUp(tmp_path, files, commands))
     assert check.status is status
-    assert word in "\n".join([check.facts, *check.remedy])
+    words = check_words(check)
+    assert word in "\n".join([words.facts, *words.remedy])
 
 
 @pytest.mark.parametrize(
