@@ -82,7 +82,7 @@ def without(choice: str) -> Iterator[None]:
     ) -> SettingDecision:
         if name not in left_out:
             return usual()
-        return SettingDecision(_first(name, candidates), Choice(name, ("left out",), (), 0))
+        return SettingDecision(_first(name, candidates), Choice(name, (), (), 0))
 
     with decided_by(first):
         yield

@@ -16,6 +16,8 @@ from hil.archive import Archive
 from hil.base.arrays import Array
 from hil.base.errors import ArchiveError
 from hil.base.files import json_digest
+from hil.pipeline.note_messages import note_lines
+from hil.pipeline.notes import MergedSamples
 from hil.pipeline.other_meanings import in_a_sentence, other_meanings
 from hil.pipeline.prepared import known_parameters, reduction_of, versions_of
 from hil.pipeline.sources import Source, known_warnings, source_of
@@ -152,9 +154,9 @@ def reduced_archive(wanted: ToReduce, settings: Settings) -> tuple[Summary, Redu
         fit = fit_least_squares(model, versions[:1], factor=factor)
         prior = body_prior(model, factor, stated=known_parameters(cell))
         scatter = ScoreScatter.of(factor, prior.gaussian)
-    warnings = [*known_warnings(cell, archive), *archive.header.findings.warnings]
-    if source.merged:
-        warnings.append(source.merged)
+    merged = [MergedSamples(source.merged)] if source.merged else []
+    sentences = note_lines(known_warnings(cell, archive))
+    warnings = [*sentences, *archive.header.findings.warnings, *note_lines(merged)]
     if is_fitted and (archive.kind == "imported" or wanted.unmodelled):
         warnings += _other_meanings(model, versions[0], source, ref.origin)
     if archive.outcome is not None and archive.outcome.repaired:

@@ -15,6 +15,8 @@ from hil.base.arrays import Array
 from hil.cell import Cell
 from hil.pipeline.estimating import posterior_of
 from hil.pipeline.estimators import fit_of
+from hil.pipeline.note_messages import note_lines
+from hil.pipeline.notes import PoorlySeparated, UnrestrictedBodies
 from identification import IdentificationError
 from identification.estimators.consistent import SolverError
 from identification.estimators.covariance import solve_with_prior
@@ -285,8 +287,10 @@ class Estimator:
         prior = posterior_of(self.cell, total, self.name, self._strength)
         if self.name != "auto":
             return prior, []
-        posterior, _, notes = prior.solved(total)
-        return posterior, notes
+        posterior, _, unsolved = prior.solved(total)
+        return posterior, [] if unsolved is None else note_lines(
+            [UnrestrictedBodies(str(unsolved))]
+        )
 
     def of_archive(self, summary: Summary, posterior: Posterior, share: float) -> Estimate:
         """Return the estimate from one archive, this share of the archives of the posterior.
@@ -401,12 +405,8 @@ class Estimator:
         unseen = Factor.zero(self.model) if group.unseen is None else group.unseen
         is_poor = not estimate.undetermined and estimate.condition > MAX_GRAM_CONDITION
         if self.name != "auto" and is_poor:
-            conditioning = (
-                f"the scaled condition number is {estimate.condition:.2g}: the motion separates"
-                " some parameters poorly, and sums of squares lose digits there; `hil identify` on"
-                " these archives uses QR"
-            )
-            warnings = (conditioning, *warnings)
+            poor = PoorlySeparated(estimate.condition, from_sums=True)
+            warnings = (*note_lines([poor]), *warnings)
         return BatchEstimate(
             level=level,
             arm=refs[0].arm,

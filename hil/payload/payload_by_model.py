@@ -9,8 +9,8 @@ from pathlib import Path
 from hil.archive import open_archive
 from hil.base.errors import ArchiveError, InputError
 from hil.base.progress import Reporter
-from hil.pipeline.cell_context import torque_scale
 from hil.pipeline.estimating import Estimation, estimate_with
+from hil.pipeline.note_messages import note_lines
 from hil.pipeline.options import Options
 from hil.pipeline.other_meanings import in_a_sentence, require_weight
 from hil.pipeline.prepared import Prepared, prepare_sources, samples_of
@@ -21,6 +21,7 @@ from hil.pipeline.sources import (
     gather_sources,
     refuse_duplicates,
 )
+from hil.pipeline.torque_scale import torque_scale
 from identification.estimators.payload_problem import KnownArm, Run
 
 from .payload_run import (
@@ -90,6 +91,7 @@ def weigh_by_model(
     estimate, body = weighed(
         cell.model, runs, scale, frame, sides, others.training, contradictions, known_arm
     )
+    sentences = note_lines((*prepared.sources.warnings, *others.warnings))
     return PayloadFound(
         estimate=replace(estimate, method=f"{estimate.method}, against the model of the arm"),
         body=body,
@@ -102,7 +104,7 @@ def weigh_by_model(
         otherwise=otherwise,
         typed=((), tuple(loaded)),
         with_currents=all(recording.motor_current is not None for recording in recordings),
-        warnings=tuple(dict.fromkeys((*prepared.sources.warnings, *others.warnings, *doubtful))),
+        warnings=tuple(dict.fromkeys((*sentences, *doubtful))),
     )
 
 

@@ -16,7 +16,7 @@ from hil.base.errors import ArchiveError, InputError
 from hil.base.one_screen import columns
 from hil.base.progress import Reporter
 from hil.cell.cell import FLANGES
-from hil.pipeline.cell_context import TorqueScale, torque_scale
+from hil.pipeline.note_messages import SCALE_SOURCES, note_lines, scale_words, scaled_words
 from hil.pipeline.options import Options
 from hil.pipeline.other_meanings import in_a_sentence, require_weight
 from hil.pipeline.prepared import Prepared, prepare_sources, samples_of
@@ -29,6 +29,7 @@ from hil.pipeline.sources import (
     gather_sources,
     refuse_duplicates,
 )
+from hil.pipeline.torque_scale import TorqueScale, torque_scale
 from identification.estimators.payload_estimate import (
     NAMES,
     PayloadEstimate,
@@ -184,7 +185,7 @@ class PayloadFound:
             f" {high:.4g} kg), its centre of mass is at {centre} mm in the frame {self.frame};"
             f" its weight loads the flange with up to {torque[0]:.3g} N·m"
             f" ({torque[1]:.3g} to {torque[2]:.3g}).",
-            f"The intervals are computed {self.scale.message}.",
+            f"The intervals are computed {scale_words(self.scale)}.",
         ]
         ambiguous = [
             name
@@ -282,8 +283,8 @@ class PayloadFound:
             "impossible": list(estimate.impossible),
             "torque_uncertainty": {
                 "std": self.scale.std.tolist(),
-                "of": self.scale.of,
-                "source": self.scale.source,
+                "of": scaled_words(self.scale),
+                "source": SCALE_SOURCES[self.scale.source],
             },
             "mounting": self.mounting,
             "otherwise": list(self.otherwise),
@@ -360,7 +361,8 @@ def find_payload(
         estimate, body = weighed(cell.model, runs, scale, frame, sides, training, contradictions)
         task.advance(1)
     doubtful = [in_a_sentence(each) for each in meanings if each.level != "wrong"]
-    warnings = (*prepared.sources.warnings, *by_side[True].warnings, *doubtful)
+    sentences = note_lines((*prepared.sources.warnings, *by_side[True].warnings))
+    warnings = (*sentences, *doubtful)
     return PayloadFound(
         estimate=estimate,
         body=body,

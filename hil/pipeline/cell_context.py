@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-import json
 from collections import Counter
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
@@ -16,16 +14,13 @@ from hil.cell import Cell
 from hil.cell.nominal import nominal_of
 from hil.cell.toml_edits import urdf_limits
 from identification.estimators.torque_channel import torque_noiseless_above
-from identification.estimators.torque_scale import TORQUE_CONSTANT_STD, described
 from identification.factor.estimate import Estimate
 from identification.model.friction import TERMS, FrictionLaw
 from identification.selection.questions import FRICTION_AT_SPEED, LOAD, LOW_PASS, REVERSAL
-from identification.signals.angle_wraps import (
-    UNWRAPPED,
-)
-from identification.signals.masks import SATURATED, SPIKE, UNMEASURED
+from identification.signals.angle_wraps import UNWRAPPED
+from identification.signals.masks import RowReason
 from identification.signals.position_steps import PositionJump, position_steps
-from identification.signals.recording import MIN_MOVEMENT, Recording
+from identification.signals.recording import MIN_MOVEMENT
 from identification.signals.samples import Samples
 from identification.validation.controller_inertia import InertiaRatio, inertia_ratio
 from identification.validation.evidence import CellContext
@@ -40,11 +35,11 @@ from identification.validation.finding import (
 from identification.validation.nominal_scale import nominal_scale
 from identification.validation.prediction import PredictionError, pooled_error
 from identification.validation.residuals import folded_noise
-from planner.arrays import numbers
 
 from .prepared import Prepared
 from .recorded_rows import commanded_positions, faulty_rows, retimed, row_counters
 from .sources import Source, Sources, has_commands_as_positions
+from .torque_scale import TorqueScale, torque_scale
 
 _MAX_POSTURES = 500
 _TIME_TOLERANCE = 1e-6  # s
@@ -121,7 +116,7 @@ def cell_context_of(prepared: Prepared, estimate: Estimate) -> CellContext:
     sources = prepared.sources
     recorded = sources.training if sources.in_sample else (*sources.training, *sources.held_out)
     driven = cell.file.drive_train is not None
-    saturated = prepared.masked.get(SATURATED)
+    saturated = prepared.masked.get(RowReason.SATURATED)
     nominal = nominal_of(cell)
     steps = [position_steps(source.recording, source.name) for source in recorded]
     return CellContext(
@@ -193,7 +188,7 @@ def _doubtful(key: FindingKey, remedy: RemedyKey, **values: Value) -> Finding:
 
 def _spikes(prepared: Prepared) -> Iterator[Finding]:
     """Yield a finding about samples of torque that stand out alone."""
-    counts = prepared.masked.get(SPIKE)
+    counts = prepared.masked.get(RowReason.SPIKE)
     if counts is None or not counts.any():
         return
     found = _doubtful("spikes", "check for damaged packets", rows=prepared.rows)
@@ -202,7 +197,7 @@ def _spikes(prepared: Prepared) -> Iterator[Finding]:
 
 def _unmeasured(prepared: Prepared) -> Iterator[Finding]:
     """Yield a finding about joints that move, and whose torque is zero throughout."""
-    counts = prepared.masked.get(UNMEASURED)
+    counts = prepared.masked.get(RowReason.UNMEASURED)
     if counts is None or not counts.any():
         return
     recorded = (*prepared.sources.training, *prepared.sources.held_out)
@@ -380,57 +375,7 @@ def torque_limits(cell: Cell) -> Array | None:
     return None if np.isnan(limits).all() else limits
 
 
-@dataclass(frozen=True, eq=False)
-class TorqueScale:
-    """Uncertainty of the scale of torques, common to all recordings of an arm."""
-
-    std: Array  #: relative standard deviation of each joint (n,)
-    of: str  #: what has it: "torque constants", or "the scale of the recorded torques"
-    source: str  #: where it is from
-
-    @property
-    def message(self) -> str:
-        """What is assumed, such as "assuming torque constants to 3 %"."""
-        if not self.std.any():
-            return f"assuming exact torques ({self.source})"
-        return f"assuming {described(self.std, self.of)} (standard deviation; {self.source})"
-
-
 def torque_scale_of(sources: Sources) -> TorqueScale:
     """Return the uncertainty of the torques of the fitted recordings."""
     recordings = [source.recording for source in sources.training]
     return torque_scale(sources.cell, recordings, simulated=sources.header.only_simulated)
-
-
-def torque_scale(cell: Cell, recordings: Sequence[Recording], *, simulated: bool) -> TorqueScale:
-    """Return the uncertainty of the torques of recordings, of the worst where they differ.
-
-    That of the column map comes first, then that of the cell. The torques of a simulated arm
-    (`simulated`: only one can have moved) are exact: its currents are made with the torque
-    constants of the cell. A controller's own currents and imported ones have torque constants of a
-    data sheet unless something else is stated, and joint torque sensors are no better
-    (`identification.estimators.torque_scale.TORQUE_CONSTANT_STD`).
-    """
-    n = len(cell.joint_names)
-    drives = cell.file.drive_train
-    with_currents = any(recording.motor_current is not None for recording in recordings)
-    of = "torque constants" if with_currents else "the scale of the recorded torques"
-    mapped = [recording.provenance.get("torque_uncertainty") for recording in recordings]
-    in_cell = cell.file.robot.torque_uncertainty
-    table = "[robot]"
-    if drives is not None and drives.torque_uncertainty is not None:
-        in_cell = drives.torque_uncertainty
-        table = "[drive_train]"
-    if in_cell is not None:
-        base = np.broadcast_to(np.asarray(in_cell, dtype=np.float64), n)
-        source = f"torque_uncertainty of {table} in the cell file"
-    elif simulated:
-        base = np.zeros(n)
-        source = "a simulated arm"
-    else:
-        base = np.full(n, TORQUE_CONSTANT_STD)
-        source = "of a data sheet, as no torque_uncertainty is stated"
-    if any(entry is not None for entry in mapped):
-        stds = [base if text is None else numbers(json.loads(text), 1) for text in mapped]
-        return TorqueScale(np.max(stds, axis=0), of, "torque_uncertainty of the column map")
-    return TorqueScale(np.array(base), of, source)

@@ -33,14 +33,27 @@ from identification.reduction.posterior import Posterior
 from identification.reduction.reduction import Reduction
 from identification.selection.settings import Settings, Strength
 from identification.signals.samples import Samples
-from identification.text import duration_text, joined, number, percentage
+from identification.text import duration_text
 from identification.validation.calibration import Refit
 
-from .cell_context import TorqueScale, torque_scale_of
+from .cell_context import torque_scale_of
 from .estimators import OF_PRIOR, Estimator, fit_of, values_of
+from .notes import (
+    ElasticGears,
+    IntervalUnits,
+    LoadNotConverged,
+    ManyOutliers,
+    Note,
+    PoorlySeparated,
+    PriorContradicted,
+    ReweightingNotConverged,
+    UnrestrictedBodies,
+    WeakInstruments,
+)
 from .options import Options
 from .prepared import MAX_RECORDINGS, Prepared, known_parameters, samples_of
 from .sources import Sources
+from .torque_scale import TorqueScale
 
 # Hz. A narrower smoother removes part of the motion from the regressor, a bias that instruments
 # cannot correct. On simulated NS 16 logs with 100 to 1000 times the encoder noise, instrumental
@@ -67,11 +80,11 @@ class Estimation:
     #: estimate with that prior, which is the result of "auto" and "prior"
     with_prior: PosteriorEstimate
     refit: Refit  #: parameters by the estimator from a factor, to predict parts of the fitted rows
-    warnings: tuple[str, ...]
+    warnings: tuple[Note, ...]
     #: the pooled result, with the uncertainty of elastic gears in its covariance, and its change by
     #: the scale of the torques: no residual shows what they do to parameters
     stated: Estimate
-    notes: tuple[str, ...]  #: what the intervals assume
+    notes: tuple[Note, ...]  #: what the intervals assume
     form: FormUncertainty | None  #: whether the friction law lacks a term
 
 
@@ -114,11 +127,7 @@ def with_transmitted_load(prepared: Prepared) -> Prepared:
     carrying = prepared.with_load(loaded.result.values)
     notes = prepared.notes
     if not loaded.converged:
-        change = percentage(loaded.change, 1)
-        notes += (
-            f"the friction that grows with load still changed the torque by {change} in pass"
-            f" {loaded.passes}",
-        )
+        notes += (LoadNotConverged(loaded.change, loaded.passes),)
     return replace(carrying, fitted=loaded.samples, notes=notes)
 
 
@@ -155,7 +164,7 @@ def estimate_with(
         precision = posterior.precision if name in OF_PRIOR else None
         if name in OF_PRIOR:
             result = _posterior(model, posterior, beside.estimate, factors)
-            warnings = unsolved
+            warnings: list[Note] = [] if unsolved is None else [UnrestrictedBodies(str(unsolved))]
         else:
             result, warnings = _without_prior(prepared, name)
         if prepared.sources.same_motion:
@@ -185,15 +194,12 @@ def estimate_with(
     )
 
 
-def _interval_notes(cell: Cell, scale: TorqueScale) -> tuple[str, ...]:
+def _interval_notes(cell: Cell, scale: TorqueScale) -> tuple[Note, ...]:
     """Return what the intervals assume."""
-    units = (
-        "the intervals of the parameters are in units of the torque of this arm; absolute ones are"
-        f" computed {scale.message}"
-    )
+    units = IntervalUnits(scale)
     if cell.file.drive_train is None:  # positions may be measured behind the gears
         return (units,)
-    return units, "they allow for elastic gears between motors and links"
+    return units, ElasticGears()
 
 
 def posterior_of(cell: Cell, factor: Factor, name: str, strength: Strength) -> Posterior:
@@ -217,7 +223,7 @@ def posterior_of(cell: Cell, factor: Factor, name: str, strength: Strength) -> P
     return Posterior.of(cell.model, factor, share, known_parameters(cell), strength)
 
 
-def _without_prior(prepared: Prepared, name: Estimator) -> tuple[RepeatedEstimate, list[str]]:
+def _without_prior(prepared: Prepared, name: Estimator) -> tuple[RepeatedEstimate, list[Note]]:
     """Fit by an estimator that has no prior; return its warnings as well."""
     model = prepared.sources.cell.model
     fitted = prepared.fitted
@@ -230,13 +236,10 @@ def _without_prior(prepared: Prepared, name: Estimator) -> tuple[RepeatedEstimat
     return result, warnings + _poorly_separated(result.pooled)
 
 
-def _poorly_separated(estimate: Estimate) -> list[str]:
+def _poorly_separated(estimate: Estimate) -> list[Note]:
     if estimate.undetermined or estimate.condition <= MAX_GRAM_CONDITION:
         return []
-    return [
-        f"the scaled condition number is {number(estimate.condition, 2)}: the motion separates some"
-        " parameters poorly (solved by QR)"
-    ]
+    return [PoorlySeparated(estimate.condition)]
 
 
 def _require_usable_rows(prepared: Prepared) -> None:
@@ -271,7 +274,7 @@ def _posterior(
 
 def _by_factor(
     model: RobotModel, fitted: Sequence[Samples], name: Estimator
-) -> tuple[RepeatedEstimate, list[str]]:
+) -> tuple[RepeatedEstimate, list[Note]]:
     try:
         # The scatter over repetitions shows noise; least squares is enough for it.
         fit = fit_of(model, "wls" if name == "consistent" else name)
@@ -294,7 +297,7 @@ _LOSSES: Final[dict[str, Loss]] = {"huber": Huber(), "tukey": Tukey()}
 
 def _robust(
     model: RobotModel, fitted: Sequence[Samples], name: str
-) -> tuple[RepeatedEstimate, list[str]]:
+) -> tuple[RepeatedEstimate, list[Note]]:
     fits: list[RobustEstimate] = []
 
     def fit(some: Sequence[Samples], total: Factor) -> Estimate:
@@ -303,26 +306,21 @@ def _robust(
 
     result = estimate_repetitions(model, fitted, fit)
     of_all = fits[0]
-    warnings = [
-        f"{percentage(of_all.outlying[joint])} of the rows of {model.joint_names[joint]} deviate by"
-        " more than four standard deviations: an unmodelled effect rather than outliers, which a"
-        " robust loss would hide; use --estimator wls"
+    warnings: list[Note] = [
+        ManyOutliers(model.joint_names[joint], float(of_all.outlying[joint]))
         for joint in np.flatnonzero(of_all.doubtful)
     ]
     if not of_all.converged:
-        warnings.append(f"the reweighting did not converge in {of_all.iterations} iterations")
+        warnings.append(ReweightingNotConverged(of_all.iterations))
     return result, warnings
 
 
-def _prior_contradictions(model: RobotModel, posterior: PosteriorEstimate) -> list[str]:
+def _prior_contradictions(model: RobotModel, posterior: PosteriorEstimate) -> list[Note]:
     far = np.flatnonzero(np.abs(np.nan_to_num(posterior.normalized_change)) > _MAX_PRIOR_DEVIATION)
     if not far.size:
         return []
-    return [
-        f"data and prior of {joined([model.parameter_names[k] for k in far])} differ by more"
-        f" than {_MAX_PRIOR_DEVIATION:g} standard deviations: correct the CAD values, or their"
-        " uncertainty in [nominal]"
-    ]
+    names = tuple(model.parameter_names[k] for k in far)
+    return [PriorContradicted(names, _MAX_PRIOR_DEVIATION)]
 
 
 # Instruments
@@ -342,7 +340,7 @@ def smoothed_for_instruments(prepared: Prepared) -> Prepared:
     return replace(prepared, fitted=fitted, hedged=())
 
 
-def _instrumental(model: RobotModel, prepared: Prepared) -> tuple[RepeatedEstimate, list[str]]:
+def _instrumental(model: RobotModel, prepared: Prepared) -> tuple[RepeatedEstimate, list[Note]]:
     """Fit with the commanded motion as instruments."""
     fitted = prepared.fitted
     factors = []
@@ -367,5 +365,4 @@ def _instrumental(model: RobotModel, prepared: Prepared) -> tuple[RepeatedEstima
         remedy = "record the commanded positions as well, or use --estimator wls"
         raise InputError(None, problem, field="--estimator iv", remedy=remedy) from error
     result = RepeatedEstimate.of(model, pooled.estimate, each, total_factor(model, fitted))
-    warnings = [f"the instruments are too weak for {joined(pooled.weak)}"] if pooled.weak else []
-    return result, warnings
+    return result, [WeakInstruments(tuple(pooled.weak))] if pooled.weak else []

@@ -23,6 +23,7 @@ from identification.validation.verdict import Verdict
 
 from .estimating import Estimation, estimate_with, with_transmitted_load
 from .figure_series import report_series
+from .notes import NotConsistent, Note, NotEssential
 from .options import Options
 from .prepared import Prepared, prepare_sources
 from .sources import Source, gather_sources, payload_warnings
@@ -56,13 +57,13 @@ class Identification:
         return self.estimate.pooled.values
 
     @property
-    def consistency(self) -> ConsistencyCheck | str:
-        """Consistent parameters, or the reason why there are none."""
+    def consistency(self) -> ConsistencyCheck | NotConsistent:
+        """Consistent parameters, or why there are none."""
         return self.validation.consistency
 
     @property
-    def essential(self) -> Elimination | str:
-        """Essential parameters, or the reason why there are none."""
+    def essential(self) -> Elimination | NotEssential:
+        """Essential parameters, or why there are none."""
         return self.validation.essential
 
     @property
@@ -98,7 +99,7 @@ def identify_archives(
     *,
     predict: Sequence[Path | Archive] = (),
     name: str = "",
-    warnings: Sequence[str] = (),
+    warnings: Sequence[Note] = (),
     diagnoses: Mapping[Path, TorqueDiagnosis] = MappingProxyType({}),
 ) -> Identification:
     """Identify from archives, files or in memory.

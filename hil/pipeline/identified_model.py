@@ -18,6 +18,7 @@ from hil.pipeline.cell_context import torque_limits
 from hil.pipeline.estimating import posterior_of
 from hil.pipeline.estimators import OF_PRIOR
 from hil.pipeline.identification import Identification
+from hil.pipeline.notes import NotConsistent
 from hil.pipeline.prepared import Prepared
 from hil.results.provenance import (
     provenance_of,
@@ -125,10 +126,10 @@ def predicted_parts(duration: float, shortest: float) -> int:
 
 def consistent_of(identification: Identification) -> ConsistentEstimate:
     """Return the physically consistent parameters of an identification, or raise InputError."""
-    if isinstance(identification.consistency, str):
+    if isinstance(identification.consistency, NotConsistent):
         raise InputError(
             identification.paths[0],
-            f"there are no physically consistent parameters: {identification.consistency}",
+            f"there are no physically consistent parameters: {identification.consistency.reason}",
             remedy="see the verdict of `hil identify`",
         )
     return identification.consistency.consistent

@@ -12,6 +12,7 @@ from hil.base.errors import InputError
 from hil.base.progress import Reporter
 from hil.base.threads import one_thread
 from hil.pipeline.identification import Identification, identify_archives
+from hil.pipeline.notes import StatedText
 from hil.pipeline.options import Options
 from identification.hypotheses.diagnosis import TorqueDiagnosis
 
@@ -87,5 +88,5 @@ def identify_recorded(
         options,
         predict=predict,
         name=root.resolve().name,
-        warnings=campaign.damaged(),
+        warnings=[*map(StatedText, campaign.damaged())],
     )

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Final
 
 from hil.base.errors import InputError
 from hil.pipeline.recorded_rows import row_findings
@@ -13,19 +12,17 @@ from identification.hypotheses.changes import Change
 from identification.hypotheses.diagnosis import TorqueDiagnosis, diagnose
 from identification.model.robot import RobotModel
 from identification.signals.samples import Samples
-from identification.validation.finding import Finding
+from identification.validation.finding import Finding, TestedOn
 from identification.validation.finding_messages import Naming, WordedFinding, worded
 from identification.validation.findings.diagnosis import of_diagnosis, without_bodies
 from identification.validation.findings.faults import fault_keys
-
-_MOTION: Final = "the recordings"
 
 
 def other_meanings(
     model: RobotModel, found: TorqueDiagnosis, sources: Sequence[Source]
 ) -> tuple[WordedFinding, ...]:
     """Return what recordings are other than described, and what to do about each."""
-    naming = Naming(tuple(model.joint_names), _MOTION)
+    naming = Naming(tuple(model.joint_names), TestedOn.RECORDINGS)
     certain = [_certain(step.change) for step in found.discrete if step.sure]
     findings = (*row_findings(sources), *certain, *of_diagnosis(found))
     return tuple(worded(each, naming) for each in findings)

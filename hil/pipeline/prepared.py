@@ -25,7 +25,6 @@ from identification.estimators.delay import (
     DelayEstimate,
     estimate_delay,
 )
-from identification.estimators.delay_messages import delay_lines
 from identification.estimators.torque_channel import possible_low_passes
 from identification.model.elements import TorqueRipple
 from identification.model.robot import RobotModel
@@ -40,8 +39,7 @@ from identification.selection.questions import (
 from identification.selection.scores import Known
 from identification.selection.settings import Settings
 from identification.signals.clock import time_base
-from identification.signals.masks import MIN_STRETCH_SAMPLES
-from identification.signals.messages import clock_lines, time_lines
+from identification.signals.masks import MIN_STRETCH_SAMPLES, RowReason
 from identification.signals.recording import Recording, in_succession
 from identification.signals.samples import (
     RIGID_BANDWIDTH,
@@ -55,6 +53,19 @@ from identification.validation.finding import Thresholds
 from planner.arrays import numbers
 
 from .estimators import OF_PRIOR
+from .notes import (
+    CompensatedDelay,
+    DelayNotApplied,
+    EstimatedDelay,
+    FittedRows,
+    MergedSamples,
+    NoOtherDelay,
+    Note,
+    PositionNoise,
+    TimesUsed,
+    UnevenClock,
+    WhyNotApplied,
+)
 from .options import Options
 from .sources import Source, Sources
 
@@ -218,7 +229,7 @@ class Decided(NamedTuple):
 
     settings: Settings
     delays: DelayEstimate | None  #: None if it cannot be determined
-    notes: tuple[str, ...]  #: about delays, one sentence each
+    notes: tuple[Note, ...]  #: about delays
 
 
 def decide(sources: Sources, options: Options, reporter: Reporter) -> Decided:
@@ -294,7 +305,7 @@ class _DelayChoice:
     estimate: DelayEstimate | None
     assumed: float  # that the choice begins with [s]
     suggested: tuple[SuggestedDelay, ...]  # that it may choose as well
-    notes: tuple[str, ...]
+    notes: tuple[Note, ...]
     #: mean square error of a delay that is used, by its value [s²]
     errors: Mapping[float, float] = field(default_factory=dict)
 
@@ -306,11 +317,12 @@ class _DelayChoice:
         unused = cls(estimate, stated.preprocessing.torque_delay, (), ())
         if estimate is None:
             return unused
-        described = delay_lines(estimate)
+        described = EstimatedDelay(estimate)
+        unapplied = (described, *_unless_applied(estimate))
         if options.delay == "auto":
             if not estimate.significant:
-                return replace(unused, notes=described, errors={unused.assumed: estimate.variance})
-            notes = (*described, _compensated(estimate.delay))
+                return replace(unused, notes=unapplied, errors={unused.assumed: estimate.variance})
+            notes = (described, CompensatedDelay(estimate.delay))
             errors = {estimate.delay: estimate.variance}
             return replace(unused, assumed=estimate.delay, notes=notes, errors=errors)
         if options.delay is not None:
@@ -318,19 +330,19 @@ class _DelayChoice:
         if sources.cell.file.controller is not None:
             filtered = stated.preprocessing.torque_bandwidth is not None
             return unused._beside_stated(
-                estimate, described, filtered=filtered or _asks_low_pass(sources, options)
+                estimate, unapplied, filtered=filtered or _asks_low_pass(sources, options)
             )
         delay = SuggestedDelay(estimate.delay, estimate.determined and estimate.significant)
         doubtful = estimate.determined and estimate.unconfirmed
         return replace(
             unused,
             suggested=(delay,) if estimate.significant or doubtful else (),
-            notes=described[:1] if doubtful else described,
+            notes=(described,) if doubtful else unapplied,
             errors=dict.fromkeys((estimate.applied, estimate.delay), estimate.variance),
         )
 
     def _beside_stated(
-        self, estimate: DelayEstimate, described: tuple[str, ...], *, filtered: bool
+        self, estimate: DelayEstimate, described: tuple[Note, ...], *, filtered: bool
     ) -> _DelayChoice:
         """Use the stated delay of a controller, or both together if the estimate excludes it.
 
@@ -348,10 +360,7 @@ class _DelayChoice:
         if filtered or not estimate.excludes(stated):
             return choice
         if abs(combined.mean - stated) >= _DELAY_TOLERANCE_CYCLES * estimate.cycle:
-            beside = f"by this and the stated {stated * 1e3:.3g} ms"
-            choice = replace(
-                choice, notes=(described[0], f"{_compensated(combined.mean)}, {beside}")
-            )
+            choice = replace(choice, notes=(described[0], CompensatedDelay(combined.mean, stated)))
         return replace(choice, assumed=combined.mean)
 
     def applied_to(self, chosen: Settings) -> Settings:
@@ -362,7 +371,7 @@ class _DelayChoice:
             torque_delay=values[0] if values else self.assumed
         )
 
-    def confirmed_by(self, how: Preprocessing) -> tuple[DelayEstimate | None, tuple[str, ...]]:
+    def confirmed_by(self, how: Preprocessing) -> tuple[DelayEstimate | None, tuple[Note, ...]]:
         """Return the estimate if the chosen preprocessing agrees with it, and the notes on it.
 
         Also one that is significant and was not applied because its interval is wide.
@@ -373,28 +382,27 @@ class _DelayChoice:
             and how.torque_shape.causal
         ):
             # It was estimated without the low-pass, and may be the lag of that.
-            unchanged = f"no other delay than the assumed {self.assumed * 1e3:.3g} ms was applied"
-            return None, (f"{unchanged} in addition to the low-pass of the torque",)
+            return None, (NoOtherDelay(self.assumed, beside_low_pass=True),)
         if how.torque_delay in [delay.value for delay in self.suggested]:
             assert self.estimate is not None
             confirmed = replace(self.estimate, significant=True)
-            return confirmed, (*self.notes, _compensated(how.torque_delay))
+            return confirmed, (*self.notes, CompensatedDelay(how.torque_delay))
         if how.torque_delay != self.assumed:
-            return None, (_compensated(how.torque_delay),)
-        if self.suggested:
+            return None, (CompensatedDelay(how.torque_delay),)
+        if self.suggested and self.estimate is not None:
             determined = all(delay.determined for delay in self.suggested)
-            reason = "it predicts worse" if determined else "it is not determined"
-            if self.estimate is not None and self.estimate.unconfirmed:
-                reason = "it predicts no better"
+            reason = WhyNotApplied.PREDICTS_WORSE if determined else WhyNotApplied.UNDETERMINED
+            if self.estimate.unconfirmed:
+                reason = WhyNotApplied.PREDICTS_NO_BETTER
             # It was estimated without a low-pass of the torque.
             suspected = not determined and how.torque_bandwidth is None
             estimate = self.estimate if suspected else None
-            return estimate, (f"{self.notes[0]}; not applied, as {reason}",)
+            return estimate, (DelayNotApplied(self.estimate, reason),)
         return self.estimate, self.notes
 
 
-def _compensated(delay: float) -> str:
-    return f"a delay of {delay * 1e3:.3g} ms of all axes was compensated"
+def _unless_applied(estimate: DelayEstimate) -> tuple[NoOtherDelay, ...]:
+    return () if estimate.significant else (NoOtherDelay(estimate.assumed),)
 
 
 def carried_over(settings: Settings, sources: Sources, options: Options) -> Settings:
@@ -623,9 +631,9 @@ class Prepared:
     settings: Settings  #: of `fitted`
     #: delay of the torque in the fitted recordings; None if it cannot be determined
     delays: DelayEstimate | None
-    masked: Mapping[str, NDArray[np.intp]]  #: excluded rows of each joint (n,), by reason
+    masked: Mapping[RowReason, NDArray[np.intp]]  #: excluded rows of each joint (n,), by reason
     rows: int  #: time samples of `fitted`
-    notes: tuple[str, ...]  #: decisions, one sentence each
+    notes: tuple[Note, ...]  #: decisions
 
     @property
     def assumed_delay(self) -> float:
@@ -656,7 +664,7 @@ class Prepared:
         """Return the same with the chosen bandwidth alone."""
         return replace(self, hedged=(), settings=replace(self.settings, hedge=None))
 
-    def warned(self, *warnings: str) -> Prepared:
+    def warned(self, *warnings: Note) -> Prepared:
         """Return the same with warnings of later steps."""
         sources = replace(self.sources, warnings=(*self.sources.warnings, *warnings))
         return replace(self, sources=sources)
@@ -694,18 +702,18 @@ def prepare_sources(sources: Sources, options: Options, reporter: Reporter) -> P
         RecordingError: a recording cannot be prepared.
         IdentificationError: a delay was requested and no row is usable.
     """
-    notes = []
+    notes: list[Note] = []
     stated = stated_settings(sources.cell, options)
     for source in (*sources.training, *sources.held_out):
-        lines = [] if source.times is None else time_lines(source.times)
-        notes += [f"{source.name}: {line}" for line in (source.merged, *lines) if line]
+        if source.merged:
+            notes.append(MergedSamples(source.merged, source.name))
+        if source.times is not None:
+            notes.append(TimesUsed(source.name, source.times))
         base = time_base(source.recording.time, source.recording.gap_before)
         if not base.uniform or base.gaps:
-            notes.append(f"{source.name}: {'; '.join(clock_lines(base))}")
+            notes.append(UnevenClock(source.name, base))
     _require_torques(sources)
-    noise = "the noise of the positions was estimated from their high-frequency part"
-    if sources.noise_variance is not None:
-        noise = "the noise of the positions was measured at standstill"
+    noise = PositionNoise(at_standstill=sources.noise_variance is not None)
     decided = decide(sources, options, reporter)
     prepared = prepared_with(sources, decided.settings, reporter)
     _require_slow_rows(sources.cell.with_friction(**stated.friction).model, prepared.fitted)
@@ -738,7 +746,7 @@ def prepared_with(sources: Sources, settings: Settings, reporter: Reporter) -> P
         training = [validation_samples(source, cell, settings) for source in sources.training]
     else:
         training = [samples.moving() for samples in fitted]
-    masked: dict[str, NDArray[np.intp]] = {}
+    masked: dict[RowReason, NDArray[np.intp]] = {}
     for mask in (samples.mask for samples in fitted if samples.mask is not None):
         for reason, counts in mask.counts.items():
             masked[reason] = masked.get(reason, 0) + counts
@@ -753,22 +761,18 @@ def prepared_with(sources: Sources, settings: Settings, reporter: Reporter) -> P
         delays=None,
         masked=masked,
         rows=rows,
-        notes=tuple(_excluded(sources, masked, rows)),
+        notes=_excluded(sources, masked, rows),
     )
 
 
-def _excluded(sources: Sources, masked: Mapping[str, NDArray[np.intp]], rows: int) -> list[str]:
+def _excluded(
+    sources: Sources, masked: Mapping[RowReason, NDArray[np.intp]], rows: int
+) -> tuple[FittedRows, ...]:
     total = rows * len(sources.cell.joint_names)
     shares = {
         reason: int(counts.sum()) / total for reason, counts in masked.items() if counts.any()
     }
-    if not shares:
-        return []
-    parts = ", ".join(f"{percentage(share, 2)} {reason}" for reason, share in shares.items())
-    return [
-        f"of {total} rows (one joint at one sample) {percentage(1.0 - sum(shares.values()), 1)} "
-        f"were fitted; excluded: {parts}"
-    ]
+    return (FittedRows(total, shares),) if shares else ()
 
 
 def motor_from_joint(recording: Recording) -> Array:

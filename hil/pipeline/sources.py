@@ -33,7 +33,19 @@ from identification.signals.recording import (
     without_repeats,
 )
 from identification.signals.row_faults import RowFault, RowFaultKind, without_faulty_rows
-from identification.text import percentage
+from identification.validation.finding import TestedOn
+
+from .notes import (
+    AssumedPayload,
+    AssumedTorqueConstants,
+    EndedEarly,
+    LastHeldOut,
+    Note,
+    NotJudged,
+    RejectedArchive,
+    RestPredicted,
+    StatedText,
+)
 
 FLOAT32_STEP = 2.0**-24
 """Relative rounding error of a float32 position on the wire."""
@@ -47,7 +59,7 @@ class Source:
     name: str  #: file name
     recording: Recording  #: joints in the order of the model
     origin: float  #: time of the first set-point [s]
-    merged: str = ""  #: note about repeated time stamps
+    merged: int = 0  #: samples that repeated the time stamp before them, averaged with it
     times: SampleTimes | None = None  #: of its samples; None where the controller counts cycles
     faults: tuple[RowFault, ...] = ()  #: rows that are not of its motion
     stamps: Array | None = None  #: time stamps of the archive's rows, where `times` is known [s]
@@ -83,8 +95,8 @@ class Sources:
     held_out: tuple[Source, ...]  #: predicted, not fitted
     noise_variance: Array | None  #: of positions at standstill (n,) [rad²]; None if not recorded
     torque_variance: Array | None  #: of torques at standstill (n,) [N²·m²]; None if not recorded
-    warnings: tuple[str, ...]
-    tested_on: str  #: description of the held-out motion
+    warnings: tuple[Note, ...]
+    tested_on: TestedOn  #: what the held-out motion is
     in_sample: bool = False  #: whether nothing is held out; `held_out` is `training` then
 
 
@@ -200,30 +212,25 @@ def _require_one_cell(archives: Sequence[Archive]) -> None:
                 raise ArchiveError(archive.path, problem, remedy=remedy)
 
 
-def _import_warnings(archives: Sequence[Archive]) -> Iterator[str]:
+def _import_warnings(archives: Sequence[Archive]) -> Iterator[Note]:
     for archive in archives:
         for warning in archive.header.findings.warnings:
-            yield f"{archive.path.name}: {warning}"
+            yield StatedText(warning, archive.path.name)
 
 
 def _with_held_out(every: Sources, held_out: tuple[Source, ...], split: float) -> Sources:
     """Return sources with these held out; if there are none, a share or the last of the fitted."""
     training = every.training
-    tested_on = "unseen motion"
+    tested_on = TestedOn.UNSEEN
     warnings = [*every.warnings]
     if not held_out and len(training) == 1:
-        tested_on = "the rest of the same motion"
+        tested_on = TestedOn.REST
         training, held_out = _split(training[0], split)
-        warnings.append(
-            f"the first {percentage(split)} of one recording were fitted and the rest was "
-            "predicted; another motion would be a stronger test"
-        )
+        warnings.append(RestPredicted(split))
     elif not held_out:
-        tested_on = (
-            "a repetition of the fitted motion" if every.same_motion else "another recording"
-        )
+        tested_on = TestedOn.REPETITION if every.same_motion else TestedOn.ANOTHER_RECORDING
         training, held_out = training[:-1], training[-1:]
-        warnings.append(f"no validation run: the last recording, {held_out[0].name}, was held out")
+        warnings.append(LastHeldOut(held_out[0].name))
     return replace(
         every,
         training=training,
@@ -269,7 +276,7 @@ def all_fitted(
         noise_variance=noise,
         torque_variance=torque,
         warnings=(),
-        tested_on="the motion that was fitted",
+        tested_on=TestedOn.FITTED,
         in_sample=True,
     )
 
@@ -337,18 +344,20 @@ def refuse_duplicates(archives: Sequence[Path | Archive]) -> None:
         seen[digest] = path
 
 
-def _incomplete(archive: Archive) -> str | None:
+def _incomplete(archive: Archive) -> Note | None:
     """Return the warning about an archive that did not end as planned."""
     name = archive.path.name
     outcome = archive.outcome
-    if archive.missing is not None or outcome is None or outcome.outcome == "completed":
-        return archive.missing
+    if archive.missing is not None:
+        return StatedText(archive.missing)
+    if outcome is None or outcome.outcome == "completed":
+        return None
     if outcome.outcome == REJECTED:
-        return f"{name} was rejected and left out: {outcome.reason}"
-    return f"{name} ended {outcome.outcome}"
+        return RejectedArchive(name, outcome.reason)
+    return EndedEarly(name, outcome.outcome)
 
 
-def _not_judged(archive: Archive) -> str | None:
+def _not_judged(archive: Archive) -> Note | None:
     """Return the warning about an archive that is not in its campaign's manifest."""
     path = archive.path
     folder = RecordedCampaign(path.parent.parent)
@@ -356,36 +365,23 @@ def _not_judged(archive: Archive) -> str | None:
         return None
     with suppress(CampaignFolderError):
         if folder.sealed and path.name not in {entry.name for entry in folder.manifest()}:
-            return (
-                f"{path.name} is not in its campaign's manifest.json: the run was killed before "
-                "the quality of the recording was checked"
-            )
+            return NotJudged(path.name)
     return None
 
 
-def known_warnings(cell: Cell, archive: Archive) -> list[str]:
+def known_warnings(cell: Cell, archive: Archive) -> list[Note]:
     """Return the warnings about known systematic errors."""
     assumed = "drive_train.torque_constant" in cell.file.cell.assumed
     if not assumed or archive.header.only_simulated:
         return []
-    warning = (
-        "the torque constants are assumed: predictions of current are not affected, but all "
-        "parameters are in units of the assumed constants"
-    )
     controller = cell.file.controller
-    if controller is not None and controller.transport == "rtde":
-        warning += "; weigh a known payload with `hil torque-constants`"
-    return [warning]
+    is_ur = controller is not None and controller.transport == "rtde"
+    return [AssumedTorqueConstants(can_be_weighed=is_ur)]
 
 
-def payload_warnings(cell: Cell) -> list[str]:
+def payload_warnings(cell: Cell) -> list[Note]:
     """Return the warning about a payload that was not weighed before it was recorded."""
-    if "robot.payload" not in cell.file.cell.assumed:
-        return []
-    return [
-        "the figures of the payload are assumed ([robot.payload]): their errors are in the "
-        "parameters of the last link (weigh it with `hil payload`)"
-    ]
+    return [AssumedPayload()] if "robot.payload" in cell.file.cell.assumed else []
 
 
 def source_of(archive: Archive, cell: Cell, *, to_fit: bool = True) -> Source:
@@ -437,16 +433,12 @@ def _usable(archive: Archive, cell: Cell, recording: Recording) -> Source:
         single = without_repeats(timed).checked(cell.joint_names)
     except RecordingError as error:
         raise ArchiveError(archive.path, str(error), remedy="leave it out") from error
-    merged = timed.n_samples - single.n_samples
-    averaged = (
-        f"{merged} samples had the time stamp of the previous sample and were averaged with it"
-    )
     return Source(
         archive.path,
         archive.path.name,
         single,
         float(single.time[0]),
-        averaged if merged else "",
+        timed.n_samples - single.n_samples,
         times,
         faults,
         stamps,

@@ -25,7 +25,8 @@ from identification.excitation import (
 )
 from identification.model.elements import TorqueRipple
 from identification.selection.essential import Elimination
-from identification.selection.messages import cut_words
+from identification.selection.messages import candidate_words, cut_words
+from identification.selection.settings import Choice
 from identification.signals.samples import Samples
 from identification.validation.consistency import ConsistencyCheck
 from identification.validation.evidence import Evidence
@@ -41,6 +42,8 @@ from sim_fixtures.ns16 import TABLE2, URDF_PATH
 
 from .estimating import Estimation
 from .estimators import ESTIMATORS
+from .note_messages import note_lines
+from .notes import NotConsistent, NotEssential
 from .prepared import Prepared, executed_rows
 from .sources import Sources
 from .validation import Validation
@@ -83,7 +86,7 @@ def summary(
         software=software(),
         excitation=excitation,
         estimator=_estimator(estimation),
-        notes=[*prepared.notes, *estimation.notes],
+        notes=note_lines([*prepared.notes, *estimation.notes]),
         parameters=_parameters(cell, estimation, truth),
         n_base=len(model.base.names),
         uncertainty=results.UncertaintyResult.of(estimation.stated),
@@ -95,12 +98,16 @@ def summary(
         fitted=_fitted(prepared, pooled.values),
         calibration=None if calibration is None else results.CalibrationResult.of(calibration),
         delays=_delays(prepared),
-        choices=[*prepared.settings.choices],
+        choices=[*map(_choice, prepared.settings.choices)],
         coverage=None if truth is None else _coverage(pooled.values, pooled.std, truth),
-        verdict=results.VerdictResult.of(verdict, warnings=[*verdict.warnings, *sources.warnings]),
+        verdict=results.VerdictResult.of(
+            verdict, warnings=[*verdict.warnings, *note_lines(sources.warnings)]
+        ),
         contact_thresholds=[*validation.thresholds],
         essential=_essential(validation.essential),
-        consistency=None if isinstance(consistency, str) else _consistency(model, consistency),
+        consistency=None
+        if isinstance(consistency, NotConsistent)
+        else _consistency(model, consistency),
         judgement=_judgement(model.joint_names, validation),
     )
 
@@ -142,8 +149,17 @@ def _consistency(model: RobotModel, check: ConsistencyCheck) -> results.Consiste
     )
 
 
-def _essential(choice: Elimination | str) -> results.EssentialResult | None:
-    if isinstance(choice, str):
+def _choice(choice: Choice) -> results.ChoiceResult:
+    return results.ChoiceResult(
+        name=choice.name,
+        candidates=candidate_words(choice.candidates),
+        errors=list(choice.errors),
+        chosen=choice.chosen,
+    )
+
+
+def _essential(choice: Elimination | NotEssential) -> results.EssentialResult | None:
+    if isinstance(choice, NotEssential):
         return None
     estimate = choice.estimate
     return results.EssentialResult.of(

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -18,11 +18,11 @@ from identification.selection.essential import Elimination, choose_essential
 from identification.validation.calibration import Calibration, TorqueMeans, calibrate
 from identification.validation.consistency import ConsistencyCheck, check_consistency
 from identification.validation.evidence import Evidence, gather
-from identification.validation.finding_messages import consistency_words
 from identification.validation.verdict import Verdict, judge
 
 from .cell_context import cell_context_of, joint_ranges
 from .estimating import Estimation
+from .notes import CostlyBodies, NoEssentialParameters, NotConsistent, Note, NotEssential
 from .options import Options
 from .prepared import Prepared
 from .sources import Sources
@@ -32,8 +32,8 @@ from .sources import Sources
 class Validation:
     """Evidence on an estimate, and the verdict."""
 
-    consistency: ConsistencyCheck | str  #: consistent parameters, or the reason why there are none
-    essential: Elimination | str  #: essential parameters, or the reason why there are none
+    consistency: ConsistencyCheck | NotConsistent  #: consistent parameters, or why there are none
+    essential: Elimination | NotEssential  #: essential parameters, or why there are none
     #: coverage of the intervals of held-out torque; None if too little or nothing was held out
     calibration: Calibration | None
     nominal: Nominal | None  #: nominal model
@@ -42,9 +42,16 @@ class Validation:
     thresholds: tuple[ContactThreshold, ...] = ()  #: of contacts, from held-out motion
 
     @property
-    def warnings(self) -> tuple[str, ...]:
+    def warnings(self) -> tuple[Note, ...]:
         """What makes no model bad."""
-        return tuple(_warnings(self.consistency, self.essential))
+        found: list[Note] = []
+        if isinstance(self.consistency, NotConsistent):
+            found.append(self.consistency)
+        elif self.consistency.costly and not self.consistency.impossible:  # which is a finding
+            found.append(CostlyBodies(self.consistency))
+        if isinstance(self.essential, NotEssential):
+            found.append(self.essential)
+        return tuple(found)
 
 
 def validate(
@@ -88,7 +95,7 @@ def validate(
             known=_known(sources, diagnoses),
             prior=ScorePrior(posterior.prior.belief.gaussian, posterior.design_effect),
         )
-        possible = None if isinstance(consistency, str) else consistency
+        possible = None if isinstance(consistency, NotConsistent) else consistency
         evidence = replace(evidence, form=estimation.form, consistency=possible)
         task.advance(1, "purposes")
         application = _application(prepared, result.pooled, evidence, consistency)
@@ -116,11 +123,13 @@ def _application(
     prepared: Prepared,
     estimate: Estimate,
     evidence: Evidence,
-    consistency: ConsistencyCheck | str,
+    consistency: ConsistencyCheck | NotConsistent,
 ) -> Application:
     sources = prepared.sources
     lower, upper = joint_ranges(sources)
-    possible = None if isinstance(consistency, str) else consistency.consistent.estimate.values
+    possible = (
+        None if isinstance(consistency, NotConsistent) else consistency.consistent.estimate.values
+    )
     return Application(
         model=sources.cell.model,
         estimate=estimate,
@@ -132,18 +141,9 @@ def _application(
     )
 
 
-def _warnings(consistency: ConsistencyCheck | str, essential: Elimination | str) -> Iterator[str]:
-    if isinstance(consistency, str):
-        yield f"no physically consistent parameters were found: {consistency}"
-    elif consistency.costly and not consistency.impossible:  # which is a finding
-        yield consistency_words(consistency)
-    if isinstance(essential, str):
-        yield f"no essential parameters: {essential}"
-
-
 def _consistency(
     estimation: Estimation, unseen: Factor, *, in_sample: bool
-) -> ConsistencyCheck | str:
+) -> ConsistencyCheck | NotConsistent:
     """Compare the posteriors with and without possible bodies, or return why that failed."""
     posterior = estimation.posterior
     training = estimation.result.factor
@@ -159,18 +159,18 @@ def _consistency(
             in_sample=in_sample,
         )
     except IdentificationError as error:
-        return str(error)
+        return NotConsistent(str(error))
 
 
-def _essential(prepared: Prepared, estimation: Estimation) -> Elimination | str:
+def _essential(prepared: Prepared, estimation: Estimation) -> Elimination | NotEssential:
     """Choose the essential parameters, or return why there are none."""
     if prepared.sources.in_sample:
-        return "they are chosen on held-out data, and there is none"
+        return NotEssential(NoEssentialParameters.NOTHING_HELD_OUT)
     model = prepared.sources.cell.model
     try:
         return choose_essential(model, estimation.result.factor, estimation.held_out)
     except IdentificationError as error:
-        return str(error)
+        return NotEssential(str(error))
 
 
 def _calibration(prepared: Prepared, estimation: Estimation) -> Calibration | None:

@@ -20,10 +20,11 @@ from hil.base.errors import InputError
 from hil.base.terminal_text import plural
 from hil.cell import Cell
 from hil.design.settings import MAX_VIA_POINTS, DesignSettings, preset
-from hil.pipeline.cell_context import TorqueScale, torque_scale
 from hil.pipeline.estimating import posterior_of
+from hil.pipeline.note_messages import scale_words
 from hil.pipeline.options import FIXED
 from hil.pipeline.prepared import reduction_of, stated_settings, versions_of
+from hil.pipeline.torque_scale import TorqueScale, torque_scale
 from hil.precision.given_recordings import given_sources
 from hil.precision.required_quantities import ReferenceMotions, RequiredQuantities
 from identification.distributions import NORMAL_95
@@ -102,7 +103,7 @@ class Forecast:
         if self.repetitions is None and self.limit > self.requirement.value:
             return (
                 f"{text}; no motion of this arm can meet it: {shown(self.limit)} remain, "
-                f"{scale.message} (weigh a known load with `hil torque-constants`, or state "
+                f"{scale_words(scale)} (weigh a known load with `hil torque-constants`, or state "
                 f"torque_uncertainty{self._own_units})"
             )
         if self.repetitions is not None:
@@ -197,7 +198,7 @@ class PrecisionDesign:
         values = nominal
         scale = torque_scale(cell, (), simulated=simulated)
         if cell.file.drive_train is not None:
-            scale = replace(scale, of="torque constants")
+            scale = replace(scale, by_currents=True)
         if given:
             values, prior, error = _posterior(cell, given)
             source = "of the given recordings"

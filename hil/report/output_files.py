@@ -21,6 +21,7 @@ from hil.base.safe_input import path_exists
 from hil.base.terminal_text import one_line
 from hil.cell import Cell
 from hil.pipeline.identification import Identification
+from hil.pipeline.notes import NotConsistent, NotEssential
 from hil.report.page import report_bytes
 from hil.results.provenance import PARAMETERS_JSON, RESULTS, provenance_of
 from hil.results.results import ExportResult, OccasionResult, Results, SettingsResult
@@ -44,8 +45,8 @@ def write_outcome(folder: Path, identification: Identification, reporter: Report
     exports = exports_of(
         identification.cell,
         identification.estimation.stated,
-        consistency if isinstance(consistency, str) else consistency.consistent,
-        essential=None if isinstance(essential, str) else essential.estimate.names,
+        consistency.reason if isinstance(consistency, NotConsistent) else consistency.consistent,
+        essential=None if isinstance(essential, NotEssential) else essential.estimate.names,
         provenance={**origin, **occasion.entries()},
         load=median_load(
             identification.cell.model,

@@ -18,11 +18,10 @@ from hil.report.rendering import environment, page_bytes, template_text
 from hil.report.rollout_section import ROLLOUT_LEGENDS, rollout_charts
 from hil.results.error_columns import RMS_TITLE, error_columns
 from hil.results.provenance import RESULTS
-from hil.results.results import ParameterResult, Results, by_id, outside_mark
+from hil.results.results import ChoiceResult, ParameterResult, Results, by_id, outside_mark
 from hil.results.rollout_result import RolloutResult
 from hil.results.series import ReportSeries
 from identification.excitation import CRITERIA, METHODS
-from identification.selection.settings import Choice
 from identification.validation.purpose_messages import TITLES, figure, requirement
 from identification.validation.verdict import fault_of
 
@@ -185,7 +184,7 @@ def every_row_errors(results: Results) -> list[float]:
     return list(np.median(np.array(joint_errors), axis=0).tolist())
 
 
-def shown_candidates(choice: Choice) -> list[int]:
+def shown_candidates(choice: ChoiceResult) -> list[int]:
     """Return the indices of the candidates to show, the first one first."""
     shown = list(range(len(choice.errors)))
     if len(shown) <= _MAX_CANDIDATES:

@@ -22,7 +22,7 @@ from identification.excitation.criteria import Criteria
 from identification.factor.estimate import KNOWN_STD_SHARES
 from identification.purposes.thresholds import ContactThreshold
 from identification.selection.essential import EliminationStep
-from identification.selection.settings import Choice, Settings
+from identification.selection.settings import Settings
 from identification.text import percentage
 from identification.validation.finding_messages import WordedFinding
 from identification.validation.purpose import Purpose
@@ -480,6 +480,17 @@ class UncertaintyResult(Frozen):
     interval_factor: float  #: Half width of a 95 % interval in standard deviations
 
 
+class ChoiceResult(Frozen):
+    """A setting chosen by inner prediction."""
+
+    name: str  #: Of the setting
+    candidates: list[str]  #: Descriptions, the default first
+    errors: list[float]
+    """``||e|| / ||tau||`` over all joints, of a low-pass their geometric mean by joint; geometric
+    mean over the segments."""
+    chosen: int  #: Index of the candidate
+
+
 class SettingsResult(Frozen):
     """What the identification used, so that exports and rollouts need no other one."""
 
@@ -540,7 +551,7 @@ class Results(Frozen):
     fitted: FittedResult
     calibration: CalibrationResult | None = None  #: Null without enough data
     delays: DelaysResult | None = None  #: Null if they could not be estimated
-    choices: list[Choice]  #: Settings chosen by inner prediction, in order
+    choices: list[ChoiceResult]  #: Settings chosen by inner prediction, in order
     coverage: CoverageResult | None
     verdict: VerdictResult
     contact_thresholds: list[ContactThreshold] = []  #: Empty if too little was held out

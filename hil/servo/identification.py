@@ -19,6 +19,7 @@ from hil.base.threads import one_thread
 from hil.base.version import software
 from hil.cell import Cell
 from hil.cell.nominal import nominal_of
+from hil.pipeline.note_messages import note_lines
 from hil.pipeline.sources import Source, Sources, gather_sources
 from hil.results.servo_result import (
     ServoContact,
@@ -408,7 +409,7 @@ def _results(
         fitted_contacts=_fitted_contacts(fitted, found, names),
         left_out=_left_out(fitted, found.fit),
         split=options.split,
-        notes=list(sources.warnings),
+        notes=note_lines(sources.warnings),
     )
 
 

@@ -23,12 +23,9 @@ def undetermined_words(estimate: DelayEstimate) -> str:
             return f"a delay of {estimate.other * 1e3:.0f} ms explains the torques as well"
 
 
-def delay_lines(estimate: DelayEstimate) -> tuple[str, ...]:
-    """Return the delay with its interval, and that none was applied if none was."""
-    line = f"delay of the torque behind the position, {_delay_words(estimate)}"
-    if estimate.significant:
-        return (line,)
-    return line, f"no other delay than the assumed {estimate.assumed * 1e3:.3g} ms was applied"
+def delay_line(estimate: DelayEstimate) -> str:
+    """Return the delay with its interval."""
+    return f"delay of the torque behind the position, {_delay_words(estimate)}"
 
 
 def _delay_words(estimate: DelayEstimate) -> str:

@@ -12,7 +12,7 @@ from identification.distributions import chi_squared_limit
 from identification.model.motion import Motion
 from identification.model.robot import RobotModel
 from identification.signals.block_mean import BLOCK_SECONDS
-from identification.signals.masks import EDGE, SATURATED, UNMEASURED
+from identification.signals.masks import RowReason
 from identification.signals.samples import Samples
 from identification.signals.smoothing import low_pass
 from identification.validation.prediction import SLOW_BANDWIDTH, driving_residual
@@ -44,7 +44,7 @@ def slow_residuals(
     for samples in recordings:
         error = driving_residual(model, samples, values)
         if samples.mask is not None:
-            for reason in (EDGE, SATURATED, UNMEASURED):
+            for reason in (RowReason.EDGE, RowReason.SATURATED, RowReason.UNMEASURED):
                 error = np.where(samples.mask.reasons[reason], 0.0, error)
         for segment in samples.segments:
             motion = samples.motion.rows(segment)

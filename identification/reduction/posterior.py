@@ -81,10 +81,10 @@ class Posterior:
             return values
         return consistent_values(self.model, factor, weights, values, self.prior, effect)
 
-    def solved(self, factor: Factor) -> tuple[Posterior, PosteriorEstimate, list[str]]:
-        """Fit a factor, without restriction to possible bodies if that fails, and say why."""
+    def solved(self, factor: Factor) -> tuple[Posterior, PosteriorEstimate, SolverError | None]:
+        """Fit a factor; if that fails, without restriction to possible bodies, with the error."""
         try:
-            return self, self.fit(factor), []
+            return self, self.fit(factor), None
         except SolverError as error:
             free = replace(self, consistent=False)
-            return free, free.fit(factor), [f"all bodies were allowed because {error}"]
+            return free, free.fit(factor), error

@@ -1,9 +1,72 @@
-"""The choice of essential parameters in words."""
+"""Chosen settings, and the choice of essential parameters, in words."""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from typing import Final
+
 from identification.selection.essential import Elimination
-from identification.text import percentage
+from identification.selection.settings import Candidate, Strength
+from identification.text import number, percentage
+
+_ROWS: Final = {
+    "slow": "slow rows and reversals",
+    "halts": "long halts of each joint",
+    "rests": "rests of the whole arm",
+    "none": "none",
+    None: "by the friction law",
+}
+
+
+def candidate_words(candidates: Sequence[Candidate]) -> list[str]:
+    """Return in what each candidate of a setting differs from others."""
+    descriptions = [_described(candidate) for candidate in candidates]
+    differ = [len(set(column)) > 1 for column in zip(*descriptions, strict=True)]
+    return [
+        ", ".join(part for part, apart in zip(parts, differ, strict=True) if apart)
+        for parts in descriptions
+    ]
+
+
+def strength_words(strength: Strength) -> tuple[str, ...]:
+    """Return the strength of a prior as phrases."""
+    return (
+        f"described bodies weigh {strength.weight:g} times",
+        "physically consistent" if strength.consistent else "not restricted to possible bodies",
+        "rotors as heavy as the torque allows" if strength.wide_rotors else "rotors like the links",
+    )
+
+
+def _described(candidate: Candidate) -> tuple[str, ...]:
+    """Return a candidate property by property."""
+    terms = ", ".join(
+        label if speed is None else f"{label} ({speed:g} rad/s)"
+        for label, speed in candidate.friction
+    )
+    reversal = "sgn(v)"
+    if candidate.tanh is not None:
+        reversal = f"tanh(v / {candidate.tanh:g} rad/s)"
+    elif candidate.presliding:
+        reversal = f"presliding over {candidate.presliding:g} rad"
+    ripple = "no torque ripple"
+    if candidate.ripple:
+        ripple = f"torque ripple, {' and '.join(map(str, candidate.ripple))} per motor turn"
+    low_pass = "no low-pass"
+    if candidate.low_pass is not None:
+        low_pass = f"low-pass of {number(candidate.low_pass)} Hz, {candidate.shape}"
+    springs = ", ".join(candidate.springs)
+    return (
+        f"{candidate.bandwidth:g} Hz",
+        "measured velocity" if candidate.velocity == "measured" else "velocity from positions",
+        terms or "no friction",
+        reversal,
+        ripple,
+        f"torsion springs of {springs}" if springs else "no torsion spring",
+        _ROWS[candidate.excluded_rows],
+        f"delay of {number(1e3 * candidate.delay)} ms",
+        low_pass,
+        *strength_words(candidate.strength),
+    )
 
 
 def cut_words(elimination: Elimination) -> str:

@@ -30,9 +30,8 @@ from identification.model.elements import Element, TorqueRipple, TorsionSpring
 from identification.model.friction import FrictionLaw
 from identification.model.robot import RobotModel
 from identification.selection.folds import FOLDS, Errors, Folds, PredictedRows, mean_error
-from identification.selection.settings import Choice, Settings, Strength
+from identification.selection.settings import Candidate, Choice, Settings, Strength
 from identification.signals.samples import Preprocessing, Samples
-from identification.text import number
 
 Rows = NDArray[np.bool_]
 
@@ -235,8 +234,8 @@ class SettingsTrial:
     def _decision(
         self, name: str, candidates: Sequence[Settings], means: Sequence[float], chosen: int
     ) -> SettingDecision:
-        described = _differences([_description(self.model(each), each) for each in candidates])
-        return SettingDecision(candidates[chosen], Choice(name, described, tuple(means), chosen))
+        values = tuple(_candidate(self.model(each), each) for each in candidates)
+        return SettingDecision(candidates[chosen], Choice(name, values, tuple(means), chosen))
 
     def knows_bodies(self, settings: Settings) -> bool:
         """Return whether the description has the masses of this arm."""
@@ -533,39 +532,24 @@ def _change(errors: Array, first: Array, transfer: float) -> tuple[float, float]
     return float(change.mean()), math.hypot(scatter, transfer)
 
 
-def _description(model: RobotModel, settings: Settings) -> tuple[str, ...]:
-    """Return descriptions of the settings of a model, one by one."""
+def _candidate(model: RobotModel, settings: Settings) -> Candidate:
+    """Return what a candidate of a setting may differ in, with its model."""
     how = settings.preprocessing
-    width = how.torque_bandwidth
+    law = model.friction.laws[0]
     elements = model.elements.elements
-    orders = next((part.orders for part in elements if isinstance(part, TorqueRipple)), ())
-    ripple = "no torque ripple"
-    if orders:
-        ripple = f"torque ripple, {' and '.join(map(str, orders))} per motor turn"
-    springs = [part.joint for part in elements if isinstance(part, TorsionSpring)]
-    rows_of = {
-        "slow": "slow rows and reversals",
-        "halts": "long halts of each joint",
-        "rests": "rests of the whole arm",
-        "none": "none",
-    }
-    return (
-        f"{how.rigid_bandwidth:g} Hz",
-        "measured velocity" if how.velocity == "measured" else "velocity from positions",
-        *model.friction.laws[0].summary(),
-        ripple,
-        f"torsion springs of {', '.join(springs)}" if springs else "no torsion spring",
-        rows_of.get(how.exclude_rows or "", "by the friction law"),
-        f"delay of {number(1e3 * how.torque_delay)} ms",
-        "no low-pass" if width is None else f"low-pass of {number(width)} Hz, {how.torque_shape}",
-        *settings.strength.describe(),
-    )
-
-
-def _differences(descriptions: Sequence[tuple[str, ...]]) -> tuple[str, ...]:
-    """Reduce descriptions of candidates to what differs."""
-    differ = [len(set(column)) > 1 for column in zip(*descriptions, strict=True)]
-    return tuple(
-        ", ".join(part for part, apart in zip(parts, differ, strict=True) if apart)
-        for parts in descriptions
+    return Candidate(
+        bandwidth=how.rigid_bandwidth,
+        velocity=how.velocity,
+        friction=tuple(
+            (term.label, term.speed if term.speed_symbol else None) for term in law.terms
+        ),
+        presliding=law.presliding,
+        tanh=law.tanh,
+        ripple=next((part.orders for part in elements if isinstance(part, TorqueRipple)), ()),
+        springs=tuple(part.joint for part in elements if isinstance(part, TorsionSpring)),
+        excluded_rows=how.exclude_rows,
+        delay=how.torque_delay,
+        low_pass=how.torque_bandwidth,
+        shape=how.torque_shape,
+        strength=settings.strength,
     )

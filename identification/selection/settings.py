@@ -7,7 +7,9 @@ from dataclasses import dataclass, field, replace
 from typing import Any
 
 from identification.selection.averaging import AveragedBandwidth
-from identification.signals.samples import Preprocessing
+from identification.signals.masks import ExcludedRows
+from identification.signals.samples import Preprocessing, VelocitySource
+from identification.signals.smoothing import LowPassShape
 
 
 @dataclass(frozen=True)
@@ -19,13 +21,24 @@ class Strength:
     #: whether rotors that act like a link's inertia may also make half of their joint's torque
     wide_rotors: bool = False
 
-    def describe(self) -> tuple[str, ...]:
-        """Return the strength as phrases."""
-        return (
-            f"described bodies weigh {self.weight:g} times",
-            "physically consistent" if self.consistent else "not restricted to possible bodies",
-            "rotors as heavy as the torque allows" if self.wide_rotors else "rotors like the links",
-        )
+
+@dataclass(frozen=True)
+class Candidate:
+    """What candidates of a setting may differ in; :mod:`.messages` words the differences."""
+
+    bandwidth: float  #: of the motion [Hz]
+    velocity: VelocitySource
+    #: names of the friction terms of the first joint, with the speed that a term has [rad/s]
+    friction: tuple[tuple[str, float | None], ...]
+    presliding: float | None  #: displacement [rad]
+    tanh: float | None  #: speed of a smooth reversal [rad/s]
+    ripple: tuple[int, ...]  #: orders per motor turn
+    springs: tuple[str, ...]  #: joints
+    excluded_rows: ExcludedRows | None  #: None: by the friction law
+    delay: float  #: of the torque [s]
+    low_pass: float | None  #: of the torque [Hz]
+    shape: LowPassShape  #: of that
+    strength: Strength  #: of the prior
 
 
 @dataclass(frozen=True)
@@ -33,7 +46,7 @@ class Choice:
     """Decision by inner prediction."""
 
     name: str  # of the setting
-    candidates: tuple[str, ...]  # descriptions
+    candidates: tuple[Candidate, ...]
     # ``||e|| / ||tau||`` over all joints, of a low-pass their geometric mean by joint; geometric
     # mean over the segments
     errors: tuple[float, ...]

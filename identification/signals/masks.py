@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from enum import Enum, auto
 from typing import Final, Literal
 
 import numpy as np
@@ -54,20 +55,24 @@ _MAX_SPIKE_SAMPLES: Final = 2  # samples
 
 ExcludedRows = Literal["rests", "halts", "slow", "none"]
 
-EDGE: Final = "next to a gap or an end of the recording"
-UNMEASURED: Final = "torque of the joint zero throughout"
-SATURATED: Final = "torque or current saturated"
-REST: Final = "at rest"
-STANDSTILL: Final = "slower than standstill"
-REVERSAL: Final = "near a velocity reversal"
-SPIKE: Final = "torque or current stands out alone"
+
+class RowReason(Enum):
+    """Why a row is not used; `identification.signals.messages` words it."""
+
+    EDGE = auto()  #: next to a gap or an end of the recording
+    UNMEASURED = auto()  #: torque of the joint zero throughout
+    SATURATED = auto()  #: torque or current
+    REST = auto()
+    STANDSTILL = auto()  #: slower than it
+    REVERSAL = auto()  #: of the velocity
+    SPIKE = auto()  #: torque or current stands out alone
 
 
 @dataclass(frozen=True, eq=False)
 class RowMask:
     """Usable rows, and reasons against the others."""
 
-    reasons: Mapping[str, Rows]  # excluded rows (m, n) by reason; a row may have several
+    reasons: Mapping[RowReason, Rows]  # excluded rows (m, n) by reason; a row may have several
     shape: tuple[int, int]  # (m, n)
     moving: Rows  # rows (m, n) without reason against them in sliding motion
 
@@ -86,7 +91,7 @@ class RowMask:
         return RowMask(reasons, (length, self.shape[1]), self.moving[part])
 
     @property
-    def counts(self) -> dict[str, NDArray[np.intp]]:
+    def counts(self) -> dict[RowReason, NDArray[np.intp]]:
         """Excluded rows per joint (n,), by the first matching reason."""
         usable = np.ones(self.shape, dtype=np.bool_)
         counts = {}
@@ -143,7 +148,7 @@ def mask_rows(
             recording, min(MAX_END_SECONDS, END_PERIODS / float(torque_bandwidth.min()))
         )
     reversal = near_any_reversal(model, motion, REVERSAL_PERIODS / bandwidth)
-    reasons = {EDGE: np.broadcast_to(edge[:, None], shape)}
+    reasons = {RowReason.EDGE: np.broadcast_to(edge[:, None], shape)}
     # Errors of velocity and delay turn dry friction there, always to less of it at low speed.
     # Half a period less, so that it ends between two rows.
     reach = max(0.0, 0.5 * (REVERSAL_SECONDS - float(np.median(np.diff(recording.time)))))
@@ -151,15 +156,19 @@ def mask_rows(
     halts = long_rests(motion.time, still)
     if exclude_rows == "rests":
         resting = long_rests(motion.time, np.all(still, axis=1)[:, None])
-        reasons |= {REST: np.broadcast_to(resting, shape), REVERSAL: turning & ~halts}
+        reasons |= {
+            RowReason.REST: np.broadcast_to(resting, shape),
+            RowReason.REVERSAL: turning & ~halts,
+        }
     elif exclude_rows == "halts":
-        reasons |= {REST: halts, REVERSAL: turning}
+        reasons |= {RowReason.REST: halts, RowReason.REVERSAL: turning}
     elif exclude_rows == "slow":
-        reasons |= {STANDSTILL: still, REVERSAL: reversal}
-    reasons[UNMEASURED] = np.broadcast_to(_unmeasured(recording), shape)
-    reasons[SATURATED] = saturated
-    reasons[SPIKE] = spikes
-    moving = ~(reasons[EDGE] | reasons[UNMEASURED] | saturated | spikes | still | reversal)
+        reasons |= {RowReason.STANDSTILL: still, RowReason.REVERSAL: reversal}
+    unmeasured = np.broadcast_to(_unmeasured(recording), shape)
+    reasons[RowReason.UNMEASURED] = unmeasured
+    reasons[RowReason.SATURATED] = saturated
+    reasons[RowReason.SPIKE] = spikes
+    moving = ~(reasons[RowReason.EDGE] | unmeasured | saturated | spikes | still | reversal)
     return RowMask(reasons, (shape[0], shape[1]), moving)
 
 

@@ -2,12 +2,26 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+from typing import Final
+
 import numpy as np
 
 from identification.signals.clock import MAX_STEP_DEVIATION, SampleTimes, TimeBase
+from identification.signals.masks import RowReason
 from identification.signals.position_steps import PositionJump
 from identification.signals.row_faults import RowFault, RowFaultKind
 from identification.text import duration_text, number, percentage
+
+ROW_REASONS: Final[Mapping[RowReason, str]] = {
+    RowReason.EDGE: "next to a gap or an end of the recording",
+    RowReason.UNMEASURED: "torque of the joint zero throughout",
+    RowReason.SATURATED: "torque or current saturated",
+    RowReason.REST: "at rest",
+    RowReason.STANDSTILL: "slower than standstill",
+    RowReason.REVERSAL: "near a velocity reversal",
+    RowReason.SPIKE: "torque or current stands out alone",
+}
 
 
 def clock_lines(clock: TimeBase) -> list[str]:

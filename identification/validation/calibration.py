@@ -25,7 +25,7 @@ from identification.factor.rows import augmented_rows
 from identification.model.robot import RobotModel
 from identification.selection.folds import FOLDS
 from identification.signals.block_mean import BLOCK_SECONDS, MIN_BLOCKS, block_index
-from identification.signals.masks import EDGE, SATURATED, UNMEASURED
+from identification.signals.masks import RowReason
 from identification.signals.samples import Samples
 
 Refit = Callable[[Factor], Array]
@@ -168,7 +168,7 @@ def _means(model: RobotModel, samples: Samples) -> tuple[Array, NDArray[np.intp]
     """Return the fields of :class:`TorqueMeans` of one recording with rows."""
     usable = np.ones(samples.torque.shape, dtype=np.bool_)
     if samples.mask is not None:
-        for reason in (EDGE, SATURATED, UNMEASURED):
+        for reason in (RowReason.EDGE, RowReason.SATURATED, RowReason.UNMEASURED):
             usable &= ~samples.mask.reasons[reason]
     index = block_index(samples)
     p = model.n_parameters

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from enum import StrEnum
 from typing import Any, Literal
 
 import numpy as np
@@ -19,6 +20,21 @@ from identification.validation.consistency import ConsistencyCheck
 from identification.validation.physical_signs import SignKind
 
 Mask = NDArray[np.bool_]
+
+
+class TestedOn(StrEnum):
+    """What the motion is that was predicted; the value is what a person and a program read."""
+
+    __test__ = False  # no test, whatever its name
+
+    UNSEEN = "unseen motion"
+    REST = "the rest of the same motion"
+    REPETITION = "a repetition of the fitted motion"
+    ANOTHER_RECORDING = "another recording"
+    FITTED = "the motion that was fitted"
+    RECORDINGS = "the recordings"  #: of commands that predict none
+
+
 Level = Literal["good", "information", "doubtful", "wrong"]
 Role = Literal["condition", "cause", "symptom"]
 

@@ -15,7 +15,6 @@ from dataclasses import dataclass
 from typing import Any, Final, NamedTuple
 
 from identification.hypotheses.changes import COUPLED, ORDERS, SIGNS, Change, Meaning
-from identification.hypotheses.column_search import UNSEEN
 from identification.signals.clock import SampleTimes
 from identification.signals.messages import fault_words, time_lines
 from identification.signals.position_steps import PositionJump
@@ -29,6 +28,7 @@ from identification.validation.finding import (
     RemedyKey,
     RepeatedSamples,
     Role,
+    TestedOn,
 )
 
 UNTESTED: Final = "tested"
@@ -80,7 +80,7 @@ class Naming:
     """Names in messages: of the joints, and of the motion that was predicted."""
 
     joints: tuple[str, ...] = ()
-    motion: str = UNSEEN
+    motion: TestedOn = TestedOn.UNSEEN
 
     def all_of(self, joints: Sequence[int]) -> str:
         """Return joints by their indices."""

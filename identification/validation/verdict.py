@@ -7,10 +7,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from identification.hypotheses.column_search import UNSEEN
 from identification.text import percentage
 from identification.validation.evidence import Evidence
-from identification.validation.finding import Thresholds
+from identification.validation.finding import TestedOn, Thresholds
 from identification.validation.finding_messages import (
     ARM,
     IMPOSSIBLE,
@@ -44,7 +43,7 @@ def judge(
     evidence: Evidence,
     thresholds: Thresholds = Thresholds(),  # noqa: B008 - frozen
     *,
-    tested_on: str = UNSEEN,
+    tested_on: TestedOn = TestedOn.UNSEEN,
     purposes: Sequence[Purpose] = (),
     asked: Sequence[PurposeName] = (),
 ) -> Verdict:
@@ -54,7 +53,7 @@ def judge(
         joint_names: of the axes.
         evidence: errors of the estimate and their possible causes.
         thresholds: limits of the checks.
-        tested_on: description of the held-out motion.
+        tested_on: what the held-out motion is.
         purposes: what the model is good for.
         asked: purposes that decide; by default the error on unseen motion and every check does.
     """
@@ -78,7 +77,7 @@ def judge(
         line = f"The model must not be relied on: {other}{(fault or wrong[0]).words}{error}."
     elif purposes:
         line = purposes_in_a_sentence(purposes, naming.joints, asked)
-        if tested_on != UNSEEN:
+        if tested_on is not TestedOn.UNSEEN:
             line += f" Judged on {tested_on}."
         if wrong:
             line += " Doubtful for anything else."
@@ -119,7 +118,7 @@ def fault_of(findings: Sequence[WordedFinding]) -> WordedFinding | None:
     )
 
 
-def _of_no_arm(tested_on: str, fault: WordedFinding | None, evidence: Evidence) -> str:
+def _of_no_arm(tested_on: TestedOn, fault: WordedFinding | None, evidence: Evidence) -> str:
     """Return that a model predicts and is of no arm, or not of the described one; else ""."""
     if fault is None or fault.check not in (ARM, IMPOSSIBLE):
         return ""

@@ -357,8 +357,8 @@ class TestChosenSettings:
         settings, choices = chosen(recording, {"springs"}, springs=MODEL.joint_names)
         assert settings.friction.get("springs") == ((joint,) if stiffness else None)
         assert not settings.strength.consistent  # nobody asked for it
-        named = [choice.candidates[choice.chosen] for choice in choices]
-        assert named == ([f"torsion springs of {joint}"] if stiffness else [])
+        named = [choice.candidates[choice.chosen].springs for choice in choices]
+        assert named == ([(joint,)] if stiffness else [])
 
     @pytest.mark.parametrize(("shape", "name"), [(None, DELAY), (CAUSAL, LOW_PASS)])
     def test_a_delay_is_not_called_a_low_pass(self, shape, name):

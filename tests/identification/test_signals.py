@@ -18,14 +18,10 @@ from identification.model.robot import RobotModel
 from identification.selection.questions import SELECTION_RATE
 from identification.signals.clock import time_base, true_times
 from identification.signals.masks import (
-    EDGE,
     END_PERIODS,
     MAX_END_SECONDS,
-    REST,
-    REVERSAL,
     REVERSAL_SECONDS,
-    SATURATED,
-    STANDSTILL,
+    RowReason,
     flat_topped,
     mask_rows,
     spiking,
@@ -679,7 +675,12 @@ class TestExcludedRows:
         np.testing.assert_array_equal(mask.usable, ~reasons)
         lost = np.sum(list(mask.counts.values()), axis=0)
         np.testing.assert_array_equal(lost + mask.usable.sum(axis=0), len(TIME))
-        for reason in (EDGE, STANDSTILL, REVERSAL, SATURATED):
+        for reason in (
+            RowReason.EDGE,
+            RowReason.STANDSTILL,
+            RowReason.REVERSAL,
+            RowReason.SATURATED,
+        ):
             assert np.all(mask.counts[reason] > 0)
 
     def still(self, *joints):
@@ -697,18 +698,18 @@ class TestExcludedRows:
 
     def test_a_joint_that_stands_while_another_moves_holds_its_load(self):
         halt, masks = self.still(1)
-        assert not masks["rests"].reasons[REST].any()
+        assert not masks["rests"].reasons[RowReason.REST].any()
         assert masks["rests"].usable[halt, 1].all()
-        assert masks["halts"].reasons[REST][halt, 1].all()
-        assert not masks["halts"].reasons[REST][:, 0].any()
-        assert masks["slow"].reasons[STANDSTILL][halt, 1].all()
+        assert masks["halts"].reasons[RowReason.REST][halt, 1].all()
+        assert not masks["halts"].reasons[RowReason.REST][:, 0].any()
+        assert masks["slow"].reasons[RowReason.STANDSTILL][halt, 1].all()
 
     def test_a_rest_of_the_whole_arm_is_left_out(self):
         halt, masks = self.still(0, 1)
-        assert masks["rests"].reasons[REST][halt].all()
+        assert masks["rests"].reasons[RowReason.REST][halt].all()
         assert masks["none"].usable[halt].all()
         # A reversal of one joint is none.
-        assert not masks["rests"].reasons[REST][~halt].any()
+        assert not masks["rests"].reasons[RowReason.REST][~halt].any()
 
     def test_rests_exclude_two_rows_at_a_reversal_of_a_moving_joint(self):
         """A motion as noise turns it: what a standing joint holds is its load."""
@@ -719,8 +720,8 @@ class TestExcludedRows:
         mask = mask_rows(recording, SLIDING, motion, np.full(2, 40.0), exclude_rows="rests")
         turning = rows_at_reversals(motion.velocity[:, 0])
         assert turning.any()
-        np.testing.assert_array_equal(mask.reasons[REVERSAL][:, 0], turning)
-        assert not mask.reasons[REVERSAL][halt, 1].any()
+        np.testing.assert_array_equal(mask.reasons[RowReason.REVERSAL][:, 0], turning)
+        assert not mask.reasons[RowReason.REVERSAL][halt, 1].any()
 
     def test_halts_exclude_two_rows_at_a_reversal(self):
         motion, recording = motion_and_recording()
@@ -728,7 +729,7 @@ class TestExcludedRows:
         for joint, speed in enumerate(motion.velocity.T):
             turning = rows_at_reversals(speed)
             assert turning.any()
-            np.testing.assert_array_equal(mask.reasons[REVERSAL][:, joint], turning)
+            np.testing.assert_array_equal(mask.reasons[RowReason.REVERSAL][:, joint], turning)
 
     @pytest.mark.parametrize("clock", [0.0, 12.3, 1.7e9])
     @pytest.mark.parametrize("rate", [50.0, SELECTION_RATE, 200.0, 2.0 * SELECTION_RATE, 1000.0])
@@ -742,7 +743,7 @@ class TestExcludedRows:
             time=time, position=position, joint_names=SLIDING.joint_names, torque=position
         )
         mask = mask_rows(recording, SLIDING, motion, np.full(2, 40.0), exclude_rows="rests")
-        at = since[mask.reasons[REVERSAL][:, 0]]
+        at = since[mask.reasons[RowReason.REVERSAL][:, 0]]
         assert REVERSAL_SECONDS == 2.0 / SELECTION_RATE
         for turn in (np.pi / 6.0, np.pi / 2.0):
             around = at[np.abs(at - turn) < 0.1]
@@ -756,7 +757,9 @@ class TestExcludedRows:
             URDF, friction=FrictionLaw(standstill=0.05), coupling=Coupling(turns, friction=friction)
         )
         motion, recording = motion_and_recording()
-        reversals = mask_rows(recording, model, motion, np.array([40.0, 20.0])).reasons[REVERSAL]
+        reversals = mask_rows(recording, model, motion, np.array([40.0, 20.0])).reasons[
+            RowReason.REVERSAL
+        ]
         motor = motion.velocity @ turns[1]
         assert model.friction.motors == ((1,) if friction else ())
 
@@ -783,7 +786,7 @@ class TestExcludedRows:
         end = min(MAX_END_SECONDS, END_PERIODS / float(samples.position_bandwidth.min()))
         read = recording.time - delay
         inside = (read >= recording.time[0] + end) & (read <= recording.time[-1] - end)
-        np.testing.assert_array_equal(samples.mask.reasons[EDGE][:, 0], ~inside)
+        np.testing.assert_array_equal(samples.mask.reasons[RowReason.EDGE][:, 0], ~inside)
         assert not samples.usable[~inside].any()
 
     def test_edges_of_gaps_and_short_segments_are_excluded(self):
@@ -793,7 +796,7 @@ class TestExcludedRows:
         gapped = Recording(
             time=TIME, position=recording.position, joint_names=SLIDING.joint_names, gap_before=gap
         )
-        rows = mask_rows(gapped, SLIDING, motion, np.full(2, 40.0)).reasons[EDGE][:, 0]
+        rows = mask_rows(gapped, SLIDING, motion, np.full(2, 40.0)).reasons[RowReason.EDGE][:, 0]
         assert rows[1950:2090].all()
         assert not rows[100:1940].any()
         assert not rows[2100:3900].any()
@@ -803,7 +806,7 @@ class TestExcludedRows:
         driven = replace(recording, motor_current=recording.torque, torque=None)
         limit = np.array([18.0, 100.0])
         mask = mask_rows(driven, SLIDING, motion, np.full(2, 40.0), current_limit=limit)
-        saturated = mask.reasons[SATURATED]
+        saturated = mask.reasons[RowReason.SATURATED]
         np.testing.assert_array_equal(saturated[:, 0], np.abs(driven.motor_current[:, 0]) >= 17.91)
         assert not saturated[:, 1].any()
 

@@ -24,7 +24,7 @@ from identification.model.friction import FrictionLaw
 from identification.model.mass_matrix import mass_matrices
 from identification.model.robot import RobotModel
 from identification.selection.folds import FOLDS
-from identification.signals.masks import EDGE, SATURATED, STANDSTILL, RowMask
+from identification.signals.masks import RowMask, RowReason
 from identification.signals.position_steps import position_jumps, position_steps
 from identification.signals.recording import Recording
 from identification.signals.samples import Preprocessing, prepare
@@ -265,7 +265,11 @@ class TestTorqueMeans:
         ends, slow = np.zeros((2, LENGTH, 2), dtype=np.bool_)
         ends[:20] = True
         slow[40:60] = True
-        reasons = {EDGE: ends, SATURATED: np.zeros_like(ends), STANDSTILL: slow}
+        reasons = {
+            RowReason.EDGE: ends,
+            RowReason.SATURATED: np.zeros_like(ends),
+            RowReason.STANDSTILL: slow,
+        }
         mask = RowMask(reasons, (LENGTH, 2), ~(ends | slow))
         error = np.where(ends, 1e3, np.where(slow, 1.0, 0.0))
         samples = replace(recording(error, MOTION), usable=mask.usable, mask=mask)

@@ -42,13 +42,27 @@ from hil.cell import Cell
 from hil.cell.schema import PayloadTable, TorsionSpringTable
 from identification.factor.factor import Factor
 from identification.selection.averaging import AveragedBandwidth
-from identification.selection.settings import Choice, Settings, Strength
+from identification.selection.settings import Candidate, Choice, Settings, Strength
 from identification.signals.samples import Preprocessing
 from identification.signals.smoothing import LowPassShape
 from sim_fixtures.ns16 import CELL_PATH
 from tests.hil.arm_histories import cell, history, model, steady
 
 KEY = "0123456789abcdef"
+CANDIDATE = Candidate(
+    bandwidth=20.0,
+    velocity="position",
+    friction=(("Coulomb", None), ("Stribeck", 0.1)),
+    presliding=1e-4,
+    tanh=None,
+    ripple=(1, 2),
+    springs=("elbow",),
+    excluded_rows=None,
+    delay=1.0 / 3.0,
+    low_pass=None,
+    shape=LowPassShape(2),
+    strength=Strength(),
+)
 
 
 def assert_intact(entry, content, arrays):
@@ -300,7 +314,7 @@ class TestCache:
             noise_variance=(1e-9 / 3.0,) * 6,
             strength=Strength(10.0, consistent=True),
             loading=(1.0 / 3.0, -2.0),
-            choices=(Choice("rows", ("slow", "rests"), (0.1, np.inf), 0),),
+            choices=(Choice("rows", (CANDIDATE, CANDIDATE), (0.1, np.inf), 0),),
         )
         cache = CacheLocation(str(tmp_path))
         place = "/data/a.mcap"

@@ -22,12 +22,14 @@ from hil.importers.column_map import ColumnMap, Quantity, TimeColumn
 from hil.importers.imported_robot import Robot
 from hil.importers.log import import_log
 from hil.importers.recording_content import Use
+from hil.pipeline.notes import PositionNoise, UnevenClock
 from hil.pipeline.options import FIXED, Options
 from hil.pipeline.prepared import Prepared, prepare_sources, stated_settings
 from hil.pipeline.sources import gather_sources
 from hil.results.results import FittedResult, Results
 from identification import Estimate, FrictionLaw, estimate, prediction_error
 from identification.factor.factor import Factor
+from identification.validation.finding import TestedOn
 from tests.hil.simulated_logs import (
     POSITION_NOISE,
     TORQUE_NOISE,
@@ -129,9 +131,9 @@ def test_seven_axes_in_degrees_at_an_uneven_100_hz(tmp_path: Path) -> None:
         """
     identified = identify(tmp_path, simulated, "log.csv", columns, FINGERS)
     assert_found(identified, simulated)
-    notes = " ".join(identified.prepared.notes)
-    assert "uneven" in notes
-    assert "1 gap" in notes
+    (clock,) = [each.base for each in identified.prepared.notes if isinstance(each, UnevenClock)]
+    assert not clock.uniform
+    assert clock.gaps - clock.pauses == 1
 
 
 def test_currents_without_torque_constants_are_refused(tmp_path: Path) -> None:
@@ -172,10 +174,10 @@ def test_a_standstill_gives_the_noise(tmp_path: Path) -> None:
     sources = gather_sources(paths, 0.7)
     assert [source.name for source in sources.training] == ["a.mcap"]
     assert [source.name for source in sources.held_out] == ["b.mcap"]
-    assert sources.tested_on == "unseen motion"
+    assert sources.tested_on is TestedOn.UNSEEN
     assert sources.noise_variance == pytest.approx(np.full(6, POSITION_NOISE**2), rel=0.2)
     prepared = prepare_sources(sources, Options(torque_bandwidth=None), Silent())
-    assert any("at standstill" in note for note in prepared.notes)
+    assert PositionNoise(at_standstill=True) in prepared.notes
 
     unread = gather_sources(paths[:1], 0.7, predict=paths[1:2])
     assert [source.name for source in unread.held_out] == ["b.mcap"]

@@ -23,6 +23,7 @@ from hil.look import Look, Row, look_at
 from hil.look import messages as look_messages
 from hil.look.readings import Channels, Decider, Evidence, NextBest, Reading, Setting
 from hil.look.result import Aspect
+from hil.pipeline import note_messages, summary
 from identification.validation import verdict
 from identification.validation.finding_messages import WordedFinding, worded
 from tests.hil.importers.moving_log import URDF
@@ -139,7 +140,7 @@ def _by_key(finding: WordedFinding) -> WordedFinding:
 
 
 def say_keys(patch: pytest.MonkeyPatch) -> None:
-    """Replace all sentences of importers, looks and findings by their keys."""
+    """Replace all sentences of importers, looks, notes, settings and findings by their keys."""
 
     def key(value: object) -> str:
         return type(value).__name__
@@ -150,13 +151,15 @@ def say_keys(patch: pytest.MonkeyPatch) -> None:
         for module in (import_messages, look_messages):
             if hasattr(module, name):
                 patch.setattr(module, name, key)
+    patch.setattr(note_messages, "_line", key)
+    patch.setattr(summary, "candidate_words", lambda candidates: [*map(key, candidates)])
     patch.setattr(verdict, "worded", lambda *arguments: _by_key(worded(*arguments)))
 
 
 MESSAGES = frozenset(
     {
         *("words", "next_step", "next_steps", "reservation", "line", "reasons", "warnings"),
-        *("content", "changes", "channels"),
+        *("content", "changes", "channels", "notes", "candidates"),
         *("findings", "reading", "reason", "decide", "options", "identified_at"),
     }
 )

@@ -66,7 +66,7 @@ def friction_findings(stated, law, chosen=1):
         model=SimpleNamespace(friction=SimpleNamespace(laws=(law,))),
         stated=SimpleNamespace(robot=SimpleNamespace(friction=table)),
     )
-    choices = (Choice(LOAD, ("first", "second"), (0.2, 0.1), chosen),)
+    choices = (Choice(LOAD, (), (0.2, 0.1), chosen),)
     prepared = SimpleNamespace(
         settings=SimpleNamespace(choices=choices), sources=SimpleNamespace(cell=cell)
     )

@@ -12,7 +12,8 @@ from hil.base.errors import SourceError
 from hil.cell import Cell
 from hil.cell.errors import CellError
 from hil.importers.log import import_log
-from hil.pipeline.cell_context import torque_scale
+from hil.pipeline.note_messages import scale_words
+from hil.pipeline.torque_scale import torque_scale
 from identification.signals.recording import Recording
 from tests.hil.simulated_logs import JOINTS, column_map, three_joint_robot
 
@@ -46,12 +47,12 @@ class TestWhichCounts:
     def test_without_a_statement_that_of_a_data_sheet(self) -> None:
         scale = torque_scale(example(), [recording()], simulated=False)
         assert scale.std.tolist() == [0.03, 0.03]
-        assert scale.message.startswith("assuming torque constants to 3 %")
+        assert scale_words(scale).startswith("assuming torque constants to 3 %")
 
     def test_a_simulated_arm_has_the_constants_of_its_cell(self) -> None:
         scale = torque_scale(example(), [recording()], simulated=True)
         assert scale.std.tolist() == [0.0, 0.0]
-        assert scale.message.startswith("assuming exact torques")
+        assert scale_words(scale).startswith("assuming exact torques")
 
     @pytest.mark.parametrize("simulated", [False, True])
     def test_the_cell_comes_before_the_default(self, simulated: bool) -> None:

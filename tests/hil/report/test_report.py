@@ -25,11 +25,10 @@ from hil.report.interactive import chart_data, encoded
 from hil.report.page import report_bytes
 from hil.report.panels import chart_panel, matrix_panel
 from hil.report.rendering import environment
-from hil.results.results import Results
+from hil.results.results import ChoiceResult, Results
 from hil.results.series import ReportSeries, SeriesError
 from identification.excitation import CRITERIA, METHODS
 from identification.excitation.criteria import Criterion
-from identification.selection.settings import Choice
 from identification.validation.finding_messages import SENTENCES
 from identification.validation.purpose import Purpose
 from sim_fixtures.ns16 import N_ESSENTIAL
@@ -268,7 +267,9 @@ class TestPage:
         estimator = results.choices[1]
         shown = [estimator.candidates[k] for k in page.shown_candidates(estimator)]
         assert shown == ["least squares", *(f"ridge {k}" for k in range(5))]
-        worst = Choice(name="x", candidates=list("abcdefgh"), errors=[0.1] * 7 + [0.9], chosen=7)
+        worst = ChoiceResult(
+            name="x", candidates=list("abcdefgh"), errors=[0.1] * 7 + [0.9], chosen=7
+        )
         assert 7 in page.shown_candidates(worst) and len(page.shown_candidates(worst)) == 6
         assert "✓ 10 Hz 6.12" in whole.text and "5 Hz 6.55" in whole.text
         assert "✓ ridge 0 20.00" in whole.text and "least squares 50.00" in whole.text

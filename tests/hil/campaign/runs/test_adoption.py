@@ -20,10 +20,11 @@ from hil.campaign import (
     Campaign,
     quality,
 )
+from hil.pipeline.notes import NotJudged
 from hil.pipeline.sources import gather_sources
 from tests.hil.batch_work import Here
 from tests.hil.campaign.runs.rig import Make, Operator, kinds, slowing
-from tests.messages import NOT_IN_CAMPAIGN, NOT_IN_MANIFEST
+from tests.messages import NOT_IN_MANIFEST
 
 pytestmark = pytest.mark.safety
 
@@ -69,7 +70,7 @@ def test_an_archive_that_was_not_checked_is_not_pooled(
     assert NOT_IN_MANIFEST in skipped.reason
     good = campaign.folder.completed("excitation")
     warnings = gather_sources([*good, slowed], 0.5).warnings
-    assert any(text.startswith(f"{slowed.name} {NOT_IN_CAMPAIGN}") for text in warnings)
+    assert NotJudged(slowed.name) in warnings
     again = campaign.run(unrehearsed=True)
     assert again.repetitions == (2, 2)
     assert [rejection.archive for rejection in again.rejected] == [slowed.name], (

@@ -23,6 +23,7 @@ from hil.campaign.quality import FIELDS, Executed, RepetitionCheck
 from hil.campaign.campaign_run import RunResult
 from hil.control.motion_watch import OperatorRequest
 from hil.control.simulated_cell import controller_settings, simulated_controller
+from hil.pipeline.notes import RejectedArchive
 from hil.pipeline.sources import gather_sources
 from sim_fixtures.faults import parse_fault, split_faults
 from tests import messages
@@ -65,7 +66,7 @@ def test_a_slowed_repetition_is_rejected_and_run_again(make: Make) -> None:
     assert rejected.archive not in {
         source.name for source in (*sources.training, *sources.held_out)
     }
-    assert any(messages.HELD_OR_SLOWED in text for text in sources.warnings)
+    assert RejectedArchive(rejected.archive, rejected.reason) in sources.warnings
 
 
 def test_a_motion_that_is_always_rejected_ends_the_run(make: Make) -> None:
