@@ -39,7 +39,7 @@ from numpy.typing import NDArray
 from benchmarks import parser_of, show, timed
 from benchmarks.archive_files import CYCLES, JOINTS, SECONDS, repetitions
 from benchmarks.batch import archives_to_estimate
-from hil.archive import container, open_archive
+from hil.archive import open_archive, verified_records
 from hil.archive.cdr import fixed_layout
 from hil.archive.schema import CYCLE, profile
 
@@ -177,11 +177,11 @@ def sizes(path: Path) -> list[dict[str, Any]]:
     with path.open("rb") as stream:
         size = path.stat().st_size
         packed_chunks = [
-            (container.parse_chunk(record), record.offset)
-            for record in container.records(stream, size)
-            if record.opcode == container.CHUNK
+            (verified_records.parse_chunk(record), record.offset)
+            for record in verified_records.records(stream, size)
+            if record.opcode == verified_records.CHUNK
         ]
-        chunks = [container.chunk_data(*entry) for entry in packed_chunks]
+        chunks = [verified_records.chunk_data(*entry) for entry in packed_chunks]
     other_bytes = size - sum(len(packed_chunk.data) for packed_chunk, _ in packed_chunks)
     methods: dict[str, tuple[Callable[[bytes], bytes], Callable[[bytes], bytes]]] = {
         "none": (bytes, bytes),

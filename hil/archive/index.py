@@ -28,9 +28,9 @@ from mcap.records import (
     SummaryOffset,
 )
 
-from hil.archive import container
-from hil.archive.chunk import ChunkMessages
-from hil.archive.container import MAGIC, encode
+from hil.archive import verified_records
+from hil.archive.chunk_messages import ChunkMessages
+from hil.archive.verified_records import MAGIC, encode
 
 _ENTRY = np.dtype([("stamp", "<u8"), ("offset", "<u8")])
 _MESSAGE_INDEX = struct.Struct("<BQHI")
@@ -126,12 +126,12 @@ class FileIndex:
             schema_count=len(self._schemas),
         )
         groups: list[tuple[int, Sequence[McapRecord]]] = [
-            (container.SCHEMA, [*self._schemas.values()]),
-            (container.CHANNEL, [*self._channels.values()]),
-            (container.STATISTICS, [statistics]),
-            (container.CHUNK_INDEX, self._chunks),
-            (container.ATTACHMENT_INDEX, self._attachments),
-            (container.METADATA_INDEX, self._metadata),
+            (verified_records.SCHEMA, [*self._schemas.values()]),
+            (verified_records.CHANNEL, [*self._channels.values()]),
+            (verified_records.STATISTICS, [statistics]),
+            (verified_records.CHUNK_INDEX, self._chunks),
+            (verified_records.ATTACHMENT_INDEX, self._attachments),
+            (verified_records.METADATA_INDEX, self._metadata),
         ]
         summary = b""
         offsets = b""
@@ -149,6 +149,6 @@ def _message_index(channel: int, messages: ChunkMessages) -> bytes:
     entries = np.empty(len(messages), _ENTRY)
     entries["stamp"] = messages.of_heads("log_time")
     entries["offset"] = np.concatenate(messages.places)
-    length = _MESSAGE_INDEX.size - container.RECORD.size + entries.nbytes
-    head = _MESSAGE_INDEX.pack(container.MESSAGE_INDEX, length, channel, entries.nbytes)
+    length = _MESSAGE_INDEX.size - verified_records.RECORD.size + entries.nbytes
+    head = _MESSAGE_INDEX.pack(verified_records.MESSAGE_INDEX, length, channel, entries.nbytes)
     return head + entries.tobytes()

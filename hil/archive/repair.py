@@ -18,8 +18,8 @@ from typing import Any, BinaryIO, Final
 
 from mcap.records import Attachment, Header, Metadata
 
-from hil.archive import container, header, schema
-from hil.archive.chunk import ChunkParser
+from hil.archive import header, schema, verified_records
+from hil.archive.chunk_messages import ChunkParser
 from hil.archive.header import METADATA, OUTCOME, ArchiveOutcome
 from hil.archive.index import FileIndex, span
 from hil.archive.reader import open_archive, scan_archive
@@ -109,7 +109,7 @@ def is_intact(path: Path, scan: Scan) -> bool:
     """Return whether the file has no damage, and its message indexes and summary fit."""
     if scan.faults:
         return False
-    begin = container.MAGIC + container.encode(Header(schema.PROFILE, schema.LIBRARY))
+    begin = verified_records.MAGIC + verified_records.encode(Header(schema.PROFILE, schema.LIBRARY))
     index = FileIndex()
     parser = ChunkParser()
     with open_file(path) as stream:
@@ -117,16 +117,16 @@ def is_intact(path: Path, scan: Scan) -> bool:
             return False
         position = len(begin)
         for head in scan.heads[1:]:
-            if head.offset != position or head.opcode == container.HEADER:
+            if head.offset != position or head.opcode == verified_records.HEADER:
                 return False
-            record = container.read_record(stream, head)
+            record = verified_records.read_record(stream, head)
             position = head.end
-            if head.opcode != container.CHUNK:
+            if head.opcode != verified_records.CHUNK:
                 parser.define(record)
-                index.add(container.parse_item(record), head.offset, head.end - head.offset)
+                index.add(verified_records.parse_item(record), head.offset, head.end - head.offset)
                 continue
-            chunk = container.parse_chunk(record)
-            messages = parser.messages(container.chunk_data(chunk, head.offset), head.offset)
+            chunk = verified_records.parse_chunk(record)
+            messages = parser.messages(verified_records.chunk_data(chunk, head.offset), head.offset)
             for definition in parser.definitions:
                 index.define(definition)
             indexes = index.add_chunk(chunk, messages, head.offset, head.end - head.offset)
@@ -179,20 +179,20 @@ def _copy(
     writer.add_metadata(METADATA, header.with_checksum(described))
     channels = _registered(writer, scan.parser)
     for head in scan.heads:
-        if head.opcode == container.HEADER:
+        if head.opcode == verified_records.HEADER:
             continue
-        record = container.read_record(stream, head)
-        if head.opcode == container.CHUNK:
-            data = container.chunk_data(container.parse_chunk(record), head.offset)
-            for item in container.split_records(data, head.offset):
-                if item.opcode == container.MESSAGE:
+        record = verified_records.read_record(stream, head)
+        if head.opcode == verified_records.CHUNK:
+            data = verified_records.chunk_data(verified_records.parse_chunk(record), head.offset)
+            for item in verified_records.split_records(data, head.offset):
+                if item.opcode == verified_records.MESSAGE:
                     number, sequence, log_time, publish_time = _MESSAGE.unpack_from(item.body)
                     message = item.body[_MESSAGE.size :]
                     channel = channels[number]
                     writer.add_message(channel, log_time, message, publish_time, sequence)
             writer.flush()
             continue
-        content = container.parse_item(record)
+        content = verified_records.parse_item(record)
         if isinstance(content, Attachment):
             writer.add_attachment(
                 content.create_time,

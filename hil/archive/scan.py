@@ -17,10 +17,9 @@ import numpy as np
 from mcap.records import Channel, Metadata, Schema
 from numpy.typing import NDArray
 
-from hil.archive import container, schema
+from hil.archive import schema, verified_records
 from hil.archive.cdr import LayoutError, MessageLayout, Rows
-from hil.archive.chunk import ChunkMessages, ChunkParser, Content
-from hil.archive.container import Damage, Head, Record
+from hil.archive.chunk_messages import ChunkMessages, ChunkParser, Content
 from hil.archive.header import (
     METADATA,
     OUTCOME,
@@ -32,6 +31,7 @@ from hil.archive.header import (
     is_supported,
 )
 from hil.archive.schema import ArchivedEvent
+from hil.archive.verified_records import Damage, Head, Record
 
 NUMERIC_TOPICS = (
     *(schema.CYCLE, schema.MEASURED, schema.COMMANDED),
@@ -44,13 +44,13 @@ _BATCH_BYTES: Final = 1 << 20  # bytes of chunks decoded at once: few calls, and
 _MAX_DAMAGES = 1000  # of one file; what follows is not read
 _MIN_BYTES_PER_SAMPLE = 8  # bytes of a file for one sample, of an arm at rest
 _COLUMN_OF: Final = {"effort": "torque"}  # names of message fields that differ from the column's
-_DEFINITION_OPCODES = (container.SCHEMA, container.CHANNEL)
+_DEFINITION_OPCODES = (verified_records.SCHEMA, verified_records.CHANNEL)
 _CONTENT_OPCODES = frozenset(
     {
-        container.HEADER,
-        container.CHUNK,
-        container.ATTACHMENT,
-        container.METADATA,
+        verified_records.HEADER,
+        verified_records.CHUNK,
+        verified_records.ATTACHMENT,
+        verified_records.METADATA,
         *_DEFINITION_OPCODES,
     }
 )
@@ -120,7 +120,7 @@ class Scan:
         self._count = 0
         self._find_heads()
         for head in self.heads:
-            if head.opcode == container.METADATA:
+            if head.opcode == verified_records.METADATA:
                 self._try(self._add_metadata, head)
         stated = self.outcome or ArchiveOutcome()
         self._repaired = stated.repaired
@@ -168,7 +168,9 @@ class Scan:
     def definitions(self) -> list[Schema | Channel]:
         """Schemas and channels of the summary, for chunks that follow a lost one."""
         start = self._data_end
-        return container.read_summary(self._stream, self.size, *_DEFINITION_OPCODES, start=start)
+        return verified_records.read_summary(
+            self._stream, self.size, *_DEFINITION_OPCODES, start=start
+        )
 
     def _find_shortfalls(self) -> Iterator[str]:
         """Yield a sentence for what the file states to contain and does not."""
@@ -192,9 +194,9 @@ class Scan:
         stream = self._stream
         heads = self.heads
         try:
-            heads += container.heads(stream, self.size, _CONTENT_OPCODES)
+            heads += verified_records.heads(stream, self.size, _CONTENT_OPCODES)
             self._data_end = heads.pop().end
-            container.check_end(stream, self.size, self._data_end)
+            verified_records.check_end(stream, self.size, self._data_end)
             return
         except Damage as damage:
             lost = damage
@@ -203,14 +205,16 @@ class Scan:
             return
         while heads:  # lengths are right up to the last record that is whole
             try:
-                verify(container.read_record(stream, heads[-1]))
+                verify(verified_records.read_record(stream, heads[-1]))
                 break
             except Damage as damage:
                 lost = damage
                 heads.pop()
         self.damages[lost.offset] = lost.reason
-        begin = heads[-1].end if heads else len(container.MAGIC)
-        heads += (head for head in container.indexed(stream, self.size) if head.offset >= begin)
+        begin = heads[-1].end if heads else len(verified_records.MAGIC)
+        heads += (
+            head for head in verified_records.indexed(stream, self.size) if head.offset >= begin
+        )
 
     def _add_metadata(self, record: Record) -> None:
         """Add header or outcome: one each, of this version and of the same recording."""
@@ -241,7 +245,7 @@ class Scan:
         if inside - {head.offset for head in self.heads}:
             self.shortfalls = ["a chunk is missing"]
         for index, head in enumerate(self.heads):
-            if head.opcode == container.CHUNK and head.offset in outside:
+            if head.opcode == verified_records.CHUNK and head.offset in outside:
                 self._flush()
                 self._skipped = True
                 self._next.clear()
@@ -259,7 +263,7 @@ class Scan:
     def _try(self, add: Callable[[Record], None], head: Head) -> None:
         """Add a record, or leave it out if it is damaged."""
         try:
-            add(container.read_record(self._stream, head))
+            add(verified_records.read_record(self._stream, head))
         except Damage as damage:
             self._flush()  # pending chunks precede it
             self._leave_out(damage)
@@ -280,14 +284,14 @@ class Scan:
     def _add(self, record: Record) -> None:
         """Verify the next record, and add its content; `Damage` if it is not the next one."""
         offset = record.offset
-        if record.opcode == container.CHUNK:
+        if record.opcode == verified_records.CHUNK:
             if self.header is None or self.mixed:
                 return  # some other MCAP file, or of either of two recordings
-            head = container.parse_chunk(record)
-            data = container.chunk_data(head, offset)
+            head = verified_records.parse_chunk(record)
+            data = verified_records.chunk_data(head, offset)
             self._add_chunk(data, offset)
-        elif record.opcode == container.ATTACHMENT:
-            attachment = container.parse_attachment(record)
+        elif record.opcode == verified_records.ATTACHMENT:
+            attachment = verified_records.parse_attachment(record)
             if attachment.name in self.attachments:
                 raise Damage(offset, f"(attachment {attachment.name!r}) occurs twice")
             self.attachments[attachment.name] = attachment.data
@@ -492,7 +496,7 @@ class Scan:
 
 def verified_metadata(record: Record) -> tuple[str, dict[str, str]]:
     """Return name and entries, without the checksum that they must have if they are ours."""
-    metadata = container.parse(Metadata, record)
+    metadata = verified_records.parse(Metadata, record)
     entries = metadata.metadata
     is_ours = metadata.name in (METADATA, OUTCOME)
     if is_ours and entries.pop("checksum", None) != checksum(entries):
@@ -502,12 +506,12 @@ def verified_metadata(record: Record) -> tuple[str, dict[str, str]]:
 
 def verify(record: Record) -> None:
     """Raise `Damage` if a record with content fails its checksum, or cannot be parsed."""
-    if record.opcode == container.CHUNK:
-        container.chunk_data(container.parse_chunk(record), record.offset)
-    elif record.opcode == container.METADATA:
+    if record.opcode == verified_records.CHUNK:
+        verified_records.chunk_data(verified_records.parse_chunk(record), record.offset)
+    elif record.opcode == verified_records.METADATA:
         verified_metadata(record)
     else:
-        container.parse_item(record)
+        verified_records.parse_item(record)
 
 
 def _chunks_by_time(
@@ -519,7 +523,7 @@ def _chunks_by_time(
     """
     if times == ALL_TIMES:
         return set(), set()
-    chunks = container.read_summary(stream, size, container.CHUNK_INDEX)
+    chunks = verified_records.read_summary(stream, size, verified_records.CHUNK_INDEX)
     first = min((chunk.chunk_start_offset for chunk in chunks), default=0)
     outside = {
         chunk.chunk_start_offset

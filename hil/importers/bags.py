@@ -17,7 +17,7 @@ import zstandard
 from rosbags.interfaces import MessageDefinitionFormat
 from rosbags.typesys import Stores, get_typestore
 
-from hil.archive.container import MAX_COMPRESSION_RATIO
+from hil.archive.verified_records import MAX_COMPRESSION_RATIO
 from hil.base.errors import SourceError
 from hil.base.safe_input import open_file, read_text
 from hil.base.terminal_text import typed

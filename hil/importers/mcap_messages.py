@@ -14,8 +14,8 @@ from mcap.exceptions import McapError
 from mcap.records import Channel, Chunk, McapRecord, Message, Schema
 from mcap.stream_reader import StreamReader, breakup_chunk
 
-from hil.archive import container
-from hil.archive.container import Damage
+from hil.archive import verified_records
+from hil.archive.verified_records import Damage
 from hil.base.errors import SourceError
 from hil.base.safe_input import open_file
 
@@ -97,7 +97,9 @@ def _records(stream: BinaryIO) -> Iterator[McapRecord]:
     )
     for record in reader.records:
         if isinstance(record, Chunk):
-            data = container.decompress(record, stream.tell(), largest=MAX_FOREIGN_CHUNK_BYTES)
+            data = verified_records.decompress(
+                record, stream.tell(), largest=MAX_FOREIGN_CHUNK_BYTES
+            )
             yield from breakup_chunk(replace(record, compression="", data=data), validate_crc=True)
         else:
             yield record
@@ -110,8 +112,8 @@ def _opened(path: Path) -> Iterator[BinaryIO]:
         with open_file(path) as stream:
             # The library would search zeros behind a truncated file to their end.
             size = stream.seek(0, os.SEEK_END)
-            stream.seek(max(0, size - len(container.MAGIC)))
-            if stream.read() != container.MAGIC:
+            stream.seek(max(0, size - len(verified_records.MAGIC)))
+            if stream.read() != verified_records.MAGIC:
                 raise Damage(size, "it has no end")
             stream.seek(0)
             yield stream

@@ -18,7 +18,7 @@ from functools import partial
 from pathlib import Path
 from typing import Final
 
-from hil.archive import container
+from hil.archive import verified_records
 from tests.arguments import parser_of, whole_number
 from tests.disk.readers import Damage, Undamaged, undamaged
 from tests.hil.fast_cell import fast_campaign, fast_cell
@@ -107,7 +107,7 @@ def _no_checksum(rng: Random, data: bytes, _: bytes) -> Changed:
 def _index_unchecked(rng: Random, data: bytes, _: bytes) -> Changed:
     """The checksum of the summary is 0, and one of its bits is flipped."""
     changed = bytearray(data)
-    footer = len(data) - len(container.MAGIC) - container.FOOTER_SIZE
+    footer = len(data) - len(verified_records.MAGIC) - verified_records.FOOTER_SIZE
     (summary,) = struct.unpack_from("<Q", changed, footer + 9)
     struct.pack_into("<I", changed, footer + 9 + 16, 0)
     at = rng.randrange(summary, footer)

@@ -11,7 +11,7 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from hil.archive import Archive, container, open_archive
+from hil.archive import Archive, open_archive, verified_records
 from hil.archive.check import check_archive
 from hil.archive.repair import repair
 from hil.base.errors import HilError
@@ -126,8 +126,10 @@ def _repairs(truth: Undamaged, path: Path) -> Iterator[str]:
 
 def _stamps(chunk: bytes) -> set[int]:
     """Stamps of the cycles in a chunk [ns]."""
-    record = container.Record(0, container.CHUNK, chunk[container.RECORD.size :])
-    content = container.chunk_data(container.parse_chunk(record), 0)
+    record = verified_records.Record(
+        0, verified_records.CHUNK, chunk[verified_records.RECORD.size :]
+    )
+    content = verified_records.chunk_data(verified_records.parse_chunk(record), 0)
     return {head.log_time for head in heads(content) if head.channel == 1}
 
 

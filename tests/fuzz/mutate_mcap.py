@@ -17,8 +17,8 @@ import lz4.frame
 import zstandard
 from mcap.records import Attachment, Chunk, Metadata
 
-from hil.archive import container, header
-from hil.archive.container import Damage, encode
+from hil.archive import header, verified_records
+from hil.archive.verified_records import Damage, encode
 from tests.fuzz.draw import mutate_bytes, mutate_text
 from tests.fuzz.targets import Mutation
 from tests.hil.mcap_bytes import Indexed
@@ -60,13 +60,13 @@ def mutate_mcap(data: bytes, most: int, seed: int) -> bytes:
 
 def split_file(data: bytes) -> list[Record] | None:
     """Return the records of the data section; None if it is no MCAP file."""
-    if not data.startswith(container.MAGIC):
+    if not data.startswith(verified_records.MAGIC):
         return None
     records = []
-    for opcode, body in split_records(data[len(container.MAGIC) :]):
-        if opcode in (container.DATA_END, container.FOOTER):
+    for opcode, body in split_records(data[len(verified_records.MAGIC) :]):
+        if opcode in (verified_records.DATA_END, verified_records.FOOTER):
             break
-        if opcode != container.MESSAGE_INDEX:
+        if opcode != verified_records.MESSAGE_INDEX:
             records.append(_opened(opcode, body))
     return records
 
@@ -75,15 +75,19 @@ def split_records(data: bytes) -> list[tuple[int, bytes]]:
     """Return opcodes and bodies up to the first invalid record."""
     records: list[tuple[int, bytes]] = []
     with contextlib.suppress(Damage):
-        records.extend((record.opcode, record.body) for record in container.split_records(data, 0))
+        records.extend(
+            (record.opcode, record.body) for record in verified_records.split_records(data, 0)
+        )
     return records
 
 
 def _opened(opcode: int, body: bytes) -> Record:
     with contextlib.suppress(Damage):  # another record, or an unreadable chunk
-        if opcode == container.CHUNK:
-            head = container.parse_chunk(container.Record(0, opcode, body))
-            inside = [Record(*piece) for piece in split_records(container.decompress(head, 0))]
+        if opcode == verified_records.CHUNK:
+            head = verified_records.parse_chunk(verified_records.Record(0, opcode, body))
+            inside = [
+                Record(*piece) for piece in split_records(verified_records.decompress(head, 0))
+            ]
             times = head.message_start_time, head.message_end_time
             return Record(opcode, body, inside, head.compression, times)
     return Record(opcode, body)
@@ -102,15 +106,19 @@ def join_file(records: list[Record], *, index: bool) -> bytes:
         file += record_of(record.opcode, body)
     if index:
         return built.ended()
-    end = record_of(container.DATA_END, bytes(4)) + record_of(container.FOOTER, bytes(20))
-    return bytes(file) + end + container.MAGIC
+    end = record_of(verified_records.DATA_END, bytes(4)) + record_of(
+        verified_records.FOOTER, bytes(20)
+    )
+    return bytes(file) + end + verified_records.MAGIC
 
 
 def _described(records: list[Record]) -> str:
     """Return the checksum of the description, which the outcome repeats."""
     for record in records:
         with contextlib.suppress(Damage):  # unreadable
-            name, entries = entries_of(record) if record.opcode == container.METADATA else ("", {})
+            name, entries = (
+                entries_of(record) if record.opcode == verified_records.METADATA else ("", {})
+            )
             if name == header.METADATA:
                 entries.pop("checksum", None)
                 return header.checksum(entries)
@@ -124,9 +132,9 @@ def _sealed(record: Record, seals: dict[str, str]) -> bytes:
         packed = _PACKED.get(record.compression, bytes)(data)
         start, end = record.times
         return body_of(Chunk(record.compression, packed, end, start, zlib.crc32(data), len(data)))
-    if record.opcode == container.ATTACHMENT and len(record.body) > 4:
+    if record.opcode == verified_records.ATTACHMENT and len(record.body) > 4:
         return record.body[:-4] + zlib.crc32(record.body[:-4]).to_bytes(4, "little")
-    if record.opcode == container.METADATA:
+    if record.opcode == verified_records.METADATA:
         with contextlib.suppress(Damage):  # unreadable
             name, entries = entries_of(record)
             if entries.pop("checksum", None) is not None:
@@ -136,11 +144,13 @@ def _sealed(record: Record, seals: dict[str, str]) -> bytes:
 
 
 def body_of(record: Attachment | Chunk | Metadata) -> bytes:
-    return encode(record)[container.RECORD.size :]
+    return encode(record)[verified_records.RECORD.size :]
 
 
 def entries_of(record: Record) -> tuple[str, dict[str, str]]:
-    metadata = container.parse(Metadata, container.Record(0, record.opcode, record.body))
+    metadata = verified_records.parse(
+        Metadata, verified_records.Record(0, record.opcode, record.body)
+    )
     return metadata.name, metadata.metadata
 
 
@@ -161,10 +171,10 @@ def _change(records: list[Record], rng: random.Random) -> None:
                 record.inside, min(len(record.inside), rng.choice((1, 1, 3, 50)))
             ):
                 _of_a_message(message, rng)
-    elif record.opcode in (container.METADATA, container.ATTACHMENT):
+    elif record.opcode in (verified_records.METADATA, verified_records.ATTACHMENT):
         with contextlib.suppress(Damage):  # unreadable
             record.body = body_of(_with_other_entry(record, rng))
-    elif record.opcode in (container.SCHEMA, container.CHANNEL) and kind < 0.7:
+    elif record.opcode in (verified_records.SCHEMA, verified_records.CHANNEL) and kind < 0.7:
         record.body = record.body[:4] + _mutated(record.body[4:], rng, mutate_text)
     else:
         record.body = _mutated(record.body, rng)
@@ -191,7 +201,7 @@ def _shuffled(records: list[Record], rng: random.Random) -> None:
 
 def _of_a_message(message: Record, rng: random.Random) -> None:
     """Change its number, times or channel, a value in it, or any bytes."""
-    if message.opcode != container.MESSAGE or len(message.body) < _MESSAGE.size:
+    if message.opcode != verified_records.MESSAGE or len(message.body) < _MESSAGE.size:
         message.body = _mutated(message.body, rng)
         return
     head = list(_MESSAGE.unpack_from(message.body))
@@ -213,14 +223,16 @@ def _of_a_message(message: Record, rng: random.Random) -> None:
 
 def _with_other_entry(record: Record, rng: random.Random) -> Attachment | Metadata:
     """Metadata with an entry changed or removed, or an attachment with other data or name."""
-    if record.opcode == container.METADATA:
+    if record.opcode == verified_records.METADATA:
         name, entries = entries_of(record)
         key = rng.choice([*entries, "period", "joint_names", "kind"])
         changed = _mutated(entries.pop(key, "").encode() or b"0", rng, mutate_text)
         if rng.random() > 0.2:
             entries[key] = changed.decode("utf-8", "replace")
         return Metadata(name, entries)
-    attachment = container.parse(Attachment, container.Record(0, record.opcode, record.body))
+    attachment = verified_records.parse(
+        Attachment, verified_records.Record(0, record.opcode, record.body)
+    )
     if rng.random() < 0.1:
         attachment.name = rng.choice(("../../x", "/dev/zero", "", "plan.json", "init_packet.bin"))
     else:

@@ -14,12 +14,12 @@ from mcap.reader import make_reader
 from mcap.records import Attachment, Chunk, Metadata
 from mcap.writer import CompressionType, IndexType, Writer
 
-from hil.archive import container
-from hil.archive.chunk import ChunkParser
-from hil.archive.container import Record, encode
+from hil.archive import verified_records
+from hil.archive.chunk_messages import ChunkParser
 from hil.archive.header import with_checksum
 from hil.archive.index import FileIndex
 from hil.archive.schema import CYCLE
+from hil.archive.verified_records import Record, encode
 
 
 class Head(NamedTuple):
@@ -33,7 +33,7 @@ class Head(NamedTuple):
 
 
 def record(opcode: int, body: bytes) -> bytes:
-    return container.RECORD.pack(opcode, len(body)) + body
+    return verified_records.RECORD.pack(opcode, len(body)) + body
 
 
 def text(value: str) -> bytes:
@@ -57,20 +57,20 @@ def attachment(name: str, content: bytes) -> bytes:
 def heads(chunk: bytes) -> Iterator[Head]:
     """Yield the messages of a decompressed chunk."""
     head = struct.Struct("<HIQQ")
-    for item in container.split_records(chunk, 0):
-        if item.opcode == container.MESSAGE:
+    for item in verified_records.split_records(chunk, 0):
+        if item.opcode == verified_records.MESSAGE:
             channel, sequence, log_time, _ = head.unpack_from(item.body)
-            start = item.offset + container.RECORD.size
+            start = item.offset + verified_records.RECORD.size
             yield Head(channel, sequence, log_time, item.offset, start + head.size)
 
 
 def chunks(data: bytes) -> list[tuple[int, int]]:
     """Return begin and end of each chunk of a file."""
     bounds = []
-    at = len(container.MAGIC)
-    while at < len(data) and data[at] != container.DATA_END:
-        opcode, end = container.record_bounds(data, at, 0)
-        if opcode == container.CHUNK:
+    at = len(verified_records.MAGIC)
+    while at < len(data) and data[at] != verified_records.DATA_END:
+        opcode, end = verified_records.record_bounds(data, at, 0)
+        if opcode == verified_records.CHUNK:
             bounds.append((at, end))
         at = end
     return bounds
@@ -82,10 +82,10 @@ def with_attachment(source: Path, target: Path, old: str, new: str) -> Path:
     data = bytearray(source.read_bytes())
     changed = 0
     with source.open("rb") as stream:
-        for record in container.records(stream, len(data)):
-            if record.opcode == container.ATTACHMENT and old.encode() in record.body:
+        for record in verified_records.records(stream, len(data)):
+            if record.opcode == verified_records.ATTACHMENT and old.encode() in record.body:
                 content = record.body[:-4].replace(old.encode(), new.encode())
-                begin = record.offset + container.RECORD.size
+                begin = record.offset + verified_records.RECORD.size
                 data[begin : record.end] = content + zlib.crc32(content).to_bytes(4, "little")
                 changed += 1
     assert changed == 1
@@ -172,21 +172,23 @@ class Indexed:
     """A file to which records are appended, completed with a valid index."""
 
     def __init__(self) -> None:
-        self.data = bytearray(container.MAGIC)
+        self.data = bytearray(verified_records.MAGIC)
         self._index = FileIndex()
 
     def put(self, data: bytes) -> None:
         """Append a record, given with its head."""
-        item = Record(len(self.data), data[0], data[container.RECORD.size :])
-        if item.opcode == container.CHUNK:
-            head = container.parse_chunk(item)
+        item = Record(len(self.data), data[0], data[verified_records.RECORD.size :])
+        if item.opcode == verified_records.CHUNK:
+            head = verified_records.parse_chunk(item)
             parser = ChunkParser()
-            by_channel = parser.messages(container.chunk_data(head, item.offset), item.offset)
+            by_channel = parser.messages(
+                verified_records.chunk_data(head, item.offset), item.offset
+            )
             for definition in parser.definitions:
                 self._index.define(definition)
             data += self._index.add_chunk(head, by_channel, item.offset, len(data))
         else:
-            self._index.add(container.parse_item(item), item.offset, len(data))
+            self._index.add(verified_records.parse_item(item), item.offset, len(data))
         self.data += data
 
     def ended(self) -> bytes:

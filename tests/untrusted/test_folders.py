@@ -25,7 +25,7 @@ from typer.testing import CliRunner
 
 from hil.archive import ArchiveHeader, ImportedSamples, open_archive, write_samples
 from hil.archive.check import check_archive
-from hil.archive.container import MAGIC
+from hil.archive.verified_records import MAGIC
 from hil.base.errors import ArchiveError, HilError, InputError
 from hil.base.files import write_atomically, write_files
 from hil.base.safe_input import parse_toml, read_text

@@ -12,8 +12,8 @@ import pytest
 from numpy.typing import NDArray
 
 from drivers.cycle_records import cycle_dtype
-from hil.archive import Archive, ArchiveWriter, container, open_archive
-from hil.archive.container import Record
+from hil.archive import Archive, ArchiveWriter, open_archive, verified_records
+from hil.archive.verified_records import Record
 
 NAME = "validation_003_a1.mcap"
 ATTACHMENTS = {"robot.urdf": b"<robot name='x'/>", "cell.toml": b"[cell]\nname = 'x'\n"}
@@ -50,7 +50,7 @@ class Written:
     @property
     def chunks(self) -> list[Record]:
         """Its chunks."""
-        return [record for record in self.records if record.opcode == container.CHUNK]
+        return [record for record in self.records if record.opcode == verified_records.CHUNK]
 
     def first(self, opcode: int) -> Record:
         """The first record of a kind."""
@@ -59,7 +59,7 @@ class Written:
     def changed(self, record: Record, at: int, mask: int = 0xFF) -> bytes:
         """The file with one byte of a record's body changed; `at` may count from its end."""
         data = bytearray(self.data)
-        begin = record.end if at < 0 else record.offset + container.RECORD.size
+        begin = record.end if at < 0 else record.offset + verified_records.RECORD.size
         data[begin + at] ^= mask
         return bytes(data)
 
@@ -81,7 +81,7 @@ class Written:
 def records_of(path: Path) -> list[Record]:
     """The records of a file up to DataEnd."""
     with path.open("rb") as stream:
-        return list(container.records(stream, path.stat().st_size, only=range(256)))
+        return list(verified_records.records(stream, path.stat().st_size, only=range(256)))
 
 
 def write(

@@ -18,10 +18,10 @@ from hil.archive import (
     ArchiveName,
     ArchiveWriter,
     Level,
-    container,
     header,
     open_archive,
     schema,
+    verified_records,
 )
 from hil.archive.check import check_archive
 from hil.base.errors import ArchiveError, ArchiveVersionError, ArchiveWriteError
@@ -80,8 +80,8 @@ def write(path: Path, rows: NDArray[np.void], *edges: int) -> Path:
 
 def chunks(path: Path) -> int:
     with path.open("rb") as stream:
-        walked = container.records(stream, path.stat().st_size)
-        return sum(record.opcode == container.CHUNK for record in walked)
+        walked = verified_records.records(stream, path.stat().st_size)
+        return sum(record.opcode == verified_records.CHUNK for record in walked)
 
 
 class TestNames:

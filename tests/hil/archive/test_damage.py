@@ -24,16 +24,16 @@ from drivers.cycle_records import cycle_dtype
 from hil.archive import (
     Archive,
     ImportedSamples,
-    container,
     header,
     open_archive,
     schema,
+    verified_records,
     write_samples,
 )
 from hil.archive import repair as repairing
 from hil.archive.check import check_archive
-from hil.archive.container import encode
 from hil.archive.repair import Repair, repair
+from hil.archive.verified_records import encode
 from hil.base.errors import ArchiveError, ArchiveWriteError, NotAnArchiveError
 from hil.cli import app
 from tests.hil import mcap_bytes
@@ -56,7 +56,7 @@ def recorded(path: Path, first: int = FIRST, missed: int = 0) -> bytes:
 def moved(data: bytes, *order: int) -> bytes:
     """Return the file with its chunks, each with its message indexes, in another order."""
     starts = [begin for begin, _ in chunks(data)]
-    end = data.index(b"\x0b\x00\x00\x00hil.outcome") - container.RECORD.size
+    end = data.index(b"\x0b\x00\x00\x00hil.outcome") - verified_records.RECORD.size
     parts = [data[begin:stop] for begin, stop in zip(starts, [*starts[1:], end], strict=True)]
     return data[: starts[0]] + b"".join(parts[k] for k in order) + data[end:]
 
@@ -151,7 +151,7 @@ LOSSES = {
         lambda w, _: flipped(w.data, w.chunks[1].end + 3), "length", ()
     ),
     "length of an attachment": Loss(
-        lambda w, _: flipped(w.data, w.first(container.ATTACHMENT).offset + 2), "length", ()
+        lambda w, _: flipped(w.data, w.first(verified_records.ATTACHMENT).offset + 2), "length", ()
     ),
     "length of a chunk, and cut": Loss(
         lambda w, _: flipped(w.data, w.chunks[1].offset + 6)[: w.chunks[4].offset + 50],
@@ -182,7 +182,7 @@ LOSSES = {
         lambda w, _: zeroed(w.data, w.chunks[3].offset + 99, w.chunks[3].end - 99), "(chunk)", (3,)
     ),
     "attachment": Loss(
-        lambda w, _: w.changed(w.first(container.ATTACHMENT), -8), "'cell.toml') fails", ()
+        lambda w, _: w.changed(w.first(verified_records.ATTACHMENT), -8), "'cell.toml') fails", ()
     ),
     **{
         f"content of chunk {k}": Loss(lambda w, _, k=k: w.changed(w.chunks[k], -5), "(chunk)", (k,))
@@ -342,13 +342,18 @@ class TestAnyDamage:
 
     def test_changed_opcode_of_any_record_is_detected(self, written, path):
         """Readers skip records of unknown kind; the missing content must be detected."""
-        matters = (container.CHUNK, container.METADATA, container.ATTACHMENT, container.DATA_END)
+        matters = (
+            verified_records.CHUNK,
+            verified_records.METADATA,
+            verified_records.ATTACHMENT,
+            verified_records.DATA_END,
+        )
         for record in written.records:
             path.write_bytes(flipped(written.data, record.offset, 0x80))
             try:
                 archive = open_archive(path)
             except NotAnArchiveError:
-                assert record.opcode == container.METADATA
+                assert record.opcode == verified_records.METADATA
                 continue
             self.assert_true(written, archive)
             assert archive.complete == (record.opcode not in matters)
@@ -366,7 +371,7 @@ class TestAnyDamage:
 class TestNothingLost:
     def test_damaged_index_is_restored_to_the_byte(self, path, written):
         data = written.data
-        index = written.changed(written.first(container.MESSAGE_INDEX), 20)
+        index = written.changed(written.first(verified_records.MESSAGE_INDEX), 20)
         variants = [data, index, written.changed(written.chunks[2], 3), data + b"tail"]
         lengths = range(written.records[-1].offset, len(data), 97)
         for variant in [*variants, *(data[:length] for length in lengths)]:
@@ -505,13 +510,15 @@ class TestRefused:
 
     @pytest.mark.parametrize("read", [check_archive, open_archive, repair])
     def test_other_files_are_refused(self, path, read):
-        other = mcap_bytes.record(container.HEADER, mcap_bytes.text("ros1") + mcap_bytes.text("x"))
-        end = mcap_bytes.record(container.DATA_END, bytes(4))
-        end += mcap_bytes.record(container.FOOTER, bytes(20)) + container.MAGIC
+        other = mcap_bytes.record(
+            verified_records.HEADER, mcap_bytes.text("ros1") + mcap_bytes.text("x")
+        )
+        end = mcap_bytes.record(verified_records.DATA_END, bytes(4))
+        end += mcap_bytes.record(verified_records.FOOTER, bytes(20)) + verified_records.MAGIC
         for data, reason in (
             (b"hello" * 9, "is not an MCAP file"),
             (b"", "is not an MCAP file"),
-            (container.MAGIC + other + end, "is an MCAP file, but not an archive"),
+            (verified_records.MAGIC + other + end, "is an MCAP file, but not an archive"),
         ):
             path.write_bytes(data)
             with pytest.raises(NotAnArchiveError, match=reason):

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from rosbags.highlevel import AnyReader
 
 from drivers.cycle_records import cycle_dtype
-from hil.archive import Archive, ArchiveWriter, container, open_archive
+from hil.archive import Archive, ArchiveWriter, open_archive, verified_records
 from hil.archive import schema as profile
 from hil.archive.schema import description_message
 from tests.hil.mcap_bytes import Content, Indexed
@@ -193,7 +193,7 @@ def test_a_check_computes_the_index_that_the_library_writes() -> None:
     writer.finish()
     data = output.getvalue()
     computed = Indexed()
-    for record in container.records(io.BytesIO(data), len(data)):
-        if record.opcode not in (container.MESSAGE_INDEX, container.DATA_END):
+    for record in verified_records.records(io.BytesIO(data), len(data)):
+        if record.opcode not in (verified_records.MESSAGE_INDEX, verified_records.DATA_END):
             computed.put(data[record.offset : record.end])
     assert computed.ended() == data

@@ -22,18 +22,18 @@ from typer.testing import CliRunner
 import hil
 from hil.archive import (
     ImportedSamples,
-    container,
     header,
     open_archive,
     schema,
+    verified_records,
     write_samples,
     writer,
 )
 from hil.archive.cdr import LayoutError, fixed_layout
 from hil.archive.check import check_archive, read_overview
-from hil.archive.container import Record
 from hil.archive.header import ArchiveHeader, HeaderError
 from hil.archive.repair import repair
+from hil.archive.verified_records import Record
 from hil.base.errors import ArchiveError
 from hil.cli import app
 from hil.pipeline.sources import cell_of, gather_sources
@@ -67,13 +67,13 @@ def forged(
     records = split_file(data)
     assert records is not None
     for record in records:
-        if record.opcode == container.METADATA:
+        if record.opcode == verified_records.METADATA:
             name, entries = entries_of(record)
             record.body = body_of(Metadata(name, {**entries, **given[name]}))
-        elif record.opcode == container.CHUNK:
+        elif record.opcode == verified_records.CHUNK:
             record.inside = [FileRecord(*part) for part in split_records(chunk(record.content))]
-        elif record.opcode == container.ATTACHMENT:
-            attachment = container.parse(Attachment, Record(0, record.opcode, record.body))
+        elif record.opcode == verified_records.ATTACHMENT:
+            attachment = verified_records.parse(Attachment, Record(0, record.opcode, record.body))
             attachment.data = (attachments or {}).get(attachment.name, attachment.data)
             record.body = body_of(attachment)
     path.write_bytes(join_file(records, index=True))
@@ -203,12 +203,14 @@ CYCLE, ELSEWHERE = 1, 9  # numbers of channels; the second is unused
 
 
 def channel(number: int, topic: str, *, schema_id: int = 1) -> bytes:
-    return container.encode(Channel(number, topic, "cdr", {}, schema_id))
+    return verified_records.encode(Channel(number, topic, "cdr", {}, schema_id))
 
 
 def another_schema(chunk: bytes) -> bytes:
     texts = map(mcap_bytes.text, ("x", "ros2msg", "bool x"))
-    return mcap_bytes.record(container.SCHEMA, struct.pack("<H", 1) + b"".join(texts)) + chunk
+    return (
+        mcap_bytes.record(verified_records.SCHEMA, struct.pack("<H", 1) + b"".join(texts)) + chunk
+    )
 
 
 def without_cycles(chunk: bytes) -> bytes:
@@ -306,7 +308,7 @@ class TestContents:
 
 
 def four_gigabytes(data: bytes, at: int) -> bytes:
-    size = at + container.RECORD.size + 16
+    size = at + verified_records.RECORD.size + 16
     return data[:size] + struct.pack("<Q", 4 << 30) + data[size + 8 :]
 
 
@@ -320,7 +322,7 @@ def larger_frame(data: bytes, at: int, *, stated: bool = False) -> bytes:
     """A frame that is larger than its chunk claims, with or without its size."""
     frame = zstandard.ZstdCompressor(write_content_size=stated).compress(bytes(1 << 27))
     head = struct.pack("<QQQI", 0, 0, 1000, 0) + mcap_bytes.text("zstd")
-    bomb = mcap_bytes.record(container.CHUNK, head + struct.pack("<Q", len(frame)) + frame)
+    bomb = mcap_bytes.record(verified_records.CHUNK, head + struct.pack("<Q", len(frame)) + frame)
     return data[:at] + bomb + data[at:]
 
 
@@ -335,7 +337,9 @@ class TestSizes:
             (larger_frame, "decompressed"),
             (lambda data, at: larger_frame(data, at, stated=True), "another length than it claims"),
             (
-                lambda data, at: data[:at] + container.RECORD.pack(container.CHUNK, 1 << 40),
+                lambda data, at: (
+                    data[:at] + verified_records.RECORD.pack(verified_records.CHUNK, 1 << 40)
+                ),
                 "claims 1099511627776 bytes",
             ),
         ],
@@ -344,7 +348,7 @@ class TestSizes:
         at = written.chunks[0].offset
         path.write_bytes(change(written.data, at))
         if "1099" in reason:  # a record as long as a sparse file
-            os.truncate(path, (1 << 40) + at + container.RECORD.size)
+            os.truncate(path, (1 << 40) + at + verified_records.RECORD.size)
         assert peak(lambda: outcomes(path)) < MEMORY
         assert any(reason in fault for fault in check_archive(path).faults)
 
@@ -363,9 +367,9 @@ class TestSizes:
             if what == "over and over":
                 return entry * 1000
             if what == "truncated":
-                return container.RECORD.pack(container.CHUNK_INDEX, 3) + b"abc"
+                return verified_records.RECORD.pack(verified_records.CHUNK_INDEX, 3) + b"abc"
             place = {"behind the file": (8, 1 << 62), "farthest": ((1 << 64) - 1, 9)}[what]
-            at = container.RECORD.size + 16
+            at = verified_records.RECORD.size + 16
             return entry[:at] + struct.pack("<QQ", *place) + entry[at + 16 :]
 
         self.with_entries(written.data, path, change)
@@ -377,16 +381,18 @@ class TestSizes:
     @staticmethod
     def with_entries(data: bytes, path: Path, change: Callable[[bytes], bytes]) -> None:
         """Write the archive, each entry of its index of chunks changed, with a valid checksum."""
-        start = struct.unpack_from("<Q", data, len(data) - len(container.MAGIC) - 20)[0]
-        body = data[start : -container.FOOTER_SIZE - len(container.MAGIC)]
+        start = struct.unpack_from("<Q", data, len(data) - len(verified_records.MAGIC) - 20)[0]
+        body = data[start : -verified_records.FOOTER_SIZE - len(verified_records.MAGIC)]
         summary = b""
-        for item_record in container.split_records(body, 0):
+        for item_record in verified_records.split_records(body, 0):
             record = mcap_bytes.record(item_record.opcode, item_record.body)
-            if item_record.opcode != container.SUMMARY_OFFSET:
-                summary += change(record) if item_record.opcode == container.CHUNK_INDEX else record
-        summary += struct.pack("<BQQQ", container.FOOTER, 20, start, 0)
+            if item_record.opcode != verified_records.SUMMARY_OFFSET:
+                summary += (
+                    change(record) if item_record.opcode == verified_records.CHUNK_INDEX else record
+                )
+        summary += struct.pack("<BQQQ", verified_records.FOOTER, 20, start, 0)
         crc = struct.pack("<I", zlib.crc32(summary))
-        path.write_bytes(data[:start] + summary + crc + container.MAGIC)
+        path.write_bytes(data[:start] + summary + crc + verified_records.MAGIC)
 
     @pytest.mark.parametrize("line", ["float64[999999999] x", "uint8[99999999999999999999] x",
                                       "float64 x\nfloat64 x"])  # fmt: skip

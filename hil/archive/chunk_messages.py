@@ -18,8 +18,8 @@ import numpy as np
 from mcap.records import Channel, Schema
 from numpy.typing import NDArray
 
-from hil.archive import container
-from hil.archive.container import Damage, Record
+from hil.archive import verified_records
+from hil.archive.verified_records import Damage, Record
 
 Bytes = NDArray[np.uint8]
 Content = bytes | memoryview
@@ -113,8 +113,8 @@ class ChunkParser:
 
     def define(self, record: Record) -> None:
         """Read a schema or channel; other records are ignored. `Damage` if it is one redefined."""
-        if record.opcode in (container.SCHEMA, container.CHANNEL):
-            self.add(container.parse_item(record), record.offset)
+        if record.opcode in (verified_records.SCHEMA, verified_records.CHANNEL):
+            self.add(verified_records.parse_item(record), record.offset)
 
     def add(self, item: Schema | Channel, offset: int) -> None:
         """Add a definition; `Damage` at `offset` if it is one redefined."""
@@ -155,8 +155,8 @@ class ChunkParser:
                     messages.places.append(first + place.start)
                 at += rows.size
                 continue
-            opcode, end = container.record_bounds(chunk, at, offset)
-            if opcode == container.MESSAGE:
+            opcode, end = verified_records.record_bounds(chunk, at, offset)
+            if opcode == verified_records.MESSAGE:
                 if end - at < HEAD.itemsize:
                     raise Damage(offset, "(chunk) ends within a record")
                 head = chunk[at : at + _FIXED.size]
@@ -168,7 +168,7 @@ class ChunkParser:
                 messages.parts.append(np.frombuffer(chunk, np.uint8, end - at, at)[None])
                 messages.places.append(np.array([at]))
             else:
-                body = bytes(chunk[at + container.RECORD.size : end])
+                body = bytes(chunk[at + verified_records.RECORD.size : end])
                 self.define(Record(offset, opcode, body))
             at = end
         return by_channel
@@ -186,7 +186,7 @@ class ChunkParser:
     def _learn(self, heads: Sequence[Content]) -> bool:
         """Use one round of heads as the pattern, if it is new and no channel occurs twice."""
         _, lengths, channels = zip(*map(_FIXED.unpack, heads), strict=True)
-        ends = np.cumsum([container.RECORD.size + length for length in lengths]).tolist()
+        ends = np.cumsum([verified_records.RECORD.size + length for length in lengths]).tolist()
         begins = [0, *ends[:-1]]
         new = [*zip(channels, map(slice, begins, ends), strict=True)]
         if len(set(channels)) < len(channels) or new == self._round:
