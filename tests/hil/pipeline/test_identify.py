@@ -26,7 +26,13 @@ from hil.importers.imported_robot import Robot
 from hil.pipeline.estimating import estimate_with
 from hil.pipeline.estimators import ESTIMATORS
 from hil.pipeline.identification import identify_archives
-from hil.pipeline.notes import CompensatedDelay, EstimatedDelay, UnrestrictedBodies
+from hil.pipeline.notes import (
+    CompensatedDelay,
+    DelayNotApplied,
+    EstimatedDelay,
+    UnrestrictedBodies,
+    WhyNotApplied,
+)
 from hil.pipeline.options import FIXED, Options, friction_from
 from hil.pipeline.prepared import _DelayChoice, decide, prepare_sources, renewed_delay, stated_delay
 from hil.pipeline.sources import gather_sources
@@ -597,12 +603,13 @@ def test_a_delay_that_predicts_no_better_is_not_applied(reason):
         significant=True,
     )  # fmt: skip
     suggested = (SuggestedDelay(estimate.delay, estimate.determined),)
-    choice = _DelayChoice(estimate, 0.0, suggested, ("4 ms ± 2 ms",))
+    choice = _DelayChoice(estimate, 0.0, suggested, (EstimatedDelay(estimate),))
     left, (note,) = choice.confirmed_by(Preprocessing(torque_delay=0.0))
     assert left is (estimate if reason else None)
     filtered = Preprocessing(torque_delay=0.0, torque_bandwidth=5.0)
     assert choice.confirmed_by(filtered)[0] is None
-    assert note.startswith("4 ms ± 2 ms; not applied, as it")
+    why = WhyNotApplied.UNDETERMINED if reason else WhyNotApplied.PREDICTS_WORSE
+    assert note == DelayNotApplied(estimate, why)
 
 
 def test_inner_prediction_decides_on_an_unconfirmed_delay(log):
@@ -614,7 +621,8 @@ def test_inner_prediction_decides_on_an_unconfirmed_delay(log):
     applied, notes = choice.confirmed_by(Preprocessing(torque_delay=2e-3))
     assert applied.significant and isinstance(notes[-1], CompensatedDelay)
     refused, (note,) = choice.confirmed_by(Preprocessing())
-    assert not refused.significant and note.endswith("predicts no better")
+    assert not refused.significant
+    assert note == DelayNotApplied(estimate, WhyNotApplied.PREDICTS_NO_BETTER)
     wide = replace(estimate, reason=UndeterminedDelay.WIDE_INTERVAL)
     assert not _DelayChoice.of(wide, sources, Settings(Preprocessing()), Options()).suggested
 
