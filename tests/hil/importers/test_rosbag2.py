@@ -18,7 +18,7 @@ from mcap.writer import CompressionType
 from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin
 from rosbags.rosbag2 import Writer as BagWriter
 
-from hil.archive import Archive, container, open_archive
+from hil.archive import Archive, open_archive, verified_records
 from hil.archive.cdr import ENCAPSULATION
 from hil.archive.recording_of_archive import open_recording
 from hil.base.errors import InputError, SourceError
@@ -464,7 +464,7 @@ def with_chunk(path: Path, body: bytes) -> None:
     """Put another chunk before the first one; the index is invalid then."""
     data = path.read_bytes()
     first, _ = mcap_bytes.chunks(data)[0]
-    path.write_bytes(data[:first] + mcap_bytes.record(container.CHUNK, body) + data[first:])
+    path.write_bytes(data[:first] + mcap_bytes.record(verified_records.CHUNK, body) + data[first:])
 
 
 class TestChunks:
