@@ -1,4 +1,4 @@
-"""What is told of recordings, settings and estimate, in words."""
+"""What the results say about recordings, settings and estimate, in words."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What is told of recordings, settings and estimate, as values; `note_messages` words them.
+"""What the results say about recordings, settings and estimate; `note_messages` words it.
 
 Nothing reads the words back: what follows from a note follows from its fields.
 """
@@ -18,7 +18,7 @@ from identification.validation.consistency import ConsistencyCheck
 
 @dataclass(frozen=True)
 class Note:
-    """One thing that the results of an identification tell."""
+    """One thing that results say."""
 
 
 # Recordings

@@ -1,4 +1,4 @@
-"""What an identification tells of recordings and settings: each note has words with its figures."""
+"""What results say about recordings and settings: each note has words with its figures."""
 
 from __future__ import annotations
 
