@@ -332,7 +332,7 @@ STOP: Final = Corner(0.0, 0.0, None)
 def round_corners(
     moves: StraightMoves, before: Rows, after: Rows, bounds: Allowance, fly: Array
 ) -> list[Corner]:
-    """Round corners between moves as far as requested.
+    """Round corners between moves as requested.
 
     A corner takes the same share of the ramps before and after it, so that no part of a move
     belongs to two corners. It never takes longer than a stop.

@@ -39,7 +39,7 @@ PUSH_SHARE = 0.15  # push as a share of the largest motor torque; it does not tr
 
 
 class FaultyProgram(Protocol):
-    """Program of a controller, as far as faults change it."""
+    """Changes of a controller's program by faults."""
 
     def axis_leaves(self, axis: int) -> None:
         """Close one axis, from 0, while the others stay open."""

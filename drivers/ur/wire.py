@@ -608,7 +608,7 @@ class UrWire:
         return frame + upload
 
     def sort(self, packet: bytes) -> PacketSort:
-        """Return the codes that the state depends on; each other packet is of a sort of its own."""
+        """Return the codes on which the state depends; any other packet differs from all others."""
         starts = packet[:1] == START
         if self.description is None or len(packet) != self._layout.length or starts:
             return PacketSort(starts, packet, 0)

@@ -292,12 +292,12 @@ class ArchiveOutcome(BaseModel):
         return {key: text for key, text in self.record.items() if key not in SEALS}
 
     def belongs_to(self, header: ArchiveHeader | None) -> bool:
-        """Return whether it may be of the recording with this header; older files do not say."""
+        """Return whether it may belong to the recording with this header (older files: always)."""
         return header is None or self.description in (None, checksum(header.entries))
 
 
 def is_supported(entries: Mapping[str, str]) -> bool:
-    """Return whether the entries of a header are of the version that this software reads."""
+    """Return whether the entries of a header have the version that this software reads."""
     return entries.get("format_version") == str(FORMAT_VERSION)
 
 

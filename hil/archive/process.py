@@ -62,7 +62,7 @@ class PreTriggerBuffer:
             self._records.pop(0)
 
     def pop_session(self) -> tuple[Records, list[ExchangeEvent]]:
-        """Remove and return what is of the last session, behind its init packet."""
+        """Remove and return the records of the last session, after its init packet."""
         events = self._events
         parts = self._records
         self._records = []
@@ -239,7 +239,7 @@ class ArchiveProcess:
         self._reply(Opened(command.job))
 
     def _transfer(self) -> None:
-        """Write what has come to the archive, and close it at the end of the interval."""
+        """Write what has arrived to the archive, and close it at the end of the interval."""
         job = self._job
         if job is None:
             self._fill_buffer()

@@ -89,7 +89,7 @@ class InputError(HilError):
         super().__init__(self._message(shown))
 
     def message_next_to(self, path: str) -> str:
-        """Return the message for a reader who sees a path: without it if it is of this error."""
+        """Return the message for a reader who sees `path`: without it if this error is about it."""
         return self._message(None) if self.path == Path(path) else str(self)
 
     def _message(self, shown: str | Path | None) -> str:

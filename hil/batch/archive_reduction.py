@@ -200,7 +200,7 @@ def _summary_key(ref: ArchiveRef, settings: Settings) -> str:
 
 
 def has_summary(ref: ArchiveRef, settings: Settings, cache: CacheLocation) -> bool:
-    """Return whether what an archive says by itself is cached, so that it need not be read."""
+    """Return whether the header data of an archive are cached, so that it need not be read."""
     return cache.has(ref.origin, _summary_key(ref, settings))
 
 

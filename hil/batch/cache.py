@@ -162,7 +162,7 @@ class CacheLocation:
 
 
 def _split(numbers: NDArray[np.uint8], layout: Mapping[str, Any]) -> Arrays:
-    """Return the arrays of these types and shapes that lie in `numbers`, as views."""
+    """Return the arrays of these types and shapes in `numbers`, as views."""
     arrays = {}
     begin = 0
     for name, (dtype, shape) in layout.items():

@@ -472,7 +472,7 @@ class _Batch:
         return receive
 
     def _uncached(self, campaign: _Campaign) -> int:
-        """Return how many archives of a campaign have to be read."""
+        """Return how many archives of a campaign must be read."""
         count = 0
         for partition in campaign.partitions:
             if not self._has(partition, campaign):

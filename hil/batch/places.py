@@ -19,9 +19,9 @@ _VALIDATORS: Final = ("ETag", "Content-MD5", "Digest", "Last-Modified", "created
 
 
 class Stamp(NamedTuple):
-    """What tells whether a file has changed."""
+    """What shows whether a file has changed."""
 
-    text: str  #: "" where the server tells nothing that changes with the content
+    text: str  #: "" if the server states nothing that changes with the content
     changed: int = 0  #: time of the last change [ns], 0 where the text shows every change
 
 

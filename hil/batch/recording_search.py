@@ -18,7 +18,7 @@ from .places import archives_at, is_url
 
 
 class KindsOfLogs(Protocol):
-    """Tells logs and bags from other files."""
+    """Distinguishes logs and bags from other files."""
 
     def is_log(self, file: Path, siblings: Collection[str]) -> bool:
         """Return whether a file, found in a folder with these names, may be a log or a bag."""

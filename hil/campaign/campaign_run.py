@@ -224,7 +224,7 @@ class _CampaignRun:
                 self._warm_up.motion_ended()
 
     def _missing(self, *kinds: str) -> list[CampaignMotion]:
-        """Return what is to be run at full speed, as far as the options say."""
+        """Return what the options require to run at full speed."""
         most = self._options.repetitions
         only = self._options.only
         return [

@@ -51,7 +51,7 @@ def yes_or_no(only_simulated: bool) -> str:
 
 
 def is_from(path: Path, only_simulated: bool) -> bool:
-    """Return whether an archive is of this kind of arm; False for a damaged one."""
+    """Return whether an archive is from this kind of arm; False for a damaged one."""
     try:
         return open_archive(path, fields=()).header.simulated == yes_or_no(only_simulated)
     except ArchiveError:

@@ -114,7 +114,7 @@ class DryRunStage:
         return agreed
 
     def _complete(self, slow: CampaignMotion) -> str | None:
-        """Return the name of its complete archive, if it is of this kind of arm."""
+        """Return the name of its complete archive, if it is from this kind of arm."""
         name = self._folder.complete_archive(slow.kind, slow.index)
         made = name is not None and is_from(self._folder.archives / name, self._archives.simulated)
         return name if made else None

@@ -128,7 +128,7 @@ class CampaignState:
 
     @property
     def precision(self) -> PrecisionRecord | None:
-        """Precision of its repetitions, as far as a run measured it."""
+        """Precision of its repetitions, if a run measured it."""
         if not path_exists(self.folder.precision):
             return None
         return PrecisionRecord.load(self.folder.precision, self.folder.plan_hash)

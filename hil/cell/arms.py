@@ -156,7 +156,7 @@ def _parents(
 def recorded_arms(
     arms: Iterable[Arm], count: int, joints: Collection[str], names: Sequence[str]
 ) -> list[Arm]:
-    """Return the arms that a recording may be of.
+    """Return the arms that may have made a recording.
 
     Args:
         arms: of the URDF.

@@ -1,4 +1,4 @@
-"""Joints of a URDF that are of a gripper or hand, by their names."""
+"""Joints of a gripper or hand in a URDF, by their names."""
 
 from __future__ import annotations
 

@@ -32,7 +32,7 @@ def planted_truth(cell: Cell) -> PlantTruth:
 
 
 def carried(cell: Cell, payload: Payload | None) -> Carried | None:
-    """Return a payload as what the simulated arm carries (ModelError: not on a moving link)."""
+    """Return a payload as the body on the simulated arm (ModelError: not on a moving link)."""
     if payload is None or payload.mass == 0.0:
         return None
     joint, inertial = payload.carried_by(cell.model.chain)

@@ -132,7 +132,7 @@ def realtime_process(priority: int | None) -> Iterator[None]:
 
 @dataclass(frozen=True)
 class Served:
-    """Result of a session on a real link; controller and counts are of the last start."""
+    """Result of a session on a real link; controller and counts belong to the last start."""
 
     controller: SimulatedController
     summary: serve.ServeCounts

@@ -241,7 +241,7 @@ class VirtualPort:
         return self._archiving
 
     def _is_complete(self, archiving: _Archiving) -> bool:
-        """Return whether a motion has ended with all that belongs to its archive.
+        """Return whether a motion has ended, and its archive has everything.
 
         A motion stopped while its axes opened has not started; they have to close.
         """

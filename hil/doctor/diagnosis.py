@@ -171,7 +171,7 @@ def run_probe(
 
 @dataclass(frozen=True)
 class Diagnosis:
-    """All results: verdicts on 1 and 2 ms and on `cycle_ms`, which has to be fit."""
+    """All results: verdicts on 1 and 2 ms and on `cycle_ms`, which must be fit."""
 
     checks: tuple[DoctorCheck, ...]
     latencies: tuple[Latency, ...]

@@ -25,12 +25,12 @@ _MIN_INDEPENDENT_SHARE: Final = 1e-6  # of a covariate, that others leave of it
 
 
 def is_heat(name: str) -> bool:
-    """Return whether a name or a unit is of a temperature."""
+    """Return whether a name or a unit means a temperature."""
     return _HEAT.search(name) is not None
 
 
 def is_since_start(name: str) -> bool:
-    """Return whether a name is of the time since a robot was started."""
+    """Return whether a name means the time since a robot was started."""
     return _SINCE_START.search(name) is not None
 
 

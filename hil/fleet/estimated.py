@@ -1,4 +1,4 @@
-"""Series of the robots of a fleet: every recording is estimated by itself."""
+"""Series of the robots of a fleet: every recording is estimated separately."""
 
 from __future__ import annotations
 
@@ -133,7 +133,7 @@ def _types(
 
 @dataclass(frozen=True, eq=False)
 class _TypeFits:
-    """Estimates of all recordings of robots of one type, each by itself."""
+    """Estimates of all recordings of robots of one type, each estimated separately."""
 
     model: RobotModel
     by_robot: Mapping[str, Sequence[Summary]]  #: in order of time

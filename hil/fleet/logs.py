@@ -261,7 +261,7 @@ def _read(
 def _by_map(
     source: Path, place: Path, reading: LogReading, log_map: LogMap, files: LogFiles
 ) -> ImportedRecording:
-    """Read a log by a map, of the robot under the gravity that belongs to it."""
+    """Read a log by a map, with the gravity of that map."""
 
     def robot_of(recorded: Callable[[], tuple[str, ...] | None]) -> Robot:
         robot = reading.robot_of(recorded)
@@ -330,7 +330,7 @@ def _files_of(source: Path) -> list[Path]:
 
 
 def _stamp(log: str) -> Stamp:
-    """Return what tells whether a log, or any file of its folder, has changed."""
+    """Return what shows whether a log, or any file of its folder, has changed."""
     stamps = [stamp_of(path.as_posix()) for path in _files_of(Path(log))]
     return Stamp("; ".join(stamp.text for stamp in stamps), max(each.changed for each in stamps))
 

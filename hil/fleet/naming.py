@@ -1,4 +1,4 @@
-"""Of which robot a recording is, and when it was made."""
+"""Robot and date of a recording."""
 
 from __future__ import annotations
 

@@ -80,7 +80,7 @@ class TypeSeries:
 
 
 def first_of(recordings: Sequence[DatedRecording]) -> int:
-    """Return how many recordings are of the first months."""
+    """Return how many recordings are from the first months."""
     start = recordings[0].moment
     within = sum(each.moment - start < REFERENCE_MONTHS * MONTH for each in recordings)
     return max(min(_MIN_REFERENCE_RECORDINGS, len(recordings)), within)

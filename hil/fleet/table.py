@@ -232,7 +232,7 @@ class _Entry(NamedTuple):
 
 
 def _series(kind: str, entries: Sequence[_Entry], conditions: Conditions) -> TypeSeries:
-    """Return the series of one type; several values of one date are of several recordings."""
+    """Return the series of one type; several values of one date are from several recordings."""
     facts: dict[str, dict[_Key, dict[str, float]]] = {}
     values: dict[FollowedQuantity, dict[str, dict[_Key, tuple[float, float]]]] = {}
     for entry in entries:

@@ -197,7 +197,7 @@ def fleet_trend(
     limits: Sequence[TrendLimit] = (),
     covariates: Sequence[str] = (),
 ) -> FleetTrend:
-    """Find what changes over time in the series of robots, each type by itself.
+    """Find what changes over time in the series of robots, each type separately.
 
     Args:
         types: their series.

@@ -41,7 +41,7 @@ def read_lines(arm: IdentifiedArm) -> list[tuple[str, str]]:
 
 
 def _decisive(arm: IdentifiedArm) -> Iterator[tuple[str, str]]:
-    """Yield what was changed in recordings, and why they may be of another arm."""
+    """Yield what was changed in recordings, and why they may be from another arm."""
     if arm.staging is None:
         return
     for place, recording in arm.staging.recordings.items():

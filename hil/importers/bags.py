@@ -342,7 +342,7 @@ def _unpacked_blocks(packed: IO[bytes], file: Path) -> Iterator[bytes]:
 
 
 def _decompressed(data: bytes, file: Path) -> bytes:
-    """Return a message, decompressed if it was compressed by itself."""
+    """Return a message, decompressed if it was compressed individually."""
     if not data.startswith(_ZSTD_MAGIC):
         return data
     try:

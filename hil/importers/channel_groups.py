@@ -49,7 +49,7 @@ class ChannelGroup:
         return first if first == last else f"{first} .. {last}"
 
     def joints(self, joints: Sequence[str]) -> tuple[str, ...]:
-        """Return the joints of the URDF that the names are of."""
+        """Return the joints of the URDF to which the names belong."""
         if not self.by_joint:
             return ()
         return tuple(joint for joint in joints if self.pattern.replace("{}", joint) in self.names)

@@ -58,7 +58,7 @@ class CommandStamps(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class Measured:
-    """Measured positions that commands have to follow."""
+    """Measured positions that must follow the commands."""
 
     joints: tuple[str, ...]  #: of the robot
     renamed: Mapping[str, str]  #: names in the URDF by name in the bag
@@ -163,7 +163,7 @@ def _candidates(topics: Mapping[str, Topic], states: str) -> list[list[str]]:
 
 
 def topics_of_kind(topics: Mapping[str, Topic], kind: str) -> list[str]:
-    """Return the topics whose messages are of a type of ROS 2, or of the same of ROS 1."""
+    """Return the topics whose messages have a type of ROS 2, or the same type of ROS 1."""
     kinds = (kind, kind.replace("/msg/", "/"))
     return [name for name, topic in topics.items() if topic.is_ros and topic.kind in kinds]
 

@@ -153,7 +153,7 @@ def _array(values: Sequence[Any]) -> NDArray[Any] | None:
 
 
 def _typed(values: Sequence[Number | Sequence[Number]]) -> NDArray[Any]:
-    """Return whole numbers as such, as a stamp in nanoseconds has too many digits for a double."""
+    """Return whole numbers as integers: a stamp in nanoseconds has too many digits for a double."""
     flat = values if not isinstance(values[0], list) else [x for row in values for x in row]  # type: ignore[union-attr]
     is_whole = all(isinstance(x, int) and abs(x) < _INT64_LIMIT for x in flat)
     return np.array(values, np.int64 if is_whole else np.float64)

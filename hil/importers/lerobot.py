@@ -202,7 +202,7 @@ class DataSet:
         raise SourceError(self.folder, problem, field=STATE, remedy=_CALIBRATE)
 
     def _unit_of_steps(self, arm: NDArray[np.bool_], ranges: Array | None) -> EpisodeUnit | None:
-        """Return the unit in which positions are steps of encoders; None if they are of none."""
+        """Return the unit in which positions are steps of encoders, or None."""
         known = arm & np.isfinite(self.steps)
         if np.count_nonzero(known) < _FEWEST_ENCODERS:
             return None

@@ -839,7 +839,7 @@ class _Log:
 
 
 def _unbroken(file: TextTable | ArrayFile, time: TimeColumn, decimals: int) -> Sequence[int | None]:
-    """Return the times of the first rows, as far as no row was left out."""
+    """Return the times of the first rows, up to the first row that was left out."""
     times = file.times(time.column, decimals, time.array)
     return times[: file.unbroken] if isinstance(file, TextTable) else times
 

@@ -37,12 +37,12 @@ class Topic:
 
     @property
     def is_ros2(self) -> bool:
-        """Whether the messages are of ROS 2."""
+        """Whether the messages are ROS 2 messages."""
         return self.encoding == "cdr" and self.schema_encoding in ("ros2msg", "ros2idl", "")
 
     @property
     def is_ros(self) -> bool:
-        """Whether the messages are of ROS 1 or ROS 2."""
+        """Whether the messages are ROS 1 or ROS 2 messages."""
         return self.is_ros2 or self.encoding == "ros1"
 
     def __str__(self) -> str:

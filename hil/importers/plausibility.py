@@ -133,7 +133,7 @@ def _constant(position: Array, names: Sequence[str], held: Collection[str]) -> I
 def _stopped(
     time: Array, position: Array, commanded: Array | None, names: Sequence[str]
 ) -> Iterator[Conclusion]:
-    """Yield a warning for each joint that moved, and stands at the end against its command."""
+    """Yield a warning for each joint that moved, and at the end rests against its command."""
     if commanded is None:
         return
     for name, places, commands in zip(names, position.T, commanded.T, strict=True):

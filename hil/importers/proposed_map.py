@@ -538,7 +538,7 @@ class _Search:
 
 
 def _likely(kind: str, groups: Sequence[ChannelGroup]) -> str:
-    """Return the pattern of the group that may be of a quantity: by its words, else the first."""
+    """Return the pattern of the group that may contain a quantity: by its words, else the first."""
     said = {
         group.pattern: kinds_said(group.pattern)
         for group in groups

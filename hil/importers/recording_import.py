@@ -418,7 +418,7 @@ def import_bag(
 def _of_recorded_joints(
     read: Callable[[RobotOf], ImportedRecording], robot_of: RobotOf, source: Path
 ) -> ImportedRecording:
-    """Import with unrecorded joints fixed, where the URDF tells which they are."""
+    """Import with unrecorded joints fixed, if the URDF shows which they are."""
     robots = _OfRecordedJoints(robot_of, source)
     try:
         return read(robots)
@@ -488,7 +488,7 @@ class _OfRecordedJoints:
         return True
 
     def _arm(self, robot: Robot, error: UnrecordedJointError) -> Arm | None:
-        """Return the only arm that the recording may be of, None without one."""
+        """Return the only arm that may have made the recording, or None."""
         arms = arms_of(robot.urdf, robot.joint_names)
         fitting = recorded_arms(arms, error.count, error.joints, error.channels)
         if len(fitting) > 1:

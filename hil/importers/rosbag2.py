@@ -173,7 +173,7 @@ def recorded_joints(
 
 
 def _choose(bag: Bag, topic: str | None) -> str:
-    """Return the requested topic, or the only one that carries joint states."""
+    """Return the requested topic, or the only one with joint states."""
     fitting = measured_topics(bag.topics)
     if topic is None and len(fitting) == 1:
         (topic,) = fitting
@@ -299,7 +299,7 @@ class _States:
         )
 
     def measured(self, samples: ImportedSamples) -> Measured:
-        """Return the positions that commands have to follow, and the clock of their stamps."""
+        """Return the positions that must follow the commands, and the clock of their stamps."""
         late = [
             received - stamp
             for part in self._parts.values()

@@ -72,7 +72,7 @@ def sign_bit_of(values: Array) -> int | None:
 
 
 def are_per_mille(names: Sequence[str], values: Array) -> bool:
-    """Return whether values (m, n) are of the objects 6077h or 6078h of a drive.
+    """Return whether values (m, n) may be the objects 6077h or 6078h of a drive.
 
     These are whole, in per mille of its rated torque or current.
     """

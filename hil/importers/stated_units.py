@@ -46,7 +46,7 @@ def without_unit(name: str) -> tuple[str, str | None]:
 
 
 def other_unit(path: Path, kind: Kind, channels: str, unit: str) -> SourceError:
-    """Return the refusal of channels whose unit is of another quantity, or of none.
+    """Return the refusal of channels whose unit belongs to another quantity, or to none.
 
     Args:
         path: of the log.

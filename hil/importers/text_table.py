@@ -250,7 +250,7 @@ class TextTable:
 
     @cached_property
     def _is_simple(self) -> bool:
-        """Whether cells are separated by nothing but the delimiter, with a decimal point."""
+        """Whether the delimiter alone separates cells, with a decimal point in numbers."""
         return self.dialect.decimal == "." and not any('"' in line for line in self.lines)
 
     def matrix(self, _name: str | None, field: str) -> Array:

@@ -22,7 +22,7 @@ _WEIGHTS: Final = {
     "kg": _KILOGRAM_FORCE, "g": 1e-3 * _KILOGRAM_FORCE, "lb": _POUND_FORCE, "lbs": _POUND_FORCE,
     "oz": _POUND_FORCE / 16.0,
 }  # fmt: skip
-"""Masses that stand for their weights where a length follows, as in the torque of servos."""
+"""Masses that mean their weights if a length follows, as in the torque of servos."""
 _LENGTHS: Final = {
     "m": 1.0, "cm": 1e-2, "mm": 1e-3, "in": 0.0254, "inch": 0.0254, "ft": 0.3048, "foot": 0.3048,
 }  # fmt: skip
@@ -63,7 +63,7 @@ _MAX_UNIT_CHARACTERS: Final = 24  # characters
 
 
 class UnitProduct(NamedTuple):
-    """A unit: the quantities that it is of, and its factor to SI units."""
+    """A unit: its quantities, and its factor to SI units."""
 
     kinds: tuple[str, ...]
     factor: float

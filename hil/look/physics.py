@@ -95,7 +95,7 @@ _ASPECTS: Final[Mapping[Meaning, Aspect]] = {
     "no gravity": "gravity",
     "mounting": "mounting",
 }
-"""The row of the table that a change belongs to."""
+"""Row of the table for a change."""
 _OPEN_SIGMAS_SHARE: Final = 0.5
 _MAX_CHOICES: Final = 3
 # error ratio of readings of which the recording does not choose one
@@ -230,7 +230,7 @@ class TorqueFindings:
 
     @property
     def _shows_times(self) -> bool:
-        """Whether the torque tells the times from others."""
+        """Whether the torque distinguishes the times from others."""
         readings = self.readings
         return shows_times(readings.model, readings.samples, readings.score)
 

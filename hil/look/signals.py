@@ -174,7 +174,7 @@ def _concluded(conclusion: Conclusion, units: Sequence[_Unit]) -> Row | None:
 
 
 def _velocity(recording: Recording) -> Row:
-    """Return what the velocity is of the slope of the position."""
+    """Return the ratio of the velocity to the slope of the position."""
     assert recording.velocity is not None
     moving = np.flatnonzero(np.ptp(recording.position, axis=0) > MIN_MOVEMENT)
     if not moving.size:

@@ -26,7 +26,7 @@ MIN_FRAME_HEIGHT: Final = 0.05
 
 
 class PartialCheck(NamedTuple):
-    """Postures that are clear, as far as shapes are known."""
+    """Postures that are clear of all known shapes."""
 
     clear: NDArray[np.bool_]  #: (m,)
     exceptions: str | None  #: pairs that are not checked, or with less than the margin

@@ -1,4 +1,4 @@
-"""Identification of archives by the folder they stand in: a campaign, or any other."""
+"""Identification of the archives in a folder: of a campaign, or any other."""
 
 from __future__ import annotations
 

@@ -48,7 +48,7 @@ class Options:
     #: rows and those near a reversal, or "none"; None depends on the friction law
     exclude_rows: ExcludedRows | Literal["auto"] | None = "auto"
     in_sample: bool = False  #: fit all recordings and hold out none
-    #: what the model has to be good for; by default it is judged by its error on unseen motion
+    #: what the model must be good for; by default it is judged by its error on unseen motion
     purposes: tuple[PurposeName, ...] = ()
     required: PurposeLimits = NOTHING_REQUIRED  #: of these
     standstill: InitVar[ExcludedRows | Literal["auto", ""]] = ""  #: `exclude_rows` before 0.2

@@ -436,7 +436,7 @@ def _asks_low_pass(sources: Sources, options: Options) -> bool:
 def _questions(
     sources: Sources, options: Options, suggested: Sequence[SuggestedDelay]
 ) -> set[Question]:
-    """Return the questions that inner prediction has to answer."""
+    """Return the questions that inner prediction decides."""
     recorded = [source.recording for source in sources.training]
     questions: dict[Question, bool] = {
         "delay": bool(suggested),

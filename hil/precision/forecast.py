@@ -140,7 +140,7 @@ class PrecisionDesign:
     cell: Cell
     required: RequiredQuantities
     subject: Array  #: parameters (p,) that the torque's scale multiplies: the arm's, or a load's
-    values: Array  #: parameters of the arm (p,), as far as they are known
+    values: Array  #: known parameters of the arm (p,)
     prior: Array  #: information of prior and recordings (p, p)
     error: Array  #: density (n,) of the torque error that every repetition has [(N m)² s]
     noise: Array  #: density (n,) of the noise that repetitions average [(N m)² s]

@@ -123,7 +123,7 @@ def settings_result(identification: Identification) -> SettingsResult:
 
 
 def is_of_report(folder: Path, rollout: RolloutResult) -> bool:
-    """Return whether a rollout is of the parameters that the report of a folder is about."""
+    """Return whether a rollout belongs to the parameters in the report of a folder."""
     parameters = folder / PARAMETERS_JSON
     reported = path_exists(parameters) and path_exists(folder / SERIES)
     return reported and rollout.parameters == file_digest(parameters)

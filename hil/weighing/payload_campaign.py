@@ -60,7 +60,7 @@ Links = Callable[[Campaign, int], MotionLink | None]
 
 
 class MountingError(UnsafeError):
-    """The payload has to be mounted or removed, with no operator to confirm it."""
+    """The payload must be mounted or removed, without an operator to confirm it."""
 
 
 class PayloadMounting:

@@ -28,7 +28,7 @@ from identification.factor.normal_equations import or_one
 from identification.model.robot import RobotModel
 
 MIN_ARMS = 10
-"""Arms of which a spread is estimated."""
+"""Number of arms from which a spread is estimated."""
 # deviations of a quantity without prior, in the largest deviation of the others
 _UNKNOWN_STD_FACTOR = 1e3
 _MIN_EIGENVALUE = 1e-14  # eigenvalue of a correlation matrix

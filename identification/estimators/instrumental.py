@@ -99,7 +99,7 @@ def planned_motion(samples: Samples, commanded: Array, *, lag: Array | None = No
 
 
 def same_plan(first: tuple[Array, Array], second: tuple[Array, Array]) -> bool:
-    """Return whether two pairs of times (m,) and commanded positions (m, n) are of one motion."""
+    """Return whether two pairs of times (m,) and commanded positions (m, n) are one motion."""
     (time, commanded) = first
     (other_time, other) = second
     if commanded.shape[1] != other.shape[1]:

@@ -188,7 +188,7 @@ def _impossible(intervals: Array, rounding: float) -> NDArray[np.bool_]:
 
 @dataclass(frozen=True)
 class Weighing:
-    """Body of one recording by itself, where it is determined."""
+    """Body of one recording alone, if it is determined."""
 
     name: str  # of the recording
     mass: tuple[float, float, float]  # value and 95 % interval [kg]
@@ -303,7 +303,7 @@ def _off_centre(mass: float, reach: Array) -> tuple[Array, Array]:
 
 
 class _BodyEstimate(NamedTuple):
-    """Ten parameters of a body, as far as they are determined."""
+    """Ten parameters of a body, and which of them are determined."""
 
     values: Array  # (10,)
     determined: Array  # determined combinations (r, 10)

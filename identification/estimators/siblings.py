@@ -39,7 +39,7 @@ class Siblings:
 
 
 def with_siblings(estimates: Sequence[Estimate]) -> Siblings | None:
-    """Return the arms of one type, from the estimate of each by itself; None of too few."""
+    """Return the arms of one type, from the estimate of each alone; None if there are too few."""
     if len(estimates) < MIN_ESTIMATES:
         return None
     stds = np.array([each.std for each in estimates])

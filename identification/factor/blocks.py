@@ -16,7 +16,7 @@ Blocks = TypeVar("Blocks", NDArray[np.float64], NDArray[np.intp])
 
 FINE_BLOCK: Final = 0.125  # s
 FOLDS: Final = 5
-"""Parts of blocks in turn, each of which is predicted from the others."""
+"""Number of interleaved parts of the blocks; each is predicted from the others."""
 
 
 def fine_blocks(samples: Samples) -> Indices:

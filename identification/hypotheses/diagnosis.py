@@ -150,7 +150,7 @@ class TorqueDiagnosis:
 
     @property
     def is_unseen_unexplained(self) -> bool:
-        """Whether no masses explain an unseen torque, by itself."""
+        """Whether no masses explain an unseen torque, judged alone."""
         return self.unseen_error is not None and self.unseen_error > UNEXPLAINED
 
     @property

@@ -111,7 +111,7 @@ def find_inertia_scale(
 
 
 def shows_times(model: RobotModel, samples: Samples, score: Score) -> bool:
-    """Return whether a torque tells times from times that are twice or half as long.
+    """Return whether a torque distinguishes times from times that are twice or half as long.
 
     It does not where friction hides the inertia, or the motion is slow. Without gravity nothing
     but the masses of the description does.

@@ -391,7 +391,7 @@ class _Joints:
 
 
 class _Search:
-    """The reading found so far, and the changes tried on it."""
+    """The best interpretation so far, and the changes tried on it."""
 
     def __init__(
         self,

@@ -71,7 +71,7 @@ def purposes_of(arm: Application, limits: PurposeLimits) -> tuple[Purpose, ...]:
 
 
 def feed_forward(evidence: Evidence, limits: PurposeLimits) -> Purpose:
-    """Return the share of the torque that feedback has to add on unseen motion."""
+    """Return the fraction of the torque that feedback must add on unseen motion."""
     share = evidence.held_out.overall
     if evidence.in_sample or not np.isfinite(share):
         return Purpose.unknown("feed-forward", "nothing held out")

@@ -84,7 +84,7 @@ class Reduction:
         return float(self.factor.samples.sum()) / max(1, int(self.unmodelled.forms.samples.sum()))
 
     def for_all_rows(self) -> Reduction:
-        """Return these sums with unmodelled effects that stand for all rows.
+        """Return these sums with unmodelled effects that represent all rows.
 
         So that reductions of different motions add in the proportion of their rows.
         """

@@ -32,7 +32,7 @@ class PositionServo(NamedTuple):
 
 
 def lead_of(servo: PositionServo | None) -> float:
-    """Return how long before a window the command of a servo has to be known [s]."""
+    """Return how long before a window the command of a servo must be known [s]."""
     return 0.0 if servo is None else max(servo.delay, MAX_SERVO_DELAY)
 
 

@@ -194,7 +194,7 @@ def _log_errors(squares: Array, resolution: Array) -> Array:
 def _choices(
     windows: ServoWindows, full: ServoEstimate, resolution: Array, done: Callable[[], None]
 ) -> tuple[TermChoice, ...]:
-    """Choose by the errors of windows that were not fitted, for each joint by itself.
+    """Choose by the errors of windows that were not fitted, for each joint separately.
 
     A joint is left without one term at most: that with which they are predicted worst.
     """

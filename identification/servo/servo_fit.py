@@ -1,4 +1,4 @@
-"""A fit of servos: the estimate, the terms that were chosen for it, and the windows it is of."""
+"""A fit of servos: the estimate, its terms, and the fitted windows."""
 
 from __future__ import annotations
 

@@ -49,7 +49,7 @@ def clock_lines(clock: TimeBase) -> list[str]:
 
 
 def time_lines(times: SampleTimes) -> list[str]:
-    """Return lines on the times that are used, none for even stamps of which none repeats."""
+    """Return lines on the times that are used; none for even stamps without repetition."""
     lines = []
     if times.removed:
         lines.append(

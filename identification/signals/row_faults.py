@@ -173,7 +173,7 @@ def _frozen(recording: Recording) -> Iterator[tuple[int, int]]:
 
 
 def _jumps(recording: Recording, gap: Rows) -> Iterator[tuple[int, NDArray[np.intp]]]:
-    """Yield rows before which several joints jump at once, and which do.
+    """Yield rows before which several joints jump together, and which do.
 
     No few missing rows explain such a step: it is larger than `GAP_STEPS` further steps at the
     speed beside it. The positions stay there, other than after a single wrong row.

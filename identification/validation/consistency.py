@@ -100,7 +100,7 @@ class ConsistencyCheck:
 
     @property
     def is_balanced(self) -> bool:
-        """Whether one joint carries a weight that no body can, as a spring or balancer does."""
+        """Whether one joint bears a weight that no body explains, as with a spring or balancer."""
         return bool(self.overloaded) and self.costly
 
 
@@ -184,7 +184,7 @@ def _rise(held_out: Factor, values: Array, free: Array) -> Array:
 def _overloaded(
     model: RobotModel, training: Factor, held_out: Factor, values: Array, free: Array
 ) -> str:
-    """Return the joint that gravity loads and that most of the rise of the squared error is of."""
+    """Return the joint under gravity with most of the increase of the squared error."""
     rise = np.maximum(held_out.squared_errors(values) - held_out.squared_errors(free), 0.0)
     joint = int(rise.argmax())
     alone = rise[joint] > 0.5 * rise.sum() and _gravity_loaded(model, training, free)[joint]

@@ -1,4 +1,4 @@
-"""Signs of an estimate that are physically impossible, as far as they are significant."""
+"""Signs of an estimate that are physically impossible and significant."""
 
 from __future__ import annotations
 

@@ -24,8 +24,8 @@ NoFigure = Literal[
 class PurposeLimits:
     """What a user requires; None is reported and not judged."""
 
-    contact: float | None = None  #: force at the flange that has to be seen [N]
-    payload: float | None = None  #: mass at the flange that has to be seen [kg]
+    contact: float | None = None  #: force at the flange that must be noticed [N]
+    payload: float | None = None  #: mass at the flange that must be noticed [kg]
     #: error of the flange after `identification.purposes.simulation_error.HORIZON_SECONDS` [m]
     distance: float = 5e-3
     feed_forward: float = 0.2  #: share of the torque that may be left for feedback

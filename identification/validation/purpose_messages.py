@@ -112,7 +112,7 @@ def _gravity(purpose: Purpose, joints: Sequence[str]) -> str:
 
 
 def requirement(purpose: Purpose) -> str:
-    """Return what the figure has to be; empty where nothing is required."""
+    """Return the requirement on the figure; empty if there is none."""
     if purpose.limit is None:
         return ""
     match purpose.name:

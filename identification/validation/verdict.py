@@ -119,7 +119,7 @@ def fault_of(findings: Sequence[WordedFinding]) -> WordedFinding | None:
 
 
 def _of_no_arm(tested_on: TestedOn, fault: WordedFinding | None, evidence: Evidence) -> str:
-    """Return that a model predicts and is of no arm, or not of the described one; else ""."""
+    """Return the clause on a model that predicts, but is no arm or another one; else ""."""
     if fault is None or fault.check not in (ARM, IMPOSSIBLE):
         return ""
     share = percentage(evidence.held_out.overall, 1)

@@ -46,7 +46,7 @@ class Threshold(Protocol):
 
     @property
     def force(self) -> float:
-        """At the flange, of which 95 % of directions exceed it [N]; infinite where none does."""
+        """Force at the flange that exceeds it in 95 % of directions [N]; infinite if none does."""
 
     @property
     def mass(self) -> float:

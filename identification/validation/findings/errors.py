@@ -151,7 +151,7 @@ def unexplained_error(evidence: Evidence, limits: Thresholds) -> Finding | None:
 
 
 def left_open(evidence: Evidence, limits: Thresholds) -> Finding | None:
-    """Return that the error does not tell models of the same fit apart.
+    """Return that the error does not distinguish models of the same fit.
 
     None if it is small, or less is open.
     """

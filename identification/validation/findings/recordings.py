@@ -13,7 +13,7 @@ from identification.validation.finding import Finding, Thresholds, Value
 
 
 def nothing_held_out(evidence: Evidence, _: Thresholds) -> Finding | None:
-    """Return that all errors are of the fit."""
+    """Return that all errors are on fitted motion."""
     if not evidence.in_sample:
         return None
     return Finding("nothing held out", "wrong", "hold out a motion")

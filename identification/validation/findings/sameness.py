@@ -42,7 +42,7 @@ def load(evidence: Evidence, limits: Thresholds) -> Finding | None:
 
 
 def _changes(evidence: Evidence, limits: Thresholds) -> tuple[UnseenChange, ...] | None:
-    """Return the changes of joints; None if another cause would be read as such."""
+    """Return the changes of joints; None if another cause would look like one."""
     # Or it has spoilt the parameters.
     if load(evidence, limits) is not None or gravity_error(evidence, limits) is not None:
         return None
@@ -65,7 +65,7 @@ def changed_torque_of_large_errors(evidence: Evidence, limits: Thresholds) -> Fi
 
 
 def changed_torque_of_small_errors(evidence: Evidence, limits: Thresholds) -> Finding | None:
-    """Return such joints whose error does not have to be explained."""
+    """Return the joints whose error needs no explanation."""
     return _changed_torque(evidence, limits, matters=False)
 
 
