@@ -35,7 +35,7 @@ _CAMPAIGN: Final = {
     "campaign.standstill_s": 2.0,
 }
 """The arm is simulated and at home: it need not approach slowly."""
-_VIA_POINTS: Final = {"campaign.n_via": 6, "campaign.fly": 0.5}  # of the print's held-out motions
+_VIA_POINTS: Final = {"campaign.n_via": 6, "campaign.fly": 0.5}  # of the paper's held-out motions
 _HELD_OUT_SHARE: Final = 0.5  # duration of held-out sines over that of the excitations
 _RAMP_SHARE: Final = 0.1  # of that duration
 # first number of a random stream that no search and no fly-by motion uses

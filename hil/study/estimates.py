@@ -32,9 +32,9 @@ from .model_errors import Condition, ModelErrors, PlannedTorque
 from .settings import PRINTED_DURATION, PRINTED_REPETITIONS
 
 PRINTED_ROWS: Final = 2000
-"""Samples of a repetition of method A in the print."""
+"""Samples of a repetition of method A in the paper."""
 CAMPAIGN_TIME: Final = PRINTED_REPETITIONS * PRINTED_DURATION
-"""Duration of the print's repetitions, in which the friction drifts, s.
+"""Duration of the paper's repetitions, in which the friction drifts, s.
 
 Repetitions of a study are evenly spread over it; held-out motions come at its end.
 """
@@ -46,7 +46,7 @@ class DesignEstimates:
 
     key: str  #: of the search
     values: Array  #: (c, r, p)
-    few_rows: Array  #: from as many rows as method A has in the print (c, r, p)
+    few_rows: Array  #: from as many rows as method A has in the paper (c, r, p)
 
     @property
     def mean(self) -> Array:

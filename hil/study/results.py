@@ -33,7 +33,7 @@ class StudyParameter(Frozen):
     truth: float  #: Of the simulated arm
     printed_id: int | None = None  #: Row of the paper's Table 2
     printed_symbol: str | None = None
-    printed_factor: float = 1.0  #: What a value is multiplied with to compare it with the print
+    printed_factor: float = 1.0  #: What a value is multiplied with to compare it with the paper
     printed_a: float | None = None
     printed_b: float | None = None
     printed_c: float | None = None
@@ -109,7 +109,7 @@ class StudyComparison(Frozen):
     first: Method
     second: Method
     motions: str  #: Class of the held-out motions
-    printed_sizes: bool = False  #: Whether A was fitted to as many rows as in the print
+    printed_sizes: bool = False  #: Whether A was fitted to as many rows as in the paper
     ratio: float  #: Geometric mean over searches and motions
     wins: int  #: Motions that the second method predicts better, in the mean over searches
     motion_count: int
@@ -135,7 +135,7 @@ class ConditionResult(Frozen):
             first: method.
             second: method that it is compared with.
             motions: on which errors are compared.
-            printed_sizes: whether A was fitted to as many rows as in the print.
+            printed_sizes: whether A was fitted to as many rows as in the paper.
         """
         key = (first, second, motions, printed_sizes)
         return next(

@@ -17,9 +17,9 @@ from hil.results.results import Frozen
 Count = Annotated[int, Field(strict=True, ge=1)]
 
 PRINTED_DURATION: Final = 16.0
-"""Duration of the print's motion of method B, 15 996 samples at 1 kHz, s."""
+"""Duration of the paper's motion of method B, 15 996 samples at 1 kHz, s."""
 PRINTED_REPETITIONS: Final = 30
-"""Executions of each excitation in the print."""
+"""Executions of each excitation in the paper."""
 
 
 class Effort(Frozen):
