@@ -99,7 +99,7 @@ def summary(
         calibration=None if calibration is None else results.CalibrationResult.of(calibration),
         delays=_delays(prepared),
         choices=[*map(_choice, prepared.settings.choices)],
-        coverage=None if truth is None else _coverage(pooled.values, pooled.std, truth),
+        coverage=None if truth is None else _coverage(pooled.values, absolute(pooled).std, truth),
         verdict=results.VerdictResult.of(
             verdict, warnings=[*verdict.warnings, *note_lines(sources.warnings)]
         ),

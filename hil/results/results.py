@@ -345,7 +345,7 @@ class ParameterResult(Frozen):
 
     @property
     def deviation(self) -> float | None:
-        """(estimate - truth) / std; None if unknown."""
+        """(estimate - truth) / std, absolute; None if unknown."""
         return self.deviation_of(self.estimate, self.std)
 
     @property
@@ -362,10 +362,15 @@ class ParameterResult(Frozen):
         return "within 10 %" if well else "within 50 %" if roughly else "not identified"
 
     def deviation_of(self, estimate: float, std: float) -> float | None:
-        """Return the deviation of another estimate of this parameter."""
+        """Return the deviation of another estimate of this parameter.
+
+        `std` is in units of the torque of this arm, whose scale the truth does not have.
+        """
         if self.truth is None or not std > 0.0:
             return None
-        z = (estimate - self.truth) / std
+        absolute = self.std if self.absolute_std is None else max(self.absolute_std, self.std)
+        scale = math.sqrt(absolute**2 - self.std**2) if math.isfinite(absolute) else 0.0
+        z = (estimate - self.truth) / math.hypot(std, scale)
         return z if math.isfinite(z) else None
 
 
