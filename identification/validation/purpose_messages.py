@@ -108,7 +108,7 @@ def _gravity(purpose: Purpose, joints: Sequence[str]) -> str:
     _, joint, error, limit = max(held)
     if not math.isfinite(error):
         return f"{joint} not determined"
-    return f"{joint} off by {rounded(error)}, dry friction {rounded(limit)} N·m"
+    return f"{joint} off by {rounded(error)} N·m, dry friction {rounded(limit)} N·m"
 
 
 def requirement(purpose: Purpose) -> str:

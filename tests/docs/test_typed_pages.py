@@ -260,10 +260,7 @@ class TestFirstHour:
                 continue
             controller = None
             if step[1] in {"new", "record", "move", "run"}:
-                far = [part.replace("2001", port) for part in simulate]
-                # A campaign of minutes meets longer pauses of a busy computer than a motion.
-                patience = () if step[1] == "run" else ("--patience", "0.5")
-                controller = self.hil([*far, *patience])
+                controller = self.hil([part.replace("2001", port) for part in simulate])
             done = self.hil([part.replace("2001", port) for part in step])
             printed, _ = done.communicate(timeout=900 if step[1] == "run" else 180)
             if controller is not None:
