@@ -43,6 +43,7 @@ def watch(supervisor: int, processor: int, file: str) -> None:
     """Note stalls of a processor in `file`, until there is one of that name ending in `.end`."""
     enter(RealTimeSettings(priority=PRIORITY, cpu=processor))
     done = Path(file).with_suffix(".end")
+    Path(file).with_suffix(".begun").touch()
     stalls = []
     deadline = time.monotonic()
     look = deadline
@@ -64,7 +65,7 @@ def watch(supervisor: int, processor: int, file: str) -> None:
 
 @contextmanager
 def watched(folder: Path) -> Iterator[dict[int, Array]]:
-    """Watch every processor in this block; the stalls are there after it."""
+    """Watch every processor in this block, from its beginning; the stalls are there after it."""
     found: dict[int, Array] = {}
     files = {cpu: folder / f"stalls_{cpu}.npy" for cpu in os.sched_getaffinity(0)}
     watches = [
@@ -74,11 +75,16 @@ def watched(folder: Path) -> Iterator[dict[int, Array]]:
     for process in watches:
         process.start()
     try:
+        begun = [file.with_suffix(".begun") for file in files.values()]
+        while not all(each.exists() for each in begun):
+            if not all(process.is_alive() for process in watches):
+                raise RuntimeError("a process that watches a processor did not begin")
+            time.sleep(0.05)
         yield found
         for file in files.values():
             file.with_suffix(".end").touch()
         for process in watches:
-            process.join(5.0)
+            process.join()
         found |= {cpu: np.load(file) for cpu, file in files.items()}
     finally:
         for process in watches:

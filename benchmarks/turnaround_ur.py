@@ -182,7 +182,13 @@ def cell_at_free_ports() -> Cell:
 
 
 def measure(cycles: int, folder: Path) -> dict[str, Any]:
-    """Run once; return the times at the controller and at the exchange."""
+    """Run once; return times at the controller and at the exchange, and the machine's stalls."""
+    with machine_stalls.watched(folder) as stalls:
+        times = _times(cycles, folder)
+    return times | {"stalls": stalls}
+
+
+def _times(cycles: int, folder: Path) -> dict[str, Any]:
     cell = cell_at_free_ports()
     processors = os.sched_getaffinity(0)
     answering = RealTimeSettings(priority=50, cpu=max(processors))
@@ -211,14 +217,13 @@ def measure(cycles: int, folder: Path) -> dict[str, Any]:
         reader.start()
         time.sleep(_SETTLING_SECONDS)
         before = exchange.status()
-        with machine_stalls.watched(folder) as stalls:
-            exchange.submit(Sinusoids(LOOP + FADE, PERIOD, loop=LOOP))
-            faults = latest = page_faults(exchange.pid)
-            while controller.is_alive():
-                exchange.send_heartbeat()
-                if exchange.alive:
-                    latest = page_faults(exchange.pid)
-                controller.join(0.1)
+        exchange.submit(Sinusoids(LOOP + FADE, PERIOD, loop=LOOP))
+        faults = latest = page_faults(exchange.pid)
+        while controller.is_alive():
+            exchange.send_heartbeat()
+            if exchange.alive:
+                latest = page_faults(exchange.pid)
+            controller.join(0.1)
         arrivals.with_suffix(".end").touch()
         while reader.is_alive():
             exchange.send_heartbeat()
@@ -239,7 +244,7 @@ def measure(cycles: int, folder: Path) -> dict[str, Any]:
         times |= {f"exchange_{name}": array for name, array in file.items()}
     return times | {
         "status": status, "before": before, "log": log, "endings": endings, "realtime": realtime,
-        "stalls": stalls, "page_faults": latest - faults,
+        "page_faults": latest - faults,
         "steal": steal_ticks() - stolen, "busy": busy_share(ticks), "load": os.getloadavg(),
     }  # fmt: skip
 
