@@ -84,7 +84,7 @@ AXES = ("t", "q{}", "tau{}")
 NOTHING = "almost nothing of the bodies"
 FAULTS = {
     "gravity": Fault(without_gravity, "torque without gravity", "gravity was removed", True),
-    "order": Fault(exchanged, "torque columns are of", "have probably been interchanged"),
+    "order": Fault(exchanged, "torque columns are of", "interchanged"),
     "sign": Fault(negated, "torque negated", "has probably the wrong sign"),
     "zeros": Fault(other_zeros, "zero moved by", "differ from the URDF"),
     "bodies": Fault(only_friction, NOTHING, NOTHING, True),
