@@ -38,6 +38,7 @@ from hil.pipeline.prepared import _DelayChoice, decide, prepare_sources, renewed
 from hil.pipeline.sources import gather_sources
 from hil.pipeline.summary import _delays
 from hil.report.output_files import settings_result, write_outcome
+from hil.results.error_columns import RMS_TITLE, error_columns
 from hil.results.results import SCHEMA_VERSION, Results
 from identification.errors import IdentificationError
 from identification.estimators.consistent import SolverError
@@ -410,8 +411,10 @@ class TestJudgement:
     def test_is_a_table_sentences_and_json(self, identification, judgement):
         rows = table(identification.results, everything=True)
         lines = sentences(identification.results)
-        heading = "joint RMS error of limit relative training noise nominal controller R²"
-        assert rows[0].split() == heading.split()
+        titles = [
+            column.title for column in error_columns(identification.results.judgement, limits=True)
+        ]
+        assert rows[0].split() == " ".join(["joint", RMS_TITLE, *titles]).split()
         names = (*identification.results.joint_names, "all")
         for row, name in zip(rows[1:], names, strict=True):
             assert row.startswith(name) and row.count("%") == (5 if name == "all" else 6)
@@ -654,7 +657,7 @@ def test_nothing_is_called_good_in_sample(log, split):
     assert more.n_samples > fewer.n_samples
     relative = [joint.relative for joint in results.judgement.joints]
     assert relative == pytest.approx(results.fitted.relative_error)
-    assert "in-sample" in table(results)[0] and "relative" not in table(results)[0]
+    assert "fitted" in table(results)[0] and "in motion" not in table(results)[0]
 
 
 # The arm of the log starts without acceleration, which no rigid body does: slow rows are left out.
