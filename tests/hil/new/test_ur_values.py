@@ -117,6 +117,7 @@ def test_a_urdf_gives_masses_and_the_arm_the_rest(
 
 
 def test_a_moving_arm_states_no_constants(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("hil.new.ur_values.REST_WAIT_SECONDS", 2.0)
     robot = SimulatedUr(program=UrProgram(rest=0.0, periods=100))
     with UrServer(robot, real_time=False).running() as server:
         for _ in range(100):
