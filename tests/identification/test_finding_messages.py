@@ -11,7 +11,7 @@ from typing import get_args
 import numpy as np
 import pytest
 
-from hil.pipeline import cell_context
+from hil.pipeline import cell_context, other_meanings, recorded_rows
 from identification.hypotheses.changes import Change
 from identification.signals.position_steps import PositionJump
 from identification.validation.finding import Finding, FindingKey, RemedyKey, RepeatedSamples
@@ -38,8 +38,8 @@ from identification.validation.physical_signs import SignKind
 NAMING = Naming(("one", "two", "three"))
 FIRST = PositionJump("a.mcap", "one", 1.5, 0.25)
 MODULES = (
-    cell_context, diagnosis, errors, excitation, faults, form, patterns, recordings, references,
-    sameness, scale,
+    cell_context, diagnosis, errors, excitation, faults, form, other_meanings, patterns,
+    recorded_rows, recordings, references, sameness, scale,
 )  # fmt: skip
 
 

@@ -268,6 +268,7 @@ class TestTorqueMeans:
         reasons = {
             RowReason.EDGE: ends,
             RowReason.SATURATED: np.zeros_like(ends),
+            RowReason.UNMEASURED: np.zeros_like(ends),
             RowReason.STANDSTILL: slow,
         }
         mask = RowMask(reasons, (LENGTH, 2), ~(ends | slow))

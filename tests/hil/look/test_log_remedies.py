@@ -21,7 +21,7 @@ from hil.identified.identified_arm import IdentifiedArm, arm_from
 from hil.importers.imported_robot import Robot
 from hil.importers.recording_import import ImportOptions, import_recording
 from hil.look import look_at
-from hil.look.readings import Decider, NextStep
+from hil.look.readings import ClockReading, Decider, MapKey, NextStep
 from hil.look.result import Look, Row
 from hil.payload.payload_run import find_payload
 from hil.pipeline.identification import Identification
@@ -119,16 +119,38 @@ def zeros_of_a_posture(read: Read) -> None:
     assert not row_of(read.look(columns=path), "zero").has_step
 
 
+def unit_of_time(read: Read) -> None:
+    look = read.look()
+    clock = row_of(look, "time").reading
+    assert look.map_text is not None
+    assert isinstance(clock, ClockReading)
+    path = read.folder / "map.toml"
+    unit = f'[time]\nunit = "{clock.unit}"\n'
+    path.write_text(look.map_text.replace("[time]\n", unit), encoding="utf-8")
+    assert not row_of(read.look(columns=path), "time").has_step
+
+
+def configuration(model: pin.Model, angles: Any) -> Any:
+    """The angles as pinocchio takes them, which has cosine and sine of joints without limits."""
+    parts = [
+        (np.cos(angle), np.sin(angle)) if joint.nq == 2 else (angle,)
+        for joint, angle in zip(model.joints[1:], angles, strict=True)
+    ]
+    return np.concatenate(parts)
+
+
 def payload_by_two_recordings(read: Read) -> None:
     urdf = str(urdf_of(read.log))
     bare, loaded = (pin.buildModelFromUrdf(urdf) for _ in range(2))
     load = pin.Inertia(LOAD, np.array([0.0, 0.0, 0.1]), 0.01 * np.eye(3))
     loaded.appendBodyToJoint(loaded.njoints - 1, load, pin.SE3.Identity())
+    angles = np.unwrap(read.position, axis=0)
     velocity, acceleration = (
-        np.gradient(read.position, read.time, axis=0),
-        np.gradient(np.gradient(read.position, read.time, axis=0), read.time, axis=0),
+        np.gradient(angles, read.time, axis=0),
+        np.gradient(np.gradient(angles, read.time, axis=0), read.time, axis=0),
     )
-    states = list(zip(read.position, velocity, acceleration, strict=True))
+    position = [configuration(bare, each) for each in angles]
+    states = list(zip(position, velocity, acceleration, strict=True))
     added = [
         pin.rnea(loaded, loaded.createData(), *state) - pin.rnea(bare, bare.createData(), *state)
         for state in states
@@ -144,6 +166,7 @@ def payload_by_two_recordings(read: Read) -> None:
 
 
 LOOK_EFFECTS: dict[Decider, Callable[[Read], None]] = {
+    MapKey("time.unit"): unit_of_time,
     NextStep.ASK_FOR_POSITIONS: raw_encoder_positions,
     NextStep.COMPARE_A_POSTURE: zeros_of_a_posture,
     NextStep.RECORD_PAYLOAD: payload_by_two_recordings,
