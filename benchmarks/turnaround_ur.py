@@ -12,9 +12,9 @@ itself stalls (`benchmarks.machine_stalls`): `late_by_stalls` are late set-point
 come in time without these stalls, `late_otherwise` are the program's own, and
 `latest_otherwise_ms` is the longest time of these from a frame to its set-point without stalls.
 `packets_late`, `replies_late` and `not_accepted` are the counts of `drivers.punctuality` during the
-motion, `exchange_page_faults` those of the exchange process then. `machine_busy` is the share of
-all processors in use, ours and others'. With `--busy` every processor is kept busy by an ordinary
-process.
+motion, `exchange_page_faults` the page faults of the exchange process then. `machine_busy` is the
+share of all processors in use, ours and others'. With `--busy` every processor is kept busy by an
+ordinary process.
 """
 
 from __future__ import annotations

@@ -132,7 +132,7 @@ class Cell:
     def with_friction_laws(self, laws: Sequence[Mapping[str, Any]]) -> Cell:
         """Return the cell with a table `[robot.friction]` for each joint, in their order.
 
-        Further tables, of coupled motors, are the same as those of their joints.
+        Further tables, of coupled motors, equal the tables of their joints.
 
         Raises:
             ValueError: a table is invalid.

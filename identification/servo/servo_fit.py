@@ -53,7 +53,7 @@ class ServoFit:
         estimate: of all windows.
         choices: of terms.
         windows: number of windows that were fitted.
-        shown: whether a term is shown by prediction; those of every model are (n, P).
+        shown: whether prediction shows a parameter (n, P); true for parameters of every model.
         left_out: stretches of the motions in which something held or pushed the arm, whose windows
             were not fitted.
     """

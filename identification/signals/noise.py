@@ -121,7 +121,7 @@ def noiseless_above(time: Array, signals: Array, segments: Sequence[slice]) -> f
 def has_small_noise(time: Array, signals: Array, segments: Sequence[slice], above: float) -> bool:
     """Return whether angles (m, c) [rad] have small white noise of a sensor.
 
-    It is larger than that of rounding to the digits of a log, or the steps are those of an encoder,
+    It is larger than rounding to the digits of a log leaves, or the steps are an encoder's,
     no decimal number of degrees or radians; and there is as much of it at the highest frequencies.
 
     Args:

@@ -64,7 +64,7 @@ def test_torques_have_as_many_steps_as_bits(log: JointLog) -> None:
 
 
 def test_a_refusal_is_a_row(log: JointLog, tmp_path: Path) -> None:
-    """Of a joint whose torque was not measured, beside a row that was."""
+    """Of a joint whose torque was not measured, next to a row whose torque was."""
     constant = log.torque.copy()
     constant[:, 0] = 1.0
     unmeasured = replace(log, torque=constant)

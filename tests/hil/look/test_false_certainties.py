@@ -42,7 +42,7 @@ def look(log: Path) -> Look:
 
 @pytest.mark.long
 def test_no_delay_is_certain_by_rounded_stamps(tmp_path: Path, simulated: Simulated) -> None:
-    """To 0.1 s: the times are those of even steps, by an estimated rate."""
+    """To 0.1 s: the times are even steps at an estimated rate."""
     found = look(log_of(tmp_path, simulated, time=np.round(TIME, 1)))
     (row,) = [row for row in found.rows if row.aspect == "delay"]
     assert row.certainty is not Certainty.CERTAIN
