@@ -180,13 +180,19 @@ class ActiveBounds:
         rank: of the active set.
     """
 
+    _age: int
+    """Cycles within a narrower set while the active one, wider than a plan's, remains."""
+
     def __init__(self) -> None:
         self.rank = 0
-        self._age = 0
 
-    def reset(self, rank: int = 0, cycles: int = 0) -> None:
-        """Activate a set for `cycles` more than `MEMORY_CYCLES`."""
-        self.rank = rank
+    def reset(self) -> None:
+        """Activate the bounds of a plan."""
+        self.rank = 0
+
+    def extrapolate(self, cycles: int) -> None:
+        """Activate the widest set for `cycles` more than `MEMORY_CYCLES`."""
+        self.rank = EXTRAPOLATED_RANK
         self._age = -cycles
 
     def update(self, bounds: BoundsName) -> int:
@@ -314,15 +320,15 @@ class Guard:
     def begin(self, q: Array, cycle: int) -> None:
         """Check the first set-point q (n,) rad, at rest, which then counts as sent."""
         self._active.reset()
-        self._history[:4] = q
-        self.check_set_point(q, np.zeros_like(q), "plan", cycle)
+        self._history[:] = q
+        self.check_set_point(q, 0.0 * q, "plan", cycle)
 
     def resume_from(self, q: Array, qd: Array, cycles: int) -> None:
         """Treat the controller's target (n,) rad and velocity, rad/s, as sent.
 
         Jerk is unbounded for this number of cycles.
         """
-        self._active.reset(EXTRAPOLATED_RANK, cycles)
+        self._active.extrapolate(cycles)
         self._history[:4] = q - np.arange(3.0, -1.0, -1.0)[:, None] * (self.period * qd)
 
     def check_start(self, target: Array, actual: Array, step: Array, cycle: int) -> None:

@@ -633,6 +633,19 @@ def enter(arguments: str = "", *, unprivileged=False, memlock=8 << 20):
     return RealTimeReport(**report), collecting, cpus
 
 
+ALLOCATE = """
+import json, resource
+from drivers.exchange.realtime import RealTimeSettings, enter
+faults = lambda: resource.getrusage(resource.RUSAGE_SELF).ru_minflt
+report = enter(RealTimeSettings(priority=0, hold_cpu_awake=False))
+before = faults()
+small = [bytes(200) for _ in range(4 << 12)]  # 4 MiB, in arenas of CPython
+small.clear()
+large = [bytes(2000) for _ in range(4 << 9)]  # 4 MiB, on the heap of C
+print(json.dumps([report.memory_locked, faults() - before]))
+"""
+
+
 needs_root = pytest.mark.skipif(os.geteuid() != 0, reason="needs the right to drop rights")
 
 
@@ -656,6 +669,13 @@ class TestRealTimeSettings:
         assert "rtprio 98" in text
         assert "memlock unlimited" in text
         assert "udev" in text or report.cpu_awake
+
+    def test_allocations_in_a_cycle_cost_no_page_fault(self):
+        command = [sys.executable, "-c", ALLOCATE]
+        locked, faults = json.loads(subprocess.check_output(command, text=True))
+        if not locked:
+            pytest.skip("memory cannot be locked here")
+        assert faults < 16
 
     @pytest.mark.parametrize(
         ("user", "limit", "flags", "locked"),

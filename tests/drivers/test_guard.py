@@ -237,8 +237,8 @@ class TestRates:
                 guard.check_set_point(row, stated * (row - before) / PERIOD, "plan", cycle)
                 before = row
 
-        toggle(1.0)
-        refused(RATES[name], toggle, 24.0, stated=1.0)
+        toggle(7.0)
+        refused(RATES[name], toggle, 9.0, stated=1.0)
 
     def test_the_bounds_of_a_plan_apply_at_first(self):
         assert ActiveBounds().rank == ActiveBounds().update("plan") == RANK["plan"]
@@ -347,6 +347,15 @@ def test_bounds_of_feedback_and_start(edge, joint, sign):
 def test_joints_left_out_of_feedback_pass_any_threshold():
     guard = begun(limits(following_error=np.full(N, 1e-3), current=np.full(N, 1e-3)))
     guard.check_feedback(REST, at(1, 9.0), at(1, 9.0), REST, 1, np.arange(N) != 1)
+
+
+def test_a_controller_that_allows_no_deviation_lets_an_arm_stand_at_its_target():
+    guard = Guard(limits(), PERIOD)
+    guard.narrow(np.zeros(N), np.zeros(N))
+    guard.check_feedback(TURNS, TURNS, REST, TURNS, 1)
+    check = guard.check_feedback
+    error = refused(Check.FOLLOWING_ERROR, check, TURNS, TURNS + at(3, 1e-9), REST, TURNS, 1)
+    assert error.joint == 3
 
 
 def test_narrower_limits_of_the_controller():
