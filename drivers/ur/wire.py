@@ -21,6 +21,7 @@ Nothing switches power on, releases brakes or unlocks a protective stop.
 
 from __future__ import annotations
 
+import math
 import struct
 from dataclasses import dataclass, replace
 from typing import Final
@@ -188,7 +189,7 @@ def reasons_not_to_move(
     found = [*expected.differences(identity, version.major)]
     if problem := version_problem(version):
         found.append(f"its software is {version}; {problem}")
-    if abs(description.period - period) > 1e-9:
+    if not math.isclose(description.period, period, abs_tol=1e-9):
         ours = f"{1e3 * period:g} ms in the cell"
         found.append(f"cycle is {1e3 * description.period:g} ms in the controller, {ours}")
     if identity.remote_control is False:
@@ -404,7 +405,7 @@ class UrWire:
             return "the program on the controller was paused"
         if stage in (Stage.STOPPING, Stage.ENDED):
             ending = self._register(ENDING_REGISTER)
-            return ENDINGS.get(Ending(ending) if ending in [*Ending] else Ending.NONE, "")
+            return ENDINGS[Ending(ending) if ending in [*Ending] else Ending.NONE]
         started = stage in (Stage.WAITING, Stage.STREAMING)
         if started and self._int("runtime_state") != _RUNTIME_PLAYING:
             said = f" ({self._remark})" if self._remark else ""

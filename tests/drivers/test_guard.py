@@ -349,7 +349,7 @@ def test_joints_left_out_of_feedback_pass_any_threshold():
     guard.check_feedback(REST, at(1, 9.0), at(1, 9.0), REST, 1, np.arange(N) != 1)
 
 
-def test_a_controller_that_allows_no_deviation_lets_an_arm_stand_at_its_target():
+def test_thresholds_of_zero_hold_an_arm_at_its_target():
     guard = Guard(limits(), PERIOD)
     guard.narrow(np.zeros(N), np.zeros(N))
     guard.check_feedback(TURNS, TURNS, REST, TURNS, 1)
