@@ -26,7 +26,7 @@ from hil.cell import AngleFrame, Cell
 from hil.cell.schema import LINKS
 from hil.cli.arguments import JsonOption, QuietOption, print_json
 from hil.control.live_link import LiveLink
-from hil.control.record import archive_path
+from hil.control.record import archive_path, moved_joints
 from hil.control.record import record as record_motion
 from hil.control.ur_recording import ConstantsFound, listening, record_arm
 from identification.text import percentage
@@ -118,7 +118,7 @@ def record_replying(
             link, cell, path,
             kind=how.kind, stop=stop, duration=how.duration, wait=how.wait, watch=view.show,
         )  # fmt: skip
-    _finish(path, done, cell, how.duration, by_operator=stop.requested, line=LINE, json=json)
+    _finish(path, done, cell, how, by_operator=stop.requested, line=LINE, json=json)
 
 
 def with_rtde(cell: Cell, link: str | None) -> Cell:
@@ -159,7 +159,7 @@ def record_listening(cell: Cell, how: RecordRequest, *, quiet: bool, json: bool)
     found = ConstantsFound.of(path, cell)
     more = {"stated_constants": [float(k) if np.isfinite(k) else None for k in found.stated]}
     _finish(
-        path, done, cell, how.duration,
+        path, done, cell, how,
         by_operator=stop.requested, line=HEARD_LINE, json=json, more=more,
     )  # fmt: skip
     if not json and not quiet and found.are_doubtful:
@@ -188,7 +188,7 @@ def _finish(
     path: Path,
     done: Recorded,
     cell: Cell,
-    duration: float | None,
+    how: RecordRequest,
     *,
     by_operator: bool,
     line: str,
@@ -196,12 +196,19 @@ def _finish(
     more: Mapping[str, object] = MappingProxyType({}),
 ) -> None:
     """Print how a recording ended, or raise how it ended early."""
-    early = _early_end(path, done, duration, by_operator=by_operator)
-    figures = {**_figures(path, done, cell), **more}
+    early = _early_end(path, done, how.duration, by_operator=by_operator)
+    moved = moved_joints(path, cell) if how.kind == "standstill" else ()
+    figures = {**_figures(path, done, cell), **more, **({"moved_joints": moved} if moved else {})}
     if not json:
         say(wrapped(line.format_map(figures)))
     elif early is None:
         print_json(figures)
+    if moved:
+        say(
+            f"warning: {', '.join(moved)} moved, so this is no standstill. Record again while the "
+            "arm rests",
+            err=True,
+        )
     if early is not None:
         raise early.beside(figures)
 

@@ -2,18 +2,22 @@
 
 from __future__ import annotations
 
+import itertools
 import json
 from collections.abc import Mapping
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from hil.archive import CONTROLLER_PROGRAM, ArchiveName, ArchiveSpec
+import numpy as np
+
+from hil.archive import CONTROLLER_PROGRAM, ArchiveName, ArchiveSpec, open_archive
 from hil.archive.schema import UR_STATE
 from hil.base.errors import InputError
 from hil.base.files import make_folder
 from hil.base.version import software
 from hil.cell import Cell
+from identification.signals.noise import STANDSTILL_WINDOW_SECONDS
 
 if TYPE_CHECKING:
     from hil.archive.recorder import Recorded
@@ -56,6 +60,23 @@ def record(
     metadata = {"motion": CONTROLLER_PROGRAM, **kind_entry(path, kind), **origin_of(cell)}
     spec = archive_spec(cell, path, metadata, durable=durable)
     return link.record(spec, stop, duration=duration, wait=wait, watch=watch)
+
+
+def moved_joints(path: Path, cell: Cell) -> tuple[str, ...]:
+    """Return the joints that moved in an archive.
+
+    Their mean position changed faster than the cell's standstill speed between two neighbouring
+    windows of `STANDSTILL_WINDOW_SECONDS`.
+
+    Raises:
+        ArchiveError: the archive cannot be read.
+    """
+    position = open_archive(path, fields=("position",)).recorded("position")["position"]
+    width = max(1, round(STANDSTILL_WINDOW_SECONDS / cell.period))
+    windows = position[: len(position) // width * width].reshape(-1, width, position.shape[1])
+    steps = np.abs(np.diff(windows.mean(axis=1), axis=0)).max(axis=0, initial=0.0)
+    moved = steps > STANDSTILL_WINDOW_SECONDS * cell.model.friction.standstill
+    return tuple(itertools.compress(cell.joint_names, moved))
 
 
 def archive_spec(

@@ -12,6 +12,7 @@ import time
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import replace
+from functools import partial
 from io import StringIO
 from pathlib import Path
 from typing import Any
@@ -32,7 +33,7 @@ from hil.campaign import Progress, Stop, VirtualLink
 from hil.cell import Cell
 from hil.cli import record as record_cli
 from hil.cli.record import record as record_command
-from hil.control.record import archive_path, record
+from hil.control.record import archive_path, moved_joints, record
 from hil.control.simulated_cell import (
     OWN_SPEED_SHARE,
     controller_settings,
@@ -135,6 +136,21 @@ def test_recordings_are_numbered_and_have_their_kind(tmp_path: Path, cell: Cell)
     path = archive_path(tmp_path / "monday.mcap", "standstill")
     recording_of(cell, path, kind="standstill", duration=0.2)
     assert open_archive(path).kind == "standstill"
+
+
+def test_a_standstill_in_which_the_arm_moved_is_named(
+    recorded: Path, tmp_path: Path, cell: Cell, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert moved_joints(recorded, cell) == cell.joint_names
+    path = tmp_path / "standstill_000_a1.mcap"
+    at_rest = recording_of(cell, path, kind="standstill", duration=0.25)
+    assert moved_joints(path, cell) == ()
+    how = record_cli.RecordRequest(path, "standstill", None, None)
+    finish = partial(record_cli._finish, by_operator=False, line=record_cli.LINE, json=False)
+    finish(path, at_rest, cell, how)
+    assert "warning" not in "".join(capsys.readouterr())
+    finish(recorded, at_rest, cell, how)
+    assert "moved, so this is no standstill" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize(("how", "outcome"), [({}, "completed"), ({"duration": 10.0}, "stopped")])
