@@ -321,14 +321,9 @@ class _Arm:
 
     @classmethod
     def of(cls, init: InitPacket, settings: ArmSettings) -> _Arm:
-        """Return the arm; PacketError if the axis map is invalid or lacks a joint."""
+        """Return the arm of an init packet in which `drivers.init_check` finds every joint open."""
         n, arm = settings.drive_train.n_joints, settings.arm
         slot_of = {axis.axis: axis.slot for axis in init.open_axes() if axis.arm == arm}
-        missing = [joint + 1 for joint in range(n) if joint not in slot_of]
-        if missing:
-            raise PacketError(
-                "open_axes_map", init.open_axes_map[arm - 1].tolist(), f"axes {missing} open"
-            )
         slots = np.array([slot_of[joint] for joint in range(n)], np.intp)
         only = settings.only_axis
         opened = np.ones(n, dtype=np.bool_) if only is None else np.arange(n) == only - 1
@@ -339,6 +334,8 @@ class C4gWire:
     """A session's C4G Open: see `drivers.wire.Wire`."""
 
     reports_use = False
+    _cold_start: bool
+    _last_packet: bytes
 
     def __init__(self, settings: ArmSettings) -> None:
         self.description: InitPacket | None = None
@@ -346,8 +343,6 @@ class C4gWire:
         self.opened = np.ones(settings.drive_train.n_joints, dtype=np.bool_)
         self._settings = settings
         self._sequence = PacketSequence()
-        self._cold_start = False
-        self._last_packet = b""
         self._number = 0
 
     def receive(self, packet: bytes, state: State, losses: LossTracker) -> Received:

@@ -364,7 +364,7 @@ class PacketSequence:
     def accept(self, number: int) -> int:
         """Advance to this number; return how many packets were missed before it."""
         ahead = self.distance(number)
-        if not 1 <= ahead <= self._window:
+        if ahead == 0 or ahead > self._window:
             ahead = 1  # after a silence, whose length the numbers do not give
         self.last = number
         self.cycle += ahead

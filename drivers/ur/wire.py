@@ -240,6 +240,8 @@ class UrWire:
     """A session's RTDE: see `drivers.wire.Wire`."""
 
     reports_use = True
+    _broken: bool
+    _last_packet: bytes
 
     def __init__(self, settings: ArmSettings, protocol: UrProtocol) -> None:
         self.description: UrDescription | None = None
@@ -250,8 +252,6 @@ class UrWire:
         drive_train = settings.drive_train
         self._ratio = drive_train.gear_ratio / TURN
         self._calibration = drive_train.calibration
-        self._broken = False
-        self._last_packet = b""
         self._program = protocol.program
         self._programs = 0
         self._remark = ""

@@ -201,3 +201,11 @@ def test_arm_moves_only_if_the_map_is_a_bijection(table, n_axes):
     received, answer = bench.cycle()
     if not valid:
         assert oracle.differences(answer, oracle.safe_answer(received, (1,) * n_axes)) == []
+
+
+def test_a_packet_of_c4g_open_states_no_cause_of_its_own():
+    slots = np.arange(6)
+    report = PacketClassifier(slots, (1,) * 6, 1, OPEN).classify(
+        bytes(4), np.full(6, CLOSED, np.int32)
+    )
+    assert (report.cause, report.remedy) == ("", "")

@@ -179,6 +179,15 @@ class TestInitPacket:
         packet = struct.pack("<iiii", 10, 3, 9, n_axes) + bytes(1184)
         assert InitPacket.decode(packet).n_axes == n_axes
 
+    def test_limits_of_an_arm(self):
+        limits = {"current_limit": 1.0, "following_error": 2.0}
+        rows = {name: k * np.arange(40.0).reshape(4, 10) for name, k in limits.items()}
+        init = InitPacket.build(3, 2, {}, **rows)
+        for name, k in limits.items():
+            stated = init.stated(name, 2, 3)
+            np.testing.assert_array_equal(stated, k * np.array([10.0, 11.0, 12.0]))
+            assert stated.dtype == np.float64
+
     @pytest.mark.parametrize("not_open", [NO_SLOT, -1])
     def test_axes_of_two_arms_in_any_slot(self, not_open):
         axes_map = np.full((4, 10), not_open)

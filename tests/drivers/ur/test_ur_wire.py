@@ -97,8 +97,9 @@ class Reader:
     def __init__(self, names: Sequence[str] = REQUIRED) -> None:
         self.names = names
         self.wire = new_wire()
-        self.state = State.INIT
+        self.state = State.SYNC
         self.read(introduction(names))
+        self.state = State.INIT
 
     def read(self, packet: bytes):
         return self.wire.receive(packet, self.state, None)
