@@ -15,6 +15,7 @@ from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 
 from drivers import CycleRing, Guard, InitPacket, InitReceived, RequestError, Session, State
+from drivers.c4g_wire import PacketClassifier
 from tests.drivers import oracle
 from tests.drivers.rig import PERIOD, Table, limits, train_of
 from tests.messages import AXIS_NOT_OPEN
