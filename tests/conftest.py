@@ -22,6 +22,8 @@ settings.register_profile(
     "hil", deadline=None, derandomize=True, suppress_health_check=[HealthCheck.too_slow]
 )
 settings.load_profile("hil")
+settings.register_profile("quick", settings.get_profile("hil"), max_examples=30)
+"""For every change; `make test-all` has all examples."""
 
 # Tests of other folders import them, too, some before those of tests/drivers.
 _OF_DRIVERS = ("transport_contract", "can_bench", "rig", "judge", "oracle", "losses")
@@ -38,6 +40,12 @@ def pytest_ignore_collect(collection_path: Path, config: pytest.Config) -> bool 
         return None
     excluded = excluded_tiers(config.getoption("markexpr", default=""))
     return bool(excluded & tiers_of(collection_path.read_text("utf-8"))) or None
+
+
+def pytest_configure(config: pytest.Config) -> None:
+    """Where long tests are left out, so are further examples of the same property."""
+    if "long" in excluded_tiers(config.getoption("markexpr", default="")):
+        settings.load_profile("quick")
 
 
 def excluded_tiers(expression: str) -> set[str]:

@@ -57,7 +57,20 @@ def tree_of(module: Path) -> ast.Module:
 def nodes_of(module: Path) -> tuple[ast.AST, ...]:
     """All nodes of a module, likewise."""
     with _no_collection():
-        return tuple(ast.walk(tree_of(module)))
+        return tuple(_walk(tree_of(module)))
+
+
+def _walk(tree: ast.AST) -> list[ast.AST]:
+    """All nodes as of `ast.walk`, without contexts such as `ast.Load`: twice as fast."""
+    nodes = [tree]
+    for node in nodes:  # it grows
+        for name in node._fields:
+            value = getattr(node, name, None)
+            if isinstance(value, list):
+                nodes += [each for each in value if isinstance(each, ast.AST)]
+            elif isinstance(value, ast.AST) and not isinstance(value, ast.expr_context):
+                nodes.append(value)
+    return nodes
 
 
 @contextmanager
@@ -278,6 +291,7 @@ def helpers_of_other_tests() -> list[str]:
     return [
         f"{path.relative_to(ROOT)}:{node.lineno} {node.module}: {alias.name}"
         for path in _tests()
+        if re.search(r"^\s*from\s+tests[\w.]*\.test_", path.read_text("utf-8"), re.MULTILINE)
         for node in nodes_of(path)
         if isinstance(node, ast.ImportFrom)
         and (node.module or "").startswith("tests.")

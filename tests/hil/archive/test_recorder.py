@@ -31,6 +31,7 @@ from hil.archive.recorder import _EVENT_TEXTS
 from hil.cell import Cell
 from hil.control.simulated_cell import simulated_controller
 from sim_fixtures.ns16 import CELL_PATH
+from tests.near import near
 
 PERIOD = 0.001
 GEAR = 50.0
@@ -132,7 +133,7 @@ class TestRecorder:
         silent, lost = (event.text for event in archive.events)
         assert "no valid packet for 1.200 s" in silent
         assert lost == "7 records overwritten"
-        assert archive.columns["torque"] == pytest.approx(GEAR * CONSTANT * 2.0), "of these drives"
+        assert archive.columns["torque"] == near(GEAR * CONSTANT * 2.0), "of these drives"
 
     def test_what_the_controller_says_is_archived(self, recorder: Recorder) -> None:
         said = "C153A1: position deviates from path"

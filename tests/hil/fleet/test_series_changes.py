@@ -61,7 +61,7 @@ class TestFound:
             (replaced_gear, "step", 12.5, -0.25),
         ],
     )
-    @pytest.mark.parametrize("heat", [True, False])
+    @pytest.mark.parametrize("heat", [True, LONG(False)])
     def test_with_kind_size_and_date(self, fault, kind, begin, size, heat):
         for seed in range(5):
             course, *others = courses(fleet(seed, fault=fault, heat=heat))
@@ -96,10 +96,10 @@ class TestNotInvented:
     @pytest.mark.parametrize(
         ("memory", "heat"),
         [
-            (0.5, True),
+            pytest.param(0.5, True, marks=pytest.mark.long),
             pytest.param(0.5, False, marks=pytest.mark.long),
             pytest.param(0.0, True, marks=pytest.mark.long),
-            pytest.param(0.0, False, marks=pytest.mark.long),
+            (0.0, False),
         ],
     )
     def test_p_values_are_at_most_uniform(self, memory, heat):
@@ -173,7 +173,7 @@ class TestAllTogether:
             for each in fleet(seed, months=months, robots=robots, heat=heat)
         ]
 
-    @pytest.mark.parametrize("heat", [True, False])
+    @pytest.mark.parametrize("heat", [True, LONG(False)])
     def test_is_dated_though_no_robot_differs_from_others(self, heat):
         for seed in range(5):
             family = self.moved(seed, heat=heat)
@@ -184,7 +184,7 @@ class TestAllTogether:
             assert change.size == pytest.approx(0.15, abs=0.05)
             assert min(holm(np.array([each.p_value for each in courses(family)]))) > 0.01
 
-    @pytest.mark.parametrize("heat", [True, False])
+    @pytest.mark.parametrize("heat", [True, LONG(False)])
     @pytest.mark.parametrize("months", [LONG(13), LONG(18), 24, LONG(36)])
     def test_is_not_invented(self, months, heat):
         p_values = [

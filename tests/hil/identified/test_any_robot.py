@@ -38,6 +38,7 @@ from tests.hil.simulated_logs import (
     simulate,
     urdf_path,
 )
+from tests.near import near
 
 pytestmark = pytest.mark.long
 
@@ -272,7 +273,7 @@ class TestFilteredTorque:
         """The lag of a causal low-pass, some 10 ms, is not identified as a delay."""
         filtered = prepared(tmp_path, order, causal=causal)
         preprocessing = filtered.settings.preprocessing
-        assert preprocessing.torque_bandwidth == pytest.approx(BANDWIDTH, rel=0.2)
+        assert preprocessing.torque_bandwidth == near(BANDWIDTH, rel=0.2)
         assert held_out_error(filtered) < 1.3 * held_out_error(unfiltered)
         if causal:
             assert preprocessing.torque_shape.causal

@@ -7,13 +7,13 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import pytest
 from numpy.typing import NDArray
 
 from hil.archive import Archive, open_archive
 from hil.importers.column_map import ColumnMap
 from hil.importers.imported_robot import Robot
 from hil.importers.log import import_log
+from tests.near import near
 
 Floats = NDArray[np.float64]
 RATE = 250
@@ -82,6 +82,6 @@ def assert_right(archive: Archive, *, without: Sequence[int] = ()) -> None:
     columns = archive.columns
     elapsed = (columns["stamp"] - columns["stamp"][0]) * 1e-9
     keep = np.delete(np.arange(COUNT), list(without))
-    assert elapsed == pytest.approx(TIME[keep] - TIME[keep[0]], abs=1e-6)
-    assert columns["position"] == pytest.approx(POSITION[keep], abs=1e-6)
-    assert columns["torque"] == pytest.approx(TORQUE[keep], abs=1e-6)
+    assert elapsed == near(TIME[keep] - TIME[keep[0]], abs=1e-6)
+    assert columns["position"] == near(POSITION[keep], abs=1e-6)
+    assert columns["torque"] == near(TORQUE[keep], abs=1e-6)

@@ -30,6 +30,7 @@ from hil.results.servo_result import ServoResults
 from tests.hil.importers.bags import bag
 from tests.identification.servo_arm import DELAY, KD, KP, an_arm, on_its_servo
 from tests.identification.two_link import MODEL, URDF, four_sines
+from tests.near import near
 from tests.tiers import quick_ones
 
 STATE = "sensor_msgs/msg/JointState"
@@ -218,8 +219,8 @@ class TestStateOfAController:
             "/arm_controller/controller_state": controller(messages, MOVED),
         }
         imported = Imported(written(tmp_path / "bag", messages, topics, kind), urdf)
-        assert imported.command == pytest.approx(MOVED.command)
-        assert imported.recording.position == pytest.approx(MOVED.position)
+        assert imported.command == near(MOVED.command)
+        assert imported.recording.position == near(MOVED.position)
         assert imported.entries["command_topic"] == "/arm_controller/controller_state"
 
     @pytest.mark.long
@@ -228,9 +229,9 @@ class TestStateOfAController:
         messages = Messages()
         topics = {"/arm_controller/controller_state": controller(messages, MOVED)}
         imported = Imported(written(tmp_path / "bag", messages, topics), urdf)
-        assert imported.recording.position == pytest.approx(MOVED.position)
-        assert imported.recording.velocity == pytest.approx(MOVED.velocity)
-        assert imported.command == pytest.approx(MOVED.command)
+        assert imported.recording.position == near(MOVED.position)
+        assert imported.recording.velocity == near(MOVED.velocity)
+        assert imported.command == near(MOVED.command)
 
     def test_at_a_lower_rate_is_interpolated(self, tmp_path, urdf) -> None:
         messages = Messages()
@@ -239,7 +240,7 @@ class TestStateOfAController:
         imported = Imported(written(tmp_path / "bag", messages, topics), urdf)
         assert np.isnan(imported.command[:100]).all()
         inside = slice(100, 996)
-        assert imported.command[inside] == pytest.approx(MOVED.command[inside], abs=2e-3)
+        assert imported.command[inside] == near(MOVED.command[inside], abs=2e-3)
         assert "commanded_position: known at 896 of 1000 samples" in imported.text
         assert imported.recording.n_samples == 1000  # nothing measured is lost
 
@@ -266,7 +267,7 @@ class TestOtherTopics:
         }
         imported = Imported(written(tmp_path / "bag", messages, topics), urdf)
         assert imported.entries["topic"] == "/joint_states"
-        assert imported.command == pytest.approx(MOVED.command)
+        assert imported.command == near(MOVED.command)
 
     def test_arrays_go_to_the_joints_that_follow_them(self, tmp_path, urdf) -> None:
         """Without names and stamps: by their numbers, and the time of receipt."""
@@ -277,7 +278,7 @@ class TestOtherTopics:
             "/forward_position_controller/commands": (ARRAY, received(MOVED.stamps, sent)),
         }
         imported = Imported(written(tmp_path / "bag", messages, topics), urdf)
-        assert imported.command == pytest.approx(MOVED.command, abs=1e-9)
+        assert imported.command == near(MOVED.command, abs=1e-9)
 
     def test_arrays_of_velocities_are_no_positions(self, tmp_path, urdf) -> None:
         messages = Messages()
@@ -309,11 +310,11 @@ class TestOtherTopics:
                   "/arm_controller/joint_trajectory": (TRAJECTORY, sent)}  # fmt: skip
         imported = Imported(written(tmp_path / "bag", messages, topics), urdf)
         assert np.isnan(imported.command[:200]).all()
-        assert imported.command[200] == pytest.approx(MOVED.position[200], abs=1e-3)
+        assert imported.command[200] == near(MOVED.position[200], abs=1e-3)
         inside = slice(250, 791)
-        assert imported.command[inside] == pytest.approx(command.position[inside], abs=1e-4)
+        assert imported.command[inside] == near(command.position[inside], abs=1e-4)
         held = np.tile(command.position[790], (200, 1))
-        assert imported.command[800:] == pytest.approx(held, abs=1e-6)
+        assert imported.command[800:] == near(held, abs=1e-6)
 
     def test_so_are_trajectories_of_one_point_each(self, tmp_path, urdf) -> None:
         """As of a servo node: each point is reached when the next one is sent."""
@@ -325,7 +326,7 @@ class TestOtherTopics:
             "/arm/joint_trajectory": (TRAJECTORY, received([MOVED.stamps[k] for k in every], sent)),
         }
         imported = Imported(written(tmp_path / "bag", messages, topics), urdf)
-        assert imported.command[5:] == pytest.approx(MOVED.command[:-5], abs=2e-3)
+        assert imported.command[5:] == near(MOVED.command[:-5], abs=2e-3)
 
 
 class TestStrangeMessages:
@@ -334,7 +335,7 @@ class TestStrangeMessages:
     def imported(self, tmp_path: Path, urdf: Path, messages: Messages, of: str, sent) -> Imported:
         topics = {"/joint_states": measured(messages, MOVED), "/arm/command": (of, sent)}
         imported = Imported(written(tmp_path / "bag", messages, topics), urdf)
-        assert imported.recording.position == pytest.approx(MOVED.position)
+        assert imported.recording.position == near(MOVED.position)
         return imported
 
     def test_a_controller_without_points(self, tmp_path, urdf) -> None:
@@ -389,7 +390,7 @@ class TestSeveralTopics:
         assert "/a/command and /b/command carry different commands" in imported.text
         assert "--command-topic /a/command" in imported.text
         chosen = Imported(path, urdf, "--command-topic", "/b/command")
-        assert chosen.command == pytest.approx(MOVED.command)
+        assert chosen.command == near(MOVED.command)
         assert Imported(path, urdf, "--command-topic", "none").command is None
 
     def test_one_that_is_missing_is_refused(self, tmp_path, urdf) -> None:
@@ -455,7 +456,7 @@ def test_a_bag_is_read_again_with_the_same_commands(tmp_path, urdf) -> None:
     assert any(
         "/b/command: commanded_position" in line for line in json.loads(done.output)["found"]
     )
-    assert open_recording(output).commanded_position == pytest.approx(MOVED.command)
+    assert open_recording(output).commanded_position == near(MOVED.command)
 
 
 @pytest.fixture(scope="module")

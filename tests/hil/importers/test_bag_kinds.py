@@ -25,6 +25,7 @@ from tests import messages
 from tests.hil.importers.bag_messages import PERIOD, STAMPS, WHOLE, Message, message
 from tests.hil.importers.bags import DEFINITION, STATE, bag, mcap
 from tests.hil.importers.moving_log import COUNT, JOINTS, POSITION, SLOPE, TIME, TORQUE, URDF
+from tests.near import near
 from tests.tiers import quick_ones
 
 
@@ -100,9 +101,9 @@ class Typed:
 def assert_right(archive: Archive, *, rows: slice = slice(None), tolerance: float = 1e-12) -> None:
     columns = archive.columns
     elapsed = (columns["stamp"] - columns["stamp"][0]) * 1e-9
-    assert elapsed == pytest.approx(TIME[rows] - TIME[rows][0], abs=1e-9)
-    assert columns["position"] == pytest.approx(POSITION[rows], abs=tolerance)
-    assert columns["torque"] == pytest.approx(TORQUE[rows], abs=1e3 * tolerance)
+    assert elapsed == near(TIME[rows] - TIME[rows][0], abs=1e-9)
+    assert columns["position"] == near(POSITION[rows], abs=tolerance)
+    assert columns["torque"] == near(TORQUE[rows], abs=1e3 * tolerance)
 
 
 @pytest.fixture(params=quick_ones(["bag"], ["db3", "bag"]))
@@ -156,8 +157,8 @@ class TestPublishers:
         shift = PERIOD / 3e9  # s
         archive = Typed(urdf, parts).archive
         expected = 0.9 * np.sin(2.0 * (TIME[1:] - shift) + 2)
-        assert archive.columns["position"][:, 2] == pytest.approx(expected, abs=1e-5)
-        assert archive.columns["position"][:, 0] == pytest.approx(POSITION[1:, 0], abs=1e-12)
+        assert archive.columns["position"][:, 2] == near(expected, abs=1e-5)
+        assert archive.columns["position"][:, 0] == near(POSITION[1:, 0], abs=1e-12)
 
     def test_a_joint_that_is_recorded_is_never_locked(self, urdf) -> None:
         """Also if it is too rare to be merged."""

@@ -17,6 +17,7 @@ from hil.base.errors import SourceError
 from hil.importers.imported_robot import Robot
 from hil.importers.recording_import import import_recording
 from tests.hil.importers.moving_log import JOINTS, POSITION, TIME, TORQUE, URDF
+from tests.near import near
 
 EPOCH = 10**18  # ns
 
@@ -57,7 +58,7 @@ def test_numbers_as_text_in_parquet_are_numbers(tmp_path: Path, robot: Robot) ->
     table["q2"] = [f"{value:.12f}" for value in table["q2"]]
     table |= {f"tau{k + 1}": column for k, column in enumerate(TORQUE.T)}
     parquet.write_table(pyarrow.table(table), tmp_path / "log.parquet")
-    assert read(tmp_path / "log.parquet", robot)["position"] == pytest.approx(POSITION, abs=1e-9)
+    assert read(tmp_path / "log.parquet", robot)["position"] == near(POSITION, abs=1e-9)
 
 
 def test_several_episodes_in_one_file_are_refused(tmp_path: Path, robot: Robot) -> None:

@@ -64,6 +64,7 @@ from tests.hil.simulated_logs import (
     urdf_path,
 )
 from tests.hil.simulated_logs import imported as read
+from tests.near import near
 
 
 @pytest.fixture
@@ -220,7 +221,7 @@ class TestMaps:
         if torque is not None:
             assert np.array_equal(columns["torque"], torque)
         if "time" in entries:
-            assert columns["stamp"] / 1e9 == pytest.approx(TIME)
+            assert columns["stamp"] / 1e9 == near(TIME)
         assert "motor_current" not in columns
 
     @pytest.mark.parametrize(("source", "entries", "sentence"), REFUSED)
@@ -266,10 +267,10 @@ class TestUnitsAndGears:
             motor_current={"columns": "tau{}", "unit": "mA"},
         )
         expected = np.radians(VALUES[:, 1:4]) * [1, -1, 2]
-        assert columns["position"] == pytest.approx(expected, rel=1e-15)
-        assert columns["motor_current"] == pytest.approx(VALUES[:, 4:] / 1000)
+        assert columns["position"] == near(expected, rel=1e-15)
+        assert columns["motor_current"] == near(VALUES[:, 4:] / 1000)
         assert "torque" not in columns
-        assert 3000 * UNITS["velocity"]["rpm"] == pytest.approx(2 * np.pi * 50)
+        assert 3000 * UNITS["velocity"]["rpm"] == near(2 * np.pi * 50)
 
     def test_motor_side_is_converted_with_power_conserved(self, tmp_path, robot):
         """Expected values are computed ratio by ratio."""
@@ -291,18 +292,18 @@ class TestUnitsAndGears:
             drive={"gear_ratio": (n1, n2, n3), "coupling": ((3, 2, n32),),
                    "joint_offset": (0.5, 0.0, -0.5)},
         )  # fmt: skip
-        assert back["position"] == pytest.approx(q + np.array([0.5, 0.0, -0.5]), rel=1e-12)
-        assert back["velocity"] == pytest.approx(qd, rel=1e-12)
+        assert back["position"] == near(q + np.array([0.5, 0.0, -0.5]), rel=1e-12)
+        assert back["velocity"] == near(qd, rel=1e-12)
         power_motors = np.sum(tau_motor * motor(qd), axis=1)
-        assert np.sum(back["torque"] * qd, axis=1) == pytest.approx(power_motors, rel=1e-9)
-        assert back["torque"][:, 1] == pytest.approx(n2 * tau_motor[:, 1] + n32 * tau_motor[:, 2])
+        assert np.sum(back["torque"] * qd, axis=1) == near(power_motors, rel=1e-9)
+        assert back["torque"][:, 1] == near(n2 * tau_motor[:, 1] + n32 * tau_motor[:, 2])
         assert cell_of(open_archive(tmp_path / "m.mcap")).model.coupling is not None
 
     def test_constants_and_gears_follow_the_joints_of_the_log(self, file, robot):
         drive = {"gear_ratio": (100, -80, 50), "torque_constant": (0.1, 0.2, 0.3)}
         columns = read(file, robot, motor_current={"columns": "tau{}"}, drive=drive)
         assert np.array_equal(columns["motor_current"], VALUES[:, 4:])
-        assert columns["torque"] == pytest.approx(VALUES[:, 4:] * [10.0, -16.0, 15.0])
+        assert columns["torque"] == near(VALUES[:, 4:] * [10.0, -16.0, 15.0])
         columns = read(
             file,
             robot,
@@ -311,7 +312,7 @@ class TestUnitsAndGears:
             drive={"gear_ratio": (10, 20, 40), "joint_offset": (1, 2, 3)},
         )
         expected = (VALUES[:, 1:4] / [10, 20, 40] + [1, 2, 3])[:, [1, 2, 0]]
-        assert columns["position"] == pytest.approx(expected)
+        assert columns["position"] == near(expected)
 
 
 class TestBadInput:
@@ -393,7 +394,7 @@ class TestArrays:
         time = {"column": "t", "unit": unit}
         columns = read(tmp_path / "a.npz", robot, position={"columns": "q"}, time=time)
         elapsed = (columns["stamp"] - columns["stamp"][0]) * 1e-9
-        assert elapsed == pytest.approx(TIME, abs=1e-9)
+        assert elapsed == near(TIME, abs=1e-9)
 
     def test_matlab_files_and_text(self, tmp_path, robot):
         savemat(tmp_path / "a.mat", {"q": Q.T, "t": TIME[None, :]})
@@ -444,7 +445,7 @@ class TestStructs:
         entries = {"time": {"column": "log.t"}}
         arrays = read_arrays(tmp_path / "a.mat", robot, position={"columns": columns}, **entries)
         assert np.array_equal(arrays["position"], STRUCTS[columns])
-        assert (arrays["stamp"] / 1e9) == pytest.approx(TIME)
+        assert (arrays["stamp"] / 1e9) == near(TIME)
 
     def test_columns_of_a_field(self, tmp_path, robot):
         savemat(tmp_path / "a.mat", {"log": {"all": np.column_stack([TIME, Q])}})
@@ -509,7 +510,7 @@ class TestMatlab73:
         path = save_73(tmp_path / "a.mat", q=Q, t=TIME, log=log)
         arrays = read(path, robot, position={"columns": columns}, time={"column": "t"})
         assert np.array_equal(arrays["position"], Q)
-        assert arrays["stamp"] / 1e9 == pytest.approx(TIME)
+        assert arrays["stamp"] / 1e9 == near(TIME)
 
     def test_a_file_without_contents_is_refused(self, tmp_path, robot):
         head = b"MATLAB 7.3 MAT-file".ljust(124) + b"\x00\x02IM"
@@ -678,7 +679,7 @@ def test_joints_are_those_of_the_robot_or_locked(tmp_path, robot):
     joints = (JOINTS[2], "gripper", *JOINTS[:2])
     read_columns = read(tmp_path / "a.npz", robot, joints=joints, position=position)
     expected = np.column_stack([Q[:, :2], 2.0 * (Q[:, 2] + 0.5)])
-    assert read_columns["position"] == pytest.approx(expected)
+    assert read_columns["position"] == near(expected)
     entries = {"joints": JOINTS[:2], "position": {"columns": "two"}}
     with pytest.raises(SourceError, match="--locked NAME, or all: --lock-others"):
         read(tmp_path / "a.npz", robot, **entries)
@@ -1351,11 +1352,11 @@ class TestReadyMaps:
         columns = ColumnMap.load(name)
         import_log(path, tmp_path / "a.mcap", robot=robot, columns=columns, outside_limits=True)
         stored = open_archive(tmp_path / "a.mcap").columns
-        assert stored["position"] == pytest.approx(Q)
+        assert stored["position"] == near(Q)
         assert stored["motor_current" if quantity == "motor_current" else "torque"] == (
             pytest.approx(TAU)
         )
-        assert np.diff(stored["stamp"]) == pytest.approx(1e7, abs=300)
+        assert np.diff(stored["stamp"]) == near(1e7, abs=300)
 
     @pytest.mark.long
     def test_listed_and_printed(self) -> None:

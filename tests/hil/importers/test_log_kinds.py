@@ -32,6 +32,7 @@ from tests.hil.importers.moving_log import (
     rows,
     text,
 )
+from tests.near import near
 
 
 @pytest.fixture
@@ -211,7 +212,7 @@ class TestRead:
         archive = imported(
             tmp_path / "log.csv", text(body, head=[names]), urdf, velocity={"columns": "v{}"}
         )
-        assert archive.columns["velocity"] == pytest.approx(SLOPE, abs=1e-12)
+        assert archive.columns["velocity"] == near(SLOPE, abs=1e-12)
 
     def test_rows_of_a_second_publisher_are_left_out(self, tmp_path: Path, urdf: Path) -> None:
         """As a bag that was exported to text has them."""
@@ -237,7 +238,7 @@ class TestRead:
         degrees = np.degrees(POSITION - np.array([0.0, 0.0, 1.5])) % 360.0
         content = text(rows(position=degrees, cell=lambda value: f"{value:.9f}"))
         archive = imported(tmp_path / "log.csv", content, urdf)
-        assert archive.columns["position"] == pytest.approx(np.radians(degrees), abs=1e-9)
+        assert archive.columns["position"] == near(np.radians(degrees), abs=1e-9)
         findings = archive.header.findings
         assert any(
             "position: no unit is stated; read as degrees" in line for line in findings.lines
@@ -351,7 +352,7 @@ class TestRemedies:
             imported(tmp_path / "log.csv", content, urdf, **missing)
         assert "leave out [torque]" in str(refused.value)
         archive = imported(tmp_path / "log.csv", content, urdf, torque=None, **missing)
-        assert archive.columns["position"] == pytest.approx(POSITION, abs=1e-6)
+        assert archive.columns["position"] == near(POSITION, abs=1e-6)
 
     def test_samples_of_one_stamp_that_are_apart_are_named(
         self, tmp_path: Path, urdf: Path
@@ -429,7 +430,7 @@ def test_cases_have_the_samples_of_plain(tmp_path: Path, cases: Path, name: str)
     elapsed = samples["stamp"] - samples["stamp"][0]
     assert np.abs(elapsed - expected["stamp"] + expected["stamp"][0]).max() < 1000  # ns
     for quantity in ("position", "torque"):
-        assert samples[quantity] == pytest.approx(expected[quantity], abs=2e-6)
+        assert samples[quantity] == near(expected[quantity], abs=2e-6)
 
 
 @pytest.mark.parametrize(
@@ -440,5 +441,5 @@ def test_whole_turns_bring_a_joint_nearest_to_its_limits(low: float, turns: int)
     limits = UrdfLimits(*(np.array([value]) for value in (-3.0, 3.0, 1.0, 1.0)))
     joint = np.array([low])
     angle = whole_turns(joint, joint + 0.5, limits, np.array([True]), 3)
-    assert angle == pytest.approx(2.0 * np.pi * turns)
+    assert angle == near(2.0 * np.pi * turns)
     assert not whole_turns(joint, joint + 0.5, limits, np.array([False]), 3)

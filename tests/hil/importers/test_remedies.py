@@ -30,6 +30,7 @@ from tests.hil.importers.moving_log import (
     rows,
     text,
 )
+from tests.near import near
 
 MAP = '[time]\ncolumn = "t"\n[position]\ncolumns = "q{}"\n[torque]\ncolumns = "tau{}"\n'
 OPTION = re.compile(r"--[a-z-]+(?: (?:[A-Z]+=[A-Z]+|/\w+|[A-Z]+|ignore))?")
@@ -57,9 +58,9 @@ def read(source: Path) -> Archive:
 
 def assert_right(source: Path, *, torque: bool = True) -> None:
     columns = read(source).columns
-    assert columns["position"] == pytest.approx(POSITION, abs=1e-6)
+    assert columns["position"] == near(POSITION, abs=1e-6)
     if torque:
-        assert columns["torque"] == pytest.approx(TORQUE, abs=1e-6)
+        assert columns["torque"] == near(TORQUE, abs=1e-6)
 
 
 def renamed(names: Sequence[str]) -> list[tuple[int, bytes]]:
@@ -161,7 +162,7 @@ class TestLogs:
         assert option == "--outside-limits"
         assert log(urdf, content, MAP, option) == ""
         columns = read(urdf.with_name("log.csv")).columns
-        assert columns["position"] == pytest.approx(POSITION + 7.0, abs=1e-6)
+        assert columns["position"] == near(POSITION + 7.0, abs=1e-6)
 
     def test_a_counter_for_a_time(self, urdf: Path) -> None:
         content = text(rows(time=range(COUNT)))

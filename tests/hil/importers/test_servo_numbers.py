@@ -15,6 +15,7 @@ from hil.base.errors import HilError
 from hil.cli import app
 from hil.importers.servo_numbers import are_per_mille, encoder_of, sign_bit_of, signed
 from tests.hil.importers.moving_log import POSITION, TIME, TORQUE, URDF
+from tests.near import near
 
 Floats = NDArray[np.float64]
 RATED = np.array([30.0, 25.0, 40.0])
@@ -76,7 +77,7 @@ class TestLoads:
         refused = refusal(source, urdf, "--columns", option)
         assert "is a magnitude with the sign in bit 10" in refused
         assert refusal(source, urdf, "--map", stated(refused, source)) == ""
-        assert read(source).columns["torque"] == pytest.approx(TORQUE, abs=0.5 * RATED.max() / 1000)
+        assert read(source).columns["torque"] == near(TORQUE, abs=0.5 * RATED.max() / 1000)
 
     @pytest.mark.parametrize("bit", [10, 15])
     def test_it_is_the_bit_without_which_the_numbers_jump(self, bit: int) -> None:
@@ -102,12 +103,12 @@ class TestObjectsOfDrives:
         refused = refusal(source, urdf)
         assert "6077h: per mille of a rated value" in refused
         assert refusal(source, urdf, "--map", stated(refused, source)) == ""
-        assert read(source).columns["torque"] == pytest.approx(TORQUE, abs=0.5 * RATED.max() / 1000)
+        assert read(source).columns["torque"] == near(TORQUE, abs=0.5 * RATED.max() / 1000)
 
     def test_torques_in_newton_metres_are_none(self, tmp_path: Path, urdf: Path) -> None:
         source = write(tmp_path, ("torque_actual_value_{}", TORQUE))
         assert refusal(source, urdf) == ""
-        assert read(source).columns["torque"] == pytest.approx(TORQUE, rel=1e-12)
+        assert read(source).columns["torque"] == near(TORQUE, rel=1e-12)
 
     def test_names_decide(self) -> None:
         assert are_per_mille(["tau{}_6077h"], PARTS)
@@ -126,7 +127,7 @@ class TestTicks:
         source = write(tmp_path, ("tau{}", TORQUE), ticks(count, middle, turn))
         assert refusal(source, urdf) == ""
         archive = read(source)
-        assert archive.columns["position"] == pytest.approx(POSITION, abs=0.51 * turn / count)
+        assert archive.columns["position"] == near(POSITION, abs=0.51 * turn / count)
         (line,) = (line for line in archive.header.findings.lines if "ticks" in line)
         assert f"an encoder of {count}, with zero at {middle}" in line
 
@@ -136,7 +137,7 @@ class TestTicks:
         scale = 2.0 * np.pi / 4096
         entries.write_text(f'[position]\nunit = "rad"\noffset = -1000\nscale = {scale!r}\n')
         assert refusal(source, urdf, "--map", entries) == ""
-        assert read(source).columns["position"] == pytest.approx(POSITION, abs=0.51 * scale)
+        assert read(source).columns["position"] == near(POSITION, abs=0.51 * scale)
 
     @pytest.mark.parametrize(
         "values",
@@ -149,7 +150,7 @@ class TestTicks:
     def test_whole_degrees_are_degrees(self, tmp_path: Path, urdf: Path) -> None:
         source = write(tmp_path, ("tau{}", TORQUE), np.rint(np.degrees(POSITION)))
         assert refusal(source, urdf) == ""
-        assert read(source).columns["position"] == pytest.approx(POSITION, abs=np.radians(0.51))
+        assert read(source).columns["position"] == near(POSITION, abs=np.radians(0.51))
 
 
 def test_the_load_of_a_public_report(shared_data: Path, tmp_path: Path) -> None:

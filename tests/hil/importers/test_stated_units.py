@@ -18,6 +18,7 @@ from hil.importers.stated_units import stated_unit, without_unit
 from hil.importers.unit_products import product_of
 from hil.importers.units import factor_of, unit_of
 from tests.hil.importers.moving_log import POSITION, SLOPE, TIME, TORQUE, URDF
+from tests.near import near
 
 Floats = NDArray[np.float64]
 # By their definitions: 1 kgf = 9.80665 N, 1 lbf = 0.45359237 kgf, 1 ozf = 1/16 lbf, 1 in = 25.4 mm.
@@ -132,10 +133,10 @@ class Log:
 
     def check(self) -> None:
         columns = open_archive(self.path.with_name("out.mcap")).columns
-        assert columns["position"] == pytest.approx(POSITION, abs=1e-9)
-        assert columns["torque"] == pytest.approx(TORQUE, rel=1e-9)
+        assert columns["position"] == near(POSITION, abs=1e-9)
+        assert columns["torque"] == near(TORQUE, rel=1e-9)
         if "velocity" in columns:
-            assert columns["velocity"] == pytest.approx(SLOPE, rel=1e-9, abs=1e-9)
+            assert columns["velocity"] == near(SLOPE, rel=1e-9, abs=1e-9)
 
 
 @pytest.fixture

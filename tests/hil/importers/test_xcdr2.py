@@ -19,6 +19,7 @@ from hil.importers.rosbag2 import import_rosbag2
 from hil.importers.xcdr2 import in_version_1
 from tests.hil.importers.bags import DEFINITION, STATE, mcap
 from tests.hil.importers.moving_log import COUNT, JOINTS, POSITION, TIME, TORQUE, URDF
+from tests.near import near
 
 START = 1_700_000_000 * 10**9
 
@@ -130,5 +131,5 @@ def test_the_recording_of_a_public_report(shared_data: Path, tmp_path: Path) -> 
     table = np.loadtxt(cases / "11-urdf-units" / "log.csv", delimiter=",", skiprows=1)
     some = table[: len(columns["position"])]
     assert len(some) > COUNT
-    assert columns["position"] == pytest.approx(some[:, 1:7], rel=1e-7)  # of eight digits
-    assert columns["torque"] == pytest.approx(some[:, 7:], rel=1e-6)
+    assert columns["position"] == near(some[:, 1:7], rel=1e-7)  # of eight digits
+    assert columns["torque"] == near(some[:, 7:], rel=1e-6)

@@ -29,6 +29,7 @@ from identification.validation.finding import Finding, RemedyKey, Thresholds
 from identification.validation.finding_messages import Naming, worded
 from identification.validation.findings.table import find
 from tests.hil.simulated_logs import simulate, write_log
+from tests.near import near
 
 CASES = Path(__file__).parents[4] / "shared" / "cases" / "logs"
 LOGS = (
@@ -239,5 +240,5 @@ def test_a_file_whose_data_are_lost_is_saved_again(tmp_path: Path) -> None:
     saved.write_bytes(header + saved.read_bytes()[len(header) :])
     (tmp_path / "read.mcap").unlink()
     again = Read.of(saved, ImportOptions(), tmp_path)
-    assert again.position == pytest.approx(plain.position, abs=1e-12)
-    assert again.torque == pytest.approx(plain.torque, abs=1e-12)
+    assert again.position == near(plain.position, abs=1e-12)
+    assert again.torque == near(plain.torque, abs=1e-12)

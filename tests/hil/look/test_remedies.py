@@ -16,6 +16,7 @@ from typer.testing import CliRunner
 from hil.archive import open_archive
 from hil.base.errors import HilError
 from hil.cli import app
+from tests.near import near
 
 pytestmark = pytest.mark.slow
 RATE = 250.0  # Hz, of the controller whose cycles were counted
@@ -74,8 +75,8 @@ def test_the_rate_in_place_of_counted_cycles(cases: Path, tmp_path: Path) -> Non
     assert typed(*line, *shlex.split(option.replace("HZ", str(RATE))))[0] == 0
     table = np.loadtxt(log, delimiter=",", skiprows=1)
     read = columns(output)
-    assert np.median(np.diff(read["stamp"])) == pytest.approx(1e9 / RATE)
-    assert read["position"] == pytest.approx(table[:, 1:7], rel=1e-12)
+    assert np.median(np.diff(read["stamp"])) == near(1e9 / RATE)
+    assert read["position"] == near(table[:, 1:7], rel=1e-12)
 
 
 def test_the_rate_in_place_of_a_map_with_milliseconds(cases: Path, tmp_path: Path) -> None:
@@ -150,7 +151,7 @@ def test_two_topics_in_one_table_need_no_remedy(cases: Path, tmp_path: Path) -> 
     read = columns(output)
     found = np.searchsorted(torques[:, 0], read["stamp"] * 1e-9 - 1e-6)
     assert len(read["stamp"]) > 0.98 * len(torques)
-    assert read["torque"] == pytest.approx(torques[np.clip(found, 0, len(torques) - 1), 7:])
+    assert read["torque"] == near(torques[np.clip(found, 0, len(torques) - 1), 7:])
 
 
 STATED = """

@@ -26,6 +26,7 @@ from tests.docs.typed import ROOT, commands
 from tests.hil.fast_cell import QUICK
 from tests.hil.payload.load_archives import CENTRE, CONSTANTS, LAW, MASS, archive_of_currents
 from tests.hil.simulated_logs import Simulated, archive_of, simulate
+from tests.near import near
 
 pytestmark = pytest.mark.long
 
@@ -257,7 +258,7 @@ class TestTorqueScale:
         result = CliRunner().invoke(app, [*arguments, "--quiet"])
         assert result.exit_code == 0, result.output
         table = tomllib.loads(result.output)
-        assert table["torque_constant"] == pytest.approx(TYPE, rel=0.03)
+        assert table["torque_constant"] == near(TYPE, rel=0.03)
         assert np.all(np.array(table["torque_uncertainty"]) < 0.02)
         Drive(**table)
 
