@@ -53,7 +53,7 @@ def verify_controller(
             are not checked.
     """
     differences = _axes(drive_train.n_joints, init, arm, other_axes)
-    if not math.isclose(init.period, period, rel_tol=1e-9):
+    if not math.isclose(init.period, period):
         ours = f"{1e3 * period:g} ms in the cell"
         cycle = f"cycle is {init.sample_time} ms in the controller, {ours}"
         differences = (cycle, *differences)

@@ -263,6 +263,11 @@ class Plant:
         """Motor positions as joint angles (n,) [rad]; with rigid gears, the joint positions."""
         return self.position
 
+    @property
+    def motor_velocity(self) -> Array:
+        """Motor velocities as joint velocities (n,) [rad/s]."""
+        return self.velocity
+
     def set_state(self, position: ArrayLike, velocity: ArrayLike) -> None:
         """Set position (n,) [rad] and velocity (n,) [rad/s]."""
         self.position = np.array(position, dtype=np.float64)
@@ -442,6 +447,11 @@ class ElasticPlant(Plant):
     def motor_position(self) -> Array:
         """Motor positions as joint angles (n,) [rad]."""
         return np.where(self._soft, self._motor, self.position)
+
+    @property
+    def motor_velocity(self) -> Array:
+        """Motor velocities as joint velocities (n,) [rad/s]."""
+        return np.where(self._soft, self._motor_velocity, self.velocity)
 
     def energy(self) -> float:
         """Return kinetic, potential and spring energy [J]."""

@@ -6,6 +6,8 @@ from what the arm is, as on a real one.
 
 from __future__ import annotations
 
+import math
+from collections import deque
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Final
@@ -25,7 +27,10 @@ _HEATING_PER_WATT: Final = 0.25  # °C per W of friction in the long run
 _HEAT_TIME_CONSTANT: Final = 900.0  # s
 _POSITION_BANDWIDTH: Final = 60.0  # of the position loop, rad/s
 _FRICTION_SPEED: Final = 0.02  # of the controller's friction law at a reversal, rad/s
-_SUBSTEP_SECONDS: Final = 5e-4  # of an arm with effects that a model leaves out, s
+_LOOP_SECONDS: Final = 2e-3  # longest period of the position loop, s
+_SUBSTEP_SECONDS: Final = 5e-4
+"""Period of the position loop of an arm with effects that a model leaves out [s]: in front of
+springs the loop moves the rotors alone, which are lighter, so it has to be faster."""
 _MOTOR_PER_JOINT: Final = 101.0 / (2.0 * np.pi)  # revolutions per rad
 
 
@@ -113,11 +118,14 @@ class SimulatedUrArm:
         carry(self._model, entered)
         self._data = self._model.createData()
         self._period = period
+        self._is_ideal = self._effects == UnmodelledEffects()
+        self._loops = math.ceil(period / (_LOOP_SECONDS if self._is_ideal else _SUBSTEP_SECONDS))
+        self._loop_period = period / self._loops
         self._rng = np.random.default_rng(seed)
         amplitude = self._effects.torque_ripple * truth.plant.coulomb
         self._ripple = SimulatedRipple(amplitude, np.random.default_rng([seed, 1]))
         self._drift = SimulatedDrift(self._effects.friction_drift, 6)
-        self._torque_before: Array = np.zeros(6)
+        self._delayed = deque([np.zeros(6)] * round(self._effects.delay / self._loop_period))
         self.current: Array = np.zeros(6)
         self.target_moment: Array = np.zeros(6)
         self.target_current: Array = np.zeros(6)
@@ -135,28 +143,27 @@ class SimulatedUrArm:
         rotor = truth.plant.rotor_inertia
         inertia = np.diag(pin.crba(self._model, self._data, q)) + rotor
         drive = rotor * qdd
-        error = q - self.plant.position
-        rate = qd - self.plant.velocity
-        correction = inertia * _POSITION_BANDWIDTH * (_POSITION_BANDWIDTH * error + 2.0 * rate)
-        command = self.target_current + (drive + correction) / truth.stated_constant
-        self.current = command
-        torque = truth.torque_constant * command
-        if self._effects == UnmodelledEffects():
-            self.plant.step(torque, self._period)
-        else:
-            self._step_with_effects(torque)
+        commands: Array = np.zeros(6)
+        for loop in range(self._loops):
+            ahead = loop * self._loop_period
+            error = q + ahead * (qd + 0.5 * ahead * qdd) - self.plant.motor_position
+            rate = qd + ahead * qdd - self.plant.motor_velocity
+            correction = inertia * _POSITION_BANDWIDTH * (_POSITION_BANDWIDTH * error + 2.0 * rate)
+            command = self.target_current + (drive + correction) / truth.stated_constant
+            commands += command
+            self._advance(truth.torque_constant * command)
+        self.current = commands / self._loops
         self._warm()
 
-    def _step_with_effects(self, torque: Array) -> None:
-        """Advance by a cycle under motor torques (6,) [N·m], in sub-steps."""
-        plant = self.plant
-        plant.scale_friction(self._drift.scale(plant.velocity, self._period))
-        delayed = round(self._effects.delay / _SUBSTEP_SECONDS)
-        for substep in range(round(self._period / _SUBSTEP_SECONDS)):
-            acting = self._torque_before if substep < delayed else torque
+    def _advance(self, torque: Array) -> None:
+        """Advance by a period of the position loop under motor torques (6,) [N·m]."""
+        plant, period = self.plant, self._loop_period
+        if not self._is_ideal:
+            plant.scale_friction(self._drift.scale(plant.velocity, period))
+            self._delayed.append(torque)
             motors = (_MOTOR_PER_JOINT * plant.motor_position).tolist()
-            plant.step(acting + self._ripple.torque(motors), _SUBSTEP_SECONDS)
-        self._torque_before = torque
+            torque = self._delayed.popleft() + self._ripple.torque(motors)
+        plant.step(torque, period)
 
     def rest(self) -> None:
         """Stay for a cycle with brakes engaged and without current."""

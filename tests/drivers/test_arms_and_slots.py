@@ -15,7 +15,6 @@ from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 
 from drivers import CycleRing, Guard, InitPacket, InitReceived, RequestError, Session, State
-from drivers.c4g_wire import PacketClassifier
 from tests.drivers import oracle
 from tests.drivers.rig import PERIOD, Table, limits, train_of
 from tests.messages import AXIS_NOT_OPEN
@@ -202,11 +201,3 @@ def test_arm_moves_only_if_the_map_is_a_bijection(table, n_axes):
     received, answer = bench.cycle()
     if not valid:
         assert oracle.differences(answer, oracle.safe_answer(received, (1,) * n_axes)) == []
-
-
-def test_a_packet_of_c4g_open_states_no_cause_of_its_own():
-    slots = np.arange(6)
-    report = PacketClassifier(slots, (1,) * 6, 1, OPEN).classify(
-        bytes(4), np.full(6, CLOSED, np.int32)
-    )
-    assert (report.cause, report.remedy) == ("", "")

@@ -19,10 +19,12 @@ from drivers.ur.connection import RtdeConnection, connected
 from drivers.ur.registers import INPUTS
 from drivers.ur.rtde import InputsInUseError
 from drivers.ur.transport import RtdeSpec
+from sim_fixtures.arm import UnmodelledEffects
 from sim_fixtures.plant import Carried, build_model
 from sim_fixtures.ur import (
     UR5E_URDF,
     SimulatedUr,
+    SimulatedUrArm,
     UrArmTruth,
     UrFault,
     UrProgram,
@@ -129,6 +131,23 @@ def test_only_a_payload_that_is_entered_is_in_the_model() -> None:
 def test_joints_warm_up_by_moving(moving: dict[str, np.ndarray]) -> None:
     rise = moving["joint_temperatures"][-1] - moving["joint_temperatures"][0]
     assert np.all(rise > 0.0) and np.all(rise < 1.0)
+
+
+@pytest.mark.parametrize("period", [0.002, 0.008])
+@pytest.mark.parametrize("elasticity", [(), (2e-5, 2e-5, 3e-5, 0.0, 0.0, 0.0)])
+def test_the_position_loop_is_stable(period: float, elasticity: tuple[float, ...]) -> None:
+    """Straight out and folded, with springs in the main axes, at the cycles of both series."""
+    amplitude, rate = np.linspace(0.3, 0.5, 6), np.linspace(1.0, 4.0, 6)
+    for elbow in (0.0, 2.6):
+        start = np.array([0.0, 0.0, elbow, 0.0, 0.0, 0.0])
+        effects = UnmodelledEffects(elasticity=elasticity, delay=5e-4 if elasticity else 0.0)
+        arm = SimulatedUrArm(UrArmTruth(), start, period, effects=effects)
+        for cycle in range(round(1.5 / period)):
+            phase = rate * cycle * period
+            q = start + amplitude * (1.0 - np.cos(phase))
+            qd, qdd = amplitude * rate * np.sin(phase), amplitude * rate**2 * np.cos(phase)
+            arm.step(q, qd, qdd)
+            assert np.abs(q - arm.plant.position).max() < 0.1
 
 
 def test_a_slider_slows_the_motion() -> None:
