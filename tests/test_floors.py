@@ -31,7 +31,7 @@ def loaded_by(*modules: str) -> set[str]:
     "modules",
     [
         pytest.param(["hil.cell"], id="the cell file"),
-        pytest.param(["hil.importers.text_table"], id="a text table"),
+        pytest.param(["hil.importers.text_table"], id="a text table", marks=pytest.mark.long),
         pytest.param([f"hil.importers.{name}" for name in IMPORTERS], id="any log or bag"),
     ],
 )

@@ -333,7 +333,9 @@ class TestReuse:
         [
             ("parameters.json", None, "there is no parameters.json"),
             ("results.json", "{", "its files cannot be read"),
-            ("parameters.json", "[]", "its files cannot be read"),
+            pytest.param(
+                *("parameters.json", "[]", "its files cannot be read"), marks=pytest.mark.long
+            ),
         ],
     )
     def test_unusable_files_are_named(

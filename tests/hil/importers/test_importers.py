@@ -65,6 +65,7 @@ from tests.hil.simulated_logs import (
 )
 from tests.hil.simulated_logs import imported as read
 from tests.near import near
+from tests.tiers import quick_ones
 
 
 @pytest.fixture
@@ -1290,7 +1291,7 @@ class TestRobotOptions:
         refused = self.refused(place, "log", *self.LOCKED)
         assert "map.toml: joints: does not name the recorded joints" in refused
 
-    @pytest.mark.parametrize("kind", ["log", "rosbag2"])
+    @pytest.mark.parametrize("kind", quick_ones(["log"], ["log", "rosbag2"]))
     def test_gravity_and_friction_law(self, place: Path, kind: str) -> None:
         """The default law is offset, Coulomb and viscous."""
         for options, gravity, third, offset in [

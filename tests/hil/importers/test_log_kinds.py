@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import re
+from collections.abc import Callable, Mapping
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -409,22 +411,34 @@ CASES = [
 ]  # fmt: skip
 
 
-@pytest.mark.parametrize("name", CASES)
-def test_cases_have_the_samples_of_plain(tmp_path: Path, cases: Path, name: str) -> None:
+def read_case(
+    folder: Path, cases: Path, stem: str, entries: Mapping[str, Any]
+) -> dict[str, Floats]:
+    """The samples of a case by its map, with some entries changed."""
+    columns = ColumnMap.load(cases / f"{stem}.toml")
+    columns = ColumnMap.model_validate({**columns.model_dump(exclude_unset=True), **entries})
+    out = folder / f"{stem}.mcap"
     robot = Robot.from_urdf(cases / "arm.urdf")
+    import_log(cases / f"{stem}.csv", out, robot=robot, columns=columns)
+    return dict(open_archive(out).columns)
 
-    def read(stem: str, **entries: Any) -> dict[str, Floats]:
-        columns = ColumnMap.load(cases / f"{stem}.toml")
-        columns = ColumnMap.model_validate({**columns.model_dump(exclude_unset=True), **entries})
-        out = tmp_path / f"{stem}.mcap"
-        import_log(cases / f"{stem}.csv", out, robot=robot, columns=columns)
-        return dict(open_archive(out).columns)
 
-    expected = read("plain")
+@pytest.fixture(scope="module")
+def plain(tmp_path_factory: pytest.TempPathFactory) -> Callable[[Path], dict[str, Floats]]:
+    """The samples of the file that has nothing special, read once."""
+    folder = tmp_path_factory.mktemp("plain")
+    return cache(lambda cases: read_case(folder, cases, "plain", {}))
+
+
+@pytest.mark.parametrize("name", CASES)
+def test_cases_have_the_samples_of_plain(
+    tmp_path: Path, cases: Path, plain: Callable[[Path], dict[str, Floats]], name: str
+) -> None:
+    expected = plain(cases)
     try:
-        samples = read(name)
+        samples = read_case(tmp_path, cases, name, {})
     except SourceError as error:
-        samples = read(name, **remedy(str(error)))
+        samples = read_case(tmp_path, cases, name, remedy(str(error)))
         line = int(re.search(r"line (\d+)", str(error))[1])  # type: ignore[index]
         expected = {key: np.delete(array, line - 2, axis=0) for key, array in expected.items()}
     elapsed = samples["stamp"] - samples["stamp"][0]

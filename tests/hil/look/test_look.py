@@ -137,7 +137,7 @@ def late(table: Mapping[str, Floats]) -> dict[str, Floats]:
             marks=pytest.mark.long,
         ),
         (of_motors, "side", "motor side (before the gears), or a current"),
-        (late, "delay", "torque 4"),
+        pytest.param(late, "delay", "torque 4", marks=pytest.mark.long),
         pytest.param(
             to_the_ground,
             "coupling",
