@@ -18,6 +18,7 @@ from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
+import scipy.signal
 
 from benchmarks import parser_of, show
 from benchmarks.board import ABOVE_PLAIN, DATA, Parts, cut, fit_errors, import_all, row_name
@@ -35,6 +36,11 @@ Row = dict[str, Any]
 TORQUE_BITS: Final = 16
 TORQUE_NOISE: Final = 0.03  # of the scatter of each joint's torque
 POSITION_NOISE: Final = 3e-5  # rad
+DECIMALS: Final = 4
+SECONDS: Final = 10.0
+FILTER: Final = 5.0  # Hz, two poles
+FILTERED_RATE: Final = 125.0  # Hz
+SCALE_SCATTER: Final = 0.5  # of the logarithm of N·m per unit of a motor's current
 _MASS: Final = re.compile(r"""(<mass[^>]*value\s*=\s*)["'][^"']*["']""")
 
 
@@ -64,6 +70,39 @@ def noisy(log: JointLog) -> JointLog:
     return replace(log, torque=log.torque + torque, position=log.position + position)
 
 
+def rounded(log: JointLog) -> JointLog:
+    """A text of few decimals."""
+    velocity = None if log.velocity is None else np.round(log.velocity, DECIMALS)
+    position, torque = np.round(log.position, DECIMALS), np.round(log.torque, DECIMALS)
+    return replace(log, position=position, velocity=velocity, torque=torque)
+
+
+def currents(log: JointLog) -> JointLog:
+    """Torques in the units of each motor's current, without the torque constants."""
+    random = np.random.default_rng(1)
+    scale = np.exp(SCALE_SCATTER * random.standard_normal(log.torque.shape[1]))
+    return replace(log, torque=log.torque * scale)
+
+
+def negated(log: JointLog) -> JointLog:
+    """Torques that act on the arm's drives, not on the arm."""
+    return replace(log, torque=-log.torque)
+
+
+def filtered(log: JointLog) -> JointLog:
+    """A controller's causal low-pass of the torque, at the rate of its interface."""
+    rate = 1.0 / float(np.median(np.diff(log.time)))
+    poles = scipy.signal.butter(2, min(FILTER, 0.4 * rate), fs=rate, output="sos")
+    start = scipy.signal.sosfilt_zi(poles)[:, :, None] * log.torque[0]
+    torque, _ = scipy.signal.sosfilt(poles, log.torque, axis=0, zi=start)
+    return slower(FILTERED_RATE)(replace(log, torque=torque))
+
+
+def short(log: JointLog) -> JointLog:
+    """The beginning of a log."""
+    return log.rows(log.time < log.time[0] + SECONDS)
+
+
 def slower(rate: float) -> Callable[[JointLog], JointLog]:
     """Return what keeps one row in several, at about a rate [Hz]."""
 
@@ -83,6 +122,12 @@ CONDITIONS: Final[dict[str, Callable[[JointLog], JointLog]]] = {
     "16 bits of torque": quantised_torque,
     "noise": noisy,
     "late torque": delayed_torque,
+    "four decimals": rounded,
+    "currents": currents,
+    "negated torque": negated,
+    "filtered torque": filtered,
+    "10 s": short,
+    "100 Hz without velocity": lambda log: without_velocity(slower(100.0)(log)),
 }
 """What becomes of both logs, by name."""
 

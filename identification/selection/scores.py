@@ -339,17 +339,25 @@ class SettingsTrial:
 
         Infinite if slower motion cannot be fitted.
         """
+        errors = self.fast_errors(settings)
+        torque = errors.torque.sum()
+        return math.sqrt(errors.squares.sum() / torque) if torque > 0.0 else 0.0
+
+    def fast_errors(self, settings: Settings) -> Errors:
+        """Return the errors of the fast motion of each segment, predicted from all slower one."""
         samples = self.samples(settings)
+        model = self.model(settings)
         speeds = [np.abs(each.motion.velocity).max(axis=0) for each in samples]
-        fast = _FAST_SPEED_SHARE * np.max(speeds, axis=0)
-        folds = Folds.of(self.model(settings), samples, fast)
-        if not (folds.fitted.samples.any() and folds.predicted.samples.any()):
-            return 0.0
+        folds = Folds.of(model, samples, _FAST_SPEED_SHARE * np.max(speeds, axis=0))
+        torque = np.array([table[:, -1, -1] for table in folds.predicted.matrices]).T
+        if not folds.fitted.samples.any():
+            return Errors(np.zeros_like(torque), np.zeros_like(torque))
         try:
             values = self._estimator(settings)(folds.fitted)
         except (IdentificationError, np.linalg.LinAlgError):
-            return math.inf
-        return folds.predicted.relative_error(values)
+            return Errors(np.full_like(torque, np.inf), torque)
+        squares = folds.predicted.squared_errors_by_block(np.tile(values, (FOLDS, 1)))
+        return Errors(squares, torque)
 
     def has_friction(self, settings: Settings) -> bool:
         """Return whether the fitted friction of every joint stays near that at rest at all speeds.
@@ -388,10 +396,12 @@ class SettingsTrial:
     def carries_over(self, settings: Settings, possible: Settings) -> bool:
         """Return whether bodies that cannot exist may be trusted in another motion.
 
-        They predict fast motion from slower one no worse than possible ones. Their inertia is one,
-        or they predict so much better that they stand for something that is there.
+        Possible ones do not predict fast motion from slower one better by more than the standard
+        error. Their inertia is one, or they predict so much better that they stand for something
+        that is there.
         """
-        if self.fast_error(settings) > self.fast_error(possible):
+        ours, theirs = (self.fast_errors(each).segments for each in (settings, possible))
+        if clearly_better(theirs, ours, 0.0, certainty=1.0):
             return False
         limit = _FAR_BETTER_ERROR_RATIO * self.errors(possible).overall
         return self.has_inertia(settings) or self.errors(settings).overall < limit

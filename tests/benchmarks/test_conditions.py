@@ -63,6 +63,44 @@ def test_torques_have_as_many_steps_as_bits(log: JointLog) -> None:
     assert 0.0 < np.abs(torque - log.torque).max() <= 0.51 * step.max()
 
 
+def test_a_text_has_few_decimals(log: JointLog) -> None:
+    changed = CONDITIONS["four decimals"](log)
+    for before, after in ((log.position, changed.position), (log.torque, changed.torque)):
+        np.testing.assert_array_equal(after, np.round(before, 4))
+    assert changed.velocity is not None and np.all(changed.velocity == np.round(log.velocity, 4))
+
+
+def test_currents_differ_by_a_factor_of_each_joint(log: JointLog) -> None:
+    ratio = CONDITIONS["currents"](log).torque / log.torque
+    np.testing.assert_allclose(ratio, ratio[:1].repeat(len(ratio), axis=0))
+    assert ratio[0, 0] != pytest.approx(ratio[0, 1]) and np.all(ratio > 0.0)
+
+
+def test_negated_torques_change_their_sign(log: JointLog) -> None:
+    np.testing.assert_array_equal(CONDITIONS["negated torque"](log).torque, -log.torque)
+
+
+def test_a_filtered_torque_lags_and_has_no_fast_part(log: JointLog) -> None:
+    """By the group delay of two poles at 5 Hz, sqrt(2) / (2 pi 5 Hz); four octaves above, 1/256."""
+    time = np.arange(0.0, 10.0, 1e-3)
+    wave = np.column_stack([np.sin(2.0 * np.pi * 0.1 * time), np.sin(2.0 * np.pi * 80.0 * time)])
+    fast = replace(log, time=time, position=wave, velocity=None, torque=wave)
+    changed = CONDITIONS["filtered torque"](fast)
+    assert np.median(np.diff(changed.time)) == pytest.approx(1.0 / 125.0)
+    later = changed.time > 1.0
+    lag = np.sqrt(2.0) / (2.0 * np.pi * 5.0)
+    slow = np.sin(2.0 * np.pi * 0.1 * (changed.time - lag))
+    np.testing.assert_allclose(changed.torque[later, 0], slow[later], atol=2e-3)
+    assert np.abs(changed.torque[later, 1]).max() < 1.0 / 200.0
+
+
+def test_a_short_log_is_the_first_ten_seconds(log: JointLog) -> None:
+    twice = replace(log, time=2.0 * log.time)
+    changed = CONDITIONS["10 s"](twice)
+    assert changed.n_rows == 500
+    np.testing.assert_array_equal(changed.position, log.position[:500])
+
+
 def test_a_refusal_is_a_row(log: JointLog, tmp_path: Path) -> None:
     """Of a joint whose torque was not measured, next to a row whose torque was."""
     constant = log.torque.copy()

@@ -556,6 +556,39 @@ class TestClearlyBetter:
         assert decided(self.FIRST, nothing).chosen == 0
 
 
+class TestImpossibleBodies:
+    """They may be chosen unless possible ones clearly predict faster motion better."""
+
+    FAST = np.linspace(0.1, 0.4, 10)
+
+    @staticmethod
+    def carry_over(errors, of_possible):
+        """Whether they may, by errors of fast motion by segment (k,); inertias are positive."""
+        trial = SettingsTrial(MODEL, lambda *_: [])
+        possible = Settings(Preprocessing(), strength=Strength(consistent=True))
+        impossible = replace(possible, strength=Strength())
+        assert not impossible.strength.consistent
+        trial.fast_errors = lambda settings: Errors(
+            np.square(of_possible if settings.strength.consistent else errors)[:, None],
+            np.ones((len(errors), 1)),
+        )
+        trial.errors = trial.fast_errors
+        trial.has_inertia = lambda _: True
+        return trial.carries_over(impossible, possible)
+
+    # The standard error is 0.17.
+    @pytest.mark.parametrize(("change", "may"), [(-0.2, True), (0.1, True), (0.2, False)])
+    def test_faster_motion_refuses_by_its_standard_error(self, change, may):
+        scatter = np.tile([0.5, -0.5], 5)
+        assert self.carry_over(self.FAST * np.exp(change + scatter), self.FAST) == may
+
+    def test_what_slower_motion_leaves_open_is_refused(self):
+        assert not self.carry_over(np.full(10, np.inf), self.FAST)
+
+    def test_without_faster_motion_they_may(self):
+        assert self.carry_over(np.empty(0), np.empty(0))
+
+
 class TestLast:
     @pytest.mark.parametrize(
         ("means", "chosen"),
