@@ -215,7 +215,7 @@ class SentSetPoints:
         cycle: int,
         where: Joints | None = None,
         *,
-        stopping: bool = False,
+        stopping: bool,
     ) -> int:
         """Require each joint's target to be one of the last set-points, or the last extrapolated.
 
@@ -515,7 +515,7 @@ class SetPointGenerator:
             joint = int(np.argmax(off & ~opened))
             raise AxisNotInMode(self._packet.misplacement(joint), self._cycle)
 
-    def _check_accepted(self, where: Joints | None = None, *, stopping: bool = False) -> None:
+    def _check_accepted(self, where: Joints | None = None, *, stopping: bool) -> None:
         """Check the target received against the set-points sent, and count lost replies."""
         self.rejected = self._history.check(
             self._raw[TARGET], self._now.losses.gap, self._cycle, where, stopping=stopping
@@ -571,7 +571,7 @@ class SetPointGenerator:
         self.require_holdable(held | ready)
         self._record_held(held)
         self._check_feedback(self._sent, continuing)
-        self._check_accepted(continuing)
+        self._check_accepted(continuing, stopping=False)
         if np.array_equal(continuing, self._wire.opened):
             # A source that ends while moving would cause a jump to rest.
             self._guard.check_set_point(self.set_point, self._still, "plan", self._cycle)

@@ -624,9 +624,10 @@ class Sent:
         self.last = self.last + steps * self.step
         self.set_points.add(self.last)
 
-    def check(self, ahead: float, missed: int = 0, **named) -> int:
-        """A target so many steps ahead of the one sent last."""
-        return self.set_points.check(self.last + ahead * self.step, missed, 7, **named)
+    def check(self, ahead: float, missed: int = 0, *, stopping: bool = False, **named) -> int:
+        """A target that many steps ahead of the one sent last."""
+        target = self.last + ahead * self.step
+        return self.set_points.check(target, missed, 7, stopping=stopping, **named)
 
     def refuse(self, ahead: float, missed: int = 0, **named) -> None:
         error = refused(Check.ACCEPTED, self.check, ahead, missed, **named)
@@ -707,7 +708,7 @@ class TestSentAgain:
         sent = Sent(SLOW)
         for step in (1.0, 2.1, -1.0):
             sent.add(step)  # one more of the last is a tenth of a step from two set-points ago
-        assert sent.set_points.check(sent.last - sent.step, 1, 7) == 0
+        assert sent.set_points.check(sent.last - sent.step, 1, 7, stopping=False) == 0
 
     def test_joint_furthest_behind_counts(self):
         sent = Sent(SLOW)
@@ -715,7 +716,7 @@ class TestSentAgain:
         for _ in range(4):
             sent.add(1.0)
         target = sent.last - sent.step * np.array([0, 1, 0, 0, 2, 0])
-        assert sent.set_points.check(target, 0, 1) == 2
+        assert sent.set_points.check(target, 0, 1, stopping=False) == 2
 
     @pytest.mark.parametrize("way", [-1.0, 1.0])
     @pytest.mark.parametrize(
