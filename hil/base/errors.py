@@ -24,6 +24,7 @@ HilError                   exit status 1
     ├── SettingsError      the settings of a design
     ├── CampaignFolderError     the campaign folder
     └── SourceError        a foreign recording (CSV, rosbag2) that cannot be imported
+        └── RefusedRecordingError  5: a recording that was read, and from which nothing follows
 ```
 """
 
@@ -123,6 +124,15 @@ class CampaignFolderError(InputError):
 
 class SourceError(InputError):
     """A foreign recording that cannot be imported."""
+
+
+class RefusedRecordingError(SourceError):
+    """A recording that was read, and from which nothing follows.
+
+    The exit status is that of the verdict on its archive: the result is negative.
+    """
+
+    exit_code: ClassVar[int] = 5
 
 
 class UnrecordedJointError(SourceError):

@@ -272,10 +272,12 @@ def are_degrees(position: Array, converted: Array, names: Sequence[str], urdf: s
     turning = _turning(urdf, names)
     if not turning.all() or not len(position):
         return False
-    finite = np.isfinite(position).all() and np.isfinite(converted).all()
+    if not (np.isfinite(position).all() and np.isfinite(converted).all()):
+        return False
+    position = in_turns(position, limits, turning)  # radians of 0 to 2 pi are none
     beyond = ~np.diag(_fits(position, limits))
     far = np.abs(position).max(axis=0) > 3.0 * np.maximum(-limits.lower, limits.upper)
-    if not finite or not (far & beyond).any():
+    if not (far & beyond).any():
         return False
     fits = np.diag(_fits(in_turns(converted, limits, turning), limits))
     moves = np.ptp(converted, axis=0).max() >= _MIN_TRAVEL

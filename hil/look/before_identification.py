@@ -9,7 +9,7 @@ from typing import Final, NamedTuple
 import numpy as np
 
 from hil.archive import Archive
-from hil.base.errors import SourceError
+from hil.base.errors import RefusedRecordingError, SourceError
 from hil.base.terminal_text import typed
 from hil.cell import Cell
 from hil.importers.conclusions import Certainty
@@ -99,7 +99,7 @@ class LayoutReading:
             use: what the recording is for.
 
         Raises:
-            SourceError: a joint moves under a constant torque.
+            RefusedRecordingError: a joint moves under a constant torque.
         """
         _require_measured(imported.archive, source)
         if self.look is None:
@@ -127,7 +127,8 @@ def concluded(
         use: what the recording is for.
 
     Raises:
-        SourceError: two readings fit alike, or the URDF is that of another arm.
+        SourceError: two readings fit alike.
+        RefusedRecordingError: no model of the arm of the URDF follows from it.
     """
     if imported.is_stated or "torque" not in imported.archive.columns:
         return Concluded(imported)
@@ -147,6 +148,8 @@ def concluded(
     if found.time is not None:
         warned = (*imported.concluded, DoubtfulTime(found.time))
         return Concluded(replace(imported, concluded=warned), found)
+    if found.is_partly_weightless:
+        return Concluded(imported, found)
     suspect = asked.is_suspect(found)
     is_bag = imported.map_text is None  # its joints have names: no other order is searched
     if is_bag or not (suspect or _hangs_otherwise(asked.cell, asked.rows, asked.score)):
@@ -175,10 +178,11 @@ def _as_a_look_says(
             return Concluded(servo)
         raise _other_arm(source, error)
     changed = _changed(look)
+    as_recorded = imported
     if look.questions or not changed:
         contradictions = asked.contradictions(error=error)
         if not changed:
-            imported = _of_this_arm(imported, source, contradictions)
+            as_recorded = _of_this_arm(imported, source, contradictions)
         if look.questions:
             raise undecided(source, look.questions[0], contradictions)
     if look.map_text != imported.map_text or look.gravity is not None:
@@ -188,7 +192,7 @@ def _as_a_look_says(
             contradictions = read.contradictions(error=error, changed=axes)
             again = _of_this_arm(again, source, contradictions)
         return Concluded(again, look=look)
-    return Concluded(imported)
+    return Concluded(as_recorded)
 
 
 @dataclass
@@ -221,16 +225,17 @@ class Asking:
 
 
 def _require_measured(archive: Archive, source: Path) -> None:
-    """Raise SourceError if a joint moves under one and the same torque."""
+    """Raise RefusedRecordingError if a joint moves under one and the same torque."""
     position, torque = (np.asarray(archive.columns[name]) for name in ("position", "torque"))
     constant = constant_torques(position, torque, cell_of(archive).joint_names)
     if constant:
         remedy = "give the channel that was measured (--columns 'torque=NAME{}'), or record it"
-        raise SourceError(source, sentence(constant[0]), field="torque", remedy=remedy)
+        problem = sentence(constant[0])
+        raise RefusedRecordingError(source, problem, field="torque", remedy=remedy)
 
 
 def _require_torque_of_arm(source: Path, found: TorqueDiagnosis) -> None:
-    """Raise SourceError if there is nothing of bodies in a torque, or it is the rate of one."""
+    """Raise RefusedRecordingError if a torque has nothing of bodies, or is the rate of one."""
     if found.rigid.is_nothing:
         raise _not_of_arm(source, without_bodies(found.rigid))
     if found.is_rate:
@@ -254,14 +259,14 @@ def _of_this_arm(
     """Return a recording, with a warning if the URDF may describe another arm.
 
     Raises:
-        SourceError: more than two independent findings contradict it.
+        RefusedRecordingError: more than two independent findings contradict it.
     """
     found = contradictions.found
     if not contradictions.is_doubtful:
         return imported
     if len(found) > _MAX_WARNED_CONTRADICTIONS:
         problem = f"is not of the arm of the URDF: {sentences(found)}"
-        raise SourceError(source, problem, field="--urdf", remedy=_REMEDY)
+        raise RefusedRecordingError(source, problem, field="--urdf", remedy=_REMEDY)
     return replace(imported, concluded=(*imported.concluded, DoubtfulArm(found)))
 
 
@@ -324,16 +329,16 @@ def undecided(
     return SourceError(source, problem, field=choices[0].aspect, remedy=remedy)
 
 
-def _not_of_arm(source: Path, found: Finding) -> SourceError:
+def _not_of_arm(source: Path, found: Finding) -> RefusedRecordingError:
     finding = worded(found, Naming())
     remedy = (
         f"{finding.next_step}; to identify anyway, give the column map (`hil look LOG"
         " --urdf ARM.urdf -o map.toml`, --map map.toml)"
     )
-    return SourceError(source, finding.words, field="torque", remedy=remedy)
+    return RefusedRecordingError(source, finding.words, field="torque", remedy=remedy)
 
 
-def _without_sign(source: Path, count: int) -> SourceError:
+def _without_sign(source: Path, count: int) -> RefusedRecordingError:
     problem = (
         f"no torque is ever negative, although {count} joints move there and back: its sign was"
         " not recorded"
@@ -343,13 +348,13 @@ def _without_sign(source: Path, count: int) -> SourceError:
         "with"
         " [torque] sign_bit = N (`hil look LOG --urdf ARM.urdf -o map.toml`, --map map.toml)"
     )
-    return SourceError(source, problem, field="torque", remedy=remedy)
+    return RefusedRecordingError(source, problem, field="torque", remedy=remedy)
 
 
-def _other_arm(source: Path, error: float) -> SourceError:
+def _other_arm(source: Path, error: float) -> RefusedRecordingError:
     problem = (
         "its torque does not follow the arm of the URDF: whatever the masses, "
         f"{percentage(error)} of it stays unexplained, and no other unit, sign or order of the "
         "joints helps: it is of another arm, or of another run than the positions"
     )
-    return SourceError(source, problem, field="--urdf", remedy=_REMEDY)
+    return RefusedRecordingError(source, problem, field="--urdf", remedy=_REMEDY)

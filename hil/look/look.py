@@ -48,6 +48,9 @@ from identification.signals.recording import Recording, RecordingError
 from identification.signals.samples import Samples, prepare
 
 _DELAY_SAMPLES: Final = 20_000
+_RANGE_NUMBER: Final = 100.0  # a servo's number at the ends of its range
+# error ratio to a free fit that angles with another scale for each joint have, and degrees have not
+_RANGE_ERROR_RATIO: Final = 1.1
 _COLUMNS: Final[tuple[tuple[str, Kind, str], ...]] = (
     ("position", "position", "rad"),
     ("torque", "torque", "N·m"),
@@ -122,6 +125,11 @@ def _look(source: Path, imported: ImportedRecording, *, described: bool) -> Look
     return replace(look, bag_text=None if imported.bag is None else imported.bag.text)
 
 
+def _may_be_of_ranges(recording: Recording) -> bool:
+    """Return whether angles in degrees may be numbers from -100 to 100 of each joint's range."""
+    return bool(np.degrees(np.abs(recording.position)).max(initial=0.0) <= _RANGE_NUMBER)
+
+
 def _no_longer_certain_unit(row: Row, error: float) -> Row:
     """Return a row whose unit the numbers alone say, of a torque that the arm does not explain.
 
@@ -169,8 +177,11 @@ def _with_torque(
         channel = [physics.by_estimated_times(row) for row in channel]
     groups = physics.determined(finding.readings)
     score = finding.readings.score
-    if score.overall > EXPLAINED_ERROR:
+    adequacy = finding.readings.adequacy
+    is_off = adequacy.ratio > _RANGE_ERROR_RATIO and _may_be_of_ranges(recording)
+    if score.overall > EXPLAINED_ERROR or finding.fits_badly or is_off:
         rows = [_no_longer_certain_unit(row, score.overall) for row in rows]
+    if score.overall > EXPLAINED_ERROR:
         channel = [physics.no_longer_certain(row, score.overall) for row in channel]
     rows = [*rows, *finding.rows(groups), *channel]
     contradictions = Contradictions.of(

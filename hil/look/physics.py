@@ -267,16 +267,20 @@ class TorqueFindings:
                 bodies, basis = self._no_bodies(), Basis.NO_BODIES
             rows = [bodies, *(_says_nothing(row, basis) for row in rest)]
         error = self.readings.score.overall
-        adequacy = self.readings.adequacy
-        doubted = any(not step.sure for step in self.readings.steps)
-        if doubted and not adequacy.is_enough:
-            beside = FreeFit(adequacy.ratio)
+        if self.fits_badly:
+            beside = FreeFit(self.readings.adequacy.ratio)
             rows.append(Row("explanation", Fact.NONE_FITS, Certainty.UNDETERMINED, (beside,)))
         if error > EXPLAINED_ERROR:
             rows = [no_longer_certain(row, error) for row in rows]
         as_read = ErrorAsRead(error)
         rows.append(Row("as read", as_read, Certainty.CERTAIN, (Basis.FREE_PARAMETERS,)))
         return rows
+
+    @property
+    def fits_badly(self) -> bool:
+        """Whether no tested change explains the torque as well as a free fit does."""
+        doubted = any(not step.sure for step in self.readings.steps)
+        return doubted and not self.readings.adequacy.is_enough
 
     def steps(self, *meanings: Meaning) -> list[Step]:
         """Return the changes of some meanings."""

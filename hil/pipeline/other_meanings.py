@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from pathlib import Path
 
-from hil.base.errors import InputError
+from hil.base.errors import RefusedRecordingError
 from hil.pipeline.recorded_rows import row_findings
 from hil.pipeline.sources import Source
 from identification.hypotheses.changes import Change
@@ -54,13 +54,13 @@ def require_weight(
         path: of the first of them.
 
     Raises:
-        InputError: gravity, or all of the bodies, was removed from the torque.
+        RefusedRecordingError: gravity, or all of the bodies, was removed from the torque.
     """
     found = diagnose(model, recordings)
     if found.rigid.is_nothing:
         finding = worded(without_bodies(found.rigid), Naming())
-        raise InputError(path, finding.words, field="torque", remedy=finding.next_step)
-    if found.is_weightless:
+        raise RefusedRecordingError(path, finding.words, field="torque", remedy=finding.next_step)
+    if found.is_weightless or found.is_partly_weightless:
         assert found.weightless is not None
         problem = (
             "gravity was removed from the torque: without it, the bare recordings are predicted"
@@ -68,5 +68,5 @@ def require_weight(
             " knows, the weight is missing as well"
         )
         remedy = "record the torque before gravity is removed from it"
-        raise InputError(path, problem, field="torque", remedy=remedy)
+        raise RefusedRecordingError(path, problem, field="torque", remedy=remedy)
     return other_meanings(model, found, sources)

@@ -24,6 +24,7 @@ from identification.hypotheses.column_search import (
     find_columns,
     find_columns_of_unseen,
 )
+from identification.hypotheses.gravity_share import has_part_of_gravity
 from identification.hypotheses.inertia_scale import InertiaScale, find_inertia_scale
 from identification.hypotheses.scores import (
     ROWS_PER_FACT,
@@ -102,6 +103,7 @@ class TorqueDiagnosis:
     Attributes:
         weightless: error of a torque without gravity, compared with one with it; None if the model
             has none.
+        keeps_gravity: whether a part of gravity is left in a torque that fits better without.
         rigid: how much of the torque is that of bodies, with gravity or without, as fits better.
         readings: signs, orders, zeros and scales other than stated; None where there is no gravity
             or no body in the torque.
@@ -127,6 +129,7 @@ class TorqueDiagnosis:
     is_rate: bool = False
     error: float = 0.0
     unseen_error: float | None = None
+    keeps_gravity: bool = False
 
     @property
     def time(self) -> float | None:
@@ -136,7 +139,8 @@ class TorqueDiagnosis:
     @property
     def is_otherwise(self) -> bool:
         """Whether the torque, or its times, are other than stated as a whole."""
-        return self.rigid.is_nothing or self.is_weightless or self.is_rate or self.time is not None
+        is_weightless = self.is_weightless or self.is_partly_weightless
+        return self.rigid.is_nothing or is_weightless or self.is_rate or self.time is not None
 
     @property
     def is_complete(self) -> bool:
@@ -155,7 +159,17 @@ class TorqueDiagnosis:
 
     @property
     def is_weightless(self) -> bool:
-        """Whether gravity was removed from the torque; other times may make it as little."""
+        """Whether gravity was removed from the torque."""
+        return self._has_little_weight and not self.keeps_gravity
+
+    @property
+    def is_partly_weightless(self) -> bool:
+        """Whether most of gravity was removed, by a model that does not fit the arm."""
+        return self._has_little_weight and self.keeps_gravity
+
+    @property
+    def _has_little_weight(self) -> bool:
+        """Whether the torque fits an arm without gravity; other times may make it as little."""
         if self.time is not None:
             return False
         found = self.weightless
@@ -234,14 +248,23 @@ def torque_of(
     """
     read = model
     weightless = None
+    keeps_gravity = False
     if np.any(model.gravity):
         without = model.under_gravity((0.0, 0.0, 0.0))
-        weightless = compare(score_of(without, rows), score, model)
+        score_without = score_of(without, rows)
+        weightless = compare(score_without, score, model)
         if weightless.ratio < 1.0:
             read = without
+            keeps_gravity = has_part_of_gravity(model, rows, score_without)
     backwards = is_backwards(model, rows, score)
     rigid = rigid_torque(read, rows)
-    found = TorqueDiagnosis(weightless, rigid, is_backwards=backwards, error=score.overall)
+    found = TorqueDiagnosis(
+        weightless,
+        rigid,
+        is_backwards=backwards,
+        error=score.overall,
+        keeps_gravity=keeps_gravity,
+    )
     if found.rigid.is_nothing:
         return found
     if is_rate(model, recordings[0], score, ROWS):

@@ -42,6 +42,7 @@ from identification.hypotheses.changes import (
     order_change,
     whole_order,
 )
+from identification.hypotheses.gravity_share import has_part_of_gravity
 from identification.hypotheses.joint_fit import (
     JointFit,
     candidates,
@@ -244,6 +245,7 @@ def find_readings(
         adequacy = search.adequacy()
     nearest = search.nearest()
     score = score_of(search.model, search.samples, search.score.columns)
+    steps = _without_adopted(steps)
     # What a change explains shows only together with the others.
     steps = [step if step.alike else replace(step, error=search.score.overall) for step in steps]
     if not adequacy.is_enough:
@@ -252,6 +254,10 @@ def find_readings(
     steps = [  # each was chosen together with the others
         step if doubted in ([], [step]) else replace(step, is_adequate=False) for step in steps
     ]
+    if any(step.change.meaning == "no gravity" for step in steps) and has_part_of_gravity(
+        model, search.samples, score
+    ):
+        steps = [replace(step, is_adequate=False) for step in steps]
     return Readings(
         tuple(steps),
         search.model,
@@ -261,6 +267,15 @@ def find_readings(
         search.unseen_zeros(),
         adequacy,
     )
+
+
+def _without_adopted(steps: Sequence[Step]) -> list[Step]:
+    """Return steps without alternatives that another step adopted in addition."""
+    adopted = [step.change for step in steps]
+    return [
+        replace(step, alike=tuple(each for each in step.alike if each[0] not in adopted))
+        for step in steps
+    ]
 
 
 def _one_by_one(started: Callable[..., _Search]) -> tuple[_Search, list[Step]]:

@@ -94,7 +94,12 @@ def feed_forward(evidence: Evidence, limits: PurposeLimits) -> Purpose:
 
 
 def gravity_compensation(model: RobotModel, estimate: Estimate, postures: Array) -> Purpose:
-    """Return the error of the gravity torque over dry friction: below one the arm stays."""
+    """Return the error of the gravity torque over dry friction: below one the arm stays.
+
+    Torques from which gravity was removed do not say how large it is.
+    """
+    if not np.any(model.gravity):
+        return Purpose.unknown("gravity", "no gravity")
     error, friction = gravity_error(model, estimate, postures)
     known = friction > 0.0
     ratio = error / np.where(known, friction, 1.0)

@@ -66,6 +66,7 @@ FindingKey = Literal[
     # what the recordings are
     "no bodies",
     "no gravity",
+    "part of gravity",
     "rate of a torque",
     "other times",
     "torque of another run",
@@ -189,6 +190,8 @@ RemedyKey = Literal[
     "negate all torques",
     "check the sign of the torque",
     "check the torque for spikes",
+    "check the positions for steps",
+    "record torque with gravity",
     "use the delay found",
     "check the constant",
     "fit load friction",

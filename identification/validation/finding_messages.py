@@ -382,6 +382,12 @@ SENTENCES: Final[Mapping[FindingKey, Sentence]] = {
         "gravity was removed from the torque: without it, the fitted motion is predicted with"
         " {ratio:.2f} times the error",
     ),
+    "part of gravity": Sentence(
+        "gravity",
+        "most of gravity was removed from the torque, by a model that does not fit this arm:"
+        " without gravity, the fitted motion is predicted with {ratio:.2f} times the error, and a"
+        " part of it is left",
+    ),
     "rate of a torque": Sentence(
         RATE_OF_TORQUE,
         "the recorded torque is the rate of a torque (N·m/s): its integral over time follows the"
@@ -814,6 +820,7 @@ REMEDIES: Final[Mapping[RemedyKey, str]] = {
         "state it: `--gravity 0 0 0` where a log is read with its URDF, or gravity of [robot] in"
         " the cell file"
     ),
+    "record torque with gravity": "record the torque before gravity is subtracted from it",
     "record the torque itself": "record the torque itself, or integrate it over time",
     "record both in one run": (
         "record torques and positions in one run, and compare the columns of both recordings"
@@ -852,6 +859,10 @@ REMEDIES: Final[Mapping[RemedyKey, str]] = {
     "check the torque for spikes": (
         "check the recorded torques for spikes, damaged packets and collisions; remove them, or use"
         " a robust estimator (`hil identify --estimator tukey` or huber)"
+    ),
+    "check the positions for steps": (
+        "check the positions for steps: the predicted torque jumps there and the measured one does"
+        " not, as of play in gear or coupling, a slipping encoder or rounded positions"
     ),
     "use the delay found": ("run `hil identify --delay auto`, or correct the delay at its source"),
     "check the constant": (

@@ -14,6 +14,7 @@ NoFigure = Literal[
     "nothing held out",
     "too short",
     "undetermined",
+    "no gravity",
     "no dry friction",
     "not possible",
 ]

@@ -22,6 +22,7 @@ MISSING: Final[dict[NoFigure, str]] = {
     "nothing held out": "no motion was held out",
     "too short": "the unseen motion is too short",
     "undetermined": "not determined",
+    "no gravity": "the torque does not contain gravity",
     "no dry friction": "no dry friction to hold the arm was identified",
     "not possible": "no physically consistent parameters",
 }

@@ -32,6 +32,8 @@ HARMONICS: Final = (1, 2, 3, 4, 6)
 _HARMONIC_SIGMAS: Final = 4.1  # largest of five harmonics: probability of about 0.001
 # robust standard deviations; one normal sample in 500 million is beyond six
 _OUTLIER_SIGMAS: Final = 6.0
+_MOST_JUMPS: Final = 1000  # outliers that are looked at
+_MEDIAN_ROWS: Final = 51  # of the running median that spikes and short steps do not move
 # Longer than the settling of a move.
 MAX_CORRELATION_LAG: Final = 0.5  # s
 _MAX_LAGS: Final = 1000
@@ -173,6 +175,7 @@ class Outliers(NamedTuple):
     share: Array  # share of usable samples (n,)
     power: Array  # their share of the squared residual (n,)
     without: PredictionError  # prediction error without outliers
+    of_positions: Rows  # whether the predicted torque jumps there, not the measured one (n,)
 
 
 def find_outliers(torque: Array, residual: Array, usable: Rows) -> Outliers:
@@ -180,6 +183,7 @@ def find_outliers(torque: Array, residual: Array, usable: Rows) -> Outliers:
     far = np.zeros_like(usable)
     total = np.zeros(residual.shape[1])
     outlying = np.zeros_like(total)
+    of_positions = np.zeros(len(total), dtype=np.bool_)
     for joint, rows in enumerate(usable.T):
         if rows.any():
             error = residual[:, joint]
@@ -188,11 +192,24 @@ def find_outliers(torque: Array, residual: Array, usable: Rows) -> Outliers:
             far[:, joint] = rows & (distance > max(limit, np.finfo(np.float64).tiny))
             total[joint] = (error[rows] ** 2).sum()
             outlying[joint] = (error[far[:, joint]] ** 2).sum()
+            measured = torque[:, joint]
+            jumps = [_jumps(each, far[:, joint]) for each in (measured, measured - error)]
+            of_positions[joint] = jumps[1] > jumps[0]
     return Outliers(
         share=np.count_nonzero(far, axis=0) / np.maximum(np.count_nonzero(usable, axis=0), 1),
         power=outlying / np.where(total > 0.0, total, 1.0),
         without=PredictionError.between(torque, torque - residual, usable & ~far),
+        of_positions=of_positions,
     )
+
+
+def _jumps(torque: Array, rows: NDArray[np.bool_]) -> float:
+    """Return how far a torque (m,) is from its running median in some rows, squared and summed."""
+    some = np.flatnonzero(rows)
+    some = some[:: max(1, len(some) // _MOST_JUMPS)]
+    half = _MEDIAN_ROWS // 2
+    window = np.clip(some[:, None] + np.arange(-half, half + 1), 0, len(torque) - 1)
+    return float(((torque[some] - np.median(torque[window], axis=1)) ** 2).sum())
 
 
 class Autocorrelation(NamedTuple):

@@ -15,6 +15,7 @@ from identification.hypotheses.diagnosis import TorqueDiagnosis, diagnose
 from identification.hypotheses.scores import ROWS_PER_FACT
 from identification.hypotheses.search import Adequacy
 from identification.signals.samples import Preprocessing, prepare
+from identification.validation.findings.diagnosis import of_diagnosis
 from tests.identification.three_axes import HIP, KNEE, NAMES, TIME, model, motion
 
 Floats = NDArray[np.float64]
@@ -69,6 +70,15 @@ def test_removed_gravity_is_seen() -> None:
     found = diagnosed(q, torque - weight)
     assert found.is_weightless
     assert not found.rigid.is_nothing
+
+
+@pytest.mark.parametrize("left", [0.1, -0.1])
+def test_gravity_removed_by_another_model_is_not_all_removed(left: float) -> None:
+    q, torque, weight = motion()
+    found = diagnosed(q, torque - (1.0 - left) * weight)
+    assert found.is_partly_weightless
+    assert not found.is_weightless
+    assert [each.key for each in of_diagnosis(found)] == ["part of gravity"]
 
 
 def test_zeros_of_several_joints_are_seen_at_once() -> None:

@@ -143,6 +143,12 @@ def test_without_dry_friction_gravity_is_reported_and_not_judged() -> None:
     assert purpose.missing == "no dry friction"
 
 
+def test_torques_without_gravity_say_nothing_of_its_compensation() -> None:
+    weightless = MODEL.under_gravity((0.0, 0.0, 0.0))
+    purpose = gravity_compensation(weightless, an_estimate(), POSTURES)
+    assert (purpose.good, purpose.figure, purpose.missing) == (None, None, "no gravity")
+
+
 def test_what_the_motion_does_not_determine_is_an_infinite_error() -> None:
     covariance = np.diag(
         np.where([name.startswith("mc") for name in MODEL.parameter_names], np.inf, 1.0)

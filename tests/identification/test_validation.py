@@ -452,6 +452,19 @@ class TestResidualChecks:
         assert checks.drift is not None and len(checks.drift.share) >= 4
         assert checks.ripple is None  # without gear ratios
 
+    @pytest.mark.parametrize("of_positions", [False, True])
+    def test_a_jump_is_of_the_torque_or_of_the_positions(self, of_positions):
+        """The measured torque jumps, or the one that was predicted by the positions."""
+        time = np.linspace(0.0, 20.0, 2000)
+        predicted, jumps = 10.0 * np.sin(time)[:, None], np.zeros((2000, 1))
+        jumps[100::400] = 5.0
+        noise = 0.1 * np.random.default_rng(7).standard_normal(jumps.shape)
+        measured = predicted + noise + (0.0 if of_positions else jumps)
+        residual = measured - predicted - (jumps if of_positions else 0.0)
+        outliers = find_outliers(measured, residual, np.ones(jumps.shape, dtype=np.bool_))
+        assert outliers.share == pytest.approx(5 / 2000)
+        assert outliers.of_positions.tolist() == [of_positions]
+
     def test_outliers_are_found_and_removed(self):
         random = np.random.default_rng(5)
         torque, residual = 10.0 * random.standard_normal((2, 5000, 2))

@@ -736,6 +736,11 @@ def clean():
     return replace(checks, ripple=None, drift=None, rms=np.full(2, 0.01))
 
 
+def few_outliers(error, of_positions=(False, False)):
+    where = np.array(of_positions)
+    return Outliers(np.full(2, 0.001), np.full(2, 0.95), an_error(error), where)
+
+
 class TestPatternsOfTheResidual:
     """Those that were found by chance alone are no finding, small ones no doubt."""
 
@@ -746,9 +751,22 @@ class TestPatternsOfTheResidual:
 
     @pytest.mark.parametrize(("error", "named"), [(0.0004, False), (0.05, True)])
     def test_an_error_of_zero_has_no_outliers(self, clean, error, named):
-        few = Outliers(np.full(2, 0.001), np.full(2, 0.95), an_error(0.2 * error))
+        few = few_outliers(0.2 * error)
         findings = found(held_out=an_error(error), residuals=replace(clean, outliers=few))
         assert ("outliers" in findings) == named
+
+    @pytest.mark.parametrize(
+        ("of_positions", "remedy"),
+        [
+            ([False, False], "check the torque for spikes"),
+            ([True, False], "check the torque for spikes"),
+            ([True, True], "check the positions for steps"),
+        ],
+    )
+    def test_outliers_are_looked_for_where_they_are(self, clean, of_positions, remedy):
+        few = few_outliers(0.01, of_positions)
+        findings = found(held_out=an_error(0.05), residuals=replace(clean, outliers=few))
+        assert findings["outliers"].remedy == remedy
 
     @pytest.mark.parametrize(
         ("share", "key", "level"),

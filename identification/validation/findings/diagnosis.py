@@ -34,7 +34,7 @@ def of_diagnosis(found: TorqueDiagnosis) -> tuple[Finding, ...]:
     findings = [_zeros(found), *(_open(step) for step in found.discrete if not step.sure)]
     if found.rigid.is_nothing:
         findings.insert(0, without_bodies(found.rigid))
-    elif found.is_weightless:
+    elif found.is_weightless or found.is_partly_weightless:
         findings.insert(0, _without_gravity(found))
     elif found.is_rate:
         findings.insert(0, rate_of_torque())
@@ -74,6 +74,8 @@ def another_run(evidence: Evidence, _: Thresholds) -> Finding | None:
 def _without_gravity(found: TorqueDiagnosis) -> Finding:
     assert found.weightless is not None
     ratio = {"ratio": found.weightless.ratio}
+    if found.is_partly_weightless:
+        return Finding("part of gravity", "wrong", "record torque with gravity", "cause", ratio)
     return Finding("no gravity", "wrong", "state that gravity was removed", "cause", ratio)
 
 

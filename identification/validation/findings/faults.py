@@ -74,10 +74,11 @@ def outliers(evidence: Evidence, limits: Thresholds) -> Finding | None:
         return None
     found = evidence.residuals.outliers
     without = found.without.overall
+    is_of_positions = bool(found.of_positions[few].all())
     return Finding(
         "outliers",
         "wrong" if _outliers_decide(evidence, limits) else "doubtful",
-        "check the torque for spikes",
+        "check the positions for steps" if is_of_positions else "check the torque for spikes",
         "cause",
         {"without": without},
         explains=1.0 - (without / max(evidence.held_out.overall, 1e-12)) ** 2,

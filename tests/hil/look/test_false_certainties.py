@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
 from typing import Any
 
@@ -12,6 +13,7 @@ from hil.base.errors import SourceError
 from hil.identified.identified_arm import arm_from
 from hil.importers.conclusions import Certainty
 from hil.importers.imported_robot import Robot
+from hil.importers.plausibility import are_degrees
 from hil.importers.recording_import import ImportOptions
 from hil.importers.stamps import concluded_unit
 from hil.look import look_at
@@ -59,6 +61,34 @@ def test_no_row_is_displaced_by_late_stamps_alone(tmp_path: Path) -> None:
     assert rows.times is not None
     assert rows.times.even
     assert rows.faults == ()
+
+
+@pytest.mark.long
+def test_shares_of_a_range_are_no_certain_degrees(tmp_path: Path, simulated: Simulated) -> None:
+    """Each joint has its own range in them, as a servo normalises it: no unit explains them."""
+    low, high = simulated.position.min(axis=0) - 0.05, simulated.position.max(axis=0) + 0.07
+    position = (simulated.position - low) / (high - low) * 200.0 - 100.0
+    log = write_log(
+        tmp_path / "log.csv", ["t", "q{}", "tau{}"], simulated.time, position, simulated.torque
+    )
+    (row,) = [row for row in look(log).rows if row.aspect == "position"]
+    assert row.certainty is not Certainty.CERTAIN
+
+
+def test_angles_of_0_to_a_turn_are_radians(tmp_path: Path, simulated: Simulated) -> None:
+    """They leave the limits of the URDF, but for a turn."""
+    position = simulated.position % (2.0 * np.pi)
+    limits = np.deg2rad(180.0) * np.array([-1.0, 1.0])
+    urdf = tmp_path / "limited.urdf"
+    narrow = re.sub(
+        r'lower="[^"]*" upper="[^"]*"', 'lower="{:.4f}" upper="{:.4f}"'.format(*limits),
+        URDF.read_text(),
+    )  # fmt: skip
+    urdf.write_text(narrow)
+    names = Robot.from_urdf(urdf).joint_names
+    converted = np.radians(position)
+    assert not are_degrees(position, converted, names, urdf.read_text())
+    assert are_degrees(np.degrees(position), position, names, urdf.read_text())
 
 
 class TestTorqueOfZeros:
