@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 from dataclasses import dataclass, replace
 from typing import Final, Self
 
@@ -18,11 +17,12 @@ from identification.excitation import (
     MissingMeshError,
     Violation,
     check_motion,
+    messages,
 )
+from identification.excitation.violation import CloseBodies, JointQuantity, LoadedDrive
 from planner import FourierSeries, JointLimits, NotSmooth, PiecewiseCubic
 from planner.piecewise_cubic import check_rest, check_smooth
 
-_JOINT_LIMIT: Final = re.compile(r"(position|velocity|acceleration|jerk) of joint (\d+)(.*)")
 _UNITS: Final = {
     "position": " deg",
     "velocity": " deg/s",
@@ -36,34 +36,33 @@ _MIN_DISTANCE_CHANGE: Final = 0.01
 def violation_text(violation: Violation, frame: AngleFrame) -> str:
     """Return a violation in degrees, in the frame of the cell's limits."""
     joints = frame.text_of_angles(violation.posture) if violation.posture else ""
-    limit = _JOINT_LIMIT.fullmatch(violation.subject) if violation.kind == "joint limit" else None
-    if limit is None:
-        return violation.sentence(joints)
-    quantity = limit[1]
-    joint = int(limit[2])
-    where = limit[3]
+    subject = violation.subject
+    if not isinstance(subject, JointQuantity):
+        return messages.violation_text(violation, joints)
+    joint = subject.joint
     # The magnitude of a rate is the same in any frame.
-    sign, zero = (frame.sign[joint], frame.offset[joint]) if quantity == "position" else (1.0, 0.0)
+    is_position = subject.quantity == "position"
+    sign, zero = (frame.sign[joint], frame.offset[joint]) if is_position else (1.0, 0.0)
     value, bound = (
         float(np.degrees(sign * number + zero)) for number in (violation.value, violation.bound)
     )
-    shown = replace(
-        violation, subject=f"{quantity} of J{joint + 1}{where}", value=value, bound=bound
-    )
-    return shown.sentence(joints, _UNITS[quantity])
+    shown = replace(violation, value=value, bound=bound)
+    where = f" at the {subject.end}" if subject.end else ""
+    name = f"{subject.quantity} of J{joint + 1}{where}"
+    return messages.violation_text(shown, joints, _UNITS[subject.quantity], name)
 
 
 def always_so(violation: Violation, checker: CollisionChecker) -> str | None:
     """Return the remedy for a pair that is too close in any posture; None for other violations."""
-    if violation.kind != "collision":
+    pair = violation.subject
+    if not isinstance(pair, CloseBodies) or (pair.first, pair.second) not in checker.pairs:
         return None
-    pairs = [pair for pair in checker.pairs if " and ".join(pair) == violation.subject]
-    if not pairs:
-        return None
-    nearest, farthest = checker.spread(*pairs[0])
+    nearest, farthest = checker.spread(pair.first, pair.second)
     if farthest - nearest > _MIN_DISTANCE_CHANGE:
         return None
-    message = f"{violation.subject} are {nearest:.3f} to {farthest:.3f} m apart in any posture"
+    message = (
+        f"{pair.first} and {pair.second} are {nearest:.3f} to {farthest:.3f} m apart in any posture"
+    )
     if nearest >= violation.bound:
         return f"{message}, too close to contact to be resolved; narrow [workspace] margin"
     if nearest > 0.0:
@@ -145,13 +144,12 @@ class MotionChecks:
     def _sentence(self, violation: Violation) -> str:
         text = violation_text(violation, self.frame)
         remedy = always_so(violation, self.checker)
-        if violation.kind == "current":
-            text += self._whose_limit(violation.subject)
+        if isinstance(violation.subject, LoadedDrive) and violation.subject.is_motor:
+            text += self._whose_limit(violation.subject.joint)
         return text if remedy is None else f"{text}; {remedy}"
 
-    def _whose_limit(self, motor: str) -> str:
-        """Return the remedy for a motor ("motor of elbow") whose limit is the controller's."""
-        joint = [f"motor of {name}" for name in self.currents.model.joint_names].index(motor)
+    def _whose_limit(self, joint: int) -> str:
+        """Return the remedy for the motor of a joint if its limit is the controller's."""
         if self.cell_limit is None:
             return ""
         ours = self.cell_limit[joint]

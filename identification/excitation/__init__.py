@@ -32,6 +32,7 @@ from identification.excitation.errors import (
     DesignError,
     JournalError,
     MissingMeshError,
+    NoFeasibleMotionError,
 )
 from identification.excitation.excitation import Excitation, ViaPointMotion
 from identification.excitation.genomes import Genome, SineGenome, ViaPointGenome
@@ -53,7 +54,7 @@ from identification.excitation.searches.search import (
     search,
 )
 from identification.excitation.validation_motions import random_validation_motions
-from identification.excitation.violation import KINDS, NoFeasibleMotionError, Violation
+from identification.excitation.violation import KINDS, Violation
 from identification.model.workspace import Box, Workspace
 
 __all__ = [

@@ -4,13 +4,19 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
-from typing import Final
+from typing import Final, Literal
 
 import numpy as np
 
 from identification.arrays import Array
 from identification.excitation.collision import CollisionChecker, Proximity
-from identification.excitation.violation import Kind, Violation
+from identification.excitation.violation import (
+    CloseBodies,
+    JointQuantity,
+    LoadedDrive,
+    Violation,
+    WholeMotion,
+)
 from identification.model.motion import Motion
 from identification.model.robot import RobotModel
 from identification.text import percentage
@@ -65,12 +71,12 @@ def rest_violations(
     try:
         check_rest(trajectory, limits)
     except NotSmooth as jump:
-        end = "end" if jump.time > 0.0 else "start"
+        end: Literal["start", "end"] = "end" if jump.time > 0.0 else "start"
         bare = isinstance(trajectory, FourierSeries) and trajectory.ramp == 0.0
         return [
             Violation(
                 "joint limit",
-                f"{jump.quantity} of joint {jump.joint} at the {end}",
+                JointQuantity(jump.quantity, jump.joint, end),
                 jump.jump,
                 0.0,
                 jump.time,
@@ -106,7 +112,7 @@ def _beyond_limits(extrema: Extrema, limits: JointLimits, motion: Motion) -> lis
             violations.append(
                 Violation(
                     "joint limit",
-                    f"{quantity} of joint {joint}",
+                    JointQuantity(quantity, joint),
                     float(value[joint]),
                     float(bound[joint]),
                     float(motion.time[k]),
@@ -161,9 +167,8 @@ class CurrentModel:
         """Return the largest violation of each joint and motor in the samples."""
         torque = self.torque(motion)
         joints = self.model.joint_names
-        motors = tuple(f"motor of {name}" for name in joints)
         usable = self.usable * self.current_limit
-        violations = _beyond("current", motors, self.current(torque), usable, motion)
+        violations = _beyond("current", joints, self.current(torque), usable, motion)
         if self.usable < 1.0:
             remedy = f"a motion may use {percentage(self.usable)} of the motor's limit"
             violations = [replace(violation, remedy=remedy) for violation in violations]
@@ -173,7 +178,11 @@ class CurrentModel:
 
 
 def _beyond(
-    kind: Kind, subjects: tuple[str, ...], values: Array, bounds: Array, motion: Motion
+    kind: Literal["current", "torque"],
+    joints: tuple[str, ...],
+    values: Array,
+    bounds: Array,
+    motion: Motion,
 ) -> list[Violation]:
     violations = []
     magnitude = np.abs(values)
@@ -182,7 +191,8 @@ def _beyond(
             posture = tuple(motion.position[k].tolist())
             time = float(motion.time[k])
             most = float(magnitude[k, j]), float(bounds[j])
-            violations.append(Violation(kind, subjects[j], *most, time, posture))
+            drive = LoadedDrive(j, joints[j], is_motor=kind == "current")
+            violations.append(Violation(kind, drive, *most, time, posture))
     return violations
 
 
@@ -215,7 +225,7 @@ class Constraints:
         duration = trajectory.duration
         bound = min(max(duration, self.min_duration), self.max_duration)
         if bound != duration:
-            violations.append(Violation("duration", "the motion", duration, bound, None))
+            violations.append(Violation("duration", WholeMotion(), duration, bound, None))
         if beyond and not motion.finite:
             return tuple(violations)
         if self.checker is not None:
@@ -259,7 +269,7 @@ def clearance(checker: CollisionChecker, q: Array) -> Violation | None:
 def _collision(checker: CollisionChecker, contact: Proximity) -> Violation:
     return Violation(
         "collision",
-        f"{contact.first} and {contact.second}",
+        CloseBodies(contact.first, contact.second),
         contact.distance,
         contact.required,
         contact.time,

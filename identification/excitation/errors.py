@@ -2,7 +2,11 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Mapping
+
 from identification.errors import IdentificationError
+from identification.excitation.messages import violation_text
+from identification.excitation.violation import Violation
 
 
 class CollisionModelError(IdentificationError):
@@ -37,3 +41,43 @@ class DesignError(IdentificationError, ValueError):
 
 class JournalError(IdentificationError, ValueError):
     """A file that is not the journal of this search with these program versions."""
+
+
+class NoFeasibleMotionError(IdentificationError):
+    """None of `tried` motions satisfies all constraints and excites all parameters.
+
+    `rejected` has their number and `nearest` the smallest violation by kind of constraint;
+    `unexciting` motions satisfy all constraints; `stopped`: the search was stopped before its end.
+    """
+
+    def __init__(
+        self,
+        rejected: Mapping[str, int],
+        nearest: Mapping[str, Violation],
+        *,
+        tried: int | None = None,
+        unexciting: int = 0,
+        stopped: bool = False,
+    ) -> None:
+        self.rejected = dict(rejected)
+        self.nearest = dict(nearest)
+        self.tried = sum(self.rejected.values()) if tried is None else tried
+        self.unexciting = unexciting
+        self.stopped = stopped
+        super().__init__(self.sentence())
+
+    def sentence(self, text_of: Callable[[Violation], str] = violation_text) -> str:
+        """Return a message; `text_of` formats a violation."""
+        reasons = [
+            f"{kind} excludes {count}, smallest violation: {text_of(self.nearest[kind])}"
+            for kind, count in sorted(self.rejected.items(), key=lambda item: -item[1])
+        ]
+        if self.unexciting:
+            reasons.append(
+                f"{self.unexciting} satisfy all constraints but leave a parameter without "
+                "excitation"
+            )
+        if self.stopped:
+            reasons.append("the search was stopped before its end")
+        which = f"none of {self.tried} motions is feasible" if self.tried else "no motion was tried"
+        return f"{which}: {'; '.join(reasons)}"

@@ -12,9 +12,10 @@ import numpy as np
 from identification.arrays import Array
 from identification.excitation.collision import CollisionChecker
 from identification.excitation.constraints import CurrentModel, check_motion, clearance
+from identification.excitation.errors import NoFeasibleMotionError
 from identification.excitation.excitation import ViaPointMotion
 from identification.excitation.genomes import straight_path
-from identification.excitation.violation import NoFeasibleMotionError, Violation
+from identification.excitation.violation import CloseBodies, Violation, WholeMotion
 from planner import (
     JointLimits,
     PlannerCrashed,
@@ -64,8 +65,8 @@ def random_validation_motions(
     """
     attempts = _Attempts(limits, home, n_via, fly, range_share, checker, currents)
     contact = None if checker is None else clearance(checker, home[None])
-    if contact is not None:
-        attempts.reject([replace(contact, subject=f"{contact.subject} at home")])
+    if contact is not None and isinstance(pair := contact.subject, CloseBodies):
+        attempts.reject([replace(contact, subject=replace(pair, at_home=True))])
         raise NoFeasibleMotionError(attempts.rejected, attempts.nearest)
     motions = []
     for k in range(count):
@@ -132,9 +133,9 @@ class _Attempts:
             # in a child, because the solver can crash its process
             trajectory = plan_in_child(via_points, self._limits, speed=speed, fly=self._fly)
         except (PlannerCrashed, PlanningError, PlanningTimedOut) as error:
-            return [Violation("planning", f"the motion ({error})", 1.0, 0.0, None)]
+            return [Violation("planning", WholeMotion(str(error)), 1.0, 0.0, None)]
         if trajectory.duration > _MAX_DURATION:
-            return [Violation("duration", "the motion", trajectory.duration, _MAX_DURATION, None)]
+            return [Violation("duration", WholeMotion(), trajectory.duration, _MAX_DURATION, None)]
         violations = check_motion(
             trajectory, self._limits, checker=self._checker, currents=self._currents
         )

@@ -33,12 +33,19 @@ from identification.excitation.criteria import (
     fitness_eq7,
     log10_det,
 )
-from identification.excitation.errors import DesignError
+from identification.excitation.errors import DesignError, NoFeasibleMotionError
 from identification.excitation.excitation import Excitation
 from identification.excitation.genomes import SineGenome, ViaPointGenome
+from identification.excitation.messages import subject_text, violation_text
 from identification.excitation.searches.population import Front, Scores
 from identification.excitation.validation_motions import random_validation_motions
-from identification.excitation.violation import KINDS, NoFeasibleMotionError, excess_by_kind
+from identification.excitation.violation import (
+    KINDS,
+    CloseBodies,
+    JointQuantity,
+    LoadedDrive,
+    excess_by_kind,
+)
 from identification.model.friction import FrictionLaw
 from identification.model.robot import RobotModel
 from identification.model.workspace import Workspace
@@ -313,14 +320,17 @@ class TestCurrents:
         for share, remedy in ((1.0, ""), (0.8, "a motion may use 80 % of the motor's limit")):
             tight = make_currents([100.0, 0.9 / share * current.max()], usable=share)
             (violation,) = check_motion(swing, ROD_LIMITS, currents=tight)
-            assert (violation.kind, violation.subject) == ("current", "motor of elbow")
+            assert (violation.kind, subject_text(violation.subject)) == (
+                "current",
+                "motor of elbow",
+            )
             assert violation.value == pytest.approx(current.max())
             assert violation.bound == pytest.approx(0.9 * current.max())
             assert violation.excess == pytest.approx(1 / 0.9 - 1)
             assert violation.time == motion.time[current.argmax()]
             assert violation.remedy == remedy
             for word in ("current", "motor of elbow", "A", f"{violation.time:.3f} s", remedy):
-                assert word in str(violation)
+                assert word in violation_text(violation)
 
     def test_a_prediction_that_is_not_finite_violates_every_limit(self, swing):
         broken = make_currents([1e9, 1e9], ROD_VALUES * np.nan)
@@ -342,7 +352,7 @@ def series(seed, *, ramp, scale=1.0):
 class TestJointLimits:
     def test_every_joint_and_quantity_beyond_is_named(self, swing):
         slow = JointLimits([-3.0, -0.5], [1.0, 3.0], [1.0, 3.0], [10.0, 4.0], [100.0, 30.0])
-        violations = {v.subject: v for v in check_motion(swing, slow)}
+        violations = {subject_text(v.subject): v for v in check_motion(swing, slow)}
         assert set(violations) == {
             "position of joint 0",
             "position of joint 1",
@@ -352,7 +362,7 @@ class TestJointLimits:
         }
         lowest = violations["position of joint 1"]
         assert (lowest.value, lowest.bound) == (pytest.approx(-1.0), -0.5)
-        assert "at least -0.5" in str(lowest)
+        assert "at least -0.5" in violation_text(lowest)
         assert lowest.excess == pytest.approx(0.5 / 3.5)  # of the range
         assert lowest.posture == pytest.approx([1.5, -1.0], abs=1e-3)
         fastest = violations["velocity of joint 0"]
@@ -384,17 +394,17 @@ class TestJointLimits:
             assert violations == []
         else:
             (violation,) = violations
-            assert violation.subject == f"{quantity} of joint {joint}"
+            assert violation.subject == JointQuantity(quantity, joint)
             assert violation.bound < violation.value == getattr(reached, name)[joint]
 
     def test_sines_without_a_ramp_are_refused_with_a_remedy(self):
         bare, gentle = (series(3, ramp=ramp, scale=0.1) for ramp in (0.0, 2.0))
         (violation,) = check_motion(bare, ROD_LIMITS)
         assert violation.kind == "joint limit"
-        assert "velocity of joint" in violation.subject
-        assert "start" in violation.subject or "end" in violation.subject
+        assert isinstance(violation.subject, JointQuantity)
+        assert violation.subject.quantity == "velocity" and violation.subject.end is not None
         assert violation.excess > 0.0
-        assert "ramp" in str(violation)
+        assert "ramp" in violation_text(violation)
         assert not check_motion(gentle, ROD_LIMITS)
         # A design may look at one all the same.
         lenient = Constraints(ROD_LIMITS, at_rest=False)
@@ -412,7 +422,7 @@ class TestViolations:
         named = (violation.kind, violation.value, violation.bound)
         assert named == ("duration", swing.duration, bound)
         assert violation.excess == pytest.approx(abs(swing.duration / bound - 1.0))
-        assert f"at {side} {bound:g} s" in str(violation)
+        assert f"at {side} {bound:g} s" in violation_text(violation)
 
     def test_excess_by_kind_is_the_largest(self, swing):
         constraints = Constraints(
@@ -434,7 +444,7 @@ class TestViolations:
         checker = CollisionChecker(ROD_URDF, Workspace(floor=-0.5, margin=0.1))
         down = plan([[0.0, 0.0], [-0.6, 0.0], [0.3, 0.0]], ROD_LIMITS, fly=0.0)
         (violation,) = check_motion(down, ROD_LIMITS, checker=checker)
-        assert (violation.kind, violation.subject) == ("collision", "lower and floor")
+        assert (violation.kind, violation.subject) == ("collision", CloseBodies("lower", "floor"))
         assert violation.bound == 0.1
         q = down.sample_one(violation.time)[0]
         np.testing.assert_allclose(q, [-0.6, 0.0], atol=2e-3)
@@ -444,7 +454,7 @@ class TestViolations:
         np.testing.assert_allclose(violation.posture, q, atol=1e-9)
         # 1 m from shoulder to elbow: that much too close would be an excess of 1
         assert violation.excess == pytest.approx(0.1 - violation.value)
-        text = str(violation)
+        text = violation_text(violation)
         assert text.startswith(
             f"collision of lower and floor: {violation.value:.4g} m, must be at least 0.1 m"
         )
@@ -735,7 +745,7 @@ class TestRefusal:
         error = self.refusal(seed=3, currents=currents(0.01))
         assert error.rejected == {"current": 100}
         mildest = error.nearest["current"]
-        assert mildest.subject.startswith("motor of joint_")
+        assert isinstance(mildest.subject, LoadedDrive) and mildest.subject.is_motor
         assert mildest.value > mildest.bound
         assert str(mildest) in str(error)
         monkeypatch.setattr(validation_motions, "_MAX_DURATION", 2.0)

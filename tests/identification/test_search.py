@@ -13,8 +13,9 @@ import pytest
 from identification.excitation import KINDS
 from identification.excitation.constraints import CurrentModel, check_motion, midpoints
 from identification.excitation.criteria import columns, coupling_index_max
-from identification.excitation.errors import JournalError
+from identification.excitation.errors import JournalError, NoFeasibleMotionError
 from identification.excitation.genomes import SineGenome
+from identification.excitation.messages import violation_text
 from identification.excitation.searches import journal
 from identification.excitation.searches.journal import Journal
 from identification.excitation.searches.methods import METHODS, SearchMethod
@@ -27,7 +28,7 @@ from identification.excitation.searches.population import (
     unplanned,
 )
 from identification.excitation.searches.search import search
-from identification.excitation.violation import NoFeasibleMotionError, excess_by_kind
+from identification.excitation.violation import excess_by_kind
 from planner import FourierSeries, JointLimits, check_limits
 from planner.errors import LimitExceeded
 from tests.identification.searching import LIMITS, bits, faulty, problem
@@ -270,10 +271,10 @@ class TestScores:
         np.testing.assert_array_equal(scores.feasible, [True, False, True])
         np.testing.assert_array_equal(scores.rows[1], unplanned())
         np.testing.assert_array_equal(unplanned()[:4], [-np.inf, np.inf, np.inf, np.nan])
-        assert violation.kind == "planning" and "planning failed" in str(violation)
+        assert violation.kind == "planning" and "planning failed" in violation_text(violation)
         with Population(problem(faulty(crash=(0.0, 1.0)))) as crashing:
             (violation,) = crashing.violations(rows[0])
-        assert violation.kind == "planning" and "signal 6" in str(violation)
+        assert violation.kind == "planning" and "signal 6" in violation_text(violation)
 
     def test_a_killed_process_changes_nothing(self, scorers):
         rows = genes(2)

@@ -28,7 +28,7 @@ from identification.excitation.searches.sensitivity import (
     gene_slopes,
     sensitivity_of,
 )
-from identification.excitation.violation import KINDS, Violation, excess_by_kind
+from identification.excitation.violation import KINDS, Violation, WholeMotion, excess_by_kind
 from planner import PlannerCrashed, PlannerError, PlanningTimedOut
 from planner.worker import WorkerProcess, chunks_of, load, map_in_children, pack
 
@@ -240,7 +240,7 @@ class Problem:
 
 
 def _unplannable(error: PlannerError) -> Violation:
-    return Violation("planning", f"the motion ({error})", np.inf, 0.0, None)
+    return Violation("planning", WholeMotion(str(error)), np.inf, 0.0, None)
 
 
 MOTIONS_PER_CHUNK: Final = 8

@@ -11,6 +11,7 @@ import numpy as np
 
 from identification.arrays import Array
 from identification.excitation.criteria import SENSE, Criteria, columns
+from identification.excitation.errors import NoFeasibleMotionError
 from identification.excitation.excitation import Excitation
 from identification.excitation.genomes import ViaPointGenome
 from identification.excitation.searches.bundle_method import SCORED_STEPS, Ascent, improve
@@ -23,7 +24,7 @@ from identification.excitation.searches.population import (
     SearchSettings,
     finite,
 )
-from identification.excitation.violation import KINDS, NoFeasibleMotionError
+from identification.excitation.violation import KINDS
 
 Phase = Literal["search", "gradient"]
 Fitness = Callable[[Scores], Array]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -14,7 +15,8 @@ from hil.control.motion_checks import MotionChecks, always_so, collision_checker
 from hil.control.motions import rest
 from hil.design import preset, problem_of
 from hil.design.messages import NoExcitationError
-from identification.excitation import CollisionChecker, Violation, Workspace
+from identification.excitation import CollisionChecker, Violation, Workspace, messages
+from identification.excitation.violation import CloseBodies, JointQuantity
 from identification.model.motion import Motion
 from sim_fixtures.ns16 import CELL_PATH
 
@@ -77,29 +79,36 @@ def test_a_joint_limit_is_in_the_angles_of_the_file(cell: Cell) -> None:
     beyond = limits.upper.copy()
     beyond[2] += np.radians(5.0)
     position = Violation(
-        "joint limit", "position of joint 2", beyond[2], limits.upper[2], 1.0, tuple(beyond)
+        "joint limit", JointQuantity("position", 2), beyond[2], limits.upper[2], 1.0, tuple(beyond)
     )
     text = violation_text(position, frame)
     assert "position of J3: -175 deg, must be at least -170 deg, at 1.000 s" in text
     assert "J3 -175.0" in text
-    fast = Violation("joint limit", "velocity of joint 1", 3.0, np.radians(155.0), 0.5)
+    fast = Violation("joint limit", JointQuantity("velocity", 1), 3.0, np.radians(155.0), 0.5)
     assert "velocity of J2: 171.9 deg/s, must be at most 155 deg/s" in violation_text(fast, frame)
     # A rate is positive for J3 too, whose sign is reversed on the teach pendant.
     assert frame.sign[2] == -1.0
-    backwards = Violation("joint limit", "velocity of joint 2", 6.9726, np.radians(155.0), 0.5)
+    backwards = Violation(
+        "joint limit", JointQuantity("velocity", 2), 6.9726, np.radians(155.0), 0.5
+    )
     text = violation_text(backwards, frame)
     assert "velocity of J3: 399.5 deg/s, must be at most 155 deg/s" in text
-    assert str(fast) == "joint limit of velocity of joint 1: 3, must be at most 2.705, at 0.500 s"
+    assert (
+        messages.violation_text(fast)
+        == "joint limit of velocity of joint 1: 3, must be at most 2.705, at 0.500 s"
+    )
 
 
 def test_advice_on_a_margin_is_for_what_no_posture_parts(cell: Cell) -> None:
     urdf = wrist(BALL.format(radius=0.05), "", BALL.format(radius=0.437))
     checker = CollisionChecker(urdf, Workspace(floor=None, margin=0.005))
     assert checker.spread("a", "c") == pytest.approx((0.013, 0.013), abs=1e-6)
-    contact = Violation("collision", "a and c", 0.013, 0.02, None, (0.0, 0.0, 0.0))
+    contact = Violation("collision", CloseBodies("a", "c"), 0.013, 0.02, None, (0.0, 0.0, 0.0))
     assert "0.013 to 0.013 m apart in any posture; [workspace] margin must be below" in str(
         always_so(contact, checker)
     )
+    at_home = replace(contact, subject=CloseBodies("a", "c", at_home=True))
+    assert always_so(at_home, checker) == always_so(contact, checker)
     deep = CollisionChecker(
         wrist(BALL.format(radius=0.1), "", BALL.format(radius=0.437)),
         Workspace(floor=None, margin=0.0),
@@ -107,7 +116,9 @@ def test_advice_on_a_margin_is_for_what_no_posture_parts(cell: Cell) -> None:
     assert deep.pairs == ()  # left out: always in contact
     assert always_so(contact, deep) is None
     checker = collision_checker(cell)
-    contact = Violation("collision", "link_5 and floor", -0.1, 0.05, None, tuple(cell.home))
+    contact = Violation(
+        "collision", CloseBodies("link_5", "floor"), -0.1, 0.05, None, tuple(cell.home)
+    )
     assert always_so(contact, checker) is None
 
 

@@ -25,6 +25,7 @@ from hil.design.settings import (
 )
 from hil.new import cell_of_urdf
 from identification.excitation import NoFeasibleMotionError, Violation
+from identification.excitation.violation import WholeMotion
 from identification.model.kinematics import chain_from_urdf
 from sim_fixtures.ns16 import CELL_PATH
 from tests import messages
@@ -228,7 +229,9 @@ SINES = preset("a")
     ],
 )
 def test_frequent_violations_have_remedies(cell, settings, rejected, remedies):
-    nearest = {kind: Violation(kind, "it", 0.01, 0.05, 1.0, (0.0,) * 6) for kind in rejected}
+    nearest = {
+        kind: Violation(kind, WholeMotion(), 0.01, 0.05, 1.0, (0.0,) * 6) for kind in rejected
+    }
     unexciting = 1000 * (not rejected)
     error = NoFeasibleMotionError(rejected, nearest, tried=1000, unexciting=unexciting)
     text = str(no_excitation(error, AngleFrame.of(cell), None, settings))
