@@ -26,6 +26,16 @@ def student_limit(share: ArrayLike, freedom: ArrayLike) -> Any:
     return -scipy.special.stdtrit(freedom, share)
 
 
+def student_freedom(share: float, limit: float) -> float:
+    """Degrees of freedom with which Student's t exceeds a limit with probability `share`.
+
+    Infinite for a limit that the standard normal variable exceeds at least as often.
+    """
+    if limit <= normal_limit(share) * (1.0 + 1e-6):  # the inverse of fewer is rounding
+        return float("inf")
+    return float(scipy.special.stdtridf(1.0 - share, limit))
+
+
 def chi_squared_limit(share: ArrayLike, freedom: ArrayLike) -> Any:
     """Value that chi-squared with `freedom` degrees exceeds with probability `share`."""
     return scipy.special.chdtri(freedom, share)

@@ -17,7 +17,7 @@ from hil.pipeline.estimating import estimate_with
 from hil.pipeline.options import FIXED
 from hil.pipeline.prepared import prepare_sources
 from hil.pipeline.sources import gather_sources
-from identification.distributions import normal_limit
+from identification.distributions import NORMAL_95, student_freedom, student_limit
 from identification.errors import IdentificationError
 from identification.signals.recording import RecordingError
 from identification.text import percentage
@@ -28,8 +28,8 @@ from .oscillation import growing_oscillation
 from .rehearsal_record import EFFECTS, RehearsalCriterion
 from .twin import Twin
 
-MAX_PARAMETER_SIGMAS: Final = 4.0
-"""Largest deviation of an estimate from the simulated value, in standard deviations."""
+FALSE_ALARM: Final = 1e-3
+"""Probability that any estimate of a correct cell file is farther from the truth than allowed."""
 MAX_ERROR_RATIO: Final = 1.2
 """Largest error on unseen motion, as a multiple of the simulated parameters' error."""
 MAX_SPEED_SHARE: Final = 1.05
@@ -195,11 +195,26 @@ def _motion_remedy(cell: Cell, name: str, path: Path, joint: int | None, remedy:
     return f"{remedy}; see `{shlex.join(command)}`"
 
 
+def largest_deviation(count: int, interval_factor: float = NORMAL_95) -> float:
+    """Return the deviation that any of some estimates exceeds with probability `FALSE_ALARM`.
+
+    In standard deviations, 1.96 of which are half a 95 % interval: a quantile of Student's t for
+    the two sides of each estimate (Bonferroni), since the variance is estimated, too.
+
+    Args:
+        count: of the estimates.
+        interval_factor: of the `Estimate`, which has the degrees of freedom of its variance.
+    """
+    freedom = student_freedom(0.025, interval_factor)
+    quantile = float(student_limit(FALSE_ALARM / (2.0 * max(1, count)), freedom))
+    return quantile * NORMAL_95 / interval_factor
+
+
 def of_estimate(twin: Twin, folder: CampaignFolder, reporter: Reporter) -> list[RehearsalCriterion]:
     """Judge an identification from the archives: determined, correct, predictive."""
     bounds = {
         "excitation": 0.0,
-        "parameters": MAX_PARAMETER_SIGMAS,
+        "parameters": largest_deviation(twin.cell.model.n_parameters),
         "unseen motion": MAX_ERROR_RATIO,
     }
     kinds = ("excitation", "validation", "standstill")
@@ -215,10 +230,11 @@ def of_estimate(twin: Twin, folder: CampaignFolder, reporter: Reporter) -> list[
     model = twin.cell.model
     estimate = estimation.result.pooled
     undetermined = estimate.undetermined
-    deviation = estimate.interval_factor / normal_limit(0.025) * estimate.std
+    deviation = estimate.interval_factor / NORMAL_95 * estimate.std
     apart = np.abs(estimate.values - twin.truth) / deviation
     finite = np.isfinite(apart)
     farthest = int(np.argmax(np.where(finite, apart, 0.0)))
+    bound = largest_deviation(int(finite.sum()), estimate.interval_factor)
     ours, theirs = (
         pooled_error(prediction_error(model, values, prepared.held_out)).rms
         for values in (estimate.values, twin.truth)
@@ -236,9 +252,9 @@ def of_estimate(twin: Twin, folder: CampaignFolder, reporter: Reporter) -> list[
         criterion(
             "parameters",
             float(apart[farthest]),
-            MAX_PARAMETER_SIGMAS,
+            bound,
             f"the errors of {finite.sum()} parameters are at most {apart[farthest]:.3g} standard "
-            f"deviations ({estimate.names[farthest]}), {MAX_PARAMETER_SIGMAS:g} are allowed",
+            f"deviations ({estimate.names[farthest]}), {bound:.3g} are allowed",
             "drive train or model in the cell file do not match the arm, or, just above the limit, "
             "by chance: `--again --seed 2` shows which",
         ),

@@ -8,16 +8,15 @@ intervals (Welch, equal variances); half a 95 % interval is `interval_factor` s.
 
 from __future__ import annotations
 
-import math
 from collections.abc import Iterator
 from functools import lru_cache
 from typing import Final
 
 import numpy as np
-from scipy.optimize import brentq
 from scipy.stats import t as student
 
 from identification import Estimate
+from identification.distributions import student_freedom
 
 SEEDS: Final = 10_000
 FALSE_ALARM: Final = 1e-3
@@ -46,11 +45,7 @@ def alike(ours: Estimate, theirs: Estimate) -> Iterator[str]:
 @lru_cache(maxsize=64)
 def degrees_of_freedom(interval_factor: float) -> float:
     """Return those of the t distribution with this 97.5 % quantile; infinite for the normal one."""
-    least = 0.5
-    most = 1e7
-    if interval_factor <= student.ppf(0.975, most):
-        return math.inf
-    return float(brentq(lambda k: student.ppf(0.975, k) - interval_factor, least, most))
+    return student_freedom(0.025, interval_factor)
 
 
 @lru_cache(maxsize=64)

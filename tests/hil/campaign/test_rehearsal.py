@@ -26,7 +26,12 @@ from hil.campaign import Campaign, CampaignPlan, NotRehearsedError, Stop, rehear
 from hil.campaign.folder import CampaignFolder
 from hil.campaign.gates import require_rehearsed
 from hil.campaign.identified_campaign import identify_campaign
-from hil.campaign.rehearsal_criteria import of_currents, of_motions
+from hil.campaign.rehearsal_criteria import (
+    FALSE_ALARM,
+    largest_deviation,
+    of_currents,
+    of_motions,
+)
 from hil.campaign.rehearsal_record import CRITERIA, Rehearsal
 from hil.campaign.simulated_sessions import result_of
 from hil.campaign.twin import (
@@ -39,6 +44,7 @@ from hil.campaign.twin import (
 from hil.cell import Cell
 from hil.cell.toml_edits import with_values
 from hil.cli import app
+from identification.distributions import NORMAL_95, student_limit, student_tail
 from planner import Move, plan_moves
 from planner.worker import WorkerProcess
 from sim_fixtures.plant import ElasticPlant, PlantTruth
@@ -85,6 +91,15 @@ def test_a_good_plan_on_a_right_cell_passes_every_criterion(designed: Campaign) 
     archives = [open_archive(twin.folder.archives / e.name) for e in twin.folder.manifest()]
     assert all(archive.header.entries["rehearsal"] == "yes" for archive in archives)
     assert sum(int(archive.columns["gap"].sum()) for archive in archives) > 0
+
+
+@pytest.mark.parametrize("freedom", [4.0, 44.0, np.inf])
+@pytest.mark.parametrize("count", [1, 58])
+def test_a_correct_cell_fails_by_its_parameters_once_in_1000(count: int, freedom: float) -> None:
+    factor = float(student_limit(0.025, freedom))
+    allowed = largest_deviation(count, factor) * factor / NORMAL_95
+    each = 2.0 * float(student_tail(allowed, freedom))
+    assert 1.0 - (1.0 - each) ** count == pytest.approx(FALSE_ALARM, rel=1e-3)
 
 
 @pytest.mark.parametrize("seed", [1, 2, 3])
