@@ -158,11 +158,14 @@ def _warnings(
 ) -> tuple[str, ...]:
     """Return what recordings without a load are other than described, by the torque found."""
     bare = [each for each in prepared if each.load is None]
-    if not gains.determined.all() or not bare:
+    known = gains.determined
+    if not known.any() or not bare:
         return ()
-    torques = [(each.current * gains.values) @ turns for each in bare]
+    torques = [(each.current * np.where(known, gains.values, 0.0)) @ turns for each in bare]
+    has_torque = ~turns[~known].any(axis=0)  # of joints that no motor without a constant turns
     samples = [
-        replace(each.samples, torque=torque) for each, torque in zip(bare, torques, strict=True)
+        replace(each.samples, torque=torque, usable=each.samples.usable & has_torque)
+        for each, torque in zip(bare, torques, strict=True)
     ]
     found = other_meanings(model, diagnose(model, samples), sources)
     return tuple(map(in_a_sentence, found))
