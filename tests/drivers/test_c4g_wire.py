@@ -28,6 +28,7 @@ def test_a_packet_states_no_cause_of_its_own():
     classifier = PacketClassifier(np.arange(N), (1,) * N, 1, OPEN)
     report = classifier.classify(bytes(4), np.full(N, CLOSED, np.int32))
     assert (report.cause, report.remedy) == ("", "")
+    assert report.misplacement(2) == "joint 3 is in mode 0; the motion needs 4"
 
 
 def test_a_sort_is_known_by_length_status_and_modes():

@@ -341,6 +341,7 @@ class TestAxes:
         assert axes.held_joints.all() == axes.held_joints.any() == opened
         assert axes.ready.all() == axes.ready.any() == (kind is Input.OPEN)
         np.testing.assert_array_equal(axes.modes, modes)
+        assert axes.misplacement(2) == (axes.cause or "joint 3 is in mode 253")
 
     @pytest.mark.parametrize(
         ("ending", "cause"),
