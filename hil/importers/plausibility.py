@@ -198,13 +198,20 @@ def in_turns(position: Array, limits: UrdfLimits, turning: NDArray[np.bool_]) ->
     low = position.min(axis=0) + _LIMIT_TOLERANCE
     high = position.max(axis=0) - _LIMIT_TOLERANCE
     usual = ((low > 0.0) & (high < 2.0 * np.pi)) | ((low > -np.pi) & (high < np.pi))
+    continued, turns = _continued(position, limits, turning)
+    nearest = continued + turns
+    fits = limit_excess(nearest.min(axis=0), nearest.max(axis=0), limits) <= _LIMIT_TOLERANCE
+    return np.where(fits & usual, nearest, continued)
+
+
+def _continued(
+    position: Array, limits: UrdfLimits, turning: NDArray[np.bool_]
+) -> tuple[Array, Array]:
+    """Return positions (m, n) without wraps, and the turn (n,) that brings each to its limits."""
     continued = position.copy()
     continued[:, turning] = unwrap(position[:, turning])
-    low = continued.min(axis=0)
-    high = continued.max(axis=0)
-    turns = whole_turns(low, high, limits, turning, 1)
-    fits = limit_excess(low + turns, high + turns, limits) <= _LIMIT_TOLERANCE
-    return np.where(fits & usual, continued + turns, continued)
+    low, high = continued.min(axis=0), continued.max(axis=0)
+    return continued, whole_turns(low, high, limits, turning, 1)
 
 
 def _outside(
@@ -274,7 +281,8 @@ def are_degrees(position: Array, converted: Array, names: Sequence[str], urdf: s
         return False
     if not (np.isfinite(position).all() and np.isfinite(converted).all()):
         return False
-    position = in_turns(position, limits, turning)  # radians of 0 to 2 pi are none
+    # Radians that wrap anywhere, and may begin a turn away from the limits, are no degrees.
+    position = np.add(*_continued(position, limits, turning))
     beyond = ~np.diag(_fits(position, limits))
     far = np.abs(position).max(axis=0) > 3.0 * np.maximum(-limits.lower, limits.upper)
     if not (far & beyond).any():

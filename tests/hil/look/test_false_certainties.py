@@ -75,10 +75,16 @@ def test_shares_of_a_range_are_no_certain_degrees(tmp_path: Path, simulated: Sim
     assert row.certainty is not Certainty.CERTAIN
 
 
-def test_angles_of_0_to_a_turn_are_radians(tmp_path: Path, simulated: Simulated) -> None:
+@pytest.mark.parametrize("wrapped_at", ["zero", "the middle of the motion"])
+def test_angles_within_a_turn_are_radians(
+    tmp_path: Path, simulated: Simulated, wrapped_at: str
+) -> None:
     """They leave the limits of the URDF, but for a turn."""
-    position = simulated.position % (2.0 * np.pi)
-    limits = np.deg2rad(180.0) * np.array([-1.0, 1.0])
+    whole = simulated.position
+    at = 0.0 if wrapped_at == "zero" else 0.5 * (whole.min(axis=0) + whole.max(axis=0))
+    position = (whole - at) % (2.0 * np.pi) + at
+    limits = (np.abs(whole).max() + 0.1) * np.array([-1.0, 1.0])
+    assert np.abs(position).max() > 3.0 * limits[1] or wrapped_at == "zero"
     urdf = tmp_path / "limited.urdf"
     narrow = re.sub(
         r'lower="[^"]*" upper="[^"]*"', 'lower="{:.4f}" upper="{:.4f}"'.format(*limits),
@@ -88,7 +94,8 @@ def test_angles_of_0_to_a_turn_are_radians(tmp_path: Path, simulated: Simulated)
     names = Robot.from_urdf(urdf).joint_names
     converted = np.radians(position)
     assert not are_degrees(position, converted, names, urdf.read_text())
-    assert are_degrees(np.degrees(position), position, names, urdf.read_text())
+    within_a_turn = simulated.position % (2.0 * np.pi)
+    assert are_degrees(np.degrees(within_a_turn), within_a_turn, names, urdf.read_text())
 
 
 class TestTorqueOfZeros:
