@@ -31,7 +31,7 @@ from hil.importers.imported_robot import Robot
 from hil.importers.recording_import import ImportOptions
 from hil.look import Look, look_at
 from hil.look.readings import ArmChange, Changes
-from identification.hypotheses.changes import SIGNS, Change
+from identification.hypotheses.joint_changes import SIGNS, Change
 
 Array = NDArray[np.float64]
 

@@ -31,8 +31,8 @@ from numpy.typing import NDArray
 
 from benchmarks import parser_of, show
 from drivers import CycleRing, DriveTrain, Guard, GuardLimits, InitPacket, Mode, Session, State
+from drivers.c4g_packets import DRIVE_ON, CyclicPacket, next_number
 from drivers.motion_source import BoundsName
-from drivers.packets import DRIVE_ON, CyclicPacket, next_number
 
 Array = NDArray[np.float64]
 

@@ -16,9 +16,9 @@ from numpy.typing import NDArray
 
 from benchmarks.session import START, N, drive_train, init_packet
 from drivers import CyclicPacket, Mode
+from drivers.c4g_packets import DRIVE_ON, LAST_NUMBER, next_number
 from drivers.cycle_records import RingReader
 from drivers.exchange.realtime import RealTimeSettings, enter
-from drivers.packets import DRIVE_ON, LAST_NUMBER, next_number
 
 Array = NDArray[np.float64]
 

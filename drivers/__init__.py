@@ -6,6 +6,7 @@ knows nothing of plans, robot dynamics or files. Every refusal is a class of `dr
 
 from __future__ import annotations
 
+from drivers.c4g_packets import MODE_FIELDS, CyclicPacket, InitPacket, Mode
 from drivers.cycle_records import CycleRing, cycle_dtype
 from drivers.drive_train import DriveTrain
 from drivers.errors import (
@@ -36,7 +37,6 @@ from drivers.events import (
 from drivers.exchange.loop import exchange
 from drivers.guard import Guard, GuardLimits
 from drivers.motion_source import BoundsName, MotionSource
-from drivers.packets import MODE_FIELDS, CyclicPacket, InitPacket, Mode
 from drivers.session import Session
 from drivers.states import Outcome, State
 from drivers.transports.base import Transport, TransportError, TransportSpec

@@ -19,13 +19,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from drivers.arrays import Array
-from drivers.drive_train import DriveTrain, MotorSide
-from drivers.errors import PacketError, RefusalError
-from drivers.events import InitReceived
-from drivers.guard import Joints
-from drivers.init_check import verify_controller
-from drivers.packet_losses import LossTracker
-from drivers.packets import (
+from drivers.c4g_packets import (
     AXIS_LENGTH,
     DRIVE_ON,
     EXIT_FROM_OPEN,
@@ -46,6 +40,12 @@ from drivers.packets import (
     next_number,
     packet_number,
 )
+from drivers.drive_train import DriveTrain, MotorSide
+from drivers.errors import PacketError, RefusalError
+from drivers.events import InitReceived
+from drivers.guard import Joints
+from drivers.init_check import verify_controller
+from drivers.packet_losses import LossTracker
 from drivers.states import (
     CLOSED_MODES,
     HOLDABLE_MODES,

@@ -9,10 +9,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from drivers.arrays import Array
+from drivers.c4g_packets import InitPacket
 from drivers.drive_train import DriveTrain
 from drivers.errors import PacketError
 from drivers.events import InitReceived
-from drivers.packets import InitPacket
 
 _RELATIVE_TOLERANCE: Final = 1e-6
 """Relative tolerance: float32 rounds by 6e-8 at most; a cell file has six digits or more."""

@@ -2,8 +2,8 @@
 
 The first set-point is the target received in the packet in which the last wanted axis opened, at
 zero velocity, compared with actual position and standstill. D2 is the step of the motor from one
-sent set-point to the next, computed in float64; `drivers.packets.MODE_FIELDS` gives the fields of
-each open mode. A motion requested while the axes are open begins under the same conditions, from
+sent set-point to the next, computed in float64; `drivers.c4g_packets.MODE_FIELDS` gives the fields
+of each open mode. A motion requested while the axes are open begins under the same conditions, from
 the set-point held. Without a requested motion the first set-point is held.
 
 While axes are open, following error and current are checked, and that the target received (D1) is

@@ -50,6 +50,7 @@ from typing import Final
 
 import numpy as np
 
+from drivers.c4g_packets import Mode
 from drivers.c4g_wire import C4gProtocol
 from drivers.cycle_records import CycleRing
 from drivers.drive_train import DriveTrain
@@ -85,7 +86,6 @@ from drivers.guard import Guard
 from drivers.motion_source import MotionSource
 from drivers.open_mode import Exit, OpenCycle, OpenReply, Refuse, Reply, SetPointGenerator
 from drivers.packet_losses import LossTracker
-from drivers.packets import Mode
 from drivers.states import (
     POSITION_MODES,
     STATES_WITH_SET_POINTS,

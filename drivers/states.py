@@ -16,8 +16,8 @@ from typing import Final, Literal, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
+from drivers.c4g_packets import MODE_FIELDS, Mode
 from drivers.packet_losses import LossTracker
-from drivers.packets import MODE_FIELDS, Mode
 
 Outcome = Literal["completed", "stopped", "refused", "lost"]
 """How a requested motion ended."""

@@ -31,8 +31,7 @@ from typing import Literal, NamedTuple, Protocol
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from drivers.errors import PacketError
-from drivers.packets import (
+from drivers.c4g_packets import (
     AXIS_DTYPE,
     DRIVE_ON,
     EXIT_FROM_OPEN,
@@ -46,6 +45,7 @@ from drivers.packets import (
     next_number,
     packet_number,
 )
+from drivers.errors import PacketError
 from sim_fixtures.arm import DisturbanceKind, SimulatedArm, UnmodelledEffects
 from sim_fixtures.arrays import Array
 from sim_fixtures.drive import SimulatedDrive

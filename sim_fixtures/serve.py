@@ -23,9 +23,7 @@ from math import inf
 from select import select
 from typing import Final, Protocol
 
-from drivers.errors import PacketError
-from drivers.exchange.control import LATENCY_BINS, bin_of, quantile
-from drivers.packets import (
+from drivers.c4g_packets import (
     AXIS_LENGTH,
     HEADER_LENGTH,
     Mode,
@@ -33,6 +31,8 @@ from drivers.packets import (
     next_number,
     packet_number,
 )
+from drivers.errors import PacketError
+from drivers.exchange.control import LATENCY_BINS, bin_of, quantile
 from drivers.transports.base import TransportError
 from drivers.transports.simulated import Peer
 from drivers.transports.udp import UdpSpec

@@ -19,8 +19,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
 
+from drivers.c4g_packets import HEADER_LENGTH, MAX_PACKET_BYTES
 from drivers.errors import TransportClosed
-from drivers.packets import HEADER_LENGTH, MAX_PACKET_BYTES
 from drivers.transports.arrival import CONTROL_BYTES, SO_TIMESTAMPNS, ArrivalClock
 from drivers.transports.base import (
     DirectRoute,

@@ -9,9 +9,9 @@ from numpy.lib.recfunctions import structured_to_unstructured
 from numpy.typing import NDArray
 
 from drivers.arrays import Array
+from drivers.c4g_packets import DRIVE_ON
 from drivers.cycle_records import ARM_STATE, cycle_dtype
 from drivers.drive_train import DriveTrain
-from drivers.packets import DRIVE_ON
 from drivers.states import State
 from drivers.ur.arm_state import STATE_DTYPE, state_columns
 from drivers.ur.outputs import N_JOINTS, POWER_MODES, ROBOT_RUNNING

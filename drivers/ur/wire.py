@@ -30,12 +30,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from drivers.arrays import Array
+from drivers.c4g_packets import DRIVE_ON
 from drivers.drive_train import TURN, DriveTrain, MotorSide
 from drivers.errors import PacketError, RefusalError
 from drivers.events import InitReceived
 from drivers.guard import Joints
 from drivers.packet_losses import LossTracker
-from drivers.packets import DRIVE_ON
 from drivers.states import AxesReport, Input, State
 from drivers.ur import outputs
 from drivers.ur.arm_state import STATE_DTYPE, state_columns

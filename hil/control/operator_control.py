@@ -11,11 +11,11 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
+from drivers.c4g_packets import DRIVE_ON
 from drivers.drive_train import TURN, DriveTrain
 from drivers.errors import RequestError
 from drivers.guard import Guard
 from drivers.motion_source import MotionSource
-from drivers.packets import DRIVE_ON
 from hil.base.arrays import Array
 from hil.base.errors import ControllerError
 from hil.control.motion_watch import MotionProgress, MotionWatch, Stop

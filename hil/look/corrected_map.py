@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from hil.base.safe_input import parse_toml
 from hil.base.toml_text import to_text
-from identification.hypotheses.changes import Axes
+from identification.hypotheses.joint_changes import Axes
 
 _COMMENT = "Proposed by hil from names, units, the URDF and the motion of the recording"
 

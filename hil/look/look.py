@@ -37,9 +37,9 @@ from hil.look.undescribed import undescribed_robot
 from hil.pipeline.sources import Source, cell_of, source_of
 from identification.errors import IdentificationError
 from identification.estimators.delay import DelayEstimate, estimate_delay
-from identification.hypotheses.changes import Axes
 from identification.hypotheses.diagnosis import UNEXPLAINED, few_rows, torque_of
 from identification.hypotheses.inertia_scale import retimed
+from identification.hypotheses.joint_changes import Axes
 from identification.hypotheses.scores import score_of
 from identification.hypotheses.search import EXPLAINED_ERROR, Readings, find_readings
 from identification.hypotheses.torque_low_pass import TorqueLowPass, torque_low_pass

@@ -87,7 +87,7 @@ from hil.look.readings import (
 )
 from hil.look.result import ChangedReading, Look, Row, TiedReading
 from identification.estimators.delay_messages import undetermined_words
-from identification.hypotheses.changes import COUPLED, ORDERS, Meaning
+from identification.hypotheses.joint_changes import COUPLED, ORDERS, Meaning
 from identification.signals.messages import clock_lines, fault_words, jump_words, time_lines
 from identification.text import number, percentage
 

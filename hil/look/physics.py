@@ -62,9 +62,17 @@ from hil.look.result import Aspect, ParameterGroup, Row, TiedReading
 from identification.estimators.delay import DelayEstimate
 from identification.estimators.prior import DETERMINED_STD_RATIO, body_prior, fit_posterior
 from identification.factor.factor import Factor
-from identification.hypotheses.changes import COUPLED, ORDERS, SIGNS, UNITS, Axes, Change, Meaning
 from identification.hypotheses.diagnosis import RigidTorque, TorqueDiagnosis, rigid_torque
 from identification.hypotheses.inertia_scale import shows_times
+from identification.hypotheses.joint_changes import (
+    COUPLED,
+    ORDERS,
+    SIGNS,
+    UNITS,
+    Axes,
+    Change,
+    Meaning,
+)
 from identification.hypotheses.scores import is_backwards
 from identification.hypotheses.search import EXPLAINED_ERROR, SEPARATE_SIGMAS, Readings, Step
 from identification.hypotheses.torque_low_pass import TorqueLowPass

@@ -20,7 +20,7 @@ from hil.importers.conclusions import (
     StatedUnit,
 )
 from identification.estimators.delay import DelayEstimate
-from identification.hypotheses.changes import Change
+from identification.hypotheses.joint_changes import Change
 from identification.signals.clock import SampleTimes, TimeBase
 from identification.signals.position_steps import PositionJump
 from identification.signals.row_faults import RowFault

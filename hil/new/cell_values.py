@@ -13,11 +13,11 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import ArrayLike
 
+from drivers.c4g_packets import N_ARMS, InitPacket
 from drivers.drive_train import WRIST_AXES, DriveTrain
 from drivers.errors import DriverError, PacketError
 from drivers.exchange.process_handle import ExchangeProcess, ExchangeSettings
 from drivers.guard import GuardLimits
-from drivers.packets import N_ARMS, InitPacket
 from drivers.transports.base import TransportSpec
 from hil.archive import open_archive
 from hil.base.arrays import Array

@@ -8,8 +8,8 @@ from pathlib import Path
 from hil.base.errors import RefusedRecordingError
 from hil.pipeline.recorded_rows import row_findings
 from hil.pipeline.sources import Source
-from identification.hypotheses.changes import Change
 from identification.hypotheses.diagnosis import TorqueDiagnosis, diagnose
+from identification.hypotheses.joint_changes import Change
 from identification.model.robot import RobotModel
 from identification.signals.samples import Samples
 from identification.validation.finding import Finding, TestedOn

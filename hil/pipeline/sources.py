@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from drivers.packets import DRIVE_ON
+from drivers.c4g_packets import DRIVE_ON
 from hil.archive import Archive, ArchiveHeader, ArchiveName, open_archive, opened, place_of
 from hil.archive.campaign_archives import RecordedCampaign
 from hil.archive.header import EPISODE, REJECTED

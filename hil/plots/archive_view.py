@@ -12,7 +12,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
-from drivers.packets import DRIVE_ON
+from drivers.c4g_packets import DRIVE_ON
 from hil.archive import Archive, open_archive
 from hil.archive.check import Overview, read_overview
 from hil.base.arrays import Array

@@ -12,8 +12,8 @@ from identification.distributions import SIGNIFICANT_SIGMAS
 from identification.estimators.prior import GaussianPrior
 from identification.factor.blocks import FOLDS
 from identification.factor.normal_equations import solve_with_ridge
-from identification.hypotheses.changes import Change
-from identification.hypotheses.columns import (
+from identification.hypotheses.joint_changes import Change
+from identification.hypotheses.torque_columns import (
     ColumnSums,
     folded,
 )

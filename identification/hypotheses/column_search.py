@@ -17,7 +17,6 @@ from typing import Final, NamedTuple
 import numpy as np
 
 from identification.arrays import Array
-from identification.hypotheses.changes import Change, Meaning, Part
 from identification.hypotheses.column_scores import (
     MIN_BLOCKS,
     ColumnScore,
@@ -25,8 +24,9 @@ from identification.hypotheses.column_scores import (
     column_score,
     rough_size,
 )
-from identification.hypotheses.columns import BLOCKS, ColumnSums, columns_of
+from identification.hypotheses.joint_changes import Change, Meaning, Part
 from identification.hypotheses.sizes import estimated_size
+from identification.hypotheses.torque_columns import BLOCKS, ColumnSums, columns_of
 from identification.model.link_wrenches import MASS_INDEX
 from identification.model.robot import RobotModel
 from identification.signals.recording import MIN_MOVEMENT

@@ -17,7 +17,6 @@ import numpy as np
 from identification.arrays import Array
 from identification.estimators.prior import body_prior, nominal_ratio, posterior_values
 from identification.factor.factor import Factor
-from identification.hypotheses.changes import Change, changed_samples
 from identification.hypotheses.column_search import (
     ExplainedFit,
     Explanation,
@@ -26,6 +25,7 @@ from identification.hypotheses.column_search import (
 )
 from identification.hypotheses.gravity_share import has_part_of_gravity
 from identification.hypotheses.inertia_scale import InertiaScale, find_inertia_scale
+from identification.hypotheses.joint_changes import Change, changed_samples
 from identification.hypotheses.scores import (
     ROWS_PER_FACT,
     Comparison,

@@ -21,7 +21,8 @@ from identification.arrays import Array
 from identification.estimators.prior import TorqueSums, body_priors
 from identification.factor.columns import every_torque_factor
 from identification.factor.factor import MIN_NOISE, Factor
-from identification.hypotheses.changes import (
+from identification.hypotheses.gravity_share import has_part_of_gravity
+from identification.hypotheses.joint_changes import (
     COUPLED,
     DEGREE,
     GRAVITIES,
@@ -42,7 +43,6 @@ from identification.hypotheses.changes import (
     order_change,
     whole_order,
 )
-from identification.hypotheses.gravity_share import has_part_of_gravity
 from identification.hypotheses.joint_fit import (
     JointFit,
     candidates,

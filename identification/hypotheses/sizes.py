@@ -24,11 +24,11 @@ from numpy.typing import NDArray
 from identification.arrays import Array
 from identification.estimators.covariance import cluster_covariance, solve_with_prior
 from identification.factor.normal_equations import NormalEquations
-from identification.hypotheses.changes import Change
 from identification.hypotheses.column_scores import (
     ScorePrior,
 )
-from identification.hypotheses.columns import ColumnSums, columns_of
+from identification.hypotheses.joint_changes import Change
+from identification.hypotheses.torque_columns import ColumnSums, columns_of
 from identification.model.link_wrenches import MASS_INDEX
 from identification.model.robot import RobotModel
 

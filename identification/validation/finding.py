@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from identification.hypotheses.carried_load import MIN_LOAD_EXPLAINED
-from identification.hypotheses.changes import Change, Coupled, Order, Sign
+from identification.hypotheses.joint_changes import Change, Coupled, Order, Sign
 from identification.hypotheses.little_torque import LITTLE_TORQUE_SHARE
 from identification.signals.clock import SampleTimes
 from identification.signals.position_steps import PositionJump

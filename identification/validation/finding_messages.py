@@ -14,7 +14,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Final, NamedTuple
 
-from identification.hypotheses.changes import COUPLED, ORDERS, SIGNS, Change, Meaning
+from identification.hypotheses.joint_changes import COUPLED, ORDERS, SIGNS, Change, Meaning
 from identification.signals.clock import SampleTimes
 from identification.signals.messages import fault_words, time_lines
 from identification.signals.position_steps import PositionJump

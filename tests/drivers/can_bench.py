@@ -23,7 +23,7 @@ from drivers import (
     TransportClosed,
     exchange,
 )
-from drivers.packets import next_number
+from drivers.c4g_packets import next_number
 from drivers.transports.can.frames import DOWN, PAYLOADS_FD, UP, BusRates, CanEndpoint
 from drivers.transports.can.transport import CanTransport
 from hil.cell import Cell

@@ -23,8 +23,8 @@ from drivers import (
     State,
     StateChanged,
 )
+from drivers.c4g_packets import DRIVE_ON, cyclic_length, next_number
 from drivers.errors import Check, GuardError
-from drivers.packets import DRIVE_ON, cyclic_length, next_number
 from drivers.states import POSITION_MODES
 
 N = 6

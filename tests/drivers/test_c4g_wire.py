@@ -7,8 +7,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from drivers.c4g_packets import DRIVE_ON, CyclicPacket, InitPacket, Mode
 from drivers.c4g_wire import C4gProtocol, PacketClassifier
-from drivers.packets import DRIVE_ON, CyclicPacket, InitPacket, Mode
 from drivers.wire import ArmSettings
 from tests.drivers.rig import PERIOD, N, drive_train
 

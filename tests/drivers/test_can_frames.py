@@ -12,7 +12,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from drivers.packets import LAST_NUMBER, CyclicPacket, Mode, cyclic_length, next_number
+from drivers.c4g_packets import LAST_NUMBER, CyclicPacket, Mode, cyclic_length, next_number
 from drivers.transports.can import frames
 from drivers.transports.can.frames import (
     DOWN,

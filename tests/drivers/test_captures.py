@@ -26,8 +26,8 @@ from drivers import (
     Session,
     State,
 )
+from drivers.c4g_packets import INIT_LENGTH, MAX_AXES, cyclic_length, is_init
 from drivers.errors import Check
-from drivers.packets import INIT_LENGTH, MAX_AXES, cyclic_length, is_init
 from tests.drivers import oracle
 from tests.drivers.rig import Rig, Table
 

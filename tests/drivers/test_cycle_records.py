@@ -13,6 +13,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from drivers import errors, events
+from drivers.c4g_packets import InitPacket
 from drivers.cycle_records import (
     MEASURED,
     CycleRing,
@@ -33,7 +34,6 @@ from drivers.errors import (
     SourceFailed,
     TransportClosed,
 )
-from drivers.packets import InitPacket
 from tests.drivers.rig import Cruise, N, moving
 
 pytestmark = pytest.mark.safety

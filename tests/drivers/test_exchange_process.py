@@ -20,6 +20,7 @@ import numpy as np
 import pytest
 
 from drivers import CyclicPacket, Mode, MotionEnded, MotionStarted, RequestError, State
+from drivers.c4g_packets import DRIVE_ON, next_number
 from drivers.cycle_records import RingReader
 from drivers.exchange import process_handle, realtime
 from drivers.exchange.control import ArchiveState, SharedState
@@ -36,7 +37,6 @@ from drivers.exchange.process_handle import (
     WithdrawnError,
 )
 from drivers.exchange.realtime import RealTimeReport, RealTimeSettings
-from drivers.packets import DRIVE_ON, next_number
 from drivers.transports.base import TransportError
 from drivers.transports.udp import UdpSpec, UdpTransport
 from hil.control.simulator_process import free_port

@@ -6,11 +6,11 @@ import numpy as np
 import pytest
 
 from drivers import GapSeen, Guard, InitReceived, Mode, MotionEnded, MotionStarted, State
+from drivers.c4g_packets import LAST_NUMBER, PacketSequence
 from drivers.errors import AxisNotInMode, Check
 from drivers.events import RepliesLost
 from drivers.guard import SERVO_LAG_SECONDS
 from drivers.open_mode import MAX_RESENDS, SentSetPoints
-from drivers.packets import LAST_NUMBER, PacketSequence
 from tests.drivers.losses import FAR, at_speed, lose, planned
 from tests.drivers.rig import (
     MOVE,

@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 
 from drivers import HoldChanged, OverrideChanged, RequestError, SourceFailed, State
+from drivers.c4g_packets import MODE_FIELDS
 from drivers.errors import (
     Check,
 )
-from drivers.packets import MODE_FIELDS
 from drivers.states import HOLDABLE_MODES, INCREMENTAL_MODES, POSITION_MODES
 from planner import JointLimits, TrajectoryPlayer, plan
 from tests import messages

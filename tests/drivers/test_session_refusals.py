@@ -16,10 +16,10 @@ from drivers import (
     State,
     open_mode,
 )
+from drivers.c4g_packets import DRIVE_ON, LAST_NUMBER
 from drivers.errors import Check, ExitTimeout, ModeRefused, RefusalError
 from drivers.events import RepliesLost
 from drivers.open_mode import EXIT_RETRY_CYCLES, EXIT_TIMEOUT
-from drivers.packets import DRIVE_ON, LAST_NUMBER
 from drivers.session import FLIGHT_RECORDER_CYCLES, STOP_TIMEOUT
 from drivers.states import POSITION_MODES
 from tests.drivers.rig import (

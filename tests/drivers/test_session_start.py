@@ -19,9 +19,9 @@ from drivers import (
     RequestError,
     State,
 )
+from drivers.c4g_packets import DRIVE_ON, INIT_LENGTH, NO_SLOT
 from drivers.c4g_wire import D1, PacketClassifier, safe_reply
 from drivers.init_check import float32_text, is_narrower, verify_controller
-from drivers.packets import DRIVE_ON, INIT_LENGTH, NO_SLOT
 from tests.drivers.rig import (
     PERIOD,
     START,

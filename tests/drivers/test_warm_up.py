@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 
 from drivers import CyclicPacket, Mode, State
+from drivers.c4g_packets import LAST_NUMBER
 from drivers.exchange.loop import exchange
 from drivers.exchange.warm_up import LEAD_SECONDS, WarmUp, may_poll
-from drivers.packets import LAST_NUMBER
 from tests.drivers.rig import PERIOD, N, Rig, closed, drive_train, limits, moving
 
 pytestmark = pytest.mark.safety

@@ -28,8 +28,8 @@ from drivers import (
     StateChanged,
     exchange,
 )
+from drivers.c4g_packets import Mode, cyclic_length
 from drivers.errors import GuardError
-from drivers.packets import Mode, cyclic_length
 from planner import JointLimits, TrajectoryPlayer, plan
 from sim_fixtures import Phase, SimulatedController
 from sim_fixtures.faults import split_faults

@@ -10,7 +10,7 @@ from typing import Any, Final
 import numpy as np
 
 from drivers import CycleRing, Guard, Session, State
-from drivers.packets import Mode
+from drivers.c4g_packets import Mode
 from drivers.wire import state_of
 from hil.cell import Cell
 from hil.control.motions import player_of

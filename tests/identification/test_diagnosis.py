@@ -9,9 +9,9 @@ from numpy.typing import NDArray
 from identification import Recording
 from identification.estimators.prior import body_prior, posterior_values
 from identification.factor.factor import Factor
-from identification.hypotheses.changes import Change
 from identification.hypotheses.column_search import ExplainedFit, find_columns
 from identification.hypotheses.diagnosis import TorqueDiagnosis, diagnose
+from identification.hypotheses.joint_changes import Change
 from identification.hypotheses.scores import ROWS_PER_FACT
 from identification.hypotheses.search import Adequacy
 from identification.signals.samples import Preprocessing, prepare

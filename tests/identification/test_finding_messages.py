@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from hil.pipeline import cell_context, other_meanings, recorded_rows
-from identification.hypotheses.changes import Change
+from identification.hypotheses.joint_changes import Change
 from identification.signals.position_steps import PositionJump
 from identification.validation.finding import Finding, FindingKey, RemedyKey, RepeatedSamples
 from identification.validation.finding_messages import (

@@ -12,7 +12,7 @@ from identification import Recording
 from identification.estimators.prior import TorqueSums, body_prior, body_priors
 from identification.factor.columns import every_torque_factor
 from identification.factor.factor import Factor
-from identification.hypotheses.changes import (
+from identification.hypotheses.joint_changes import (
     Axes,
     Change,
     change_of_motion,

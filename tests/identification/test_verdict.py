@@ -14,15 +14,15 @@ from identification.factor.estimate import estimate
 from identification.factor.factor import Factor
 from identification.hypotheses import column_search
 from identification.hypotheses.carried_load import CarriedLoad
-from identification.hypotheses.changes import DISCRETE_MEANINGS, Change, Part
 from identification.hypotheses.column_scores import ScorePrior
 from identification.hypotheses.column_search import (
     ExplainedFit,
     find_columns_of_unseen,
 )
-from identification.hypotheses.columns import ColumnSums
 from identification.hypotheses.diagnosis import diagnose
+from identification.hypotheses.joint_changes import DISCRETE_MEANINGS, Change, Part
 from identification.hypotheses.sizes import estimated_size
+from identification.hypotheses.torque_columns import ColumnSums
 from identification.hypotheses.unseen_changes import UnseenChange
 from identification.model.known_payload import Payload
 from identification.model.robot import RobotModel

@@ -7,7 +7,7 @@ import time
 from dataclasses import replace
 from pathlib import Path
 
-from drivers.packets import packet_number
+from drivers.c4g_packets import packet_number
 from hil.cell import Cell
 from hil.control.simulated_cell import controller_settings, simulated_controller
 from hil.control.simulator_on_link import Buttons, realtime_process, serve_session

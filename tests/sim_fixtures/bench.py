@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from drivers.packets import CyclicPacket, Mode, echo, is_init, next_number
+from drivers.c4g_packets import CyclicPacket, Mode, echo, is_init, next_number
 from sim_fixtures import (
     ControllerSettings,
     PlantTruth,

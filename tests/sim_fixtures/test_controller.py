@@ -13,7 +13,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from drivers.packets import (
+from drivers.c4g_packets import (
     CyclicPacket,
     InitPacket,
     Mode,

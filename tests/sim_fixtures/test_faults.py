@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from drivers.packets import CyclicPacket, echo, is_init, next_number, packet_number
+from drivers.c4g_packets import CyclicPacket, echo, is_init, next_number, packet_number
 from drivers.transports.simulated import Corrupt, Delay, Duplicate, Lose, Reorder
 from sim_fixtures import Phase, SettingError, SimulatedController
 from sim_fixtures.faults import (

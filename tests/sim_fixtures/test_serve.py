@@ -11,7 +11,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from drivers.packets import CyclicPacket, echo, next_number, packet_number
+from drivers.c4g_packets import CyclicPacket, echo, next_number, packet_number
 from sim_fixtures.serve import Request, serve
 
 T = 0.001

@@ -9,10 +9,10 @@ from typing import Any
 import numpy as np
 import pytest
 
+from drivers.c4g_packets import PacketSequence
 from drivers.execution import Execution
 from drivers.guard import Guard
 from drivers.packet_losses import LossTracker
-from drivers.packets import PacketSequence
 from hil.archive.recorder import Recorder
 from hil.campaign.folder import CampaignFolder
 from hil.campaign.motion_runner import Runner

@@ -13,8 +13,8 @@ from collections import Counter
 from dataclasses import dataclass
 from typing import Final, NamedTuple
 
+from drivers.c4g_packets import MAX_PACKET_BYTES, InitPacket, cyclic_length, is_init
 from drivers.errors import DriverError, PacketError
-from drivers.packets import MAX_PACKET_BYTES, InitPacket, cyclic_length, is_init
 from drivers.transports.base import TransportError
 
 PAYLOADS_FD: Final = (0, 1, 2, 3, 4, 5, 6, 7, 8, 12, 16, 20, 24, 32, 48, 64)

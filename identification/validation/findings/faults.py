@@ -9,8 +9,8 @@ import numpy as np
 
 from identification.arrays import Array
 from identification.distributions import SIGNIFICANT_SIGMAS
-from identification.hypotheses.changes import SIGNS, Change, Meaning
 from identification.hypotheses.column_search import Explanation
+from identification.hypotheses.joint_changes import SIGNS, Change, Meaning
 from identification.validation.evidence import Evidence
 from identification.validation.finding import (
     Finding,

@@ -7,9 +7,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from drivers.c4g_packets import DRIVE_ON
 from drivers.cycle_records import ARM_STATE
 from drivers.drive_train import DriveTrain
-from drivers.packets import DRIVE_ON
 from drivers.states import State
 from drivers.ur.cycles import CycleCounter
 from drivers.ur.reader import OutputFrames

@@ -11,8 +11,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from drivers.c4g_packets import DRIVE_ON
 from drivers.errors import PacketError
-from drivers.packets import DRIVE_ON
 from drivers.states import Input, State
 from drivers.ur.description import UrDescription
 from drivers.ur.identity import ArmIdentity

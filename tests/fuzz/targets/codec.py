@@ -5,8 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from drivers import CyclicPacket, InitPacket
-from drivers.errors import PacketError
-from drivers.packets import (
+from drivers.c4g_packets import (
     DRIVE_ON,
     INIT_LENGTH,
     MAX_AXES,
@@ -16,6 +15,7 @@ from drivers.packets import (
     next_number,
     packet_number,
 )
+from drivers.errors import PacketError
 from drivers.transports.can.frames import DOWN, UP, BusRates, CanEndpoint, CanError, Frame
 from tests.fuzz.draw import Draw, mutate_bytes
 from tests.fuzz.targets import Target

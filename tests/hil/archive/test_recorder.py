@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from drivers.c4g_packets import InitPacket
 from drivers.cycle_records import cycle_dtype
 from drivers.drive_train import DriveTrain
 from drivers.events import (
@@ -23,7 +24,6 @@ from drivers.events import (
     StateChanged,
 )
 from drivers.exchange.event_log import ExchangeEvent
-from drivers.packets import InitPacket
 from drivers.states import State
 from hil.archive import Archive, ArchiveSpec, Recorder, open_archive
 from hil.archive.process import BUFFERED_CYCLES, PreTriggerBuffer

@@ -13,10 +13,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from drivers.c4g_packets import INIT_LENGTH
 from drivers.exchange.event_log import NO_ARCHIVE
 from drivers.exchange.process_handle import ExchangeProcess, ExchangeSettings
 from drivers.motion_source import MotionSource
-from drivers.packets import INIT_LENGTH
 from drivers.states import State
 from drivers.transports.base import TransportSpec
 from drivers.transports.udp import UdpSpec

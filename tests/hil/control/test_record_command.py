@@ -21,8 +21,8 @@ import numpy as np
 import pytest
 from rich.console import Console
 
+from drivers.c4g_packets import DRIVE_ON, INIT_LENGTH
 from drivers.errors import ModeRefused
-from drivers.packets import DRIVE_ON, INIT_LENGTH
 from drivers.states import State
 from drivers.transports.simulated import Corrupt, Lose, SimulatedTransport
 from hil.archive import open_archive

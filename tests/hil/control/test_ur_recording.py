@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from drivers.packets import DRIVE_ON
+from drivers.c4g_packets import DRIVE_ON
 from drivers.states import State
 from drivers.ur.description import UrDescription
 from hil.archive import Archive, open_archive

@@ -12,7 +12,7 @@ from types import SimpleNamespace
 
 import pytest
 
-from drivers.packets import INIT_DTYPE
+from drivers.c4g_packets import INIT_DTYPE
 from hil.cell import Cell
 from hil.control.simulated_cell import simulated_controller
 from hil.testing import UdpController

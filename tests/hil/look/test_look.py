@@ -47,7 +47,7 @@ from hil.look.result import Aspect, TiedReading
 from hil.look.torque_sample import SETTINGS
 from hil.pipeline.sources import cell_of, source_of
 from identification.estimators.delay import DelayEstimate, UndeterminedDelay
-from identification.hypotheses.changes import Axes, Change
+from identification.hypotheses.joint_changes import Axes, Change
 from identification.hypotheses.scores import Score, compare, score_of
 from identification.hypotheses.torque_low_pass import TorqueLowPass
 from identification.model.robot import RobotModel

@@ -17,8 +17,8 @@ import pinocchio as pin
 import pytest
 from typer.testing import CliRunner
 
+from drivers.c4g_packets import InitPacket
 from drivers.init_check import verify_controller
-from drivers.packets import InitPacket
 from drivers.transports.udp import UdpSpec
 from hil.archive import ImportedSamples, write_samples
 from hil.base.errors import ArchiveError, ControllerError, InputError

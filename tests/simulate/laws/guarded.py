@@ -10,8 +10,8 @@ from collections.abc import Iterator
 
 import numpy as np
 
+from drivers.c4g_packets import LAST_NUMBER
 from drivers.events import MotionEnded
-from drivers.packets import LAST_NUMBER
 from tests.drivers.judge import Conduct
 from tests.drivers.oracle import number_of
 from tests.simulate.observed import Observed

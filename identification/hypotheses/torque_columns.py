@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from identification.arrays import Array
 from identification.factor.blocks import FOLDS
-from identification.hypotheses.changes import Change
+from identification.hypotheses.joint_changes import Change
 from identification.model.link_wrenches import N_LINK
 from identification.model.regressor import RegressorPlan
 from identification.model.robot import RobotModel

@@ -2,7 +2,7 @@
 
 Signs, orders, units, zeros and coupled angles of joints are changes of what was recorded; delay,
 drift of a zero, friction by the load, a load, and scale or friction of joints, throughout or in a
-part, are linear in columns of torque (:mod:`identification.hypotheses.columns`).
+part, are linear in columns of torque (:mod:`identification.hypotheses.torque_columns`).
 """
 
 from __future__ import annotations

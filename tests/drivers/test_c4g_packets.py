@@ -8,7 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from drivers import CyclicPacket, InitPacket, Mode, PacketError
-from drivers.packets import (
+from drivers.c4g_packets import (
     AXIS_DTYPE,
     INIT_DTYPE,
     INIT_LENGTH,
