@@ -37,6 +37,7 @@ from pathlib import Path
 from types import MappingProxyType
 from typing import Any, ClassVar, Final, Self
 
+from hil.base.exit_status import ExitStatus
 from hil.base.terminal_text import printable
 
 DISK_ERRNOS: Final = frozenset({errno.ENOSPC, errno.EDQUOT, errno.EIO, errno.EROFS, errno.EFBIG})
@@ -49,7 +50,7 @@ class HilError(Exception):
     `exit_code` is that of the command line; `figures` are JSON data about the work done before.
     """
 
-    exit_code: ClassVar[int] = 1
+    exit_code: ClassVar[int] = ExitStatus.FAILED
     figures: Mapping[str, object] = MappingProxyType({})
 
     def __reduce__(self) -> tuple[Any, ...]:
@@ -72,7 +73,7 @@ def _restored(kind: type[HilError], args: tuple[Any, ...], state: dict[str, Any]
 class InputError(HilError):
     """Invalid input of the user: file (or None), field in it, problem with the value, remedy."""
 
-    exit_code: ClassVar[int] = 2
+    exit_code: ClassVar[int] = ExitStatus.BAD_INPUT
 
     def __init__(
         self,
@@ -132,7 +133,7 @@ class RefusedRecordingError(SourceError):
     The exit status is that of the verdict on its archive: the result is negative.
     """
 
-    exit_code: ClassVar[int] = 5
+    exit_code: ClassVar[int] = ExitStatus.NEGATIVE_RESULT
 
 
 class UnrecordedJointError(SourceError):
@@ -172,19 +173,19 @@ class OutputError(HilError):
 class UnsafeError(HilError):
     """A motion that was refused before anything was sent."""
 
-    exit_code: ClassVar[int] = 3
+    exit_code: ClassVar[int] = ExitStatus.REFUSED
 
 
 class OperatorStopError(HilError):
     """Stopped by the operator; everything recorded is archived."""
 
-    exit_code: ClassVar[int] = 130
+    exit_code: ClassVar[int] = ExitStatus.STOPPED
 
 
 class ExecutionError(HilError):
     """A motion did not begin, or ended otherwise than planned, whoever ended it."""
 
-    exit_code: ClassVar[int] = 4
+    exit_code: ClassVar[int] = ExitStatus.CONTROLLER_FAULT
 
 
 class ControllerError(ExecutionError):

@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import ClassVar
 
 from hil.base.errors import HilError, UnsafeError
+from hil.base.exit_status import ExitStatus
 from hil.base.terminal_text import plural
 
 
@@ -46,7 +47,7 @@ class RepetitionsRejectedError(HilError):
     `cause` is a sentence on another likely cause.
     """
 
-    exit_code: ClassVar[int] = 5
+    exit_code: ClassVar[int] = ExitStatus.NEGATIVE_RESULT
 
     def __init__(self, motion: str, reasons: Sequence[str], cause: str = "") -> None:
         self.motion = motion

@@ -1,9 +1,7 @@
 """Command line of the package.
 
-Exit status: 0 done, 1 internal error or a disk that cannot be written, 2 bad input, 3 refused as
-unsafe, 4 controller fault, 5 done with a negative result (a model that is not good, a PC that is
-not fit, archives that could not be used), 130 stopped by the operator. With `--json` stdout is one
-JSON object, also on failure; the error text is printed to stderr in any case.
+Exit statuses are in `hil.base.exit_status`. With `--json` stdout is one JSON object, also on failure;
+the error text is printed to stderr in any case.
 """
 
 from __future__ import annotations
@@ -26,16 +24,12 @@ from rich.text import Text
 from typer.core import TyperCommand, TyperGroup, TyperOption
 
 from hil.base.errors import DISK_ERRNOS, HilError, InputError, OperatorStopError
+from hil.base.exit_status import ExitStatus
 from hil.base.interrupt import leave_if_interrupted
 from hil.base.progress_lines import command_lines
 from hil.base.terminal_text import printable
 from hil.base.version import software
 from hil.cli.suggestions import OTHER_COMMANDS, improve, with_present_names
-
-EXIT_INTERNAL = 1
-"""Exit status of an internal error, or of a disk that cannot be written."""
-EXIT_USAGE = 2
-"""Exit status of bad input."""
 
 
 def asks_for_json(arguments: Sequence[str]) -> bool:
@@ -49,11 +43,11 @@ def exit_code_of(error: BaseException) -> int:
     cause: BaseException | None = error
     while cause is not None:
         if isinstance(cause, OSError) and cause.errno in DISK_ERRNOS:
-            return EXIT_INTERNAL
+            return ExitStatus.FAILED
         cause = cause.__cause__
     if _comes_from_below(error):
-        return EXIT_USAGE
-    code = getattr(error, "exit_code", 1)  # of HilError and of click
+        return ExitStatus.BAD_INPUT
+    code = getattr(error, "exit_code", ExitStatus.FAILED)  # of HilError and of click
     return code if isinstance(code, int) else 1
 
 
@@ -308,9 +302,9 @@ def main() -> None:
         if error.errno not in DISK_ERRNOS:
             raise
         file = f"{error.filename}: " if error.filename else ""
-        _fail(f"{file}cannot be written ({error.strerror}); make room", EXIT_INTERNAL)
+        _fail(f"{file}cannot be written ({error.strerror}); make room", ExitStatus.FAILED)
     except KeyboardInterrupt:
-        _fail("interrupted", 130, stopped=True)
+        _fail("interrupted", ExitStatus.STOPPED, stopped=True)
     except Exception as error:
         if not isinstance(error, HilError) and not _comes_from_below(error):
             raise

@@ -13,16 +13,13 @@ import typer
 from hil.archive.check import ArchiveCheck, Overview, archive_files, check_archive, read_overview
 from hil.archive.repair import repair as repair_archive
 from hil.base.errors import ArchiveError, InputError
+from hil.base.exit_status import ExitStatus
 from hil.base.terminal_text import printable, typed
 from hil.cli import exit_code_of
 from hil.cli.arguments import JsonOption, print_json
 
 app = typer.Typer(help="Inspect, check and repair archives.", no_args_is_help=True)
 
-EXIT_NOT_CONFORMING = 5
-EXIT_NO_ARCHIVE = 2
-EXIT_FAILED = 1
-EXIT_RECORDS_LOST = 3
 
 Files = Annotated[
     list[Path], typer.Argument(help="Archives, or folders of them.", show_default=False)
@@ -55,11 +52,11 @@ def check(files: Files, as_json: JsonOption = False) -> None:
         try:
             result = check_archive(path)
         except ArchiveError as error:
-            status = EXIT_NO_ARCHIVE
+            status = ExitStatus.BAD_INPUT
             _print_error(path, error, as_json=as_json)
             continue
         if not result.conforms and not status:
-            status = EXIT_NOT_CONFORMING
+            status = ExitStatus.NEGATIVE_RESULT
         typer.echo(json.dumps(_check_dict(result)) if as_json else _shown(_check_lines(result)))
     raise typer.Exit(status)
 
@@ -87,7 +84,7 @@ def repair(
         done = repair_archive(file, output, in_place=in_place)
     except ArchiveError as error:
         _print_error(file, error, as_json=as_json)
-        raise typer.Exit(EXIT_FAILED) from error
+        raise typer.Exit(ExitStatus.FAILED) from error
     if as_json:
         print_json(
             {
@@ -99,7 +96,7 @@ def repair(
                 "samples_lost": done.samples_lost,
             }
         )
-        raise typer.Exit(EXIT_RECORDS_LOST if done.losses else 0)
+        raise typer.Exit(ExitStatus.RECORDS_LOST if done.losses else 0)
     for loss in done.losses:
         typer.echo(_shown([f"lost: {loss}"]), err=True)
     if done.output is None:
@@ -108,7 +105,7 @@ def repair(
         lost = {0: ", none lost", None: ", unknown number lost"}
         end = lost.get(done.samples_lost, f", {done.samples_lost} lost")
         typer.echo(_shown([f"wrote {done.output}: {done.samples} samples{end}"]))
-    raise typer.Exit(EXIT_RECORDS_LOST if done.losses else 0)
+    raise typer.Exit(ExitStatus.RECORDS_LOST if done.losses else 0)
 
 
 def _print_error(path: Path, error: ArchiveError, *, as_json: bool) -> None:

@@ -10,6 +10,7 @@ from typing import Annotated, Any, Final
 
 import typer
 
+from hil.base.exit_status import ExitStatus
 from hil.base.files import convert_write_errors, make_folder
 from hil.base.one_screen import TAIL_LINES, brief
 from hil.base.progress import reporter as make_reporter
@@ -26,9 +27,6 @@ from hil.cli.imports import RARE, Described, Reading
 from hil.fleet.logs import LogMap, write_maps
 from hil.fleet.table import write_batch
 from identification.text import percentage
-
-EXIT_SOME_BROKEN: Final = 5
-"""Exit status if some archives could not be used."""
 
 _MAX_LINES: Final = 20
 
@@ -84,7 +82,7 @@ def batch(
     else:
         _print(result, work.maps, written, quiet=quiet, verbose=verbose)
     if result.broken:
-        raise typer.Exit(EXIT_SOME_BROKEN)
+        raise typer.Exit(ExitStatus.NEGATIVE_RESULT)
 
 
 def _print(

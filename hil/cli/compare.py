@@ -7,13 +7,13 @@ from typing import Annotated
 
 import typer
 
+from hil.base.exit_status import ExitStatus
 from hil.base.files import make_folder, write_files
 from hil.base.one_screen import brief
 from hil.base.progress import reporter as make_reporter
 from hil.base.terminal_text import printable
 from hil.batch.cluster import Cluster
 from hil.cli.arguments import JsonOption, QuietOption, VerboseOption, print_json
-from hil.cli.verdict import EXIT_CHANGED
 from hil.compare import comparison as comparing
 from identification.text import unit_text
 
@@ -54,7 +54,7 @@ def compare(
         for line in lines if verbose else brief(lines):
             typer.echo(printable(line))
     if fail_on_change and comparison.changed:
-        raise typer.Exit(EXIT_CHANGED)
+        raise typer.Exit(ExitStatus.NEGATIVE_RESULT)
 
 
 def _lines(comparison: comparing.ArmComparison) -> list[str]:

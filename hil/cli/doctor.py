@@ -8,11 +8,11 @@ from typing import Annotated
 import typer
 from rich.console import Console
 
+from hil.base.exit_status import ExitStatus
 from hil.base.one_screen import brief
 from hil.base.progress import reporter, say
 from hil.cell import Cell
 from hil.cli.arguments import JsonOption, VerboseOption, print_json
-from hil.cli.verdict import EXIT_NOT_GOOD
 from hil.doctor.diagnosis import examine
 from hil.doctor.messages import as_json, show, summary
 
@@ -59,4 +59,4 @@ def doctor(
         for line in brief([*summary(diagnosis), "all checks, every remedy and the criteria: -v"]):
             say(line)
     if not diagnosis.fit or diagnosis.provisional:
-        raise typer.Exit(EXIT_NOT_GOOD)
+        raise typer.Exit(ExitStatus.NEGATIVE_RESULT)

@@ -9,6 +9,7 @@ from typing import Annotated, Literal
 import typer
 
 from hil.base.errors import InputError
+from hil.base.exit_status import ExitStatus
 from hil.base.one_screen import brief
 from hil.base.progress import reporter as make_reporter
 from hil.base.progress import say
@@ -20,7 +21,6 @@ from hil.cli.arguments import (
     with_options,
 )
 from hil.cli.identify_options import FEW, EstimatorOption, Identifying
-from hil.cli.verdict import EXIT_NOT_GOOD
 from hil.export.controller_code import (
     CodeName,
     ExportedCode,
@@ -115,7 +115,7 @@ def export(
         good = arm.good
         print_export(_exported(arm, archives, to, what, precision), json=json, quiet=quiet)
     if not good:
-        raise typer.Exit(EXIT_NOT_GOOD)
+        raise typer.Exit(ExitStatus.NEGATIVE_RESULT)
 
 
 def _exported(

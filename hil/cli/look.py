@@ -10,6 +10,7 @@ from typing import Annotated, Final
 
 import typer
 
+from hil.base.exit_status import ExitStatus
 from hil.base.files import write_output
 from hil.base.one_screen import SCREEN_COLUMNS, SCREEN_LINES, Paragraph, Part, one_screen
 from hil.base.progress import say
@@ -29,9 +30,6 @@ from hil.look.messages import (
 )
 from hil.look.readings import Fact
 from identification.text import joined, percentage
-
-EXIT_IN_DOUBT = 2
-"""Exit status of a recording that two explanations fit equally well."""
 
 
 @with_options(Described, "arm", but=("friction", "standstill_speed"))
@@ -80,7 +78,7 @@ def look(
         if not json:
             say(f"wrote {output}{', without what is undetermined: add a line' if is_open else ''}")
     if is_open:
-        raise typer.Exit(EXIT_IN_DOUBT)
+        raise typer.Exit(ExitStatus.BAD_INPUT)
 
 
 def whole(result: Look) -> list[str]:

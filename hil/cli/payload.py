@@ -8,11 +8,11 @@ from typing import Annotated
 
 import typer
 
+from hil.base.exit_status import ExitStatus
 from hil.base.one_screen import brief
 from hil.base.progress import reporter as make_reporter
 from hil.cli.arguments import JsonOption, QuietOption, VerboseOption, figures
 from hil.cli.identify_options import DelayOption, delay_from
-from hil.cli.verdict import EXIT_NOT_GOOD
 from hil.payload.payload_by_model import weigh_by_model
 from hil.payload.payload_run import find_payload
 from hil.pipeline.options import Options
@@ -69,4 +69,4 @@ def payload(
     lines = result.lines(wanted, outside, settings=verbose)
     typer.echo(text if json else "\n".join(lines if verbose else brief(lines)))
     if outside or result.is_doubtful:
-        raise typer.Exit(EXIT_NOT_GOOD)
+        raise typer.Exit(ExitStatus.NEGATIVE_RESULT)

@@ -6,13 +6,13 @@ from typing import Annotated
 
 import typer
 
+from hil.base.exit_status import ExitStatus
 from hil.base.one_screen import brief
 from hil.base.progress import reporter as make_reporter
 from hil.base.progress import say
 from hil.campaign import Campaign, stop_on_interrupt
 from hil.campaign.rehearsal_record import Rehearsal
 from hil.cli.arguments import CampaignArgument, JsonOption, QuietOption, VerboseOption
-from hil.cli.verdict import EXIT_NOT_GOOD
 
 
 def rehearse(
@@ -50,7 +50,7 @@ def rehearse(
         for line in [*lines, rehearsal.line] if verbose else brief([rehearsal.line, *lines]):
             say(line)
     if not rehearsal.passed:
-        raise typer.Exit(EXIT_NOT_GOOD)
+        raise typer.Exit(ExitStatus.NEGATIVE_RESULT)
 
 
 def _lines(rehearsal: Rehearsal, *, verbose: bool) -> list[str]:

@@ -9,6 +9,7 @@ from typing import Annotated
 import typer
 
 from hil.base.errors import InputError
+from hil.base.exit_status import ExitStatus
 from hil.base.files import make_folder
 from hil.base.one_screen import MAX_JOINT_ROWS, SCREEN_LINES, Paragraph, Part, columns, one_screen
 from hil.base.progress import Reporter, say
@@ -22,7 +23,6 @@ from hil.cli.arguments import (
     with_options,
 )
 from hil.cli.identify_options import EstimatorOption, Identifying, servo_from
-from hil.cli.verdict import EXIT_NOT_GOOD
 from hil.pipeline.options import Options
 from hil.pipeline.stored_identification import read_or_identify
 from hil.plots.plan_picture import save
@@ -112,7 +112,7 @@ def rollout(
         for line in [simulated.result.message] if quiet else lines:
             say(line)
     if not good:
-        raise typer.Exit(EXIT_NOT_GOOD)
+        raise typer.Exit(ExitStatus.NEGATIVE_RESULT)
 
 
 def screen(result: RolloutResult) -> list[str]:

@@ -13,6 +13,7 @@ import typer
 from hil.archive import ArchiveName
 from hil.archive.live import LiveView
 from hil.base.errors import ExecutionError, InputError
+from hil.base.exit_status import ExitStatus
 from hil.base.one_screen import brief
 from hil.base.progress import reporter as make_reporter
 from hil.base.progress import say
@@ -29,7 +30,7 @@ from hil.cli.arguments import (
     print_json,
     with_options,
 )
-from hil.cli.verdict import EXIT_NOT_GOOD, as_json, finish
+from hil.cli.verdict import as_json, finish
 from hil.cli.weigh import WeighingOptions, weigh
 from hil.control.cell_link import require_real_time
 from hil.control.errors import stopped
@@ -185,7 +186,7 @@ def _identify(
     verdict = json_format.loads(as_json(identification.results))
     print_json({**result.to_dict(), "verdict": verdict})
     if not identification.verdict.good:
-        raise typer.Exit(EXIT_NOT_GOOD)
+        raise typer.Exit(ExitStatus.NEGATIVE_RESULT)
 
 
 def _print(result: RunResult, *, verbose: bool, json: bool) -> None:

@@ -7,11 +7,11 @@ from pathlib import Path
 
 import typer
 
+from hil.base.exit_status import ExitStatus
 from hil.base.one_screen import Part, one_screen
 from hil.base.progress import say
 from hil.base.terminal_text import printable, typed
 from hil.cli.arguments import print_json
-from hil.cli.verdict import EXIT_NOT_GOOD
 from hil.results.servo_result import ServoResults
 from hil.servo.messages import screen, whole
 
@@ -51,4 +51,4 @@ def finish_servo(
         for line in one_screen([*screen(results, read), last]):
             typer.echo(printable(line))
     if not results.verdict.good:
-        raise typer.Exit(EXIT_NOT_GOOD)
+        raise typer.Exit(ExitStatus.NEGATIVE_RESULT)

@@ -12,6 +12,7 @@ from typing import Annotated, Final, Literal
 import typer
 
 from hil.base.errors import InputError
+from hil.base.exit_status import ExitStatus
 from hil.base.one_screen import wrapped
 from hil.base.progress import say_at_once
 from hil.base.terminal_text import plural, printable
@@ -280,9 +281,9 @@ def simulate(
     finally:
         end.close()
     if not served.summary.ended and pressed.interrupted:
-        raise typer.Exit(130)
+        raise typer.Exit(ExitStatus.STOPPED)
     if served.controller.program.gave_up or not served.summary.ended:
-        raise typer.Exit(4)
+        raise typer.Exit(ExitStatus.CONTROLLER_FAULT)
 
 
 @dataclass(frozen=True)

@@ -11,13 +11,13 @@ import tomlkit
 import typer
 
 from hil.base.errors import InputError
+from hil.base.exit_status import ExitStatus
 from hil.base.one_screen import SCREEN_COLUMNS
 from hil.base.progress import reporter as make_reporter
 from hil.base.progress import say
 from hil.base.toml_text import comment_lines, inline
 from hil.cli.arguments import JsonOption, QuietOption, numbers, print_json
 from hil.cli.identify_options import delay_from
-from hil.cli.verdict import EXIT_NOT_GOOD
 from hil.pipeline.sources import archives_in
 from hil.pipeline.torque_constants import GainsFound, find_gains
 from identification.estimators.current_gains import (
@@ -82,7 +82,7 @@ def torque_constants(
         for warning in result.warnings:
             say(f"warning: {warning}", err=True)
     if not result.gains.determined.all():
-        raise typer.Exit(EXIT_NOT_GOOD)
+        raise typer.Exit(ExitStatus.NEGATIVE_RESULT)
 
 
 def _refusal(field: str, problem: str, remedy: str) -> InputError:

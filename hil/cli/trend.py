@@ -9,6 +9,7 @@ from typing import Annotated, Final
 
 import typer
 
+from hil.base.exit_status import ExitStatus
 from hil.base.files import convert_write_errors, make_folder, write_files
 from hil.base.one_screen import TAIL_LINES, brief
 from hil.base.progress import reporter as make_reporter
@@ -17,7 +18,6 @@ from hil.cli.arguments import JsonOption, QuietOption, VerboseOption, print_json
 from hil.cli.fleet_options import Fleet, RecordingsArgument, last, map_lines, skipped_line
 from hil.cli.identify_options import Identifying
 from hil.cli.imports import RARE, Described, Reading
-from hil.cli.verdict import EXIT_CHANGED
 from hil.fleet.conditions import Conditions
 from hil.fleet.documents import as_dict
 from hil.fleet.estimated import estimated_fleet
@@ -94,7 +94,7 @@ def trend(
     else:
         _print(result, maps, written, quiet=quiet, verbose=verbose)
     if fail_on_change and result.changed:
-        raise typer.Exit(EXIT_CHANGED)
+        raise typer.Exit(ExitStatus.NEGATIVE_RESULT)
 
 
 def _print(

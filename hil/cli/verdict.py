@@ -10,6 +10,7 @@ from typing import Final
 
 import typer
 
+from hil.base.exit_status import ExitStatus
 from hil.base.one_screen import MAX_JOINT_ROWS, Paragraph, Part, columns, one_screen
 from hil.base.progress import say
 from hil.base.terminal_text import printable, typed
@@ -18,11 +19,6 @@ from hil.results.results import JointJudgement, JudgementResult, Results
 from identification.text import number, percentage
 from identification.validation.purpose_messages import TITLES, figure, requirement
 from identification.validation.verdict import fault_of
-
-EXIT_NOT_GOOD = 5
-"""Exit status of a command whose model is not good."""
-EXIT_CHANGED: Final = 5
-"""Exit status with --fail-on-change: something has changed."""
 
 MAX_SHOWN: Final = 3
 """Findings, and next steps, on one screen."""
@@ -64,7 +60,7 @@ def finish(
         for line in screen(results, written, read):
             typer.echo(printable(line))
     if not results.verdict.good:
-        raise typer.Exit(EXIT_NOT_GOOD)
+        raise typer.Exit(ExitStatus.NEGATIVE_RESULT)
 
 
 def as_json(results: Results, written: tuple[Path, Path] | None = None) -> str:

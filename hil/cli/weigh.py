@@ -11,6 +11,7 @@ import typer
 from rich.console import Console
 
 from hil.base.errors import InputError
+from hil.base.exit_status import ExitStatus
 from hil.base.one_screen import brief
 from hil.base.progress import reporter as make_reporter
 from hil.campaign import Campaign, stop_on_interrupt
@@ -18,7 +19,6 @@ from hil.campaign.campaign_run import RunResult
 from hil.campaign.operator_keys import can_read
 from hil.campaign.screen import confirmed
 from hil.cli.arguments import PAYLOAD, numbers, print_json
-from hil.cli.verdict import EXIT_NOT_GOOD
 from hil.precision.requirements import Requirement
 from hil.weighing.payload_campaign import (
     DEFAULT_CENTRE,
@@ -151,5 +151,5 @@ def weigh(
     else:
         typer.echo("\n".join(result.lines if verbose else brief(result.summary)))
     if result.payload.is_doubtful:
-        raise typer.Exit(EXIT_NOT_GOOD)
+        raise typer.Exit(ExitStatus.NEGATIVE_RESULT)
     return None

@@ -11,6 +11,7 @@ from typing import Any, ClassVar, Final
 
 from drivers.transports.simulated import SimulatedTransport
 from hil.base.errors import HilError
+from hil.base.exit_status import ExitStatus
 from hil.base.progress import Silent
 from hil.campaign import Campaign, VirtualLink, design
 from hil.cell import Cell
@@ -86,7 +87,7 @@ SESSION_SECONDS: Final = 120.0
 class SessionError(HilError):
     """The session of a simulated controller has no summary."""
 
-    exit_code: ClassVar[int] = 4
+    exit_code: ClassVar[int] = ExitStatus.CONTROLLER_FAULT
 
 
 @dataclass(eq=False)

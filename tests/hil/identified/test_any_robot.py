@@ -15,9 +15,9 @@ from scipy.signal import butter, sosfilt, sosfiltfilt
 from typer.testing import CliRunner
 
 from hil.base.errors import ArchiveError
+from hil.base.exit_status import ExitStatus
 from hil.base.progress import Silent
 from hil.cli import app
-from hil.cli.verdict import EXIT_NOT_GOOD
 from hil.importers.column_map import ColumnMap, Quantity, TimeColumn
 from hil.importers.imported_robot import Robot
 from hil.importers.log import import_log
@@ -198,7 +198,7 @@ def fitted_by(commands: list[str], output: Path) -> FittedResult:
         status = 0
         if arguments[0] == "identify":
             arguments = [*arguments, "--output", str(output)]
-            status = EXIT_NOT_GOOD
+            status = ExitStatus.NEGATIVE_RESULT
         result = CliRunner().invoke(app, arguments)
         assert result.exit_code == status, (command, result.output, result.exception)
     return Results.load(output / "results.json").fitted

@@ -16,11 +16,12 @@ from typer.testing import CliRunner
 
 from hil.archive import ImportedSamples, write_samples
 from hil.base.errors import ArchiveError, InputError, OutputError
+from hil.base.exit_status import ExitStatus
 from hil.base.one_screen import SCREEN_COLUMNS, SCREEN_LINES
 from hil.base.progress import Silent
 from hil.campaign.identified_campaign import identify_campaign
 from hil.cli import app
-from hil.cli.verdict import EXIT_NOT_GOOD, as_json, finish, screen, sentences, table, whole
+from hil.cli.verdict import as_json, finish, screen, sentences, table, whole
 from hil.control.planted_arm import planted_values
 from hil.importers.imported_robot import Robot
 from hil.pipeline.estimating import estimate_with
@@ -439,7 +440,7 @@ class TestJudgement:
         verdict = identification.results.verdict.model_copy(update={"good": good})
         with nullcontext() if good else pytest.raises(typer.Exit) as left:
             finish(identification.results.model_copy(update={"verdict": verdict}), json=False)
-        assert good or left.value.exit_code == EXIT_NOT_GOOD
+        assert good or left.value.exit_code == ExitStatus.NEGATIVE_RESULT
         printed = capsys.readouterr()
         assert " ".join(printed.out.split()).startswith(verdict.line)
         assert printed.err == ""
