@@ -1,7 +1,7 @@
 """Command line of the package.
 
-Exit statuses are in `hil.base.exit_status`. With `--json` stdout is one JSON object, also on failure;
-the error text is printed to stderr in any case.
+Exit statuses are in `hil.base.exit_status`. With `--json` stdout is one JSON object, also on
+failure; the error text is printed to stderr in any case.
 """
 
 from __future__ import annotations
