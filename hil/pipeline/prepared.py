@@ -333,11 +333,10 @@ class _DelayChoice:
                 estimate, unapplied, filtered=filtered or _asks_low_pass(sources, options)
             )
         delay = SuggestedDelay(estimate.delay, estimate.determined and estimate.significant)
-        doubtful = estimate.determined and estimate.unconfirmed
         return replace(
             unused,
-            suggested=(delay,) if estimate.significant or doubtful else (),
-            notes=(described,) if doubtful else unapplied,
+            suggested=(delay,) if estimate.significant or estimate.unconfirmed else (),
+            notes=(described,) if estimate.unconfirmed else unapplied,
             errors=dict.fromkeys((estimate.applied, estimate.delay), estimate.variance),
         )
 
