@@ -3,76 +3,27 @@
 `plan` turns via points into a `PiecewiseCubic`, `plan_moves` does so with settings for each move,
 `Interpolator` step by step while targets arrive. `TrajectoryPlayer` returns one set-point per
 controller cycle, at an override that may change, and stops a motion on its path.
+
+The names of `planner.api`, which are imported when the first of them is used: who needs one
+module does not wait for all.
 """
 
-from planner.errors import (
-    InvalidLimits,
-    InvalidPlanFile,
-    InvalidSetting,
-    InvalidTrajectory,
-    InvalidViaPoints,
-    LimitExceeded,
-    NotSmooth,
-    PlannerCrashed,
-    PlannerError,
-    PlannerNotStarted,
-    PlanningError,
-    PlanningTimedOut,
-    StartMismatch,
-    UnsupportedSolver,
-)
-from planner.fourier import FourierSeries, harmonic_bounds
-from planner.interpolator import Interpolator
-from planner.limits import JointLimits
-from planner.moves import (
-    MotionPlan,
-    Move,
-    Overrides,
-    TargetPassage,
-    plan,
-    plan_chunk,
-    plan_moves,
-)
-from planner.piecewise_cubic import Extrema, PiecewiseCubic, Trajectory, check_limits, check_rest
-from planner.plan_file import PlanFile, to_csv
-from planner.player import TrajectoryPlayer
-from planner.worker import WorkerProcess, in_child, plan_in_child
+from importlib import import_module
+from typing import TYPE_CHECKING, Any
 
-__all__ = [
-    "plan",
-    "plan_moves",
-    "Move",
-    "Overrides",
-    "MotionPlan",
-    "TargetPassage",
-    "plan_chunk",
-    "plan_in_child",
-    "in_child",
-    "WorkerProcess",
-    "check_limits",
-    "check_rest",
-    "JointLimits",
-    "Trajectory",
-    "PiecewiseCubic",
-    "Extrema",
-    "FourierSeries",
-    "harmonic_bounds",
-    "TrajectoryPlayer",
-    "Interpolator",
-    "PlanFile",
-    "to_csv",
-    "PlannerError",
-    "InvalidLimits",
-    "InvalidSetting",
-    "InvalidTrajectory",
-    "InvalidPlanFile",
-    "InvalidViaPoints",
-    "PlanningError",
-    "LimitExceeded",
-    "NotSmooth",
-    "UnsupportedSolver",
-    "PlannerCrashed",
-    "PlannerNotStarted",
-    "PlanningTimedOut",
-    "StartMismatch",
-]
+if TYPE_CHECKING:
+    from planner.api import *  # noqa: F403
+
+
+def __getattr__(name: str) -> Any:
+    """A name of `planner.api`."""
+    if name == "__all__" or not name.startswith("_"):
+        api = import_module("planner.api")
+        if name in ("__all__", *api.__all__):
+            return getattr(api, name)
+    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+
+
+def __dir__() -> list[str]:
+    """All names, loaded or not: the reference documents them."""
+    return [*globals(), *import_module("planner.api").__all__]

@@ -24,7 +24,7 @@ from hil.base.safe_input import parse_toml, read_text, remedy_for_missing
 from hil.base.terminal_text import typed
 from identification.model.robot import RobotModel
 from identification.model.workspace import Box, Workspace
-from planner import JointLimits
+from planner.limits import JointLimits
 
 from .errors import CellError, first_error, require_known
 from .robot_model import robot_model
