@@ -32,7 +32,7 @@ from hil.look.other_arm import Contradictions
 from hil.look.readings import Basis, Fact, NextStep, NoJointTorque
 from hil.look.result import Aspect, Look, ParameterGroup, Row
 from hil.look.servo_load import may_be_load, servo_load, torques_without_sign, without_torque
-from hil.look.torque_sample import SETTINGS, TorqueSample, explained
+from hil.look.torque_sample import SETTINGS, TorqueSample, explained, prepared
 from hil.look.undescribed import undescribed_robot
 from hil.pipeline.sources import Source, cell_of, source_of
 from identification.errors import IdentificationError
@@ -44,8 +44,8 @@ from identification.hypotheses.scores import score_of
 from identification.hypotheses.search import EXPLAINED_ERROR, Readings, find_readings
 from identification.hypotheses.torque_low_pass import TorqueLowPass, torque_low_pass
 from identification.model.robot import RobotModel
-from identification.signals.recording import Recording, RecordingError
-from identification.signals.samples import Samples, prepare
+from identification.signals.recording import RIGID_RATE, Recording, RecordingError
+from identification.signals.samples import Samples
 
 _DELAY_SAMPLES: Final = 20_000
 _RANGE_NUMBER: Final = 100.0  # a servo's number at the ends of its range
@@ -208,7 +208,7 @@ def look_at_joints(source: Path, imported: ImportedRecording) -> Look:
 def _finding(
     source: Path, imported: ImportedRecording, cell: Cell, recording: Recording
 ) -> physics.TorqueFindings:
-    samples = prepare(recording, cell.model, options=SETTINGS)
+    samples = prepared(recording, cell.model)
     rows = few_rows([samples])
     torque = torque_of(cell.model, [samples], rows, score_of(cell.model, rows))
     if torque.time is not None:
@@ -264,9 +264,10 @@ def _channel(
     recording: Recording, model: RobotModel
 ) -> tuple[DelayEstimate | None, TorqueLowPass | None]:
     """Return delay and low-pass of the torque; None where the motion does not say."""
-    some = recording.between(0, min(recording.n_samples, _DELAY_SAMPLES))
+    some = recording.between(0, min(recording.n_samples, _DELAY_SAMPLES)).averaged(RIGID_RATE)
     try:
         delay = estimate_delay(some, model, options=SETTINGS)
+        delay = replace(delay, cycle=float(np.median(np.diff(recording.time))))
         return delay, torque_low_pass(some, model, SETTINGS)
     except IdentificationError:
         return None, None

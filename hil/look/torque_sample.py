@@ -23,7 +23,9 @@ from identification.hypotheses.diagnosis import (
     with_readings,
 )
 from identification.hypotheses.scores import Score, score_of
+from identification.model.robot import RobotModel
 from identification.signals.position_steps import PositionJump, position_steps
+from identification.signals.recording import RIGID_RATE, Recording
 from identification.signals.samples import Preprocessing, Samples, Smoothed, prepare
 
 SETTINGS: Final = Preprocessing(14.0, exclude_rows="rests")
@@ -34,6 +36,11 @@ logs of four real arms have 0.04 to 0.11, with URDFs of other arms 0.09 to 1.1."
 # of the error, that a low-pass or heavy rotors leave where they are there
 _EXPLAINED_ERROR_RATIO: Final = 0.5
 _DRIVING_FRICTION_SIGMAS: Final = -4.0  # standard errors of a friction that drives a joint
+
+
+def prepared(recording: Recording, model: RobotModel) -> Samples:
+    """Return a recording prepared for a comparison of its readings."""
+    return prepare(recording.averaged(RIGID_RATE), model, options=SETTINGS)
 
 
 @dataclass(frozen=True, eq=False)
@@ -60,7 +67,7 @@ class TorqueSample:
         cell = cell_of(archive)
         try:
             source = source_of(archive, cell)
-            samples = prepare(source.recording, cell.model, options=SETTINGS)
+            samples = prepared(source.recording, cell.model)
             rows = few_rows([samples])
             if not rows.usable.any():
                 return None  # nothing moves
@@ -120,7 +127,7 @@ def explained(archive: Archive) -> Explained | None:
     cell = cell_of(archive)
     model = cell.model
     try:
-        recording = source_of(archive, cell).recording
+        recording = source_of(archive, cell).recording.averaged(RIGID_RATE)
         motions: dict[Preprocessing, Smoothed] = {}
         unfiltered = prepare(recording, model, options=SETTINGS, motions=motions)
         least = min(UNEXPLAINED, _EXPLAINED_ERROR_RATIO * score_of(model, unfiltered).overall)

@@ -40,7 +40,7 @@ from identification.selection.scores import Known
 from identification.selection.settings import Settings
 from identification.signals.clock import time_base
 from identification.signals.masks import MIN_STRETCH_SAMPLES, RowReason
-from identification.signals.recording import Recording, in_succession
+from identification.signals.recording import RIGID_RATE, Recording, in_succession
 from identification.signals.samples import (
     RIGID_BANDWIDTH,
     Preprocessing,
@@ -210,7 +210,6 @@ def _array(figures: tuple[float, ...] | None) -> Array | None:
 
 MAX_RECORDINGS: Final = 32
 """Recordings that settings are chosen from."""
-_DELAY_RATE: Final = 250.0  # Hz, to which it is averaged; both positions and torques, without bias
 # cycles, by which a delay in use may differ from the stated one unsaid
 _DELAY_TOLERANCE_CYCLES: Final = 0.05
 _STEP_TOLERANCE: Final = 0.1  # of sampling intervals of recordings that are estimated together
@@ -333,10 +332,11 @@ class _DelayChoice:
                 estimate, unapplied, filtered=filtered or _asks_low_pass(sources, options)
             )
         delay = SuggestedDelay(estimate.delay, estimate.determined and estimate.significant)
+        doubtful = estimate.determined and estimate.unconfirmed
         return replace(
             unused,
-            suggested=(delay,) if estimate.significant or estimate.unconfirmed else (),
-            notes=(described,) if estimate.unconfirmed else unapplied,
+            suggested=(delay,) if estimate.significant or doubtful else (),
+            notes=(described,) if doubtful else unapplied,
             errors=dict.fromkeys((estimate.applied, estimate.delay), estimate.variance),
         )
 
@@ -607,7 +607,7 @@ def _averaged_for(duration: float, sources: Sequence[Source]) -> list[Recording]
         if duration < np.inf:
             recording = recording.between(0, max(2, math.ceil(duration / _step(recording))))
             duration -= recording.n_samples * _step(recording)
-        average = recording.averaged(_DELAY_RATE)
+        average = recording.averaged(RIGID_RATE)
         if not averages or np.isclose(_step(average), _step(averages[0]), rtol=_STEP_TOLERANCE):
             averages.append(average)
     return averages

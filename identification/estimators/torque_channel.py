@@ -23,7 +23,7 @@ from identification.model.robot import RobotModel
 from identification.signals.clock import MAX_STEP_DEVIATION
 from identification.signals.masks import MAX_END_SECONDS, edge_rows
 from identification.signals.noise import noiseless_above
-from identification.signals.recording import Recording
+from identification.signals.recording import RIGID_RATE, Recording
 from identification.signals.samples import RIGID_BANDWIDTH, Preprocessing, Samples, prepare
 from identification.signals.smoothing import (
     FORWARDS,
@@ -44,7 +44,6 @@ _VERTEX_SPACINGS: Final = (0.07, 0.02)
 _BANDWIDTH_OCTAVES: Final = ((1.0, 2.0), (2.0, 4.0))
 # share of a low-pass from which on the torque is nearer to it than to none
 _MIN_LOW_PASS_SHARE: Final = 0.5
-_MAX_RATE: Final = 250.0  # Hz; rows beyond it are averaged
 
 # Half a period of the lowest bandwidth: shorter stretches do not show it, and shorter rests between
 # stretches stay in, because leaving them out would cost more neighbouring rows.
@@ -108,7 +107,7 @@ def possible_low_passes(
         undelayed: delay without a low-pass [s], by default that of the options.
     """
     still = options.torque_delay if undelayed is None else undelayed
-    mean = recording.averaged(_MAX_RATE)
+    mean = recording.averaged(RIGID_RATE)
     if noise_variance is not None:
         noise_variance = noise_variance * mean.n_samples / recording.n_samples
     wide = replace(

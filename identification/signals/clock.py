@@ -29,7 +29,6 @@ _REGULAR_STEP_TOLERANCE: Final = 0.25
 _STEP_LAG: Final = 7  # steps for measuring the usual step
 _PHASE_SAMPLES: Final = 51  # samples averaged for the phase; slower changes are drift
 _REFINEMENTS: Final = 3  # iterations of step and count of steps
-_EARLIEST: Final = 3.0  # distances of the lower quartile from the median, below that quartile
 _DRIFT_SAMPLES: Final = 101
 _DECISION_SIGMAS: Final = 3.0  # required significance of the decision, standard deviations
 _OUTLIER_SIGMAS: Final = 6.0  # limit of the influence of a row, standard deviations
@@ -257,8 +256,7 @@ def _are_late_in_bursts(time: Array, signals: Array, reported: Rows | None) -> b
 def _mean_step(time: Array, segments: Sequence[slice]) -> float:
     """Return the step [s] of the line below the stamps of the longest segment.
 
-    Stamps come late, so that the earliest show the clock; a clock that was set back for some rows
-    does not.
+    Stamps come late and never early, so that the earliest show the clock.
     """
     longest = max(segments, key=lambda part: part.stop - part.start)
     stamps = time[longest] - time[longest.start]
@@ -268,8 +266,7 @@ def _mean_step(time: Array, segments: Sequence[slice]) -> float:
     for _ in range(_REFINEMENTS):
         line = np.polynomial.Polynomial.fit(rows[early], stamps[early], 1)
         late = stamps - line(rows)
-        low, middle = np.quantile(late, (0.25, 0.5))
-        early = (low - _EARLIEST * (middle - low) <= late) & (late <= middle)
+        early = late <= np.median(late)
         slope = float(line.convert().coef[1])
     return slope
 

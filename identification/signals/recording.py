@@ -21,6 +21,9 @@ MAX_PAUSE_SECONDS: Final = 600.0
 PAUSE_SECONDS: Final = 10.0
 """Time without sample [s] at which an imported recording is cut."""
 _PART_GAP_SECONDS: Final = 1.0  # s, left of a pause; a gap at every rate
+RIGID_RATE: Final = 250.0
+"""Rate [Hz] to which recordings are averaged where only the arm as rigid bodies is asked about:
+positions and torques alike, without bias."""
 GAP_STEPS: Final = 5.0  # clock steps of a gap, in usual steps
 
 

@@ -44,13 +44,14 @@ from hil.look.readings import (
     TorqueDelay,
 )
 from hil.look.result import Aspect, TiedReading
-from hil.look.torque_sample import SETTINGS
+from hil.look.torque_sample import SETTINGS, prepared
 from hil.pipeline.sources import cell_of, source_of
 from identification.estimators.delay import DelayEstimate, UndeterminedDelay
 from identification.hypotheses.joint_changes import Axes, Change
 from identification.hypotheses.scores import Score, compare, score_of
 from identification.hypotheses.torque_low_pass import TorqueLowPass
 from identification.model.robot import RobotModel
+from identification.signals.recording import Recording
 from identification.signals.samples import prepare
 from tests.hil.importers.bags import STATE, bag, state, states
 from tests.hil.importers.moving_log import JOINTS, URDF
@@ -514,6 +515,15 @@ class TestOtherArm:
         result = hil("identify", path, "--urdf", other)
         assert not isinstance(result.exception, SourceError)
         assert (tmp_path / "a" / "results.json").exists()
+
+
+def test_rows_beyond_what_rigid_bodies_show_are_averaged() -> None:
+    time = np.arange(5000) * 1e-3
+    position = np.sin(time[:, None] * [1.0, 1.3, 1.7])
+    recording = Recording(time, position, JOINTS, np.cos(position))
+    averaged = prepared(recording, RobotModel.from_urdf(URDF))
+    assert averaged.motion.n_samples == 1250
+    assert averaged.motion.position[600] == pytest.approx(position[2400:2404].mean(axis=0), 1e-4)
 
 
 def test_payload_is_part_of_what_the_motion_determines(
