@@ -88,14 +88,14 @@ class Change(NamedTuple):
         return self.order or self.joints[::-1]
 
 
-_AS_READ: Final = Change("position order")
+AS_READ: Final = Change("position order")
 """No change: an order of no joints."""
 
 
 def change_of_motion(change: Change) -> Change:
     """Return the change of the motion that is part of a change, or of a mounting."""
     if change.meaning in ("torque sign", "torque order", "scale"):
-        return _AS_READ
+        return AS_READ
     if change.meaning == "axis sign":
         return change._replace(meaning="position sign")
     if change.meaning.endswith("order"):
@@ -132,7 +132,7 @@ def changed_samples(model: RobotModel, samples: Samples, change: Change) -> Samp
     if samples.parent is not None:
         parent, part = samples.parent
         result = replace(result, parent=(changed_samples(model, parent, change), part))
-    if change_of_motion(change) == _AS_READ:
+    if change_of_motion(change) == AS_READ:
         return result
     order = axes.position_order
     read = axes.factor * np.eye(model.n_joints)[order] * axes.position_sign[:, None]

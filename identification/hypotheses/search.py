@@ -23,6 +23,7 @@ from identification.factor.columns import every_torque_factor
 from identification.factor.factor import MIN_NOISE, Factor
 from identification.hypotheses.gravity_share import has_part_of_gravity
 from identification.hypotheses.joint_changes import (
+    AS_READ,
     COUPLED,
     DEGREE,
     GRAVITIES,
@@ -699,12 +700,15 @@ class _Search:
     def unseen_zeros(self) -> tuple[int, ...]:
         """Return the joints whose zeros may also be others."""
         joints = np.flatnonzero(self.model.chain.revolute).tolist()
-        unseen = []
-        for joint in joints:
-            trials = [self._try(Change("zero", (joint,), s * 45.0 * DEGREE)) for s in (-1.0, 1.0)]
-            if min(trial.against.sigmas for trial in trials) < SEPARATE_SIGMAS:
-                unseen.append(joint)
-        return tuple(unseen)
+        angles = (-45.0 * DEGREE, 45.0 * DEGREE)
+        return tuple(
+            joint
+            for joint in joints
+            if any(
+                self._try(Change("zero", (joint,), angle)).against.sigmas < SEPARATE_SIGMAS
+                for angle in angles
+            )
+        )
 
     def _are_alike(self, trial: Trial, best: Trial) -> bool:
         """Whether two changes fit alike, so that the recording does not choose one."""
@@ -773,15 +777,9 @@ class _Search:
         """Return the changes of least error, tried on all rows."""
         if self._trials is None:
             fits = _Fits(self.model, _thinned(self.samples, _FIRST_TRIAL_ROWS), self._mountings)
-            errors = fits.errors(list(self._to_try()))
-            ranked = sorted(errors, key=lambda change: errors[change])
-            closer = ranked[:_COMPARED_CHANGES]
-            kinds = {kind_of(change) for change in closer}
-            for change in ranked:
-                if kind_of(change) not in kinds:
-                    kinds.add(kind_of(change))
-                    closer.append(change)
-            trials = [self._try(change) for change in closer]
+            errors = fits.errors([AS_READ, *self._to_try()])
+            excluded = errors.pop(AS_READ) + SURE_SIGMAS**2 * ROWS_PER_FACT / fits.rows
+            trials = [self._try(change) for change in to_compare(errors, excluded)]
             self._trials = [*trials, *self._orders(trials, fits)]
         return self._trials
 
@@ -836,6 +834,11 @@ class _Fits:
         self._counts = ~little_torque(torque, ~np.array(model.chain.revolute))
         self._sums: dict[Change, Factor] = {}  # of every torque, by the change of the motion
 
+    @property
+    def rows(self) -> int:
+        """Number of rows."""
+        return len(self._samples.torque)
+
     def errors(self, changes: Sequence[Change]) -> dict[Change, float]:
         """Return logarithms of the squared errors of fits, each summed over the torques.
 
@@ -871,6 +874,27 @@ class _Fits:
             squares = each.squared_errors(values)[self._counts[read.torque_order]]
             errors[change] = float(np.log(np.where(squares > 0.0, squares, 1.0)).sum())
         return errors
+
+
+def to_compare(errors: Mapping[Change, float], excluded: float) -> list[Change]:
+    """Return the changes to compare on all rows: those of least error, and one of each kind.
+
+    Of those that the fits exclude, only the nearest of each meaning: it says how certainly.
+
+    Args:
+        errors: of fits to few rows.
+        excluded: error from which a change is certainly worse than none.
+    """
+    chosen: list[Change] = []
+    kinds: set[object] = set()
+    meanings: set[Meaning] = set()
+    for place, change in enumerate(sorted(errors, key=lambda change: errors[change])):
+        is_new = place < _COMPARED_CHANGES or kind_of(change) not in kinds
+        if (is_new and errors[change] < excluded) or change.meaning not in meanings:
+            chosen.append(change)
+        kinds.add(kind_of(change))
+        meanings.add(change.meaning)
+    return chosen
 
 
 def of_torques(every: Sequence[Factor], axes: Sequence[Axes]) -> TorqueSums:

@@ -18,7 +18,7 @@ from identification.hypotheses.joint_changes import (
     change_of_motion,
     changed_samples,
 )
-from identification.hypotheses.search import Step, find_readings, of_torques
+from identification.hypotheses.search import Step, find_readings, of_torques, to_compare
 from identification.signals.samples import Preprocessing, prepare
 from tests.identification.three_axes import HIP, KNEE, NAMES, TIME, model, motion
 from tests.tiers import quick_ones
@@ -165,3 +165,12 @@ def test_sums_of_every_torque_are_those_of_each_reading() -> None:
         of_factor = TorqueSums.of(factor).posterior(prior.mean, prior.information, 1e-6)
         alone = TorqueSums(gram, rows).posterior(mean, information, 1e-6)
         np.testing.assert_allclose(alone[1], of_factor[1], rtol=1e-6)
+
+
+def test_excluded_readings_are_hardly_compared() -> None:
+    signs = [Change("torque sign", (joint,)) for joint in range(20)]
+    zeros = [Change("zero", (joint,), 0.5) for joint in range(3)]
+    errors = {change: float(place) for place, change in enumerate([*signs, *zeros])}
+    assert to_compare(errors, 30.0) == [*signs, *zeros]  # each joint has a sign and a zero
+    assert to_compare(errors, 2.5) == [*signs[:3], zeros[0]]
+    assert to_compare(errors, -1.0) == [signs[0], zeros[0]]

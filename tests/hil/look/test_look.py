@@ -517,7 +517,7 @@ class TestOtherArm:
         assert (tmp_path / "a" / "results.json").exists()
 
 
-def test_rows_beyond_what_rigid_bodies_show_are_averaged() -> None:
+def test_a_high_rate_is_averaged() -> None:
     time = np.arange(5000) * 1e-3
     position = np.sin(time[:, None] * [1.0, 1.3, 1.7])
     recording = Recording(time, position, JOINTS, np.cos(position))
