@@ -224,7 +224,7 @@ def _gate(campaign: CampaignState, step: CampaignStep, record: Path) -> Campaign
     if step.done or record.exists() or not campaign.cell.only_simulated:
         return step
     if all(_motions(campaign, kind, kind).done for kind in ("excitation", "validation")):
-        return CampaignStep("done", "left out, which a simulated arm allows")
+        return CampaignStep("done", "skipped, as the arm is simulated")
     return step
 
 

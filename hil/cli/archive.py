@@ -14,9 +14,13 @@ from hil.archive.check import ArchiveCheck, Overview, archive_files, check_archi
 from hil.archive.repair import repair as repair_archive
 from hil.base.errors import ArchiveError, InputError
 from hil.base.exit_status import ExitStatus
+from hil.base.one_screen import SCREEN_COLUMNS, SCREEN_LINES
 from hil.base.terminal_text import printable, typed
 from hil.cli import exit_code_of
-from hil.cli.arguments import JsonOption, print_json
+from hil.cli.arguments import JsonOption, VerboseOption, print_json
+
+_CUT: Final = " ..."
+"""End of a line that is longer than the screen."""
 
 app = typer.Typer(help="Inspect, check and repair archives.", no_args_is_help=True)
 
@@ -27,7 +31,7 @@ Files = Annotated[
 
 
 @app.command("info")
-def info(files: Files, as_json: JsonOption = False) -> None:
+def info(files: Files, as_json: JsonOption = False, verbose: VerboseOption = False) -> None:
     """Print the content of archives: motion, joints, channels, sizes, attachments."""
     failed = 0
     for path in archive_files(files):
@@ -37,7 +41,9 @@ def info(files: Files, as_json: JsonOption = False) -> None:
             failed = exit_code_of(error)
             _print_error(path, error, as_json=as_json)
             continue
-        typer.echo(json.dumps(overview.to_dict()) if as_json else _shown(_info_lines(overview)))
+        lines = _info_lines(overview)
+        shown = lines if verbose else _one_screen(lines)
+        typer.echo(json.dumps(overview.to_dict()) if as_json else _shown(shown))
     raise typer.Exit(failed)
 
 
@@ -157,6 +163,22 @@ _UNITS: Final[Mapping[str, str | Mapping[str, str]]] = {
     },
 }
 """Units of the entries of an overview: of a row, or by the name of a table's row."""
+
+
+def _one_screen(lines: Sequence[str]) -> list[str]:
+    """Return at most a screen of lines, each cut to its width, and what -v shows in addition."""
+    whole = [printable(line, keep="") for line in lines]
+    if len(whole) <= SCREEN_LINES and max(map(len, whole)) <= SCREEN_COLUMNS:
+        return whole
+    shown = [*map(_cut, whole[: SCREEN_LINES - 1])]
+    more = len(whole) - len(shown)
+    return [*shown, f"{more} more lines, and whole lines: -v" if more > 0 else "whole lines: -v"]
+
+
+def _cut(line: str) -> str:
+    if len(line) <= SCREEN_COLUMNS:
+        return line
+    return f"{line[: SCREEN_COLUMNS - len(_CUT)].rstrip()}{_CUT}"
 
 
 def _info_lines(overview: Overview) -> list[str]:

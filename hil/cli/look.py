@@ -194,13 +194,21 @@ def summary(rows: Sequence[Row]) -> list[str]:
             meaning = shorten(text.reading, _MEANING_COLUMNS, placeholder=" ...")
             certainty_cell = f"{row.certainty:{_CERTAINTY_COLUMNS}}"
             first = f"{row.aspect:{width}}  {meaning:{_MEANING_COLUMNS}}  {certainty_cell}  "
-            words = " ".join(text.reason.split()[:_EVIDENCE_WORDS]).rstrip(":;,")
-            lines.append(first + shorten(words, SCREEN_COLUMNS - len(first), placeholder=" ..."))
+            lines.append(first + short_evidence(text.reason, SCREEN_COLUMNS - len(first)))
     for certainty in Certainty:
         names = ", ".join(row.aspect for row in usual if row.certainty is certainty)
         if names:
             lines.append(f"as the URDF says, {certainty}: {names}")
     return lines
+
+
+def short_evidence(reason: str, width: int) -> str:
+    """Return the first words of a reason, at most `width` characters, with dots where it is cut."""
+    words = reason.split()
+    if len(words) <= _EVIDENCE_WORDS:
+        return shorten(reason, width, placeholder=" ...")
+    first = " ".join(words[:_EVIDENCE_WORDS]).rstrip(":;,")
+    return shorten(f"{first} ...", width, placeholder=" ...")
 
 
 def determined(groups: Sequence[ParameterGroup]) -> list[str]:

@@ -66,9 +66,9 @@ def rollout(
     the measured ones, for the identified arm, the nominal one, and arms drawn from the posterior.
     The arm is driven by the recorded torque and a light feedback, or by a servo. Parameters and
     settings come from results.json and parameters.json in a folder, as for `hil export`; its report
-    gets a section. From archives without torque, --polish identifies servo, friction and rotors by
-    commanded and measured positions, with the masses of the URDF. Writes rollout.json and
-    rollout.png. Exit status 5 if the model is not good.
+    gets a section. Archives without torque are simulated on a servo, which is identified with
+    friction and rotors from commanded and measured positions, with the masses of the URDF. Writes
+    rollout.json and rollout.png. Exit status 5 if the model is not good.
 
     **Example:** `hil rollout runs/demo`
 
@@ -93,7 +93,7 @@ def rollout(
     options = how.options(split=split, estimator=estimator)
     output = _folder(output, archives)
     as_usual = options == Options() and not again
-    if polish and without_torque(archives):
+    if without_torque(archives):
         if servo is not None:
             problem = "cannot be given for recordings without torque, from which it is identified"
             raise InputError(archives[0], problem, field="--servo", remedy="omit it")

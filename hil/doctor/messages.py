@@ -11,7 +11,7 @@ from rich.table import Table
 from rich.text import Text
 
 from drivers.exchange.realtime import LIMITS_FILE, RealTimeSettings
-from hil.base.terminal_text import printable
+from hil.base.terminal_text import plural, printable
 from hil.doctor.diagnosis import REPLY_RESERVE_SECONDS, Diagnosis, Fitness
 from hil.doctor.findings import (
     CanInterface,
@@ -389,7 +389,7 @@ def reason_of(verdict: Fitness) -> str:
     if late := verdict.late_cycles:
         hours = evidence.seconds / 3600.0
         return (
-            f"{late} cycles late in {evidence.seconds:.0f} s of {evidence.worst} (some"
+            f"{plural(late, 'cycle')} late in {evidence.seconds:.0f} s of {evidence.worst} (about"
             f" {late / hours:.0f} an hour), the longest {1e3 * evidence.longest:.1f} ms"
         )
     if not verdict.fit:

@@ -73,7 +73,7 @@ def servo_read_lines(servo: IdentifiedServo) -> list[tuple[str, str]]:
             *lines[: _MAX_RECORDING_LINES - 1],
             ("", f"and {plural(more + 1, 'recording')} more"),
         ]
-    return [*lines, *(("of all", text) for text in common)]
+    return [*lines, *(("all files", text) for text in common)]
 
 
 def _same(arm: IdentifiedArm) -> bool:

@@ -63,7 +63,7 @@ def recording_results(staging: Staging, predicted: Sequence[Path]) -> list[Recor
         RecordingResult(
             file=staging.sources[place].name,
             use="predicted" if staging.sources[place] in predicted else "fitted",
-            content=content(recording),
+            content=size(recording),
             changes=[
                 sentence(found)
                 for found in recording.concluded

@@ -745,7 +745,7 @@ def _(explained: ExplainedTorque) -> str:
 @import_messages.worded.register
 def _(none: NoJointTorque) -> str:
     reasons = f"{_why_no_torque(none)}; {_as_a_torque(none)}"
-    return f"torque: left out as the load or duty of a servo: {reasons}"
+    return f"torque: ignored, as it looks like the load or duty cycle of a servo: {reasons}"
 
 
 @_worded.register

@@ -9,7 +9,7 @@ from pathlib import Path
 
 from hil.base.progress import Reporter
 from hil.cell.nominal import Nominal, nominal_of
-from identification import Estimate, Factor, IdentificationError
+from identification import Factor, IdentificationError
 from identification.hypotheses.column_scores import ScorePrior
 from identification.hypotheses.diagnosis import TorqueDiagnosis
 from identification.purposes.purposes import Application, purposes_of
@@ -98,7 +98,7 @@ def validate(
         possible = None if isinstance(consistency, NotConsistent) else consistency
         evidence = replace(evidence, form=estimation.form, consistency=possible)
         task.advance(1, "purposes")
-        application = _application(prepared, result.pooled, evidence, consistency)
+        application = _application(prepared, estimation, evidence, consistency)
         verdict = judge(
             model.joint_names,
             evidence,
@@ -121,7 +121,7 @@ def _known(sources: Sources, diagnoses: Mapping[Path, TorqueDiagnosis]) -> Torqu
 
 def _application(
     prepared: Prepared,
-    estimate: Estimate,
+    estimation: Estimation,
     evidence: Evidence,
     consistency: ConsistencyCheck | NotConsistent,
 ) -> Application:
@@ -132,7 +132,8 @@ def _application(
     )
     return Application(
         model=sources.cell.model,
-        estimate=estimate,
+        estimate=estimation.result.pooled,
+        stated=estimation.stated,
         evidence=evidence,
         held_out=() if sources.in_sample else prepared.held_out,
         consistent=possible,

@@ -437,8 +437,8 @@ class CalibrationResult(Frozen):
         return (
             f"{percentage(self.inside, 1)} of {self.means} held-out means of torque "
             f"({self.block:g} s, per"
-            f" joint) are inside their 95 % intervals; with intervals for white residuals"
-            f" {percentage(self.white_inside)}"
+            f" joint) are inside their 95 % intervals; intervals that assume white residuals"
+            f" contain {percentage(self.white_inside)}"
         )
 
 

@@ -78,7 +78,7 @@ def roll_out_servo(
     The bodies are the URDF's.
 
     Args:
-        paths: archives that are fitted.
+        paths: archives that are fitted, or folders with them.
         predict: archives that are held out.
         split: part of a single recording that is held out.
         reporter: of progress.
@@ -86,7 +86,7 @@ def roll_out_servo(
     Raises:
         InputError: there are no masses, no commanded positions, no servo or no window.
     """
-    sources = gather_sources(paths, split, predict, with_torque=False)
+    sources = gather_sources([*archives_in(paths)], split, predict, with_torque=False)
     cell = sources.cell.with_friction(**friction_from(_FRICTION))
     fitted = _samples(sources.training, cell)
     held_out = _samples(sources.held_out, cell)

@@ -55,7 +55,8 @@ def verdict_of(results: ServoResults) -> ServoVerdict:
     figures = ", ".join(_figure(each) for each in results.validation)
     line = (
         f"The servo model {'predicts' if good else 'does not predict'} {results.tested_on} from its"
-        f" commands: {figures} {unit} (command itself {_judged(worst)[1]:.3g})."
+        f" commands: position error of {figures} {unit} RMS ({_judged(worst)[1]:.3g} {unit} if the"
+        " arm were where it is commanded)."
     )
     if results.stuck:
         warnings.append(
@@ -93,7 +94,7 @@ def verdict_of(results: ServoResults) -> ServoVerdict:
     if scale:
         warnings.append(
             f"the torque scale of {', '.join(scale)} is not determined: gravity and inertia of the"
-            " bodies hardly show in its position, or parts of the motion disagree; gains and"
+            " bodies hardly show in the positions, or parts of the motion disagree; gains and"
             " friction are valid only together"
         )
     return ServoVerdict(good=good, line=line, warnings=warnings, next_steps=steps)
@@ -198,15 +199,28 @@ def screen(results: ServoResults, read: Sequence[Part] = ()) -> list[Part]:
     parts += columns(_errors(results, results.validation[:_MAX_LINES]))
     parts += ["", *columns(_parameters(results, [*results.joint_names][:MAX_JOINT_ROWS])), ""]
     parts.append(f"{_delay(results)}; ? = not determined by the motion")
+    parts.append(Paragraph(_units(results), most=2))
     parts += [Paragraph(text, "doubtful  ", 2) for text in verdict.warnings[:_MAX_LINES]]
     parts += [Paragraph(text, "next      ", 2) for text in verdict.next_steps[:_MAX_LINES]]
     return parts
 
 
+def _units(results: ServoResults) -> str:
+    """Return the units of the table of joints, each with the columns that have it."""
+    units: dict[str, list[str]] = {results.error_unit: ["error"]}
+    for name in _SHOWN:
+        of_name = dict.fromkeys(each.unit for each in results.servo if each.name == name)
+        units.setdefault(" or ".join(of_name), []).append(name)
+    columns_by_unit = [
+        f"{', '.join(names)} [{unit}]" for unit, names in units.items() if unit not in ("", "-")
+    ]
+    return f"units: {'; '.join(columns_by_unit)}"
+
+
 def _delay(results: ServoResults) -> str:
     if results.delay_known:
-        return f"delay of commands {1e3 * results.delay:.0f} ms"
-    return "delay of commands not known, as their clock is another"
+        return f"command delay {1e3 * results.delay:.0f} ms"
+    return "command delay unknown, as the commands have another clock"
 
 
 def whole(results: ServoResults) -> list[str]:

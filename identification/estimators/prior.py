@@ -239,7 +239,7 @@ class BodyPrior:
             return self
         std = self.std.copy()
         std[self.bodies] /= np.sqrt(weight)
-        origin = f"{self.origin}, which weigh {weight:g} times"
+        origin = f"{self.origin}, with {weight:g} times the weight"
         return replace(self, std=std, origin=origin, believed=self.belief)
 
     def most_probable(self, values: Array) -> Array:
@@ -545,7 +545,7 @@ def body_prior(
     mean, std, placeholder = _mean_and_deviations(
         model, TorqueSums.of(factor), share, wide_rotors=wide_rotors
     )
-    origin = f"nominal bodies to {100.0 * share:g} %"
+    origin = f"nominal bodies to within {100.0 * share:g} %"
     if placeholder:
         reason = without_masses(model)
         if not reason:
@@ -556,7 +556,7 @@ def body_prior(
         mean[names.index(name)] = value
         std[names.index(name)] = spread
     if stated:
-        origin += f", {len(stated)} given"
+        origin += f", {len(stated)} values given"
     bodies = layout.links.ravel()
     return BodyPrior(mean, std, _of_model(model).combinations, origin, bodies, bool(placeholder))
 

@@ -30,6 +30,7 @@ class Application:
     Attributes:
         model: of the arm.
         estimate: the result.
+        stated: the result with the uncertainty that is reported, as of elastic gears.
         evidence: errors on held-out motion.
         held_out: this motion; empty if nothing was held out.
         consistent: parameters (p,) of possible bodies, as files for simulators have them; None:
@@ -40,6 +41,7 @@ class Application:
 
     model: RobotModel
     estimate: Estimate
+    stated: Estimate
     evidence: Evidence
     held_out: Sequence[Samples]
     consistent: Array | None
@@ -66,7 +68,7 @@ def purposes_of(arm: Application, limits: PurposeLimits) -> tuple[Purpose, ...]:
         simulation(arm, limits),
         contact_detection(arm.model, residuals, postures, limits),
         change_of_payload(arm.model, residuals, limits),
-        single_parameters(arm.estimate),
+        single_parameters(arm.stated),
     )
 
 

@@ -79,7 +79,7 @@ def cut_words(elimination: Elimination) -> str:
     )
     if elimination.refused:
         refused = ", ".join(elimination.refused)
-        text += f"; removing these raises the error on held-out motion: {refused}"
+        text += f"; kept because removing them raises the error on held-out motion: {refused}"
     elif chosen.spread < elimination.rule.spread:
         text += f", less than {elimination.rule.spread:g}"
     return (

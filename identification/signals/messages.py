@@ -37,7 +37,11 @@ def clock_lines(clock: TimeBase) -> list[str]:
     if clock.backward:
         lines.append(f"{clock.backward} samples are older than their predecessors")
     if clock.dropped:
-        lines.append(f"{clock.dropped} samples are missing one by one")
+        lines.append(
+            "1 single sample is missing"
+            if clock.dropped == 1
+            else f"{clock.dropped} single samples are missing"
+        )
     if gaps := clock.gaps - clock.pauses:
         lines.append(f"{gaps} gap{'s' if gaps > 1 else ''}")
     if clock.pauses == 1:

@@ -198,7 +198,7 @@ class _Text(string.Formatter):
                 return _change(value, self._naming)
             case PositionJump():
                 after = f"after {value.time:.3f} s of {value.recording}"
-                size = "" if format_spec == "time" else f"by {value.size:+.3g} "
+                size = "" if format_spec == "time" else f"by {value.size:+.3g} rad or m "
                 return f"{value.joint} {size}{after}"
             case RowFault():
                 return fault_words(value)
@@ -272,8 +272,8 @@ _CONSTANT: Final = (
 _EXCEEDS: Final = "the torque error on {motion} exceeds {limit:pc0}"
 _SLOW: Final = "the torque error on {motion} beyond noise exceeds {limit:pc1}: {each}"
 _ROWS_EQUAL: Final = (
-    "the residual is correlated over {memory:.3g} ms (median axis), {rows} rows equal {worth:.0f}"
-    " independent ones, for {parameters} parameters"
+    "the residual is correlated over {memory:.3g} ms (median axis), {rows} rows are worth"
+    " {worth:.0f} independent ones, for {parameters} parameters"
 )
 _OF_RESIDUAL: Final = (
     "({error:+.3g} {torque_unit} about {at:.2g} {unit}, {relative:pc1} of its torque)"
@@ -296,7 +296,7 @@ SENTENCES: Final[Mapping[FindingKey, Sentence]] = {
     "no torque": Sentence(UNTESTED, "the measured torque of {joints} is zero throughout {motion}"),
     "position jumps": Sentence(
         "position jumps",
-        "the measured position jumped faster than an arm can move (rad or m): {jumps:3}",
+        "the measured position jumped faster than an arm can move: {jumps:3}",
     ),
     "faulty rows": Sentence("rows", "{recording}: {fault}"),
     "spikes": Sentence(
@@ -440,7 +440,7 @@ SENTENCES: Final[Mapping[FindingKey, Sentence]] = {
     ),
     "scale of the torque": Sentence(
         "scale of the torque",
-        "ratio of measured torque to the torque of the nominal inertias: {each}",
+        "measured torque over the torque of the nominal inertias (expected: 1): {each}",
         "{scale:.3g} ± {tolerance:.2g}",
     ),
     "all torques opposite": Sentence(
@@ -811,7 +811,7 @@ REMEDIES: Final[Mapping[RemedyKey, str]] = {
     ),
     "slow the motion down": "slow the motion down where {joints} is at its limit",
     "design a motion": "design a motion for this arm (`hil design`) and record it",
-    "move in both directions": "record a motion in which {joints} moves in both directions",
+    "move in both directions": "record a motion that moves {joints} in both directions",
     "record all torque": (
         "record the torque of the motors or of joint sensors, before the controller's model is"
         " subtracted"

@@ -28,6 +28,10 @@ MISSING: Final[dict[NoFigure, str]] = {
 }
 
 
+_NO_FRICTION: Final = 1e-3
+"""Dry friction over the error of gravity, below which none is shown: a bound of the estimate."""
+
+
 def purposes_in_a_sentence(
     purposes: Sequence[Purpose], joints: Sequence[str], asked: Sequence[PurposeName] = ()
 ) -> str:
@@ -82,7 +86,9 @@ def figure(purpose: Purpose, joints: Sequence[str]) -> str:
             roughly, unknown = (int(purpose.references[name]) for name in ("roughly", "not"))
             return f"{int(purpose.figure)} known to 10 %, {roughly} to 50 %, {unknown} not"
         case _:
-            return f"from {noticed(purpose)}"
+            period = purpose.references.get("period")
+            rate = f", one false alarm in {period:g} s" if period else ""
+            return f"from {noticed(purpose)}{rate}"
 
 
 def _nominal(purpose: Purpose) -> str:
@@ -109,7 +115,10 @@ def _gravity(purpose: Purpose, joints: Sequence[str]) -> str:
     _, joint, error, limit = max(held)
     if not math.isfinite(error):
         return f"{joint} not determined"
-    return f"{joint} off by {rounded(error)} N·m, dry friction {rounded(limit)} N·m"
+    held_by = (
+        f"dry friction {rounded(limit)} N·m" if limit > _NO_FRICTION * error else "no dry friction"
+    )
+    return f"{joint} off by {rounded(error)} N·m, {held_by}"
 
 
 def requirement(purpose: Purpose) -> str:

@@ -92,8 +92,8 @@ def test_words_have_no_full_stop_and_no_capital(text: str) -> None:
         ),
         (
             Finding("position jumps", "wrong", values={"jumps": (FIRST,) * 5}),
-            "the measured position jumped faster than an arm can move (rad or m): "
-            + ", ".join(["one by +0.25 after 1.500 s of a.mcap"] * 3)
+            "the measured position jumped faster than an arm can move: "
+            + ", ".join(["one by +0.25 rad or m after 1.500 s of a.mcap"] * 3)
             + " and 2 more",
             "",
         ),

@@ -29,6 +29,8 @@ from identification.purposes.quiet_torque import (
     slow_residuals,
 )
 from identification.purposes.simulation_error import HORIZON_SECONDS, flange_error
+from identification.validation.purpose import Purpose
+from identification.validation.purpose_messages import figure
 from tests.identification.quiet_motion import quiet
 from tests.identification.robots import random_urdf
 from tests.identification.two_link import (
@@ -306,3 +308,21 @@ def test_parameters_are_counted_by_how_well_they_are_known() -> None:
     purpose = single_parameters(an_estimate(values, covariance))
     assert purpose.figure == 1
     assert purpose.references == {"roughly": 1, "not": P - 2}
+
+
+@pytest.mark.parametrize(
+    ("friction", "held_by"),
+    [
+        (0.2, "dry friction 0.20 N·m"),
+        (3.8e-11, "no dry friction"),
+        (1e-3, "dry friction 0.0010 N·m"),
+    ],
+)
+def test_dry_friction_at_its_bound_is_called_none(friction: float, held_by: str) -> None:
+    purpose = Purpose("gravity", False, 4.0, 1.0, joints=(0.8,), joint_limits=(friction,))
+    assert figure(purpose, ["one"]) == f"one off by 0.80 N·m, {held_by}"
+
+
+def test_a_smallest_force_has_the_rate_of_its_false_alarms() -> None:
+    purpose = Purpose("contact", None, 8.6, unit="N", references={"period": 60.0})
+    assert figure(purpose, []) == "from 8.6 N, one false alarm in 60 s"

@@ -35,6 +35,7 @@ from hil.archive.header import ArchiveHeader, HeaderError
 from hil.archive.repair import repair
 from hil.archive.verified_records import Record
 from hil.base.errors import ArchiveError
+from hil.base.one_screen import SCREEN_COLUMNS, SCREEN_LINES
 from hil.cli import app
 from hil.pipeline.sources import cell_of, gather_sources
 from tests.fuzz.mutate_mcap import Record as FileRecord
@@ -180,6 +181,16 @@ class TestEntries:
         shown = CliRunner().invoke(app, ["archive", "info", str(path)]).output
         assert "owned" in shown
         assert not {"\x1b", "\x07", "\r"} & set(shown)
+
+    def test_a_long_overview_is_cut_to_one_screen(self, written, path):
+        rows = {f"entry_{number}": "word " * 40 for number in range(30)}
+        forged(written.data, path, metadata=rows)
+        shown = CliRunner().invoke(app, ["archive", "info", str(path)]).output.splitlines()
+        assert len(shown) == SCREEN_LINES
+        assert max(map(len, shown)) <= SCREEN_COLUMNS
+        assert shown[-1].endswith("more lines, and whole lines: -v")
+        whole = CliRunner().invoke(app, ["archive", "info", "-v", str(path)]).output
+        assert all(f"{name} " in whole and text.strip() in whole for name, text in rows.items())
 
     def test_an_attachment_is_no_path(self, written, tmp_path):
         """No command writes attachments under names that the archive chooses."""

@@ -314,7 +314,7 @@ class TestMistypedPaths:
         assert "has no archive (*.mcap) in it" in done.stderr
 
     def test_info_has_the_date_on_top_and_units(self, folder: Path) -> None:
-        lines = hil("archive", "info", folder / "first.mcap").stdout.splitlines()
+        lines = hil("archive", "info", "-v", folder / "first.mcap").stdout.splitlines()
         assert lines[1].split() == ["recorded", "2023-11-14T22:13:20+00:00"]
         shown = {line.split()[0]: line.split()[-1] for line in lines[1:] if len(line.split()) > 1}
         assert shown["duration"] == "s"

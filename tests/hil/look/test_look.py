@@ -22,6 +22,7 @@ from benchmarks.look import measure
 from hil.archive import open_archive
 from hil.base.errors import SourceError
 from hil.cli import app
+from hil.cli.look import short_evidence
 from hil.importers.bag_map import BagMap
 from hil.importers.column_map import ColumnMap
 from hil.importers.conclusions import Certainty
@@ -604,3 +605,18 @@ class TestTerminal:
         assert "two explanations fit equally well" in screen
         assert "side: 1 or 2, or 0 if unknown" in screen
         assert code == status
+
+
+@pytest.mark.parametrize(
+    ("reason", "shown"),
+    [
+        ("by the name; a usual rate", "by the name; a usual rate"),
+        ("rad, by the field of the message type", "rad, by the field of the ..."),
+        (
+            "by the positions alone; torque does not show it",
+            "by the positions alone; torque does ...",
+        ),
+    ],
+)
+def test_evidence_is_cut_with_dots(reason: str, shown: str) -> None:
+    assert short_evidence(reason, 40) == shown

@@ -125,3 +125,15 @@ def test_without_commands_neither(log: Path, tmp_path: Path) -> None:
     refused = run("rollout", archive, "--polish")
     assert isinstance(refused.exception, InputError)
     assert "the recordings have no commanded positions" in str(refused.exception)
+
+
+def test_a_folder_without_torque_needs_no_option(log: Path, tmp_path: Path) -> None:
+    """As `hil identify` leaves it: archives that have no torque, and no commands either here."""
+    text = tmp_path / "map.toml"
+    text.write_text('[time]\ncolumn = "t"\n[position]\ncolumns = "q{}"\n')
+    archive = tmp_path / "identified" / "positions.mcap"
+    archive.parent.mkdir()
+    run("import", "log", log, "--urdf", log.with_name("robot.urdf"), "--map", text, "-o", archive)
+    refused = run("rollout", archive.parent)
+    assert isinstance(refused.exception, InputError)
+    assert "the recordings have no commanded positions" in str(refused.exception)

@@ -105,7 +105,10 @@ class TestCommand:
     ) -> None:
         _, output, _ = identified
         lines = " ".join(output.split())
-        assert "torque: left out as the load or duty of a servo: it is never negative" in lines
+        assert (
+            "torque: ignored, as it looks like the load or duty cycle of a servo: it is never"
+            " negative" in lines
+        )
         assert "--columns 'torque=NAME'" in lines
 
     def test_files_are_written(self, identified: tuple[Path, str, int]) -> None:
@@ -206,7 +209,7 @@ class TestCommand:
         results = ServoResults.load(folder / "results.json")
         assert results.delay_known
         apart = results.model_copy(update={"delay_known": False})
-        assert "delay of commands not known" in "\n".join(one_screen(screen(apart)))
+        assert "command delay unknown" in "\n".join(one_screen(screen(apart)))
 
     def test_results_and_report_say_what_was_read(self, identified: tuple[Path, str, int]) -> None:
         folder, _, _ = identified
