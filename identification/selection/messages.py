@@ -79,7 +79,7 @@ def cut_words(elimination: Elimination) -> str:
     )
     if elimination.refused:
         refused = ", ".join(elimination.refused)
-        text += f"; kept because removing them raises the error on held-out motion: {refused}"
+        text += f"; without any of the following, the error on held-out motion rises: {refused}"
     elif chosen.spread < elimination.rule.spread:
         text += f", less than {elimination.rule.spread:g}"
     return (
