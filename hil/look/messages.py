@@ -53,6 +53,7 @@ from hil.look.readings import (
     LowPassedTorque,
     MapEntries,
     MapKey,
+    MirrorImage,
     MotorCurrents,
     MotorTorque,
     Mounting,
@@ -248,7 +249,7 @@ def row_text(row: Row) -> RowText:
 def choice_text(choice: TiedReading) -> str:
     """Return one of the readings that fit alike in words."""
     if choice.reading is not None:
-        return described(choice.reading)
+        return worded(choice.reading)
     return "motor current" if isinstance(choice.setting, MotorCurrents) else "torque of the motors"
 
 
@@ -437,6 +438,11 @@ def _(changes: Changes) -> str:
 
 
 @_worded.register
+def _(change: ArmChange) -> str:
+    return described(change)
+
+
+@_worded.register
 def _(order: ColumnOrder) -> str:
     columns = {"torque": order.torque, "position": order.position}
     return "; ".join(
@@ -570,6 +576,11 @@ def _(nearest: NextBest) -> str:
 @_worded.register
 def _(nearest: NearestZero) -> str:
     return f"{described(nearest.change)}: error {nearest.ratio:.2f} times as large"
+
+
+@_worded.register
+def _(image: MirrorImage) -> str:
+    return f"its mirror image moves alike, with {described(image.change)}"
 
 
 @_worded.register

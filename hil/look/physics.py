@@ -37,6 +37,7 @@ from hil.look.readings import (
     LastBody,
     LowPassedTorque,
     MapEntries,
+    MirrorImage,
     MotorCurrents,
     MotorTorque,
     Mounting,
@@ -73,6 +74,7 @@ from identification.hypotheses.joint_changes import (
     Change,
     Meaning,
 )
+from identification.hypotheses.mirror_images import SignRival, Signs
 from identification.hypotheses.scores import is_backwards
 from identification.hypotheses.search import EXPLAINED_ERROR, SEPARATE_SIGMAS, Readings, Step
 from identification.hypotheses.torque_low_pass import TorqueLowPass
@@ -366,12 +368,20 @@ class TorqueFindings:
         dissipates = (friction > SEPARATE_SIGMAS) & (share > 0.0)
         reading = Fact.SIGNS_OF_URDF
         if dissipates.all():
-            return Row("signs", reading, Certainty.CERTAIN, (Basis.DISSIPATION,))
-        row = self._unchanged("signs", reading, "torque sign", "position sign", decider=decider)
-        unseen = tuple(
-            name for name, seen in zip(self.cell.joint_names, dissipates, strict=True) if not seen
-        )
-        return replace(row, evidence=(*row.evidence, UnseenFriction(unseen)))
+            row = Row("signs", reading, Certainty.CERTAIN, (Basis.DISSIPATION,))
+        else:
+            row = self._unchanged("signs", reading, "torque sign", "position sign", decider=decider)
+            unseen = tuple(
+                name
+                for name, seen in zip(self.cell.joint_names, dissipates, strict=True)
+                if not seen
+            )
+            row = replace(row, evidence=(*row.evidence, UnseenFriction(unseen)))
+        if not self.readings.rivals or row.certainty is Certainty.UNDETERMINED:
+            return row
+        image = Change("axis sign", self.readings.rivals[0].flipped)
+        evidence = (*row.evidence, MirrorImage(self._of_arm(image)))
+        return replace(row, certainty=Certainty.LIKELY, evidence=evidence)
 
     def _unit(self) -> Row:
         steps = self.steps("degrees", "radians")
@@ -485,15 +495,21 @@ class TorqueFindings:
         choices: list[tuple[TiedReading, ...]] = []
         if self.readings.score.overall > EXPLAINED_ERROR:
             return ()  # none of them is right
+        disputed = self.readings.disputed_signs
         for step in self.readings.steps:
-            if not step.alike:
+            alike = step.alike
+            if step in disputed:  # asked of all joints at once
+                alike = tuple(pair for pair in alike if pair[0].meaning not in SIGNS)
+            if not alike:
                 continue
-            pairs = [(step.change, step.error), *step.alike]
+            pairs = [(step.change, step.error), *alike]
             # A joint turned to the other side is another reading.
             meanings = [(change.meaning, change.size > 0.0) for change, _ in pairs]
             first = [pair for k, pair in enumerate(pairs) if meanings[k] not in meanings[:k]]
             shown = first[:_MAX_CHOICES] if len(first) > 1 else pairs[:2]
             choices.append(tuple(self._choice(step, *pair) for pair in shown))
+        if any(step.change.meaning in SIGNS for step in disputed):
+            choices.append(self._signs_alike())
         size = self.size
         if self.rigid.is_nothing or self.torque.is_rate:
             return tuple(choices)
@@ -504,14 +520,30 @@ class TorqueFindings:
     def _choice(self, step: Step, change: Change, error: float) -> TiedReading:
         others = [change if other is step else other.change for other in self.readings.steps]
         axes = Axes.of(others, self.cell.model.n_joints)
-        entries: Mapping[str, Any] = {}
-        if self.map_text is not None:
-            entries = self._entries_of(axes, self.map_text)
-        setting: Setting | None = MapEntries(tuple(entries.items())) if entries else None
+        setting: Setting | None = self._line_of(axes)
         if setting is None and change.meaning in ("no gravity", "mounting"):
             gravity = (0.0, 0.0, 0.0) if change.meaning == "no gravity" else MOUNTINGS[change.name]
             setting = GravityOption(gravity)
         return TiedReading(_ASPECTS[change.meaning], self._of_arm(change), error, setting)
+
+    def _line_of(self, axes: Axes) -> MapEntries | None:
+        """Return the entries of a map that state axes; None if there are none."""
+        if self.map_text is None:
+            return None
+        entries = self._entries_of(axes, self.map_text)
+        return MapEntries(tuple(entries.items())) if entries else None
+
+    def _signs_alike(self) -> tuple[TiedReading, ...]:
+        """Return the signs that were found, and those of mirror images of the arm."""
+        found = SignRival(Signs.of(self.axes), (), self.readings.score.overall)
+        choices = []
+        for each in (found, *self.readings.rivals)[:_MAX_CHOICES]:
+            image = Change("axis sign", each.flipped)
+            changes = [*(step.change for step in self.readings.steps), image]
+            axes = Axes.of(changes, self.cell.model.n_joints)
+            reading = Changes(tuple(map(self._of_arm, each.signs.changes)))
+            choices.append(TiedReading("signs", reading, each.error, self._line_of(axes)))
+        return tuple(choices)
 
     def _sides(self) -> tuple[TiedReading, ...]:
         factor = self.size.factor or 1.0

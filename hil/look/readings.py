@@ -363,6 +363,13 @@ class NearestZero:
 
 
 @dataclass(frozen=True)
+class MirrorImage:
+    """An image of the arm, with positions and torques negated, that explains the torque alike."""
+
+    change: ArmChange
+
+
+@dataclass(frozen=True)
 class UnseenFriction:
     """Joints in which friction is not seen."""
 
@@ -537,6 +544,7 @@ Evidence = (
     | ErrorRatio
     | NextBest
     | NearestZero
+    | MirrorImage
     | UnseenFriction
     | StillUnexplained
     | FreeFit

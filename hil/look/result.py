@@ -8,6 +8,7 @@ from typing import Any, Literal
 from hil.importers.conclusions import Certainty, Conclusion
 from hil.look.readings import (
     ArmChange,
+    Changes,
     Decider,
     Evidence,
     MapEntries,
@@ -90,14 +91,15 @@ class TiedReading:
 
     Attributes:
         aspect: that of a row.
-        reading: what it would be: a change, or, where the side is open, what its setting says.
+        reading: what it would be: a change, the signs of all joints, or, where the side is open,
+            what its setting says.
         error: of the torque, predicted from other parts of the recording, as a share of it; None
             if the motion says nothing about it.
         setting: what states it; None if nothing does.
     """
 
     aspect: Aspect
-    reading: ArmChange | None
+    reading: ArmChange | Changes | None
     error: float | None
     setting: Setting | None
 

@@ -120,7 +120,7 @@ def score_of(
         )
         estimates.append(values)
         squares[left_out] = _squares(factor, values, left_out)
-    friction = np.array(estimates) @ _friction_columns(model, samples).T
+    friction = np.array(estimates) @ friction_columns(model, samples).T
     deviation = np.sqrt((FOLDS - 1) * friction.var(axis=0))
     torque = factor.gram[:, -1, -1]
     rms = np.maximum(np.sqrt(torque / np.maximum(factor.samples, 1)), 1e-300)
@@ -172,7 +172,7 @@ def _squares(factor: Factor, values: Array, blocks: slice | NDArray[np.bool_]) -
     return np.asarray(np.maximum(np.column_stack(squares), 0.0))
 
 
-def _friction_columns(model: RobotModel, samples: Samples) -> Array:
+def friction_columns(model: RobotModel, samples: Samples) -> Array:
     """Return the friction of each joint at a usual speed as a sum of the parameters (n, p)."""
     speed = np.quantile(np.abs(samples.motion.velocity), _SPEED_QUANTILE, axis=0)
     columns = np.zeros((model.n_joints, model.n_parameters))

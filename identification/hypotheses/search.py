@@ -12,7 +12,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
-from itertools import combinations
+from itertools import combinations, product
 from typing import Final
 
 import numpy as np
@@ -52,11 +52,13 @@ from identification.hypotheses.joint_fit import (
     starting_at,
 )
 from identification.hypotheses.little_torque import little_torque
+from identification.hypotheses.mirror_images import SignRival, Signs, mirror_images
 from identification.hypotheses.scores import (
     ROWS_PER_FACT,
     Comparison,
     Score,
     compare,
+    friction_columns,
     inertial_torque,
     score_of,
     sigmas_of,
@@ -101,6 +103,8 @@ _ADEQUATE_JOINT_ERROR_RATIO: Final = 2.0
 _FAR_ZERO: Final = 90.0 * DEGREE
 # signs of least error, compared together with zeros and scales
 _COMPARED_SIGNS: Final = 3
+_MAX_NEGATED_JOINTS: Final = 8  # that move, up to which every combination of their signs is tried
+_RIDGE: Final = 1e-6  # of the squares of a column, where others say the same
 _FITS_AT_ONCE: Final = 24  # fits, so that their sums stay in the processor's cache
 # deg, near which a fit starts
 _START_ZEROS_DEGREES: Final = (-135.0, -90.0, -45.0, 45.0, 90.0, 135.0, 180.0)
@@ -205,6 +209,7 @@ class Readings:
         nearest: by meaning, the change that comes nearest to the reading found, compared with it.
         unseen_zeros: joints of which the torque shows no zero: others fit alike.
         adequacy: whether nothing else explains the rows much better.
+        rivals: signs of the joints that explain the rows alike, fewest changes first.
     """
 
     steps: tuple[Step, ...]
@@ -214,6 +219,14 @@ class Readings:
     nearest: Mapping[Meaning, tuple[Change, Comparison]]
     unseen_zeros: tuple[int, ...] = ()
     adequacy: Adequacy = Adequacy(1.0, 1.0, agrees=True)
+    rivals: tuple[SignRival, ...] = ()
+
+    @property
+    def disputed_signs(self) -> tuple[Step, ...]:
+        """The signs that were found, and are others where the rows are explained alike."""
+        axes = Axes.of((step.change for step in self.steps), self.model.n_joints)
+        signs = Signs.of(axes)
+        return tuple(step for step in self.steps if _is_disputed(step, signs, self.rivals))
 
 
 def find_readings(
@@ -243,7 +256,16 @@ def find_readings(
     is_doubted = not adequacy.is_enough or any(not step.sure or step.is_far for step in steps)
     if is_doubted and (steps or search.score.overall > EXPLAINED_ERROR):
         search, steps = _with_a_sign(started, search, steps)
-        adequacy = search.adequacy()
+    has_signs = any(step.change.meaning in SIGNS for step in steps)
+    is_several = has_signs and len(steps) > 1
+    if (is_doubted or is_several) and (steps or search.score.overall > EXPLAINED_ERROR):
+        search, steps = _with_signs(started, search, steps)
+    rivals = search.sign_rivals()
+    if has_signs and rivals and len(rivals[0].signs.changes) < len(search.signs.changes):
+        search.change([Change("axis sign", rivals[0].flipped)])
+        rivals = search.sign_rivals()
+    search, steps = _signs_together(started, search, steps)
+    adequacy = search.adequacy()
     nearest = search.nearest()
     score = score_of(search.model, search.samples, search.score.columns)
     steps = _without_adopted(steps)
@@ -259,6 +281,10 @@ def find_readings(
         model, search.samples, score
     ):
         steps = [replace(step, is_adequate=False) for step in steps]
+    steps = [
+        replace(step, is_adequate=False) if _is_disputed(step, search.signs, rivals) else step
+        for step in steps
+    ]
     return Readings(
         tuple(steps),
         search.model,
@@ -267,7 +293,90 @@ def find_readings(
         nearest,
         search.unseen_zeros(),
         adequacy,
+        rivals,
     )
+
+
+def _is_disputed(step: Step, signs: Signs, rivals: Sequence[SignRival]) -> bool:
+    """Return whether a step is of signs that are others where the rows are explained alike.
+
+    So is the zero of a position that was negated, as its direction is.
+    """
+    joints = list(step.change.joints)
+    is_of_negated = step.change.meaning == "zero" and bool((signs.position[joints] < 0.0).any())
+    return (step.change.meaning in SIGNS or is_of_negated) and not all(
+        signs.agrees(rival.signs, joints) for rival in rivals
+    )
+
+
+def _with_signs(
+    started: Callable[..., _Search], found: _Search, steps: list[Step]
+) -> tuple[_Search, list[Step]]:
+    """Return a hypothesis with signs of all joints chosen at once, or the found one if better.
+
+    One after the other leads astray where several are wrong.
+    """
+    first = started()
+    tried = []
+    for signs in first.best_signs():
+        if signs.changes == found.signs.changes:
+            continue
+        search = started(signs.changes)
+        tried.append((search, search.by_joint_fit(())))
+    if not tried:
+        return found, steps
+    best, more = min(tried, key=lambda each: each[0].score.overall)
+    against = compare(best.score, found.score, found.model)
+    is_alike = (
+        against.sigmas < SEPARATE_SIGMAS
+        and best.score.overall < (1.0 + _ALIKE_REDUCTION) * found.score.overall
+    )
+    is_better = against.ratio < 1.0 - _LARGE_REDUCTION and against.sigmas < -SEPARATE_SIGMAS
+    count = len(best.signs.changes) + len(more), sum(step.is_far for step in more)
+    is_simpler = count < (len(steps), sum(step.is_far for step in steps))
+    if not is_better and not (is_alike and is_simpler):
+        return found, steps
+    chosen = best.signs.changes
+    others = best.more_steps()
+    return best, [*_sign_steps(started, best, chosen), *more, *others]
+
+
+def _sign_steps(
+    started: Callable[..., _Search], search: _Search, signs: Sequence[Change]
+) -> list[Step]:
+    """Return the steps of signs, each compared with all but it."""
+    before = started().score.overall
+    steps = []
+    for sign in signs:
+        without = started([change for change in search.changes if change != sign])
+        ratio, sigmas, _ = compare(search.score, without.score, search.model)
+        steps.append(Step(sign, search.score.overall, before, ratio, sigmas))
+    return steps
+
+
+def _signs_together(
+    started: Callable[..., _Search], search: _Search, steps: list[Step]
+) -> tuple[_Search, list[Step]]:
+    """Return a hypothesis with one change of the sign for each joint; several may cancel."""
+    signs = search.signs.changes
+    adopted = [change for change in search.changes if change.meaning in SIGNS]
+    if len(signs) == len(adopted) and {*signs} == {*adopted}:
+        return search, steps
+    axes = Axes.of(search.changes, search.model.n_joints)
+    others = [step for step in steps if step.change.meaning not in SIGNS]
+    sized = []
+    for step in others:
+        change = step.change
+        if change.meaning == "zero":  # one adopted before a sign is negated by it
+            (joint,) = change.joints
+            change = change._replace(size=float(axes.zero[joint]))
+        sized.append(replace(step, change=change))
+    first = [step for step in sized if step.change.meaning not in SIZED]
+    last = [step for step in sized if step.change.meaning in SIZED]
+    again = started([step.change for step in first] + [*signs] + [step.change for step in last])
+    known = {step.change: step for step in steps}
+    new = [known.get(step.change, step) for step in _sign_steps(started, again, signs)]
+    return again, [*first, *new, *last]
 
 
 def _without_adopted(steps: Sequence[Step]) -> list[Step]:
@@ -427,6 +536,16 @@ class _Search:
         self._tries: dict[Change, Trial] = {}
         self._fitted: list[_Joints] = []
 
+    @property
+    def changes(self) -> tuple[Change, ...]:
+        """What was adopted."""
+        return tuple(self._changes)
+
+    @property
+    def signs(self) -> Signs:
+        """The signs of all joints that were adopted."""
+        return Signs.of(Axes.of(self._changes, self.model.n_joints))
+
     def change(self, changes: Sequence[Change]) -> None:
         """Adopt changes as they are."""
         for change in changes:
@@ -512,6 +631,50 @@ class _Search:
             samples = changed_samples(self.model, self.samples, change)
             costs[change] = fit_joints(self.model, samples, free).cost
         return sorted(costs, key=lambda change: costs[change])
+
+    def best_signs(self) -> list[Signs]:
+        """Return the signs of all joints that fit few rows best."""
+        moved = np.flatnonzero(np.ptp(self.samples.motion.position, axis=0) > 0.0)
+        if len(moved) > _MAX_NEGATED_JOINTS:
+            return []
+        fits = _Fits(self.model, _thinned(self.samples, _FIRST_TRIAL_ROWS), self._mountings)
+        positions = []
+        for negated in product((1.0, -1.0), repeat=len(moved)):
+            position = np.ones(self.model.n_joints)
+            position[moved] = negated
+            positions.append(position)
+        signs = fits.by_friction(positions)
+        errors = fits.of_signs(signs)
+        best = [signs[k] for k in np.argsort(errors, kind="stable")[:_COMPARED_SIGNS]]
+        return list({each.changes: each for each in map(fits.with_best_torques, best)}.values())
+
+    def sign_rivals(self) -> tuple[SignRival, ...]:
+        """Return the signs of mirror images of the arm that fit alike, fewest changes first."""
+        tried = list(mirror_images(self.model.chain, self.model.gravity))
+        if self.signs.changes:
+            tried += [(joint,) for joint in range(self.model.n_joints)]
+        alike: dict[tuple[int, ...], float] = {}
+        self._keep_alike(alike, tried)
+        several = list(alike)
+        for joints in several:  # images of images
+            both = [tuple(sorted({*joints} ^ {*others})) for others in alike]
+            self._keep_alike(alike, [each for each in both if each and each not in alike])
+        rivals = [
+            SignRival(self.signs.flipped(joints), joints, error) for joints, error in alike.items()
+        ]
+        probable = [rival for rival in rivals if rival.signs.is_probable]
+        return tuple(sorted(probable, key=lambda rival: len(rival.signs.changes)))
+
+    def _keep_alike(
+        self, alike: dict[tuple[int, ...], float], tried: Sequence[tuple[int, ...]]
+    ) -> None:
+        """Add the joints that may be negated as well, with the error then."""
+        for joints in tried:
+            trial = self._try(Change("axis sign", joints))
+            if trial.against.sigmas < SEPARATE_SIGMAS and (
+                trial.score.overall < (1.0 + _ALIKE_REDUCTION) * self.score.overall
+            ):
+                alike[joints] = trial.score.overall
 
     def _singles(self, but: _Joints | None = None) -> list[Trial]:
         """Return single fitted zeros and scales, other than the best."""
@@ -858,21 +1021,75 @@ class _Fits:
     def _errors(self, model: RobotModel, changes: Sequence[Change]) -> dict[Change, float]:
         """Return the errors of changes under one gravity."""
         motions = [change_of_motion(change) for change in changes]
+        axes = [Axes.of([change], self.model.n_joints) for change in changes]
+        errors = self._errors_as_read(model, motions, axes)
+        return dict(zip(changes, errors, strict=True))
+
+    def _reduce(self, model: RobotModel, motions: Sequence[Change]) -> None:
+        """Reduce each motion once, for all torques."""
         if new := list(dict.fromkeys(motion for motion in motions if motion not in self._sums)):
             moved = [changed_samples(self.model, self._samples, motion) for motion in new]
             factor = every_torque_factor(model, moved)
             for block, motion in enumerate(new):
                 self._sums[motion] = factor.blocks(slice(block, block + 1))
-        axes = [Axes.of([change], self.model.n_joints) for change in changes]
+
+    def by_friction(self, positions: Sequence[Array]) -> list[Signs]:
+        """Return signs of positions (n,) with those of torques by which friction takes energy.
+
+        Each joint is fitted for itself: the torques of others may have any sign.
+        """
+        columns = friction_columns(self.model, self._samples)
+        motions = [_negated_positions(position) for position in positions]
+        for first in range(0, len(motions), _FITS_AT_ONCE):
+            self._reduce(self.model, motions[first : first + _FITS_AT_ONCE])
+        signs = []
+        for position, motion in zip(positions, motions, strict=True):
+            torque = np.ones(len(position))
+            factor = self._sums[motion]
+            for joint, (matrix,) in enumerate(factor.matrices):
+                width = len(matrix) - factor.n_joints
+                own = matrix[:width, :width]
+                ridge = _RIDGE * np.diag(own.diagonal() + np.finfo(np.float64).tiny)
+                fitted = np.linalg.solve(own + ridge, matrix[:width, width + joint])
+                friction = columns[joint, factor.columns[joint][:width]] @ fitted
+                torque[joint] = -1.0 if friction < 0.0 else 1.0
+            signs.append(Signs(position, torque))
+        return signs
+
+    def with_best_torques(self, signs: Signs) -> Signs:
+        """Return signs with those of torques that fit best, changed one by one."""
+        (error,) = self.of_signs([signs])
+        while True:
+            torques = signs.torque * (1.0 - 2.0 * np.eye(len(signs.torque)))
+            others = [signs._replace(torque=torque) for torque in torques]
+            errors = self.of_signs(others)
+            best = int(np.argmin(errors))
+            if errors[best] >= error:
+                return signs
+            signs, error = others[best], errors[best]
+
+    def of_signs(self, signs: Sequence[Signs]) -> list[float]:
+        """Return the errors of signs of all joints, likewise."""
+        errors: list[float] = []
+        for first in range(0, len(signs), _FITS_AT_ONCE):
+            some = signs[first : first + _FITS_AT_ONCE]
+            motions = [_negated_positions(each.position) for each in some]
+            axes = [Axes.of(each.changes, self.model.n_joints) for each in some]
+            errors += self._errors_as_read(self.model, motions, axes)
+        return errors
+
+    def _errors_as_read(
+        self, model: RobotModel, motions: Sequence[Change], axes: Sequence[Axes]
+    ) -> list[float]:
+        """Return the errors of motions, each with the torque as its axes read it."""
+        self._reduce(model, motions)
         sums = of_torques([self._sums[motion] for motion in motions], axes)
         priors = body_priors(model, sums)
-        errors = {}
-        for change, each, read, mean, information in zip(
-            changes, sums.each(), axes, *priors, strict=True
-        ):
+        errors = []
+        for each, read, mean, information in zip(sums.each(), axes, *priors, strict=True):
             values, _ = each.posterior(mean, ROWS_PER_FACT * information, MIN_NOISE)
             squares = each.squared_errors(values)[self._counts[read.torque_order]]
-            errors[change] = float(np.log(np.where(squares > 0.0, squares, 1.0)).sum())
+            errors.append(float(np.log(np.where(squares > 0.0, squares, 1.0)).sum()))
         return errors
 
 
@@ -895,6 +1112,12 @@ def to_compare(errors: Mapping[Change, float], excluded: float) -> list[Change]:
         kinds.add(kind_of(change))
         meanings.add(change.meaning)
     return chosen
+
+
+def _negated_positions(sign: Array) -> Change:
+    """Return the change of the motion to positions with signs (n,)."""
+    joints = tuple(np.flatnonzero(sign < 0.0).tolist())
+    return Change("position sign", joints) if joints else AS_READ
 
 
 def of_torques(every: Sequence[Factor], axes: Sequence[Axes]) -> TorqueSums:

@@ -161,16 +161,16 @@ class TestWhatWasRead:
     """Report and `results.json` say what is not as the log has it."""
 
     @pytest.mark.long
-    def test_turned_torques_are_named(self, folder: Path, tmp_path: Path) -> None:
+    def test_exchanged_torques_are_named(self, folder: Path, tmp_path: Path) -> None:
         import pandas
 
         frame = pandas.read_csv(folder / "a.csv")
-        frame[[name for name in frame if name.startswith("tau")]] *= -1.0
+        frame[["tau1", "tau2"]] = frame[["tau2", "tau1"]].to_numpy()
         arm = hil.identify(frame, urdf=folder / "three.urdf")
-        place = arm.save(tmp_path / "turned")
+        place = arm.save(tmp_path / "exchanged")
         (read,) = Results.load(place / "results.json").recordings
         assert (read.file, read.use) == ("recording.csv", "fitted")
-        assert any("torque negated" in change for change in read.changes), read.changes
+        assert any("torque columns are of" in change for change in read.changes), read.changes
         assert any(line.startswith("tau1 .. tau3: torque") for line in read.channels)
         assert read.changes[0] in (place / "report.html").read_text()
 

@@ -92,7 +92,7 @@ def reading(looked: Look, aspect: str) -> tuple[str, str]:
 def test_a_log_as_it_is(tmp_path: Path, urdf: Path, table: Mapping[str, Floats]) -> None:
     looked = look(urdf, tmp_path / "a.csv", table)
     assert not looked.questions
-    assert reading(looked, "signs") == ("as the URDF's axes", "certain")
+    assert reading(looked, "signs") == ("as the URDF's axes", "likely")
     assert reading(looked, "angle unit") == ("unit as read", "certain")
     assert reading(looked, "side") == ("joint side, a torque", "certain")
     assert reading(looked, "velocity")[0] == "q1 .. q3: rad" or reading(looked, "motion")
@@ -244,13 +244,13 @@ class TestCommand:
     ) -> None:
         path = tmp_path / "a.csv"
         target = tmp_path / "map.toml"
-        write_log(path, ["t", "q{}", "v{}", "tau{}"], *{**table, **negated(table)}.values())
+        write_log(path, ["t", "q{}", "v{}", "tau{}"], *{**table, **exchanged(table)}.values())
         result = hil("look", path, "--urdf", urdf, "-o", target, "--json")
         assert result.exit_code == 0, result.output
         assert json.loads(result.stdout)["source"] == "a.csv"
         torque = ColumnMap.load(target).torque
         assert torque is not None
-        assert torque.scale == (-1.0, -1.0, -1.0)
+        assert torque.columns == ("tau2", "tau1", "tau3")
 
     def test_without_an_arm_names_clock_and_slopes(
         self, tmp_path: Path, table: Mapping[str, Floats]
@@ -279,11 +279,13 @@ class TestConclusions:
         self, tmp_path: Path, urdf: Path, table: Mapping[str, Floats]
     ) -> None:
         path = tmp_path / "a.csv"
-        write_log(path, ["t", "q{}", "v{}", "tau{}"], *{**table, **negated(table)}.values())
+        write_log(path, ["t", "q{}", "v{}", "tau{}"], *{**table, **exchanged(table)}.values())
         result = hil("identify", path, "--urdf", urdf)
-        assert "signs: torque negated: all joints, inferred" in result.output
+        first, second, third = JOINTS
+        order = f"order: torque columns are of {second}, {first}, {third}, inferred"
+        assert order in " ".join(result.output.split())
         text = (tmp_path / "a" / "map.toml").read_text()
-        assert "scale = [-1.0, -1.0, -1.0]" in text
+        assert 'columns = ["tau2", "tau1", "tau3"]' in text
 
     @pytest.mark.long
     def test_a_coupled_angle_is_its_own_in_the_archive(

@@ -114,8 +114,8 @@ def test_what_a_row_of_a_look_may_have_has_words(kind: type) -> None:
 ASPECTS = frozenset(get_args(Aspect))
 
 
-def negated(columns: tuple[Floats, ...]) -> tuple[Floats, ...]:
-    return (*columns[:3], -columns[3])
+def exchanged(columns: tuple[Floats, ...]) -> tuple[Floats, ...]:
+    return (*columns[:3], columns[3][:, [1, 0, 2]])
 
 
 def in_degrees_and_milliseconds(columns: tuple[Floats, ...]) -> tuple[Floats, ...]:
@@ -127,7 +127,7 @@ def of_motors(columns: tuple[Floats, ...]) -> tuple[Floats, ...]:
 
 
 LOGS: Mapping[str, Callable[[tuple[Floats, ...]], tuple[Floats, ...]]] = {
-    "negated torque": negated,
+    "exchanged torques": exchanged,
     "degrees and milliseconds": in_degrees_and_milliseconds,
     "motor side": of_motors,
 }
@@ -181,7 +181,7 @@ def without_messages(value: Any) -> Any:
 @pytest.mark.parametrize(
     "log",
     [
-        pytest.param("negated torque", marks=pytest.mark.long),
+        pytest.param("exchanged torques", marks=pytest.mark.long),
         "degrees and milliseconds",
         pytest.param("motor side", marks=pytest.mark.long),
     ],
