@@ -19,6 +19,7 @@ from hil.control.errors import MotionFailedError
 from hil.control.motion_checks import USABLE_CURRENT_SHARE, collision_checker
 from hil.control.motion_watch import Stop, Unattended
 from hil.control.virtual_link import VirtualLink
+from identification.excitation.collision_messages import unchecked_text
 from planner.worker import WorkerProcess
 from sim_fixtures import SimulationError
 
@@ -177,7 +178,7 @@ def _not_seen(cell: Cell) -> list[str]:
         "torque constants and current limits: the simulated motors take them from the cell file",
         "floor, walls and shapes: they are checked, but as the cell file and the URDF have them",
     ]
-    if (unchecked := collision_checker(cell).exceptions) is not None:
+    if (unchecked := unchecked_text(collision_checker(cell))) is not None:
         sentences.append(unchecked)
     if unknown:
         sentences.append(

@@ -17,6 +17,7 @@ from hil.base.toml_text import to_text
 from hil.cell import AngleFrame, Cell
 from hil.control.motion_checks import violation_text
 from identification import excitation
+from identification.excitation.collision_messages import unchecked_text
 from identification.text import duration_text
 
 from .messages import criteria_text, infeasible_text, no_excitation
@@ -268,8 +269,9 @@ def run_search(
     settings = search_settings(requested)
     checker = problem.constraints.checker
     total = excitation.most_evaluations(settings)
-    if checker is not None and checker.exceptions is not None:
-        reporter.say(checker.exceptions)
+    unchecked = None if checker is None else unchecked_text(checker)
+    if unchecked is not None:
+        reporter.say(unchecked)
     done = 0
     note = "scoring the first motions"
     with (

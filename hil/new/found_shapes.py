@@ -16,6 +16,7 @@ from identification.excitation import (
     MissingMeshError,
     Workspace,
 )
+from identification.excitation.collision_messages import unchecked_text
 from identification.excitation.separation import frames
 from identification.model.kinematics import chain_from_urdf
 from identification.model.urdf_text import urdf_tree
@@ -69,7 +70,7 @@ def check_by_found_shapes(
         clear = checker.clear(postures)
         if links:
             clear &= _above_floor(urdf, postures, workspace)
-        return PartialCheck(clear, checker.exceptions, tuple(links))
+        return PartialCheck(clear, unchecked_text(checker), tuple(links))
     return PartialCheck(_above_floor(urdf, postures, workspace), None, tuple(links))
 
 

@@ -75,9 +75,6 @@ class ClosePair(NamedTuple):
     nearest: float  # distance in the sampled postures [m], negative if they overlap
     farthest: float
 
-    def __str__(self) -> str:
-        return f"{self.first} and {self.second} ({self.nearest:.3f} to {self.farthest:.3f} m)"
-
 
 class Path(NamedTuple):
     """Positions of all bodies at m samples."""
@@ -148,18 +145,6 @@ class CollisionChecker:
     def pairs(self) -> tuple[tuple[str, str], ...]:
         """Names of the checked pairs of bodies, without repetitions."""
         return tuple(dict.fromkeys(map(self.names, range(len(self.separation.first)))))
-
-    @property
-    def exceptions(self) -> str | None:
-        """Message about pairs checked not at all or with less than the margin, None if none."""
-        messages = {
-            "not checked for collisions, always closer than the margin": self.unchecked,
-            "checked with less than the margin, which they never or hardly have": self.reduced,
-        }
-        parts = [
-            f"{text}: {'; '.join(map(str, pairs))}" for text, pairs in messages.items() if pairs
-        ]
-        return "; ".join(parts) or None
 
     def path(self, q: Array) -> Path:
         """Return the positions of all bodies at postures (m, n).

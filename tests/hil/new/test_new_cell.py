@@ -36,6 +36,7 @@ from hil.new import cell_of_urdf, from_archive
 from hil.new.cell_text import with_fixed
 from hil.new.cell_values import _nothing_moves
 from hil.testing import shortened
+from identification.excitation.collision_messages import unchecked_text
 from sim_fixtures.ns16 import CELL_PATH, URDF_PATH
 from tests.hil.new_cells import TWO_JOINTS, described_robot, filled_in
 from tests.hil.simulated_logs import urdf_path
@@ -145,7 +146,7 @@ def test_a_design_begins_where_the_arm_is_clear(
     assert (cell.campaign.home_deg, cell.file.workspace.floor) == (home, floor)
     checker = collision_checker(cell)
     assert checker.clear(cell.home[None]).tolist() == [True]
-    assert checker.exceptions in summary["notes"]
+    assert unchecked_text(checker) in summary["notes"]
     comments = " ".join(line.lstrip("# ") for line in cell.text.splitlines())
     assert all(f"Note: {note}" in comments for note in summary["notes"])
 
