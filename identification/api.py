@@ -52,9 +52,9 @@ from identification.model.motion import Motion
 from identification.model.regressor import Regressor
 from identification.model.robot import RobotModel
 from identification.selection.essential import Elimination, eliminate
-from identification.signals.clock import SampleTimes, TimeBase, time_base, true_times
 from identification.signals.noise import standstill_variance
 from identification.signals.recording import Recording, RecordingError
+from identification.signals.sample_times import SampleTimes, TimeBase, time_base, true_times
 from identification.signals.samples import Preprocessing, Samples, prepare, smooth
 from identification.validation.evidence import Evidence, gather
 from identification.validation.finding import Thresholds

@@ -19,7 +19,7 @@ from hil.base.toml_text import comment_lines, inline
 from hil.cli.arguments import JsonOption, QuietOption, numbers, print_json
 from hil.cli.identify_options import delay_from
 from hil.pipeline.sources import archives_in
-from hil.pipeline.torque_constants import GainsFound, find_gains
+from hil.pipeline.torque_constant_fit import GainsFound, find_gains
 from identification.estimators.current_gains import (
     MAX_RELATIVE_STD,
     GainProblem,

@@ -12,7 +12,7 @@ from typing import Literal
 
 from hil.cell.arms import Links
 from hil.importers.units import Kind
-from identification.signals.clock import TimeBase
+from identification.signals.sample_times import TimeBase
 
 Sample = Literal["row", "message"]
 """What one sample of a recording is called: a row of a log, a message of a bag."""

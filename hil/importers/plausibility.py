@@ -50,10 +50,10 @@ from identification.model.urdf_text import urdf_tree
 from identification.signals.angle_wraps import (
     unwrap,
 )
-from identification.signals.clock import time_base
 from identification.signals.recording import (
     MIN_MOVEMENT,
 )
+from identification.signals.sample_times import time_base
 
 _LIMIT_TOLERANCE: Final = 0.05  # rad or m beyond a limit, for calibration and overshoot
 _MIN_TRAVEL: Final = 0.1  # rad or m

@@ -21,9 +21,9 @@ from hil.importers.conclusions import (
 )
 from identification.estimators.delay import DelayEstimate
 from identification.hypotheses.joint_changes import Change
-from identification.signals.clock import SampleTimes, TimeBase
 from identification.signals.position_steps import PositionJump
 from identification.signals.row_faults import RowFault
+from identification.signals.sample_times import SampleTimes, TimeBase
 
 Vector = tuple[float, ...]
 

@@ -56,13 +56,13 @@ from hil.pipeline.sources import Source, has_commands_as_positions
 from identification.signals.angle_wraps import (
     UNWRAPPED,
 )
-from identification.signals.clock import time_base
 from identification.signals.noise import has_small_noise, noiseless_above
 from identification.signals.position_steps import position_steps
 from identification.signals.recording import (
     MIN_MOVEMENT,
     Recording,
 )
+from identification.signals.sample_times import time_base
 
 _MAX_RATIO_DEVIATION: Final = 0.1  # relative deviation of their ratio
 _MAX_LAG_SECONDS: Final = 0.1  # s

@@ -11,8 +11,8 @@ from enum import Enum, auto
 
 from hil.pipeline.torque_scale import TorqueScale
 from identification.estimators.delay import DelayEstimate
-from identification.signals.clock import SampleTimes, TimeBase
 from identification.signals.masks import RowReason
+from identification.signals.sample_times import SampleTimes, TimeBase
 from identification.validation.consistency import ConsistencyCheck
 
 

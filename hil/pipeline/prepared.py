@@ -38,9 +38,9 @@ from identification.selection.questions import (
 )
 from identification.selection.scores import Known
 from identification.selection.settings import Settings
-from identification.signals.clock import time_base
 from identification.signals.masks import MIN_STRETCH_SAMPLES, RowReason
 from identification.signals.recording import RIGID_RATE, Recording, in_succession
+from identification.signals.sample_times import time_base
 from identification.signals.samples import (
     RIGID_BANDWIDTH,
     Preprocessing,

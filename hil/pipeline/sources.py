@@ -23,7 +23,6 @@ from hil.base.errors import ArchiveError, CampaignFolderError, InputError
 from hil.base.files import file_digest
 from hil.base.safe_input import path_exists
 from hil.cell import Cell
-from identification.signals.clock import SampleTimes, true_times
 from identification.signals.noise import standstill_variance
 from identification.signals.recording import (
     Recording,
@@ -33,6 +32,7 @@ from identification.signals.recording import (
     without_repeats,
 )
 from identification.signals.row_faults import RowFault, RowFaultKind, without_faulty_rows
+from identification.signals.sample_times import SampleTimes, true_times
 from identification.validation.finding import TestedOn
 
 from .notes import (

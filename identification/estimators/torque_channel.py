@@ -20,10 +20,10 @@ from identification.arrays import Array
 from identification.factor.blocks import EqualRuns, add_grams, equal_runs
 from identification.factor.factor import MIN_NOISE
 from identification.model.robot import RobotModel
-from identification.signals.clock import MAX_STEP_DEVIATION
 from identification.signals.masks import MAX_END_SECONDS, edge_rows
 from identification.signals.noise import noiseless_above
 from identification.signals.recording import RIGID_RATE, Recording
+from identification.signals.sample_times import MAX_STEP_DEVIATION
 from identification.signals.samples import RIGID_BANDWIDTH, Preprocessing, Samples, prepare
 from identification.signals.smoothing import (
     FORWARDS,

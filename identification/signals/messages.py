@@ -7,10 +7,10 @@ from typing import Final
 
 import numpy as np
 
-from identification.signals.clock import MAX_STEP_DEVIATION, SampleTimes, TimeBase
 from identification.signals.masks import RowReason
 from identification.signals.position_steps import PositionJump
 from identification.signals.row_faults import RowFault, RowFaultKind
+from identification.signals.sample_times import MAX_STEP_DEVIATION, SampleTimes, TimeBase
 from identification.text import duration_text, number, percentage
 
 ROW_REASONS: Final[Mapping[RowReason, str]] = {

@@ -22,8 +22,8 @@ import scipy
 from numpy.typing import NDArray
 
 from identification.arrays import Array
-from identification.signals.clock import MAX_STEP_DEVIATION
 from identification.signals.noise import ROWS_AT_ONCE
+from identification.signals.sample_times import MAX_STEP_DEVIATION
 
 Complex = NDArray[np.complex128]
 

@@ -13,9 +13,9 @@ from numpy.typing import NDArray
 from identification.hypotheses.carried_load import MIN_LOAD_EXPLAINED
 from identification.hypotheses.joint_changes import Change, Coupled, Order, Sign
 from identification.hypotheses.little_torque import LITTLE_TORQUE_SHARE
-from identification.signals.clock import SampleTimes
 from identification.signals.position_steps import PositionJump
 from identification.signals.row_faults import RowFault
+from identification.signals.sample_times import SampleTimes
 from identification.validation.consistency import ConsistencyCheck
 from identification.validation.physical_signs import SignKind
 

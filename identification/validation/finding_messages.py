@@ -15,10 +15,10 @@ from dataclasses import dataclass
 from typing import Any, Final, NamedTuple
 
 from identification.hypotheses.joint_changes import COUPLED, ORDERS, SIGNS, Change, Meaning
-from identification.signals.clock import SampleTimes
 from identification.signals.messages import fault_words, time_lines
 from identification.signals.position_steps import PositionJump
 from identification.signals.row_faults import RowFault
+from identification.signals.sample_times import SampleTimes
 from identification.text import joined, number, percentage
 from identification.validation.consistency import ConsistencyCheck, ImpossibleParameter
 from identification.validation.finding import (

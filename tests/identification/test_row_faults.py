@@ -10,9 +10,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from identification.signals.clock import true_times
 from identification.signals.recording import Recording
 from identification.signals.row_faults import RowFaultKind, without_faulty_rows
+from identification.signals.sample_times import true_times
 
 Floats = NDArray[np.float64]
 RATE = 250

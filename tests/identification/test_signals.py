@@ -16,7 +16,6 @@ from identification.model.friction import FrictionLaw
 from identification.model.motion import Motion
 from identification.model.robot import RobotModel
 from identification.selection.questions import SELECTION_RATE
-from identification.signals.clock import time_base, true_times
 from identification.signals.masks import (
     END_PERIODS,
     MAX_END_SECONDS,
@@ -39,6 +38,7 @@ from identification.signals.recording import (
     offsets_of_repetitions,
     without_repeats,
 )
+from identification.signals.sample_times import time_base, true_times
 from identification.signals.samples import Preprocessing, prepare
 from identification.signals.smoothing import (
     fit_smoothing_spline,

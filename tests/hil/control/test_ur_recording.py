@@ -40,7 +40,7 @@ from hil.look.readings import Fact
 from hil.pipeline.identification import identify_archives
 from hil.pipeline.options import FIXED
 from hil.pipeline.sources import source_of
-from hil.pipeline.torque_constants import find_gains
+from hil.pipeline.torque_constant_fit import find_gains
 from identification.estimators.delay import estimate_delay
 from identification.model.known_payload import Payload
 from sim_fixtures.plant import Carried

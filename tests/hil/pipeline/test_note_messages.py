@@ -12,8 +12,8 @@ from hil.pipeline.note_messages import note_lines
 from hil.pipeline.notes import Note
 from hil.pipeline.torque_scale import ScaleSource, TorqueScale
 from identification.estimators.delay import DelayEstimate
-from identification.signals.clock import SampleTimes, time_base
 from identification.signals.masks import RowReason
+from identification.signals.sample_times import SampleTimes, time_base
 from identification.validation.consistency import ConsistencyCheck
 
 DELAY = DelayEstimate(
