@@ -31,6 +31,7 @@ class CarriedLoad(NamedTuple):
     explained: float  # share of the additional error on unseen motion that it explains
     axes: int  # number of joints whose error is far above that of the fit
     half_interval: float = np.inf  # of the mass, 95 % [kg]; infinite if unknown
+    is_throughout: bool = True  # whether both halves of the unseen motion have this mass
 
 
 def find_load(
@@ -75,12 +76,39 @@ def find_load(
     if load.explained <= MIN_LOAD_EXPLAINED:
         return load
     try:
-        runs = [
-            Run.of(str(k), model, samples, None, loaded=loaded)
-            for loaded, some in ((False, training), (True, held_out))
-            for k, samples in enumerate(some)
-        ]
-        mass, _, high = mass_difference(model, runs)
+        mass, half_interval = _mass(model, training, held_out)
     except IdentificationError:
         return load
-    return load._replace(mass=mass, half_interval=high - mass) if np.isfinite(high) else load
+    if not np.isfinite(half_interval):
+        return load
+    is_throughout = _is_throughout(model, training, held_out)
+    return load._replace(mass=mass, half_interval=half_interval, is_throughout=is_throughout)
+
+
+def _is_throughout(
+    model: RobotModel, training: Sequence[Samples], held_out: Sequence[Samples]
+) -> bool:
+    """Return whether the masses in both halves of each recording agree, within their intervals."""
+    pairs = [(samples, len(samples.torque)) for samples in held_out]
+    halves = (
+        [samples.between(0, rows // 2) for samples, rows in pairs],
+        [samples.between(rows // 2, rows) for samples, rows in pairs],
+    )
+    try:
+        masses, intervals = np.transpose([_mass(model, training, half) for half in halves])
+    except IdentificationError:
+        return True  # too few rows to tell
+    return not abs(masses[0] - masses[1]) > np.hypot(*intervals)
+
+
+def _mass(
+    model: RobotModel, training: Sequence[Samples], loaded: Sequence[Samples]
+) -> tuple[float, float]:
+    """Return the mass of a body in loaded recordings [kg], and half its 95 % interval."""
+    runs = [
+        Run.of(str(k), model, samples, None, loaded=is_loaded)
+        for is_loaded, some in ((False, training), (True, loaded))
+        for k, samples in enumerate(some)
+    ]
+    mass, _, high = mass_difference(model, runs)
+    return mass, high - mass

@@ -521,9 +521,15 @@ SENTENCES: Final[Mapping[FindingKey, Sentence]] = {
     ),
     "load": Sentence(
         "load",
-        "on {motion} the arm carried {mass:.3g}{interval} kg {difference:more} than on the fitted"
-        " motion: a body on the last link explains {explained:pc0} of the additional error",
-        optional={"interval": Optional(" ± {half_interval:.2g}")},
+        "on {motion} the arm carried {load} the fitted motion: a body on the last link explains"
+        " {explained:pc0} of the additional error",
+        optional={
+            "interval": Optional(" ± {half_interval:.2g}"),
+            "load": Optional(
+                "{mass:.3g}{interval} kg {difference:more} than on",
+                "a load for a part of the time that it did not carry on",
+            ),
+        },
     ),
     "changed torque": Sentence(
         "sameness",

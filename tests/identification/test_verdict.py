@@ -602,6 +602,13 @@ class TestJudgement:
         assert findings["load"].level == "wrong" and "unexplained error" not in findings
         assert_figures(findings["load"], {"mass": 2.0, "explained": 0.98, "half_interval": 0.1})
 
+    def test_a_load_for_a_part_of_the_time_has_no_mass(self):
+        """The mass that fits all of the unseen motion is between that of the load and none."""
+        changes = {"held_out": an_error(0.1), "noise_floor": np.full(2, 0.1), "diagnosis": NOTHING}
+        load = CarriedLoad(1.1, 0.93, 2, half_interval=0.6, is_throughout=False)
+        finding = found(**changes, load=load)["load"]
+        assert_figures(finding, {"explained": 0.93})
+
     def test_a_motion_in_one_direction_is_doubtful(self):
         finding = found(one_way=np.array([False, True]))["one direction"]
         assert (finding.level, finding.joints) == ("doubtful", (1,))

@@ -29,14 +29,12 @@ def load(evidence: Evidence, limits: Thresholds) -> Finding | None:
     if 2 * found.axes < len(evidence.held_out.rows):
         return None
     # A mass whose interval includes zero is no load; one without an interval is not known.
-    if half_interval < np.inf and abs(found.mass) <= half_interval:
+    if half_interval < np.inf and abs(found.mass) <= half_interval and found.is_throughout:
         return None
-    values: dict[str, Value] = {
-        "mass": abs(found.mass),
-        "difference": found.mass,
-        "explained": found.explained,
-    }
-    if is_known:
+    values: dict[str, Value] = {"explained": found.explained}
+    if found.is_throughout:  # else the mass is that of no time
+        values |= {"mass": abs(found.mass), "difference": found.mass}
+    if is_known and found.is_throughout:
         values["half_interval"] = half_interval
     return Finding("load", "wrong", "record with one payload", "cause", values)
 
