@@ -30,7 +30,7 @@ def loaded_by(*modules: str) -> set[str]:
 @pytest.mark.parametrize(
     "modules",
     [
-        pytest.param(["hil.cell"], id="the cell file"),
+        pytest.param(["hil.cell.cell"], id="the cell file"),
         pytest.param(["hil.importers.text_table"], id="a text table", marks=pytest.mark.long),
         pytest.param([f"hil.importers.{name}" for name in IMPORTERS], id="any log or bag"),
     ],
@@ -44,3 +44,9 @@ def test_reading_a_file_loads_neither_estimators_nor_searches(modules: list[str]
 
 def test_identification_knows_nothing_of_hil() -> None:
     assert not {name for name in loaded_by("identification.api") if name.startswith("hil")}
+
+
+def test_a_look_loads_no_interpolator_or_recorder() -> None:
+    loaded = loaded_by("hil.cli.look")
+    assert "planner.limits" in loaded
+    assert not {"planner.api", "planner.interpolator", "hil.archive.recorder"} & loaded

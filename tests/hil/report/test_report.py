@@ -737,6 +737,18 @@ class TestPictures:
         shown = [float(text.replace("−", "-")) for text in texts_of(panel, "end") if text]
         assert shown and all(0.5 * values[0] <= value <= 2.0 * values[1] for value in shown)
 
+    def test_have_a_grid_line_at_every_number(self):
+        panel = chart_panel(one_chart([0.0, 1.0, 0.0]))
+        (grid,) = re.findall(r'd="([^"]*)"[^>]*stroke:var\(--grid\)', panel.svg)
+        lines = [[float(x) for x in part.split()] for part in grid.split("M")[1:]]
+        upright = [line for line in lines if line[0] == line[2]]
+        level = [line for line in lines if line[1] == line[3]]
+        assert len(level) == len(texts_of(panel, "end"))
+        columns = [
+            float(x) for x in re.findall(r'text-anchor:middle[^>]* x="([^"]*)"[^>]*>\d', panel.svg)
+        ]
+        assert [line[0] for line in upright] == pytest.approx(columns, abs=0.2)
+
     def test_interrupt_a_line_at_nan(self):
         panel = chart_panel(one_chart([0.0, 1.0, np.nan, 1.0, 0.0]))
         (line,) = re.findall(r'd="([^"]*)"[^>]*stroke:var\(--ink\)', panel.svg)
