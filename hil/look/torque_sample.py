@@ -96,8 +96,11 @@ class TorqueSample:
         return bool(self.jumps) and self._is_far
 
     def is_suspect(self, found: TorqueDiagnosis) -> bool:
-        """Return whether the torque does not follow the arm as it is read."""
-        return self._is_far or any(step.sure for step in found.zeros)
+        """Return whether the torque does not follow the arm as it is read.
+
+        Joints of a wrist have so little torque that the error of all hides theirs.
+        """
+        return self._is_far or any(step.sure for step in (*found.zeros, *found.discrete))
 
     def contradictions(
         self,
