@@ -5,6 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Annotated
 
+import numpy as np
 import typer
 
 from hil.base.exit_status import ExitStatus
@@ -45,12 +46,13 @@ def compare(
 
         make_folder(output.parent)
         write_files(output.parent, {output.name: comparison_page(comparison)})
-        reporter.say(f"report: {output}")
     if json:
         print_json(comparison.document)
     else:
         lines = [] if quiet else _lines(comparison)
         lines = [f"{comparison.verdict}.", *lines]
+        if output is not None and not quiet:
+            lines.append(f"report: {output}")
         for line in lines if verbose else brief(lines):
             typer.echo(printable(line))
     if fail_on_change and comparison.changed:
@@ -65,4 +67,29 @@ def _lines(comparison: comparing.ArmComparison) -> list[str]:
         f"change {change.change:+.3g} ± {change.half:.2g} (95 %), p {change.p_value:.1g}"
         for change in sorted(comparison.changed, key=lambda change: change.p_value)
     ]
-    return [*changes, *(f"note: {warning}" for warning in comparison.warnings)]
+    notes = [f"note: {warning}" for warning in comparison.warnings]
+    return [*changes, *_scope(comparison), *notes]
+
+
+def _scope(comparison: comparing.ArmComparison) -> list[str]:
+    """Return what was compared with what, and how small a change of friction shows."""
+    reference, *others = comparison.names
+    kinds = [change.kind for change in comparison.changes if change.campaign == others[0]]
+    inertial, friction = kinds.count("inertia"), kinds.count("friction")
+    lines = [
+        f"compared with {reference}: {', '.join(others)}; {inertial} inertial parameters and the "
+        f"friction of {friction} joints"
+    ]
+    halves = {
+        change.axis: 100.0 * change.half / abs(change.before)
+        for change in comparison.changes
+        if change.kind == "friction" and change.before and np.isfinite(change.half)
+    }
+    if halves:
+        least, most = (extreme(halves, key=halves.__getitem__) for extreme in (min, max))
+        lines.append(
+            f"95 % interval of a change of friction: ± {halves[least]:.2g} % in {least} to "
+            f"± {halves[most]:.2g} % in {most}; a change below "
+            f"{100.0 * comparing.MIN_RELATIVE_CHANGE:.0f} % is not reported"
+        )
+    return lines

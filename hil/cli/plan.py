@@ -170,7 +170,9 @@ def _table(summary: Mapping[str, Any], start: Array, joint_names: Sequence[str])
     closing = (
         "{duration:.3f} s; {duration_with_stops:.3f} s with a stop at every target; {reduced} "
         "corners rounded less than requested, {stopped} not at all\n"
-        "closest to its limit: {worst_limit}, {worst_limit_ratio:.6f} of it ({angles} angles; "
+        "closest to its limit: {worst_limit}, {closest:.1f} % of it ({angles} angles; "
         "floor, walls, currents and self-collision were not checked)"
     )
-    return "\n".join([*lines, wrapped(closing.format_map(summary))])
+    return "\n".join(
+        [*lines, wrapped(closing.format(closest=100.0 * summary["worst_limit_ratio"], **summary))]
+    )

@@ -123,18 +123,19 @@ def screen(result: RolloutResult) -> list[str]:
     shown = [(name, arm) for name, arm in arms if arm is not None]
     joints = range(min(MAX_JOINT_ROWS, len(result.joint_names)))
     more = len(result.joint_names) - len(joints)
+    heads = [text for name, _ in shown for text in (name, *[""] * (len(result.horizons) - 1))]
     lines = columns(
         [
+            ["", "", *heads],
             ["", "", *(f"{h:g} s" for _ in shown for h in result.horizons)],
             *(_row(result, joint, shown) for joint in joints),
             [result.tool, "mm", *(milli(at) for _, arm in shown for at in arm.tool)],
         ],
         left=2,
     )
-    names = ", then ".join(name for name, _ in shown)
     parts: list[Part] = [
         Paragraph(result.message),
-        f"{result.windows} windows; error of the {names} arm after",
+        f"{result.windows} windows; position error of each arm after",
         *lines,
     ]
     if more > 0:

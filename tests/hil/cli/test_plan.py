@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import re
 import subprocess
 import sys
 
@@ -60,6 +61,8 @@ def test_via_points_are_reported_in_controller_angles(via, tmp_path):
     assert [row[9].rstrip(",") for row in rows] == ["start", "flown", "flown", "stopped"]
     times = [float(row[7]) for row in rows]
     assert times == sorted(times) and times[0] == 0.0
+    (nearest,) = re.findall(r"closest to its limit: .* ([\d.]+) % of it", " ".join(lines))
+    assert 50.0 < float(nearest) <= 100.0
     fast, slow = (json.loads(run("--via", via, "--json", "--speed", speed)) for speed in (100, 20))
     assert fast["angles"] == "controller"
     np.testing.assert_allclose(fast["targets"][0]["target_deg"], [40, 30, -60, 50, 40, 10])

@@ -108,6 +108,14 @@ class TestRecorded:
         assert done.exit_code == 5
         assert done.stdout == f"{printed['verdict']}.\n"
 
+    def test_the_screen_names_reference_intervals_and_report(self, folders, tmp_path):
+        page = tmp_path / "compare.html"
+        pair = [str(folders["march"]), str(folders["june"])]
+        done = CliRunner().invoke(app, ["compare", *pair, "-o", str(page)])
+        assert "compared with march: june" in done.stdout
+        assert "95 % interval of a change of friction: ±" in done.stdout
+        assert done.stdout.count("compare.html") == 1
+
     @pytest.mark.parametrize(
         ("other", "why"),
         [
