@@ -17,6 +17,7 @@ from hil.control.connection import active_checks, narrower_limits
 from hil.control.link import MotionLink
 from hil.control.motion_checks import MotionChecks
 from hil.control.motions import CampaignMotion, CheckedMoves, require_allowed
+from identification.excitation.collision_messages import unchecked_text
 
 from .dry_run_record import MAX_DRY_RUN_OVERRIDE, DryRunState
 from .dry_run_stage import DryRunStage
@@ -161,8 +162,9 @@ class _CampaignRun:
         cell = self._campaign.cell
         reporter = self._reporter
         checks = MotionChecks.of(cell)
-        if checks.not_checked is not None and self._options.say_unchecked:
-            reporter.say(checks.not_checked)
+        unchecked = unchecked_text(checks.checker.exceptions)
+        if unchecked is not None and self._options.say_unchecked:
+            reporter.say(unchecked)
         sent = [*slow, *full, *(self._warm_up.next_motion() if full else ())]
         # What is wrong with a motion itself is reported before anything is connected.
         require_allowed(sent, checks)

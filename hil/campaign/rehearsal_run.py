@@ -178,7 +178,7 @@ def _not_seen(cell: Cell) -> list[str]:
         "torque constants and current limits: the simulated motors take them from the cell file",
         "floor, walls and shapes: they are checked, but as the cell file and the URDF have them",
     ]
-    if (unchecked := unchecked_text(collision_checker(cell))) is not None:
+    if (unchecked := unchecked_text(collision_checker(cell).exceptions)) is not None:
         sentences.append(unchecked)
     if unknown:
         sentences.append(

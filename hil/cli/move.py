@@ -43,6 +43,7 @@ from hil.control.move import (
     turned,
 )
 from hil.control.record import archive_path
+from identification.excitation.collision_messages import unchecked_text
 
 
 def move(
@@ -243,7 +244,8 @@ def _described(move: CheckedMove, cell: Cell, link: MotionLink) -> str:
     )
     below = narrower_limits(cell, link.connection, "following_error")
     lines += [f"the smaller following-error threshold applies, {note}" for note in below]
-    return wrapped("\n".join(filter(None, [*lines, move.checks.not_checked])))
+    unchecked = unchecked_text(move.checks.checker.exceptions)
+    return wrapped("\n".join(filter(None, [*lines, unchecked])))
 
 
 def _print(text: str, figures: dict[str, object], *, json: bool) -> None:

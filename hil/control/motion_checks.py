@@ -19,7 +19,6 @@ from identification.excitation import (
     check_motion,
     messages,
 )
-from identification.excitation.collision_messages import unchecked_text
 from identification.excitation.violation import CloseBodies, JointQuantity, LoadedDrive
 from planner import FourierSeries, JointLimits, NotSmooth, PiecewiseCubic
 from planner.piecewise_cubic import check_rest, check_smooth
@@ -112,11 +111,6 @@ class MotionChecks:
         ours = self.currents.current_limit
         currents = replace(self.currents, current_limit=np.where(below, controller_limits, ours))
         return replace(self, currents=currents, cell_limit=ours)
-
-    @property
-    def not_checked(self) -> str | None:
-        """Pairs of shapes that are not checked since they are always too close; None for none."""
-        return unchecked_text(self.checker)
 
     def refusal(self, trajectory: PiecewiseCubic | FourierSeries) -> str | None:
         """Return why a motion must not be sent, or None."""

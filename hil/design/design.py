@@ -269,7 +269,7 @@ def run_search(
     settings = search_settings(requested)
     checker = problem.constraints.checker
     total = excitation.most_evaluations(settings)
-    unchecked = None if checker is None else unchecked_text(checker)
+    unchecked = None if checker is None else unchecked_text(checker.exceptions)
     if unchecked is not None:
         reporter.say(unchecked)
     done = 0

@@ -30,6 +30,7 @@ from hil.control.link import SESSION_END_TIMEOUT
 from hil.control.live_link import ExchangeMonitor
 from hil.control.motion_watch import Stop
 from identification.excitation import CollisionModelError, Workspace
+from identification.excitation.collision_messages import unchecked_text
 from planner import JointLimits
 
 from .found_shapes import MIN_FRAME_HEIGHT, check_by_found_shapes
@@ -156,7 +157,8 @@ def clear_home(urdf: str, cell_values: CellValues, mesh_folders: Sequence[str]) 
         clear = np.flatnonzero(check.clear)
         if len(clear) > 0:
             values: dict[str, Any] = {"campaign.home_deg": _degrees(postures[clear[0]])}
-            notes = [] if check.exceptions is None else [check.exceptions]
+            unchecked = unchecked_text(check.exceptions)
+            notes = [] if unchecked is None else [unchecked]
             if check.links:
                 notes.append(
                     f"the collision shapes of {', '.join(check.links)} were not found: in "

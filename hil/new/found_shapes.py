@@ -16,7 +16,7 @@ from identification.excitation import (
     MissingMeshError,
     Workspace,
 )
-from identification.excitation.collision_messages import unchecked_text
+from identification.excitation.collision import PairExceptions
 from identification.excitation.separation import frames
 from identification.model.kinematics import chain_from_urdf
 from identification.model.urdf_text import urdf_tree
@@ -30,7 +30,7 @@ class PartialCheck(NamedTuple):
     """Postures that are clear of all known shapes."""
 
     clear: NDArray[np.bool_]  #: (m,)
-    exceptions: str | None  #: pairs that are not checked, or with less than the margin
+    exceptions: PairExceptions
     links: tuple[str, ...]  #: without shapes, or with a mesh that was not found
 
 
@@ -70,8 +70,8 @@ def check_by_found_shapes(
         clear = checker.clear(postures)
         if links:
             clear &= _above_floor(urdf, postures, workspace)
-        return PartialCheck(clear, unchecked_text(checker), tuple(links))
-    return PartialCheck(_above_floor(urdf, postures, workspace), None, tuple(links))
+        return PartialCheck(clear, checker.exceptions, tuple(links))
+    return PartialCheck(_above_floor(urdf, postures, workspace), PairExceptions(), tuple(links))
 
 
 def _without(root: Element, mesh: str) -> list[str]:

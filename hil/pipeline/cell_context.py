@@ -15,7 +15,7 @@ from hil.cell.nominal import nominal_of
 from hil.cell.toml_edits import urdf_limits
 from identification.estimators.torque_channel import torque_noiseless_above
 from identification.factor.estimate import Estimate
-from identification.model.friction import TERMS, FrictionLaw
+from identification.model.friction import COULOMB, TERMS
 from identification.selection.questions import FRICTION_AT_SPEED, LOAD, LOW_PASS, REVERSAL
 from identification.signals.angle_wraps import UNWRAPPED
 from identification.signals.masks import RowReason
@@ -258,23 +258,15 @@ def _friction_law(prepared: Prepared) -> Iterator[Finding]:
     law = cell.model.friction.laws[0]
     table = cell.stated.robot.friction
     stated = law.changed({term.option: getattr(table, term.option) for term in TERMS})
-    laws: dict[str, Value] = {"law": law.summary()[0], "stated": stated.summary()[0]}
-    removed = [term.label.lower() for term in stated.terms if term not in law.terms]
+    laws: dict[str, Value] = {"law": law, "stated": stated}
+    removed = [term for term in stated.terms if term not in law.terms]
     if law.tanh is not None and law.coulomb:
-        removed = [label for label in removed if label != "coulomb"]  # it reverses smoothly
+        removed = [term for term in removed if term != COULOMB]  # it reverses smoothly
     if removed:
         key: FindingKey = "chosen friction law in place of the stated"
-        yield _doubtful(key, "keep the stated friction", option=_option(stated), **laws)
+        yield _doubtful(key, "keep the stated friction", **laws)
     else:
         yield Finding("chosen friction law", "information", values=laws)
-
-
-def _option(law: FrictionLaw) -> str:
-    """Return the terms of a law as an entry of `--friction`."""
-    return ",".join(
-        f"{term.label.lower()}={term.speed:g}" if term.speed_symbol else term.label.lower()
-        for term in law.terms
-    )
 
 
 def _torque_channel(prepared: Prepared) -> Iterator[Finding]:

@@ -76,6 +76,13 @@ class ClosePair(NamedTuple):
     farthest: float
 
 
+class PairExceptions(NamedTuple):
+    """Pairs of bodies that are always, or nearly always, closer than the margin."""
+
+    unchecked: tuple[ClosePair, ...] = ()
+    reduced: tuple[ClosePair, ...] = ()  # checked with a smaller margin
+
+
 class Path(NamedTuple):
     """Positions of all bodies at m samples."""
 
@@ -91,7 +98,7 @@ class CollisionChecker:
     shapes of the arm at most two joints apart (a wrist), and a shape of the first link at a
     constant distance from an obstacle (a rotating foot in the floor). Two shapes at most two joints
     apart whose largest distance there is about the margin, or less and not excluded as above, but
-    not a touch, are checked with that distance less 5 mm. `exceptions` reports all of these.
+    not a touch, are checked with that distance less 5 mm. `exceptions` has all of these.
 
     Meshes of the robot description, in `mesh_folders` of `package://` paths, are replaced by their
     convex hulls. Random postures are within limits, if given, else ± half a turn.
@@ -99,7 +106,7 @@ class CollisionChecker:
     Attributes:
         separation: distance bounds of the p pairs.
         required: least distance of each pair (p,) [m].
-        unchecked, reduced: pairs that are not checked, or with less than the margin.
+        exceptions: pairs that are not checked, or with less than the margin.
         arm_length: length along the arm from the base to its last joint [m]; 1 if it is zero.
 
     Raises:
@@ -133,7 +140,7 @@ class CollisionChecker:
         self.separation = Separation(self._bodies, pairs)
         self._postures = random_postures(chain.n_joints, limits)
         self._tried = self.path(self._postures)
-        self.required, self.unchecked, self.reduced = self._find_close_pairs()
+        self.required, self.exceptions = self._find_close_pairs()
         still = np.zeros(chain.n_joints)
         self._turning_reaches = reaches(chain, self._bodies, self.separation, still)
         self.arm_length = _length(chain)
@@ -189,7 +196,7 @@ class CollisionChecker:
         a, b = self.indices(pair)
         return self._bodies[a].name, self._bodies[b].name
 
-    def _find_close_pairs(self) -> tuple[Array, tuple[ClosePair, ...], tuple[ClosePair, ...]]:
+    def _find_close_pairs(self) -> tuple[Array, PairExceptions]:
         """Remove pairs that are always too close; return the least distances of the others."""
         # Removed: two links at most two joints apart that are too close in all postures, and an
         # obstacle and a shape of the first link at a constant distance below the margin.
@@ -226,7 +233,7 @@ class CollisionChecker:
             required.append(most - slack if close_to_margin else self.margin)
             checked.append((a, b))
         self.separation = Separation(self._bodies, checked)
-        return np.array(required), tuple(unchecked), tuple(reduced)
+        return np.array(required), PairExceptions(tuple(unchecked), tuple(reduced))
 
     def spread(self, first: str, second: str) -> tuple[float, float]:
         """Return the least and largest distance [m] of one of `pairs` in random postures.

@@ -2,14 +2,15 @@
 
 from __future__ import annotations
 
-from identification.excitation.collision import ClosePair, CollisionChecker
+from identification.excitation.collision import ClosePair, PairExceptions
 
 
-def unchecked_text(checker: CollisionChecker) -> str | None:
+def unchecked_text(exceptions: PairExceptions) -> str | None:
     """Return which pairs are not checked, or with a smaller margin; None without any."""
+    unchecked, reduced = exceptions
     groups = {
-        "not checked for collisions, as they are always closer than the margin": checker.unchecked,
-        "checked with a smaller margin, as they are hardly ever further apart": checker.reduced,
+        "not checked for collisions, as they are always closer than the margin": unchecked,
+        "checked with a smaller margin, as they are hardly ever further apart": reduced,
     }
     parts = [
         f"{text}: {'; '.join(map(_pair_text, pairs))}" for text, pairs in groups.items() if pairs

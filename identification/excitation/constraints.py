@@ -14,12 +14,12 @@ from identification.excitation.violation import (
     CloseBodies,
     JointQuantity,
     LoadedDrive,
+    UsableShare,
     Violation,
     WholeMotion,
 )
 from identification.model.motion import Motion
 from identification.model.robot import RobotModel
-from identification.text import percentage
 from planner import FourierSeries, JointLimits, NotSmooth, PiecewiseCubic, Trajectory, check_rest
 from planner.limits import position_rounding
 from planner.piecewise_cubic import Extrema
@@ -81,9 +81,7 @@ def rest_violations(
                 0.0,
                 jump.time,
                 scale=float(getattr(limits, jump.quantity)[jump.joint]),
-                remedy="a sum of sines without a ramp starts and ends at speed; set a ramp"
-                if bare
-                else "a motion must start and end at rest",
+                remedy="set a ramp" if bare else "rest at both ends",
             )
         ]
     return []
@@ -170,8 +168,8 @@ class CurrentModel:
         usable = self.usable * self.current_limit
         violations = _beyond("current", joints, self.current(torque), usable, motion)
         if self.usable < 1.0:
-            remedy = f"a motion may use {percentage(self.usable)} of the motor's limit"
-            violations = [replace(violation, remedy=remedy) for violation in violations]
+            share = UsableShare(self.usable)
+            violations = [replace(violation, remedy=share) for violation in violations]
         if self.torque_limit is not None:
             violations += _beyond("torque", joints, torque, self.torque_limit, motion)
         return violations

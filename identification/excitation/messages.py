@@ -9,10 +9,13 @@ from identification.excitation.violation import (
     JointQuantity,
     Kind,
     LoadedDrive,
+    Remedy,
     Subject,
+    UsableShare,
     Violation,
     WholeMotion,
 )
+from identification.text import percentage
 
 _UNITS: Final[dict[Kind, str]] = {
     "planning": "",
@@ -61,4 +64,14 @@ def violation_text(
         text += f": {violation.value:.4g}{unit}, must be at {side} {violation.bound:.4g}{unit}"
     text += "" if violation.time is None else f", at {violation.time:.3f} s"
     text += f", joints at {joints}" if joints else ""
-    return f"{text}; {violation.remedy}" if violation.remedy else text
+    return text if violation.remedy is None else f"{text}; {_remedy_text(violation.remedy)}"
+
+
+def _remedy_text(remedy: Remedy) -> str:
+    match remedy:
+        case UsableShare(share):
+            return f"a motion may use {percentage(share)} of the motor's limit"
+        case "set a ramp":
+            return "a sum of sines without a ramp starts and ends at speed; set a ramp"
+        case "rest at both ends":
+            return "a motion must start and end at rest"

@@ -50,6 +50,16 @@ class WholeMotion:
     problem: str = ""  #: why it could not be planned
 
 
+@dataclass(frozen=True)
+class UsableShare:
+    """A motion may use a share of a motor's current limit only."""
+
+    share: float  #: 0 to 1
+
+
+Remedy = Literal["set a ramp", "rest at both ends"] | UsableShare
+"""What to do about a violation, or which bound applies."""
+
 Subject = JointQuantity | LoadedDrive | CloseBodies | WholeMotion
 
 
@@ -64,7 +74,7 @@ class Violation:
     time: float | None  #: of the worst instant [s], if there is one
     posture: tuple[float, ...] = ()  #: joint positions there [rad]; empty if irrelevant
     scale: float | None = None  #: deviation from the bound that means an excess of 1; None: bound
-    remedy: str = ""  #: empty if unknown
+    remedy: Remedy | None = None  #: None if unknown
 
     @property
     def excess(self) -> float:

@@ -267,17 +267,6 @@ class FrictionLaw:
         """Symbols of the terms."""
         return tuple(term.symbol for term in self.terms)
 
-    def summary(self) -> tuple[str, str]:
-        """Return the terms, and the behaviour of dry friction at a reversal, as texts."""
-        joined = ", ".join(
-            f"{term.label} ({term.speed:g} rad/s)" if term.speed_symbol else term.label
-            for term in self.terms
-        )
-        reversal = f"presliding over {self.presliding:g} rad" if self.presliding else "sgn(v)"
-        if self.tanh is not None:
-            reversal = f"tanh(v / {self.tanh:g} rad/s)"
-        return joined or "no friction", reversal
-
     def sign(self, velocity: Array, out: Array | None = None) -> Array:
         """Return the direction of motion: sgn(v), or in a linear zone v / standstill."""
         if self.zone == "exclude":

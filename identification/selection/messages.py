@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Final
 
+from identification.model.messages import reversal_text, terms_text
 from identification.selection.essential import Elimination
 from identification.selection.settings import Candidate, Strength
 from identification.text import number, percentage
@@ -39,15 +40,6 @@ def strength_words(strength: Strength) -> tuple[str, ...]:
 
 def _described(candidate: Candidate) -> tuple[str, ...]:
     """Return a candidate property by property."""
-    terms = ", ".join(
-        label if speed is None else f"{label} ({speed:g} rad/s)"
-        for label, speed in candidate.friction
-    )
-    reversal = "sgn(v)"
-    if candidate.tanh is not None:
-        reversal = f"tanh(v / {candidate.tanh:g} rad/s)"
-    elif candidate.presliding:
-        reversal = f"presliding over {candidate.presliding:g} rad"
     ripple = "no torque ripple"
     if candidate.ripple:
         ripple = f"torque ripple, {' and '.join(map(str, candidate.ripple))} per motor turn"
@@ -58,8 +50,8 @@ def _described(candidate: Candidate) -> tuple[str, ...]:
     return (
         f"{candidate.bandwidth:g} Hz",
         "measured velocity" if candidate.velocity == "measured" else "velocity from positions",
-        terms or "no friction",
-        reversal,
+        terms_text(candidate.friction),
+        reversal_text(candidate.tanh, candidate.presliding),
         ripple,
         f"torsion springs of {springs}" if springs else "no torsion spring",
         _ROWS[candidate.excluded_rows],

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from identification.hypotheses.carried_load import MIN_LOAD_EXPLAINED
 from identification.hypotheses.joint_changes import Change, Coupled, Order, Sign
 from identification.hypotheses.little_torque import LITTLE_TORQUE_SHARE
+from identification.model.friction import FrictionLaw
 from identification.signals.position_steps import PositionJump
 from identification.signals.row_faults import RowFault
 from identification.signals.sample_times import SampleTimes
@@ -260,6 +261,7 @@ Value = (
     | RowFault
     | SampleTimes
     | ConsistencyCheck
+    | FrictionLaw
     | tuple[str, ...]
     | tuple[int, ...]
     | tuple[float, ...]

@@ -15,6 +15,8 @@ from dataclasses import dataclass
 from typing import Any, Final, NamedTuple
 
 from identification.hypotheses.joint_changes import COUPLED, ORDERS, SIGNS, Change, Meaning
+from identification.model.friction import FrictionLaw
+from identification.model.messages import law_option, law_text
 from identification.signals.messages import fault_words, time_lines
 from identification.signals.position_steps import PositionJump
 from identification.signals.row_faults import RowFault
@@ -206,6 +208,8 @@ class _Text(string.Formatter):
                 return "; ".join(time_lines(value))
             case ConsistencyCheck():
                 return f"{_consistency_cost(value)}: {_consistency_remedy(value)}"
+            case FrictionLaw():
+                return law_option(value) if format_spec == "option" else law_text(value)
             case RepeatedSamples():
                 return f"{value.joint} {value.count} in {value.recording}"
             case tuple() if format_spec == "names":
@@ -921,7 +925,9 @@ REMEDIES: Final[Mapping[RemedyKey, str]] = {
         "describe the friction of {joints} by further terms (`--friction` or [robot.friction]), or"
         " use its curve in the report"
     ),
-    "keep the stated friction": ("keep it with `hil identify --friction {option}` if it is known"),
+    "keep the stated friction": (
+        "keep it with `hil identify --friction {stated:option}` if it is known"
+    ),
     "describe elements, or check the drives": (
         f"describe {_ELEMENTS}, if the arm has one, in [[robot.elements]] of the cell file; else"
         " check gear ratios, signs, torque constants and the delay between torque and position"

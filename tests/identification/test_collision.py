@@ -339,12 +339,12 @@ class TestPairs:
     def test_only_close_pairs_of_a_wrist_are_unchecked(self):
         wrist = CollisionChecker(ball_chain(0.08, 0.01, 0.2), NOWHERE)
         assert ("link_0", "link_2") not in wrist.pairs
-        (pair,) = wrist.unchecked
+        (pair,) = wrist.exceptions.unchecked
         assert (pair.first, pair.second) == ("link_0_0", "link_2_0")
         assert pair.nearest <= pair.farthest < 0.0
-        assert "link_0_0 and link_2_0" in str(unchecked_text(wrist))
-        assert checkers(0.05).unchecked == ()
-        assert unchecked_text(checkers(0.05)) is None
+        assert "link_0_0 and link_2_0" in str(unchecked_text(wrist.exceptions))
+        assert checkers(0.05).exceptions.unchecked == ()
+        assert unchecked_text(checkers(0.05).exceptions) is None
         # Four joints between base and tip: permanent contact is reported.
         far = CollisionChecker(ball_chain(0.3, 0.0, 0.0, 0.4), NOWHERE)
         contact = far.deepest_contact(np.zeros((1, 4)))
@@ -356,8 +356,8 @@ class TestPairs:
         urdf = ball_chain(0.08, 0.0, 0.1)
         _, most = CollisionChecker(urdf, NOWHERE).spread("link_0", "link_2")
         checker = CollisionChecker(urdf, Workspace(floor=None, margin=most - 0.001))
-        assert (len(checker.reduced), checker.unchecked) == (1, ())
-        assert "link_0_0 and link_2_0" in str(unchecked_text(checker))
+        assert (len(checker.exceptions.reduced), checker.exceptions.unchecked) == (1, ())
+        assert "link_0_0 and link_2_0" in str(unchecked_text(checker.exceptions))
         q = np.random.default_rng(5).uniform(-np.pi, np.pi, (100, 3))
         distances = [checker.distance(0, checker.path(q), k) for k in range(len(q))]
         clear = np.array(distances) >= most - 0.005
@@ -403,7 +403,7 @@ class TestPairs:
         with_obstacle = {first for first, second in checker.pairs if not second.startswith("link")}
         assert with_obstacle >= {f"link_{k}" for k in range(2, 7)}
         # The first link turns in it in all motions: reported, not checked.
-        assert {pair.first[:6] for pair in checker.unchecked} == {"link_1"}
+        assert {pair.first[:6] for pair in checker.exceptions.unchecked} == {"link_1"}
         home = np.array([[0.0, -np.pi / 2, np.pi / 2, 0.0, np.pi / 2, 0.0]])
         contact = checker.deepest_contact(home)
         assert contact is not None and contact.first == "link_2"
@@ -418,7 +418,7 @@ class TestPairs:
         )
         checker = CollisionChecker(urdf, Workspace(floor=floor))
         assert checker.pairs == (("arm", "floor"),)
-        assert checker.unchecked == ()
+        assert checker.exceptions.unchecked == ()
 
     def test_a_ur5_on_the_floor_is_checked_but_for_its_mounting(self):
         """Base and shoulder turn 3 cm above it, less than the margin, in every posture."""
@@ -433,4 +433,4 @@ class TestPairs:
         level = np.array([0.0, -0.05, 0.0, -1.57, 0.0, 0.0])
         bowed = np.array([0.0, 0.1, -0.6, -1.57, 0.0, 0.0])
         assert checker.clear(np.array([upright, level, bowed])).tolist() == [True, True, False]
-        assert "upper_arm_link_0 and floor" in str(unchecked_text(checker))
+        assert "upper_arm_link_0 and floor" in str(unchecked_text(checker.exceptions))

@@ -44,6 +44,8 @@ from identification.excitation.violation import (
     CloseBodies,
     JointQuantity,
     LoadedDrive,
+    UsableShare,
+    Violation,
     excess_by_kind,
 )
 from identification.model.friction import FrictionLaw
@@ -317,7 +319,8 @@ class TestCurrents:
         generous = make_currents([100.0, 100.0])
         assert check_motion(swing, ROD_LIMITS, currents=generous) == ()
         current = np.abs(generous.current(generous.torque(motion)))[:, 1]
-        for share, remedy in ((1.0, ""), (0.8, "a motion may use 80 % of the motor's limit")):
+        usable = UsableShare(0.8), "a motion may use 80 % of the motor's limit"
+        for share, remedy, words in ((1.0, None, ""), (0.8, *usable)):
             tight = make_currents([100.0, 0.9 / share * current.max()], usable=share)
             (violation,) = check_motion(swing, ROD_LIMITS, currents=tight)
             assert (violation.kind, subject_text(violation.subject)) == (
@@ -329,8 +332,20 @@ class TestCurrents:
             assert violation.excess == pytest.approx(1 / 0.9 - 1)
             assert violation.time == motion.time[current.argmax()]
             assert violation.remedy == remedy
-            for word in ("current", "motor of elbow", "A", f"{violation.time:.3f} s", remedy):
+            for word in ("current", "motor of elbow", "A", f"{violation.time:.3f} s", words):
                 assert word in violation_text(violation)
+
+    @pytest.mark.parametrize(
+        ("remedy", "words"),
+        [
+            ("set a ramp", "a sum of sines without a ramp starts and ends at speed; set a ramp"),
+            ("rest at both ends", "a motion must start and end at rest"),
+        ],
+    )
+    def test_a_motion_that_is_not_at_rest_at_an_end_gets_a_remedy(self, remedy, words):
+        subject = JointQuantity("velocity", 0, "start")
+        violation = Violation("joint limit", subject, 0.5, 0.0, 0.0, remedy=remedy)
+        assert violation_text(violation).endswith(f"; {words}")
 
     def test_a_prediction_that_is_not_finite_violates_every_limit(self, swing):
         broken = make_currents([1e9, 1e9], ROD_VALUES * np.nan)
@@ -747,7 +762,7 @@ class TestRefusal:
         mildest = error.nearest["current"]
         assert isinstance(mildest.subject, LoadedDrive) and mildest.subject.is_motor
         assert mildest.value > mildest.bound
-        assert str(mildest) in str(error)
+        assert violation_text(mildest) in str(error)
         monkeypatch.setattr(validation_motions, "_MAX_DURATION", 2.0)
         error = self.refusal(seed=1)
         assert error.rejected == {"duration": 100}

@@ -13,6 +13,7 @@ from identification.model.coupling import Coupling
 from identification.model.elements import TorqueRipple, TorsionSpring
 from identification.model.friction import FrictionLaw, dissipation
 from identification.model.known_payload import Payload
+from identification.model.messages import law_text
 from identification.model.robot import RobotModel
 from sim_fixtures.ns16 import urdf_text
 from tests.identification.two_link import MODEL, NOISE, URDF, a_motion, simulated, truth
@@ -44,7 +45,7 @@ class TestLaw:
 
     def test_it_is_a_table_of_a_cell_file(self):
         assert FrictionLaw.from_table(LAW.table()) == LAW
-        assert LAW.summary()[0] == "Coulomb, viscous, load"
+        assert law_text(LAW) == "Coulomb, viscous, load"
 
     def test_joints_may_differ(self):
         model = RobotModel.from_urdf(

@@ -32,6 +32,7 @@ from identification.model.elements import (
 )
 from identification.model.friction import FrictionLaw, JointFriction, dissipation, presliding_state
 from identification.model.kinematics import PINOCCHIO_ORDER, chain_from_urdf
+from identification.model.messages import law_text, reversal_text
 from identification.model.motion import Motion
 from identification.model.pseudo_inertia import (
     AS_GIVEN,
@@ -491,12 +492,16 @@ def torque_of(law, coefficients, v):
 
 
 def test_a_law_states_its_terms():
-    assert FrictionLaw(tanh=0.05).summary()[1] == "tanh(v / 0.05 rad/s)"
-    assert FrictionLaw(presliding=1e-3).summary()[1] == "presliding over 0.001 rad"
-    assert FrictionLaw(coulomb=False, viscous=False, third=None).summary() == (
-        "no friction",
-        "sgn(v)",
+    assert (
+        law_text(FrictionLaw(stribeck=0.1)) == "Coulomb, viscous, quadratic, Stribeck (0.1 rad/s)"
     )
+    assert law_text(FrictionLaw(coulomb=False, viscous=False, third=None)) == "no friction"
+
+
+def test_a_reversal_is_at_a_speed_over_a_displacement_or_at_once():
+    assert reversal_text(tanh=0.05, presliding=0.0) == "tanh(v / 0.05 rad/s)"
+    assert reversal_text(tanh=None, presliding=1e-3) == "presliding over 0.001 rad"
+    assert reversal_text(tanh=None, presliding=0.0) == "sgn(v)"
 
 
 def test_the_package_lists_its_names():

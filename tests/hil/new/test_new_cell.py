@@ -146,7 +146,7 @@ def test_a_design_begins_where_the_arm_is_clear(
     assert (cell.campaign.home_deg, cell.file.workspace.floor) == (home, floor)
     checker = collision_checker(cell)
     assert checker.clear(cell.home[None]).tolist() == [True]
-    assert unchecked_text(checker) in summary["notes"]
+    assert unchecked_text(checker.exceptions) in summary["notes"]
     comments = " ".join(line.lstrip("# ") for line in cell.text.splitlines())
     assert all(f"Note: {note}" in comments for note in summary["notes"])
 

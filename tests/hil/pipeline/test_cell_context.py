@@ -6,7 +6,9 @@ import numpy as np
 import pytest
 
 from hil.pipeline.cell_context import _friction_law, _resolution, _sampling_rate, grid_step
+from hil.pipeline.options import friction_from
 from identification.model.friction import FrictionLaw
+from identification.model.messages import law_option
 from identification.selection.questions import LOAD
 from identification.selection.settings import Choice
 from identification.signals.angle_wraps import (
@@ -18,6 +20,7 @@ from identification.signals.recording import (
     Recording,
 )
 from identification.signals.samples import Preprocessing
+from identification.validation.finding_messages import Naming, worded
 from tests.identification.two_link import MODEL, as_samples, one_sine
 
 TIME = np.arange(0.0, 20.0, 0.01)
@@ -79,7 +82,7 @@ class TestFrictionLaw:
     def test_a_term_that_nobody_stated_is_said(self):
         (finding,) = friction_findings(self.BASIC, self.BASIC.changed({"load": True}))
         assert (finding.key, finding.level) == ("chosen friction law", "information")
-        assert finding.values["law"] == "Coulomb, viscous, load, offset"
+        assert finding.values == {"law": self.BASIC.changed({"load": True}), "stated": self.BASIC}
 
     @pytest.mark.parametrize("stated", [{"third": "quadratic"}, {"stribeck": 0.1}, {"load": True}])
     def test_a_stated_term_that_goes_is_a_warning(self, stated):
@@ -87,7 +90,16 @@ class TestFrictionLaw:
         assert finding.level == "doubtful"
         terms = {"quadratic": "quadratic", 0.1: "stribeck=0.1", True: "load"}
         (term,) = stated.values()
-        assert finding.values["option"].endswith(f"{terms[term]},offset")
+        option = f"--friction coulomb,viscous,{terms[term]},offset`"
+        assert option in worded(finding, Naming()).next_step
+
+    def test_coulomb_friction_that_reverses_smoothly_is_kept(self):
+        (finding,) = friction_findings(self.BASIC, self.BASIC.changed({"tanh": 0.05}))
+        assert finding.key == "chosen friction law"
+
+    def test_the_option_in_the_next_step_gives_the_stated_law(self):
+        stated = FrictionLaw(third="cubic", stribeck=0.1, load=True, asymmetric=True, offset=True)
+        assert stated.changed(friction_from(law_option(stated))) == stated
 
     def test_the_stated_law_is_not_mentioned(self):
         assert friction_findings(self.BASIC, self.BASIC, chosen=0) == []
