@@ -260,7 +260,7 @@ class Cell:
         spec = self.link_spec
         if spec is None:
             problem = "a simulated controller has no link"
-            remedy = "write " + " or ".join(f'"{name}"' for name in LINKS)
+            remedy = "write one of " + ", ".join(f'"{name}"' for name in LINKS)
             raise self.error("controller.transport", table.transport, problem, remedy)
         try:
             spec.check(table.mode)
