@@ -153,7 +153,7 @@ class Wire(Protocol):
         """Return what makes packets of a backlog alike, without interpreting them."""
 
     def ahead(self, later: int, earlier: int) -> int:
-        """Return the packets by which one number is ahead of another."""
+        """Return how many packets one number is ahead of another."""
 
 
 class PacketSort(NamedTuple):
@@ -174,7 +174,7 @@ class OwnPackets(Protocol):
     """Packets of a controller that rests, made on this computer."""
 
     def first(self) -> bytes:
-        """Return the packet by which it introduces itself."""
+        """Return the packet that introduces the controller."""
 
     def next(self, *, opened: bool) -> bytes:
         """Return the packet of the next cycle, with axes open or closed."""

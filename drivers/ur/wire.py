@@ -456,7 +456,7 @@ class UrWire:
         self._columns.write(self._values, state)
 
     def fill_safe(self, requested: bool, cycle: int) -> None:
-        """Begin a reply by which the arm stays where it was commanded.
+        """Begin a reply that keeps the arm at its last command.
 
         Raises:
             ArmNotReadyError: the controller's state does not permit a motion.

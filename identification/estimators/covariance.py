@@ -131,7 +131,7 @@ def block_covariance(
 
 
 def solve_with_prior(equations: NormalEquations, precision: Array) -> Solution:
-    """Solve with the information (p, p) of a prior of mean zero, by which all is determined."""
+    """Solve with the information (p, p) of a zero-mean prior that determines every parameter."""
     return solve(equations._replace(A=equations.A + precision), _MAX_CONDITION_WITH_PRIOR)
 
 

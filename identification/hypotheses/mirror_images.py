@@ -23,7 +23,7 @@ _PARALLEL: Final = 0.9  # cosine of the angle between an axis and its image
 
 
 class Signs(NamedTuple):
-    """Signs by which recorded positions and torques of n joints are multiplied."""
+    """Signs that multiply recorded positions and torques of n joints."""
 
     position: Array  # (n,)
     torque: Array  # (n,)
@@ -85,7 +85,7 @@ class SignRival(NamedTuple):
 
 
 def mirror_images(chain: Chain, gravity: Array) -> tuple[tuple[int, ...], ...]:
-    """Return the sets of joints of which all are negated in a mirror image of an arm.
+    """Return the sets of joints that a mirror image of an arm negates together.
 
     By the directions of its axes at zero: whether lengths and masses allow it, a recording says.
 

@@ -48,7 +48,7 @@ _ALIKE_ERROR_RATIO: Final = 1.1
 
 
 class UnseenChange(NamedTuple):
-    """Factor by which a joint's torque or friction on unseen motion differs from the fitted one."""
+    """Ratio of a joint's torque or friction on unseen motion to the fitted one."""
 
     kind: ChangeKind
     joint: int

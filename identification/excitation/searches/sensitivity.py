@@ -173,7 +173,7 @@ def sensitivity_of(problem: SensitivityProblem, genes: Array, weights: Array | N
 
 
 def gene_steps(genes: Array) -> Array:
-    """Return the steps (n_genes,) by which genes are changed, towards the middle of their range."""
+    """Return the step of each gene (n_genes,), towards the middle of their range."""
     return np.where(genes > 0.5, -_GENE_STEP, _GENE_STEP)
 
 
