@@ -306,9 +306,11 @@ def _estimated(
         step = np.clip(solution.values[p], -_PROFILE_STEP, _PROFILE_STEP)
         previous = shift
         shift = float(np.clip(shift + step, *ends))
-        if abs(shift - previous) <= max(
+        settled = abs(shift - previous) <= max(
             _CONVERGED_SECONDS, _CONVERGED_STD_SHARE * float(np.sqrt(solution.inverse[p, p]))
-        ):
+        )
+        # The first step is weighted by a fit without what resembles a delay.
+        if settled and iteration > 0:
             break
         # What is far from determined need not settle, and often does not.
         if iteration >= _FIRST_ITERATIONS and blocks.delay_std(solution)[0] > MAX_HALF_INTERVAL:
