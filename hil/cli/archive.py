@@ -14,13 +14,10 @@ from hil.archive.check import ArchiveCheck, Overview, archive_files, check_archi
 from hil.archive.repair import repair as repair_archive
 from hil.base.errors import ArchiveError, InputError
 from hil.base.exit_status import ExitStatus
-from hil.base.one_screen import SCREEN_COLUMNS, SCREEN_LINES
+from hil.base.one_screen import SCREEN_LINES, brief
 from hil.base.terminal_text import printable, typed
 from hil.cli import exit_code_of
 from hil.cli.arguments import JsonOption, VerboseOption, print_json
-
-_CUT: Final = " ..."
-"""End of a line that is longer than the screen."""
 
 app = typer.Typer(help="Inspect, check and repair archives.", no_args_is_help=True)
 
@@ -41,8 +38,11 @@ def info(files: Files, as_json: JsonOption = False, verbose: VerboseOption = Fal
             failed = exit_code_of(error)
             _print_error(path, error, as_json=as_json)
             continue
-        lines = _info_lines(overview)
-        shown = lines if verbose else _one_screen(lines)
+        lines = [printable(line, keep="") for line in _info_lines(overview)]
+        shown = lines if verbose else brief(lines)
+        if overview.damage:  # the command is never cut
+            remedy = f"  to repair it: hil archive repair {typed(overview.path)}"
+            shown = [*(shown if verbose else shown[: SCREEN_LINES - 1]), remedy]
         typer.echo(json.dumps(overview.to_dict()) if as_json else _shown(shown))
     raise typer.Exit(failed)
 
@@ -165,26 +165,13 @@ _UNITS: Final[Mapping[str, str | Mapping[str, str]]] = {
 """Units of the entries of an overview: of a row, or by the name of a table's row."""
 
 
-def _one_screen(lines: Sequence[str]) -> list[str]:
-    """Return at most a screen of lines, each cut to its width, and what -v shows in addition."""
-    whole = [printable(line, keep="") for line in lines]
-    if len(whole) <= SCREEN_LINES and max(map(len, whole)) <= SCREEN_COLUMNS:
-        return whole
-    shown = [*map(_cut, whole[: SCREEN_LINES - 1])]
-    more = len(whole) - len(shown)
-    return [*shown, f"{more} more lines, and whole lines: -v" if more > 0 else "whole lines: -v"]
-
-
-def _cut(line: str) -> str:
-    if len(line) <= SCREEN_COLUMNS:
-        return line
-    return f"{line[: SCREEN_COLUMNS - len(_CUT)].rstrip()}{_CUT}"
-
-
 def _info_lines(overview: Overview) -> list[str]:
     """Return the entries of the overview with their units, tables row by row."""
     lines = [str(overview.path)]
-    for key, value in overview.to_dict().items():
+    entries = overview.to_dict()
+    if overview.damage:  # first, as one screen may not have room for all
+        entries = {"damage": entries.pop("damage"), **entries}
+    for key, value in entries.items():
         if key in ("file", "archive"):
             continue
         unit = _UNITS.get(key, "")
@@ -198,8 +185,6 @@ def _info_lines(overview: Overview) -> list[str]:
         else:
             shown = _cell(value)
             lines.append(f"  {key:<12} {shown}{f' {unit}' if value and unit else ''}")
-    if overview.damage:
-        lines.append(f"  to repair it: hil archive repair {typed(overview.path)}")
     return lines
 
 

@@ -633,7 +633,7 @@ class TestCommands:
         assert "is not an MCAP file" in done.stderr
 
     def test_info(self, written, truncated, text_file):
-        done = run("info", written.path)
+        done = run("info", "-v", written.path)
         assert done.exit_code == 0
         for line in ("validation 4, attempt 1", "completed", "samples      43", "tick  text"):
             assert line in done.stdout

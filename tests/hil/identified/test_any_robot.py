@@ -132,7 +132,7 @@ def test_seven_axes_in_degrees_at_an_uneven_100_hz(tmp_path: Path) -> None:
         """
     identified = identify(tmp_path, simulated, "log.csv", columns, FINGERS)
     assert_found(identified, simulated)
-    (clock,) = [each.base for each in identified.prepared.notes if isinstance(each, UnevenClock)]
+    clock, *_ = [each.base for each in identified.prepared.notes if isinstance(each, UnevenClock)]
     assert not clock.uniform
     assert clock.gaps - clock.pauses == 1
 

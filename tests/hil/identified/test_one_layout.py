@@ -17,15 +17,15 @@ from tests.hil.simulated_logs import write_log, write_moving_log
 from tests.tiers import quick_ones
 
 COLUMNS = ["t", "q{}", "v{}", "tau{}"]
-TURNED = 1  # joint whose torque has the other sign, from 0
+EXCHANGED = [1, 0, 2]  # torques in another order than the joints
 
 
-def moving(path: Path, *, seed: int, turned: bool, names: list[str] = COLUMNS) -> Path:
-    """A log of the arm, perhaps with the torque of one joint of the other sign."""
+def moving(path: Path, *, seed: int, exchanged: bool, names: list[str] = COLUMNS) -> Path:
+    """A log of the arm, perhaps with the torques of two joints exchanged."""
     table = np.loadtxt(write_moving_log(path, URDF, seed=seed), delimiter=",", skiprows=1)
     time, position, velocity, torque = np.split(table, [1, 4, 7], axis=1)
-    if turned:
-        torque[:, TURNED] *= -1.0
+    if exchanged:
+        torque = torque[:, EXCHANGED]
     return write_log(path, names, time[:, 0], position, velocity, torque)
 
 
@@ -46,14 +46,14 @@ def changes(staging: Staging) -> dict[str, list[ChangedReading]]:
     }
 
 
-@pytest.mark.parametrize("turned", quick_ones([False], [False, True]))
-def test_what_is_held_out_is_read_as_what_is_fitted(tmp_path: Path, turned: bool) -> None:
-    """Even if it is of the other sign: the verdict says so, and no error is hidden."""
-    first = moving(tmp_path / "a.csv", seed=0, turned=True)
-    second = moving(tmp_path / "b.csv", seed=1, turned=turned)
+@pytest.mark.parametrize("exchanged", quick_ones([False], [False, True]))
+def test_what_is_held_out_is_read_as_what_is_fitted(tmp_path: Path, exchanged: bool) -> None:
+    """Even if it is in the other order: the verdict says so, and no error is hidden."""
+    first = moving(tmp_path / "a.csv", seed=0, exchanged=True)
+    second = moving(tmp_path / "b.csv", seed=1, exchanged=exchanged)
     staging = read([first], [second], tmp_path)
     found = changes(staging)
-    assert [change.row.aspect for change in found["a.csv"]] == ["signs"]
+    assert [change.row.aspect for change in found["a.csv"]] == ["order"]
     assert [(change.row, change.source) for change in found["b.csv"]] == [
         (found["a.csv"][0].row, "a.csv")
     ]
@@ -62,15 +62,15 @@ def test_what_is_held_out_is_read_as_what_is_fitted(tmp_path: Path, turned: bool
 
 
 def test_a_held_out_log_alone_changes_nothing(tmp_path: Path) -> None:
-    first = moving(tmp_path / "a.csv", seed=0, turned=False)
-    second = moving(tmp_path / "b.csv", seed=1, turned=True)
+    first = moving(tmp_path / "a.csv", seed=0, exchanged=False)
+    second = moving(tmp_path / "b.csv", seed=1, exchanged=True)
     assert changes(read([first], [second], tmp_path)) == {"a.csv": [], "b.csv": []}
 
 
 @pytest.mark.long
 def test_logs_of_other_columns_are_examined_alone(tmp_path: Path) -> None:
-    first = moving(tmp_path / "a.csv", seed=0, turned=False)
+    first = moving(tmp_path / "a.csv", seed=0, exchanged=False)
     others = ["t", "pos{}", "vel{}", "torque{}"]
-    second = moving(tmp_path / "b.csv", seed=1, turned=True, names=others)
+    second = moving(tmp_path / "b.csv", seed=1, exchanged=True, names=others)
     found = changes(read([first], [second], tmp_path))
-    assert [(change.row.aspect, change.source) for change in found["b.csv"]] == [("signs", "")]
+    assert [(change.row.aspect, change.source) for change in found["b.csv"]] == [("order", "")]
