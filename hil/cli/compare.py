@@ -5,7 +5,6 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Annotated
 
-import numpy as np
 import typer
 
 from hil.base.exit_status import ExitStatus
@@ -16,7 +15,7 @@ from hil.base.terminal_text import printable
 from hil.batch.cluster import Cluster
 from hil.cli.arguments import JsonOption, QuietOption, VerboseOption, print_json
 from hil.compare import comparison as comparing
-from identification.text import unit_text
+from identification.text import percentage, unit_text
 
 
 def compare(
@@ -80,16 +79,12 @@ def _scope(comparison: comparing.ArmComparison) -> list[str]:
         f"compared with {reference}: {', '.join(others)}; {inertial} inertial parameters and the "
         f"friction of {friction} joints"
     ]
-    halves = {
-        change.axis: 100.0 * change.half / abs(change.before)
-        for change in comparison.changes
-        if change.kind == "friction" and change.before and np.isfinite(change.half)
-    }
-    if halves:
-        least, most = (extreme(halves, key=halves.__getitem__) for extreme in (min, max))
+    if known := comparison.known_friction:
+        least, most = known[0], known[-1]
         lines.append(
-            f"95 % interval of a change of friction: ± {halves[least]:.2g} % in {least} to "
-            f"± {halves[most]:.2g} % in {most}; a change below "
-            f"{100.0 * comparing.MIN_RELATIVE_CHANGE:.0f} % is not reported"
+            "95 % interval of a change of friction: "
+            f"± {percentage(least.relative_half, 2)} in {least.axis} to "
+            f"± {percentage(most.relative_half, 2)} in {most.axis}; "
+            f"a change below {percentage(comparing.MIN_RELATIVE_CHANGE)} is not reported"
         )
     return lines

@@ -85,6 +85,11 @@ class QuantityChange:
         bool  #: whether it is significant and at least `MIN_RELATIVE_CHANGE` of the first value
     )
 
+    @property
+    def relative_half(self) -> float:
+        """Half width of the interval, as a share of the first value; NaN without one."""
+        return self.half / abs(self.before) if self.before else math.nan
+
 
 @dataclass(frozen=True, eq=False)
 class ArmComparison:
@@ -103,6 +108,16 @@ class ArmComparison:
     def changed(self) -> tuple[QuantityChange, ...]:
         """Significant and relevant changes."""
         return tuple(change for change in self.changes if change.changed)
+
+    @property
+    def known_friction(self) -> tuple[QuantityChange, ...]:
+        """Changes of friction with an interval, the narrowest in relation to the friction first."""
+        known = (
+            change
+            for change in self.changes
+            if change.kind == "friction" and math.isfinite(change.relative_half)
+        )
+        return tuple(sorted(known, key=lambda change: change.relative_half))
 
     @property
     def document(self) -> dict[str, Any]:
