@@ -60,7 +60,8 @@ _MAX_ITERATIONS: Final = 12
 _FIRST_ITERATIONS: Final = 3  # iterations
 # Half a 95 % interval that less noise of the positions may make that of a determined delay.
 _REACHABLE_HALF_INTERVAL: Final = 3e-3  # s
-_CONVERGED_STD_SHARE: Final = 0.02  # share of the standard deviation
+_CONVERGED_SECONDS = 1e-6  # s
+_CONVERGED_STD_SHARE = 0.02  # share of the standard deviation
 # difference of log variance up to which two minima are equally good
 _EQUAL_LOG_VARIANCE: Final = 0.05
 _TIME_BLOCKS: Final = 80  # blocks of time
@@ -70,8 +71,6 @@ CLOSED_LOOP_BIAS: Final = 1e-4
 """Standard deviation [s] of an estimate's error in addition to its interval: encoder noise in the
 closed loop, elastic gears, ripple. Simulated NS 16, UR5, Panda and arm of two joints with effects,
 cycles of 1 and 2 ms: nine runs, 0.01 to 0.17 ms, RMS 0.1 ms."""
-# Rows near reversals come and go with the shift, which then alternates by a few microseconds.
-_CONVERGED_SECONDS: Final = 0.05 * CLOSED_LOOP_BIAS
 
 
 def read_at(time: Array, values: Array, at: Array) -> Array:
@@ -306,11 +305,9 @@ def _estimated(
         step = np.clip(solution.values[p], -_PROFILE_STEP, _PROFILE_STEP)
         previous = shift
         shift = float(np.clip(shift + step, *ends))
-        settled = abs(shift - previous) <= max(
+        if abs(shift - previous) <= max(
             _CONVERGED_SECONDS, _CONVERGED_STD_SHARE * float(np.sqrt(solution.inverse[p, p]))
-        )
-        # The first step is weighted by a fit without what resembles a delay.
-        if settled and iteration > 0:
+        ):
             break
         # What is far from determined need not settle, and often does not.
         if iteration >= _FIRST_ITERATIONS and blocks.delay_std(solution)[0] > MAX_HALF_INTERVAL:

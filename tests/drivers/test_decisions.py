@@ -210,7 +210,7 @@ class TestOwner:
 
 
 IN_THE_SESSION = {
-    "session", "packets", "c4g_wire", "open_mode", "guard", "drive_train", "execution",
+    "session", "c4g_packets", "c4g_wire", "open_mode", "guard", "drive_train", "execution",
 }  # fmt: skip
 BESIDE = {"states", "packet_losses", "cycle_records"}
 """The session's table, what it counts as lost, and the ring that receives the record."""
