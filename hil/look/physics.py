@@ -534,7 +534,7 @@ class TorqueFindings:
         return MapEntries(tuple(entries.items())) if entries else None
 
     def _signs_alike(self) -> tuple[TiedReading, ...]:
-        """Return the signs that were found, and those of mirror images of the arm."""
+        """Return the signs found, then the signs of each mirror image of the arm."""
         found = SignRival(Signs.of(self.axes), (), self.readings.score.overall)
         choices = []
         for each in (found, *self.readings.rivals)[:_MAX_CHOICES]:

@@ -1034,9 +1034,9 @@ class _Fits:
                 self._sums[motion] = factor.blocks(slice(block, block + 1))
 
     def by_friction(self, positions: Sequence[Array]) -> list[Signs]:
-        """Return signs of positions (n,) with those of torques by which friction takes energy.
+        """Complete position signs (n,) with the torque signs that make friction dissipate energy.
 
-        Each joint is fitted for itself: the torques of others may have any sign.
+        Each joint is fitted alone, as the other torques may have any sign.
         """
         columns = friction_columns(self.model, self._samples)
         motions = [_negated_positions(position) for position in positions]
@@ -1057,7 +1057,7 @@ class _Fits:
         return signs
 
     def with_best_torques(self, signs: Signs) -> Signs:
-        """Return signs with those of torques that fit best, changed one by one."""
+        """Return the signs after flipping torque signs one by one while the fit improves."""
         (error,) = self.of_signs([signs])
         while True:
             torques = signs.torque * (1.0 - 2.0 * np.eye(len(signs.torque)))
@@ -1069,7 +1069,7 @@ class _Fits:
             signs, error = others[best], errors[best]
 
     def of_signs(self, signs: Sequence[Signs]) -> list[float]:
-        """Return the errors of signs of all joints, likewise."""
+        """Return the error of each combination of joint signs."""
         errors: list[float] = []
         for first in range(0, len(signs), _FITS_AT_ONCE):
             some = signs[first : first + _FITS_AT_ONCE]
@@ -1094,9 +1094,9 @@ class _Fits:
 
 
 def to_compare(errors: Mapping[Change, float], excluded: float) -> list[Change]:
-    """Return the changes to compare on all rows: those of least error, and one of each kind.
+    """Return the changes to compare on all rows: the best ones, and the best of each kind.
 
-    Of those that the fits exclude, only the nearest of each meaning: it says how certainly.
+    Among changes that the fits exclude, only the best of each meaning: it shows how certain that is.
 
     Args:
         errors: of fits to few rows.

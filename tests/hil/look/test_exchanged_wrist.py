@@ -1,4 +1,4 @@
-"""Torques of two wrist joints exchanged: small beside those of the shoulder."""
+"""Two wrist torques are exchanged; they are small compared with the shoulder torques."""
 
 from __future__ import annotations
 
