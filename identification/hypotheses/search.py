@@ -1096,7 +1096,7 @@ class _Fits:
 def to_compare(errors: Mapping[Change, float], excluded: float) -> list[Change]:
     """Return the changes to compare on all rows: the best ones, and the best of each kind.
 
-    Among changes that the fits exclude, only the best of each meaning: it shows how certain that is.
+    Of changes that the fits exclude, only the best of each meaning: it shows how certain they are.
 
     Args:
         errors: of fits to few rows.
