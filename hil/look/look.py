@@ -48,6 +48,8 @@ from identification.signals.recording import RIGID_RATE, Recording, RecordingErr
 from identification.signals.samples import Samples
 
 _DELAY_SAMPLES: Final = 20_000
+# Both motion and torque are limited to a twelfth of it before a delay is estimated.
+_DELAY_RATE: Final = 125.0  # Hz
 _RANGE_NUMBER: Final = 100.0  # a servo's number at the ends of its range
 # error ratio to a free fit that angles with another scale for each joint have, and degrees have not
 _RANGE_ERROR_RATIO: Final = 1.1
@@ -266,7 +268,7 @@ def _channel(
     """Return delay and low-pass of the torque; None where the motion does not say."""
     some = recording.between(0, min(recording.n_samples, _DELAY_SAMPLES)).averaged(RIGID_RATE)
     try:
-        delay = estimate_delay(some, model, options=SETTINGS)
+        delay = estimate_delay(some.averaged(_DELAY_RATE), model, options=SETTINGS)
         delay = replace(delay, cycle=float(np.median(np.diff(recording.time))))
         return delay, torque_low_pass(some, model, SETTINGS)
     except IdentificationError:

@@ -28,7 +28,7 @@ from identification.arrays import Array
 from identification.distributions import fisher_limit, student_limit
 from identification.errors import IdentificationError
 from identification.estimators.covariance import block_length, spread
-from identification.estimators.delay_nuisances import nuisances
+from identification.estimators.delay_nuisances import Nuisances, nuisances
 from identification.estimators.load_friction import fit_with_load
 from identification.factor.blocks import FOLDS, count_by_block, merged
 from identification.factor.estimate import Estimate, estimate, inverse_variance, residual_variance
@@ -61,9 +61,10 @@ _FIRST_ITERATIONS: Final = 3  # iterations
 # Half a 95 % interval that less noise of the positions may make that of a determined delay.
 _REACHABLE_HALF_INTERVAL: Final = 3e-3  # s
 _CONVERGED_SECONDS = 1e-6  # s
-_CONVERGED_STD_SHARE = 0.02  # share of the standard deviation
+_CONVERGED_STD_SHARE = 0.1  # share of the standard deviation
 # difference of log variance up to which two minima are equally good
 _EQUAL_LOG_VARIANCE: Final = 0.05
+_SAME_NUISANCES_STEP: Final = 1e-3  # s, step of the delay that hardly moves what resembles it
 _TIME_BLOCKS: Final = 80  # blocks of time
 _ROWS_AT_ONCE: Final = 8192
 _FALSE_DELAY_PROBABILITY: Final = 0.005  # one-sided probability of a false delay
@@ -298,13 +299,17 @@ def _estimated(
     ends = (-MAX_ESTIMATED_DELAY - assumed, MAX_ESTIMATED_DELAY - assumed)
     reader, (grid, heights, values) = _profiled(model, samples, ends)
     shift = float(grid[np.argmin(heights)])
+    beside: Nuisances | None = None
     for iteration in range(_MAX_ITERATIONS):
-        blocks = reader.linearised(shift, values)
+        blocks = reader.linearised(shift, values, beside=beside)
         solution = blocks.solution()
         values = np.delete(solution.values, p)
         step = np.clip(solution.values[p], -_PROFILE_STEP, _PROFILE_STEP)
         previous = shift
         shift = float(np.clip(shift + step, *ends))
+        # The first values are of a fit without what resembles a delay.
+        is_near = iteration > 0 and abs(shift - previous) < _SAME_NUISANCES_STEP
+        beside = blocks.beside if is_near else None
         if abs(shift - previous) <= max(
             _CONVERGED_SECONDS, _CONVERGED_STD_SHARE * float(np.sqrt(solution.inverse[p, p]))
         ):
@@ -400,6 +405,7 @@ class _Blocks:
     joints: int  # n
     weights: Array  # (n,)
     rows: int
+    beside: Nuisances  # what resembles a delay
 
     @cached_property
     def gram(self) -> Array:
@@ -642,10 +648,17 @@ class _Reader:
         model = self.model
         return Factor.of_rows([(index, tables)], counts, model.plan.columns, model.parameter_names)
 
-    def linearised(self, shift: float, values: Array, weights: Array | None = None) -> _Blocks:
+    def linearised(
+        self,
+        shift: float,
+        values: Array,
+        weights: Array | None = None,
+        beside: Nuisances | None = None,
+    ) -> _Blocks:
         """Return normal equations at a shift, linear near parameters.
 
-        `values` are these (p,), or these and the coefficients of what resembles a delay (p + r,).
+        `values` are these (p,), or these and the coefficients of what resembles a delay (p + r,),
+        whose columns may be given, of parameters and a shift nearby.
         """
         model = self.model
         p = model.n_parameters
@@ -653,7 +666,7 @@ class _Reader:
         samples = self.at(shift)
         blocks, columns = samples.regressor(model)
         load = samples.known_torque(model)
-        beside = nuisances(model, samples, values[:p])
+        beside = beside or nuisances(model, samples, values[:p])
         tables = []
         for j, (block, used) in enumerate(zip(blocks, columns, strict=True)):
             torque = load[:, j] + block @ values[used]
@@ -677,4 +690,4 @@ class _Reader:
             variance = residual_variance(factor, unmoved, nothing, np.ones(n))
             weights = inverse_variance(variance)
         rows = max(1, int(factor.samples.sum()))
-        return _Blocks(factor.by_block(weights), p, n, weights, rows)
+        return _Blocks(factor.by_block(weights), p, n, weights, rows, beside)
