@@ -352,7 +352,6 @@ class TestSources:
         ("spoilt", "sentence"),
         [
             ({"nan": (700, 2)}, r"position of joint joint_3 is nan at sample 700"),
-            ({"fall": 300}, r"clock falls back at sample 300"),
             ({"torque": False}, "neither joint torques"),
             (
                 {"names": tuple(f"joint_{j}" for j in (2, 1, 3, 4, 5, 6))},
@@ -371,9 +370,18 @@ class TestSources:
         errors = identification.results.fitted.all_rows_joint_errors
         assert np.isfinite(np.delete(errors, 4)).all()
 
-    def test_alone_are_split_and_repeated_stamps_averaged(self, tmp_path):
-        identification = identified(imported(tmp_path / "one.mcap", repeat=300))
-        assert any("1 samples had the time stamp" in note for note in identification.results.notes)
+    @pytest.mark.parametrize("spoilt", [{"repeat": 300}, {"fall": 300}])
+    def test_with_one_wrong_stamp_are_read_at_even_times(self, tmp_path, spoilt):
+        whole = identified(imported(tmp_path / "whole.mcap"))
+        identification = identified(imported(tmp_path / "one.mcap", **spoilt))
+        assert any("used: even times" in note for note in identification.results.notes)
+        errors = [
+            each.results.validation[0].all_rows_relative_error for each in (whole, identification)
+        ]
+        assert errors[1] < 1.01 * errors[0]
+
+    def test_alone_are_split(self, tmp_path):
+        identification = identified(imported(tmp_path / "one.mcap"))
         assert any(
             "the rest was predicted" in warning
             for warning in identification.results.verdict.warnings
