@@ -87,6 +87,8 @@ def require_dry_run(
         return
     if dry_run is None:
         remedy = f"{first} and watch the arm"
+        if simulated:
+            remedy = f"the arm is simulated: accept it with `{folder.run_command} --accept-dry-run`"
         raise DryRunError(root, "was not done, and there is no operator to accept it", remedy)
     if dry_run.accepted is None:
         raise not_accepted(folder, dry_run, dry_run.against_gravity)

@@ -108,15 +108,14 @@ def at_most_one(**given: object) -> None:
         raise InputError(None, problem, field=" and ".join(typed), remedy="give one of them")
 
 
-def exactly_one(remedy: str, /, **given: object) -> None:
+def exactly_one(missing: str, remedy: str, /, **given: object) -> None:
     """Raise InputError unless one of several options was given; by their Python names.
 
-    `remedy` is a sentence with a value for each.
+    `missing` says what is not known without them, `remedy` gives each with a value.
     """
     at_most_one(**given)
     if all(value in (None, False, []) for value in given.values()):
-        names = " or ".join(map(_option, given))
-        raise InputError(None, "one of them is required", field=names, remedy=remedy)
+        raise InputError(None, missing, remedy=remedy)
 
 
 def _option(name: str) -> str:

@@ -14,7 +14,7 @@ from hil.base.exit_status import ExitStatus
 from hil.base.files import convert_write_errors, make_folder
 from hil.base.one_screen import TAIL_LINES, brief
 from hil.base.progress import reporter as make_reporter
-from hil.base.terminal_text import plural, printable
+from hil.base.terminal_text import plural, printable, typed
 from hil.batch import graph as run
 from hil.batch.cluster import SkippedArchive
 from hil.batch.estimates import BatchEstimate, BatchEstimator, relative_error
@@ -25,7 +25,7 @@ from hil.cli.fleet_options import Fleet, RecordingsArgument, last, map_lines, sk
 from hil.cli.identify_options import Identifying
 from hil.cli.imports import RARE, Described, Reading
 from hil.fleet.logs import LogMap, write_maps
-from hil.fleet.table import write_batch
+from hil.fleet.table import NAME, write_batch
 from identification.text import percentage
 
 _MAX_LINES: Final = 20
@@ -98,8 +98,7 @@ def _print(
     if not quiet:
         lines = [*map_lines(maps, verbose=verbose), *result_lines(result)]
         if written:
-            names = ", ".join(path.name for path in written)
-            lines.append(f"written to {written[0].parent}: {names}")
+            lines.append(_files(written))
     for line in last(_broken_lines(result.broken), _MAX_LINES, "--output and --json"):
         typer.echo(printable(line), err=True)
     if result.skipped and not quiet:
@@ -107,6 +106,15 @@ def _print(
     lines.append(_counts(result))
     for line in lines if verbose else brief(lines, last=TAIL_LINES):
         typer.echo(printable(line))
+
+
+def _files(written: Sequence[Path]) -> str:
+    """Return the tables that were written, and what they are for."""
+    folder = written[0].parent
+    names = [path.name for path in written if path.suffix != ".parquet"]
+    text = f"{folder}: {', '.join(names)}; the tables as .parquet, too"
+    quantities = next((path for path in written if path.stem == NAME), None)
+    return text if quantities is None else f"{text}. Over time: hil trend {typed(quantities)}"
 
 
 def _counts(result: BatchResult) -> str:

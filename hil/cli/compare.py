@@ -51,7 +51,7 @@ def compare(
         lines = [] if quiet else _lines(comparison)
         lines = [f"{comparison.verdict}.", *lines]
         if output is not None and not quiet:
-            lines.append(f"report: {output}")
+            lines.append(f"{output}: every parameter before and after, for a browser")
         for line in lines if verbose else brief(lines):
             typer.echo(printable(line))
     if fail_on_change and comparison.changed:
@@ -76,7 +76,7 @@ def _scope(comparison: comparing.ArmComparison) -> list[str]:
     kinds = [change.kind for change in comparison.changes if change.campaign == others[0]]
     inertial, friction = kinds.count("inertia"), kinds.count("friction")
     lines = [
-        f"compared with {reference}: {', '.join(others)}; {inertial} inertial parameters and the "
+        f"{', '.join(others)} compared with {reference}: {inertial} inertial parameters and the "
         f"friction of {friction} joints"
     ]
     if known := comparison.known_friction:

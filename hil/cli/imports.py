@@ -152,7 +152,8 @@ class Described:
     def robot(self, recorded: Callable[[], tuple[str, ...] | None]) -> Robot:
         """Return the robot of a cell file, URDF or DH table; `recorded` reads the joint names."""
         exactly_one(
-            "--urdf arm.urdf, or --cell cell.toml, or --dh table.csv with --convention",
+            "there is no description of the robot",
+            "add --urdf arm.urdf, --cell cell.toml, or --dh table.csv with --convention",
             urdf=self.urdf,
             cell=self.cell,
             dh=self.dh,

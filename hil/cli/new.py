@@ -103,7 +103,8 @@ def new(
         force: Replace an earlier file.
     """
     if controller is None or (urdf and dh):
-        exactly_one("--urdf arm.urdf, or --dh table.csv with --convention", urdf=urdf, dh=dh)
+        remedy = "add --urdf arm.urdf, or --dh table.csv with --convention"
+        exactly_one("there is no description of the arm", remedy, urdf=urdf, dh=dh)
     at_most_one(
         design_only=design_only, from_controller=from_controller,
         from_archive=from_archive_file, controller=controller,

@@ -102,7 +102,8 @@ def plan(
     if picture is not None:
         check_format(picture)
     exactly_one(
-        "--random 6 plans through six random points, --via FILE through the points of a table",
+        "there are no via points",
+        "add --via FILE with a table of them, or --random 6 for six random ones",
         via=via,
         random=random,
     )

@@ -12,8 +12,8 @@ from hil.base.errors import InputError
 from hil.base.exit_status import ExitStatus
 from hil.base.files import make_folder
 from hil.base.one_screen import MAX_JOINT_ROWS, SCREEN_LINES, Paragraph, Part, columns, one_screen
-from hil.base.progress import Reporter, say
 from hil.base.progress import reporter as make_reporter
+from hil.base.progress import say
 from hil.cli.arguments import (
     ArchivesArgument,
     JsonOption,
@@ -103,20 +103,20 @@ def rollout(
         arm = read_or_identify(archives, options, reporter, reuse=as_usual, predict=predict or ())
         good = arm.good
         simulated = roll_out(arm, requested, reporter)
-    if output is not None:
-        _write(output, simulated, reporter)
+    files = [] if output is None else _write(output, simulated)
     if json:
         print_json(simulated.result.model_dump(mode="json"))
     else:
-        lines = simulated.result.lines() if verbose else screen(simulated.result)
-        for line in [simulated.result.message] if quiet else lines:
+        result = simulated.result
+        lines = [*result.lines(), *files] if verbose else screen(result, files)
+        for line in [result.message] if quiet else lines:
             say(line)
     if not good:
         raise typer.Exit(ExitStatus.NEGATIVE_RESULT)
 
 
-def screen(result: RolloutResult) -> list[str]:
-    """Return one screen: the result, the errors of identified and nominal arm side by side."""
+def screen(result: RolloutResult, files: Sequence[str] = ()) -> list[str]:
+    """Return one screen: the result, errors of identified and nominal arm side by side, files."""
     arms = [("identified", result.identified), ("nominal", result.nominal)]
     if result.polish is not None:
         arms[1:] = [("polished", result.polish.errors)]
@@ -143,8 +143,10 @@ def screen(result: RolloutResult) -> list[str]:
     servo = [] if result.servo is None else result.servo.lines(result.joint_names)
     warning = f"warning: {result.band_message}" if result.band_message else ""
     remarks = [*servo, *result.stability(), warning, *result.notes]
-    parts += [Paragraph(text, most=2) for text in remarks if text][: SCREEN_LINES - len(parts) - 1]
-    return one_screen([*parts, "drawn arms and what drives the arm: -v"])
+    last: list[Part] = [*map(Paragraph, files), "drawn arms and what drives the arm: -v"]
+    spare = SCREEN_LINES - len(parts) - len(last)
+    parts += [Paragraph(text, most=2) for text in remarks if text][:spare]
+    return one_screen([*parts, *last])
 
 
 def _row(result: RolloutResult, joint: int, arms: Sequence[tuple[str, ArmErrors]]) -> list[str]:
@@ -163,12 +165,13 @@ def _folder(output: Path | None, archives: list[Path]) -> Path | None:
     return output
 
 
-def _write(output: Path, simulated: Rollout, reporter: Reporter) -> None:
-    """Write all files of a rollout, and report them."""
+def _write(output: Path, simulated: Rollout) -> list[str]:
+    """Write all files of a rollout, and return what they are."""
     missing = write_rollout(output, simulated)
     columns = [[chart] for chart in overview_charts(simulated.result)]
     legends = overview_legends(simulated.result)
     save(draw_charts(columns, legends, enlarged=1.4), output / PICTURE)
-    polished = [POLISHED] if simulated.polished is not None else []
-    reporter.say(f"written to {output}: {', '.join([ROLLOUT, PICTURE, *polished])}")
-    reporter.say(missing or f"section of the report: {output / REPORT}")
+    lines = [f"{output / PICTURE}: the errors over time; {output / ROLLOUT}: all figures"]
+    if simulated.polished is not None:
+        lines.append(f"{output / POLISHED}: the polished arm, for MuJoCo")
+    return [*lines, missing or f"{output / REPORT}: the report has a section about it now"]

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping
 from functools import partial
 from pathlib import Path
 from typing import Annotated, Final
@@ -100,7 +100,7 @@ def trend(
 def _print(
     result: FleetTrend,
     maps: Mapping[LogMap, int],
-    written: Sequence[Path],
+    written: Mapping[Path, str],
     *,
     quiet: bool,
     verbose: bool,
@@ -111,7 +111,7 @@ def _print(
     for line in last(broken, _MAX_BROKEN_LINES, "--json"):
         typer.echo(printable(line), err=True)
     if written and not quiet:
-        lines.append(f"written: {', '.join(map(str, written))}")
+        lines += [f"{path}: {use}" for path, use in written.items()]
     if result.skipped and not quiet:
         lines.append(skipped_line(result.skipped))
     lines = [f"{verdict(result)}.", *lines, _counts(result)]
@@ -131,16 +131,16 @@ def _counts(result: FleetTrend) -> str:
     return f"{recordings} of {robots}; {len(result.skipped)} skipped, {len(result.broken)} failed"
 
 
-def _written(result: FleetTrend, output: Path | None, table: Path | None) -> list[Path]:
-    """Write the requested report and table; return their paths."""
-    written = []
+def _written(result: FleetTrend, output: Path | None, table: Path | None) -> dict[Path, str]:
+    """Write the requested report and table; return what each is, by path."""
+    written = {}
     if output is not None:
         make_folder(output.parent)
         write_files(output.parent, {output.name: trend_page(result)})
-        written.append(output)
+        written[output] = "each joint over time, for a browser"
     if table is not None:
         make_folder(table.parent)
         with convert_write_errors(table.parent):
             write_trend(table, result)
-        written.append(table)
+        written[table] = "every value of every series"
     return written

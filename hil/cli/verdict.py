@@ -18,7 +18,6 @@ from hil.results.error_columns import RMS_MEANING, RMS_TITLE, error_columns
 from hil.results.results import JointJudgement, JudgementResult, Results
 from identification.text import number, percentage
 from identification.validation.purpose_messages import TITLES, figure, requirement
-from identification.validation.verdict import fault_of
 
 MAX_SHOWN: Final = 3
 """Findings, and next steps, on one screen."""
@@ -85,7 +84,7 @@ def screen(
 ) -> list[str]:
     """Return one screen: verdict, recordings, table, findings, next steps, files."""
     judgement = results.judgement
-    named = fault_of(judgement.findings)
+    named = judgement.at(results.verdict.headline)
     open_findings = [
         finding
         for finding in judgement.worst_first
@@ -106,6 +105,8 @@ def screen(
     if remarks:
         report = "" if written is None else f", or {written[1]}"
         parts.append(f"{remarks} more remark{'s' if remarks > 1 else ''}: -v{report}")
+    elif written is not None:
+        parts.append(f"{written[1]}: the report, for a browser")
     return one_screen(parts)
 
 

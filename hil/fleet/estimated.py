@@ -96,6 +96,8 @@ def estimated_fleet(
         if ref.use == "excitation" and not ref.when
     ]
     broken = [*found.broken, *undated]
+    if undated and not refs:
+        raise _without_dates(found.refs, undated)
     if not refs:
         first = [f"{each.path}: {each.message}" for each in (*broken, *found.skipped)[:1]]
         raise InputError(None, "; ".join(["no recording can be used", *first]))
@@ -110,6 +112,16 @@ def estimated_fleet(
         skipped=found.skipped,
         warnings=warning_lines([each for fits in types for each in fits.warned]),
     )
+
+
+def _without_dates(refs: Sequence[ArchiveRef], undated: Sequence[SkippedArchive]) -> InputError:
+    """Return the error of recordings of which none has a date."""
+    others = f", like {len(undated) - 1} more" if len(undated) > 1 else ""
+    remedy = "put the date into names and state where: --robot '{robot}/{date}.mcap'"
+    if all(ref.simulated for ref in refs):
+        others += ": an arm simulated in virtual time has none"
+        remedy = f"compare such campaigns with `hil compare`, or {remedy}"
+    return InputError(undated[0].path, f"has no date{others}", remedy=remedy)
 
 
 def _types(

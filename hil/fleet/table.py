@@ -28,7 +28,7 @@ from hil.fleet.series import DatedRecording, QuantityFamily, TypeSeries, moment_
 from hil.fleet.trend import FleetTrend
 
 NAME: Final = "quantities"
-"""Name of the table of a batch."""
+"""Name of the table of `hil batch` that `hil trend` reads."""
 _SERIES: Final = ("robot", "type", "joint", "quantity", "unit", "speed", "when", "value", "std")
 _TREND: Final = (
     *("adjusted", "fitted", "change", "half", "rate", "rate_half"),

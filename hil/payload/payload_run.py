@@ -154,14 +154,14 @@ class PayloadFound:
             name: expected.get(name, float(factor * value))
             for name, factor, value in zip(NAMES, factors, self.figures, strict=True)
         }
-        centre = ",".join(f"{figures[name]:.4f}" for name in NAMES[1:4])
+        centre = ",".join(_rounded(figures[name], 4) for name in NAMES[1:4])
         arguments = ["hil", "torque-constants", *map(str, bare)]
         for path in loaded:
             arguments += ["--loaded", str(path)]
         arguments += ["--mass", f"{figures['mass']:g}", f"--centre={centre}", "--frame", self.frame]
         if self.determines(*NAMES[4:]):
             order = ("Ixx", "Ixy", "Ixz", "Iyy", "Iyz", "Izz")
-            tensor = ",".join(f"{figures[name]:.5f}" for name in order)
+            tensor = ",".join(_rounded(figures[name], 5) for name in order)
             arguments.append(f"--inertia={tensor}")
         return shlex.join(arguments)
 
@@ -390,19 +390,21 @@ class PayloadContradictions(NamedTuple):
     otherwise: tuple[str, ...]
 
 
-def _no_payload(estimate: PayloadEstimate, contradictions: PayloadContradictions) -> NoPayloadError:
+def _no_payload(
+    estimate: PayloadEstimate, contradictions: PayloadContradictions, loaded: Sequence[Path]
+) -> NoPayloadError:
+    """Return the error of loaded recordings without a payload, which names the first of them."""
     low, high = estimate.intervals[0]
-    problem = (
-        f"the loaded archives show no payload: its mass is between {low:.3g} and {high:.3g} kg"
-    )
-    remedy = "give recordings that were made with the payload"
+    others = f", like {len(loaded) - 1} more given as loaded" if len(loaded) > 1 else ""
+    problem = f"shows no payload{others}: its mass is between {low:.3g} and {high:.3g} kg"
+    remedy = "give recordings made with the payload here, and the ones without it as bare"
     if contradictions.mounting is not None:
         problem += ", as the arm is stated to be mounted"
         remedy = f"the mounting is doubtful: {contradictions.mounting}; then {remedy}"
     if contradictions.otherwise:
         problem += ", with the recordings as described"
         remedy = "; ".join([*contradictions.otherwise, f"then {remedy}"])
-    return NoPayloadError(None, problem, field="--loaded", remedy=remedy)
+    return NoPayloadError(loaded[0], problem, remedy=remedy)
 
 
 def _sides(bare: Sequence[Path], loaded: Sequence[Path]) -> dict[bool, list[Path]]:
@@ -483,7 +485,7 @@ def weighed(
     """
     estimate = identify_payload(model, runs, scale.std, arm)
     if estimate.body is None:
-        raise _no_payload(estimate, contradictions)
+        raise _no_payload(estimate, contradictions, sides[True])
     _require_agreement(model, runs, estimate, frame, sides, training, arm)
     positions = [np.abs(source.recording.position).max(axis=0) for source in training]
     travel = np.max(positions, axis=0)

@@ -109,6 +109,7 @@ class StoredIdentification:
             tuple(judgement.next_steps),
             tuple(judgement.findings),
             tuple(verdict.purposes),
+            verdict.headline,
         )
 
     @cached_property

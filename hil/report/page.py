@@ -23,7 +23,6 @@ from hil.results.rollout_result import RolloutResult
 from hil.results.series import ReportSeries
 from identification.excitation import CRITERIA, METHODS
 from identification.validation.purpose_messages import TITLES, figure, requirement
-from identification.validation.verdict import fault_of
 
 _MAX_CANDIDATES: Final = 6
 """Candidates shown of one choice: the first, and the best of the others."""
@@ -161,9 +160,7 @@ def other_reasons(results: Results) -> list[str]:
     wrong = [finding for finding in results.judgement.findings if finding.level == "wrong"]
     if len(wrong) != len(results.verdict.reasons):  # files of earlier versions
         return list(results.verdict.reasons)
-    headline = fault_of(wrong)
-    if headline is None and wrong and not results.verdict.purposes:
-        headline = wrong[0]
+    headline = results.judgement.at(results.verdict.headline)
     return [finding.words for finding in wrong if finding is not headline]
 
 

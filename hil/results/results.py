@@ -178,6 +178,12 @@ class JudgementResult(Frozen):
         """Findings that are warnings, the most consequential first."""
         return [finding for finding in self.worst_first if finding.level == "doubtful"]
 
+    def at(self, index: int | None) -> WordedFinding | None:
+        """Return a finding by its index, such as the headline of the verdict."""
+        if index is None or not 0 <= index < len(self.findings):
+            return None
+        return self.findings[index]
+
     def any_joint(self, figure: str) -> bool:
         """Whether a field of :class:`JointJudgement` is known for any joint."""
         return any(getattr(joint, figure) is not None for joint in self.joints)
@@ -466,6 +472,7 @@ class VerdictResult(Frozen):
     reasons: list[str]  #: Why the model is not good
     warnings: list[str]  #: Problems that do not make the model bad
     purposes: list[Purpose] = []  #: What the model is good for; empty in earlier files
+    headline: int | None = None  #: Finding of the judgement that the line names; by its index
 
 
 class EstimatorResult(Frozen):

@@ -382,8 +382,8 @@ def write_rollout(folder: Path, rollout: Rollout) -> str:
         read_back(text, form, rollout.polished)
     write_files(folder, {ROLLOUT: result.to_json(), POLISHED: text})
     if not result.parameters:
-        return f"not in {REPORT}: the arm was identified for this rollout"
+        return f"{REPORT} has no section about it: the arm was identified for this rollout alone"
     if not is_of_report(folder, result):
-        return f"not in {REPORT}: {folder} has none of these parameters"
+        return f"no report has a section about it: {folder} has no report of these parameters"
     rewrite_report(folder)
     return ""

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from typing import Final
 
 from identification.text import number, percentage
-from identification.validation.purpose import NoFigure, Purpose, PurposeName
+from identification.validation.purpose import NoFigure, Purpose, PurposeName, good_for
 
 TITLES: Final[dict[PurposeName, str]] = {
     "feed-forward": "feed-forward",
@@ -33,11 +33,22 @@ _NO_FRICTION: Final = 1e-3
 
 
 def purposes_in_a_sentence(
-    purposes: Sequence[Purpose], joints: Sequence[str], asked: Sequence[PurposeName] = ()
+    purposes: Sequence[Purpose],
+    joints: Sequence[str],
+    asked: Sequence[PurposeName] = (),
+    *,
+    only: bool = False,
 ) -> str:
     """Return what a model is good for, what not, and what it would notice.
 
-    Requested purposes that could not be judged are named with the reason.
+    What it is not good for comes first if that was requested; requested purposes that could not
+    be judged are named with the reason.
+
+    Args:
+        purposes: all of them, judged.
+        joints: names of the joints.
+        asked: requested purposes.
+        only: whether it is good for nothing else.
     """
     good = [_with_figure(p, joints) for p in purposes if p.good]
     bad = [_with_figure(p, joints) for p in purposes if p.good is False]
@@ -49,11 +60,13 @@ def purposes_in_a_sentence(
     ]
     unknown = [_with_figure(p, joints) for p in purposes if p.name in asked and p.good is None]
     sentences = [
-        f"Good for {_enumerated(good)}." if good else "",
+        f"Good {'only ' if only else ''}for {_enumerated(good)}." if good else "",
         f"Not for {_enumerated(bad)}." if bad else "",
         f"Not judged: {_enumerated(unknown)}." if unknown else "",
         f"It notices {_enumerated(seen)}." if seen else "",
     ]
+    if not good_for(purposes, asked):
+        sentences[:3] = [*sentences[1:3], sentences[0]]
     return " ".join(filter(None, sentences))
 
 

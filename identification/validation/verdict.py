@@ -36,6 +36,7 @@ class Verdict:
     next_steps: tuple[str, ...] = ()
     findings: tuple[WordedFinding, ...] = ()  #: every check with its outcome
     purposes: tuple[Purpose, ...] = ()  #: what the model is good for; empty if not examined
+    headline: int | None = None  #: index in `findings` of the one that the line names
 
 
 def judge(
@@ -66,22 +67,23 @@ def judge(
     reserve = "; ".join(finding.reservation for finding in findings if finding.reservation)
     but = f", but {reserve}" if reserve else ""
     line = f"The model predicts {tested_on} well{but}: {measure}."
-    fault = fault_of(findings)
+    fault = _fault_of(findings)
+    named = fault or (wrong[0] if wrong and not asked else None)
     good = not wrong
     if asked:
         good = fault is None and good_for(purposes, asked)
-    if wrong and (fault is not None or not purposes):
+    if named is not None and (fault is not None or not purposes):
         error = "" if purposes else f"; {measure}"
         is_near = evidence.held_out.overall <= evidence.allowed(thresholds)
         other = _of_no_arm(tested_on, fault, evidence) if is_near else ""
-        line = f"The model must not be relied on: {other}{(fault or wrong[0]).words}{error}."
+        line = f"The model must not be relied on: {other}{named.words}{error}."
     elif purposes:
-        line = purposes_in_a_sentence(purposes, naming.joints, asked)
+        line = purposes_in_a_sentence(purposes, naming.joints, asked, only=bool(wrong))
+        if named is not None:
+            line = f"Not good: {named.words}. {line}"
         if tested_on is not TestedOn.UNSEEN:
             line += f" Judged on {tested_on}."
-        if wrong:
-            line += " Doubtful for anything else."
-        elif reserve:
+        if reserve and not wrong:
             line += f" {reserve[0].upper()}{reserve[1:]}."
     return Verdict(
         good=good,
@@ -91,6 +93,7 @@ def judge(
         next_steps=_next_steps(wrong, doubtful),
         findings=tuple(findings),
         purposes=tuple(purposes),
+        headline=None if named is None else findings.index(named),
     )
 
 
@@ -105,7 +108,7 @@ def _next_steps(
     return tuple(step for step in steps if step)
 
 
-def fault_of(findings: Sequence[WordedFinding]) -> WordedFinding | None:
+def _fault_of(findings: Sequence[WordedFinding]) -> WordedFinding | None:
     """Return the first wrong finding for which a model is good for no purpose."""
     return next(
         (

@@ -369,9 +369,23 @@ class TestJudgement:
         refused = judged(**large, purposes=unknown, asked=("contact",))
         assert not refused.good
         assert "Not judged: contact detection (the unseen motion is too short)" in refused.line
-        line = judged(**large, purposes=purposes).line
-        assert line.startswith("Good for feed-forward (15 % of the torque left)")
-        assert "Not for simulation (flange 20 mm off after 0.2 s)" in line
+
+    def test_a_model_that_is_not_good_says_first_what_is_wrong(self):
+        purposes = (
+            Purpose("feed-forward", True, 0.15, 0.2, references={"none": 1.0}),
+            Purpose("simulation", False, 0.02, 0.005, "m", references={"horizon": 0.2}),
+        )
+        large = {"held_out": an_error(0.15), "training": an_error(0.15)}
+        verdict = judged(**large, purposes=purposes)
+        assert verdict.headline is not None
+        named = verdict.findings[verdict.headline]
+        assert named.level == "wrong"
+        assert verdict.line == (
+            f"Not good: {named.words}. Good only for feed-forward (15 % of the torque left). Not"
+            " for simulation (flange 20 mm off after 0.2 s)."
+        )
+        refused = judged(**large, purposes=purposes, asked=("simulation",)).line
+        assert refused.startswith("Not for simulation (flange 20 mm off after 0.2 s). Good only")
 
     def test_a_fault_comes_before_any_purpose(self):
         purposes = (Purpose("feed-forward", True, 0.05, 0.2, references={"none": 1.0}),)

@@ -98,7 +98,7 @@ HOME = "0 0 -90 0 90 0\n"
 @pytest.mark.parametrize(
     ("text", "arguments", "problem"),
     [
-        (VIA, [], "--via or --random: one of them is required"),
+        (VIA, [], "there are no via points; add --via FILE"),
         (VIA, ["--random", "3", "--via", "VIA"], "--via and --random: exclude each other"),
         (VIA, ["--via", "missing.csv"], "cannot be read"),
         (VIA, ["--via", "VIA", "--picture", "plan.bmp"], "not a picture format"),

@@ -164,7 +164,7 @@ class TestByModel:
         assert widths[0] > 0.5 * widths[1]
 
     def test_another_arm_and_nothing_carried_are_refused(self, folder: Path, arm: Path) -> None:
-        with pytest.raises(InputError, match=r"show no payload|does not separate"):
+        with pytest.raises(InputError, match=r"empty\.mcap: shows no payload|does not separate"):
             run(folder, "--model", str(arm), "empty.mcap")
         other = archived(
             arm.parent / "ur10.mcap", simulate("ur10_robot.urdf", np.arange(0.0, 6.0, 8e-3), seed=1)

@@ -356,7 +356,7 @@ class TestPage:
             {"check": "overall", "level": "wrong", "words": words[1], "role": "symptom"},
         ]
         line = "The model must not be relied on: 2 kg more."
-        verdict = {"good": False, "line": line, "reasons": words, "warnings": []}
+        verdict = {"good": False, "line": line, "reasons": words, "warnings": [], "headline": 0}
         html = render(
             make_results(verdict=verdict, judgement=_judgement() | {"findings": findings})
         )
