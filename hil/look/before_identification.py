@@ -10,6 +10,7 @@ import numpy as np
 
 from hil.archive import Archive
 from hil.base.errors import RefusedRecordingError, SourceError
+from hil.base.safe_input import parse_toml
 from hil.base.terminal_text import typed
 from hil.cell import Cell
 from hil.importers.conclusions import Certainty
@@ -26,6 +27,7 @@ from hil.look.readings import (
     DoubtfulTime,
     GravityOption,
     NoJointTorque,
+    ReadAsGiven,
 )
 from hil.look.result import ChangedReading, Look, Row, TiedReading
 from hil.look.servo_load import may_be_load, servo_load, torques_without_sign, without_torque
@@ -185,13 +187,19 @@ def _as_a_look_says(
             as_recorded = _of_this_arm(imported, source, contradictions)
         if look.questions:
             raise undecided(source, look.questions[0], contradictions)
-    if look.map_text != imported.map_text or look.gravity is not None:
+    assert look.map_text is not None
+    assert imported.map_text is not None
+    is_other_map = parse_toml(look.map_text) != parse_toml(imported.map_text)
+    if is_other_map or look.gravity is not None:
         again = _again(imported, source, robot_of, look, use)
         if (read := TorqueSample.of(again.archive)) is not None:
             axes = [row.aspect for row in changed if row.aspect in _OF_AXES]
             contradictions = read.contradictions(error=error, changed=axes)
             again = _of_this_arm(again, source, contradictions)
         return Concluded(again, look=look)
+    if look.no_better is not None and not changed:
+        given = ReadAsGiven(error, look.no_better)
+        as_recorded = replace(as_recorded, concluded=(*as_recorded.concluded, given))
     return Concluded(as_recorded)
 
 

@@ -236,6 +236,7 @@ def _look_of(
         text,
         finding.gravity(),
         finding.readings.score.overall,
+        no_better=finding.no_better,
     )
 
 

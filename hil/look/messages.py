@@ -60,11 +60,13 @@ from hil.look.readings import (
     NearestZero,
     NextBest,
     NextStep,
+    NoBetter,
     NoJointTorque,
     NotSlopes,
     OtherAxes,
     OtherLengths,
     OtherTimes,
+    ReadAsGiven,
     RigidShare,
     RowsReading,
     Setting,
@@ -594,6 +596,12 @@ def _(error: StillUnexplained) -> str:
 
 
 @_worded.register
+def _(found: NoBetter) -> str:
+    changes = " or ".join(map(described, found.changes))
+    return f"{changes} explains no more than chance does"
+
+
+@_worded.register
 def _(rigid: RigidShare) -> str:
     return (
         f"at most {percentage(rigid.over_friction)} of the friction of a joint, and "
@@ -777,6 +785,14 @@ def _why_no_torque(none: NoJointTorque) -> str:
 def _as_a_torque(none: NoJointTorque) -> str:
     factor = "" if none.ratio is None else f"*{number(1.0 / none.ratio, 2)}"
     return f"to use it anyway, name it: --columns 'torque=NAME{factor}'"
+
+
+@import_messages.worded.register
+def _(given: ReadAsGiven) -> str:
+    return (
+        f"torque: read as given, although {percentage(given.error)} of it stays unexplained: "
+        f"{worded(given.no_better)}"
+    )
 
 
 @import_messages.worded.register

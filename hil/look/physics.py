@@ -43,6 +43,7 @@ from hil.look.readings import (
     Mounting,
     NearestZero,
     NextBest,
+    NoBetter,
     NoJointTorque,
     OtherTimes,
     Reading,
@@ -283,8 +284,20 @@ class TorqueFindings:
         if error > EXPLAINED_ERROR:
             rows = [no_longer_certain(row, error) for row in rows]
         as_read = ErrorAsRead(error)
-        rows.append(Row("as read", as_read, Certainty.CERTAIN, (Basis.FREE_PARAMETERS,)))
+        evidence: tuple[Evidence, ...] = (Basis.FREE_PARAMETERS,)
+        if self.no_better is not None:
+            evidence = (*evidence, self.no_better)
+        rows.append(Row("as read", as_read, Certainty.CERTAIN, evidence))
         return rows
+
+    @property
+    def no_better(self) -> NoBetter | None:
+        """The changes that fit best, by no more than chance; None if there are none."""
+        changes = self.readings.no_better
+        if not changes:
+            return None
+        shown = _first_of_each([(change, 0.0) for change in changes])[:_MAX_CHOICES]
+        return NoBetter(tuple(self._of_arm(change) for change, _ in shown))
 
     @property
     def fits_badly(self) -> bool:
@@ -503,9 +516,7 @@ class TorqueFindings:
             if not alike:
                 continue
             pairs = [(step.change, step.error), *alike]
-            # A joint turned to the other side is another reading.
-            meanings = [(change.meaning, change.size > 0.0) for change, _ in pairs]
-            first = [pair for k, pair in enumerate(pairs) if meanings[k] not in meanings[:k]]
+            first = _first_of_each(pairs)
             shown = first[:_MAX_CHOICES] if len(first) > 1 else pairs[:2]
             choices.append(tuple(self._choice(step, *pair) for pair in shown))
         if any(step.change.meaning in SIGNS for step in disputed):
@@ -596,6 +607,14 @@ _RATE: Final = Row(
     Decide.RECORD_TORQUE,
     is_fault=True,
 )
+
+
+def _first_of_each(pairs: Sequence[tuple[Change, float]]) -> list[tuple[Change, float]]:
+    """Return the first change of each meaning; a joint turned to the other side is another one."""
+    first: dict[object, tuple[Change, float]] = {}
+    for change, error in pairs:
+        first.setdefault((change.meaning, change.size > 0.0), (change, error))
+    return list(first.values())
 
 
 def _other_times(factor: float) -> Row:

@@ -385,6 +385,13 @@ class RigidShare:
 
 
 @dataclass(frozen=True)
+class NoBetter:
+    """Changes that fit best, by no more than chance."""
+
+    changes: tuple[ArmChange, ...]
+
+
+@dataclass(frozen=True)
 class FreeFit:
     """Error over the error of a fit with free masses, zeros and scales."""
 
@@ -547,6 +554,7 @@ Evidence = (
     | MirrorImage
     | UnseenFriction
     | StillUnexplained
+    | NoBetter
     | FreeFit
     | RigidShare
     | SizeRatio
@@ -659,6 +667,14 @@ class ExplainedTorque(Conclusion):
 
     low_pass: float | None
     heavy_rotors: bool
+
+
+@dataclass(frozen=True)
+class ReadAsGiven(Conclusion):
+    """A torque read as given: this share of it stays unexplained, and nothing explains more."""
+
+    error: float
+    no_better: NoBetter
 
 
 @dataclass(frozen=True)

@@ -13,6 +13,7 @@ from hil.look.readings import (
     Evidence,
     MapEntries,
     NextStep,
+    NoBetter,
     Reading,
     Setting,
     Vector,
@@ -134,6 +135,7 @@ class Look:
         error: of the torque as read, predicted from other parts of the recording, as a share of
             it; None without a torque or an arm.
         bag_text: how the joint states of a bag were read, as a map; None for other recordings.
+        no_better: changes that fit best, by no more than chance; None if there are none.
     """
 
     source: str
@@ -144,6 +146,7 @@ class Look:
     gravity: Vector | None = None
     error: float | None = None
     bag_text: str | None = None
+    no_better: NoBetter | None = None
 
 
 @dataclass(frozen=True)

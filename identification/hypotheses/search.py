@@ -210,6 +210,7 @@ class Readings:
         unseen_zeros: joints of which the torque shows no zero: others fit alike.
         adequacy: whether nothing else explains the rows much better.
         rivals: signs of the joints that explain the rows alike, fewest changes first.
+        no_better: changes that fit best, by no more than chance: the recording is read without.
     """
 
     steps: tuple[Step, ...]
@@ -220,6 +221,7 @@ class Readings:
     unseen_zeros: tuple[int, ...] = ()
     adequacy: Adequacy = Adequacy(1.0, 1.0, agrees=True)
     rivals: tuple[SignRival, ...] = ()
+    no_better: tuple[Change, ...] = ()
 
     @property
     def disputed_signs(self) -> tuple[Step, ...]:
@@ -260,6 +262,8 @@ def find_readings(
     is_several = has_signs and len(steps) > 1
     if (is_doubted or is_several) and (steps or search.score.overall > EXPLAINED_ERROR):
         search, steps = _with_signs(started, search, steps)
+    search, steps, no_better = _without_chance(started, search, steps)
+    has_signs = any(step.change.meaning in SIGNS for step in steps)
     rivals = search.sign_rivals()
     if has_signs and rivals and len(rivals[0].signs.changes) < len(search.signs.changes):
         search.change([Change("axis sign", rivals[0].flipped)])
@@ -294,7 +298,29 @@ def find_readings(
         search.unseen_zeros(),
         adequacy,
         rivals,
+        no_better,
     )
+
+
+def _without_chance(
+    started: Callable[..., _Search], search: _Search, steps: list[Step]
+) -> tuple[_Search, list[Step], tuple[Change, ...]]:
+    """Return a hypothesis without changes that are not better than none, and these changes.
+
+    Where several changes fit alike, a recording without any of them is one more that may: the best
+    of many explains some of what no change explains.
+    """
+    open_steps = [step for step in steps if step.alike]
+    if not open_steps:
+        return search, steps, ()
+    rest = [step for step in steps if not step.alike]
+    without = started([step.change for step in rest])
+    drives_more = without.score.driven.sum() > search.score.driven.sum()
+    if drives_more or _is_better(compare(search.score, without.score, search.model)):
+        return search, steps, ()
+    alike = (pair[0] for step in open_steps for pair in step.alike)
+    no_better = dict.fromkeys([*(step.change for step in open_steps), *alike])
+    return without, rest, tuple(no_better)
 
 
 def _is_disputed(step: Step, signs: Signs, rivals: Sequence[SignRival]) -> bool:

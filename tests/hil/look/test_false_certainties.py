@@ -9,19 +9,25 @@ from typing import Any
 import numpy as np
 import pytest
 
+from benchmarks.board import cut, import_all
+from benchmarks.conditions import filtered, written
+from benchmarks.joint_log import JointLog
+from benchmarks.published import Published
 from hil.base.errors import SourceError
 from hil.identified.identified_arm import arm_from
 from hil.importers.conclusions import Certainty
 from hil.importers.imported_robot import Robot
 from hil.importers.plausibility import are_degrees
-from hil.importers.recording_import import ImportOptions
+from hil.importers.recording_import import ImportOptions, read_recording
 from hil.importers.stamps import concluded_unit
 from hil.look import look_at
-from hil.look.readings import RowsReading, ZeroTorques
+from hil.look.before_identification import concluded
+from hil.look.readings import ReadAsGiven, RowsReading, ZeroTorques
 from hil.look.result import Look
 from tests.hil.simulated_logs import Simulated, simulate, urdf_path, write_log
 
 URDF = urdf_path("ur5_robot.urdf")
+RECORDED = Path(__file__).resolve().parents[4] / "shared" / "data"
 TIME = np.arange(0.0, 12.0, 0.008)
 
 
@@ -141,3 +147,22 @@ def test_a_slow_log_is_refused_by_its_rate(tmp_path: Path, simulated: Simulated)
     log = write_log(path, ["t", "q{}", "tau{}"], *signals)
     with pytest.raises(SourceError, match="has 5 samples per second"):
         look(log)
+
+
+@pytest.mark.long
+def test_a_log_that_nothing_explains_better_is_read_as_given(tmp_path: Path) -> None:
+    """A low-pass leaves 15 % of the torque; a zero, a sign and an order explain 1 % of that."""
+    if not (RECORDED / "kr300").is_dir():
+        pytest.skip("the recordings are not here")
+    published = Published.named("kr300")
+    archives = import_all(published, RECORDED / "kr300", tmp_path)
+    logs = {name: JointLog.read(path, published.rated_payload) for name, path in archives.items()}
+    (split,) = [split for split in published.splits if str(split) == "B to A"]
+    fitted = cut(split, {name: filtered(log) for name, log in logs.items()}).fitted
+    source = written(fitted, tmp_path / "fitted.npz")
+    imported = read_recording(source, lambda _: fitted.robot, ImportOptions())
+    found = concluded(imported, source, lambda _: fitted.robot, ImportOptions(), "excitation")
+    assert found.recording.map_text == imported.map_text
+    (given,) = [each for each in found.recording.concluded if isinstance(each, ReadAsGiven)]
+    assert given.error > 0.15
+    assert len(given.no_better.changes) == 3
