@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import fields
+from dataclasses import fields, replace
 from pathlib import Path
 from typing import Any, Final
 
@@ -18,6 +18,9 @@ COPIED_COMMANDS: Final = "copied_commands"
 """Entry of the header: the commands that the positions of a log copy bit for bit."""
 ROW_COUNTER: Final = "row_counter"
 """Entry of the header: the unit in which a map reads a column of times that counts the rows."""
+TORQUE_SIDE: Final = "torque_side"
+"""Entry of the header: `UNDECIDED` where a log may have torques or currents of motors."""
+UNDECIDED: Final = "undecided"
 _OUTCOME: Final = "completed"
 _DERIVED: Final = ("joint_names", "period", "format_version", "attachments", "kind")
 """Entries of the header that `write_samples` makes itself."""
@@ -64,6 +67,14 @@ def imported_archive(
         events=(),
         damage=None,
     )
+
+
+def with_entry(archive: Archive, key: str, text: str) -> Archive:
+    """Return an archive in memory with another entry of the header."""
+    entries = {**archive.header.entries, key: text}
+    record = {} if archive.outcome is None else archive.outcome.record
+    outcome = ArchiveOutcome.of({**record, DESCRIPTION: checksum(entries)})
+    return replace(archive, header=ArchiveHeader.of(entries), outcome=outcome)
 
 
 def write_archive(archive: Archive, path: Path) -> Path:

@@ -136,6 +136,21 @@ class RefusedRecordingError(SourceError):
     exit_code: ClassVar[int] = ExitStatus.NEGATIVE_RESULT
 
 
+class UndecidedError(SourceError):
+    """A recording of which an option has to decide how it is read.
+
+    Attributes:
+        aspect: what is open.
+    """
+
+    aspect: str = ""
+
+    def of(self, aspect: str) -> Self:
+        """Return the error with what is open."""
+        self.aspect = aspect
+        return self
+
+
 class UnrecordedJointError(SourceError):
     """A foreign recording without a joint of its robot.
 

@@ -87,7 +87,8 @@ def whole(result: Look) -> list[str]:
     if result.groups:
         lines += ["", "the recording determines (parameters):", *groups_table(result.groups)]
     for choices in result.questions:
-        lines += ["", *(f"{part.label}{part.text}" for part in question(choices))]
+        asked = question(choices, of_archive=result.is_of_archive)
+        lines += ["", *(f"{part.label}{part.text}" for part in asked)]
     return [*lines, *_options(result)]
 
 
@@ -101,7 +102,11 @@ def screen(result: Look) -> list[str]:
         for row in sorted(result.rows, key=lambda row: not row.is_fault)
         if row.has_step
     ]
-    questions = [part for choices in result.questions for part in question(choices)]
+    questions = [
+        part
+        for choices in result.questions
+        for part in question(choices, of_archive=result.is_of_archive)
+    ]
     parts += ["", *questions, *_options(result), "reasons, and all rows: -v"]
     lines_left = SCREEN_LINES - len([part for part in parts if part])
     if not questions:
@@ -109,9 +114,11 @@ def screen(result: Look) -> list[str]:
     return one_screen(parts)
 
 
-def question(choices: Sequence[TiedReading]) -> list[Paragraph]:
+def question(choices: Sequence[TiedReading], *, of_archive: bool) -> list[Paragraph]:
     """Return a question about explanations that fit equally well, with the setting of each."""
-    question = f"{choices[0].aspect}: {fit_alike(choices)}; choose one line for the map:"
+    line = "import its log again with one line in the map:"
+    line = line if of_archive else "choose one line for the map:"
+    question = f"{choices[0].aspect}: {fit_alike(choices)}; {line}"
     parts = [Paragraph(question)]
     for number, choice in enumerate(choices, 1):
         error = "" if choice.error is None else f" (error {percentage(choice.error, 2)})"

@@ -9,7 +9,8 @@ from typing import Final, NamedTuple
 import numpy as np
 
 from hil.archive import Archive
-from hil.base.errors import RefusedRecordingError, SourceError
+from hil.archive.imported import TORQUE_SIDE, UNDECIDED, with_entry
+from hil.base.errors import RefusedRecordingError, SourceError, UndecidedError
 from hil.base.safe_input import parse_toml
 from hil.base.terminal_text import typed
 from hil.cell import Cell
@@ -22,6 +23,7 @@ from hil.importers.recording_import import ImportedRecording, ImportOptions, Rob
 from hil.look.look import look_at_joints, mountings
 from hil.look.messages import choice_text, fit_alike, sentences, setting_text
 from hil.look.other_arm import Contradictions
+from hil.look.physics import Size, sides_alike
 from hil.look.readings import (
     DoubtfulArm,
     DoubtfulTime,
@@ -156,8 +158,11 @@ def concluded(
     is_bag = imported.map_text is None  # its joints have names: no other order is searched
     if is_bag or not (suspect or _hangs_otherwise(asked.cell, asked.rows, asked.score)):
         imported = _of_this_arm(imported, source, asked.contradictions())
+        if not is_bag:
+            _require_known_side(source, imported, asked)
         return Concluded(imported, found if found.is_complete else None)
     if asked.score.overall > SUSPECT_ERROR and (how := explained(imported.archive)):
+        _require_known_side(source, imported, asked)
         imported = replace(imported, concluded=(*imported.concluded, how.how))
         return Concluded(_of_this_arm(imported, source, asked.contradictions(how.score)))
     return _as_a_look_says(imported, source, robot_of, use, asked, is_open)
@@ -229,7 +234,19 @@ class Asking:
             return concluded(imported, self.source, self.robot_of, self.options, self.use).recording
         except SourceError as error:
             self.refusal = error
+            if isinstance(error, UndecidedError) and error.aspect == "side":
+                # so that commands ask the same of the archive
+                archive = with_entry(imported.archive, TORQUE_SIDE, UNDECIDED)
+                return replace(imported, archive=archive)
             return imported
+
+
+def _require_known_side(source: Path, imported: ImportedRecording, asked: TorqueSample) -> None:
+    """Raise UndecidedError, as a look asks, if a torque may be that of motors, or their current."""
+    size = Size.of(asked.cell, asked.cell.model, asked.rows)
+    if sides_alike(size, asked.cell.joint_names):
+        for choices in look_at_joints(source, imported).questions:
+            raise undecided(source, choices, Contradictions())
 
 
 def _require_measured(archive: Archive, source: Path) -> None:
@@ -306,8 +323,9 @@ def _again(
 
 def undecided(
     source: Path, choices: tuple[TiedReading, ...], contradictions: Contradictions
-) -> SourceError:
+) -> UndecidedError:
     """Return the refusal of hypotheses that fit equally well; a doubtful arm comes first."""
+    aspect = choices[0].aspect
     errors = [
         f" (error {percentage(choice.error, 1)})" if choice.error else "" for choice in choices
     ]
@@ -331,10 +349,14 @@ def undecided(
     if contradictions.is_doubtful:
         found = sentences(contradictions.found)
         problem = f"may not be of the arm of the URDF: {found}; and {problem}"
-        return SourceError(source, problem, field="--urdf", remedy=f"{_REMEDY}; or {remedy}")
-    if choices[0].aspect in _OF_AXES:
+        remedy = f"{_REMEDY}; or {remedy}"
+        return UndecidedError(source, problem, field="--urdf", remedy=remedy).of(aspect)
+    if aspect in _OF_AXES:
         remedy += "; if none of these is the case, give the URDF of this arm"
-    return SourceError(source, problem, field=choices[0].aspect, remedy=remedy)
+    if aspect == "side":
+        problem = f"its torque is too small for the joints of this arm; {problem}"
+        remedy += "; a map without them reads it as the torque of the joints"
+    return UndecidedError(source, problem, field=aspect, remedy=remedy).of(aspect)
 
 
 def _not_of_arm(source: Path, found: Finding) -> RefusedRecordingError:

@@ -10,6 +10,7 @@ from typing import Final
 import numpy as np
 
 from hil.archive import open_archive
+from hil.archive.imported import TORQUE_SIDE, UNDECIDED
 from hil.archive.schema import CYCLE
 from hil.base.errors import ArchiveError, SourceError
 from hil.cell import Cell
@@ -218,8 +219,27 @@ def _finding(
     readings = _readings(cell, samples, imported)
     axes = Axes.of((step.change for step in readings.steps), cell.model.n_joints)
     return physics.TorqueFindings(
-        cell, recording, torque, readings, axes, imported.map_text, source, imported.files
+        cell,
+        recording,
+        torque,
+        readings,
+        axes,
+        imported.map_text,
+        source,
+        imported.files,
+        is_side_open=_is_side_open(imported),
     )
+
+
+def _is_side_open(imported: ImportedRecording) -> bool:
+    """Return whether nothing states that a torque is that of the joints.
+
+    A map of the user states it, so does the message of a bag, and an archive unless its log was
+    imported without.
+    """
+    if imported.map_text is None:
+        return imported.archive.header.entries.get(TORQUE_SIDE) == UNDECIDED
+    return not imported.is_stated
 
 
 def _look_of(

@@ -183,6 +183,40 @@ class Size:
         return bool(abs(abs(np.log(self.factor)) - np.log(_THOUSAND)) < np.log(2.0))
 
 
+def sides_alike(
+    size: Size, joints: Sequence[str], gears: Sequence[Change] = ()
+) -> tuple[TiedReading, ...]:
+    """Return what a torque may be that is too small for the joint side; empty if it is not.
+
+    Args:
+        size: of the torque.
+        joints: names of all.
+        gears: changes of scales and signs that the gears explain.
+    """
+    if not size.may_be_geared or size.is_thousand:
+        return ()
+    torque = _motor_torque(size, joints, gears)
+    settings = (torque, MotorCurrents(torque.ratios, torque.unseen))
+    return tuple(TiedReading("side", None, None, setting) for setting in settings)
+
+
+def _motor_torque(size: Size, joints: Sequence[str], gears: Sequence[Change]) -> MotorTorque:
+    """Return the gear ratios with which a torque of motors has the size that the arm needs."""
+    factors = size.of_joints or (None,) * len(joints)
+    axes = Axes.of(gears, len(joints))
+    of_joints = axes.torque_sign / axes.torque_scale
+    ratios = tuple(
+        float(each) / (seen or size.factor or 1.0)
+        for each, seen in zip(of_joints, factors, strict=True)
+    )
+    unseen = tuple(
+        name
+        for name, seen, each in zip(joints, factors, of_joints, strict=True)
+        if seen is None and each == 1.0
+    )
+    return MotorTorque(ratios, unseen)
+
+
 def mounted(cell: Cell, gravity: tuple[float, ...]) -> Cell:
     """Return a cell with another gravity in the base frame [m/s²]."""
     robot = cell.file.robot.model_copy(update={"gravity": gravity})
@@ -212,6 +246,7 @@ class TorqueFindings:
         torque: what it is as recorded, as a whole.
         map_text: the column map of the import; None for a bag.
         files: the recording, parsed.
+        is_side_open: whether nothing states that the torque is that of the joints.
     """
 
     cell: Cell
@@ -222,6 +257,7 @@ class TorqueFindings:
     map_text: str | None
     source: Path
     files: LogFiles
+    is_side_open: bool = True
 
     @cached_property
     def size(self) -> Size:
@@ -484,8 +520,10 @@ class TorqueFindings:
             reading = Fact.SMALL_TORQUE
             scaled = TorqueFactor(1.0 / factor)
             return Row("side", reading, Certainty.UNDETERMINED, evidence, scaled)
-        reading = Fact.MOTOR_SIDE
-        return Row("side", reading, Certainty.UNDETERMINED, evidence, Decide.ASK_FOR_UNIT)
+        decides: Decider = Decide.ASK_FOR_UNIT
+        if not self.is_side_open and self.map_text is not None:
+            decides = _motor_torque(self.size, self.cell.joint_names, self._gears)
+        return Row("side", Fact.MOTOR_SIDE, Certainty.UNDETERMINED, evidence, decides)
 
     def _payload(self, groups: Sequence[ParameterGroup]) -> Row:
         payload = self.cell.file.robot.payload
@@ -521,12 +559,16 @@ class TorqueFindings:
             choices.append(tuple(self._choice(step, *pair) for pair in shown))
         if any(step.change.meaning in SIGNS for step in disputed):
             choices.append(self._signs_alike())
-        size = self.size
-        if self.rigid.is_nothing or self.torque.is_rate:
+        if self.rigid.is_nothing or self.torque.is_rate or not self.is_side_open:
             return tuple(choices)
-        if size.may_be_geared and not size.is_thousand:
-            choices.append(self._sides())
+        if sides := sides_alike(self.size, self.cell.joint_names, self._gears):
+            choices.append(sides)
         return tuple(choices)
+
+    @property
+    def _gears(self) -> list[Change]:
+        """Scales and signs that are not in the map, which belong to the gears."""
+        return [step.change for step in self.readings.steps if not step.sure]
 
     def _choice(self, step: Step, change: Change, error: float) -> TiedReading:
         others = [change if other is step else other.change for other in self.readings.steps]
@@ -555,25 +597,6 @@ class TorqueFindings:
             reading = Changes(tuple(map(self._of_arm, each.signs.changes)))
             choices.append(TiedReading("signs", reading, each.error, self._line_of(axes)))
         return tuple(choices)
-
-    def _sides(self) -> tuple[TiedReading, ...]:
-        factor = self.size.factor or 1.0
-        joints = self.cell.joint_names
-        factors = self.size.of_joints or (None,) * len(joints)
-        # As recorded: scales and signs that are not in the map belong to the gears.
-        gears = [step.change for step in self.readings.steps if not step.sure]
-        axes = Axes.of(gears, len(joints))
-        of_joints = axes.torque_sign / axes.torque_scale
-        ratios = tuple(
-            float(each) / (seen or factor) for each, seen in zip(of_joints, factors, strict=True)
-        )
-        unseen = tuple(
-            name
-            for name, seen, each in zip(joints, factors, of_joints, strict=True)
-            if seen is None and each == 1.0
-        )
-        settings = (MotorTorque(ratios, unseen), MotorCurrents(ratios, unseen))
-        return tuple(TiedReading("side", None, None, setting) for setting in settings)
 
     def _entries_of(self, axes: Axes, text: str) -> dict[str, Any]:
         names = {channel.name for channel in channels_of(self.source, files=self.files)}

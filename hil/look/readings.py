@@ -654,7 +654,9 @@ class MotorCurrents:
     unseen: tuple[str, ...]
 
 
-Decider = NextStep | MapKey | MapEntries | GravityOption | OutsideLimits | TorqueFactor
+Decider = (
+    NextStep | MapKey | MapEntries | GravityOption | OutsideLimits | TorqueFactor | MotorTorque
+)
 """What decides a row; positions outside the limits say by what they would be within them."""
 
 Setting = MapEntries | GravityOption | MotorTorque | MotorCurrents

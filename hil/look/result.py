@@ -148,6 +148,11 @@ class Look:
     bag_text: str | None = None
     no_better: NoBetter | None = None
 
+    @property
+    def is_of_archive(self) -> bool:
+        """Whether it is of an archive, which no map describes."""
+        return self.map_text is None and self.bag_text is None
+
 
 @dataclass(frozen=True)
 class ChangedReading(Conclusion):

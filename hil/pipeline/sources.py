@@ -16,12 +16,13 @@ from drivers.c4g_packets import DRIVE_ON
 from hil.archive import Archive, ArchiveHeader, ArchiveName, open_archive, opened, place_of
 from hil.archive.campaign_archives import RecordedCampaign
 from hil.archive.header import EPISODE, REJECTED
-from hil.archive.imported import COPIED_COMMANDS
+from hil.archive.imported import COPIED_COMMANDS, TORQUE_SIDE, UNDECIDED
 from hil.archive.recording_of_archive import recording_of
 from hil.base.arrays import Array
 from hil.base.errors import ArchiveError, CampaignFolderError, InputError
 from hil.base.files import file_digest
 from hil.base.safe_input import path_exists
+from hil.base.terminal_text import typed
 from hil.cell import Cell
 from identification.signals.noise import standstill_variance
 from identification.signals.recording import (
@@ -397,6 +398,13 @@ def source_of(archive: Archive, cell: Cell, *, to_fit: bool = True) -> Source:
         if recording.commanded_position is not None:
             remedy += "; `hil identify` finds servo and friction from positions alone"
         raise ArchiveError(archive.path, problem, remedy=remedy)
+    if to_fit and recording.provenance.get(TORQUE_SIDE) == UNDECIDED:
+        problem = "is of a log whose torque is too small for the joints of this arm"
+        remedy = (
+            f"choose what it is by `hil look {typed(archive.path.name)}`, and import the log again"
+            " with that line in its map; a map without it reads it as the torque of the joints"
+        )
+        raise ArchiveError(archive.path, problem, field="side", remedy=remedy)
     return _usable(archive, cell, recording)
 
 

@@ -20,7 +20,7 @@ from typer.testing import CliRunner
 
 from benchmarks.look import measure
 from hil.archive import open_archive
-from hil.base.errors import SourceError
+from hil.base.errors import ArchiveError, SourceError, UndecidedError
 from hil.cli import app
 from hil.cli.look import short_evidence
 from hil.importers.bag_map import BagMap
@@ -238,6 +238,34 @@ class TestCommand:
         assert "gear_ratio" in result.output
         assert "torque_constant" in result.output
         assert [*tmp_path.iterdir()] == [path]
+
+    @pytest.mark.long
+    def test_every_command_asks_the_side_of_a_log_and_of_its_archive(
+        self, tmp_path: Path, urdf: Path, table: Mapping[str, Floats]
+    ) -> None:
+        """Unless a map says that it is the torque of the joints: then the verdict judges it."""
+        path = tmp_path / "a.csv"
+        columns = {**table, **of_motors(table)}
+        write_log(path, ["t", "q{}", "v{}", "tau{}"], *columns.values())
+        archive = tmp_path / "a.mcap"
+        imported = hil("import", "log", path, "--urdf", urdf, "-o", archive)
+        assert imported.exit_code == 0
+        assert "too small for the joints of this arm; two explanations" in imported.output
+        of_log = hil("identify", path, "--urdf", urdf).exception
+        assert isinstance(of_log, UndecidedError)
+        assert of_log.aspect == of_log.field == "side"
+        looked = hil("look", archive)
+        assert looked.exit_code == 2
+        assert "import its log again with one line in the map" in looked.output
+        of_archive = hil("identify", archive).exception
+        assert isinstance(of_archive, ArchiveError)
+        assert of_archive.field == "side"
+        assert of_archive.exit_code == of_log.exit_code == 2
+        target = archive.with_suffix(".map.toml")
+        stated = hil("look", path, "--urdf", urdf, "--map", target, "-v")
+        assert stated.exit_code == 0, stated.output
+        assert '[torque] side = "motor"; [drive] gear_ratio = ' in stated.output
+        assert hil("identify", path, "--urdf", urdf, "--map", target).exit_code == 5
 
     def test_the_map_it_writes_is_read(
         self, tmp_path: Path, urdf: Path, table: Mapping[str, Floats]
