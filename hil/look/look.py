@@ -30,7 +30,14 @@ from hil.importers.units import Kind
 from hil.look import physics, signals
 from hil.look.corrected_map import with_entries
 from hil.look.other_arm import Contradictions
-from hil.look.readings import Basis, Fact, NextStep, NoJointTorque
+from hil.look.readings import (
+    Basis,
+    Evidence,
+    Fact,
+    NextStep,
+    NoJointTorque,
+    StillUnexplained,
+)
 from hil.look.result import Aspect, Look, ParameterGroup, Row
 from hil.look.servo_load import may_be_load, servo_load, torques_without_sign, without_torque
 from hil.look.torque_sample import SETTINGS, TorqueSample, explained, prepared
@@ -51,9 +58,6 @@ from identification.signals.samples import Samples
 _DELAY_SAMPLES: Final = 20_000
 # Both motion and torque are limited to a twelfth of it before a delay is estimated.
 _DELAY_RATE: Final = 125.0  # Hz
-_RANGE_NUMBER: Final = 100.0  # a servo's number at the ends of its range
-# error ratio to a free fit that angles with another scale for each joint have, and degrees have not
-_RANGE_ERROR_RATIO: Final = 1.1
 _COLUMNS: Final[tuple[tuple[str, Kind, str], ...]] = (
     ("position", "position", "rad"),
     ("torque", "torque", "N·m"),
@@ -128,20 +132,18 @@ def _look(source: Path, imported: ImportedRecording, *, described: bool) -> Look
     return replace(look, bag_text=None if imported.bag is None else imported.bag.text)
 
 
-def _may_be_of_ranges(recording: Recording) -> bool:
-    """Return whether angles in degrees may be numbers from -100 to 100 of each joint's range."""
-    return bool(np.degrees(np.abs(recording.position)).max(initial=0.0) <= _RANGE_NUMBER)
-
-
-def _no_longer_certain_unit(row: Row, error: float) -> Row:
-    """Return a row whose unit the numbers alone say, of a torque that the arm does not explain.
+def _by_numbers(rows: Sequence[Row], evidence: Evidence) -> list[Row]:
+    """Return rows whose units the numbers alone say, which are not certain for a reason.
 
     One joint in another unit than the others leaves the limits of the URDF as all of them do.
     """
-    by_numbers = any(isinstance(each, ConcludedUnit) for each in row.evidence)
-    if row.aspect not in ("position", "velocity") or not by_numbers:
-        return row
-    return physics.no_longer_certain(row, error)
+    return [
+        physics.no_longer_certain(row, evidence)
+        if row.aspect in ("position", "velocity")
+        and any(isinstance(each, ConcludedUnit) for each in row.evidence)
+        else row
+        for row in rows
+    ]
 
 
 def _archived(source: Path) -> ImportedRecording | None:
@@ -180,13 +182,20 @@ def _with_torque(
         channel = [physics.by_estimated_times(row) for row in channel]
     groups = physics.determined(finding.readings)
     score = finding.readings.score
-    adequacy = finding.readings.adequacy
-    is_off = adequacy.ratio > _RANGE_ERROR_RATIO and _may_be_of_ranges(recording)
-    if score.overall > EXPLAINED_ERROR or finding.fits_badly or is_off:
-        rows = [_no_longer_certain_unit(row, score.overall) for row in rows]
+    of_torque = finding.rows(groups)
+    unexplained = StillUnexplained(score.overall)
+    if score.overall > EXPLAINED_ERROR or finding.fits_badly:
+        rows = _by_numbers(rows, unexplained)
     if score.overall > EXPLAINED_ERROR:
-        channel = [physics.no_longer_certain(row, score.overall) for row in channel]
-    rows = [*rows, *finding.rows(groups), *channel]
+        channel = [physics.no_longer_certain(row, unexplained) for row in channel]
+    if (scales := finding.other_scales) is not None:
+        # Such as numbers of a servo from -100 to 100, with a range of its own for each joint.
+        rows = _by_numbers(rows, scales)
+        of_torque = [
+            physics.no_longer_certain(row, scales) if row.aspect == "angle unit" else row
+            for row in of_torque
+        ]
+    rows = [*rows, *of_torque, *channel]
     contradictions = Contradictions.of(
         cell, finding.readings.model, finding.readings.samples, score, score.overall
     )
@@ -261,16 +270,20 @@ def _look_of(
 
 
 def _readings(cell: Cell, samples: Samples, imported: ImportedRecording) -> Readings:
-    stated = any(
-        each.kind == "position" and each.unit_basis is not UnitBasis.NUMBERS
-        for each in imported.concluded
-        if isinstance(each, ChannelMeaning)
-    )
     return find_readings(
         cell.model,
         samples,
         mountings=mountings(cell),
-        unit_is_open=not stated,
+        unit_is_open=_is_unit_open(imported),
+    )
+
+
+def _is_unit_open(imported: ImportedRecording) -> bool:
+    """Return whether the numbers alone say the unit of the positions."""
+    return not any(
+        each.kind == "position" and each.unit_basis is not UnitBasis.NUMBERS
+        for each in imported.concluded
+        if isinstance(each, ChannelMeaning)
     )
 
 

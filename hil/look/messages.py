@@ -65,6 +65,7 @@ from hil.look.readings import (
     NotSlopes,
     OtherAxes,
     OtherLengths,
+    OtherScales,
     OtherTimes,
     ReadAsGiven,
     RigidShare,
@@ -593,6 +594,14 @@ def _(unseen: UnseenFriction) -> str:
 @_worded.register
 def _(error: StillUnexplained) -> str:
     return f"but {percentage(error.error)} of the torque stays unexplained"
+
+
+@_worded.register
+def _(scales: OtherScales) -> str:
+    if not scales.factors:
+        return "the torque does not show the scale of most positions"
+    factors = ", ".join(f"{joint} {number(factor, 2)}" for joint, factor in scales.factors)
+    return f"the torque fits positions multiplied by another factor better: {factors}"
 
 
 @_worded.register

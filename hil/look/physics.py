@@ -45,6 +45,7 @@ from hil.look.readings import (
     NextBest,
     NoBetter,
     NoJointTorque,
+    OtherScales,
     OtherTimes,
     Reading,
     RigidShare,
@@ -318,13 +319,22 @@ class TorqueFindings:
             beside = FreeFit(self.readings.adequacy.ratio)
             rows.append(Row("explanation", Fact.NONE_FITS, Certainty.UNDETERMINED, (beside,)))
         if error > EXPLAINED_ERROR:
-            rows = [no_longer_certain(row, error) for row in rows]
+            rows = [no_longer_certain(row, StillUnexplained(error)) for row in rows]
         as_read = ErrorAsRead(error)
         evidence: tuple[Evidence, ...] = (Basis.FREE_PARAMETERS,)
         if self.no_better is not None:
             evidence = (*evidence, self.no_better)
         rows.append(Row("as read", as_read, Certainty.CERTAIN, evidence))
         return rows
+
+    @property
+    def other_scales(self) -> OtherScales | None:
+        """Return what leaves the unit of positions open; None if it is stated, or is shown."""
+        scales = self.readings.scales
+        if scales is None or scales.agrees:
+            return None
+        names = self.cell.joint_names
+        return OtherScales(tuple((names[j], float(scales.factor[j])) for j in scales.other))
 
     @property
     def no_better(self) -> NoBetter | None:
@@ -653,12 +663,11 @@ def _says_nothing(row: Row, basis: Basis) -> Row:
     return replace(row, certainty=Certainty.UNDETERMINED, evidence=(basis,), decider=None)
 
 
-def no_longer_certain(row: Row, error: float) -> Row:
-    """Return a row that rests on a torque which the arm does not explain."""
+def no_longer_certain(row: Row, evidence: Evidence) -> Row:
+    """Return a row that rests on a torque of which the evidence leaves it less than certain."""
     if row.certainty is not Certainty.CERTAIN or row.aspect == "payload":
         return row
-    evidence = (*row.evidence, StillUnexplained(error))
-    return replace(row, certainty=Certainty.LIKELY, evidence=evidence)
+    return replace(row, certainty=Certainty.LIKELY, evidence=(*row.evidence, evidence))
 
 
 def _repeats(change: Change, steps: list[Step]) -> bool:

@@ -385,6 +385,13 @@ class RigidShare:
 
 
 @dataclass(frozen=True)
+class OtherScales:
+    """Factors of positions that the torque fits better; none where it shows no scale of most."""
+
+    factors: tuple[tuple[str, float], ...]
+
+
+@dataclass(frozen=True)
 class NoBetter:
     """Changes that fit best, by no more than chance."""
 
@@ -555,6 +562,7 @@ Evidence = (
     | UnseenFriction
     | StillUnexplained
     | NoBetter
+    | OtherScales
     | FreeFit
     | RigidShare
     | SizeRatio

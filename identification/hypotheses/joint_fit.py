@@ -13,6 +13,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import Final, NamedTuple
 
 import numpy as np
@@ -53,6 +54,8 @@ _COST_TOLERANCE: Final = 1e-2  # change of twice the log posterior
 _MAX_SCALE_DEVIATION: Final = 0.1  # relative deviation of a scale that the motion shows
 _SAME_ZERO_TOLERANCE: Final = np.radians(3.0)  # difference of two fits that agree
 _SAME_ZERO_SIGMAS: Final = 3.0  # the same, in standard deviations
+# Relative deviation of the positions' scale: model errors of real arms look like up to 0.17.
+_MIN_POSITION_SCALE: Final = 0.2
 _MAX_HALVINGS: Final = 4
 _WEIGHTING_ROUNDS: Final = 6
 _GAIN_LOWER_BOUND: Final = -0.95
@@ -189,6 +192,76 @@ def find_joints(
     return replace(fit, tied=tied)
 
 
+class PositionScales(NamedTuple):
+    """By how much the positions of each joint may be multiplied, with its zero free.
+
+    Attributes:
+        factor: that explains the rows best, by one step from the positions as read (n,).
+        std: standard deviation of it (n,); infinite for joints that slide or do not move.
+    """
+
+    factor: Array
+    std: Array
+
+    @property
+    def shown(self) -> Mask:
+        """Which scales the rows show (n,)."""
+        return np.asarray(self.std < _MAX_SCALE_DEVIATION)
+
+    @property
+    def other(self) -> tuple[int, ...]:
+        """The joints with another scale than read."""
+        off = np.abs(self.factor - 1.0)
+        least = np.maximum(_MIN_POSITION_SCALE, _SAME_ZERO_SIGMAS * self.std)
+        return tuple(np.flatnonzero(self.shown & (off > least)).tolist())
+
+    @property
+    def agrees(self) -> bool:
+        """Whether the rows show that half of the moving joints have the scale as read."""
+        moves = np.isfinite(self.std)
+        is_most = 2 * np.count_nonzero(self.shown) >= np.count_nonzero(moves)
+        return bool(is_most) and not self.other
+
+
+def position_scales(model: RobotModel, samples: Samples) -> PositionScales:
+    """Estimate a scale and a zero of the positions of each joint with all parameters.
+
+    Args:
+        model: of the arm.
+        samples: some hundred rows, as read.
+    """
+    problem = _Problem.of(model, samples, 1.0)
+    point = problem.start(None)
+    n, p = problem.n, model.n_parameters
+    turns = candidates(model, samples)
+    free = np.concatenate([turns[:n], np.zeros(n, dtype=np.bool_)])
+    moving = np.flatnonzero(turns[:n] & (np.ptp(samples.motion.position, axis=0) > 0.0))
+    sums = problem.linearised(point, free)
+    stretched = problem.stretched(point, moving)
+    _, turned = problem.turned(point, free)
+    weights = problem.weights(point.squares)
+    zeros = np.flatnonzero(free[:n])
+    added = p + n + np.arange(len(moving))
+    matrix = np.zeros((p + n + len(moving), p + n + len(moving)))
+    matrix[: p + n, : p + n] = sums.matrix[: p + n, : p + n]
+    matrix[added, added] = ROWS_PER_FACT / GAIN_SPREAD**2
+    gradient = np.concatenate([sums.gradient[: p + n], np.zeros(len(moving))])
+    for joint, (block, places) in enumerate(zip(*point.regressor, strict=True)):
+        usable = samples.usable[:, joint]
+        known = np.concatenate([places, p + zeros])
+        table = np.hstack([block, turned[:, :, joint].T])[usable]
+        own = stretched[:, usable, joint]
+        cross = weights[joint] * (own @ table)
+        matrix[np.ix_(added, known)] += cross
+        matrix[np.ix_(known, added)] += cross.T
+        matrix[np.ix_(added, added)] += weights[joint] * (own @ own.T)
+        gradient[added] += weights[joint] * (own @ point.residuals[usable, joint])
+    factor, std = np.ones(n), np.full(n, np.inf)
+    factor[moving] += _solved(matrix, gradient)[p + n :]
+    std[moving] = np.sqrt(ROWS_PER_FACT * _inverse(matrix).diagonal()[p + n :])
+    return PositionScales(factor, std)
+
+
 class _Point(NamedTuple):
     """Zeros and scales, the parameters that fit with them, and the errors then."""
 
@@ -305,7 +378,7 @@ class _Problem:
         """Return the sums at a point, with columns of zero for what is fixed."""
         p = self.model.n_parameters
         n = self.n
-        torque, turned = self._turned(point, free)
+        torque, turned = self.turned(point, free)
         factor = 1.0 + point.gain
         weights = self.weights(point.squares)
         matrix = np.zeros((p + 2 * n, p + 2 * n))
@@ -328,7 +401,7 @@ class _Problem:
         gradient[p:][~free] = 0.0
         return _Sums(matrix, gradient)
 
-    def _turned(self, point: _Point, free: Mask) -> tuple[Array, Array]:
+    def turned(self, point: _Point, free: Mask) -> tuple[Array, Array]:
         """Return the torque (m, n), and its derivative by each free zero (k, m, n)."""
         joints = np.flatnonzero(free[: self.n])
         motion = self.moved(point.zero)
@@ -337,6 +410,18 @@ class _Problem:
         position[range(1, len(position)), :, joints] += _DERIVATIVE_STEP
         torque, *turned = self.model.torque(point.values, moved).reshape(position.shape)
         return torque, (np.reshape(turned, (-1, *torque.shape)) - torque) / _DERIVATIVE_STEP
+
+    def stretched(self, point: _Point, joints: NDArray[np.intp]) -> Array:
+        """Return the derivative of the torque by the scale of each joint's positions (k, m, n)."""
+        motion = self.moved(point.zero)
+        torque = self.model.torque(point.values, motion)
+        parts = []
+        for joint in joints:
+            scale = np.ones(self.n)
+            scale[joint] += _DERIVATIVE_STEP
+            other = motion.converted(partial(np.multiply, scale))
+            parts.append((self.model.torque(point.values, other) - torque) / _DERIVATIVE_STEP)
+        return np.reshape(parts, (-1, *torque.shape))
 
 
 def _of_any_scale(prior: GaussianPrior) -> Array:

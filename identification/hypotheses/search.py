@@ -46,9 +46,11 @@ from identification.hypotheses.joint_changes import (
 )
 from identification.hypotheses.joint_fit import (
     JointFit,
+    PositionScales,
     candidates,
     find_joints,
     fit_joints,
+    position_scales,
     starting_at,
 )
 from identification.hypotheses.little_torque import little_torque
@@ -211,6 +213,7 @@ class Readings:
         adequacy: whether nothing else explains the rows much better.
         rivals: signs of the joints that explain the rows alike, fewest changes first.
         no_better: changes that fit best, by no more than chance: the recording is read without.
+        scales: of the positions, where the numbers alone say their unit.
     """
 
     steps: tuple[Step, ...]
@@ -222,6 +225,7 @@ class Readings:
     adequacy: Adequacy = Adequacy(1.0, 1.0, agrees=True)
     rivals: tuple[SignRival, ...] = ()
     no_better: tuple[Change, ...] = ()
+    scales: PositionScales | None = None
 
     @property
     def disputed_signs(self) -> tuple[Step, ...]:
@@ -289,6 +293,12 @@ def find_readings(
         replace(step, is_adequate=False) if _is_disputed(step, search.signs, rivals) else step
         for step in steps
     ]
+    scales = position_scales(search.model, search.samples) if unit_is_open else None
+    if scales is not None and scales.other:  # which zeros and scales of torques may imitate
+        steps = [
+            replace(step, is_adequate=step.is_adequate and step.change.meaning not in SIZED)
+            for step in steps
+        ]
     return Readings(
         tuple(steps),
         search.model,
@@ -299,6 +309,7 @@ def find_readings(
         adequacy,
         rivals,
         no_better,
+        scales,
     )
 
 

@@ -24,7 +24,14 @@ from hil.look import look_at
 from hil.look.before_identification import concluded
 from hil.look.readings import ReadAsGiven, RowsReading, ZeroTorques
 from hil.look.result import Look
-from tests.hil.simulated_logs import Simulated, simulate, urdf_path, write_log
+from tests.hil.simulated_logs import (
+    Simulated,
+    simulate,
+    urdf_path,
+    write_log,
+    write_moving_log,
+)
+from tests.tiers import quick_ones
 
 URDF = urdf_path("ur5_robot.urdf")
 RECORDED = Path(__file__).resolve().parents[4] / "shared" / "data"
@@ -79,6 +86,59 @@ def test_shares_of_a_range_are_no_certain_degrees(tmp_path: Path, simulated: Sim
     )
     (row,) = [row for row in look(log).rows if row.aspect == "position"]
     assert row.certainty is not Certainty.CERTAIN
+
+
+def planar_arm(axis: str, count: int) -> str:
+    """Description of an arm whose axes are parallel."""
+    links = ['<link name="link0"/>']
+    for joint in range(1, count + 1):
+        mass = 3.0 / joint
+        links.append(
+            f'''<link name="link{joint}"><inertial><origin xyz="0.15 0 0"/><mass value="{mass}"/>
+            <inertia ixx="0.002" iyy="{0.02 * mass}" izz="{0.02 * mass}" ixy="0" ixz="0" iyz="0"/>
+            </inertial></link><joint name="joint{joint}" type="revolute">
+            <parent link="link{joint - 1}"/><child link="link{joint}"/>
+            <origin xyz="{0.3 * (joint > 1)} 0 0"/><axis xyz="{axis}"/>
+            <limit lower="-2.9" upper="2.9" effort="200" velocity="20"/></joint>'''
+        )
+    return f'<robot name="planar">{"".join(links)}</robot>'
+
+
+UPRIGHT_AXIS, LEVEL_AXIS = "0 0 1", "0 1 0"
+
+
+@pytest.mark.parametrize(
+    ("axis", "count", "in_degrees"),
+    quick_ones(
+        [(LEVEL_AXIS, 2, False)],
+        [
+            (axis, count, in_degrees)
+            for axis in (LEVEL_AXIS, UPRIGHT_AXIS)
+            for count in (2, 3)
+            for in_degrees in (False, True)
+            if in_degrees <= (axis == LEVEL_AXIS)
+        ],
+    ),
+)
+def test_the_unit_of_a_planar_arm_is_certain_if_its_torque_shows_the_scale(
+    tmp_path: Path, axis: str, count: int, in_degrees: bool
+) -> None:
+    """Gravity shows it of axes that are level; numbers from -100 to 100 are no degrees."""
+    urdf = tmp_path / "arm.urdf"
+    urdf.write_text(planar_arm(axis, count))
+    log = write_moving_log(tmp_path / "log.csv", urdf.read_text(), duration=16.0)
+    table = np.loadtxt(log, delimiter=",", skiprows=1)
+    time, position, torque = table[:, 0], table[:, 1 : count + 1], table[:, -count:]
+    low, high = position.min(axis=0) - 0.05, position.max(axis=0) + 0.2
+    numbers = (position - low) / (high - low) * 200.0 - 100.0
+    numbers = np.degrees(position) if in_degrees else numbers
+    write_log(log, ["t", "q{}", "tau{}"], time, numbers, torque)
+    found = look_at(log, lambda _: Robot.from_urdf(urdf), ImportOptions())
+    certain = {row.aspect for row in found.rows if row.certainty is Certainty.CERTAIN}
+    assert ("position" in certain) == in_degrees
+    assert ("angle unit" in certain) == in_degrees
+    if not in_degrees:
+        assert not certain & {"zero", "scale"}
 
 
 @pytest.mark.parametrize("wrapped_at", ["zero", "the middle of the motion"])
