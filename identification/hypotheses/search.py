@@ -279,27 +279,7 @@ def find_readings(
     steps = _without_adopted(steps)
     # What a change explains shows only together with the others.
     steps = [step if step.alike else replace(step, error=search.score.overall) for step in steps]
-    if not adequacy.is_enough:
-        steps = _doubted(steps, search, started())
-    doubted = [step for step in steps if not step.sure]
-    steps = [  # each was chosen together with the others
-        step if doubted in ([], [step]) else replace(step, is_adequate=False) for step in steps
-    ]
-    if any(step.change.meaning == "no gravity" for step in steps) and has_part_of_gravity(
-        model, search.samples, score
-    ):
-        steps = [replace(step, is_adequate=False) for step in steps]
-    steps = [
-        replace(step, is_adequate=False) if _is_disputed(step, search.signs, rivals) else step
-        for step in steps
-    ]
-    scales = position_scales(search.model, search.samples) if unit_is_open else None
-    if scales is not None and scales.other:  # which zeros and scales of torques may imitate
-        steps = [
-            replace(step, is_adequate=step.is_adequate and step.change.meaning not in SIZED)
-            for step in steps
-        ]
-    return Readings(
+    found = Readings(
         tuple(steps),
         search.model,
         search.samples,
@@ -309,8 +289,32 @@ def find_readings(
         adequacy,
         rivals,
         no_better,
-        scales,
+        position_scales(search.model, search.samples) if unit_is_open else None,
     )
+    return replace(found, steps=tuple(_judged(started, search, found)))
+
+
+def _judged(started: Callable[..., _Search], search: _Search, found: Readings) -> list[Step]:
+    """Return the steps that were found, each adequate if nothing else explains the rows alike."""
+    steps = list(found.steps)
+    if not found.adequacy.is_enough:
+        steps = _doubted(steps, search, started())
+    doubted = [step for step in steps if not step.sure]
+    steps = [  # each was chosen together with the others
+        step if doubted in ([], [step]) else replace(step, is_adequate=False) for step in steps
+    ]
+    if any(step.change.meaning == "no gravity" for step in steps) and has_part_of_gravity(
+        started().model, search.samples, found.score
+    ):
+        steps = [replace(step, is_adequate=False) for step in steps]
+    has_other_scales = found.scales is not None and bool(found.scales.other)
+    return [
+        replace(step, is_adequate=False)
+        if _is_disputed(step, search.signs, found.rivals)
+        or (has_other_scales and step.change.meaning in SIZED)  # which may imitate them
+        else step
+        for step in steps
+    ]
 
 
 def _without_chance(

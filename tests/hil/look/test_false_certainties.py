@@ -120,7 +120,7 @@ UPRIGHT_AXIS, LEVEL_AXIS = "0 0 1", "0 1 0"
         ],
     ),
 )
-def test_the_unit_of_a_planar_arm_is_certain_if_its_torque_shows_the_scale(
+def test_a_planar_arm_may_show_the_unit_of_its_positions(
     tmp_path: Path, axis: str, count: int, in_degrees: bool
 ) -> None:
     """Gravity shows it of axes that are level; numbers from -100 to 100 are no degrees."""
