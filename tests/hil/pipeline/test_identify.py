@@ -121,8 +121,9 @@ def imported_ur5(folder, time, late, still=0):
     q = made.position[rows]
     tau = torque[rows]
     before = t[0] + (time[1] - time[0]) * np.arange(-still, 0)
-    resting = (np.repeat(channel[:1], still, axis=0) for channel in (q, tau))
-    q, tau = (np.concatenate(both) for both in zip(resting, (q, tau), strict=True))
+    noise = 0.3 * np.random.default_rng(1).standard_normal((still, 6))  # no frozen logger's rows
+    q = np.concatenate([np.repeat(q[:1], still, axis=0), q])
+    tau = np.concatenate([tau[0] + noise, tau])
     arrays = {"t": np.concatenate([before, t]), "q": q, "tau": tau}
     return archive_of(folder / "log.mcap", made.urdf, **arrays)
 
