@@ -195,7 +195,10 @@ def check_clock(stamp: Stamps, path: Path, remedy: str | None = None) -> None:
         raise SourceError(path, problem, field="time", remedy=f"{cut}, or {other}")
     if steps.size and not steps.any():
         problem = f"all {len(stamp)} samples have the same time"
-        other = remedy or "give the column of the time, or give sample_rate instead"
+        other = remedy or (
+            "state the column of the time, --columns time=NAME, or the rate of the samples, "
+            "--sample-rate HZ ([time] and sample_rate of a map)"
+        )
         raise SourceError(path, problem, field="time", remedy=other)
     rate = 1e9 / float(np.median(steps[steps > 0])) if steps.size else np.inf
     if rate < _MIN_PLAUSIBLE_RATE:
