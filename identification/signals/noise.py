@@ -102,7 +102,10 @@ _SILENT_POWER_SHARE: Final = 1e-6  # share of a signal's power; noise of 0.1 % o
 # share of half the sampling rate; anti-alias filters cut at about 0.8
 _MAX_EDGE_SHARE: Final = 0.75
 _MIN_ROUNDING_STD_RATIO: Final = 2.0  # noise over that of rounding to the smallest step
-_MIN_WHITE_SHARE: Final = 0.5  # of the power above a frequency, in noise that reaches all of them
+_MIN_WHITE_SHARE: Final = 0.5  # of the power that white noise of the upper frequencies would have
+_UPPER_SHARE: Final = 0.25  # of half the sampling rate, from which only noise is left of a motion
+# Single precision rounds angles to a third of it, and no joint's encoder resolves it.
+_MIN_SENSOR_NOISE: Final = 5e-7  # rad
 _DECIMAL_TOLERANCE: Final = 1e-3  # of a step, as a power of ten
 
 
@@ -122,13 +125,14 @@ def has_small_noise(time: Array, signals: Array, segments: Sequence[slice], abov
     """Return whether angles (m, c) [rad] have small white noise of a sensor.
 
     It is larger than rounding to the digits of a log leaves, or the steps are an encoder's,
-    no decimal number of degrees or radians; and there is as much of it at the highest frequencies.
+    no decimal number of degrees or radians; and there is as much of it at the highest frequencies
+    as in all of the upper part of the spectrum, in which no motion is left.
 
     Args:
         time: of the samples (m,) [s].
         signals: that move.
         segments: without gaps.
-        above: frequency [Hz] above which the noise is all there is.
+        above: frequency [Hz] above which there is hardly any motion.
     """
     frequency, power = _power(time, signals, segments)
     longest = max(segments, key=lambda segment: int(segment.stop - segment.start))
@@ -139,9 +143,10 @@ def has_small_noise(time: Array, signals: Array, segments: Sequence[slice], abov
     rounding = step**2 / 12.0
     beyond = variance > _MIN_ROUNDING_STD_RATIO**2 * rounding
     of_encoder = (variance > rounding / _MIN_ROUNDING_STD_RATIO**2) & ~_is_decimal(step)
-    here = frequency >= above
-    of_band = power[here][:, moving].sum(axis=0) * (frequency[1] - frequency[0])
-    white = variance >= _MIN_WHITE_SHARE * of_band
+    # What little motion there is next to its edge is more than the noise of a fine encoder.
+    lowest = max(above, _UPPER_SHARE * frequency[-1])
+    of_band = power[frequency >= lowest][:, moving].mean(axis=0) * frequency[-1]
+    white = variance >= np.maximum(_MIN_WHITE_SHARE * of_band, _MIN_SENSOR_NOISE**2)
     return bool(np.mean((beyond | of_encoder) & white) > 0.5)
 
 

@@ -8,7 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.integrate import quad
 from scipy.interpolate import BSpline
-from scipy.signal import butter, sosfiltfilt
+from scipy.signal import butter, lfilter, sosfiltfilt
 
 from identification.errors import ShapeError
 from identification.model.coupling import Coupling
@@ -28,6 +28,7 @@ from identification.signals.masks import (
 from identification.signals.messages import clock_lines
 from identification.signals.noise import (
     difference_variance,
+    has_small_noise,
     noiseless_above,
     standstill_variance,
 )
@@ -514,6 +515,28 @@ class TestNoise:
         with pytest.raises(RecordingError, match=r"requires .* samples, got 3"):
             measure(np.arange(3.0), np.zeros((3, 1)))
         assert noiseless_above(np.arange(3.0), np.zeros((3, 1)), [slice(0, 3)]) is None
+
+    @pytest.mark.parametrize(
+        ("logged", "measured"),
+        [
+            (lambda angle, noise: angle + 1e-5 * noise, True),
+            (lambda angle, noise: angle, False),
+            (lambda angle, noise: angle.astype(np.float32).astype(float), False),
+            (lambda angle, noise: np.round(angle, 4), False),
+            (lambda angle, noise: angle + 1e-5 * lfilter([0.02], [1.0, -0.98], noise, 0), False),
+        ],
+        ids=["encoder", "computed", "single precision", "four decimals", "low-passed noise"],
+    )
+    def test_small_noise_of_an_encoder_is_told_from_what_arithmetic_leaves(self, logged, measured):
+        """Of chirps, whose fastest part is weak but larger than the noise."""
+        time = np.arange(20000) * 1e-3
+        chirp = np.sin(2.0 * np.pi * (0.1 + 0.1 * time) * time) * np.exp(-0.5 * time)
+        angle = np.column_stack([chirp + 1.5 * np.sin(time), chirp + 1.5 * np.cos(time)])
+        noise = np.random.default_rng(7).standard_normal(angle.shape)
+        angle = logged(angle, noise)
+        above = noiseless_above(time, angle, [slice(0, len(time))])
+        assert above is not None
+        assert has_small_noise(time, angle, [slice(0, len(time))], above) == measured
 
 
 class TestSamples:
