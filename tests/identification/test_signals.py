@@ -527,7 +527,7 @@ class TestNoise:
         ],
         ids=["encoder", "computed", "single precision", "four decimals", "low-passed noise"],
     )
-    def test_small_noise_of_an_encoder_is_told_from_what_arithmetic_leaves(self, logged, measured):
+    def test_small_noise_of_an_encoder_is_none_of_arithmetic(self, logged, measured):
         """Of chirps, whose fastest part is weak but larger than the noise."""
         time = np.arange(20000) * 1e-3
         chirp = np.sin(2.0 * np.pi * (0.1 + 0.1 * time) * time) * np.exp(-0.5 * time)
