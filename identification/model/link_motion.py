@@ -6,7 +6,6 @@ import numpy as np
 
 from identification.arrays import Array
 from identification.model.kinematics import Chain, skew
-from identification.model.motion import Motion
 
 _COSINE_ROUNDING = 1e-15  # of direction cosines
 
@@ -24,50 +23,75 @@ class LinkMotion:
 
     with the twist s_i of joint i per unit speed, and the *spatial* acceleration a_i, minus gravity
     at the base. `motion` is velocity and acceleration of the links (n, 2, 2, 3, size), `twists`
-    per link those of the a joints that move it, base first (a, 2, 3, size), `velocity` and
-    `acceleration` qd and qdd of the joints (n, size).
+    per link those of the a joints that move it, base first (a, 2, 3, size); without `all_twists`
+    that of its own joint alone. `states` are q, qd and qdd of the joints (3, n, size).
     """
 
-    def __init__(self, chain: Chain, gravity: Array, size: int) -> None:
-        n = chain.n_joints
+    def __init__(
+        self, chain: Chain, gravity: Array, states: Array, *, all_twists: bool = True
+    ) -> None:
+        n, size = states.shape[1:]
+        paths = [len(chain.ancestors(i)) if all_twists else 1 for i in range(n)]
         # Slots of a link: velocity, acceleration, then twists, as many as the longest path needs.
-        slots = np.zeros((n, 2 + n, 2, 3, size))
+        slots = np.zeros((n, 2 + max(paths), 2, 3, size))
         self.motion = slots[:, :2]
-        self.twists = tuple(slots[i, 2 : 2 + len(chain.ancestors(i))] for i in range(n))
-        self._joints = np.zeros((3, n, size))
-        self._position, self.velocity, self.acceleration = self._joints
+        self.twists = tuple(slots[i, 2 : 2 + path] for i, path in enumerate(paths))
+        self._position = states[0]
         self._basis = np.ones((n, 3, size))
         self._rotation = np.empty((n, 9, size))
         base = np.zeros((2, 2, 3, size))
         base[1, 1] = -gravity[:, None]
-        self._steps = []
+        steps = []
         for joint in range(n):
             parent = int(chain.parents[joint])
-            carried = len(self.twists[joint]) + 1  # all slots but the joint's own twist
+            carried = paths[joint] + 1  # all slots but the joint's own twist
             before = base if parent < 0 else slots[parent, :carried]
             rotation = self._rotation[joint].reshape(3, 3, size)
             after = slots[joint, : carried + 1]
-            self._steps.append(_Step(chain, joint, before, rotation, after, self._joints[:, joint]))
-        self._blend = np.array([step.blend for step in self._steps])
-
-    def set_joints(self, motion: Motion) -> None:
-        """Set the joint motion of k <= size samples; the other samples are at rest."""
-        k = motion.n_samples
-        states = motion.position, motion.velocity, motion.acceleration
-        for target, given in zip(self._joints, states, strict=True):
-            target[:, :k] = given.T
-            target[:, k:] = 0.0
+            steps.append(LinkStep(chain, joint, before, rotation, after, states[:, joint]))
+        self.steps = tuple(steps)
+        self._blend = np.array([step.blend for step in steps])
 
     def update(self) -> None:
         """Compute all links for the joint motion that is set."""
         _cos_sin(self._position, self._basis[:, 1], self._basis[:, 2])
         np.matmul(self._blend, self._basis, out=self._rotation)
-        for step in self._steps:
+        for step in self.steps:
             step.carry()
             step.move()
 
 
-class _Step:
+class LinkForces:
+    r"""Torques of the joints from the wrenches of the links, as Newton and Euler add them up.
+
+    From the last link to the first, the wrench of link i about the origin of its frame, in its
+    axes, is its own and those of the links that it carries:
+
+    .. math:: f_i = m_i + \sum_c X_c^T f_c, \qquad \tau_i = s_i^T f_i
+
+    `own` are the wrenches m_i (n, 2, 3, size), moment and force; `motion` that of the links.
+    """
+
+    def __init__(self, chain: Chain, gravity: Array, states: Array) -> None:
+        n, size = states.shape[1:]
+        self.motion = LinkMotion(chain, gravity, states, all_twists=False)
+        self.own = np.zeros((n, 2, 3, size))
+        self._carried = np.zeros((2, 3, size))
+        self._parents = chain.parents.tolist()
+
+    def torque(self) -> Array:
+        """Return the torques (n, size); the wrenches become those of all that each link carries."""
+        torque = np.empty((len(self.own), self.own.shape[-1]))
+        for joint in reversed(range(len(torque))):
+            step = self.motion.steps[joint]
+            torque[joint] = step.along_axis(self.own[joint])
+            if self._parents[joint] >= 0:
+                step.carry_back(self.own[joint], self._carried)
+                self.own[self._parents[joint]] += self._carried
+        return torque
+
+
+class LinkStep:
     """Recursion over one joint, from slots of its parent (c, 2, 3, size) to its own, one more.
 
     All views are created once: a view costs as much as the arithmetic on a few hundred samples.
@@ -85,6 +109,7 @@ class _Step:
         self.blend = _blend(axis, chain.rotation[joint].T, revolute)
         self._position, self._speed, self._rate_of_speed = motion
         self._revolute = revolute
+        self._part = part
         self._axis = [(a, float(axis[a])) for a in range(3) if axis[a] != 0.0]
         self._carried = after[:-1]
         self._velocity = after[0]
@@ -94,25 +119,28 @@ class _Step:
         ]
         # Shift of the reference point p: linear part l + w x p = l - [p]x w.
         self._before = before
-        matrix = -skew(chain.translation[joint])
-        self._shifted = np.empty_like(before) if np.any(matrix) else before
+        lever = skew(chain.translation[joint])
+        places = np.argwhere(lever != 0.0).tolist()
+        self._lever = [(row, column, float(lever[row, column])) for row, column in places]
+        self._shifted = np.empty_like(before) if self._lever else before
         self._shifts = [
-            (before[:, 0, column], float(matrix[row, column]), self._shifted[:, 1, row])
-            for row, column in np.argwhere(matrix != 0.0)
+            (before[:, 0, column], -arm, self._shifted[:, 1, row])
+            for row, column, arm in self._lever
         ]
         self._scratch = np.empty_like(before[:, 0, 0])
         # Rotation of the axes: as a whole, or one axis fixed and two in a plane.
-        rows = columns = slice(0, 3)
+        self._rows = self._columns = slice(0, 3)
+        self._fixed = _find_fixed_axis(self.blend)
         self._fixed_axis: tuple[Array, float, Array] | None = None
-        if (fixed_axis := _find_fixed_axis(self.blend)) is not None:
-            row, column, sign = fixed_axis
+        if self._fixed is not None:
+            row, column, sign = self._fixed
             self._fixed_axis = (self._shifted[:, :, column], sign, self._carried[:, :, row])
-            rows = _OTHER_AXES[row]
-            columns = _OTHER_AXES[column]
+            self._rows = _OTHER_AXES[row]
+            self._columns = _OTHER_AXES[column]
         self._turn = (
-            rotation[rows, columns],
-            self._shifted[:, :, columns],
-            self._carried[:, :, rows],
+            rotation[self._rows, self._columns],
+            self._shifted[:, :, self._columns],
+            self._carried[:, :, self._rows],
         )
 
     def carry(self) -> None:
@@ -143,6 +171,29 @@ class _Step:
         for own_velocity, own_acceleration, component in self._along:
             own_velocity += component * speed
             own_acceleration += component * self._rate_of_speed
+
+    def along_axis(self, wrench: Array) -> Array:
+        """Return the torque or force (size,) that a wrench (2, 3, size) exerts on the joint."""
+        (first, component), *others = self._axis
+        torque = component * wrench[self._part, first]
+        for a, component in others:
+            torque += component * wrench[self._part, a]
+        return np.asarray(torque)
+
+    def carry_back(self, wrench: Array, out: Array) -> None:
+        """Express a wrench (2, 3, size) of the child in the parent's frame; the wrench is lost."""
+        if not self._revolute:
+            for a, component in self._axis:
+                _add_cross(wrench[0], wrench[1], a, -component * self._position)
+        if self._fixed is not None:
+            fixed_row, fixed_column, sign = self._fixed
+            np.multiply(wrench[:, fixed_row], sign, out=out[:, fixed_column])
+        rotation, *_ = self._turn
+        np.einsum("abt,xat->xbt", rotation, wrench[:, self._rows], out=out[:, self._columns])
+        moment, force = out
+        for row, column, arm in self._lever:
+            np.multiply(force[column], arm, out=self._scratch[0])
+            moment[row] += self._scratch[0]
 
 
 def _cos_sin(angle: Array, cosine: Array, sine: Array) -> None:

@@ -36,8 +36,8 @@ ROTATIONAL_COLUMNS = slice(_ALPHA_COLUMN, N_PRIMITIVES)
 _TENSOR_INDICES = ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2))
 
 
-def wrench_matrix(symbol: int) -> Array:
-    """Return the wrench (moment, then force) of a unit parameter of `LINK_SYMBOLS`, (6, 12)."""
+def _wrench_matrix(symbol: int) -> Array:
+    """Return the matrix (6, 12) of one of `LINK_SYMBOLS`, see `WRENCH_MATRICES`."""
     matrix = np.zeros((6, N_PRIMITIVES))
     if symbol < N_INERTIA:
         _add_inertia(matrix[:3], *_TENSOR_INDICES[symbol])
@@ -92,3 +92,8 @@ def _add_first_moment(moment: Array, force: Array, c: int) -> None:
     force[b, _ALPHA_COLUMN + a] = -1.0
     force[b, _product(b, c)] = 1.0
     force[c, [_SQUARE_COLUMN + a, _SQUARE_COLUMN + b]] = -1.0
+
+
+WRENCH_MATRICES: Final = np.array([_wrench_matrix(symbol) for symbol in range(N_LINK)])
+"""Wrenches (moment, then force) of unit `LINK_SYMBOLS` from the primitives (10, 6, 12)."""
+WRENCH_MATRICES.flags.writeable = False

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
+from functools import cached_property
 from threading import Lock
 from typing import NamedTuple
 
@@ -14,13 +15,13 @@ from identification.arrays import Array
 from identification.model.elements import JointElements, PlacedElement
 from identification.model.friction import FrictionLaw, JointFriction, JointTerm
 from identification.model.kinematics import Chain
-from identification.model.link_motion import LinkMotion
+from identification.model.link_motion import LinkForces, LinkMotion
 from identification.model.link_wrenches import (
     LINK_SYMBOLS,
     N_INERTIA,
     N_PRIMITIVES,
     ROTATIONAL_COLUMNS,
-    wrench_matrix,
+    WRENCH_MATRICES,
     write_primitives,
 )
 from identification.model.motion import Motion
@@ -154,8 +155,8 @@ class RegressorPlan:
     def torque(self, values: Array, motion: Motion) -> Array:
         """Return the torques (m, n) of parameters (p,) along a motion, see :meth:`chunks`.
 
-        The wrenches of a link's parameters are added up first, so it takes half the time of the
-        regressor, and hardly any for parameters of the drives alone.
+        By the recursion of Newton and Euler, so it takes about half the time of the regressor, and
+        hardly any for parameters of the drives alone.
         """
         m, n = motion.position.shape
         torque = np.empty((m, n))
@@ -165,21 +166,21 @@ class RegressorPlan:
             for start in range(0, m, work.size):
                 part = slice(start, min(start + work.size, m))
                 rows = motion.rows(part)
-                work.set_motion(rows, links=bool(bodies))
+                work.set_motion(rows)
                 work.update_drives(rows)
                 torque[part] = work.torque(bodies, drives)[:, : part.stop - start].T
         return torque
 
-    def _body_weights(self, values: Array) -> list[tuple[int, Rows, Array]]:
-        """Return links with the joints that move them, and wrenches from primitives (6, 12)."""
+    def _body_weights(self, values: Array) -> list[tuple[int, Array]]:
+        """Return links that have parameters, and their wrenches from primitives (6, 12)."""
         weights = []
         first = 0
         for link, (symbols, rotor) in enumerate(zip(self.links, self.rotors, strict=True)):
             used = values[first : first + len(symbols)]
             first += len(symbols) + rotor
             if used.any():
-                matrix = np.tensordot(used, [wrench_matrix(symbol) for symbol in symbols], axes=1)
-                weights.append((link, _as_slice(self.chain.ancestors(link)), matrix))
+                matrix = used @ WRENCH_MATRICES[list(symbols)].reshape(len(used), -1)
+                weights.append((link, matrix.reshape(WRENCH_MATRICES.shape[1:])))
         return weights
 
     def _drive_weights(self, values: Array) -> list[Array]:
@@ -239,7 +240,11 @@ class _Workspace:
         self._drive_rows = plan.drive_rows
         self._joint_friction = plan.friction
         self._first_drive_row = plan.first_drive_row
-        self._motion = LinkMotion(plan.chain, plan.gravity, size)
+        self._states = np.zeros((3, n, size))
+        _, self._velocity, self._acceleration = self._states
+        self._chain = plan.chain
+        self._gravity = plan.gravity
+        self._motion = LinkMotion(plan.chain, plan.gravity, self._states)
         motors = 0 if plan.friction is None else len(plan.friction.motors)
         self._direction = np.zeros((n + motors, size))
         self._load = np.zeros((n, size))
@@ -266,14 +271,15 @@ class _Workspace:
         part = twists[:, 0] if moments_only else twists.reshape(len(twists), 6, size)
         length = part.shape[1]
         used = ROTATIONAL_COLUMNS if moments_only else slice(None)
-        matrix = np.concatenate([wrench_matrix(symbol)[:length, used] for symbol in symbols])
+        primitives = self._primitives[link, used]
+        matrix = WRENCH_MATRICES[list(symbols), :length, used].reshape(-1, len(primitives))
         wrenches = np.empty((len(matrix), size))
         columns = slice(first, first + len(symbols))
         contiguous = isinstance(joints, slice)
         self._contractions.append(
             _Contraction(
                 matrix,
-                self._primitives[link, used],
+                primitives,
                 wrenches,
                 part,
                 wrenches.reshape(len(symbols), length, size),
@@ -284,7 +290,7 @@ class _Workspace:
 
     def _friction_parts(self) -> list[tuple[FrictionLaw, Array, Array, Array, Array]]:
         """Return laws with views of speeds, directions, transmitted torques and target rows."""
-        velocity = self._motion.velocity
+        velocity = self._velocity
         direction = self._direction[: len(velocity)]
         if self._joint_friction is None:
             return []
@@ -304,7 +310,7 @@ class _Workspace:
 
     def _drive_parts(self) -> list[tuple[Array, Array]]:
         """Return views of accelerations and target rows of rotors and coupling inertias."""
-        acceleration = self._motion.acceleration
+        acceleration = self._acceleration
         rotors = {drive.rotor for drive in self._drive_rows}
         parts = []
         if len(rotors) == 1 and None not in rotors:  # one step for all joints
@@ -334,7 +340,7 @@ class _Workspace:
         for motor, share, direction in zip(
             friction.motors, friction.motor_speeds(), directions, strict=True
         ):
-            speed = share @ self._motion.velocity
+            speed = share @ self._velocity
             for joint in np.flatnonzero(share):
                 for (_, term, owner, _, _), row in self._drive_rows[joint].motors.items():
                     if owner == motor:
@@ -345,7 +351,7 @@ class _Workspace:
         if motion.direction is not None:
             self._direction[:, : motion.n_samples] = motion.direction.T
             return
-        velocity = self._motion.velocity
+        velocity = self._velocity
         n = friction.n_joints
         if (common_law := friction.one_law) is not None:
             common_law.sign(velocity, out=self._direction[:n])
@@ -360,6 +366,8 @@ class _Workspace:
     def update(self, motion: Motion) -> None:
         """Compute all columns for k <= size samples; the others are undefined."""
         self.set_motion(motion)
+        self._motion.update()
+        write_primitives(self._motion.motion, self._primitives)
         for c in self._contractions:
             np.matmul(c.matrix, c.primitives, out=c.flat_wrenches)
             if c.joints is None:
@@ -368,12 +376,13 @@ class _Workspace:
                 c.target[c.joints] = np.einsum("jrt,crt->jct", c.twists, c.wrenches)
         self.update_drives(motion)
 
-    def set_motion(self, motion: Motion, *, links: bool = True) -> None:
-        """Set the motion of k <= size samples, of joints alone or of the links as well."""
-        self._motion.set_joints(motion)
-        if links:
-            self._motion.update()
-            write_primitives(self._motion.motion, self._primitives)
+    def set_motion(self, motion: Motion) -> None:
+        """Set the joint motion of k <= size samples; the other samples are at rest."""
+        k = motion.n_samples
+        states = motion.position, motion.velocity, motion.acceleration
+        for target, given in zip(self._states, states, strict=True):
+            target[:, :k] = given.T
+            target[:, k:] = 0.0
 
     def update_drives(self, motion: Motion) -> None:
         """Compute the columns of drives, friction and elements for the motion that is set."""
@@ -392,7 +401,7 @@ class _Workspace:
         if self._joint_friction is not None and self._joint_friction.motors:
             self._write_motor_friction(self._joint_friction)
 
-    def torque(self, bodies: Sequence[tuple[int, Rows, Array]], drives: Sequence[Array]) -> Array:
+    def torque(self, bodies: Sequence[tuple[int, Array]], drives: Sequence[Array]) -> Array:
         """Return the torque (n, size) of links, with their wrenches, and of drives.
 
         See :meth:`RegressorPlan._body_weights`.
@@ -404,11 +413,21 @@ class _Workspace:
                 for joint, weights in enumerate(drives)
             ]
         )
-        for link, joints, matrix in bodies:
-            twists = self._motion.twists[link]
-            wrench = matrix @ self._primitives[link]
-            torque[joints] += np.einsum("jrt,rt->jt", twists.reshape(len(twists), 6, -1), wrench)
+        if bodies:
+            forces = self._forces
+            forces.motion.update()
+            write_primitives(forces.motion.motion, self._primitives)
+            forces.own[:] = 0.0
+            for link, matrix in bodies:
+                own = forces.own[link].reshape(len(matrix), -1)
+                np.matmul(matrix, self._primitives[link], out=own)
+            torque += forces.torque()
         return torque
+
+    @cached_property
+    def _forces(self) -> LinkForces:
+        """Of the links; a regressor alone needs none."""
+        return LinkForces(self._chain, self._gravity, self._states)
 
 
 class _Contraction(NamedTuple):
