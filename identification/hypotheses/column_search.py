@@ -24,10 +24,10 @@ from identification.hypotheses.column_scores import (
     column_score,
     rough_size,
 )
-from identification.hypotheses.joint_changes import Change, Meaning, Part
+from identification.hypotheses.joint_changes import Change, Meaning, Part, changed_samples
 from identification.hypotheses.sizes import estimated_size
 from identification.hypotheses.torque_columns import BLOCKS, ColumnSums, columns_of
-from identification.model.link_wrenches import MASS_INDEX
+from identification.model.link_wrenches import MASS_INDEX, N_LINK
 from identification.model.robot import RobotModel
 from identification.signals.recording import MIN_MOVEMENT
 from identification.signals.samples import Samples
@@ -39,6 +39,8 @@ _MIN_ERROR_REDUCTION: Final = 0.1  # relative reduction of the error by a signif
 _ALIKE_ERROR_RATIO: Final = 1.05
 _MIN_PAYLOAD_SIGMAS: Final = 2.0  # standard deviations of a payload that is one
 _MAX_CHANGES: Final = 4  # changes
+_SCALE_ROUNDS: Final = 20  # fits, each with the scale of the one before undone
+_SCALE_TOLERANCE: Final = 1e-3  # relative change of a scale
 _PARTS_PER_BLOCK: Final = 4  # parts of a block whose scatter gives the interval of a size
 _OF_ARM: Final[tuple[Meaning, ...]] = ("payload", "arm")  # that may be of a part
 _OF_JOINT: Final[tuple[Meaning, ...]] = ("scale", "friction")
@@ -182,39 +184,116 @@ class _Search:
         """Return the changes found, one after the other."""
         found: list[Explanation] = []
         while len(found) < most and (trial := _best(self.trials())) is not None:
-            found.append(self._resized(trial))
-            if trial.explanation.change.meaning in ("arm", "drift"):
+            meaning = trial.explanation.change.meaning
+            if most > 1 and (both := self._load_and_scale(trial.explanation)):
+                self.known.append(both[0].change)
+                found += both
+                continue
+            found.append(self._resized(trial.explanation, trial.values))
+            if meaning in ("arm", "drift"):
                 break  # separate parameters leave nothing to compare, a drift what is not linear
             self.known.append(trial.explanation.change)
         return tuple(found)
 
+    def _load_and_scale(self, found: Explanation) -> list[Explanation]:
+        """Return a load in a part with the scale of a joint, if they explain more than was found.
+
+        Where the torque of a joint has another scale, a load alone leaves its error, or is a wrong
+        one, and other scales or parameters of the part imitate both. What is left is searched with
+        the scale undone.
+        """
+        if found.change.part is None:
+            return []
+        load = Change("payload", part=found.change.part)
+        before = self._before
+        usual = self._score(before)
+        separate = self._score(before, Change("arm", part=found.change.part))
+        of_load = self._score(before, load)
+        is_arm = found.change.meaning == "arm"  # which has many more coefficients
+        least = (_ALIKE_ERROR_RATIO if is_arm else 1.0 - _MIN_ERROR_REDUCTION) * found.ratio
+        best: tuple[Change, float, float] | None = None
+        for joint in self.moved:
+            scale = Change("scale", (joint,))
+            both = self._score(before, load, scale)
+            ratio, highest = both.ratio_to(usual)
+            alone = both.ratio_to(self._score(before, scale)), both.ratio_to(of_load)
+            is_needed = all(
+                each < 1.0 - _MIN_ERROR_REDUCTION and limit < 1.0 for each, limit in alone
+            )
+            explains = both.explains((), usual, self._noise, separate)
+            if is_needed and explains and highest < 1.0 and ratio < least:
+                least = ratio
+                best = scale, alone[0][0], alone[1][0]
+        if best is None:
+            return []
+        scale, ratio_of_load, ratio_of_scale = best
+        size, std = self._undo(scale, load)
+        of_load_alone = self._resized(Explanation(load, ratio_of_load))
+        return [of_load_alone, Explanation(scale, ratio_of_scale, size, std)]
+
+    def _undo(self, scale: Change, load: Change) -> tuple[float, float]:
+        """Undo the scale of a joint's torque in the recordings, and return it, and its deviation.
+
+        It multiplies the torque of a load as well, so that it is found in rounds.
+        """
+        size = std = 0.0
+        recorded = self.recordings
+        for _ in range(_SCALE_ROUNDS):
+            undone = scale._replace(size=size)
+            self.recordings = [changed_samples(self.model, each, undone) for each in recorded]
+            self._refitted(self.fitted.values)
+            both = self._score(self._before, load, scale)
+            more = both.added[:, N_LINK]  # after the columns of the load
+            std = (1.0 + size) * float(np.sqrt((len(more) - 1) * more.var()))
+            size = (1.0 + size) * (1.0 + float(more.mean())) - 1.0
+            self._refitted(both.values.mean(axis=0))
+            if abs(more.mean()) < _SCALE_TOLERANCE:
+                break
+        return size, std
+
+    def _refitted(self, values: Array) -> None:
+        self.fitted = replace(self.fitted, values=values)
+        self.tables = ColumnSums.of(self.model, self.recordings, values, blocks=self.blocks)
+
+    @property
+    def _before(self) -> Array:
+        """Columns of what was found before."""
+        none = np.zeros((*self.tables.gram.shape[:3], 0))
+        return np.concatenate([none, *map(self._columns, self.known)], axis=3)
+
+    @property
+    def _noise(self) -> Array:
+        """Sums of squared noise (n,)."""
+        noise = self.fitted.noise
+        noise = np.zeros(self.model.n_joints) if noise is None else np.nan_to_num(noise)
+        return np.asarray(noise**2 * self.tables.rows.sum(axis=0))
+
+    def _columns(self, change: Change) -> Array:
+        return columns_of(self.tables, self.model, self.fitted.values, change)
+
+    def _score(self, before: Array, *changes: Change) -> ColumnScore:
+        columns = np.concatenate([*map(self._columns, changes), before], axis=3)
+        return column_score(self.tables, columns, self.tables.torques)
+
     def trials(self) -> list[_Trial]:
         """Try each change."""
-        model = self.model
         tables = self.tables
-        values = self.fitted.values
-        target = tables.torques
-        none = np.zeros((*tables.gram.shape[:3], 0))
-        known = [columns_of(tables, model, values, earlier) for earlier in self.known]
-        before = np.concatenate([none, *known], axis=3)
-        usual = column_score(tables, before, target)
-        noise = np.zeros(model.n_joints) if self.fitted.noise is None else self.fitted.noise
-        noise = np.nan_to_num(noise) ** 2 * tables.rows.sum(axis=0)
+        before = self._before
+        usual = self._score(before)
+        noise = self._noise
         separate: dict[Part | None, ColumnScore] = {}
         trials = []
         for change in self._changes():
             if change.part is not None:
                 if change.part not in separate:
-                    every = columns_of(tables, model, values, Change("arm", part=change.part))
-                    columns = np.concatenate([every, before], axis=3)
-                    separate[change.part] = column_score(tables, columns, target)
+                    separate[change.part] = self._score(before, Change("arm", part=change.part))
                 # All that may have changed is within separate parameters.
                 if separate[change.part].fit_ratio_to(usual) > 1.0 - _MIN_ERROR_REDUCTION:
                     continue
-            added = columns_of(tables, model, values, change)
+            added = self._columns(change)
             if not added.any():
                 continue  # such as friction of a frictionless joint
-            score = column_score(tables, np.concatenate([added, before], axis=3), target)
+            score = self._score(before, change)
             explains = score.explains(change.joints, usual, noise, separate.get(change.part))
             size, std = rough_size(change, score, tables)
             if change.meaning == "load friction" and (size or 0.0) <= 0.0:
@@ -232,19 +311,19 @@ class _Search:
             )
         return trials
 
-    def _resized(self, trial: _Trial) -> Explanation:
-        """Return the explanation of a trial with the size that is most probable of all."""
-        explanation = trial.explanation
+    def _resized(self, explanation: Explanation, values: Array | None = None) -> Explanation:
+        """Return an explanation with the size that is most probable, by a fit with it (p,)."""
+        values = self.fitted.values if values is None else values
         if explanation.change.meaning == "arm":
             return explanation
         tables = ColumnSums.of(
-            self.model, self.recordings, trial.values, blocks=self.blocks, divided=_PARTS_PER_BLOCK
+            self.model, self.recordings, values, blocks=self.blocks, divided=_PARTS_PER_BLOCK
         )
         found = estimated_size(
             explanation.change,
             tables,
             self.model,
-            trial.values,
+            values,
             known=self.known,
             prior=self.fitted.prior,
             scale_std=self.fitted.scale_std,
@@ -268,6 +347,7 @@ class _Search:
                     yield Change("drift", (joint,))
         for part in self._later_parts():
             yield from (change._replace(part=part) for change in of_parts)
+        yield from (Change("payload", part=part) for part in self._inner_parts())
         if not self.seen and len(self.recordings) > 2:
             for change in of_parts:
                 yield change._replace(part=self._other_recordings(change))
@@ -290,6 +370,21 @@ class _Search:
         blocks = np.isin(tables.recording, those)
         name = ", ".join(self.fitted.name_of(k) for k in those)
         return Part(name, tuple(blocks.tolist()))
+
+    def _inner_parts(self) -> Iterator[Part]:
+        """Yield the blocks from each time to another, within a recording."""
+        tables = self.tables
+        blocks = np.arange(len(tables.recording))
+        for first in range(MIN_BLOCKS, len(blocks) - 2 * MIN_BLOCKS + 1):
+            k = int(tables.recording[first])
+            if k < self.seen or tables.start[first] == 0.0:
+                continue
+            for end in range(first + MIN_BLOCKS, len(blocks) - MIN_BLOCKS + 1):
+                if tables.recording[end] != k or tables.start[end] == 0.0:
+                    break
+                start, stop = tables.start[first], tables.start[end]
+                name = f"{self.fitted.name_of(k)} from {start:.3g} s to {stop:.3g} s"
+                yield Part(name, tuple(((blocks >= first) & (blocks < end)).tolist()))
 
     def _later_parts(self) -> Iterator[Part]:
         """Yield the blocks from each time on, in recordings that are not known to be without."""

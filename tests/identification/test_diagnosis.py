@@ -191,3 +191,29 @@ def test_a_log_without_drift_has_none() -> None:
     factor = Factor.of(model(), samples)
     values, _ = posterior_values(factor, body_prior(model(), factor).gaussian, ROWS_PER_FACT)
     assert not find_columns(model(), [samples], ExplainedFit(values))
+
+
+@pytest.mark.parametrize(
+    ("start", "end", "scales"),
+    [(0.5, 1.0, (1.0, 1.0, 1.0)), (0.3, 0.7, (1.0, 1.0, 1.0)), (0.5, 1.0, (1.0, 1.6, 1.0))],
+)
+def test_a_load_in_a_part_is_no_scale_of_a_torque(
+    start: float, end: float, scales: tuple[float, ...]
+) -> None:
+    """A scale throughout is found with it; the load has the mass of the last body, 1 kg."""
+    q, bare, _ = motion()
+    loaded = motion((1.0, 1.0, 2.0))[1]
+    share = TIME / TIME[-1]
+    torque = np.where(((start <= share) & (share <= end))[:, None], loaded, bare) * scales
+    recording = Recording(TIME, q, NAMES, torque)
+    samples = prepare(recording, model(), options=Preprocessing(14.0, exclude_rows="rests"))
+    factor = Factor.of(model(), samples)
+    values, _ = posterior_values(factor, body_prior(model(), factor).gaussian, ROWS_PER_FACT)
+    load, *others = find_columns(model(), [samples], ExplainedFit(values))
+    assert load.change.meaning == "payload"
+    assert load.change.part is not None
+    until = "on" if end == 1.0 else f"to {end * TIME[-1]:.1f} s"
+    assert load.change.part.name == f"recording 1 from {start * 6.0:.3g} s {until}"
+    assert load.size == pytest.approx(1.0, abs=0.01)
+    found = {each.change.joints: each.size for each in others}
+    assert found == {(j,): pytest.approx(s - 1.0, abs=0.01) for j, s in enumerate(scales) if s > 1}
