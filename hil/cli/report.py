@@ -9,8 +9,10 @@ from hil.base.progress import reporter as make_reporter
 from hil.campaign import Campaign
 from hil.cli.arguments import CampaignArgument, JsonOption, QuietOption, print_json
 from hil.report.output_files import REPORT, rewrite_report
+from hil.report.servo_page import rewrite_servo_report
 from hil.results.provenance import RESULTS
-from hil.results.results import Results
+from hil.results.results import Results, VerdictResult
+from hil.results.servo_result import ServoVerdict, is_servo_result
 
 
 def report(
@@ -24,8 +26,11 @@ def report(
     results yet, identifies first as `hil identify` does. The folder of `hil identify LOG` has a
     report as well, which is regenerated from its results.
     """
-    if (campaign / RESULTS).is_file() and not RecordedCampaign(campaign).sealed:
-        page = campaign / REPORT
+    page = campaign / REPORT
+    verdict: VerdictResult | ServoVerdict
+    if is_servo_result(campaign / RESULTS):
+        verdict = rewrite_servo_report(campaign).verdict
+    elif (campaign / RESULTS).is_file() and not RecordedCampaign(campaign).sealed:
         verdict = rewrite_report(campaign).verdict
     else:
         opened = Campaign.open(campaign)

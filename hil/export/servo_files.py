@@ -242,11 +242,7 @@ def actuators_of(
 def _archives(folder: Path, results: ServoResults) -> tuple[Cell, tuple[Source, ...]]:
     """Return the cell of the archives of a result, and its held-out recordings."""
     fitted = [folder / name for name in results.archives]
-    predicted = [
-        folder / name
-        for name in dict.fromkeys(each.archive for each in results.validation)
-        if name not in results.archives
-    ]
+    predicted = [folder / name for name in results.predicted]
     for path in (*fitted, *predicted):
         if not path_exists(path):
             remedy = "keep archives and results in one folder, or identify again"

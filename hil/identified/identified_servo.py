@@ -22,7 +22,9 @@ from hil.pipeline.options import Options
 from hil.report.output_files import REPORT
 from hil.report.servo_page import LEGENDS, motion_charts, servo_page_bytes
 from hil.results.provenance import RESULTS
+from hil.results.series import SERIES
 from hil.results.servo_result import ServoResults
+from hil.results.servo_series import servo_series_bytes
 from hil.servo.identification import ServoIdentification, ServoOptions, identify_servos
 
 PICTURE = "motion.png"
@@ -142,6 +144,7 @@ def write_servo(
     series = servo.identification.series
     files: dict[str, str | bytes | None] = {
         RESULTS: results.to_json(),
+        SERIES: servo_series_bytes(series),
         REPORT: servo_page_bytes(results, series),
     }
     if sources is not None:

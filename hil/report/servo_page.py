@@ -3,16 +3,20 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from pathlib import Path
 from typing import Final
 
 import numpy as np
 
 from hil import report  # its pictures load matplotlib, on first use
+from hil.base.files import write_files
 from hil.report.chart import Caption, Chart, Legend, Plot, label
 from hil.report.interactive import chart_data, library
+from hil.report.output_files import REPORT
 from hil.report.rendering import environment, page_bytes, template_text
+from hil.results.provenance import RESULTS
 from hil.results.servo_result import ServoResults
-from hil.results.servo_series import ServoSeries
+from hil.results.servo_series import ServoSeries, load_servo_series
 from identification.text import interval_text
 
 MEASURED: Final = Legend("measured", "measured", "--first", 1.6)
@@ -76,6 +80,19 @@ def _chart(results: ServoResults, series: ServoSeries, joint: int) -> Chart:
         [Plot(_PLOT_HEIGHT, f"position [{unit}]", traces, shaded=held, shade=HELD)],
         joint=joint,
     )
+
+
+def rewrite_servo_report(folder: Path) -> ServoResults:
+    """Create the report again from results and series in a folder.
+
+    Raises:
+        InputError: one of them cannot be read.
+        OutputError: the report cannot be written.
+    """
+    results = ServoResults.load(folder / RESULTS)
+    page = servo_page_bytes(results, load_servo_series(folder, results))
+    write_files(folder, {REPORT: page})
+    return results
 
 
 def servo_page_bytes(results: ServoResults, series: Sequence[ServoSeries]) -> bytes:

@@ -136,20 +136,34 @@ def load_series(folder: Path, n_joints: int) -> ReportSeries:
     """
     path = folder / SERIES
     try:
-        with open_file(path) as stream:
-            with zipfile.ZipFile(stream) as members:
-                size = sum(member.file_size for member in members.infolist())
-            if size > _MAX_BYTES:
-                raise ValueError(f"it would take {size} bytes")
-            stream.seek(0)
-            with np.load(stream, allow_pickle=False) as archive:
-                arrays: dict[str, Any] = {name: archive[name] for name in archive.files}
+        arrays = read_arrays(path)
         arrays["example_archive"] = str(arrays["example_archive"])
         return ReportSeries.from_arrays(arrays).checked_for(n_joints)
     except Exception as error:  # readers of a corrupt file may raise anything
-        problem = f"does not contain the series of a report ({error})"
-        remedy = "identify again from the archives (`hil identify`)"
-        raise InputError(path, problem, remedy=remedy) from error
+        raise not_series(path, error) from error
+
+
+def read_arrays(path: Path) -> dict[str, Any]:
+    """Return the arrays of a `.npz` file by name; a corrupt one raises anything.
+
+    Raises:
+        ValueError: it is too large.
+    """
+    with open_file(path) as stream:
+        with zipfile.ZipFile(stream) as members:
+            size = sum(member.file_size for member in members.infolist())
+        if size > _MAX_BYTES:
+            raise ValueError(f"it would take {size} bytes")
+        stream.seek(0)
+        with np.load(stream, allow_pickle=False) as archive:
+            return {name: archive[name] for name in archive.files}
+
+
+def not_series(path: Path, error: Exception) -> InputError:
+    """Return the error of a file that has no series of a report."""
+    problem = f"does not contain the series of a report ({error})"
+    remedy = "identify again from the archives (`hil identify`)"
+    return InputError(path, problem, remedy=remedy)
 
 
 def example_series(

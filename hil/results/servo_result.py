@@ -16,7 +16,7 @@ from hil.base.safe_input import parse_json, read_text
 from hil.results.results import Frozen, Known, RecordingResult
 
 KIND: Final = "servo"
-SERVO_SCHEMA_VERSION: Final = 1
+SERVO_SCHEMA_VERSION: Final = 2
 
 
 class ServoValue(Frozen):
@@ -128,7 +128,8 @@ class ServoResults(Frozen):
     joint_names: list[str]
     joint_units: list[str]  #: rad or m
     software: dict[str, str]
-    archives: list[str]  #: that were fitted
+    archives: list[str]  #: files that were fitted, or of which the first part was
+    predicted: list[str]  #: other files, that were held out
     windows: int  #: that were fitted
     seconds: float  #: processor time of the fit
     delay: float  #: of commands, common to all joints [s]

@@ -9,13 +9,15 @@ from pathlib import Path
 import numpy as np
 
 from hil.archive import open_archive
-from hil.base.errors import InputError
+from hil.base.errors import InputError, RefusedRecordingError
 from hil.base.progress import Reporter
+from hil.base.terminal_text import typed
 from hil.cell import Cell
 from hil.pipeline.identified_model import arm_with
 from hil.pipeline.options import Options, friction_from
 from hil.pipeline.prepared import samples_of, stated_settings
 from hil.pipeline.sources import Source, Sources, archives_in, gather_sources
+from hil.results.provenance import RESULTS
 from hil.results.rollout_result import (
     JUDGED_HORIZON,
     ArmErrors,
@@ -23,6 +25,7 @@ from hil.results.rollout_result import (
     ServoParameter,
     ServoResult,
 )
+from hil.results.servo_result import is_servo_result
 from hil.rollout.polishing import polish
 from hil.rollout.torque_rollout import (
     MAX_WINDOWS,
@@ -50,7 +53,7 @@ from identification.rollout.position_errors import (
     simulate,
 )
 from identification.rollout.servo_by_positions import NAMES, EncoderFit, fit_servo
-from identification.rollout.servo_by_torque import lead_of
+from identification.rollout.servo_by_torque import UndeterminedGainError, lead_of
 from identification.rollout.windows import STEP_SECONDS, WINDOW_STRIDE, windows_of
 
 _FRICTION = "coulomb,viscous"
@@ -84,6 +87,7 @@ def roll_out_servo(
         reporter: of progress.
 
     Raises:
+        RefusedRecordingError: the recordings do not determine the gain of a joint.
         InputError: there are no masses, no commanded positions, no servo or no window.
     """
     sources = gather_sources([*archives_in(paths)], split, predict, with_torque=False)
@@ -104,6 +108,14 @@ def roll_out_servo(
         fit = fit_servo(bodies, stretches, STEP_SECONDS)
         training = _driven(fit, sources.training, fitted, POLISHED_WINDOWS)
         unseen = _driven(fit, sources.held_out, held_out, MAX_WINDOWS)
+    except UndeterminedGainError as error:
+        remedy = "record a longer motion of this joint, with the commanded positions"
+        if len(paths) == 1 and is_servo_result(paths[0] / RESULTS):
+            remedy += (
+                f"; `hil export {typed(paths[0])} --to mjcf` plays the held-out motion back in"
+                " MuJoCo without it"
+            )
+        raise RefusedRecordingError(paths[0], str(error), field="servo", remedy=remedy) from error
     except IdentificationError as error:
         remedy = "record the torque, or a longer motion with the commanded positions"
         raise InputError(paths[0], str(error), field="servo", remedy=remedy) from error

@@ -367,6 +367,7 @@ def _results(
     turning = cell.model.chain.revolute
     estimate = found.fit.estimate
     names = cell.joint_names
+    fitted_files = _files_of(sources.training)
     placeholder = ServoVerdict(good=False, line="", warnings=[], next_steps=[])
     return ServoResults(
         name=name,
@@ -375,7 +376,8 @@ def _results(
         joint_names=list(names),
         joint_units=["rad" if turns else "m" for turns in turning],
         software=software(),
-        archives=[source.name for source in sources.training],
+        archives=fitted_files,
+        predicted=[name for name in _files_of(sources.held_out) if name not in fitted_files],
         windows=found.fit.windows,
         seconds=found.seconds,
         delay=estimate.bus_delay,
@@ -411,6 +413,10 @@ def _results(
         split=options.split,
         notes=note_lines(sources.warnings),
     )
+
+
+def _files_of(sources: Sequence[Source]) -> list[str]:
+    return [*dict.fromkeys(source.path.name for source in sources)]
 
 
 def _values(fit: ServoFit, cell: Cell, stuck: NDArray[np.bool_]) -> list[ServoValue]:

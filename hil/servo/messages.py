@@ -80,7 +80,7 @@ def verdict_of(results: ServoResults) -> ServoVerdict:
             )
     if missed:
         warnings.append(
-            f"more than a tenth of the motion of {', '.join(missed)} (of its square) is not"
+            f"more than a tenth of the variance of the motion of {', '.join(missed)} is not"
             " predicted: commands may be late by more than 0.2 s, or belong to other joints"
         )
     if not good:

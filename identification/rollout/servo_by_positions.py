@@ -37,6 +37,7 @@ from identification.rollout.servo_by_torque import (
     MAX_SERVO_DELAY,
     NoServoError,
     PositionServo,
+    UndeterminedGainError,
     best_delay,
     command_of,
     without_means,
@@ -70,8 +71,9 @@ def fit_servo(arm: ExportedArm, stretches: Sequence[Stretch], step: float) -> En
     Its friction law has to have `f0` and `f1`; other terms are set to zero.
 
     Raises:
-        NoServoError: motors are coupled, there is no commanded position, no stretch is long
-            enough, or a joint does not follow its command.
+        UndeterminedGainError: a joint hardly moves, or does not follow its command.
+        NoServoError: motors are coupled, there is no commanded position, or no stretch is long
+            enough.
     """
     model = arm.model
     if not model.layout.rotor_inertia or model.layout.pairs:
@@ -94,7 +96,7 @@ def fit_servo(arm: ExportedArm, stretches: Sequence[Stretch], step: float) -> En
     stiffness = values[:, 0] - _DETERMINED_SIGMAS * deviations[:, 0]
     if not (stiffness > 0.0).all():
         name = model.joint_names[int(np.argmin(stiffness))]
-        raise NoServoError(
+        raise UndeterminedGainError(
             f"the gain of {name} is not determined: it hardly moves, or does not follow its"
             " commanded position"
         )

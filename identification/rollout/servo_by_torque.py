@@ -23,6 +23,10 @@ class NoServoError(IdentificationError):
     """The recordings do not show a servo."""
 
 
+class UndeterminedGainError(NoServoError):
+    """The gain of a joint is not determined."""
+
+
 class PositionServo(NamedTuple):
     """Joint torque ``kp (q_c(t - delay) - q) + kd (v_c(t - delay) - v)`` plus a constant."""
 

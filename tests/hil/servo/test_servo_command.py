@@ -745,3 +745,29 @@ def torque_rows(log: Path, **chosen: str) -> list[Row]:
     robot = Robot.from_urdf(log.with_name("arm.urdf"))
     look = look_at(log, lambda _: robot, ImportOptions(chosen=chosen))
     return [row for row in look.rows if row.aspect == "torque"]
+
+
+@pytest.mark.long
+@pytest.mark.skipif(not SO101.is_dir(), reason="the recordings of the SO-101 are absent")
+def test_a_part_of_one_recording_is_exported_reported_and_refused_a_rollout(
+    tmp_path: Path,
+) -> None:
+    """Its first part was fitted: the files are found again, and the report is the same."""
+    folder = tmp_path / "out"
+    urdf = str(SO101 / "robot.urdf")
+
+    def run(*words: str) -> tuple[int, str]:
+        done = CliRunner().invoke(app, [words[0], str(folder), *words[1:]])
+        return getattr(done.exception, "exit_code", done.exit_code), done.output
+
+    CliRunner().invoke(
+        app, ["identify", str(SO101 / "chirp_sweep"), "--urdf", urdf, "-o", str(folder)]
+    )
+    page = (folder / "report.html").read_bytes()
+    (folder / "report.html").unlink()
+    assert run("report")[0] == 0
+    assert (folder / "report.html").read_bytes() == page
+    status, output = run("export", "--to", "mjcf")
+    assert status == 5
+    assert (folder / "identified.xml").is_file(), output
+    assert run("rollout")[0] == 5
