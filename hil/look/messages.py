@@ -92,7 +92,8 @@ from hil.look.readings import (
 from hil.look.result import ChangedReading, Look, Row, TiedReading
 from identification.estimators.delay_messages import undetermined_words
 from identification.hypotheses.joint_changes import COUPLED, ORDERS, Meaning
-from identification.signals.messages import clock_lines, fault_words, jump_words, time_lines
+from identification.signals.messages import clock_lines, faults_words, jump_words, time_lines
+from identification.signals.row_faults import by_kind
 from identification.text import number, percentage
 
 _FACTS: Final[Mapping[Fact, str]] = {
@@ -392,7 +393,7 @@ def _(clock: ClockReading) -> str:
 def _(rows: RowsReading) -> str:
     times = () if rows.times is None else time_lines(rows.times)
     jumps = [jump_words(jump) for jump in rows.jumps[:_MAX_JUMPS]]
-    return "; ".join([*jumps, *map(fault_words, rows.faults), *times])
+    return "; ".join([*jumps, *map(faults_words, by_kind(rows.faults)), *times])
 
 
 @_worded.register

@@ -8,7 +8,7 @@ from typing import Final
 from hil.archive.imported import ROW_COUNTER
 from hil.pipeline.sources import Source, has_commands_as_positions
 from identification.signals.position_steps import position_steps
-from identification.signals.row_faults import RowFaultKind
+from identification.signals.row_faults import RowFaultKind, by_kind
 from identification.validation.finding import Finding, RemedyKey, Value
 from identification.validation.findings.recordings import of_jumps
 
@@ -51,9 +51,9 @@ def commanded_positions(sources: Sequence[Source], delay: float | None = None) -
 def faulty_rows(sources: Sequence[Source]) -> Iterator[Finding]:
     """Yield findings about rows that are not of one motion."""
     for source in {source.path: source for source in sources}.values():
-        for fault in source.faults:
-            values: dict[str, Value] = {"recording": source.path.name, "fault": fault}
-            yield Finding("faulty rows", "doubtful", _REMEDIES[fault.kind], values=values)
+        for faults in by_kind(source.faults):
+            values: dict[str, Value] = {"recording": source.path.name, "faults": faults}
+            yield Finding("faulty rows", "doubtful", _REMEDIES[faults.kind], values=values)
 
 
 def row_counters(sources: Sequence[Source]) -> Iterator[Finding]:

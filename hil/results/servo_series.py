@@ -15,7 +15,7 @@ from hil.base.arrays import Array
 from hil.results.series import SERIES, SeriesError, not_series, read_arrays
 from hil.results.servo_result import ServoContact, ServoResults
 
-_DRAWN: Final = ("measured", "commanded", "identified", "compared")
+_PLOTTED: Final = ("measured", "commanded", "identified", "compared")
 
 
 @dataclass(frozen=True, eq=False)
@@ -54,7 +54,7 @@ def servo_series_bytes(series: Sequence[ServoSeries]) -> bytes:
     content = BytesIO()
     arrays: dict[str, Any] = {}
     for k, each in enumerate(series):
-        known = {name: getattr(each, name) for name in ("time", *_DRAWN)}
+        known = {name: getattr(each, name) for name in ("time", *_PLOTTED)}
         arrays |= {f"{name}_{k}": value for name, value in known.items() if value is not None}
     np.savez_compressed(content, **arrays)
     return content.getvalue()
@@ -73,9 +73,9 @@ def load_servo_series(folder: Path, results: ServoResults) -> list[ServoSeries]:
         arrays = read_arrays(path)
         for k, prediction in enumerate(results.validation):
             time = np.asarray(arrays[f"time_{k}"], np.float64)
-            drawn = {name: arrays.get(f"{name}_{k}") for name in _DRAWN}
+            plotted = {name: arrays.get(f"{name}_{k}") for name in _PLOTTED}
             shape = (len(time), len(stuck))
-            if any(values is not None and values.shape != shape for values in drawn.values()):
+            if any(values is not None and values.shape != shape for values in plotted.values()):
                 raise SeriesError(f"motion {k} is not of shape {shape}")
             series.append(
                 ServoSeries(
@@ -85,7 +85,7 @@ def load_servo_series(folder: Path, results: ServoResults) -> list[ServoSeries]:
                     arrays[f"commanded_{k}"],
                     arrays[f"identified_{k}"],
                     simulators={},
-                    compared=drawn["compared"],
+                    compared=plotted["compared"],
                     contacts=prediction.contacts,
                     stuck=stuck,
                 )

@@ -9,7 +9,7 @@ import numpy as np
 
 from identification.signals.masks import RowReason
 from identification.signals.position_steps import PositionJump
-from identification.signals.row_faults import RowFault, RowFaultKind
+from identification.signals.row_faults import RowFault, RowFaultKind, RowFaults
 from identification.signals.sample_times import MAX_STEP_DEVIATION, SampleTimes, TimeBase
 from identification.text import duration_text, number, percentage
 
@@ -82,8 +82,37 @@ def jump_words(jump: PositionJump) -> str:
     )
 
 
-def fault_words(fault: RowFault) -> str:
-    """Return what is wrong with rows, and what was done about it."""
+def faults_words(faults: RowFaults) -> str:
+    """Return what is wrong with rows in one place or more, and what was done about it."""
+    if len(faults.faults) == 1:
+        return _fault_words(faults.faults[0])
+    at = f"in {len(faults.faults)} places (first at {number(faults.faults[0].time, 4)} s)"
+    match faults.kind:
+        case RowFaultKind.FROZEN:
+            longest = max(fault.duration for fault in faults.faults)
+            return (
+                f"the log repeats one row {at} for up to {duration_text(longest)} while the arm"
+                f" moved on: {faults.rows} rows were left out"
+            )
+        case RowFaultKind.WRITTEN_TWICE:
+            return f"{faults.rows} rows {at} were written before, bit for bit, and were left out"
+        case RowFaultKind.DISPLACED:
+            largest = max(fault.size for fault in faults.faults)
+            return (
+                f"the position of {', '.join(faults.joints)} is displaced by up to"
+                f" {number(largest, 2)} rad or m {at}, and where it was afterwards:"
+                f" {faults.rows} rows were left out"
+            )
+        case RowFaultKind.JUMP:
+            return (
+                f"the positions of {', '.join(faults.joints)} jump {at}, further than any arm moves"
+                " in a step: several motions in one file, or missing rows that the stamps do not"
+                " show; all parts are used, but not the rows next to a jump"
+            )
+
+
+def _fault_words(fault: RowFault) -> str:
+    """Return what is wrong with rows in one place."""
     at = f"at {number(fault.time, 4)} s"
     match fault.kind:
         case RowFaultKind.FROZEN:

@@ -57,6 +57,38 @@ class RowFault:
     size: float = 0.0
 
 
+@dataclass(frozen=True)
+class RowFaults:
+    """Rows of a log with the same fault, in one place or more.
+
+    Attributes:
+        kind: what is wrong.
+        faults: in order of time.
+    """
+
+    kind: RowFaultKind
+    faults: tuple[RowFault, ...]
+
+    @property
+    def rows(self) -> int:
+        """How many rows were left out."""
+        return sum(fault.rows for fault in self.faults)
+
+    @property
+    def joints(self) -> tuple[str, ...]:
+        """Joints whose positions jump, or are displaced."""
+        return tuple(dict.fromkeys(joint for fault in self.faults for joint in fault.joints))
+
+
+def by_kind(faults: Sequence[RowFault]) -> tuple[RowFaults, ...]:
+    """Return faults with those of one kind together."""
+    of_kind = {
+        kind: tuple(sorted((f for f in faults if f.kind is kind), key=lambda fault: fault.time))
+        for kind in RowFaultKind
+    }
+    return tuple(RowFaults(kind, found) for kind, found in of_kind.items() if found)
+
+
 def without_faulty_rows(recording: Recording) -> tuple[Recording, tuple[RowFault, ...]]:
     """Return a recording without such rows, with gaps where they were, and what was found."""
     frozen = list(_frozen(recording))

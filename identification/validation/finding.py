@@ -15,7 +15,7 @@ from identification.hypotheses.joint_changes import Change, Coupled, Order, Sign
 from identification.hypotheses.little_torque import LITTLE_TORQUE_SHARE
 from identification.model.friction import FrictionLaw
 from identification.signals.position_steps import PositionJump
-from identification.signals.row_faults import RowFault
+from identification.signals.row_faults import RowFaults
 from identification.signals.sample_times import SampleTimes
 from identification.validation.consistency import ConsistencyCheck
 from identification.validation.physical_signs import SignKind
@@ -258,7 +258,7 @@ Value = (
     Figure
     | Change
     | PositionJump
-    | RowFault
+    | RowFaults
     | SampleTimes
     | ConsistencyCheck
     | FrictionLaw

@@ -17,9 +17,9 @@ from typing import Any, Final, NamedTuple
 from identification.hypotheses.joint_changes import COUPLED, ORDERS, SIGNS, Change, Meaning
 from identification.model.friction import FrictionLaw
 from identification.model.messages import law_option, law_text
-from identification.signals.messages import fault_words, time_lines
+from identification.signals.messages import faults_words, time_lines
 from identification.signals.position_steps import PositionJump
-from identification.signals.row_faults import RowFault
+from identification.signals.row_faults import RowFaults
 from identification.signals.sample_times import SampleTimes
 from identification.text import joined, number, percentage
 from identification.validation.consistency import ConsistencyCheck, ImpossibleParameter
@@ -202,8 +202,8 @@ class _Text(string.Formatter):
                 after = f"after {value.time:.3f} s of {value.recording}"
                 size = "" if format_spec == "time" else f"by {value.size:+.3g} rad or m "
                 return f"{value.joint} {size}{after}"
-            case RowFault():
-                return fault_words(value)
+            case RowFaults():
+                return faults_words(value)
             case SampleTimes():
                 return "; ".join(time_lines(value))
             case ConsistencyCheck():
@@ -302,7 +302,7 @@ SENTENCES: Final[Mapping[FindingKey, Sentence]] = {
         "position jumps",
         "the measured position jumped faster than an arm can move: {jumps:3}",
     ),
-    "faulty rows": Sentence("rows", "{recording}: {fault}"),
+    "faulty rows": Sentence("rows", "{recording}: {faults}"),
     "spikes": Sentence(
         "rows",
         "samples of the torque stand out alone and are left out of fit and error: {each} of {rows}"

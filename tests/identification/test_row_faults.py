@@ -10,8 +10,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
+from identification.signals.messages import faults_words
 from identification.signals.recording import Recording
-from identification.signals.row_faults import RowFaultKind, without_faulty_rows
+from identification.signals.row_faults import RowFault, RowFaultKind, by_kind, without_faulty_rows
 from identification.signals.sample_times import true_times
 
 Floats = NDArray[np.float64]
@@ -197,3 +198,12 @@ class TestBursts:
         timed, times = true_times(recording)
         assert not times.even
         np.testing.assert_array_equal(timed.time, recording.time)
+
+
+def test_faults_of_one_kind_are_one_remark() -> None:
+    frozen = [RowFault(RowFaultKind.FROZEN, time, 0.04, 8) for time in (5.0, 1.0, 3.0)]
+    jump = RowFault(RowFaultKind.JUMP, 2.0, 0.0, 0, ("elbow",))
+    first, second = by_kind([frozen[0], jump, *frozen[1:]])
+    assert first.rows == 24
+    assert faults_words(first).startswith("the log repeats one row in 3 places (first at 1 s)")
+    assert second.faults == (jump,)
