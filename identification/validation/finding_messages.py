@@ -827,7 +827,7 @@ REMEDIES: Final[Mapping[RemedyKey, str]] = {
         " subtracted"
     ),
     "state that gravity was removed": (
-        "state it: `--gravity 0 0 0` where a log is read with its URDF, or gravity of [robot] in"
+        "state that the torque has no gravity: `--gravity 0 0 0` with a log, or gravity of [robot] in"
         " the cell file"
     ),
     "record torque with gravity": "record the torque before gravity is subtracted from it",

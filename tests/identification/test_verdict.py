@@ -370,7 +370,7 @@ class TestJudgement:
         assert not refused.good
         assert "Not judged: contact detection (the unseen motion is too short)" in refused.line
 
-    def test_a_model_that_is_not_good_says_first_what_is_wrong(self):
+    def test_what_is_wrong_is_said_first(self):
         purposes = (
             Purpose("feed-forward", True, 0.15, 0.2, references={"none": 1.0}),
             Purpose("simulation", False, 0.02, 0.005, "m", references={"horizon": 0.2}),

@@ -749,7 +749,7 @@ def torque_rows(log: Path, **chosen: str) -> list[Row]:
 
 @pytest.mark.long
 @pytest.mark.skipif(not SO101.is_dir(), reason="the recordings of the SO-101 are absent")
-def test_a_part_of_one_recording_is_exported_reported_and_refused_a_rollout(
+def test_results_of_a_part_are_used_again(
     tmp_path: Path,
 ) -> None:
     """Its first part was fitted: the files are found again, and the report is the same."""
