@@ -827,8 +827,8 @@ REMEDIES: Final[Mapping[RemedyKey, str]] = {
         " subtracted"
     ),
     "state that gravity was removed": (
-        "state that the torque has no gravity: `--gravity 0 0 0` with a log, or gravity of [robot] in"
-        " the cell file"
+        "state that the torque has no gravity: `--gravity 0 0 0` with a log, or gravity of [robot]"
+        " in the cell file"
     ),
     "record torque with gravity": "record the torque before gravity is subtracted from it",
     "record the torque itself": "record the torque itself, or integrate it over time",
