@@ -23,6 +23,7 @@ class Paragraph:
     text: str
     label: str = ""  #: before the first line; the others are indented by as much
     most: int = 4  #: lines
+    complete: bool = False  #: whether it is never cut, such as a command to copy
 
     def lines(self, count: int) -> list[str]:
         """Return the text on at most `count` lines, cut at the end of a word."""
@@ -41,6 +42,11 @@ class Paragraph:
         """Number of lines of the whole text, at most `most`."""
         return min(self.most, len(self.lines(len(self.text) + 1)))
 
+    @property
+    def least(self) -> int:
+        """Number of lines that it gets in any case."""
+        return self.whole if self.complete else 1
+
 
 Part = str | Paragraph
 """A line as it is, such as the row of a table; or text that may be cut."""
@@ -49,6 +55,8 @@ Part = str | Paragraph
 def one_screen(parts: Sequence[Part], lines: int = SCREEN_LINES) -> list[str]:
     """Return parts on at most `lines` lines: one each, and the first parts get the remaining ones.
 
+    Text that is never cut gets all its lines before them.
+
     Empty lines are dropped, the last one first, if text needs the space.
     """
     chosen = list(parts)
@@ -56,7 +64,7 @@ def one_screen(parts: Sequence[Part], lines: int = SCREEN_LINES) -> list[str]:
     while wanted > lines and "" in chosen:
         del chosen[len(chosen) - 1 - chosen[::-1].index("")]
         wanted = wanted - 1
-    spare = lines - len(chosen)
+    spare = lines - sum(1 if isinstance(part, str) else part.least for part in chosen)
     shown: list[str] = []
     for part in chosen:
         if isinstance(part, str):
@@ -64,9 +72,9 @@ def one_screen(parts: Sequence[Part], lines: int = SCREEN_LINES) -> list[str]:
                 part[:SCREEN_COLUMNS].rstrip() if len(part) <= SCREEN_COLUMNS else _cut(part)
             )
             continue
-        more = min(part.whole - 1, max(spare, 0))
-        spare -= max(more, 0)
-        shown += part.lines(1 + max(more, 0))
+        more = min(part.whole - part.least, max(spare, 0))
+        spare -= more
+        shown += part.lines(part.least + more)
     return shown[:lines]
 
 

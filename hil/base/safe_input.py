@@ -195,6 +195,8 @@ def path_exists(path: Path) -> bool:
 
 
 _MAX_SIBLINGS = 10_000
+_MISTYPED = 0.75
+"""Similarity of a folder's name that may be a slip: one wrong letter of four."""
 
 
 def similar_path(path: Path) -> Path | None:
@@ -209,7 +211,9 @@ def similar_path(path: Path) -> Path | None:
         similar = similar_path(folder)
         if similar is None or not similar.is_dir():
             return None
-        return similar / path.name if path_exists(similar / path.name) else similar
+        if path_exists(similar / path.name):
+            return similar / path.name
+        return similar if get_close_matches(folder.name, [similar.name], 1, _MISTYPED) else None
     try:
         names = [entry.name for entry in islice(folder.iterdir(), _MAX_SIBLINGS)]
     except OSError:

@@ -143,10 +143,10 @@ def screen(result: RolloutResult, files: Sequence[str] = ()) -> list[str]:
     servo = [] if result.servo is None else result.servo.lines(result.joint_names)
     warning = f"warning: {result.band_message}" if result.band_message else ""
     remarks = [*servo, *result.stability(), warning, *result.notes]
-    last: list[Part] = [*map(Paragraph, files), "drawn arms and what drives the arm: -v"]
-    spare = SCREEN_LINES - len(parts) - len(last)
+    written = [Paragraph(file, complete=True) for file in files]
+    spare = SCREEN_LINES - len(parts) - sum(file.least for file in written) - 1
     parts += [Paragraph(text, most=2) for text in remarks if text][:spare]
-    return one_screen([*parts, *last])
+    return one_screen([*parts, *written, "drawn arms and what drives the arm: -v"])
 
 
 def _row(result: RolloutResult, joint: int, arms: Sequence[tuple[str, ArmErrors]]) -> list[str]:

@@ -195,7 +195,7 @@ def _files(results: Results, written: tuple[Path, Path] | None) -> list[Part]:
     if model is None:
         return [f"results in {folder}; no model for simulators: see -v"]
     use = f"for pinocchio, MuJoCo, Gazebo; `hil export {typed(folder)} --to mjcf`"
-    return [Paragraph(f"{folder / model}: {use}")]
+    return [Paragraph(f"{folder / model}: {use}", complete=True)]
 
 
 def _three_decimals(value: float | None) -> str:

@@ -16,6 +16,7 @@ from hil.base.one_screen import brief
 from hil.base.progress import reporter as make_reporter
 from hil.campaign import Campaign, stop_on_interrupt
 from hil.campaign.campaign_run import RunResult
+from hil.campaign.folder import PAYLOAD_RESULT
 from hil.campaign.operator_keys import can_read
 from hil.campaign.screen import confirmed
 from hil.cli.arguments import PAYLOAD, numbers, print_json
@@ -149,7 +150,9 @@ def weigh(
     if json:
         print_json(result.as_json())
     else:
-        typer.echo("\n".join(result.lines if verbose else brief(result.summary)))
+        file = f"{weighed.root / PAYLOAD_RESULT}: all figures, for programs"
+        lines = [*(result.lines if verbose else result.summary), file]
+        typer.echo("\n".join(lines if verbose else brief(lines)))
     if result.payload.is_doubtful:
         raise typer.Exit(ExitStatus.NEGATIVE_RESULT)
     return None

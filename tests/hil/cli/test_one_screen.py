@@ -49,6 +49,11 @@ class TestText:
         assert shown[0].startswith("found  word") and shown[1].startswith("       word")
         assert shown[1].endswith(" ...")
 
+    def test_a_command_to_copy_is_never_cut(self) -> None:
+        command = Paragraph("word " * 30 + "end", complete=True)
+        shown = one_screen([Paragraph("first " * 60), *["row"] * 20, command])
+        assert len(shown) == SCREEN_LINES and shown[-1].endswith("word end")
+
     def test_empty_lines_go_before_text_is_cut(self) -> None:
         parts = [Paragraph("word " * 60), "", *["row"] * 21, ""]
         shown = one_screen(parts)
