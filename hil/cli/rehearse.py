@@ -39,14 +39,15 @@ def rehearse(
         again: Rehearse again even if it passed.
     """
     reporter = make_reporter(quiet=quiet or json, messages=verbose)
+    opened = Campaign.open(campaign)
     with stop_on_interrupt() as stop:
-        rehearsal = Campaign.open(campaign).rehearse(
-            reporter=reporter, seed=seed, stop=stop, again=again
-        )
+        rehearsal = opened.rehearse(reporter=reporter, seed=seed, stop=stop, again=again)
     if json:
         typer.echo(rehearsal.model_dump_json())
     else:
         lines = [] if quiet else _lines(rehearsal, verbose=verbose)
+        if rehearsal.passed and not quiet:
+            lines.append(f"next: {opened.folder.run_command}")
         for line in [*lines, rehearsal.line] if verbose else brief([rehearsal.line, *lines]):
             say(line)
     if not rehearsal.passed:
