@@ -12,6 +12,12 @@ from identification.distributions import SIGNIFICANT_SIGMAS
 from identification.estimators.prior import GaussianPrior
 from identification.factor.blocks import FOLDS
 from identification.factor.normal_equations import solve_with_ridge
+from identification.hypotheses.error_ratios import (
+    ErrorRatios,
+    error_ratio,
+    geometric_mean,
+    mean_and_error,
+)
 from identification.hypotheses.joint_changes import Change
 from identification.hypotheses.torque_columns import (
     ColumnSums,
@@ -89,7 +95,7 @@ class ColumnScore(NamedTuple):
         floor = usual.shares(noise)
         if np.all(after[affected] <= _NEAR_NOISE_FLOORS**2 * floor[affected]):
             return True
-        ratio = _geometric_mean(np.sqrt(after[affected] / before[affected]))
+        ratio = geometric_mean(np.sqrt(after[affected] / before[affected]))
         if ratio <= _EXPLAINED_ERROR_RATIO:
             return True
         others = np.setdiff1d(every, affected)
@@ -102,37 +108,25 @@ class ColumnScore(NamedTuple):
         least = separate.squares.sum(axis=0)[affected]
         mine = self.squares.sum(axis=0)[affected]
         positive = (least > 0.0) & (mine > 0.0)
-        return bool(positive.any()) and _geometric_mean(
+        return bool(positive.any()) and geometric_mean(
             np.sqrt(mine[positive] / least[positive])
         ) <= (_SEPARATE_ERROR_RATIO)
 
     def fit_ratio_to(self, other: ColumnScore) -> float:
         """Return the ratio of the errors of the fits, geometric mean over the joints."""
         positive = (self.fitted > 0.0) & (other.fitted > 0.0)
-        return _geometric_mean(np.sqrt(self.fitted[positive] / other.fitted[positive]))
+        return geometric_mean(error_ratio(self.fitted, other.fitted)[positive])
 
     def ratio_to(self, other: ColumnScore) -> tuple[float, float]:
         """Return the error ratio, geometric mean over the joints, and its upper limit by blocks."""
-        tested = np.isfinite(self.squares) & np.isfinite(other.squares)
-        tested &= (self.squares > 0.0) & (other.squares > 0.0)
-        tested_joints = tested.any(axis=0)
-        if not tested_joints.any():
+        ratios = ErrorRatios.of(self.squares, other.squares)
+        if not ratios.tested.any():
             return 1.0, np.inf
-        ours = np.where(tested, self.squares, 0.0).sum(axis=0)[tested_joints]
-        theirs = np.where(tested, other.squares, 0.0).sum(axis=0)[tested_joints]
-        ratio = _geometric_mean(np.sqrt(ours / theirs))
-        change = np.zeros(tested.shape)
-        change[tested] = 0.5 * np.log(self.squares[tested] / other.squares[tested])
-        some = tested.any(axis=1)
-        blocks = change[some].sum(axis=1) / np.count_nonzero(tested[some], axis=1)
-        if len(blocks) < MIN_BLOCKS:
-            return ratio, np.inf
-        error = np.std(blocks, ddof=1) / np.sqrt(len(blocks))
-        return ratio, float(np.exp(blocks.mean() + SIGNIFICANT_SIGMAS * error))
-
-
-def _geometric_mean(ratios: Array) -> float:
-    return float(np.exp(np.mean(np.log(np.maximum(ratios, 1e-12)))))
+        ratio = geometric_mean(ratios.joints[ratios.some_joints])
+        some = ratios.some_blocks
+        counts = np.count_nonzero(ratios.tested[some], axis=1)
+        mean, error = mean_and_error(ratios.changes[some].sum(axis=1) / counts)
+        return ratio, float(np.exp(mean + SIGNIFICANT_SIGMAS * error))
 
 
 def column_score(

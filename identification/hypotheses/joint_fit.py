@@ -23,6 +23,7 @@ from identification.arrays import Array
 from identification.estimators.prior import GaussianPrior, body_prior
 from identification.factor.factor import MIN_NOISE, Factor
 from identification.factor.normal_equations import solve_positive
+from identification.hypotheses.error_ratios import geometric_mean
 from identification.model.motion import Motion
 from identification.model.regressor import Regressor
 from identification.model.robot import RobotModel
@@ -115,8 +116,7 @@ class JointFit:
 
     def ratio_to(self, other: JointFit) -> float:
         """Return the error over another fit's of the same torques: mean over the joints."""
-        ratios = np.log(self.ratios_to(other))
-        return float(np.exp(ratios.mean())) if len(ratios) else 1.0
+        return geometric_mean(self.ratios_to(other))
 
     def ratios_to(self, other: JointFit) -> Array:
         """Return the error over the error of another fit, for each joint with a torque."""

@@ -12,6 +12,11 @@ from identification.arrays import Array
 from identification.estimators.prior import body_prior, posterior_values
 from identification.factor.blocks import FOLDS
 from identification.factor.factor import Factor
+from identification.hypotheses.error_ratios import (
+    ErrorRatios,
+    geometric_mean,
+    mean_and_error,
+)
 from identification.hypotheses.little_torque import little_torque
 from identification.model.motion import Motion
 from identification.model.robot import RobotModel
@@ -194,20 +199,16 @@ def compare(score: Score, other: Score, model: RobotModel) -> Comparison:
     counts = (torque > 0.0) & ~little_torque(torque, ~np.array(model.chain.revolute)[at])
     mine = score.squares[:, score.joints[counts]]
     its = other.squares[:, at[counts]]
-    tested = (mine > 0.0) & (its > 0.0)
-    totals = np.where(tested, mine, 0.0).sum(axis=0), np.where(tested, its, 0.0).sum(axis=0)
-    both = (totals[0] > 0.0) & (totals[1] > 0.0)
+    ratios = ErrorRatios.of(mine, its)
     joints = np.ones(len(counts))
-    joints[np.flatnonzero(counts)[both]] = np.sqrt(totals[0][both] / totals[1][both])
-    if not both.any():
+    joints[counts] = ratios.joints
+    if not ratios.tested.any():
         return Comparison(1.0, 0.0, joints)
-    ratio = float(np.exp(np.log(joints[counts]).mean()))
-    change = np.zeros(tested.shape)
-    change[tested] = 0.5 * np.log(mine[tested] / its[tested])
-    return Comparison(ratio, sigmas_of(change[tested.any(axis=1)].mean(axis=1)), joints)
+    changes = ratios.changes[ratios.some_blocks].mean(axis=1)
+    return Comparison(geometric_mean(joints[counts]), sigmas_of(changes), joints)
 
 
 def sigmas_of(changes: Array) -> float:
     """Return the mean of changes by block over its standard error."""
-    error = float(np.std(changes, ddof=1)) / np.sqrt(len(changes)) if len(changes) > 1 else np.inf
-    return float(changes.mean() / error) if error > 0.0 else 0.0
+    mean, error = mean_and_error(changes)
+    return mean / error if error > 0.0 else 0.0
