@@ -26,6 +26,7 @@ from identification.estimators.friction_drift import TREND_PIECES
 from identification.estimators.least_squares import fit_least_squares
 from identification.estimators.prior import ScoreScatter, body_prior
 from identification.factor.estimate import Estimate
+from identification.factor.estimation_method import EstimationMethod, TimeBlocks
 from identification.factor.factor import Factor
 from identification.hypotheses.diagnosis import diagnose
 from identification.model.robot import RobotModel
@@ -426,7 +427,7 @@ def _entry(summary: Summary) -> dict[str, Any]:
     }
     if fit is not None and scatter is not None:
         entry["fit"] = {
-            "method": fit.method,
+            "method": fit.method.as_json(),
             "condition": fit.condition,
             "undetermined": fit.undetermined,
             "interval_factor": fit.interval_factor,
@@ -434,7 +435,7 @@ def _entry(summary: Summary) -> dict[str, Any]:
         entry["scatter"] = {
             "rows": len(scatter.rows),
             "interval_factor": scatter.interval_factor,
-            "description": scatter.description,
+            "blocks": asdict(scatter.blocks),
         }
     return entry
 
@@ -464,14 +465,18 @@ def _unpacked(
                 names=names,
                 units=units,
                 **{name: arrays[name][fit_number].copy() for name in FIT},
-                method=intern(stated["method"]),
+                method=EstimationMethod.of_json(stated["method"]),
                 condition=stated["condition"],
                 undetermined=tuple(stated["undetermined"]),
                 interval_factor=stated["interval_factor"],
             )
-            scatter_end = scatter_begin + entry["scatter"].pop("rows")
-            scatter_rows = arrays["scatter"][scatter_begin:scatter_end]
-            scatter = ScoreScatter(scatter_rows, **entry["scatter"])
+            scattered = entry["scatter"]
+            scatter_end = scatter_begin + scattered["rows"]
+            scatter = ScoreScatter(
+                rows=arrays["scatter"][scatter_begin:scatter_end],
+                interval_factor=scattered["interval_factor"],
+                blocks=TimeBlocks(**scattered["blocks"]),
+            )
             fit_number += 1
             scatter_begin = scatter_end
         summaries.append(

@@ -21,7 +21,6 @@ from identification import IdentificationError
 from identification.estimators.consistent import SolverError
 from identification.estimators.covariance import solve_with_prior
 from identification.estimators.least_squares import no_narrower
-from identification.estimators.prior import posterior_method
 from identification.factor.estimate import Estimate
 from identification.factor.factor import MAX_GRAM_CONDITION, Factor, require_rows
 from identification.reduction.intervals import delayed, widened
@@ -317,7 +316,7 @@ class Estimator:
             result.estimate,
             covariance=covariance + np.outer(result.shift, result.shift),
             interval_factor=scatter.interval_factor,
-            method=posterior_method(result.origin, result.design_effect, scatter.description),
+            method=replace(result.estimate.method, blocks=scatter.blocks),
         )
 
     def of_group(

@@ -13,6 +13,7 @@ from hil.base.files import replace_file
 from hil.base.safe_input import parse_time
 from hil.base.version import software
 from hil.batch.graph import BatchResult
+from identification.factor.messages import method_words
 
 from .estimates import BatchEstimate, relative_error
 
@@ -144,7 +145,7 @@ def _parameter_rows(result: BatchResult) -> Iterator[Row]:
                 estimate.noise_std, level.torque_rms, estimate.samples
             ),
             "unseen_relative_error": relative_error(level.unseen_rms, level.unseen_torque_rms),
-            "method": estimate.method,
+            "method": method_words(estimate.method),
             "warnings": "; ".join(level.warnings),
             "estimator": result.estimator,
             "settings": level.settings,

@@ -7,7 +7,7 @@ from typing import NamedTuple
 import numpy as np
 
 from hil.base.arrays import Array
-from identification.model.nominal_masses import without_masses
+from identification.model.nominal_masses import mass_fault
 
 from .cell import Cell
 
@@ -29,7 +29,7 @@ def nominal_of(cell: Cell) -> Nominal | None:
         has_rotors = bool(np.any(table.rotor_inertia))
         return Nominal(cell.nominal_values(), "the nominal values", has_rotors, table.uncertainty)
     standard = model.nominal
-    if without_masses(model):
+    if mass_fault(model) is not None:
         return None
     values = np.zeros(model.n_parameters)
     values[: model.base.rank] = model.base.grouping @ standard

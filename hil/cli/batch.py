@@ -26,6 +26,7 @@ from hil.cli.identify_options import Identifying
 from hil.cli.imports import RARE, Described, Reading
 from hil.fleet.logs import LogMap, write_maps
 from hil.fleet.table import NAME, write_batch
+from identification.factor.messages import method_words
 from identification.text import percentage
 
 _MAX_LINES: Final = 20
@@ -198,7 +199,7 @@ def _level(level: BatchEstimate) -> dict[str, Any]:
         "when": level.when or None,
         "setup": level.setup,
         "repetitions": level.repetitions,
-        "method": level.estimate.method,
+        "method": method_words(level.estimate.method),
         "parameters": {
             name: {"value": float(value), "std": float(std) if math.isfinite(std) else None}
             for name, value, std in zip(

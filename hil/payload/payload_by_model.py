@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
 from pathlib import Path
 
 from hil.archive import open_archive
@@ -93,7 +92,7 @@ def weigh_by_model(
     )
     sentences = note_lines((*prepared.sources.warnings, *others.warnings))
     return PayloadFound(
-        estimate=replace(estimate, method=f"{estimate.method}, against the model of the arm"),
+        estimate=estimate,
         body=body,
         frame=frame,
         gravity=weight_per_mass(cell.model),

@@ -40,6 +40,7 @@ from identification.estimators.payload_estimate import (
 )
 from identification.estimators.payload_problem import KnownArm, Run
 from identification.factor.columns import standard_factor
+from identification.factor.messages import blocks_words
 from identification.hypotheses.gravity_direction import find_gravity
 from identification.model.pseudo_inertia import Body
 from identification.model.robot import STANDARD_GRAVITY, RobotModel
@@ -264,6 +265,11 @@ class PayloadFound:
             lines.append(f"settings of {', '.join(self.controllers)}: -v")
         return lines
 
+    @property
+    def _method(self) -> str:
+        by_model = "" if self.bare else ", against the model of the arm"
+        return f"{blocks_words(self.estimate.blocks)}{by_model}"
+
     def as_json(self) -> dict[str, Any]:
         """Return all values as JSON data; infinite ends and undetermined values are null."""
         torque = self.wrist_torque
@@ -289,7 +295,7 @@ class PayloadFound:
             "mounting": self.mounting,
             "otherwise": list(self.otherwise),
             "least_squares": estimate.parameters.tolist(),
-            "method": estimate.method,
+            "method": self._method,
             "controllers": self.controllers,
             "bare": list(self.bare),
             "loaded": list(self.loaded),

@@ -23,6 +23,7 @@ from identification.excitation import (
     friction_of_excitation,
     information,
 )
+from identification.factor.messages import method_words, prior_words, status_words
 from identification.model.elements import TorqueRipple
 from identification.selection.essential import Elimination
 from identification.selection.messages import candidate_words, cut_words
@@ -89,7 +90,9 @@ def summary(
         notes=note_lines([*prepared.notes, *estimation.notes]),
         parameters=_parameters(cell, estimation, truth),
         n_base=len(model.base.names),
-        uncertainty=results.UncertaintyResult.of(estimation.stated),
+        uncertainty=results.UncertaintyResult.of(
+            estimation.stated, method=method_words(estimation.stated.method)
+        ),
         repetitions=[source.name for source in sources.training],
         repetition_values=estimate.values.tolist(),
         noise_std=pooled.noise_std.tolist(),
@@ -117,8 +120,8 @@ def _estimator(estimation: Estimation) -> results.EstimatorResult:
     pooled = estimation.result.pooled
     return results.EstimatorResult(
         name=name,
-        words=pooled.method if name == "auto" else ESTIMATORS[name],
-        prior=estimation.with_prior.origin,
+        words=method_words(pooled.method) if name == "auto" else ESTIMATORS[name],
+        prior=prior_words(estimation.with_prior.origin),
         condition=pooled.condition,
         grouping=estimation.posterior.model.base.explanation(),
     )
@@ -133,7 +136,7 @@ def _consistency(model: RobotModel, check: ConsistencyCheck) -> results.Consiste
         in_sample=consistent.relative_error,
         unconstrained_in_sample=consistent.unconstrained_relative_error,
         shift=consistent.shift,
-        status=consistent.status,
+        status=status_words(consistent.fits),
         moved=check.shifted_parameters,
         sentence=consistency_words(check),
         bounds=[impossible_words(violation) for violation in check.violations],

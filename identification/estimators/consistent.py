@@ -327,7 +327,7 @@ class ConsistentEstimate:
     relative_error: float  # ||tau - tau_hat|| / ||tau|| over all fitted rows
     unconstrained_relative_error: float
     reference: tuple[str, ...]  # description of the nominal body of each link (n,)
-    status: str  # "optimal", or that no consistent parameters fit the data to their noise
+    fits: bool  # whether these parameters fit the data to their noise, as the unconstrained do
 
     @property
     def shift(self) -> Array:
@@ -381,15 +381,12 @@ def consistent_estimate(
             unconstrained,
             values=values,
             noise_std=factor.residual_rms(values),
-            method="physically consistent (pseudo-inertia, rotor inertia and friction);"
-            f" covariance of the unconstrained estimate: {unconstrained.method}",
+            method=replace(unconstrained.method, is_consistent=True),
         ),
         unconstrained=unconstrained,
         margin=margin(standard[links]),
         relative_error=float(np.nan_to_num(factor.relative_error(values))),
         unconstrained_relative_error=float(np.nan_to_num(free)),
         reference=bodies.origins,
-        status="optimal"
-        if excess <= equations.n
-        else "optimal (no consistent parameters fit the data to their noise)",
+        fits=excess <= equations.n,
     )

@@ -31,6 +31,7 @@ from identification.distributions import student_limit
 from identification.estimators.loss_functions import Loss
 from identification.factor.blocks import FINE_BLOCK, block_slices, fine_blocks, merged
 from identification.factor.estimate import Estimate, mark_undetermined
+from identification.factor.estimation_method import TimeBlocks
 from identification.factor.factor import Factor
 from identification.factor.normal_equations import (
     MAX_UNDETERMINED_SHARE,
@@ -71,8 +72,7 @@ class Clustered:
     determined: NDArray[np.bool_]  # (p,)
     design_effect: float  # mean ratio of the variance to that of white residuals
     interval_factor: float  # standard deviations in half a 95 % interval
-    description: str
-    blocks: int  # number of blocks
+    blocks: TimeBlocks
     shares: Array  # of the blocks in the information, (B, k, k): ``S' A_b S``
 
     def interval_factors(self, rows: Array) -> Array:
@@ -88,7 +88,7 @@ class Clustered:
         of_blocks = np.einsum("dk,bkl,dl->bd", directions, self.shares, directions, optimize=True)
         leverage = np.divide(of_blocks, whole, out=np.zeros_like(of_blocks), where=whole > 0.0)
         squares = (_trusted(leverage) * leverage**2).sum(axis=0)
-        counts = 1.0 / np.maximum(squares, 1.0 / max(2, self.blocks))
+        counts = 1.0 / np.maximum(squares, 1.0 / max(2, self.blocks.count))
         return np.asarray(student_limit(0.025, np.maximum(1.0, counts - 1.0)))
 
 
@@ -193,29 +193,25 @@ def _sandwich(
         determined=solution.determined,
         design_effect=effect,
         interval_factor=float(student_limit(0.025, max(1, count - 1))),
-        description=f"cluster-robust covariance over {count} blocks of {duration:g} s",
-        blocks=count,
+        blocks=TimeBlocks(count, duration),
         shares=shares,
     )
 
 
-def with_block_covariance(
-    estimate: Estimate, factor: Factor, weights: Array, name: str = "weighted least squares"
-) -> Estimate:
+def with_block_covariance(estimate: Estimate, factor: Factor, weights: Array) -> Estimate:
     """Return an estimate with cluster-robust covariance.
 
     Args:
         estimate: from the factor.
         factor: of the data, by blocks of time.
         weights: of the joints (n,).
-        name: of the method.
     """
     clustered = block_covariance(factor, weights, estimate.values)
     return replace(
         estimate,
         covariance=clustered.covariance,
         interval_factor=clustered.interval_factor,
-        method=f"{name}, {clustered.description}",
+        method=replace(estimate.method, blocks=clustered.blocks),
     )
 
 

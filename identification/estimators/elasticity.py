@@ -273,5 +273,5 @@ def with_elastic_gears(
     return replace(
         estimate,
         covariance=estimate.covariance + added,
-        method=f"{estimate.method}, with elastic gears",
+        method=estimate.method.widened("elastic_gears"),
     )

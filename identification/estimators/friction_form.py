@@ -220,7 +220,7 @@ def with_uncertain_form(estimate: Estimate, uncertainty: FormUncertainty) -> Est
     return replace(
         estimate,
         covariance=estimate.covariance + uncertainty.covariance,
-        method=f"{estimate.method}, with an uncertain form of friction",
+        method=estimate.method.widened("friction_form"),
     )
 
 
@@ -241,5 +241,5 @@ def with_drift(model: RobotModel, estimate: Estimate, change: Array) -> Estimate
     return replace(
         estimate,
         covariance=estimate.covariance + spread @ spread.T,
-        method=f"{estimate.method}, with friction that changes",
+        method=estimate.method.widened("friction_drift"),
     )

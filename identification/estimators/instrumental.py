@@ -33,6 +33,7 @@ from identification.factor.estimate import (
     joint_weights,
     residual_variance,
 )
+from identification.factor.estimation_method import EstimationMethod, Instrumental, TimeBlocks
 from identification.factor.factor import Factor
 from identification.factor.normal_equations import MAX_CONDITION, MAX_UNDETERMINED_SHARE
 from identification.model.motion import Motion
@@ -244,8 +245,7 @@ def estimate_instrumental(
             values=solution.values, condition=solution.condition, determined=solution.determined
         ),
         weights,
-        f"instrumental variables, cluster-robust covariance over {len(scores)} blocks of"
-        f" {length * FINE_BLOCK:g} s",
+        EstimationMethod(Instrumental(), TimeBlocks(len(scores), length * FINE_BLOCK)),
         moved.T @ moved,
         float(student_limit(0.025, max(1, len(scores) - 1))),
     )

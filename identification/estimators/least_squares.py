@@ -12,6 +12,7 @@ from identification.arrays import Array
 from identification.distributions import chi_squared_limit
 from identification.estimators.covariance import Clustered, block_covariance, clustered_covariance
 from identification.factor.estimate import Estimate, estimate, estimate_of, joint_weights
+from identification.factor.estimation_method import EstimationMethod, LeastSquares
 from identification.factor.factor import Factor, reduced, total_factor
 from identification.factor.normal_equations import Solution
 from identification.model.robot import RobotModel
@@ -42,13 +43,13 @@ def fit_least_squares(
     precise = reduced(model, recordings, factor)
     weights = np.ones(model.n_joints) if weighting == "ordinary" else joint_weights(precise)
     solution, clustered = clustered_fit(model, precise, recordings, factor, weights)
-    method = f"{weighting} least squares{precise.method_suffix}, {clustered.description}"
+    fit = LeastSquares(weighting, by_qr=precise.storage == "qr")
     return estimate_of(
         model.units,
         precise,
         solution,
         weights,
-        method,
+        EstimationMethod(fit, clustered.blocks),
         clustered.covariance,
         clustered.interval_factor,
     )

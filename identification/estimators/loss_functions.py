@@ -6,19 +6,19 @@ A fit uses the weight :math:`u(x) = \psi(x)/x`, a covariance the slope :math:`\p
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import ClassVar
 
 import numpy as np
 
 from identification.arrays import Array
+from identification.factor.estimation_method import LossName
 
 
 class Loss:
     """Squared loss, and base class."""
 
-    @property
-    def name(self) -> str:
-        """Name and constant."""
-        return "squares"
+    name: ClassVar[LossName] = "squares"
+    tuning: float = np.inf
 
     def weight(self, x: Array) -> Array:
         """Return psi(x)/x, between 0 and 1, for residuals in standard deviations."""
@@ -33,12 +33,8 @@ class Loss:
 class Huber(Loss):
     """Square within `tuning` standard deviations, linear beyond (Huber 1964); convex."""
 
+    name = "huber"
     tuning: float = 1.345  #: 1.345 keeps 95 % of the efficiency on Gaussian noise
-
-    @property
-    def name(self) -> str:
-        """Name and constant."""
-        return f"Huber's loss (k = {self.tuning:g})"
 
     def weight(self, x: Array) -> Array:
         """Return min(1, k/|x|)."""
@@ -53,12 +49,8 @@ class Huber(Loss):
 class Tukey(Loss):
     """Bisquare: rows beyond `tuning` standard deviations do not count (Beaton and Tukey 1974)."""
 
+    name = "tukey"
     tuning: float = 4.685  #: 4.685 keeps 95 % of the efficiency on Gaussian noise
-
-    @property
-    def name(self) -> str:
-        """Name and constant."""
-        return f"Tukey's bisquare (c = {self.tuning:g})"
 
     def weight(self, x: Array) -> Array:
         """Return (1 - (x/c)²)² within c, zero beyond."""

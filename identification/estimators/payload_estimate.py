@@ -33,6 +33,7 @@ from identification.estimators.payload_problem import (
     fit_body,
 )
 from identification.estimators.torque_scale import scale_covariance
+from identification.factor.estimation_method import TimeBlocks
 from identification.factor.normal_equations import MAX_UNDETERMINED_SHARE
 from identification.model.pseudo_inertia import (
     Body,
@@ -85,7 +86,7 @@ class PayloadEstimate:
     undetermined: tuple[str, ...]  # figures of the body that are set to zero
     # of those, moments of inertia whose 95 % interval lies below zero: no body has them
     impossible: tuple[str, ...]
-    method: str  # description of the covariance
+    blocks: TimeBlocks  # of the covariance
     # share of the squared interval of the mass that the torque scale makes; no recording reduces it
     scale_share: float = 0.0
 
@@ -122,7 +123,7 @@ def identify_payload(
     if low <= 0.0:
         undetermined = NAMES[1:]
         return PayloadEstimate(
-            estimate.values, None, intervals, estimate.moment, undetermined, (), estimate.method
+            estimate.values, None, intervals, estimate.moment, undetermined, (), estimate.blocks
         )
     intervals[1:4] = estimate.centre_intervals
     open_ended = np.isinf(intervals[:, 1])
@@ -151,7 +152,7 @@ def identify_payload(
         moment=estimate.moment,
         undetermined=tuple(np.array(NAMES)[open_ended].tolist()),
         impossible=tuple(np.array(NAMES)[negative].tolist()),
-        method=estimate.method,
+        blocks=estimate.blocks,
         scale_share=estimate.scale_share_of_mass,
     )
 
@@ -311,9 +312,9 @@ class _BodyEstimate(NamedTuple):
     by_scale: Array  # covariance of those that the torque scale makes (r, r)
 
     @property
-    def method(self) -> str:
-        """Description of the intervals."""
-        return self.fit.clustered.description
+    def blocks(self) -> TimeBlocks:
+        """Blocks of time of its covariance."""
+        return self.fit.clustered.blocks
 
     @property
     def scale_share_of_mass(self) -> float:

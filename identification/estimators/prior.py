@@ -31,11 +31,16 @@ from identification.factor.estimate import (
     joint_weights,
     mark_undetermined,
 )
+from identification.factor.estimation_method import (
+    EstimationMethod,
+    PriorAndData,
+    PriorOrigin,
+    TimeBlocks,
+)
 from identification.factor.factor import Factor, require_rows
 from identification.factor.normal_equations import Solution, solve_positive, solve_rows
-from identification.model.nominal_masses import without_masses
+from identification.model.nominal_masses import MassFault, mass_fault
 from identification.model.robot import RobotModel
-from identification.text import number
 
 # Posterior over prior standard deviation of a parameter that is determined by the data, which then
 # gave three quarters of its information (inverse variance).
@@ -161,13 +166,13 @@ class GaussianPrior:
 
     mean: Array  #: (p,)
     root: Array  #: (k, p); flat in directions without information
-    origin: str
+    origin: PriorOrigin | None = None  #: None: given as numbers
     #: what is believed, if this prior is a stronger one; None: this one
     believed: GaussianPrior | None = None
 
     @classmethod
     def of_combinations(
-        cls, combinations: Array, mean: Array, std: Array, origin: str = "given"
+        cls, combinations: Array, mean: Array, std: Array, origin: PriorOrigin | None = None
     ) -> GaussianPrior:
         """Return the prior on ``combinations @ s`` of independent s.
 
@@ -177,7 +182,7 @@ class GaussianPrior:
             combinations: (p, s).
             mean: of s (s,).
             std: of s (s,); an infinite one makes the direction on which its quantity acts flat.
-            origin: what the prior is from.
+            origin: what the prior is made from; None: from given numbers.
         """
         flat = np.isinf(std)
         spread = combinations[:, ~flat] * std[~flat]
@@ -212,7 +217,7 @@ class BodyPrior:
     mean: Array  #: of the standard parameters (s,), then of friction and elements (k,)
     std: Array  #: likewise; infinite where nothing is known
     combinations: Array  #: ``pi = combinations @ [standard; others]``, (p, s + k)
-    origin: str
+    origin: PriorOrigin
     bodies: NDArray[np.intp]  #: where the standard parameters of the links are
     #: whether the description has no masses, or masses without relation to the torque
     placeholder: bool = False
@@ -239,7 +244,7 @@ class BodyPrior:
             return self
         std = self.std.copy()
         std[self.bodies] /= np.sqrt(weight)
-        origin = f"{self.origin}, with {weight:g} times the weight"
+        origin = replace(self.origin, weight=weight * self.origin.weight)
         return replace(self, std=std, origin=origin, believed=self.belief)
 
     def most_probable(self, values: Array) -> Array:
@@ -259,10 +264,10 @@ class PosteriorEstimate:
     estimate: Estimate  #: its covariance is the posterior's
     prior_mean: Array  #: (p,)
     prior_std: Array  #: (p,), infinite where unknown
-    origin: str  #: of the prior
+    origin: PriorOrigin | None  #: of the prior
     design_effect: float  #: rows of data that count as one
     shift: Array  #: way of the parameters (p,) from those by what is believed
-    scatter: str = ""  #: how the scatter of the data entered the covariance
+    blocks: TimeBlocks | None = None  #: of the covariance; None: of white residuals
 
     @property
     def ratio(self) -> Array:
@@ -341,9 +346,7 @@ def with_prior(
         values=prior.mean + posterior.values,
         condition=solve_rows(rows, target).condition if len(rows) else np.inf,
     )
-    method = f"weighted least squares with a Gaussian prior ({prior.origin}), posterior covariance"
-    if design_effect > 1.0:
-        method += f", design effect {number(design_effect)}"
+    method = EstimationMethod(PriorAndData(prior.origin, design_effect))
     estimate = estimate_of(model.units, factor, solution, weights / design_effect, method)
     return PosteriorEstimate(
         estimate, prior.mean, prior.std, prior.origin, design_effect, np.zeros_like(prior.mean)
@@ -388,21 +391,20 @@ def fit_posterior(
             values=values,
             covariance=base.estimate.covariance + np.outer(bias, bias),
             noise_std=factor.residual_rms(values),
-            method=posterior_method(prior.origin, design_effect, base.scatter),
+            method=EstimationMethod(PriorAndData(prior.origin, design_effect), base.blocks),
         )
         return replace(base, estimate=estimate, origin=prior.origin, shift=shift)
     spread = block_covariance(factor, weights, values, prior.information, design_effect)
     alone = factor.solve(weights)
     solution = Solution(values, spread.root, alone.condition, alone.determined)
-    scatter = spread.description
-    method = posterior_method(prior.origin, design_effect, scatter)
+    method = EstimationMethod(PriorAndData(prior.origin, design_effect), spread.blocks)
     estimate = estimate_of(model.units, factor, solution, weights, method)
     estimate = replace(
         estimate, covariance=spread.covariance, interval_factor=spread.interval_factor
     )
     unmoved = np.zeros_like(prior.mean)
     return PosteriorEstimate(
-        estimate, prior.mean, prior.std, prior.origin, design_effect, unmoved, scatter
+        estimate, prior.mean, prior.std, prior.origin, design_effect, unmoved, spread.blocks
     )
 
 
@@ -435,20 +437,13 @@ def _beyond_chance(
     return shift * np.sqrt(max(0.0, 1.0 - by_chance / square)) if square > 0.0 else shift
 
 
-def posterior_method(origin: str, design_effect: float, scatter: str) -> str:
-    """Return the description of an estimate from a prior; `scatter` describes its covariance."""
-    size = number(design_effect)
-    rows = "each row counts" if size == "1" else f"{size} rows count as one"
-    return f"posterior of the prior ({origin}), {rows}; {scatter}"
-
-
 @dataclass(frozen=True, eq=False)
 class ScoreScatter:
     """Cluster-robust scatter of the scores of a factor by time, for estimates from its sum."""
 
     rows: Array  #: (k, p), ``rows' rows`` is the covariance of the sum of the scores
     interval_factor: float  #: standard deviations in half a 95 % interval
-    description: str  #: of the covariance
+    blocks: TimeBlocks  #: of the covariance
 
     @classmethod
     def of(cls, factor: Factor, prior: GaussianPrior) -> ScoreScatter:
@@ -459,7 +454,7 @@ class ScoreScatter:
         of_parameters = np.linalg.pinv(spread.root / size[:, None]) / size
         # Not all blocks, of which there may be very many, but rows of the same products.
         triangle = np.linalg.qr(spread.scores, mode="r")
-        return cls(triangle @ of_parameters, spread.interval_factor, spread.description)
+        return cls(triangle @ of_parameters, spread.interval_factor, spread.blocks)
 
     def covariance(self, root: Array, precision: Array, design_effect: float) -> Array:
         """Return the covariance of a posterior (p, p).
@@ -545,18 +540,17 @@ def body_prior(
     mean, std, placeholder = _mean_and_deviations(
         model, TorqueSums.of(factor), share, wide_rotors=wide_rotors
     )
-    origin = f"nominal bodies to within {100.0 * share:g} %"
+    origin = PriorOrigin(share, stated=len(stated or {}))
     if placeholder:
-        reason = without_masses(model)
-        if not reason:
+        fault = mass_fault(model)
+        if fault is None:
             scale, _ = nominal_ratio(model, factor)
-            reason = f"the torque is {number(scale, 2)} times the torque of the described bodies"
-        origin = f"bodies of the size of the torque, as {reason}"
+            origin = replace(origin, fault=MassFault.UNRELATED, scale=scale)
+        else:
+            origin = replace(origin, fault=fault)
     for name, (value, spread) in (stated or {}).items():
         mean[names.index(name)] = value
         std[names.index(name)] = spread
-    if stated:
-        origin += f", {len(stated)} values given"
     bodies = layout.links.ravel()
     return BodyPrior(mean, std, _of_model(model).combinations, origin, bodies, bool(placeholder))
 
@@ -616,7 +610,7 @@ def _of_model(model: RobotModel) -> _OfModel:
     )
     return _OfModel(
         combinations, _usual_columns(model), nominal, np.array(sliding, dtype=np.intp),
-        dry, viscous, offset, not without_masses(model),
+        dry, viscous, offset, mass_fault(model) is None,
     )  # fmt: skip
 
 

@@ -13,6 +13,7 @@ from identification.arrays import Array
 from identification.estimators.covariance import clustered_covariance
 from identification.estimators.loss_functions import Huber, Loss, Tukey
 from identification.factor.estimate import Estimate, estimate_of, inverse_variance
+from identification.factor.estimation_method import EstimationMethod, Reweighted
 from identification.factor.factor import Factor, reduced, total_factor
 from identification.factor.normal_equations import Solution
 from identification.factor.rows import augmented_rows
@@ -97,14 +98,15 @@ def robust_estimate(
     clustered = clustered_covariance(model, recordings, state.solution, weights, loss)
     scaled = np.concatenate(state.residuals) / state.scale
     rows = np.where(np.isfinite(state.scale), np.count_nonzero(np.isfinite(scaled), axis=0), np.nan)
-    ended = "" if state.converged else ", NOT converged"
+    fit = Reweighted(
+        loss.name, loss.tuning, state.passes, state.converged, by_qr=factor.storage == "qr"
+    )
     estimate = estimate_of(
         model.units,
         state.factor,
         state.solution._replace(determined=clustered.determined),
         weights,
-        f"iteratively reweighted least squares{factor.method_suffix}, {loss.name}, {state.passes}"
-        f" passes{ended}, {clustered.description}",
+        EstimationMethod(fit, clustered.blocks),
         clustered.covariance,
         clustered.interval_factor,
     )

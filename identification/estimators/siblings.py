@@ -137,5 +137,5 @@ def _replaced(
         values=every,
         covariance=whole,
         undetermined=tuple(name for name in estimate.undetermined if name not in names),
-        method=f"{estimate.method}, with a common prior of the arms of its type",
+        method=estimate.method.widened("siblings"),
     )

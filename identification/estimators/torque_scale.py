@@ -92,7 +92,7 @@ def absolute(estimate: Estimate) -> Estimate:
     return replace(
         estimate,
         covariance=estimate.covariance + added,
-        method=f"{estimate.method}, with the uncertain scale of torques",
+        method=estimate.method.widened("torque_scale"),
         scale_change=None,
     )
 

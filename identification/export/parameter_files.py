@@ -18,6 +18,8 @@ from identification.estimators.torque_scale import absolute
 from identification.export.parameter_table import ParameterRow, parameter_table
 from identification.export.urdf import not_in_urdf
 from identification.factor.estimate import Estimate
+from identification.factor.estimation_method import EstimationMethod
+from identification.factor.messages import method_words, status_words
 from identification.model.link_wrenches import LINK_SYMBOLS
 from identification.model.robot import RobotModel
 
@@ -69,7 +71,8 @@ def parameters_json(
         "friction_laws": [law.table() for law in model.friction.laws],
         "motor_speeds": model.friction.motor_speeds().tolist(),
         "convention": CONVENTION,
-        "method": estimate.method,
+        "method": method_words(estimate.method),
+        "estimation": estimate.method.as_json(),
         "interval_factor": estimate.interval_factor,
         "condition": estimate.condition,
         "noise_std": estimate.noise_std.tolist(),
@@ -121,7 +124,7 @@ def covariance_csv(estimate: Estimate, *, provenance: Mapping[str, str] | None =
 
 
 def _remarks(estimate: Estimate, provenance: Mapping[str, str] | None) -> dict[str, str]:
-    return {**(provenance or {}), "method": estimate.method, "convention": CONVENTION}
+    return {**(provenance or {}), "method": method_words(estimate.method), "convention": CONVENTION}
 
 
 def _table(remarks: Mapping[str, str], rows: Iterable[Sequence[object]]) -> str:
@@ -145,7 +148,7 @@ def _standard(model: RobotModel, consistent: ConsistentEstimate) -> dict[str, An
     terms = list(zip(model.friction.terms, consistent.friction.tolist(), strict=True))
     elements = consistent.estimate.values[model.element_part].tolist()
     return {
-        "method": consistent.estimate.method,
+        "method": method_words(consistent.estimate.method),
         "links": [
             {
                 "joint": name,
@@ -167,7 +170,7 @@ def _standard(model: RobotModel, consistent: ConsistentEstimate) -> dict[str, An
         "motor_friction": {term.name: value for term, value in terms if term.motor},
         "elements": dict(zip(model.elements.names, elements, strict=True)),
         "not_in_urdf": list(not_in_urdf(model)),
-        "status": consistent.status,
+        "status": status_words(consistent.fits),
         "relative_error": consistent.relative_error,
         "unconstrained_relative_error": consistent.unconstrained_relative_error,
         "covariance": "that of the unconstrained parameters; undetermined directions are nominal",
@@ -201,7 +204,7 @@ def estimate_in(content: Mapping[str, Any]) -> Estimate:
         np.array([[float(value) for value in row] for row in content["covariance"]]),
         np.array([float(value) for value in content["noise_std"]]),
         np.array(content["samples"], dtype=np.intp),
-        str(content["method"]),
+        EstimationMethod.of_json(content.get("estimation", {})),  # not in earlier files
         float(content["condition"]),
         tuple(str(name) for name in content["undetermined"]),
         float(content["interval_factor"]),

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from identification.arrays import Array, Indices
 from identification.distributions import NORMAL_95
+from identification.factor.estimation_method import EstimationMethod, LeastSquares
 from identification.factor.factor import Factor, require_rows
 from identification.factor.normal_equations import Solution
 from identification.model.robot import RobotModel
@@ -65,7 +66,7 @@ class Estimate:
     covariance: Array  #: (p, p); the variance of an undetermined parameter is infinite
     noise_std: Array  #: standard deviation of the torque residual per joint (n,) [N·m or N]
     samples: Indices  #: rows per joint (n,)
-    method: str  #: description of estimator and covariance
+    method: EstimationMethod
     condition: float  #: condition number of the weighted regressor with unit columns
     undetermined: tuple[str, ...] = ()  #: undetermined parameters, alone or in a combination
     #: standard deviations in half a 95 % interval: 1.96, more for covariances of few data
@@ -105,7 +106,7 @@ def estimate(model: RobotModel, factor: Factor, weights: Array | None = None) ->
     require_rows(model, factor)
     if weights is None:
         weights = joint_weights(factor)
-    method = f"weighted least squares{factor.method_suffix}, classical covariance (white residuals)"
+    method = EstimationMethod(LeastSquares(by_qr=factor.storage == "qr"))
     return estimate_of(model.units, factor, factor.solve(weights), weights, method)
 
 
@@ -114,7 +115,7 @@ def estimate_of(
     factor: Factor,
     solution: Solution,
     weights: Array,
-    method: str,
+    method: EstimationMethod,
     covariance: Array | None = None,
     interval_factor: float = NORMAL_95,
 ) -> Estimate:
@@ -125,7 +126,7 @@ def estimate_of(
         factor: that was solved.
         solution: of it.
         weights: of the joints (n,).
-        method: name of the estimator.
+        method: that gave it.
         covariance: of the parameters (p, p); by default A^-1.
         interval_factor: standard deviations in half a 95 % interval.
     """

@@ -193,11 +193,6 @@ class Factor:
         return tuple(np.einsum("bki,bkj->ij", triangles, triangles) for triangles in self.matrices)
 
     @property
-    def method_suffix(self) -> str:
-        """Suffix of estimator names."""
-        return " by QR" if self.storage == "qr" else ""
-
-    @property
     def smallest_noise(self) -> float:
         """Smallest noise as a share of the torque's RMS, for joints that fit exactly."""
         return 1e-12 if self.storage == "qr" else MIN_NOISE

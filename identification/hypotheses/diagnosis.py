@@ -45,7 +45,7 @@ from identification.hypotheses.search import (
 )
 from identification.hypotheses.torque_rate import is_rate
 from identification.model.motion import Motion
-from identification.model.nominal_masses import without_masses
+from identification.model.nominal_masses import mass_fault
 from identification.model.robot import RobotModel
 from identification.signals.samples import Samples
 
@@ -347,7 +347,7 @@ def rigid_torque(model: RobotModel, samples: Samples) -> RigidTorque:
     power = max(float(factor.gram[:, -1, -1].sum()), np.finfo(np.float64).tiny)
     error = float(np.sqrt(factor.squared_errors(values).sum() / power))
     is_little = samples.usable.any(axis=1).sum() < _MIN_ROWS or not powers[1].any()
-    if without_masses(model) or is_little:
+    if mass_fault(model) is not None or is_little:
         return RigidTorque(np.nan, np.inf, over, error)
     return RigidTorque(*nominal_ratio(model, factor), over, error)
 

@@ -23,7 +23,7 @@ from identification.estimators.prior import nominal_ratio
 from identification.factor.factor import Factor
 from identification.hypotheses.scores import Comparison, Score, compare, score_of
 from identification.hypotheses.search import EXPLAINED_ERROR, SEPARATE_SIGMAS, SURE_SIGMAS
-from identification.model.nominal_masses import without_masses
+from identification.model.nominal_masses import mass_fault
 from identification.model.robot import RobotModel
 from identification.signals.samples import Samples
 
@@ -172,7 +172,7 @@ def _lighter(model: RobotModel, factor: float) -> RobotModel:
 
 def _weight(model: RobotModel, samples: Samples, factor: float) -> float:
     """Return the weight in a torque over the weight of the described masses."""
-    if without_masses(model):
+    if mass_fault(model) is not None:
         return float("nan")
     lighter = _lighter(model, factor)
     scale, _ = nominal_ratio(lighter, Factor.of(lighter, samples))

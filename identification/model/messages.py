@@ -1,10 +1,11 @@
-"""Friction laws in words."""
+"""Friction laws and described masses in words."""
 
 from __future__ import annotations
 
 from collections.abc import Iterable
 
 from identification.model.friction import FrictionLaw, FrictionTerm
+from identification.model.nominal_masses import MassFault
 
 
 def law_text(law: FrictionLaw) -> str:
@@ -33,6 +34,15 @@ def law_option(law: FrictionLaw) -> str:
         term.label.lower() if (speed := _speed(term)) is None else f"{term.label.lower()}={speed:g}"
         for term in law.terms
     )
+
+
+def mass_fault_words(fault: MassFault) -> str:
+    """Return why the masses of a description are not the arm's."""
+    return {
+        MassFault.NONE: "the description has no masses",
+        MassFault.EQUAL: "all bodies of the description have the same mass",
+        MassFault.UNRELATED: "the torque is unrelated to the masses of the description",
+    }[fault]
 
 
 def _speed(term: FrictionTerm) -> float | None:

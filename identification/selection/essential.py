@@ -21,6 +21,7 @@ from identification.errors import IdentificationError
 from identification.estimators.covariance import block_length, with_block_covariance
 from identification.factor.blocks import merged
 from identification.factor.estimate import Estimate, estimate_of, joint_weights
+from identification.factor.estimation_method import EstimationMethod, LeastSquares
 from identification.factor.factor import Factor, joined
 from identification.factor.normal_equations import Solution, solve
 from identification.model.robot import RobotModel
@@ -127,14 +128,14 @@ def eliminate(
     path.remove_all()
     part = training.restricted(chosen.left)
     units = [model.units[k] for k in chosen.left]
-    classical = estimate_of(units, part, chosen.solution, weights, "")
-    name = "essential parameters by weighted least squares"
+    method = EstimationMethod(LeastSquares(essential_only=True))
+    classical = estimate_of(units, part, chosen.solution, weights, method)
     return Elimination(
         steps=tuple(path.steps),
         cut=cut,
         refused=refused,
         rule=rule,
-        estimate=with_block_covariance(classical, part, weights, name),
+        estimate=with_block_covariance(classical, part, weights),
         values=chosen.values,
     )
 

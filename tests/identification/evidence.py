@@ -6,6 +6,7 @@ import numpy as np
 
 from identification.estimators.delay import DelayEstimate
 from identification.factor.estimate import Estimate
+from identification.factor.estimation_method import EstimationMethod
 from identification.hypotheses.column_search import Explanation
 from identification.hypotheses.diagnosis import RigidTorque, TorqueDiagnosis
 from identification.hypotheses.joint_changes import Change
@@ -41,7 +42,8 @@ def an_error(relative, joints=2):
 def an_estimate(**changes):
     fields = {
         "names": ("a", "b"), "units": ("kg", "kg"), "values": np.ones(2), "covariance": np.eye(2),
-        "noise_std": np.ones(2), "samples": np.full(2, 1000), "method": "", "condition": 10.0,
+        "noise_std": np.ones(2), "samples": np.full(2, 1000), "method": EstimationMethod(),
+        "condition": 10.0,
     }  # fmt: skip
     return Estimate(**(fields | changes))
 

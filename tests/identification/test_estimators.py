@@ -71,9 +71,17 @@ from identification.estimators.prior import (
 )
 from identification.export.urdf import NotConsistentError
 from identification.factor.estimate import joint_weights
+from identification.factor.estimation_method import (
+    EstimationMethod,
+    LeastSquares,
+    PriorOrigin,
+    Reweighted,
+    TimeBlocks,
+)
 from identification.factor.factor import total_factor
 from identification.factor.normal_equations import NormalEquations, rows_of, solve
 from identification.model.motion import Motion
+from identification.model.nominal_masses import MassFault
 from identification.model.pseudo_inertia import pseudo_inertia
 from identification.signals.recording import in_succession
 from identification.signals.smoothing import low_pass
@@ -164,7 +172,7 @@ class TestParts:
         )
         assert np.max(np.abs(undivided.values - many.values) / undivided.std) < 1e-9
         np.testing.assert_allclose(many.std, undivided.std, rtol=1e-9)
-        assert many.method.rpartition(", ")[2] == undivided.method.rpartition(", ")[2]  # the blocks
+        assert many.method.blocks == undivided.method.blocks
 
     def found(self, name, pieces):
         if name in PIECES:
@@ -283,7 +291,7 @@ class TestBlocks:
         clustered = Clustered(
             covariance=np.eye(2), root=root, scores=np.zeros((25, 2)),
             determined=np.ones(2, dtype=np.bool_), design_effect=1.0, interval_factor=2.0,
-            description="", blocks=25, shares=root @ information @ root,
+            blocks=TimeBlocks(25, 0.25), shares=root @ information @ root,
         )  # fmt: skip
         expected = [student_limit(0.025, 24), student_limit(0.025, freedom)]
         factors = clustered.interval_factors(np.eye(2))
@@ -299,7 +307,7 @@ class TestBlocks:
             clustered = Clustered(
                 covariance=np.eye(1), root=root, scores=np.zeros((25, 1)),
                 determined=np.ones(1, dtype=np.bool_), design_effect=1.0, interval_factor=2.0,
-                description="", blocks=25, shares=weights[:, None, None] * root**2,
+                blocks=TimeBlocks(25, 0.25), shares=weights[:, None, None] * root**2,
             )  # fmt: skip
             factors.append(float(clustered.interval_factors(np.eye(1))[0]))
         assert factors[0] == pytest.approx(student_limit(0.025, 2))
@@ -309,7 +317,7 @@ class TestBlocks:
         motion = a_motion()
         noise = coloured(np.random.default_rng(0), len(motion.time), 5e-3, 0.0)
         result = estimate_repetitions(MODEL, [recording(noise, motion)]).pooled
-        assert "40 blocks of 0.25 s" in result.method
+        assert result.method.blocks == TimeBlocks(40, 0.25)
         assert result.interval_factor == pytest.approx(2.02, abs=0.01)
 
     def test_independent_repetitions_are_averaged(self):
@@ -493,8 +501,9 @@ class TestRobustEstimate:
         samples = recording(with_outliers(rng, gaussian(rng, motion), 0.05, 30.0), motion)
         result = robust_estimate(MODEL, [samples], most_iterations=1)
         assert not result.converged
-        assert "NOT converged" in result.estimate.method
-        assert "Huber" in result.estimate.method
+        assert result.estimate.method.fit == Reweighted(
+            "huber", 1.345, result.iterations, converged=False
+        )
 
     def test_many_outliers_mean_a_wrong_model(self):
         motion = a_motion(5.0)
@@ -941,20 +950,19 @@ class TestPlaceholders:
         factor = Factor.of(model, replace(samples, torque=size * samples.torque))
         return body_prior(model, factor), factor
 
-    @pytest.mark.parametrize(
-        ("model", "origin"), [(EQUAL, "have the same mass"), (BARE, "has no masses")]
-    )
-    def test_equal_or_missing_masses_are_some(self, model, origin):
+    @pytest.mark.parametrize(("model", "fault"), [(EQUAL, MassFault.EQUAL), (BARE, MassFault.NONE)])
+    def test_equal_or_missing_masses_are_some(self, model, fault):
         prior, _ = self.prior(model)
         assert prior.placeholder
-        assert origin in prior.origin
+        assert prior.origin == PriorOrigin(0.3, fault)
         assert not prior.mean[: model.layout.size].any()
 
     @pytest.mark.parametrize("size", [20.0, 0.05, -1.0])
     def test_masses_with_another_torque_are_some(self, size):
         prior, _ = self.prior(MODEL, size)
         assert prior.placeholder
-        assert "times the torque of the described bodies" in prior.origin
+        assert prior.origin.fault is MassFault.UNRELATED
+        assert prior.origin.scale == pytest.approx(size, rel=0.5)
         assert not prior.mean[: MODEL.layout.size].any()
 
     @pytest.mark.parametrize("size", [0.7, 1.0, 1.5])
@@ -1077,7 +1085,7 @@ class TestConsistentEstimate:
         consistent = fit_of(truth(), noise, 1, samples=samples)
         rank = MODEL.base.rank
         assert_consistent(MODEL, consistent)
-        assert consistent.status == "optimal" and np.all(consistent.margin > 0.0)
+        assert consistent.fits and np.all(consistent.margin > 0.0)
         expected = MODEL.base.grouping @ consistent.standard
         np.testing.assert_allclose(consistent.estimate.values[:rank], expected, atol=1e-12)
         np.testing.assert_array_equal(consistent.estimate.values[rank:], consistent.friction)
@@ -1132,7 +1140,7 @@ class TestConsistentEstimate:
         values[MODEL.parameter_names.index("I2yy")] = -0.3
         consistent = fit_of(values, noise, 6)
         assert_consistent(MODEL, consistent)
-        assert "no consistent parameters fit" in consistent.status
+        assert not consistent.fits
         assert error_rise(consistent) > 0.02
 
     def test_a_solver_that_stalls_takes_shorter_steps(self, monkeypatch):
@@ -1157,7 +1165,7 @@ class TestConsistentEstimate:
         np.testing.assert_allclose(consistent.estimate.noise_std, rms, rtol=1e-6)
         relative = np.linalg.norm(error) / np.linalg.norm(torque)
         assert consistent.relative_error == pytest.approx(relative, rel=1e-6)
-        assert "covariance of the unconstrained estimate" in consistent.estimate.method
+        assert consistent.estimate.method == EstimationMethod(LeastSquares(), is_consistent=True)
         np.testing.assert_array_equal(
             consistent.estimate.covariance, consistent.unconstrained.covariance
         )

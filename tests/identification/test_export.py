@@ -20,7 +20,12 @@ from identification.excitation.collision import CollisionChecker
 from identification.excitation.errors import CollisionModelError
 from identification.export.exported_arm import Ranges
 from identification.export.friction_curve import friction_curve, median_load
-from identification.export.parameter_files import covariance_csv, parameters_csv, parameters_json
+from identification.export.parameter_files import (
+    covariance_csv,
+    estimate_in,
+    parameters_csv,
+    parameters_json,
+)
 from identification.export.parameter_table import parameter_table
 from identification.export.simulators import (
     AGREEMENT_TOLERANCE,
@@ -31,6 +36,7 @@ from identification.export.simulators import (
 )
 from identification.export.urdf import NotConsistentError, WriteBackError, not_in_urdf, write_urdf
 from identification.factor.estimate import estimate
+from identification.factor.estimation_method import EstimationMethod
 from identification.factor.factor import Factor
 from identification.model.coupling import Coupling
 from identification.model.elements import Anchors, GasCylinder, TorqueRipple, TorsionSpring
@@ -524,11 +530,18 @@ class TestParameters:
         assert [p["unit"] for p in read["parameters"]] == list(estimated.units)
         np.testing.assert_array_equal(read["covariance"], estimated.covariance)
         assert read["provenance"] == PROVENANCE
+        assert estimate_in(read).method == estimated.method
         assert read["parameters"][0]["expression"] == "I1yy + I1m + 0.25 m2"
         links = read["standard"]["links"]
         assert [link["joint"] for link in links] == ["shoulder", "elbow"]
         assert [link["rotor_inertia"] for link in links] == consistent.standard[[10, 21]].tolist()
         assert links[1]["friction"] == {"f0": consistent.friction[1], "f1": consistent.friction[3]}
+
+    def test_an_earlier_file_does_not_state_how_it_was_made(self, fit):
+        model, estimated, _ = fit
+        read = json.loads(parameters_json(model, estimated))
+        del read["estimation"]
+        assert estimate_in(read).method == EstimationMethod()
 
     def test_json_has_texts_for_undetermined_values(self, fit):
         model, estimated, _ = fit

@@ -15,6 +15,7 @@ from identification.estimators.covariance import with_block_covariance
 from identification.estimators.least_squares import fit_least_squares
 from identification.estimators.robust import robust_estimate
 from identification.factor.estimate import estimate, joint_weights, residual_variance
+from identification.factor.estimation_method import LeastSquares
 from identification.factor.factor import MAX_GRAM_CONDITION, Factor, reduced, total_factor
 from identification.factor.normal_equations import solve, solve_rows
 from identification.factor.rows import augmented_rows
@@ -127,7 +128,7 @@ class TestFactor:
                 np.testing.assert_allclose(getattr(of_sum, name), getattr(other, name), rtol=1e-9)
             scale = np.outer(of_sum.std, of_sum.std)
             assert np.abs((of_sum.covariance - other.covariance) / scale).max() < 1e-9
-            assert ("QR" in of_sum.method) == (storage == "qr")
+            assert of_sum.method.fit.by_qr == (storage == "qr")
 
     def test_the_dense_regressor_is_not_allocated(self):
         model, motion, torque = some_samples(30_000)
@@ -195,9 +196,9 @@ class TestConditioning:
         assert factor.solve(np.ones(2)).condition > MAX_GRAM_CONDITION
         np.testing.assert_array_equal(factor.samples, 2 * np.count_nonzero(bad.usable, axis=0))
         estimated = fit_least_squares(MODEL, [bad])
-        assert "by QR" in estimated.method
+        assert estimated.method.fit.by_qr
         np.testing.assert_allclose(estimated.values, truth(), rtol=1e-4)
-        assert "by QR" in robust_estimate(MODEL, [bad]).estimate.method
+        assert robust_estimate(MODEL, [bad]).estimate.method.fit.by_qr
 
     @both
     def test_undetermined_parameters_are_named(self, storage):
@@ -311,4 +312,4 @@ class TestEstimate:
         np.testing.assert_allclose(fitted.values, expected.values, rtol=1e-9)
         np.testing.assert_allclose(fitted.std, expected.std, rtol=1e-6)
         assert fitted.interval_factor == expected.interval_factor
-        assert fitted.method.startswith(f"{weighting} least squares, cluster-robust covariance")
+        assert fitted.method == replace(expected.method, fit=LeastSquares(weighting))

@@ -9,6 +9,7 @@ import pytest
 
 from identification.arrays import Array
 from identification.factor.estimate import Estimate
+from identification.factor.estimation_method import EstimationMethod
 from identification.model.flange import flange_motion, flange_name
 from identification.model.friction import FrictionLaw
 from identification.model.kinematics import chain_from_urdf, pinocchio_model
@@ -53,7 +54,7 @@ def an_estimate(values: Array | None = None, covariance: Array | None = None) ->
         covariance=np.zeros((P, P)) if covariance is None else covariance,
         noise_std=NOISE,
         samples=np.full(2, 1000),
-        method="planted",
+        method=EstimationMethod(),
         condition=1.0,
     )
 

@@ -14,6 +14,7 @@ from scipy.signal import butter, sosfilt, sosfiltfilt
 from identification.errors import IdentificationError
 from identification.estimators.torque_channel import possible_low_passes
 from identification.factor.estimate import estimate
+from identification.factor.estimation_method import LeastSquares
 from identification.factor.factor import Factor
 from identification.model.elements import TorqueRipple, TorsionSpring
 from identification.model.friction import FrictionLaw
@@ -180,8 +181,8 @@ class TestElimination:
         assert estimated.units == tuple(
             ARM.units[ARM.parameter_names.index(name)] for name in estimated.names
         )
-        assert "essential" in estimated.method
-        assert "cluster-robust" in estimated.method
+        assert estimated.method.fit == LeastSquares(essential_only=True)
+        assert estimated.method.blocks is not None
 
     def test_the_ns16_predicts_equally_with_fewer_parameters(self):
         model = RobotModel.from_urdf(urdf_text())

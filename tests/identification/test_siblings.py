@@ -7,6 +7,7 @@ import pytest
 
 from identification.estimators.siblings import MIN_ESTIMATES, with_siblings
 from identification.factor.estimate import Estimate
+from identification.factor.estimation_method import EstimationMethod, LeastSquares
 
 MEAN = np.array([10.0, 5.0, 2.0])
 SPREAD = np.array([1.0, 0.1, 0.4])
@@ -25,7 +26,7 @@ def estimated(values, std, *, undetermined=()):
         covariance=covariance,
         noise_std=np.ones(1),
         samples=np.array([100]),
-        method="least squares",
+        method=EstimationMethod(LeastSquares()),
         condition=1.0,
         undetermined=tuple("abc"[k] for k in undetermined),
     )

@@ -115,7 +115,7 @@ class TestScaleCovariance:
         added = scale_covariance(scale_sensitivity(factor, weights, inverse), SCALE_STD)
         half = (2.5 * estimated.std) ** 2 + 1.96**2 * np.diag(added)
         np.testing.assert_allclose((2.5 * wider.std) ** 2, half)
-        assert "scale of torques" in wider.method
+        assert wider.method == estimated.method.widened("torque_scale")
 
     def test_undetermined_parameters_stay_undetermined(self, torque):
         motion, measured = torque

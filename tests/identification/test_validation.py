@@ -16,6 +16,7 @@ from identification.estimators.covariance import with_block_covariance
 from identification.estimators.least_squares import estimate_repetitions
 from identification.estimators.prior import NOMINAL_STD_SHARE
 from identification.factor.estimate import Estimate, estimate, joint_weights
+from identification.factor.estimation_method import EstimationMethod
 from identification.factor.factor import Factor, total_factor
 from identification.factor.normal_equations import solve
 from identification.hypotheses.unseen_changes import find_changes
@@ -499,7 +500,7 @@ def known(values, model=MODEL, std=0.01):
     return Estimate(
         names=model.parameter_names, units=model.units, values=values,
         covariance=np.diag((std * np.maximum(np.abs(values), 0.1)) ** 2), noise_std=np.ones(2),
-        samples=np.full(2, 1000), method="", condition=10.0,
+        samples=np.full(2, 1000), method=EstimationMethod(), condition=10.0,
     )  # fmt: skip
 
 

@@ -25,7 +25,12 @@ from hil.base.progress import Silent
 from hil.batch import archive_discovery, archive_reduction
 from hil.batch import graph as batch_run
 from hil.batch.archive_discovery import discover, open_ref
-from hil.batch.archive_reduction import ToReduce, cached_reduction, reduce_archives
+from hil.batch.archive_reduction import (
+    ToReduce,
+    cached_reduction,
+    reduce_archives,
+    reduction_key,
+)
 from hil.batch.cache import CacheLocation
 from hil.batch.cluster import Cluster
 from hil.batch.estimates import BatchEstimator
@@ -271,7 +276,7 @@ class TestCache:
             patch.setattr(archive_discovery, "open_archive", pytest.fail)
             second = batch(folder, cache=CacheLocation(), estimator="consistent")
         assert (second.read, second.cached) == (0, 5)
-        assert "consistent" in second.campaigns[0].estimate.method
+        assert second.campaigns[0].estimate.method.is_consistent
         assert batch(folder, cache=CacheLocation(), delay=0.002).read == 5
 
     def test_of_a_campaign_is_read_by_the_task_that_estimates_it(self, folder, tmp_path):
@@ -300,6 +305,22 @@ class TestCache:
         assert [matrix.tobytes() for matrix in cached.matrices] == [
             matrix.tobytes() for matrix in computed.matrices
         ]
+
+    def test_an_entry_of_other_content_is_computed_again(self, folder, tmp_path):
+        """As of a version whose estimates stated how they were made in words."""
+        (ref, *_) = found_in(excitations(folder)[0]).refs
+        archives = (ToReduce(ref),)
+        cache = CacheLocation(str(tmp_path / "cache"))
+        first = reduce_archives(archives, SETTINGS, cache)
+        key = reduction_key(archives, SETTINGS)
+        content, arrays = cache.read(ref.origin, key)
+        content["archives"][0]["fit"]["method"] = "weighted least squares"
+        cache.write(ref.origin, key, content, arrays)
+        assert cached_reduction(archives, SETTINGS, cache) is None
+        again = reduce_archives(archives, SETTINGS, cache)
+        assert (again.read, again.cached) == (1, 0)
+        assert again.summaries[0].fit.method == first.summaries[0].fit.method
+        assert cached_reduction(archives, SETTINGS, cache).cached == 1
 
     def test_of_a_read_only_folder_is_in_the_home(self, folder, tmp_path, monkeypatch):
         monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "xdg"))
