@@ -30,13 +30,6 @@ class Oscillation:
     growth: float
     seconds: float
 
-    def sentence(self, joint_names: tuple[str, ...]) -> str:
-        """Return it in a clause."""
-        return (
-            f"{joint_names[self.joint]} oscillates at {self.frequency:.0f} Hz, with an amplitude "
-            f"that grows {self.growth:.0f} times in {self.seconds:.1f} s"
-        )
-
 
 def growing_oscillation(error: Array, period: float, resolution: Array) -> Oscillation | None:
     """Return the strongest growing oscillation in a following error; None without one.

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-import shlex
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Final
+from typing import Final, NamedTuple
 
 import numpy as np
 
@@ -20,12 +20,10 @@ from hil.pipeline.sources import gather_sources
 from identification.distributions import NORMAL_95, student_freedom, student_limit
 from identification.errors import IdentificationError
 from identification.signals.recording import RecordingError
-from identification.text import percentage
 from identification.validation.prediction import pooled_error, prediction_error
 
 from .folder import CampaignFolder
-from .oscillation import growing_oscillation
-from .rehearsal_record import EFFECTS, RehearsalCriterion
+from .oscillation import Oscillation, growing_oscillation
 from .twin import Twin
 
 FALSE_ALARM: Final = 1e-3
@@ -37,27 +35,126 @@ MAX_SPEED_SHARE: Final = 1.05
 SATURATION_SHARE: Final = 0.99  # Share of the current limit from which a motor is saturated
 
 
-def criterion(
-    name: str, value: float | None, bound: float, text: str, remedy: str = ""
-) -> RehearsalCriterion:
-    """Return a criterion that is met by a finite value up to a bound; else with a remedy.
+@dataclass(frozen=True)
+class WorstMotion:
+    """The motion in which a criterion has its largest value."""
 
-    Args:
-        name: of the criterion.
-        value: that is judged.
-        bound: largest value.
-        text: what the value is.
-        remedy: where it is not met.
-    """
-    finite = None if value is None or not np.isfinite(value) else value
-    passed = finite is not None and finite <= bound
-    sentence = text if passed or not remedy else f"{text}: {remedy}"
-    return RehearsalCriterion(
-        name=name, value=finite, bound=bound, passed=passed, sentence=sentence
-    )
+    archive: Path
+    joint: int | None = None  #: or motor, from 0
+    #: that grows in it: then the control of the simulated arm is at fault, not the motion
+    oscillation: Oscillation | None = None
 
 
-def of_currents(cell: Cell, folder: CampaignFolder, name: str, bound: float) -> RehearsalCriterion:
+@dataclass(frozen=True)
+class CurrentShare:
+    """Largest current of any motor, as a share of its limit."""
+
+    run: str
+    share: float
+    allowed: float
+    worst: WorstMotion
+
+
+@dataclass(frozen=True)
+class SpeedShare:
+    """Largest speed of any joint in motions that were all completed, as a share of its limit."""
+
+    run: str
+    share: float
+    worst: WorstMotion
+
+
+@dataclass(frozen=True)
+class FailedMotion:
+    """A motion that was not completed."""
+
+    run: str
+    failure: str  #: as its error states it
+    last: WorstMotion | None  #: the last one that was archived
+
+
+@dataclass(frozen=True)
+class Undetermined:
+    """Parameters that the excitation does not determine."""
+
+    parameters: tuple[str, ...]
+
+
+@dataclass(frozen=True)
+class ParameterErrors:
+    """Largest error of the determined parameters [standard deviations]."""
+
+    count: int
+    largest: float
+    parameter: str  #: that has it
+    allowed: float
+
+
+@dataclass(frozen=True)
+class UnseenError:
+    """Largest torque error of any joint on unseen motion, over that of the true parameters."""
+
+    ratio: float
+    joint: int
+
+
+@dataclass(frozen=True)
+class NotIdentified:
+    """A criterion of an identification that failed."""
+
+    criterion: str
+    allowed: float
+    problem: str  #: as its error states it
+
+
+Judged = (
+    CurrentShare
+    | SpeedShare
+    | FailedMotion
+    | Undetermined
+    | ParameterErrors
+    | UnseenError
+    | NotIdentified
+)
+
+
+class Judgement(NamedTuple):
+    """A criterion's name, value and largest value that passes; no value if undetermined."""
+
+    name: str
+    value: float | None
+    bound: float
+
+    @property
+    def passed(self) -> bool:
+        """Whether it is met."""
+        return self.value is not None and self.value <= self.bound
+
+
+def judgement_of(judged: Judged) -> Judgement:
+    """Return whether a criterion is met; a value that is not finite is undetermined."""
+    match judged:
+        case CurrentShare(run, share, allowed):
+            return _judgement(f"current ({run})", share, allowed)
+        case SpeedShare(run, share):
+            return _judgement(f"motions ({run})", float(share > MAX_SPEED_SHARE), 0.0)
+        case FailedMotion(run):
+            return _judgement(f"motions ({run})", 1.0, 0.0)
+        case Undetermined(parameters):
+            return _judgement("excitation", float(len(parameters)), 0.0)
+        case ParameterErrors(_, largest, _, allowed):
+            return _judgement("parameters", largest, allowed)
+        case UnseenError(ratio):
+            return _judgement("unseen motion", ratio, MAX_ERROR_RATIO)
+        case NotIdentified(name, allowed):
+            return Judgement(name, None, allowed)
+
+
+def _judgement(name: str, value: float, bound: float) -> Judgement:
+    return Judgement(name, value if np.isfinite(value) else None, bound)
+
+
+def of_currents(cell: Cell, folder: CampaignFolder, run: str, bound: float) -> CurrentShare:
     """Judge the largest current of any motor, as a share of its limit.
 
     The two cycles after a lost packet, in which the controller comes back from its extrapolation to
@@ -66,12 +163,12 @@ def of_currents(cell: Cell, folder: CampaignFolder, name: str, bound: float) -> 
     Args:
         cell: of the campaign.
         folder: of the rehearsal.
-        name: of the criterion.
+        run: name of the run.
         bound: margin of the motion.
     """
-    worst = 0.0
+    largest = -1.0
     motor = 0
-    where = ""
+    where = folder.archives
     limit = cell.drive_train.current_limit
     for entry in folder.manifest():
         columns = open_archive(folder.archives / entry.name).columns
@@ -80,69 +177,36 @@ def of_currents(cell: Cell, folder: CampaignFolder, name: str, bound: float) -> 
         after_loss[1:] |= after_loss[:-1].copy()
         shares[after_loss[:, None] & (shares <= SATURATION_SHARE)] = 0.0
         share = shares.max(axis=0, initial=0.0)
-        if share.max() > worst:
-            worst = float(share.max())
+        if share.max() > largest:
+            largest = float(share.max())
             motor = int(share.argmax())
-            where = entry.name
-    return criterion(
-        f"current ({name})",
-        worst,
-        bound,
-        f"{name}: the largest current is {percentage(worst)} of its limit (motor of "
-        f"{cell.joint_names[motor]}, {where}), at most {percentage(bound)} is allowed",
-        _motion_remedy(
-            cell,
-            name,
-            folder.archives / where,
-            motor,
-            "lower acceleration_deg in [limits] of the cell file, and design again",
-        ),
-    )
+            where = folder.archives / entry.name
+    worst = WorstMotion(where, motor, _oscillation(cell, where) if largest > bound else None)
+    return CurrentShare(run, largest, bound, worst)
 
 
-_CORRECT = (
-    "correct the cause, by [limits] or [drive_train] of the cell file, or the tables of the "
-    "simulated arm ([nominal], [controller], [simulation])"
-)
-
-
-def of_motions(cell: Cell, folder: CampaignFolder, name: str, failure: str) -> RehearsalCriterion:
+def of_motions(
+    cell: Cell, folder: CampaignFolder, run: str, failure: str
+) -> SpeedShare | FailedMotion:
     """Judge whether all motions were completed, within the speed limits.
 
     Args:
         cell: of the campaign.
         folder: of the rehearsal.
-        name: of the criterion.
-        failure: of a motion; "" if there was none.
+        run: name of the run.
+        failure: of a motion, as its error states it; "" if there was none.
     """
-    entries = folder.manifest()
+    paths = [folder.archives / entry.name for entry in folder.manifest()]
     if failure:
-        path = folder.archives / entries[-1].name if entries else None
-        remedy = "" if path is None else _motion_remedy(cell, name, path, None, _CORRECT)
-        text = f"{name}: {failure}"
-        return criterion(f"motions ({name})", 1.0, 0.0, text, remedy)
-    shares = [_speed_shares(cell, folder.archives / entry.name) for entry in entries]
+        last = WorstMotion(paths[-1], None, _oscillation(cell, paths[-1])) if paths else None
+        return FailedMotion(run, failure, last)
+    shares = [_speed_shares(cell, path) for path in paths]
     fastest = int(np.argmax([share.max() for share in shares]))
     joint = int(np.argmax(shares[fastest]))
     share = float(shares[fastest][joint])
-    where = entries[fastest].name
-    if share <= MAX_SPEED_SHARE:
-        text = f"{name}: every motion was completed, at up to {percentage(share)} of a speed limit"
-        return criterion(f"motions ({name})", 0.0, 0.0, text)
-    return criterion(
-        f"motions ({name})",
-        1.0,
-        0.0,
-        f"{name}: {cell.joint_names[joint]} moved at {percentage(share)} of its speed limit "
-        f"({where}), at most {percentage(MAX_SPEED_SHARE)} is allowed",
-        _motion_remedy(
-            cell,
-            name,
-            folder.archives / where,
-            joint,
-            "lower velocity_deg in [limits] of the cell file, and design again",
-        ),
-    )
+    path = paths[fastest]
+    oscillation = _oscillation(cell, path) if share > MAX_SPEED_SHARE else None
+    return SpeedShare(run, share, WorstMotion(path, joint, oscillation))
 
 
 def _speed_shares(cell: Cell, path: Path) -> Array:
@@ -170,29 +234,12 @@ def _encoder_resolution(cell: Cell) -> Array:
     return np.asarray(count * np.abs(cell.drive_train.joint_from_motor).sum(axis=1))
 
 
-def _motion_remedy(cell: Cell, name: str, path: Path, joint: int | None, remedy: str) -> str:
-    """Return what to do about a motion of the run `name`, and the command that plots it.
-
-    An oscillation that grows has another cause than the motion: `remedy` does not apply to it.
-    """
-    causes = "current_delay_cycles in [controller]"
-    if name == EFFECTS:
-        causes = "delay and elasticity in [simulation]"
+def _oscillation(cell: Cell, path: Path) -> Oscillation | None:
+    """Return an oscillation that grows in a motion, None without one."""
     columns = open_archive(path).columns
     error = columns["commanded_position"] - columns["position"]
     error = error[np.isfinite(error).all(axis=1)]
-    oscillation = growing_oscillation(error, cell.period, _encoder_resolution(cell))
-    if oscillation is not None:
-        joint = oscillation.joint
-        remedy = (
-            f"{oscillation.sentence(cell.joint_names)}: the control of the simulated arm is "
-            f"unstable, the motion is not at fault; correct {causes} or rotor_inertia in [nominal] "
-            "of the cell file"
-        )
-    command = ["hil", "plot", str(path)]
-    if joint is not None:
-        command += ["--joint", cell.joint_names[joint]]
-    return f"{remedy}; see `{shlex.join(command)}`"
+    return growing_oscillation(error, cell.period, _encoder_resolution(cell))
 
 
 def largest_deviation(count: int, interval_factor: float = NORMAL_95) -> float:
@@ -210,7 +257,7 @@ def largest_deviation(count: int, interval_factor: float = NORMAL_95) -> float:
     return quantile * NORMAL_95 / interval_factor
 
 
-def of_estimate(twin: Twin, folder: CampaignFolder, reporter: Reporter) -> list[RehearsalCriterion]:
+def of_estimate(twin: Twin, folder: CampaignFolder, reporter: Reporter) -> list[Judged]:
     """Judge an identification from the archives: determined, correct, predictive."""
     bounds = {
         "excitation": 0.0,
@@ -223,10 +270,7 @@ def of_estimate(twin: Twin, folder: CampaignFolder, reporter: Reporter) -> list[
         prepared = prepare_sources(gather_sources(paths, FIXED.split), FIXED, reporter)
         estimation = estimate_with(prepared, FIXED, reporter)
     except (InputError, IdentificationError, RecordingError) as error:
-        problem = f"cannot be determined: the identification failed ({error})"
-        return [
-            criterion(name, None, bound, f"{name}: {problem}") for name, bound in bounds.items()
-        ]
+        return [NotIdentified(name, bound, str(error)) for name, bound in bounds.items()]
     model = twin.cell.model
     estimate = estimation.result.pooled
     undetermined = estimate.undetermined
@@ -242,28 +286,7 @@ def of_estimate(twin: Twin, folder: CampaignFolder, reporter: Reporter) -> list[
     ratio = ours / np.maximum(theirs, np.finfo(np.float64).tiny)
     joint = int(np.argmax(np.where(np.isfinite(ratio), ratio, np.inf)))
     return [
-        criterion(
-            "excitation",
-            float(len(undetermined)),
-            bounds["excitation"],
-            f"parameters not determined by the excitation: {', '.join(undetermined) or 'none'}",
-            "design a motion that moves every joint",
-        ),
-        criterion(
-            "parameters",
-            float(apart[farthest]),
-            bound,
-            f"the errors of {finite.sum()} parameters are at most {apart[farthest]:.3g} standard "
-            f"deviations ({estimate.names[farthest]}), {bound:.3g} are allowed",
-            "drive train or model in the cell file do not match the arm, or, just above the limit, "
-            "by chance: `--again --seed 2` shows which",
-        ),
-        criterion(
-            "unseen motion",
-            float(ratio[joint]),
-            MAX_ERROR_RATIO,
-            f"on unseen motion the torque error is {ratio[joint]:.2f} times what noise leaves "
-            f"({twin.cell.joint_names[joint]}), at most {MAX_ERROR_RATIO:g} is allowed",
-            "design a better excitation (`hil design`)",
-        ),
+        Undetermined(undetermined),
+        ParameterErrors(int(finite.sum()), float(apart[farthest]), estimate.names[farthest], bound),
+        UnseenError(float(ratio[joint]), joint),
     ]

@@ -12,14 +12,19 @@ from hil.base.files import make_folder
 from hil.base.progress import Reporter, Silent
 from hil.base.version import software
 from hil.campaign.planned_motions import planned_motions, require_runnable
-from hil.campaign.rehearsal_criteria import SATURATION_SHARE, of_currents, of_estimate, of_motions
+from hil.campaign.rehearsal_criteria import (
+    SATURATION_SHARE,
+    Judged,
+    of_currents,
+    of_estimate,
+    of_motions,
+)
 from hil.campaign.twin import Twin
 from hil.cell import Cell
 from hil.control.errors import MotionFailedError
-from hil.control.motion_checks import USABLE_CURRENT_SHARE, collision_checker
+from hil.control.motion_checks import USABLE_CURRENT_SHARE
 from hil.control.motion_watch import Stop, Unattended
 from hil.control.virtual_link import VirtualLink
-from identification.excitation.collision_messages import unchecked_text
 from planner.worker import WorkerProcess
 from sim_fixtures import SimulationError
 
@@ -28,9 +33,11 @@ from .errors import RepetitionsRejectedError
 from .folder import CampaignFolder
 from .motion_runner import RunOptions
 from .operator import RunWatch
-from .rehearsal_record import AS_MODELLED, CRITERIA, EFFECTS, Rehearsal, RehearsalCriterion
+from .rehearsal_messages import assumption_words, criterion_record, undetected_words
+from .rehearsal_record import AS_MODELLED, CRITERIA, EFFECTS, Rehearsal
 from .simulated_sessions import MAX_RUN_SECONDS, result_of
 from .state import CampaignState
+from .undetected import undetected_of
 
 REPETITIONS: Final = 3
 """Repetitions of the excitation: enough for their scatter, few enough for a minute."""
@@ -83,8 +90,9 @@ def _rehearsed(
 ) -> Rehearsal:
     """Run the plan in the rehearsal folder on two simulated arms in parallel, and judge it."""
     twin = Twin.of(campaign.cell, seed=seed, repetitions=REPETITIONS)
-    for sentence in twin.assumed:
-        reporter.say(f"assumed: {sentence}")
+    assumed = [*map(assumption_words, twin.assumed)]
+    for words in assumed:
+        reporter.say(f"assumed: {words}")
     modelled = _created(campaign, twin.cell, "plain")
     # One repetition shows the effects that the model leaves out.
     with_effects = _created(campaign, twin.cell.with_campaign(repetitions=1), "effects")
@@ -94,24 +102,25 @@ def _rehearsed(
         link = twin.link(_planned(modelled), effects=False)
         failure = _failure(modelled, link, twin, reporter, stop)
         seconds = link.cycles * modelled.cell.period
-        criteria = _of_run(twin, modelled.folder, AS_MODELLED, failure, USABLE_CURRENT_SHARE)
+        judged = _of_run(twin, modelled.folder, AS_MODELLED, failure, USABLE_CURRENT_SHARE)
         if failure:  # the other criteria would fail for the same reason
             child.close()
             shutil.rmtree(with_effects.folder.root)
         else:
-            criteria += of_estimate(twin, modelled.folder, reporter)
+            judged += of_estimate(twin, modelled.folder, reporter)
             reporter.step(f"rehearsing on a simulated arm, {EFFECTS}")
             failure, cycles = result_of(child, stop, "the rehearsal", "rehearse again")
             seconds += cycles * modelled.cell.period
-            criteria += _of_run(twin, with_effects.folder, EFFECTS, failure, SATURATION_SHARE)
+            judged += _of_run(twin, with_effects.folder, EFFECTS, failure, SATURATION_SHARE)
+    criteria = [criterion_record(each, campaign.cell) for each in judged]
     names = {criterion.name for criterion in criteria}
     return Rehearsal(
         plan_hash=plan_hash,
         seed=seed,
         passed=names == {*CRITERIA} and all(criterion.passed for criterion in criteria),
         criteria=criteria,
-        assumed=[*twin.assumed],
-        not_seen=_not_seen(campaign.cell),
+        assumed=assumed,
+        not_seen=[*map(undetected_words, undetected_of(campaign.cell))],
         repetitions=twin.cell.campaign.repetitions,
         motion_seconds=seconds,
         software=software(),
@@ -130,12 +139,12 @@ def _planned(rehearsal: CampaignState) -> float:
 
 def _of_run(
     twin: Twin, folder: CampaignFolder, name: str, failure: str, bound: float
-) -> list[RehearsalCriterion]:
+) -> list[Judged]:
     """Return the criteria of motions and currents of a run."""
-    criteria = [of_motions(twin.cell, folder, name, failure)]
+    judged: list[Judged] = [of_motions(twin.cell, folder, name, failure)]
     if folder.manifest():
-        criteria.append(of_currents(twin.cell, folder, name, bound))
-    return criteria
+        judged.append(of_currents(twin.cell, folder, name, bound))
+    return judged
 
 
 def run_with_effects(folder: Path, twin: Twin) -> tuple[str, int]:
@@ -165,25 +174,3 @@ def _failure(
             return error.sentence
         return str(error).rstrip(".")
     return ""
-
-
-def _not_seen(cell: Cell) -> list[str]:
-    """Return what no simulation of this cell file can detect."""
-    simulation = cell.file.simulation
-    given = set() if simulation is None else simulation.drive_train.model_fields_set
-    unknown = [
-        name for name in ("gear_ratio", "joint_sign", "joint_offset_deg") if name not in given
-    ]
-    sentences = [
-        "torque constants and current limits: the simulated motors take them from the cell file",
-        "floor, walls and shapes: they are checked, but as the cell file and the URDF have them",
-    ]
-    if (unchecked := unchecked_text(collision_checker(cell).exceptions)) is not None:
-        sentences.append(unchecked)
-    if unknown:
-        sentences.append(
-            f"{', '.join(unknown)} of [drive_train]: the simulated arm takes them from there, so "
-            "that errors in them are not detected; the controller's init packet (gears, coupling) "
-            "and the dry run (signs) detect them, or a table [simulation.drive_train] now"
-        )
-    return sentences

@@ -20,6 +20,7 @@ from .dry_run_record import DryRunRecord
 from .folder import PAYLOAD_RESULT, PAYLOADS, SIDES, CampaignFolder
 from .joint_warm_up import WarmUpRecord, drift_wanted
 from .precision_record import PrecisionRecord
+from .rehearsal_messages import rehearsal_line
 from .rehearsal_record import Rehearsal
 from .state import CampaignState
 
@@ -171,7 +172,7 @@ def _rehearsal(folder: CampaignFolder) -> CampaignStep:
         return CampaignStep("next", message, "rehearse {}")
     return CampaignStep(
         "done" if rehearsal.passed else "next",
-        rehearsal.line,
+        rehearsal_line(rehearsal),
         "rehearse {}",
         (
             *(criterion.sentence for criterion in rehearsal.criteria),

@@ -19,8 +19,6 @@ from hil.base.arrays import Array
 from hil.cell import Cell
 from hil.control.planted_arm import planted_values
 from hil.control.simulated_cell import (
-    NOISE_SHARE,
-    RESOLUTION_SHARE,
     assumed_simulation,
     controller_settings,
     simulated_controller,
@@ -28,7 +26,6 @@ from hil.control.simulated_cell import (
 )
 from hil.control.ur_simulation import UrPeer, arm_truth, simulated_ur
 from hil.control.virtual_link import VirtualLink
-from identification.text import percentage
 from sim_fixtures import ServoSettings, UnmodelledEffects
 
 # Largest relative deviation of the simulated parameters from the nominal ones
@@ -48,6 +45,44 @@ _FAULT_HORIZON_FACTOR: Final = 4.0
 """Period of link faults as a multiple of the motions' duration: moves take time, too."""
 
 
+@dataclass(frozen=True)
+class CurrentNoise:
+    """Noise (rms) and resolution of the current [A], by the weakest motor's limit."""
+
+    noise: float
+    resolution: float
+
+
+@dataclass(frozen=True)
+class DefaultEffects:
+    """What the model leaves out, of default sizes."""
+
+    torque_ripple: float  #: share of the Coulomb torque
+    friction_drift: float  #: share by which friction falls
+    delay: float  #: [s]
+
+
+@dataclass(frozen=True)
+class ZeroNominal:
+    """Fields of `[nominal]` that are all zero."""
+
+    fields: tuple[str, ...]
+
+
+@dataclass(frozen=True)
+class NoLostPackets:
+    """No packet is lost, as that would end a motion at full speed."""
+
+    motor: str  #: joint of the motor
+    turns: float  #: revolutions in a cycle
+    allowed: float  #: by the guard
+    cycle_ms: float
+
+
+Assumption = CurrentNoise | DefaultEffects | ZeroNominal | NoLostPackets
+"""What a simulated arm has that the cell file does not state."""
+
+
 @dataclass(frozen=True, eq=False)
 class Twin:
     """A simulated arm for a rehearsal.
@@ -55,13 +90,13 @@ class Twin:
     Attributes:
         cell: with a simulated controller; its `[simulation]` has the varied parameters.
         truth: simulated parameters (p,) in the order of the model.
-        assumed: assumed properties, in sentences.
+        assumed: what the cell file does not state.
         seed: of the variation.
     """
 
     cell: Cell
     truth: Array
-    assumed: tuple[str, ...]
+    assumed: tuple[Assumption, ...]
     seed: int
 
     @classmethod
@@ -78,8 +113,8 @@ class Twin:
                 "campaign.repetitions": min(repetitions, cell.campaign.repetitions),
             }
         )
-        if (sentence := too_far_without_a_packet(twin)) is not None:
-            assumed.append(sentence)
+        if (limit := too_far_without_a_packet(twin)) is not None:
+            assumed.append(limit)
         return cls(twin, planted_values(twin), tuple(assumed), seed)
 
     def link(self, seconds: float, *, effects: bool) -> VirtualLink:
@@ -151,7 +186,7 @@ def link_faults(cell: Cell, seconds: float, seed: int) -> tuple[Fault, ...]:
     return tuple(faults)
 
 
-def too_far_without_a_packet(cell: Cell) -> str | None:
+def too_far_without_a_packet(cell: Cell) -> NoLostPackets | None:
     """Return why a lost packet ends a motion at full speed; None where the motion survives it.
 
     A controller that extrapolates is then one step ahead of the set-point sent last.
@@ -165,14 +200,9 @@ def too_far_without_a_packet(cell: Cell) -> str | None:
     motor = int(np.argmax(steps / share))
     if steps[motor] <= share[motor]:
         return None
-    return (
-        f"no packet is lost: at full speed the motor of {cell.joint_names[motor]} turns by "
-        f"{steps[motor]:.2g} revolutions in a cycle of {cell.controller.cycle_ms} ms; the guard "
-        f"allows {share[motor]:.2g} ({percentage(MAX_TARGET_JUMP)} of following_error in "
-        "[drive_train]), so "
-        "that a packet lost at that speed ends the motion on the real arm; a shorter cycle or a "
-        "lower velocity_deg in [limits] avoids this"
-    )
+    name = cell.joint_names[motor]
+    turned, allowed = float(steps[motor]), float(share[motor])
+    return NoLostPackets(name, turned, allowed, cell.controller.cycle_ms)
 
 
 def _varied(cell: Cell, rng: np.random.Generator) -> dict[str, list[float]]:
@@ -195,33 +225,23 @@ def _varied(cell: Cell, rng: np.random.Generator) -> dict[str, list[float]]:
 
 def _simulation(
     cell: Cell, planted: dict[str, list[float]], seed: int
-) -> tuple[dict[str, Any], list[str]]:
+) -> tuple[dict[str, Any], list[Assumption]]:
     """Return `[simulation]` of the simulated arm, and what in it is assumed."""
     table: dict[str, Any] = {**planted, "seed": seed}
-    assumed = []
+    assumed: list[Assumption] = []
     given = cell.file.simulation
     if given is None:
         table |= assumed_simulation(cell)
-        assumed.append(
-            f"the current has a noise of {table['current_noise']:.3g} A rms and a resolution of "
-            f"{table['current_resolution']:.3g} A ({percentage(NOISE_SHARE, 1)} and "
-            f"{percentage(RESOLUTION_SHARE, 1)} of the weakest motor's limit)"
-        )
+        assumed.append(CurrentNoise(table["current_noise"], table["current_resolution"]))
     if given is None or not (
         given.torque_ripple or given.friction_drift or any(given.elasticity) or given.delay
     ):
         effects = _ordinary_effects(cell, np.array(planted["rotor_inertia"]))
         table |= asdict(effects) | {"elasticity": list(effects.elasticity)}
-        assumed.append(
-            "effects that the model leaves out have default sizes: torque ripple of "
-            f"{percentage(effects.torque_ripple)} of the Coulomb torque, friction that falls by "
-            f"{percentage(effects.friction_drift)}, springs in the main axes, "
-            f"{1e3 * effects.delay:g} ms "
-            "of delay"
-        )
-    unknown = [key for key in ("rotor_inertia", "coulomb", "viscous") if not any(planted[key])]
-    if unknown:
-        assumed.append(f"[nominal] has only zeros for {', '.join(unknown)}: so has the arm")
+        assumed.append(DefaultEffects(effects.torque_ripple, effects.friction_drift, effects.delay))
+    fields = ("rotor_inertia", "coulomb", "viscous")
+    if unknown := tuple(key for key in fields if not any(planted[key])):
+        assumed.append(ZeroNominal(unknown))
     return table, assumed
 
 

@@ -28,11 +28,13 @@ from hil.campaign.gates import require_rehearsed
 from hil.campaign.identified_campaign import identify_campaign
 from hil.campaign.rehearsal_criteria import (
     FALSE_ALARM,
+    judgement_of,
     largest_deviation,
     of_currents,
     of_motions,
 )
-from hil.campaign.rehearsal_record import CRITERIA, Rehearsal
+from hil.campaign.rehearsal_messages import criterion_record
+from hil.campaign.rehearsal_record import AS_MODELLED, CRITERIA, Rehearsal
 from hil.campaign.simulated_sessions import result_of
 from hil.campaign.twin import (
     MAX_RESONANCE,
@@ -203,13 +205,14 @@ def test_packets_are_lost_where_a_motion_survives_it(
     cell = designed.cell.with_values({"controller.cycle_ms": cycle_ms, **changes})
     lost = [each for each in link_faults(cell, 300.0, seed=1) if isinstance(each, Lose)]
     assert bool(lost) is survives
-    sentence = too_far_without_a_packet(cell)
+    limit = too_far_without_a_packet(cell)
     if survives:
-        assert sentence is None
+        assert limit is None
     else:
-        assert sentence is not None
-        assert "motor of shoulder turns by 0.44 revolutions in a cycle of 4 ms" in sentence
-        assert sentence in Twin.of(cell, seed=1, repetitions=3).assumed
+        assert limit is not None
+        assert (limit.motor, limit.cycle_ms) == ("shoulder", 4)
+        assert limit.turns == pytest.approx(0.44, abs=0.005) and limit.turns > limit.allowed
+        assert limit in Twin.of(cell, seed=1, repetitions=3).assumed
 
 
 @pytest.mark.parametrize(
@@ -229,7 +232,8 @@ def test_a_lost_packet_is_not_the_motion(
         return SimpleNamespace(columns=columns)
 
     monkeypatch.setattr(rehearsal_criteria, "open_archive", with_a_loss)
-    assert of_currents(twin.cell, twin.folder, "as modelled", 0.8).passed is passed
+    judged = of_currents(twin.cell, twin.folder, AS_MODELLED, 0.8)
+    assert judgement_of(judged).passed is passed
 
 
 @pytest.mark.parametrize(
@@ -263,17 +267,18 @@ def test_an_unstable_servo_is_named_with_commands_that_work(
 
 def test_a_motion_beyond_a_speed_limit_is_no_completed_one(designed: Campaign) -> None:
     plain = CampaignFolder(designed.folder.rehearsed / "plain")
-    assert of_motions(designed.cell, plain, "plain", "").passed
+    assert judgement_of(of_motions(designed.cell, plain, AS_MODELLED, "")).passed
     velocity = [0.7 * speed for speed in designed.cell.file.limits.velocity_deg]
     slow = designed.cell.with_values({"limits.velocity_deg": velocity})
-    criterion = of_motions(slow, plain, "plain", "")
+    criterion = criterion_record(of_motions(slow, plain, AS_MODELLED, ""), slow)
     assert not criterion.passed
     assert "of its speed limit" in criterion.sentence and "hil plot" in criterion.sentence
 
 
 def test_a_refused_motion_names_the_tables_to_correct(designed: Campaign) -> None:
     plain = CampaignFolder(designed.folder.rehearsed / "plain")
-    sentence = of_motions(designed.cell, plain, "plain", "move 2 was refused").sentence
+    failed = of_motions(designed.cell, plain, "plain", "move 2 was refused")
+    sentence = criterion_record(failed, designed.cell).sentence
     assert "plain: move 2 was refused: correct the cause, by [limits]" in sentence
     for table in ("[drive_train]", "[nominal]", "[controller]", "[simulation]"):
         assert table in sentence
