@@ -25,6 +25,7 @@ from .gates import require_as_rehearsed, require_dry_run, require_gates
 from .motion_runner import RunArchives, Runner, RunOptions
 from .operator import RunWatch
 from .quality import Rejected
+from .quality_messages import replaced_words
 from .state import CampaignState
 from .warm_up_stage import WarmUpStage
 
@@ -68,7 +69,8 @@ class RunResult:
 
     def to_dict(self) -> dict[str, Any]:
         """Return the result for JSON."""
-        return asdict(self)
+        rejected = [{"archive": each.archive, "reason": each.reason} for each in self.rejected]
+        return {**asdict(self), "rejected": rejected}
 
 
 def run_motions(
@@ -241,6 +243,7 @@ class _CampaignRun:
         archives = self._archives
         dry_run = self._dry_run.record()
         precision = campaign.precision
+        replaced = archives.review.replaced
         return RunResult(
             campaign=str(campaign.folder.root),
             command=campaign.folder.run_command,
@@ -261,7 +264,7 @@ class _CampaignRun:
                 *archives.notes,
                 *(f"dry run: {text}" for text in (() if dry_run is None else dry_run.warnings)),
                 *self._warm_up.notes,
-                *archives.review.notes,
+                *(() if replaced is None else (replaced_words(replaced),)),
                 *self._watch.problems,
             ),
         )

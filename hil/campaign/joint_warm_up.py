@@ -142,11 +142,11 @@ class WarmUpRecord:
             f"below {percentage(self.threshold, 2)} the arm is warm: {self.outcome}"
         )
 
-    def rested(self, now: float) -> str:
-        """Return how long the arm has rested, as the beginning of a sentence."""
+    def rest_before(self, now: float) -> float | None:
+        """Return how long the arm has rested [s]; None if that is unknown."""
         if self.moved_at is None or now < self.moved_at:
-            return "the arm had rested for an unknown time"
-        return f"the arm had rested for {(now - self.moved_at) / 60.0:.0f} min"
+            return None
+        return now - self.moved_at
 
 
 def change_per_motion(friction: Sequence[Array] | Array) -> float:

@@ -33,7 +33,9 @@ from .dry_run_record import MAX_DRY_RUN_OVERRIDE, SIMULATED, yes_or_no
 from .errors import RepetitionsRejectedError
 from .folder import CampaignFolder
 from .operator import ExpectedMotion, RunWatch
-from .quality import ArchiveReview, QualityProblem
+from .quality import ArchiveReview
+from .quality_messages import problem_words
+from .quality_problems import QualityProblem
 from .state import CampaignState
 
 
@@ -252,10 +254,10 @@ class Runner:
             if problem is None:
                 return name
             self._watch.expect([ExpectedMotion(motion.trajectory.duration)])
+            reasons.append(problem_words(problem))
             self._reporter.say(
-                f"{motion} ({name}) is rejected: {problem.sentence}; the motion is run again"
+                f"{motion} ({name}) is rejected: {reasons[-1]}; the motion is run again"
             )
-            reasons.append(problem.sentence)
         raise RepetitionsRejectedError(str(motion), reasons)
 
     def go_back(self, most: float = 1.0) -> None:

@@ -11,7 +11,7 @@ from collections.abc import Callable, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Final
+from typing import Final, Literal
 
 import numpy as np
 
@@ -28,15 +28,28 @@ from hil.control.slips import slip_of
 from identification.distributions import MAD_TO_STD
 from identification.signals.noise import STANDSTILL_WINDOW_SECONDS
 from identification.signals.recording import stuck
-from identification.text import percentage
 from planner import FourierSeries, PiecewiseCubic
 
 from .folder import CampaignFolder
+from .quality_messages import problem_words
+from .quality_problems import (
+    MAX_MISSED_SHARE,
+    HeldOrSlowed,
+    IncompleteArchive,
+    MissedPackets,
+    MovedAtRest,
+    OtherRepetition,
+    OthersAgree,
+    QualityProblem,
+    ReplacedRepetitions,
+    SaturatedCurrent,
+    Slipped,
+    StuckJoint,
+)
 
 _SENT: Final = ("commanded_position", "commanded_velocity")
 FIELDS: Final = ("cycle", "gap", "position", "target_current", *_SENT)
 """Columns of an archive that are checked."""
-MAX_MISSED_SHARE: Final = 0.01  # Largest share of missed packets
 MAX_PATH_DEVIATION: Final = 1e-4
 """Largest distance of set-point and plan, rad; float32 targets are exact to 2e-6."""
 SATURATION_SHARE: Final = 0.98  # Share of the current limit from which a current is saturated
@@ -44,12 +57,12 @@ MIN_SATURATED_CYCLES: Final = 3  # Saturated cycles in a row that are more than 
 COMPARED_REPETITIONS: Final = 9  # Earlier repetitions that a new one is compared with
 # Earlier repetitions from which the bounds follow their own scatter
 MIN_REPETITIONS_FOR_SCATTER: Final = 4
-_CHANNELS: Final = (
-    ("position", "the following-error threshold", 0.05, 0.005),
-    ("current", "its rms current", 0.1, 0.02),
+_CHANNELS: Final[tuple[tuple[Literal["position", "current"], float, float], ...]] = (
+    ("position", 0.05, 0.005),
+    ("current", 0.1, 0.02),
 )
-"""Quantity; its scale; share of it by which the first repetitions may differ (rms); and the least
-bound of later ones."""
+"""Quantity; share of following-error threshold or rms current by which the first repetitions may
+differ (rms); and the least bound of later ones."""
 # Least bound as a multiple of the median difference of the earlier ones
 _MIN_BOUND_FACTOR: Final = 3.0
 _OUTLIER_SIGMAS: Final = 6.0  # Robust standard deviations above the median difference
@@ -57,21 +70,6 @@ _MIN_ALIKE_REPETITIONS: Final = 2
 """Least number of attempts that agree with each other before the first repetition is rejected."""
 
 Motion = PiecewiseCubic | FourierSeries
-
-
-@dataclass(frozen=True)
-class QualityProblem:
-    """Why a motion is rejected.
-
-    Attributes:
-        differs: whether its only problem is a difference from the repetitions before it.
-    """
-
-    sentence: str
-    differs: bool = False
-
-    def __str__(self) -> str:
-        return self.sentence
 
 
 @dataclass(frozen=True, eq=False)
@@ -119,25 +117,18 @@ def problem_of(executed: Executed, trajectory: Motion, cell: Cell) -> QualityPro
         return problem
     cycles = int(np.ceil(trajectory.duration / cell.period - 1e-6))
     if executed.missed > MAX_MISSED_SHARE * cycles:
-        return QualityProblem(
-            f"{executed.missed} of {cycles} packets were missed; {percentage(MAX_MISSED_SHARE)} are"
-            " allowed"
-        )
+        return MissedPackets(executed.missed, cycles)
     high = np.abs(executed.current) >= SATURATION_SHARE * cell.drive_train.current_limit
     for joint, name in enumerate(cell.joint_names):
         standstill = stuck(executed.position[:, joint], executed.commanded[:, joint])
         if standstill is not None:
             start, travel = standstill
-            return QualityProblem(
-                f"{name} is stuck: its position does not change from {start * cell.period:.2f} s "
-                f"after the start on while it is commanded to move by {travel:.3g} rad"
-            )
+            return StuckJoint(name, start * cell.period, travel)
     for name, column in zip(cell.joint_names, high.T, strict=True):
         edges = np.flatnonzero(np.diff(column.astype(np.int8), prepend=0, append=0))
         longest = int((edges[1::2] - edges[::2]).max(initial=0))
         if longest >= MIN_SATURATED_CYCLES:
-            lasted = f"{longest * cell.period * 1e3:.0f} ms"
-            return QualityProblem(f"the current of {name} was at its limit for {lasted}")
+            return SaturatedCurrent(name, longest * cell.period)
     return None
 
 
@@ -148,17 +139,13 @@ def incomplete_or_slowed(
     cycles = int(np.ceil(trajectory.duration / cell.period - 1e-6))
     rows = len(executed.commanded)
     if rows < cycles - 1:
-        return QualityProblem(f"{rows} of its {cycles} cycles are archived")
+        return IncompleteArchive(rows, cycles)
     times = np.minimum(np.arange(rows) * cell.period, trajectory.duration)
     off = executed.commanded - trajectory.sample(times)[0]
     off = np.abs(off - off[0]).max(axis=1)
     if off.max() <= MAX_PATH_DEVIATION:
         return None
-    at = int(np.argmax(off > MAX_PATH_DEVIATION)) * cell.period
-    return QualityProblem(
-        f"it was held or slowed about {at:.1f} s after its start, so it is no repetition; leave "
-        "the override at 100 %"
-    )
+    return HeldOrSlowed(int(np.argmax(off > MAX_PATH_DEVIATION)) * cell.period)
 
 
 def moving_arm(executed: Executed, _trajectory: Motion, cell: Cell) -> QualityProblem | None:
@@ -172,10 +159,7 @@ def moving_arm(executed: Executed, _trajectory: Motion, cell: Cell) -> QualityPr
     joint = int(np.argmax(speed / allowed))
     if speed[joint] <= allowed[joint]:
         return None
-    return QualityProblem(
-        f"{cell.joint_names[joint]} moved at {speed[joint]:.2g} rad/s while the arm was to stand "
-        f"still; at most {allowed[joint]:.2g} rad/s are allowed"
-    )
+    return MovedAtRest(cell.joint_names[joint], float(speed[joint]), float(allowed[joint]))
 
 
 _JUDGES: Final = {
@@ -214,7 +198,7 @@ class RepetitionCheck:
             return problem
         new = self._difference(executed)
         past = np.array(self._differences)
-        for row, (what, scale, first, least) in enumerate(_CHANNELS):
+        for row, (quantity, first, least) in enumerate(_CHANNELS):
             bound = np.full(len(new[row]), first)
             if len(past) >= MIN_REPETITIONS_FOR_SCATTER - 1:
                 middle = np.median(past[:, row], axis=0)
@@ -223,11 +207,12 @@ class RepetitionCheck:
                 bound = np.maximum(usual, least)
             joint = int(np.argmax(new[row] / bound))
             if new[row, joint] > bound[joint]:
-                return QualityProblem(
-                    f"the {what} of {self._cell.joint_names[joint]} differs from the "
-                    f"{len(self._earlier)} repetitions before by {percentage(new[row, joint], 2)} "
-                    f"of {scale} (rms); {percentage(bound[joint], 2)} are allowed",
-                    differs=True,
+                return OtherRepetition(
+                    quantity,
+                    self._cell.joint_names[joint],
+                    repetitions=len(self._earlier),
+                    difference=float(new[row, joint]),
+                    allowed=float(bound[joint]),
                 )
         return None
 
@@ -258,10 +243,15 @@ def following_threshold(cell: Cell) -> Array:
 
 @dataclass(frozen=True)
 class Rejected:
-    """A completed motion that was rejected: file name of its archive, and the reason."""
+    """A completed motion that was rejected: file name of its archive, and why."""
 
     archive: str
-    reason: str
+    problem: QualityProblem
+
+    @property
+    def reason(self) -> str:
+        """Why, as its archive and the manifest state it."""
+        return problem_words(self.problem)
 
 
 class ArchiveReview:
@@ -272,7 +262,7 @@ class ArchiveReview:
     Attributes:
         rejected: archives that failed their check.
         adopted: archives of an earlier run that was killed before it entered them.
-        notes: what a reader must know.
+        replaced: accepted repetitions that this run rejected, None for none.
     """
 
     def __init__(self, folder: CampaignFolder, cell: Cell, motion: Motion) -> None:
@@ -283,7 +273,7 @@ class ArchiveReview:
         self._check.learn(folder.completed("excitation"))
         self.rejected: list[Rejected] = []
         self.adopted: list[str] = []
-        self.notes: list[str] = []
+        self.replaced: ReplacedRepetitions | None = None
 
     def enter(
         self, motion: CampaignMotion, name: str, stated_problem: QualityProblem | None = None
@@ -301,7 +291,7 @@ class ArchiveReview:
             if executed is not None:
                 self._check.accept(executed)
             return None
-        self._reject(name, problem.sentence)
+        self._reject(name, problem)
         return problem
 
     def adopt(
@@ -327,7 +317,7 @@ class ArchiveReview:
             if archive.complete and completed and made(archive.header):
                 self.adopted.append(name)
                 slip = slip_of(self._folder.archives / name)
-                self.enter(motion, name, QualityProblem(slip) if slip else None)
+                self.enter(motion, name, None if slip is None else Slipped(slip))
 
     def _judged(self, executed: Executed) -> QualityProblem | None:
         """Return the problem of a repetition, None for none.
@@ -339,7 +329,7 @@ class ArchiveReview:
         """
         problem = self._check.problem(executed)
         accepted = [path.name for path in self._folder.completed("excitation")]
-        if problem is None or not problem.differs or not accepted or self.notes:
+        if not isinstance(problem, OtherRepetition) or not accepted or self.replaced:
             return problem
         several = len(accepted) > 1
         if several and (executed.missed or not all(map(self._has_missed, accepted))):
@@ -348,31 +338,20 @@ class ArchiveReview:
         enough = max(_MIN_ALIKE_REPETITIONS, self._cell.campaign.bad_repetitions, len(accepted))
         if len(alike) + 1 < max(enough, with_accepted + 2):
             return problem
-        attempts = ", ".join(alike)
-        reason = f"{attempts} and the next repetition agree with each other, not with this"
-        if several:
-            reason += ": packets were missed in it, and none in the other recordings"
         for name in accepted:
-            self._reject(name, reason)
-        later = f"{len(alike) + 1} later ones agree with each other and not with"
-        self.notes.append(
-            f"packets were missed in {', '.join(accepted)}, all accepted ones; they were rejected "
-            f"because {later} them, in which none was missed: all of them were disturbed, or the "
-            f"arm was changed after them"
-            if several
-            else f"{accepted[0]} was the only accepted repetition, and was rejected because"
-            f" {later} it: it was disturbed, or the arm was changed after it"
-        )
+            self._reject(name, OthersAgree(tuple(alike), only_missed=several))
+        self.replaced = ReplacedRepetitions(tuple(accepted), len(alike) + 1)
         self._check = RepetitionCheck(self._cell, self._motion)
         return None
 
     def _has_missed(self, name: str) -> bool:
         return self._executed(name).missed > 0
 
-    def _reject(self, name: str, reason: str) -> None:
+    def _reject(self, name: str, problem: QualityProblem) -> None:
+        reason = problem_words(problem)
         amend_outcome(self._folder.archives / name, REJECTED, reason)
         self._folder.add(name, REJECTED, reason)
-        self.rejected.append(Rejected(name, reason))
+        self.rejected.append(Rejected(name, problem))
 
     def _alike(self, executed: Executed, *, without_missed: bool = False) -> tuple[list[str], int]:
         """Return attempts that agree with this one and each other, and how many with the accepted.

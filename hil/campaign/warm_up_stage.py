@@ -11,7 +11,8 @@ from hil.control.motions import CampaignMotion
 from .joint_warm_up import FrictionMeter, WarmUpRecord, drift_wanted
 from .motion_runner import RunArchives, Runner
 from .operator import ExpectedMotion, RunWatch
-from .quality import QualityProblem
+from .quality_messages import rest_words
+from .quality_problems import ColdStart
 from .state import CampaignState
 
 
@@ -86,12 +87,12 @@ class WarmUpStage:
         if self._cold(time.time()) is not None:
             self.run(runner)
 
-    def cold_start(self, began: float) -> QualityProblem | None:
+    def cold_start(self, began: float) -> ColdStart | None:
         """Return the problem of a repetition that began cold [s since 1970], as after a hold."""
         record = self._cold(began)
         if record is None:
             return None
-        return QualityProblem(f"{record.rested(began)} when it began and was assumed to be cold")
+        return ColdStart(record.rest_before(began))
 
     def motion_ended(self) -> None:
         """Record that a motion that warms the joints has ended."""
@@ -121,7 +122,7 @@ class WarmUpStage:
         """Return the warm-up to continue; a new one if the joints have cooled down."""
         state = self._state()
         if state.motions and state.cold(time.time()):
-            rested = state.rested(time.time())
+            rested = rest_words(state.rest_before(time.time()))
             self._reporter.say(f"{rested} and is assumed to be cold: warming up again")
             self._pauses.append(f"{rested} during the campaign, and was warmed up again")
             return state.cooled()

@@ -11,6 +11,9 @@ from drivers.events import Refused
 from hil.base.errors import ExecutionError, OperatorStopError, UnsafeError
 from hil.base.terminal_text import with_joint_names
 from hil.cell import AngleFrame, Cell
+from identification.signals.position_steps import PositionJump
+
+from .messages import slip_words
 
 
 class MotionRefusedError(UnsafeError):
@@ -56,8 +59,9 @@ class MotionFailedError(ExecutionError):
 class SlippedError(MotionFailedError):
     """A motion in which a measured position slipped: the arm is not where its encoders say."""
 
-    def __init__(self, motion: str, slip: str, archive: str) -> None:
-        super().__init__(motion, "rejected", slip, archive)
+    def __init__(self, motion: str, slip: PositionJump, archive: str) -> None:
+        super().__init__(motion, "rejected", slip_words(slip), archive)
+        self.slip = slip
         remedy = (
             "it is not used, and nothing else was moved. Check encoder, coupling, belt and "
             "brake of that joint, and its position at a known mark, before the arm moves again"

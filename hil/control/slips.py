@@ -23,6 +23,7 @@ from identification.signals.position_steps import PositionJump, position_jumps
 from identification.signals.recording import Recording
 
 from .errors import SlippedError
+from .messages import slip_words
 
 CHECKED_OUTCOMES: Final = ("completed", "stopped")
 """Outcomes of motions whose measured positions are checked; the others are failures already."""
@@ -31,8 +32,8 @@ NEIGHBOUR_CYCLES: Final = 3  # cycles on either side of a jump whose velocities 
 _FIELDS: Final = ("cycle", "gap", "position", "velocity")
 
 
-def slip_of(path: Path) -> str:
-    """Return the largest slip of a measured position in an archive, in a sentence; "" for none.
+def slip_of(path: Path) -> PositionJump | None:
+    """Return the largest slip of a measured position in an archive; None for none.
 
     Raises:
         ArchiveError: it cannot be read.
@@ -42,7 +43,7 @@ def slip_of(path: Path) -> str:
         recording = recording_of(archive)
     except ArchiveError:
         if path.exists() and not open_archive(path, fields=()).n_samples:
-            return ""  # nothing was recorded
+            return None  # nothing was recorded
         raise
     found = position_jumps(recording)
     velocity = archive.columns.get("velocity")
@@ -57,13 +58,7 @@ def slip_of(path: Path) -> str:
     found = [
         jump for jump in found if not (np.abs(disturbed - jump.time) < LOSS_MARGIN_SECONDS).any()
     ]
-    if not found:
-        return ""
-    largest = max(found, key=lambda jump: abs(jump.size))
-    return (
-        f"the measured position of {largest.joint} slipped by {np.degrees(abs(largest.size)):.2g}° "
-        f"{largest.time:.2f} s after the archive begins, which no motion of the arm explains"
-    )
+    return max(found, key=lambda jump: abs(jump.size), default=None)
 
 
 def require_no_slip(motion: str, path: Path) -> None:
@@ -73,8 +68,8 @@ def require_no_slip(motion: str, path: Path) -> None:
         SlippedError: it did.
         ArchiveError: the archive cannot be read, or changed.
     """
-    if slip := slip_of(path):
-        amend_outcome(path, REJECTED, slip)
+    if (slip := slip_of(path)) is not None:
+        amend_outcome(path, REJECTED, slip_words(slip))
         raise SlippedError(motion, slip, path.name)
 
 

@@ -265,7 +265,7 @@ class TestBlocks:
         information = np.tile(np.eye(k) / blocks, (blocks, 1, 1))
         solution = solve(NormalEquations(np.eye(k), scores.sum(axis=0)))
         clustered = cluster_covariance(information, scores, solution)
-        assert clustered.blocks == blocks // 2
+        assert clustered.blocks.count == blocks // 2
         assert np.trace(clustered.covariance) / k == pytest.approx(1.0 + 2.0 * shared, rel=0.05)
 
     def test_blocks_grow_with_the_correlation_of_the_scores(self):

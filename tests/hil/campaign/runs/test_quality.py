@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Collection, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Final
+from unittest.mock import ANY
 
 import numpy as np
 import pytest
@@ -20,6 +22,13 @@ from hil.campaign.errors import (
     RepetitionsRejectedError,
 )
 from hil.campaign.quality import FIELDS, Executed, RepetitionCheck
+from hil.campaign.quality_problems import (
+    IncompleteArchive,
+    MissedPackets,
+    OtherRepetition,
+    SaturatedCurrent,
+    StuckJoint,
+)
 from hil.campaign.campaign_run import RunResult
 from hil.control.motion_watch import OperatorRequest
 from hil.control.simulated_cell import controller_settings, simulated_controller
@@ -143,11 +152,10 @@ def played(archive: Path) -> Executed:
 
 
 @pytest.mark.parametrize(
-    ("channel", "joint", "named"),
-    [("position", 1, "position of elbow"), ("current", 0, "current of shoulder")],
+    ("channel", "joint", "name"), [("position", 1, "elbow"), ("current", 0, "shoulder")]
 )
 def test_the_check_lets_noise_pass_and_names_what_differs(
-    undisturbed: Campaign, channel: str, joint: int, named: str
+    undisturbed: Campaign, channel: str, joint: int, name: str
 ) -> None:
     check = RepetitionCheck(undisturbed.cell, undisturbed.plan.excitation.trajectory)
     *earlier, last = (played(path) for path in undisturbed.folder.completed("excitation"))
@@ -157,7 +165,10 @@ def test_the_check_lets_noise_pass_and_names_what_differs(
     assert check.problem(last) is None
     values = getattr(last, channel).copy()
     values[:, joint] += 0.2 * np.std(values[:, joint])
-    assert named in str(check.problem(replace(last, **{channel: values})))
+    problem = check.problem(replace(last, **{channel: values}))
+    assert isinstance(problem, OtherRepetition)
+    assert (problem.quantity, problem.joint, problem.repetitions) == (channel, name, len(earlier))
+    assert problem.difference > problem.allowed
 
 
 def test_a_truncated_stuck_or_saturated_motion_is_named(undisturbed: Campaign) -> None:
@@ -174,17 +185,18 @@ def test_a_truncated_stuck_or_saturated_motion_is_named(undisturbed: Campaign) -
     current[100:102, 1] = limit
     saturated[100:105, 1] = -limit
     few, many = (round(share * len(good.position)) for share in (0.005, 0.03))
-    for changes, message in (
+    duration = undisturbed.plan.excitation.trajectory.duration
+    cycles = math.ceil(duration / undisturbed.cell.period)
+    for changes, expected in (
         ({}, None),
-        (short, "cycles are archived"),
+        (short, IncompleteArchive(400, cycles)),
         ({"missed": few}, None),
-        ({"missed": many}, "packets were missed"),
-        ({"position": position}, "elbow is stuck: its position does not change from 0.20 s"),
+        ({"missed": many}, MissedPackets(many, cycles)),
+        ({"position": position}, StuckJoint("elbow", 0.2, ANY)),
         ({"current": current}, None),
-        ({"current": saturated}, "current of elbow was at its limit for 10 ms"),
+        ({"current": saturated}, SaturatedCurrent("elbow", 0.01)),
     ):
-        problem = check.problem(replace(good, **changes))
-        assert problem is None if message is None else message in str(problem)
+        assert check.problem(replace(good, **changes)) == expected
 
 
 class TestMissedPackets:
