@@ -15,6 +15,7 @@ from hil.base.progress import Reporter
 from hil.base.safe_input import parse_json, read_text
 from hil.cell import Cell
 from hil.control.errors import MotionRefusedError
+from hil.control.messages import refusal_words
 from hil.control.motion_checks import MotionChecks, planned
 from hil.control.motions import moves_from_dict, moves_to_dict
 from hil.design import DesignSettings, preset, run_search
@@ -161,8 +162,8 @@ def plan_around(
         NoExcitationError: no validation motion satisfies the constraints.
     """
     checks = checks or MotionChecks.of(cell)
-    problem = checks.refusal(excitation.trajectory)
-    if problem is not None:
+    if (refusal := checks.refusal(excitation.trajectory)) is not None:
+        problem = refusal_words(refusal, checks.frame)
         raise MotionRefusedError("the excitation", problem, "design another motion")
     # A design may be judged by some parameters only; the plan has the criteria over all of them.
     criteria = Objective(cell.model).criteria(excitation.trajectory, RESCORE_PERIOD)

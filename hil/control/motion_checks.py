@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import Final, Self
+from typing import Final, Self, get_args
 
 import numpy as np
 
-from drivers.init_check import float32_text, is_narrower
+from drivers.init_check import is_narrower
 from hil.base.arrays import Array
 from hil.cell import AngleFrame, Cell, CellError
 from identification.excitation import (
@@ -17,63 +17,41 @@ from identification.excitation import (
     MissingMeshError,
     Violation,
     check_motion,
-    messages,
 )
-from identification.excitation.violation import CloseBodies, JointQuantity, LoadedDrive
+from identification.excitation.violation import CloseBodies, LoadedDrive
 from planner import FourierSeries, JointLimits, NotSmooth, PiecewiseCubic
 from planner.piecewise_cubic import check_rest, check_smooth
 
-_UNITS: Final = {
-    "position": " deg",
-    "velocity": " deg/s",
-    "acceleration": " deg/s²",
-    "jerk": " deg/s³",
-}
+from .motion_refusals import (
+    MAX_MOTION_SECONDS,
+    MAX_SINES,
+    BrokenConstraint,
+    FixedDistance,
+    MotionRefusal,
+    NarrowerLimit,
+    NoRamp,
+    NotFinite,
+    OtherJointCount,
+    Rate,
+    TooLong,
+    TooManySines,
+)
+
 _MIN_DISTANCE_CHANGE: Final = 0.01
 """Change of a distance below which no motion changes it, m."""
 
 
-def violation_text(violation: Violation, frame: AngleFrame) -> str:
-    """Return a violation in degrees, in the frame of the cell's limits."""
-    joints = frame.text_of_angles(violation.posture) if violation.posture else ""
-    subject = violation.subject
-    if not isinstance(subject, JointQuantity):
-        return messages.violation_text(violation, joints)
-    joint = subject.joint
-    # The magnitude of a rate is the same in any frame.
-    is_position = subject.quantity == "position"
-    sign, zero = (frame.sign[joint], frame.offset[joint]) if is_position else (1.0, 0.0)
-    value, bound = (
-        float(np.degrees(sign * number + zero)) for number in (violation.value, violation.bound)
-    )
-    shown = replace(violation, value=value, bound=bound)
-    where = f" at the {subject.end}" if subject.end else ""
-    name = f"{subject.quantity} of J{joint + 1}{where}"
-    return messages.violation_text(shown, joints, _UNITS[subject.quantity], name)
-
-
-def always_so(violation: Violation, checker: CollisionChecker) -> str | None:
-    """Return the remedy for a pair that is too close in any posture; None for other violations."""
+def fixed_distance(violation: Violation, checker: CollisionChecker) -> FixedDistance | None:
+    """Return the pair of a violation that is too close in any posture; None for others."""
     pair = violation.subject
     if not isinstance(pair, CloseBodies) or (pair.first, pair.second) not in checker.pairs:
         return None
     nearest, farthest = checker.spread(pair.first, pair.second)
     if farthest - nearest > _MIN_DISTANCE_CHANGE:
         return None
-    message = (
-        f"{pair.first} and {pair.second} are {nearest:.3f} to {farthest:.3f} m apart in any posture"
-    )
-    if nearest >= violation.bound:
-        return f"{message}, too close to contact to be resolved; narrow [workspace] margin"
-    if nearest > 0.0:
-        return f"{message}; [workspace] margin must be below that"
-    return f"{message}: they overlap; correct their collision shapes in the URDF"
+    return FixedDistance(pair.first, pair.second, nearest, farthest, violation.bound)
 
 
-MAX_MOTION_SECONDS: Final = 600.0
-"""Longest motion, s: checks take time and memory in proportion, and a failed motion is repeated."""
-MAX_SINES: Final = 20
-"""Most sines per joint, as in a design."""
 USABLE_CURRENT_SHARE: Final = 0.8
 """Share of a motor's current limit in planning and rehearsal. The rest is for noise and the control
 error of the servo. Before a motion is sent, the full limit counts."""
@@ -112,49 +90,44 @@ class MotionChecks:
         currents = replace(self.currents, current_limit=np.where(below, controller_limits, ours))
         return replace(self, currents=currents, cell_limit=ours)
 
-    def refusal(self, trajectory: PiecewiseCubic | FourierSeries) -> str | None:
+    def refusal(self, trajectory: PiecewiseCubic | FourierSeries) -> MotionRefusal | None:
         """Return why a motion must not be sent, or None."""
         if trajectory.n_joints != self.limits.n_joints:
-            return f"it is for {trajectory.n_joints} joints, the arm has {self.limits.n_joints}"
+            return OtherJointCount(trajectory.n_joints, self.limits.n_joints)
         unsupported = _unsupported(trajectory)
         if unsupported is not None:
             return unsupported
         with np.errstate(over="ignore", invalid="ignore"):  # what overflows is refused
             return self._refusal(trajectory)
 
-    def _refusal(self, trajectory: PiecewiseCubic | FourierSeries) -> str | None:
+    def _refusal(self, trajectory: PiecewiseCubic | FourierSeries) -> MotionRefusal | None:
         try:
             if isinstance(trajectory, FourierSeries):
                 check_rest(trajectory, self.limits)
             else:
                 check_smooth(trajectory, self.limits)
         except NotSmooth as error:
-            return str(error)
+            return error
         # First the quick checks.
         violations = check_motion(trajectory, self.limits) or check_motion(
             trajectory, self.limits, checker=self.checker, currents=self.currents
         )
-        return self._sentence(violations[0]) if violations else None
+        if not violations:
+            return None
+        violation = violations[0]
+        subject = violation.subject
+        narrower = None
+        if isinstance(subject, LoadedDrive) and subject.is_motor:
+            narrower = self._narrower(subject.joint)
+        return BrokenConstraint(violation, fixed_distance(violation, self.checker), narrower)
 
-    def _sentence(self, violation: Violation) -> str:
-        text = violation_text(violation, self.frame)
-        remedy = always_so(violation, self.checker)
-        if isinstance(violation.subject, LoadedDrive) and violation.subject.is_motor:
-            text += self._whose_limit(violation.subject.joint)
-        return text if remedy is None else f"{text}; {remedy}"
-
-    def _whose_limit(self, joint: int) -> str:
-        """Return the remedy for the motor of a joint if its limit is the controller's."""
+    def _narrower(self, joint: int) -> NarrowerLimit | None:
+        """Return the limits of the motor of a joint if the controller's counts."""
         if self.cell_limit is None:
-            return ""
-        ours = self.cell_limit[joint]
-        theirs = self.currents.current_limit[joint]
-        if theirs == ours:
-            return ""
-        return (
-            f"; the controller has {float32_text(theirs)} A as the limit of that motor, the "
-            f"cell file {ours:.9g} A: write the controller's into [drive_train] current_limit"
-        )
+            return None
+        ours = float(self.cell_limit[joint])
+        theirs = float(self.currents.current_limit[joint])
+        return None if theirs == ours else NarrowerLimit(theirs, ours)
 
 
 def collision_checker(cell: Cell) -> CollisionChecker:
@@ -217,19 +190,19 @@ def planned(currents: CurrentModel) -> CurrentModel:
     return replace(currents, usable=USABLE_CURRENT_SHARE)
 
 
-def _unsupported(trajectory: PiecewiseCubic | FourierSeries) -> str | None:
+def _unsupported(trajectory: PiecewiseCubic | FourierSeries) -> MotionRefusal | None:
     """Return why a motion cannot be checked, or None."""
     if not trajectory.duration <= MAX_MOTION_SECONDS:
-        return f"it lasts {trajectory.duration:.6g} s; at most {MAX_MOTION_SECONDS:g} s are allowed"
+        return TooLong(trajectory.duration)
     if not isinstance(trajectory, FourierSeries):
         return None
     if trajectory.ramp == 0.0:
-        return "its sines begin and end at full speed; give them a ramp"
+        return NoRamp()
     sines = trajectory.amplitude.shape[1]
     if sines > MAX_SINES:
-        return f"it has {sines} sines for each joint; at most {MAX_SINES} are allowed"
-    for quantity, order in (("velocity", 1), ("acceleration", 2), ("jerk", 3)):
+        return TooManySines(sines)
+    for order, quantity in enumerate(get_args(Rate), 1):
         endless = np.flatnonzero(~np.isfinite(trajectory.derivative_bound(order)))
         if len(endless):
-            return f"the {quantity} of joint {int(endless[0])} is not finite"
+            return NotFinite(quantity, int(endless[0]))
     return None

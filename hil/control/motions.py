@@ -13,6 +13,7 @@ from hil.archive.header import motion_name
 from hil.base.arrays import Array
 from hil.cell import AngleFrame, Cell
 from hil.control.errors import MotionRefusedError
+from hil.control.messages import refusal_words
 from hil.control.motion_checks import MotionChecks
 from planner import (
     FourierSeries,
@@ -147,7 +148,7 @@ class CheckedMoves:
         go(home)
         go(where)
         for previous, after in pairwise(joined):
-            _require(after, _jump(previous, after))
+            _require_joined(previous, after)
         return joined
 
 
@@ -157,7 +158,8 @@ def require_allowed(motions: Sequence[CampaignMotion], checks: MotionChecks) -> 
     for motion in motions:
         different.setdefault(id(motion.trajectory), motion)
     for motion in different.values():
-        _require(motion, checks.refusal(motion.trajectory))
+        if (refusal := checks.refusal(motion.trajectory)) is not None:
+            raise _refused(motion, refusal_words(refusal, checks.frame))
 
 
 def player_of(cell: Cell, trajectory: PiecewiseCubic | FourierSeries) -> TrajectoryPlayer:
@@ -210,29 +212,28 @@ def straight_move(
     return CampaignMotion("move", 0, motion.trajectory, PlanFile.of(motion, cell.joint_names))
 
 
-def _require(motion: CampaignMotion, problem: str | None) -> None:
-    if problem is None:
-        return
+def _refused(motion: CampaignMotion, problem: str) -> MotionRefusedError:
     remedy = "design another motion"
     if motion.from_arm:
         remedy = "jog the arm to a posture from which the straight path to the motion is free"
     elif motion.kind == "standstill":
         remedy = "correct home_deg or standstill_s in [campaign], or [workspace], of the cell file"
-    raise MotionRefusedError(str(motion), problem, remedy)
+    return MotionRefusedError(str(motion), problem, remedy)
 
 
-def _jump(previous: CampaignMotion, after: CampaignMotion) -> str | None:
-    """Return why `after` cannot follow `previous`, None if it begins where that ends."""
+def _require_joined(previous: CampaignMotion, after: CampaignMotion) -> None:
+    """Require that a motion begins where the one before it ends (MotionRefusedError)."""
     end = previous.ends[1]
     start = after.ends[0]
     distance = np.abs(start - end)
     if np.max(distance) <= START_TOLERANCE:
-        return None
+        return
     joint = int(np.argmax(distance))
-    return (
+    problem = (
         f"it begins with joint {joint + 1} at {start[joint]:.6g} rad, but {previous} ends at "
         f"{end[joint]:.6g} rad"
     )
+    raise _refused(after, problem)
 
 
 def moves_to_dict(moves: PlanFile | None) -> dict[str, Any]:

@@ -15,6 +15,7 @@ from hil.cell import AngleFrame, Cell
 from hil.control.connection import active_checks
 from hil.control.errors import MotionRefusedError
 from hil.control.link import MotionLink
+from hil.control.messages import refusal_words
 from hil.control.motion_checks import MotionChecks
 from hil.control.motion_watch import MotionWatch, Stop, unwatched_motion
 from hil.control.motions import CampaignMotion, moves_to_dict, player_of, straight_move
@@ -211,6 +212,7 @@ def send(
 
 
 def _require(checks: MotionChecks, trajectory: PiecewiseCubic | FourierSeries) -> None:
-    if (problem := checks.refusal(trajectory)) is not None:
+    if (refusal := checks.refusal(trajectory)) is not None:
+        problem = refusal_words(refusal, checks.frame)
         remedy = "reduce the speed, move via another posture, or jog the arm"
         raise MotionRefusedError("the motion", problem, remedy)

@@ -15,7 +15,7 @@ from hil.base.progress import Reporter
 from hil.base.safe_input import open_file
 from hil.base.toml_text import to_text
 from hil.cell import AngleFrame, Cell
-from hil.control.motion_checks import violation_text
+from hil.control.messages import violation_text
 from identification import excitation
 from identification.excitation.collision_messages import unchecked_text
 from identification.text import duration_text

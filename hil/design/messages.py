@@ -8,7 +8,9 @@ from typing import Final
 
 from hil.base.errors import UnsafeError
 from hil.cell import AngleFrame
-from hil.control.motion_checks import always_so, violation_text
+from hil.control.messages import fixed_words, violation_text
+from hil.control.motion_checks import fixed_distance
+from hil.control.motion_refusals import FixedDistance
 from identification import excitation
 from identification.model.kinematics import Chain
 
@@ -61,9 +63,9 @@ def no_excitation(
         chain: of the arm; one of several arms is advised to be designed for one.
     """
     contact = error.nearest.get("collision")
-    always = None if contact is None or checker is None else always_so(contact, checker)
+    fixed = None if contact is None or checker is None else fixed_distance(contact, checker)
     of_arms = None if chain is None else advice_on_branches(chain)
-    advice = "; ".join([*filter(None, [of_arms]), *_advice(error, settings, always)])
+    advice = "; ".join([*filter(None, [of_arms]), *_advice(error, settings, fixed)])
     text = infeasible_text(error, frame)
     return NoExcitationError(f"{text}. Possible changes: {advice}" if advice else text)
 
@@ -102,13 +104,14 @@ def _branch(chain: Chain, end: int) -> set[int]:
 
 
 def _advice(
-    error: excitation.NoFeasibleMotionError, settings: DesignSettings, always: str | None
+    error: excitation.NoFeasibleMotionError, settings: DesignSettings, fixed: FixedDistance | None
 ) -> Iterator[str]:
     """Yield remedies for the constraints that exclude more than half, or most, of the motions."""
     kinds = sorted(error.rejected, key=lambda kind: -error.rejected[kind])
     ruling = [kind for kind in kinds if 2 * error.rejected[kind] > error.tried]
     for kind in ruling or kinds[:1]:
-        yield always if kind == "collision" and always is not None else _REMEDIES[kind]
+        collides = fixed if kind == "collision" else None
+        yield _REMEDIES[kind] if collides is None else fixed_words(collides)
     if error.unexciting:
         more = "via points" if settings.sines is None else "harmonics, or a longer motion,"
         yield f"use more {more} or fewer parameters ([objective] parameters)"

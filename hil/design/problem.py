@@ -9,12 +9,12 @@ from numpy.typing import NDArray
 
 from hil.base.arrays import Array
 from hil.cell import AngleFrame, Cell
+from hil.control.messages import fixed_words, violation_text
 from hil.control.motion_checks import (
-    always_so,
     collision_checker,
     current_model,
+    fixed_distance,
     planned,
-    violation_text,
 )
 from identification.excitation import (
     CollisionChecker,
@@ -114,7 +114,8 @@ def _require_start(
     exceeded = currents.check(Motion.at_rest(posture[None])) if currents else []
     if checker is not None and contact is not None:
         reason = violation_text(contact, frame)
-        remedy = always_so(contact, checker) or f"correct [workspace] or {setting}"
+        fixed = fixed_distance(contact, checker)
+        remedy = f"correct [workspace] or {setting}" if fixed is None else fixed_words(fixed)
     elif exceeded:
         worst = replace(max(exceeded, key=lambda violation: violation.excess), time=None)
         reason = f"at rest there, {violation_text(worst, frame)}"

@@ -38,6 +38,7 @@ from hil.cell.cell import ASSUMED_PAYLOAD
 from hil.cell.schema import CellFile
 from hil.control.errors import MotionRefusedError
 from hil.control.link import MotionLink
+from hil.control.messages import refusal_words
 from hil.control.motion_checks import MotionChecks
 from hil.control.motion_watch import Stop
 from hil.control.simulated_cell import simulated_link
@@ -454,13 +455,14 @@ def loaded_cell(cell: Cell, name: str, assumed: Payload) -> Cell:
 
 def _require_allowed(cell: Cell, plan: CampaignPlan, name: str, assumed: Payload) -> None:
     """Refuse a motion that breaks a limit with the payload (MotionRefusedError)."""
-    problem = MotionChecks.of(cell).refusal(plan.excitation.trajectory)
-    if problem is None:
+    checks = MotionChecks.of(cell)
+    refusal = checks.refusal(plan.excitation.trajectory)
+    if refusal is None:
         return
     centre = ", ".join(f"{part:g}" for part in assumed.centre)
     raise MotionRefusedError(
         f"the motion with {name} (assumed: {assumed.mass:g} kg at {centre} m in {assumed.frame})",
-        problem,
+        refusal_words(refusal, checks.frame),
         f"design one with it (hil design --for payload {payload_options(assumed)})",
     )
 

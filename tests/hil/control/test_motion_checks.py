@@ -11,12 +11,14 @@ import pytest
 
 from hil.cell import AngleFrame, Cell, CellError
 from hil.cell.toml_edits import with_values
-from hil.control.motion_checks import MotionChecks, always_so, collision_checker, violation_text
+from hil.control.messages import fixed_words, violation_text
+from hil.control.motion_checks import MotionChecks, collision_checker, fixed_distance
+from hil.control.motion_refusals import BrokenConstraint, FixedDistance
 from hil.control.motions import rest
 from hil.design import preset, problem_of
 from hil.design.messages import NoExcitationError
 from identification.excitation import CollisionChecker, Violation, Workspace, messages
-from identification.excitation.violation import CloseBodies, JointQuantity
+from identification.excitation.violation import CloseBodies, JointQuantity, LoadedDrive
 from identification.model.motion import Motion
 from sim_fixtures.ns16 import CELL_PATH
 
@@ -104,22 +106,23 @@ def test_advice_on_a_margin_is_for_what_no_posture_parts(cell: Cell) -> None:
     checker = CollisionChecker(urdf, Workspace(floor=None, margin=0.005))
     assert checker.spread("a", "c") == pytest.approx((0.013, 0.013), abs=1e-6)
     contact = Violation("collision", CloseBodies("a", "c"), 0.013, 0.02, None, (0.0, 0.0, 0.0))
-    assert "0.013 to 0.013 m apart in any posture; [workspace] margin must be below" in str(
-        always_so(contact, checker)
-    )
+    fixed = fixed_distance(contact, checker)
+    assert fixed is not None
+    assert fixed == FixedDistance("a", "c", *checker.spread("a", "c"), required=0.02)
+    assert "0.013 to 0.013 m apart in any posture; [workspace] margin must be" in fixed_words(fixed)
     at_home = replace(contact, subject=CloseBodies("a", "c", at_home=True))
-    assert always_so(at_home, checker) == always_so(contact, checker)
+    assert fixed_distance(at_home, checker) == fixed
     deep = CollisionChecker(
         wrist(BALL.format(radius=0.1), "", BALL.format(radius=0.437)),
         Workspace(floor=None, margin=0.0),
     )
     assert deep.pairs == ()  # left out: always in contact
-    assert always_so(contact, deep) is None
+    assert fixed_distance(contact, deep) is None
     checker = collision_checker(cell)
     contact = Violation(
         "collision", CloseBodies("link_5", "floor"), -0.1, 0.05, None, tuple(cell.home)
     )
-    assert always_so(contact, checker) is None
+    assert fixed_distance(contact, checker) is None
 
 
 def test_a_robot_without_shapes_gets_the_file_and_a_remedy() -> None:
@@ -184,8 +187,9 @@ def test_gravity_beyond_a_torque_limit_is_refused(cell: Cell) -> None:
         torque[HELD] = share * held_torque(cell)
         refusal = MotionChecks.of(limited(cell, torque)).refusal(rest(cell.home, 1.0))
         assert (refusal is None) == (share > 1.0)
-    assert refusal is not None and refusal.startswith("torque of joint_3: ")
-    assert f"N·m, must be at most {torque[HELD]:.4g} N·m" in refusal
+    assert isinstance(refusal, BrokenConstraint)
+    assert refusal.violation.subject == LoadedDrive(HELD, "joint_3", is_motor=False)
+    assert refusal.violation.bound == pytest.approx(torque[HELD])
     torque[HELD] = 0.5 * held_torque(cell)
     with pytest.raises(NoExcitationError, match=r"torque of joint_3: .* N·m"):
         problem_of(limited(cell, torque), preset("b"))
