@@ -40,6 +40,7 @@ from hil.new import (
     from_init,
     read_init,
 )
+from hil.new.messages import note_lines
 
 PORT = 1000
 """Default UDP port of C4G Open."""
@@ -136,16 +137,17 @@ def new(
     made = replace(made, values=values)
     made = made.for_design() if design_only else made
     text, unknown = made.text(output)
+    notes = note_lines(made.values.notes)
     with convert_write_errors(output):
         output.parent.mkdir(parents=True, exist_ok=True)
         if made.urdf is not None:
             write_atomically(made.urdf_beside(output), made.urdf)
         write_atomically(output, text)
     if json:
-        summary = {"joints": made.joint_names, "unknown": unknown, "notes": made.values.notes}
+        summary = {"joints": made.joint_names, "unknown": unknown, "notes": notes}
         print_json({"cell": str(output), **summary})
         return
-    for note in made.values.notes:
+    for note in notes:
         say(wrapped(f"note: {note}"))
     say(wrapped(f"{output}: {len(made.joint_names)} joints ({', '.join(made.joint_names)})"))
     if unknown:

@@ -24,7 +24,7 @@ from hil.base.arrays import Array
 from hil.base.errors import InputError
 from hil.base.safe_input import read_input, read_text
 from hil.base.toml_text import comment_lines, inline
-from hil.cell.arms import MAX_NAMES, Links, joints_outside
+from hil.cell.arms import Links, joints_outside
 from hil.cell.errors import UNKNOWN, WHERE, models_of
 from hil.cell.gripper_names import gripper_joints, links_of
 from hil.cell.schema import CellFile
@@ -40,6 +40,19 @@ from identification.model.kinematics import (
 from identification.model.urdf_text import urdf_tree
 
 from .cell_values import ASSUMED, CellValues, assumed_for_design, clear_home, from_urdf
+from .messages import note_lines
+from .notes import (
+    CellNote,
+    FixedMimic,
+    FixedOutside,
+    FixedPrismatic,
+    GeometryOfArm,
+    GeometryOfTable,
+    GripperJoints,
+    LiftingJoints,
+    NoCollisionShapes,
+    SeveralBranches,
+)
 
 
 @contextmanager
@@ -197,7 +210,7 @@ class NewCell:
             sources=f"Its values are {origins}." if origins else "",
             joints=", ".join(f"{k} {name}" for k, name in enumerate(self.joint_names, 1)),
         )
-        notes = [_wrapped(f"Note: {note}") for note in self.values.notes]
+        notes = [_wrapped(f"Note: {note}") for note in note_lines(self.values.notes)]
         document = tomlkit.document()
         for line in comment_lines("\n".join([head, *notes])):
             document.add(line)
@@ -312,9 +325,9 @@ def _wrapped(text: str, mark: str = "") -> str:
 def cell_of_dh(path: Path, convention: Convention, fixed: Mapping[str, float]) -> NewCell:
     """Return the cell of a table of DH parameters, with a URDF to write, or raise InputError."""
     text = urdf_of_dh(path, convention)
-    note = "the URDF contains the geometry of the DH parameters only: no masses, no limits"
     made = _cell_of(path, text, fixed, moved=True)
-    return replace(made, urdf=made.urdf or text, values=CellValues(notes=(note,)) | made.values)
+    values = CellValues(notes=(GeometryOfTable(),)) | made.values
+    return replace(made, urdf=made.urdf or text, values=values)
 
 
 def cell_of_parameters(
@@ -322,12 +335,8 @@ def cell_of_parameters(
 ) -> NewCell:
     """Return the cell of DH parameters by name (`urdf_of_parameters`), with a URDF to write."""
     text = urdf_of_parameters(name, joints, parameters)
-    note = (
-        "the URDF contains the calibrated geometry that the arm states: no masses; one with masses "
-        "(--urdf) gives the estimate a prior"
-    )
     made = _cell_of(Path(name), text, {}, moved=True)
-    return replace(made, urdf=text, values=CellValues(notes=(note,)) | made.values)
+    return replace(made, urdf=text, values=CellValues(notes=(GeometryOfArm(),)) | made.values)
 
 
 def cell_of_urdf(
@@ -373,12 +382,12 @@ def cell_of_urdf(
     nearest = np.clip(0.0, limits.lower, limits.upper).tolist()
     arm = with_fixed(text, dict(zip(others, nearest, strict=True)))
     made = _cell_of(path, arm, fixed, moved=moved)
-    note = f"fixed, as they do not lie between {links}: {', '.join(others)}"
+    note = FixedOutside(links, tuple(others))
     return replace(made, urdf=made.urdf or arm, values=made.values | CellValues(notes=(note,)))
 
 
-def _note_on_gripper(fingers: Sequence[str], chain: Chain, text: str) -> str:
-    """Return a note on joints that seem to belong to a gripper."""
+def _gripper(fingers: Sequence[str], chain: Chain, text: str) -> GripperJoints:
+    """Return joints of a gripper, with the last link of the arm if there is one."""
     links = links_of(text)
     parents = dict(zip(chain.joint_names, chain.parents.tolist(), strict=True))
     wrists = {
@@ -386,33 +395,21 @@ def _note_on_gripper(fingers: Sequence[str], chain: Chain, text: str) -> str:
         for name in fingers
         if parents[name] >= 0 and chain.joint_names[parents[name]] not in fingers
     }
-    tip = wrists.pop() if len(wrists) == 1 else "LINK"
-    names = ", ".join(fingers[:MAX_NAMES])
-    if len(fingers) > MAX_NAMES:
-        names += f" and {len(fingers) - MAX_NAMES} others"
-    looks = "looks like a joint" if len(fingers) == 1 else "look like joints"
-    note = f"{names} {looks} of a gripper or hand by name: "
-    if len(fingers) <= MAX_NAMES:
-        fixing = " ".join(f"--fix {name}" for name in fingers)
-        note += f"fix what is not identified ({fixing}), or "
-    return f"{note}give the last link of the arm (--tip {tip})"
+    return GripperJoints(tuple(fingers), wrists.pop() if len(wrists) == 1 else None)
 
 
-def _note_on_branches(text: str, chain: Chain) -> list[str]:
-    """Return notes on a gripper and on further arms among the joints that move."""
-    notes = []
+def _branches(text: str, chain: Chain) -> list[CellNote]:
+    """Return a gripper and further arms among the joints that move."""
+    notes = list[CellNote]()
     fingers = gripper_joints(text, chain.joint_names)
     if fingers:
-        notes.append(_note_on_gripper(fingers, chain, text))
+        notes.append(_gripper(fingers, chain, text))
     arm = [k for k, name in enumerate(chain.joint_names) if name not in fingers]
     inner = {int(chain.parents[k]) for k in arm}
     links = links_of(text)
-    ends = [links[chain.joint_names[k]][1] for k in arm if k not in inner]
+    ends = tuple(links[chain.joint_names[k]][1] for k in arm if k not in inner)
     if len(ends) > 1:
-        notes.append(
-            f"the joints form {len(ends)} branches, with the last moving links "
-            f"{', '.join(ends[:MAX_NAMES])}: choose one arm with --base LINK --tip LINK"
-        )
+        notes.append(SeveralBranches(ends))
     return notes
 
 
@@ -429,16 +426,6 @@ def _lifting(text: str, chain: Chain) -> list[str]:
         if not chain.revolute[joint] and vertical > _MIN_ALIGNMENT_COSINE and name not in gripper:
             lifting.append(name)
     return lifting
-
-
-def _note_on_lifting(names: Sequence[str]) -> str:
-    slides = "slides" if len(names) == 1 else "slide"
-    fixing = " ".join(f"--fix {name}" for name in names)
-    return (
-        f"{', '.join(names)} {slides} along gravity: its weight and the offset of its friction are "
-        "estimated together, from recordings (`hil import log --cell`). The cell has no tables for "
-        f"motion, which are in degrees; {fixing} writes them for the other joints"
-    )
 
 
 def _cell_of(path: Path, text: str, fixed: Mapping[str, float], *, moved: bool) -> NewCell:
@@ -461,30 +448,17 @@ def _cell_of(path: Path, text: str, fixed: Mapping[str, float], *, moved: bool) 
         name: leader for name, leader in led.items() if name in names and name not in sliding
     }
     positions = sliding | {name: offset for name, (_, offset) in following.items()} | {**fixed}
-    notes = [
-        f"{name} is prismatic, and fixed at {position:g} m in the cell's copy of the URDF; "
-        f"--fix {name}=… for another position"
-        for name, position in sliding.items()
-    ]
+    notes: list[CellNote] = [FixedPrismatic(*joint) for joint in sliding.items()]
     if lifting and not moved:
-        notes.append(_note_on_lifting(lifting))
-    notes += [
-        f"{name} follows {leader} (<mimic>), which the model does not support: it is fixed at "
-        f"{positions[name]:g} rad in the cell's copy of the URDF, --fix {name}=… for another "
-        "position. If it belongs to a linkage that supports the arm, the model is wrong"
-        for name, (leader, _) in following.items()
-    ]
+        notes.append(LiftingJoints(tuple(lifting)))
+    notes += [FixedMimic(name, leader, positions[name]) for name, (leader, _) in following.items()]
     used = with_fixed(text, positions) if positions else text
     moving_chain = _chain(path, used)
     moving = moving_chain.joint_names
-    notes += _note_on_branches(used, moving_chain)
+    notes += _branches(used, moving_chain)
     shapes = _COLLISION.findall(text)
     if not shapes:
-        notes.append(
-            "the URDF has no <collision> shapes: add some (boxes, cylinders or spheres). Without "
-            "them only a design works, with collision = false in the settings that `hil design "
-            "--show-settings front` prints"
-        )
+        notes.append(NoCollisionShapes())
     name = re.search(r"<robot\b[^>]*\bname\s*=\s*[\"']([^\"']*)[\"']", used)
     return NewCell(
         name=(name[1].strip()[:80] if name else "") or path.stem,

@@ -30,10 +30,20 @@ from hil.control.link import SESSION_END_TIMEOUT
 from hil.control.live_link import ExchangeMonitor
 from hil.control.motion_watch import Stop
 from identification.excitation import CollisionModelError, Workspace
-from identification.excitation.collision_messages import unchecked_text
 from planner import JointLimits
 
-from .found_shapes import MIN_FRAME_HEIGHT, check_by_found_shapes
+from .found_shapes import check_by_found_shapes
+from .notes import (
+    CellNote,
+    ClosedAxes,
+    EveryPostureInContact,
+    FromSimulation,
+    HomeNotChecked,
+    NoFloor,
+    ShapesNotFound,
+    UncheckedPairs,
+    UnsupportedCycle,
+)
 
 _MAX_TURNED_JOINTS: Final = 3
 """Joints turned to find a clear home posture."""
@@ -50,11 +60,11 @@ class CellValues:
 
     values: Mapping[str, Any] = field(default_factory=dict)
     origin: Mapping[str, str] = field(default_factory=dict)
-    notes: tuple[str, ...] = ()
+    notes: tuple[CellNote, ...] = ()
 
     @classmethod
     def of_origin(
-        cls, origin: str, values: Mapping[str, Any], notes: Sequence[str] = ()
+        cls, origin: str, values: Mapping[str, Any], notes: Sequence[CellNote] = ()
     ) -> CellValues:
         """Create from values of one origin, without unknown fields."""
         nothing: list[Any] = [UNKNOWN]
@@ -153,23 +163,20 @@ def clear_home(urdf: str, cell_values: CellValues, mesh_folders: Sequence[str]) 
         try:
             check = check_by_found_shapes(urdf, postures, workspace, limits, mesh_folders)
         except CollisionModelError as error:
-            return CellValues(notes=(f"campaign.home_deg was not checked for collisions: {error}",))
+            return CellValues(notes=(HomeNotChecked(str(error)),))
         clear = np.flatnonzero(check.clear)
         if len(clear) > 0:
             values: dict[str, Any] = {"campaign.home_deg": _degrees(postures[clear[0]])}
-            unchecked = unchecked_text(check.exceptions)
-            notes = [] if unchecked is None else [unchecked]
+            notes = list[CellNote]()
+            if any(check.exceptions):
+                notes.append(UncheckedPairs(check.exceptions))
             if check.links:
-                notes.append(
-                    f"the collision shapes of {', '.join(check.links)} were not found: in "
-                    f"campaign.home_deg their frames are {MIN_FRAME_HEIGHT * 100:g} cm off the "
-                    "floor, and nothing else about them was checked"
-                )
+                notes.append(ShapesNotFound(tuple(check.links)))
             if floor is None:
                 values["workspace.floor"] = "none"
-                notes.append("no posture tried is clear of a floor at 0 m: no floor is assumed")
+                notes.append(NoFloor())
             return CellValues.of_origin(ASSUMED, values, notes)
-    return CellValues(notes=("every posture tried is in contact: correct campaign.home_deg",))
+    return CellValues(notes=(EveryPostureInContact(),))
 
 
 def _turned(home: Array, limits: JointLimits) -> Iterator[Array]:
@@ -196,16 +203,15 @@ def from_init(init: InitPacket, n_joints: int, arm: int) -> CellValues:
         **{f"drive_train.{k}": _wire([v])[0] for k, v in wrist.items() if n >= WRIST_AXES},
         "controller.arm": arm,
     }
-    notes = []
+    notes = list[CellNote]()
     cycle = init.sample_time
     if cycle in _CYCLES_MS:
         values["controller.cycle_ms"] = cycle
     else:
-        notes.append(f"the cycle of the controller is {cycle} ms; supported are 1 and 2")
+        notes.append(UnsupportedCycle(cycle))
     opened = {axis.axis for axis in init.open_axes() if axis.arm == arm}
-    if missing := ", ".join(str(axis + 1) for axis in range(n) if axis not in opened):
-        closed = f"axes {missing} of arm {arm} are not open in the controller"
-        notes.append(f"{closed}; a campaign needs all axes of the arm")
+    if closed := tuple(axis + 1 for axis in range(n) if axis not in opened):
+        notes.append(ClosedAxes(closed, arm))
     version = ".".join(map(str, init.version))
     return CellValues.of_origin(f"from the init packet (C4G {version})", values, notes)
 
@@ -247,8 +253,7 @@ def from_archive(path: str | PathLike[str], joint_names: Sequence[str]) -> CellV
     if not cell_values.values:
         raise refusal("contains neither a cell nor an init packet")
     if archive.header.only_simulated:
-        note = f"{archive.path.name} was recorded from a simulated controller"
-        cell_values |= CellValues(notes=(note,))
+        cell_values |= CellValues(notes=(FromSimulation(archive.path.name),))
     return cell_values
 
 

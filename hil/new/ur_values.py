@@ -25,6 +25,13 @@ from hil.cell.schema import RtdeTable
 
 from .cell_text import NewCell, cell_of_parameters
 from .cell_values import ASSUMED, CellValues
+from .notes import (
+    CellNote,
+    NotAsked,
+    PayloadWithoutFrame,
+    TorqueConstantsOfArm,
+    UnknownTorqueConstants,
+)
 
 JOINT_NAMES: Final = (
     "shoulder_pan_joint",
@@ -283,24 +290,13 @@ def _following_error(arm: UrArmStatements) -> list[float]:
     return [round(float(turns), 2) for turns in lag]
 
 
-def _notes(arm: UrArmStatements, urdf: str) -> Iterator[str]:
-    yield from (f"not asked: {text}" for text in arm.identity.unreachable)
-    if np.isnan(constants_of(arm)).any():
-        yield (
-            "the torque constants of some joints are unknown: hold the arm still in a posture in "
-            "which gravity loads every joint but the first, and run this command again"
-        )
-    else:
-        yield (
-            "the torque constants come from the arm's own model, uncertain by 10 %: weigh a "
-            "known payload (`hil torque-constants`), then correct torque_uncertainty"
-        )
-    if _payload_mass(arm) and _flange(urdf) is None:
-        mass = f"{_payload_mass(arm):g} kg"
-        yield (
-            f"the controller is set to a payload of {mass}, and the URDF has no link "
-            f"{' or '.join(FLANGES)} for its frame: add [robot.payload]"
-        )
+def _notes(arm: UrArmStatements, urdf: str) -> Iterator[CellNote]:
+    yield from map(NotAsked, arm.identity.unreachable)
+    is_unknown = np.isnan(constants_of(arm)).any()
+    yield UnknownTorqueConstants() if is_unknown else TorqueConstantsOfArm()
+    mass = _payload_mass(arm)
+    if mass and _flange(urdf) is None:
+        yield PayloadWithoutFrame(mass)
 
 
 def _known(values: Array) -> list[float | str]:

@@ -25,6 +25,7 @@ from hil.base.errors import ArchiveError, ControllerError, InputError
 from hil.base.progress import Silent
 from hil.campaign import Campaign, CampaignPlan, Stop, design
 from hil.cell import Cell
+from hil.cell.arms import Links
 from hil.cell.errors import UnknownFieldsError
 from hil.cell.toml_edits import urdf_limits
 from hil.cli import app
@@ -35,6 +36,7 @@ from hil.importers.imported_robot import Robot
 from hil.new import cell_of_urdf, from_archive
 from hil.new.cell_text import with_fixed
 from hil.new.cell_values import _nothing_moves
+from hil.new.notes import FixedOutside, GripperJoints, SeveralBranches
 from hil.testing import shortened
 from identification.excitation.collision_messages import unchecked_text
 from sim_fixtures.ns16 import CELL_PATH, URDF_PATH
@@ -444,36 +446,33 @@ class TestOneArmOfARobot:
         assert made.joint_names == (
             "left_s0", "left_s1", "left_e0", "left_e1", "left_w0", "left_w1", "left_w2"
         )  # fmt: skip
-        note = next(note for note in made.values.notes if note.startswith("fixed, as they do not"))
-        assert "right_w2" in note
-        assert not any("branches" in note for note in made.values.notes)
+        (fixed,) = (note for note in made.values.notes if isinstance(note, FixedOutside))
+        assert fixed.links == Links(base="torso", tip="left_wrist")
+        assert "right_w2" in fixed.joints
+        assert not any(isinstance(note, SeveralBranches) for note in made.values.notes)
 
     def test_branches_are_named(self) -> None:
         notes = cell_of_urdf(urdf_path("baxter.urdf"), {}).values.notes
-        assert any(
-            "3 branches, with the last moving links head, left_wrist, right_wrist" in note
-            for note in notes
-        )
+        assert SeveralBranches(("head", "left_wrist", "right_wrist")) in notes
 
     def test_joints_that_look_like_a_gripper_are_named(self, tmp_path: Path) -> None:
         path = tmp_path / "hand.urdf"
         path.write_text(HAND)
         made = cell_of_urdf(path, {})
-        assert any(
-            "left_finger looks like a joint of a gripper" in note and "--tip arm" in note
-            for note in made.values.notes
-        )
+        assert GripperJoints(("left_finger",), "arm") in made.values.notes
         made = cell_of_urdf(path, {}, tip="tool")
         assert made.joint_names == ("shoulder",)
-        assert not any("gripper" in note for note in made.values.notes)
+        assert not any(isinstance(note, GripperJoints) for note in made.values.notes)
 
     def test_a_wrist_that_carries_a_gripper_is_of_the_arm(self) -> None:
         notes = cell_of_urdf(urdf_path("so101.urdf"), {}).values.notes
-        assert any(note.startswith("gripper looks like a joint of a gripper") for note in notes)
+        (found,) = (note for note in notes if isinstance(note, GripperJoints))
+        assert found.joints == ("gripper",)
 
     def test_arms_with_hands_are_branches_too(self) -> None:
         notes = cell_of_urdf(urdf_path("talos_reduced.urdf"), {}).values.notes
-        assert any("5 branches" in note and "arm_left_7_link" in note for note in notes)
+        (found,) = (note for note in notes if isinstance(note, SeveralBranches))
+        assert len(found.ends) == 5 and "arm_left_7_link" in found.ends
 
     def test_one_arm_of_a_robot_with_too_many_joints(self) -> None:
         tiago = urdf_path("tiago_dual.urdf")
