@@ -16,9 +16,8 @@ from hil.archive import Archive
 from hil.base.arrays import Array
 from hil.base.errors import ArchiveError
 from hil.base.files import json_digest
-from hil.pipeline.note_messages import note_lines
-from hil.pipeline.notes import MergedSamples
-from hil.pipeline.other_meanings import in_a_sentence, other_meanings
+from hil.pipeline.notes import MergedSamples, Note, OtherMeaning, RepairedArchive, StatedText
+from hil.pipeline.other_meanings import other_meanings
 from hil.pipeline.prepared import known_parameters, reduction_of, versions_of
 from hil.pipeline.sources import Source, known_warnings, source_of
 from identification.estimators.elasticity import ElasticTorque
@@ -39,6 +38,7 @@ from identification.validation.findings.diagnosis import of_diagnosis
 from .archive_discovery import JOINT_TEMPERATURE, ArchiveRef, cell_in, errors_of_origin, open_ref
 from .cache import Arrays, CacheLocation, code_digest
 from .cluster import SkippedArchive, reason_of
+from .notes import note_as_json, note_of_json
 
 Term = TypeVar("Term", Factor, Reduction)
 
@@ -54,7 +54,7 @@ class Summary:
     #: validation run
     fit: Estimate | None
     scatter: ScoreScatter | None  #: for the estimate with a prior; None of a validation run
-    warnings: tuple[str, ...] = ()  #: about the archive
+    warnings: tuple[Note, ...] = ()  #: about the archive
     #: what else it has: mean temperature of each joint [°C], by name
     facts: Mapping[str, float] = field(default_factory=dict)
 
@@ -156,12 +156,12 @@ def reduced_archive(wanted: ToReduce, settings: Settings) -> tuple[Summary, Redu
         prior = body_prior(model, factor, stated=known_parameters(cell))
         scatter = ScoreScatter.of(factor, prior.gaussian)
     merged = [MergedSamples(source.merged)] if source.merged else []
-    sentences = note_lines(known_warnings(cell, archive))
-    warnings = [*sentences, *archive.header.findings.warnings, *note_lines(merged)]
+    stated = map(StatedText, archive.header.findings.warnings)
+    warnings: list[Note] = [*known_warnings(cell, archive), *stated, *merged]
     if is_fitted and (archive.kind == "imported" or wanted.unmodelled):
         warnings += _other_meanings(model, versions[0], source, ref.origin)
     if archive.outcome is not None and archive.outcome.repaired:
-        warnings.append("it was repaired with loss")
+        warnings.append(RepairedArchive())
     parts = factor.parts(wanted.parts)
     summary = Summary(ref, parts, fit, scatter, tuple(warnings), _temperatures(archive))
     return summary, reduction
@@ -169,7 +169,7 @@ def reduced_archive(wanted: ToReduce, settings: Settings) -> tuple[Summary, Redu
 
 def _other_meanings(
     model: RobotModel, samples: Samples, source: Source, origin: str
-) -> tuple[str, ...]:
+) -> tuple[OtherMeaning, ...]:
     """Return what a recording is other than stated, as a verdict and an import ask it.
 
     Raises:
@@ -181,7 +181,10 @@ def _other_meanings(
     if found.is_otherwise:
         finding = worded(of_diagnosis(found)[0], Naming(tuple(model.joint_names)))
         raise ArchiveError(origin, finding.words, field="torque", remedy=finding.next_step)
-    return tuple(map(in_a_sentence, other_meanings(model, found, [source])))
+    return tuple(
+        OtherMeaning(each.key, each.words, each.next_step)
+        for each in other_meanings(model, found, [source])
+    )
 
 
 def _temperatures(archive: Archive) -> dict[str, float]:
@@ -421,7 +424,7 @@ def _entry(summary: Summary) -> dict[str, Any]:
     fit = summary.fit
     scatter = summary.scatter
     entry: dict[str, Any] = {
-        "warnings": summary.warnings,
+        "warnings": [*map(note_as_json, summary.warnings)],
         "blocks": len(summary.total),
         "facts": dict(summary.facts),
     }
@@ -487,7 +490,7 @@ def _unpacked(
                 ),
                 fit=fit,
                 scatter=scatter,
-                warnings=tuple(map(intern, entry["warnings"])),
+                warnings=tuple(map(note_of_json, entry["warnings"])),
                 facts=entry["facts"],
             )
         )

@@ -15,8 +15,7 @@ from hil.base.arrays import Array
 from hil.cell import Cell
 from hil.pipeline.estimating import posterior_of
 from hil.pipeline.estimators import fit_of
-from hil.pipeline.note_messages import note_lines
-from hil.pipeline.notes import PoorlySeparated, UnrestrictedBodies
+from hil.pipeline.notes import Note, PoorlySeparated, UnrestrictedBodies
 from identification import IdentificationError
 from identification.estimators.consistent import SolverError
 from identification.estimators.covariance import solve_with_prior
@@ -40,6 +39,7 @@ from .archive_reduction import (
 )
 from .cache import CacheLocation
 from .cluster import SkippedArchive
+from .notes import DifferentSetups, MoreNotes, OfSomeArchives
 
 Level = Literal["repetition", "campaign", "pooled", "siblings"]
 BatchEstimator = Literal["auto", "wls", "consistent"]
@@ -78,7 +78,7 @@ class BatchEstimate:
     unseen_rms: Array  #: torque error per joint (n,) on the campaign's validation runs; NaN if none
     unseen_torque_rms: Array  #: torque per joint (n,) there; NaN if none
     settings: str  #: digest of the settings; "" where campaigns with different ones are pooled
-    warnings: tuple[str, ...] = ()  #: about the archives and the estimate
+    warnings: tuple[Note, ...] = ()  #: about the archives and the estimate
     #: payload and delay that the cell states, as text; "" if neither, or if campaigns with
     #: different ones are pooled
     setup: str = ""
@@ -111,7 +111,7 @@ class EstimateGroup:
     values: tuple[Array, ...] = ()  #: parameters (p,) from each of them
     unseen: Factor | None = None  #: sum of the totals of validation runs; None if none
     #: every archive, with the warnings about it
-    warned: tuple[tuple[ArchiveRef, tuple[str, ...]], ...] = ()
+    warned: tuple[tuple[ArchiveRef, tuple[Note, ...]], ...] = ()
     settings: frozenset[str] = frozenset()  #: digests
     setups: frozenset[str] = frozenset()  #: payloads and delays that the cells state
 
@@ -247,13 +247,9 @@ def estimate_arm(
     group = sum(parts, EstimateGroup())
     if group.total is None:
         return None
-    notes: list[str] = []
+    notes = list[Note]()
     if len(group.setups) > 1:
-        setups = "; ".join(sorted(setup or "nothing" for setup in group.setups))
-        notes = [
-            "pooled over campaigns whose cells state different payloads or delays, which are"
-            f" compensated: {setups}"
-        ]
+        notes.append(DifferentSetups(tuple(sorted(group.setups))))
     estimator = Estimator(arm)
     try:
         posterior, others = estimator.posterior(group.total.factor)
@@ -276,7 +272,7 @@ class Estimator:
         self._delay_variance = settings.delay_variance
         self._strength = settings.strength
 
-    def posterior(self, total: Factor) -> tuple[Posterior, list[str]]:
+    def posterior(self, total: Factor) -> tuple[Posterior, list[Note]]:
         """Return the posterior of a sum and its archives, and notes.
 
         Raises:
@@ -287,9 +283,7 @@ class Estimator:
         if self.name != "auto":
             return prior, []
         posterior, _, unsolved = prior.solved(total)
-        return posterior, [] if unsolved is None else note_lines(
-            [UnrestrictedBodies(str(unsolved))]
-        )
+        return posterior, [] if unsolved is None else [UnrestrictedBodies(str(unsolved))]
 
     def of_archive(self, summary: Summary, posterior: Posterior, share: float) -> Estimate:
         """Return the estimate from one archive, this share of the archives of the posterior.
@@ -383,7 +377,7 @@ class Estimator:
         level: Level,
         group: EstimateGroup,
         posterior: Posterior,
-        warnings: Sequence[str],
+        warnings: Sequence[Note],
         recordings: Sequence[Factor] = (),
     ) -> BatchEstimate:
         """Return the estimate of a campaign, or of all campaigns of the arm.
@@ -405,7 +399,7 @@ class Estimator:
         is_poor = not estimate.undetermined and estimate.condition > MAX_GRAM_CONDITION
         if self.name != "auto" and is_poor:
             poor = PoorlySeparated(estimate.condition, from_sums=True)
-            warnings = (*note_lines([poor]), *warnings)
+            warnings = (poor, *warnings)
         return BatchEstimate(
             level=level,
             arm=refs[0].arm,
@@ -417,25 +411,23 @@ class Estimator:
             unseen_rms=_rms(unseen, unseen.squared_errors(estimate.values)),
             unseen_torque_rms=_rms(unseen),
             settings=next(iter(group.settings)) if len(group.settings) == 1 else "",
-            warnings=(*warnings, *warning_lines(group.warned)),
+            warnings=(*warnings, *frequent_notes(group.warned)),
             setup=next(iter(group.setups)) if len(group.setups) == 1 else "",
         )
 
 
-def warning_lines(warned: Sequence[tuple[ArchiveRef, Sequence[str]]]) -> tuple[str, ...]:
-    """Return warnings with the archives they concern, most frequent first."""
-    counts = Counter(text for _, warnings in warned for text in warnings)
-    first = {text: ref for ref, warnings in reversed(warned) for text in warnings}
-    lines = []
-    for text, count in counts.most_common(_MAX_SHOWN_WARNINGS):
-        name = f"{first[text].campaign.rsplit('/', 1)[-1]}/{first[text].name}"
-        some = f"{count} of {len(warned)} archives, such as {name}: {text}"
-        lines.append(text if count == len(warned) else some)
+def frequent_notes(warned: Sequence[tuple[ArchiveRef, Sequence[Note]]]) -> tuple[Note, ...]:
+    """Return notes on archives with the archives they concern, most frequent first."""
+    counts = Counter(note for _, notes in warned for note in notes)
+    first = {note: ref for ref, notes in reversed(warned) for note in notes}
+    found = list[Note]()
+    for note, count in counts.most_common(_MAX_SHOWN_WARNINGS):
+        example = f"{first[note].campaign.rsplit('/', 1)[-1]}/{first[note].name}"
+        is_of_all = count == len(warned)
+        found.append(note if is_of_all else OfSomeArchives(note, count, len(warned), example))
     if len(counts) > _MAX_SHOWN_WARNINGS:
-        lines.append(
-            f"{len(counts) - _MAX_SHOWN_WARNINGS} more warnings are listed with the repetitions"
-        )
-    return tuple(lines)
+        found.append(MoreNotes(len(counts) - _MAX_SHOWN_WARNINGS))
+    return tuple(found)
 
 
 def _rms(factor: Factor, squares: Array | None = None) -> Array:

@@ -16,6 +16,7 @@ from hil.batch.graph import BatchResult
 from identification.factor.messages import method_words
 
 from .estimates import BatchEstimate, relative_error
+from .messages import batch_lines
 
 Row = dict[str, Any]
 
@@ -146,7 +147,7 @@ def _parameter_rows(result: BatchResult) -> Iterator[Row]:
             ),
             "unseen_relative_error": relative_error(level.unseen_rms, level.unseen_torque_rms),
             "method": method_words(estimate.method),
-            "warnings": "; ".join(level.warnings),
+            "warnings": "; ".join(batch_lines(level.warnings)),
             "estimator": result.estimator,
             "settings": level.settings,
             "code": result.code,

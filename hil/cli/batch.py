@@ -19,6 +19,7 @@ from hil.batch import graph as run
 from hil.batch.cluster import SkippedArchive
 from hil.batch.estimates import BatchEstimate, BatchEstimator, relative_error
 from hil.batch.graph import BatchResult
+from hil.batch.messages import batch_lines
 from hil.batch.table import write_tables
 from hil.cli.arguments import JsonOption, QuietOption, VerboseOption, print_json, with_options
 from hil.cli.fleet_options import Fleet, RecordingsArgument, last, map_lines, skipped_line
@@ -144,8 +145,8 @@ def result_lines(result: BatchResult) -> Iterator[str]:
             [_line(estimate) for estimate in campaigns], _MAX_LINES, "--output and --json"
         )
         pooled = [estimate for estimate in result.pooled if estimate.arm == digest]
-        for warning in dict.fromkeys(text for estimate in pooled for text in estimate.warnings):
-            yield f"  note: {warning}"
+        notes = dict.fromkeys(note for estimate in pooled for note in estimate.warnings)
+        yield from (f"  note: {line}" for line in batch_lines(notes))
 
 
 def _line(campaign: BatchEstimate) -> str:
@@ -206,5 +207,5 @@ def _level(level: BatchEstimate) -> dict[str, Any]:
                 level.estimate.names, level.estimate.values, level.estimate.std, strict=True
             )
         },
-        "warnings": list(level.warnings),
+        "warnings": batch_lines(level.warnings),
     }

@@ -15,6 +15,7 @@ from hil.base.terminal_text import printable
 from hil.batch.cluster import Cluster
 from hil.cli.arguments import JsonOption, QuietOption, VerboseOption, print_json
 from hil.compare import comparison as comparing
+from hil.compare.messages import comparison_lines, verdict_line
 from identification.text import percentage, unit_text
 
 
@@ -49,7 +50,7 @@ def compare(
         print_json(comparison.document)
     else:
         lines = [] if quiet else _lines(comparison)
-        lines = [f"{comparison.verdict}.", *lines]
+        lines = [f"{verdict_line(comparison.changed)}.", *lines]
         if output is not None and not quiet:
             lines.append(f"{output}: every parameter before and after, for a browser")
         for line in lines if verbose else brief(lines):
@@ -66,7 +67,7 @@ def _lines(comparison: comparing.ArmComparison) -> list[str]:
         f"change {change.change:+.3g} ± {change.half:.2g} (95 %), p {change.p_value:.1g}"
         for change in sorted(comparison.changed, key=lambda change: change.p_value)
     ]
-    notes = [f"note: {warning}" for warning in comparison.warnings]
+    notes = [f"note: {line}" for line in comparison_lines(comparison.warnings)]
     return [*changes, *_scope(comparison), *notes]
 
 

@@ -9,6 +9,7 @@ from hil.compare.comparison import (
     MIN_REPETITIONS,
     ArmComparison,
 )
+from hil.compare.messages import comparison_lines, verdict_line
 from hil.report.rendering import environment, page_bytes
 
 
@@ -20,4 +21,11 @@ def comparison_page(comparison: ArmComparison) -> bytes:
         "repetitions": MIN_REPETITIONS,
     }
     template = environment().get_template("changes.html.j2")
-    return page_bytes(template.render(found=comparison, rules=rules, software=software()))
+    text = template.render(
+        found=comparison,
+        verdict=verdict_line(comparison.changed),
+        notes=comparison_lines(comparison.warnings),
+        rules=rules,
+        software=software(),
+    )
+    return page_bytes(text)

@@ -8,7 +8,7 @@ effective number is n (1 - ρ) / (1 + ρ) (Bayley and Hammersley 1946) with ρ c
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import asdict, dataclass, replace
 from os.path import commonpath
 from pathlib import Path
@@ -24,11 +24,21 @@ from hil.batch import graph as run
 from hil.batch.archive_discovery import ArchiveRef, Discovery, cell_in, open_ref
 from hil.batch.cluster import Cluster
 from hil.batch.estimates import BatchArm, BatchEstimate
+from hil.pipeline.notes import Note
 from hil.pipeline.options import Options
 from hil.pipeline.sources import arm_differences
 from identification import RobotModel
 from identification.distributions import student_limit, student_tail
 from identification.factor.estimate import Estimate
+
+from .messages import comparison_lines, verdict_line
+from .notes import (
+    OfCampaign,
+    OtherSetups,
+    SingleRepetition,
+    UnknownDailyVariation,
+    UnusableArchive,
+)
 
 MIN_REPETITIONS: Final = 15
 """Repetitions needed to estimate their correlation. With fewer the effective number is 1, as all
@@ -41,10 +51,6 @@ FRICTION_SPEEDS: Final = np.geomspace(0.02, 5.0, 40)  # rad/s or m/s
 _MAX_CORRELATION: Final = 0.95
 _NORMAL_95: Final = float(student_limit(0.025, 1e6))
 _TWO: Final = "give two or more campaigns of one arm"
-_CAVEAT: Final = (
-    "the normal variation from day to day is not known from a few campaigns: friction of a cold arm"
-    " is tens of per cent higher, so compare campaigns at the same temperature"
-)
 
 
 class Figure(NamedTuple):
@@ -98,11 +104,10 @@ class ArmComparison:
     arm: str  #: name
     simulated: bool
     dated: bool  #: whether campaigns are in chronological order
-    verdict: str  #: one line
     campaigns: tuple[BatchEstimate, ...]
     names: tuple[str, ...]  #: of the campaigns, with their days if known
     changes: tuple[QuantityChange, ...]  #: of all quantities, by campaign
-    warnings: tuple[str, ...]
+    warnings: tuple[Note, ...]
 
     @property
     def changed(self) -> tuple[QuantityChange, ...]:
@@ -127,7 +132,7 @@ class ArmComparison:
             "arm": self.arm,
             "simulated": self.simulated,
             "dated": self.dated,
-            "verdict": self.verdict,
+            "verdict": verdict_line(self.changed),
             "changed": bool(self.changed),
             "campaigns": [
                 {
@@ -142,7 +147,7 @@ class ArmComparison:
                 {name: None if value != value else value for name, value in row.items()}
                 for row in numbers
             ],
-            "warnings": list(self.warnings),
+            "warnings": comparison_lines(self.warnings),
         }
 
 
@@ -191,7 +196,7 @@ def compare(places: Sequence[str], cluster: Cluster, reporter: Reporter) -> ArmC
         for campaign in campaigns
     ]
     comparison = compare_campaigns(result.arms[campaigns[0].arm], campaigns, repetitions)
-    lost = [f"{each.path} could not be used: {each.message}" for each in result.broken]
+    lost = map(UnusableArchive, result.broken)
     # All archives of an arm are simulated, or none.
     return replace(comparison, simulated=refs[0].simulated, warnings=(*lost, *comparison.warnings))
 
@@ -262,11 +267,10 @@ def compare_campaigns(
         arm=arm.name,
         simulated=False,
         dated=all(campaign.when for campaign in campaigns),
-        verdict=_verdict([change for change in changes if change.changed]),
         campaigns=tuple(campaigns),
         names=tuple(names),
         changes=changes,
-        warnings=(*_warnings(names, campaigns, repetitions), _CAVEAT),
+        warnings=tuple(_notes(names, campaigns, repetitions)),
     )
 
 
@@ -330,15 +334,6 @@ def projected(estimate: Estimate, weights: Array) -> tuple[Array, Array]:
     return value, np.where(determined, variance, np.nan)
 
 
-def _verdict(changed: Sequence[QuantityChange]) -> str:
-    """Return one line: what changed, friction by axis."""
-    names = dict.fromkeys(
-        f"friction of {change.axis}" if change.kind == "friction" else change.parameter
-        for change in changed
-    )
-    return f"Changed: {', '.join(names)}" if names else "No significant change"
-
-
 def _names(campaigns: Sequence[BatchEstimate]) -> list[str]:
     """Return names of campaigns: folder below the common one, setup if ambiguous, and day."""
     folders = [campaign.campaign for campaign in campaigns]
@@ -355,26 +350,21 @@ def _names(campaigns: Sequence[BatchEstimate]) -> list[str]:
     return names
 
 
-def _warnings(
+def _notes(
     names: Sequence[str],
     campaigns: Sequence[BatchEstimate],
     repetitions: Sequence[Sequence[BatchEstimate]],
-) -> list[str]:
-    warnings = []
-    setups = {name: campaign.setup for name, campaign in zip(names, campaigns, strict=True)}
+) -> Iterator[Note]:
+    """Yield what limits a comparison of campaigns with these names."""
+    setups = dict(zip(names, (campaign.setup for campaign in campaigns), strict=True))
     if len(set(setups.values())) > 1:
-        stated = "; ".join(f"{name}: {setup or 'nothing'}" for name, setup in setups.items())
-        warnings.append(f"the cells state different payloads or delays, compensated ({stated})")
+        yield OtherSetups(tuple(setups.items()))
     for name, estimates in zip(names, repetitions, strict=True):
         if len(estimates) < 2:
-            warnings.append(
-                f"{name}: with one repetition, uncertainty includes noise only, not the scatter of"
-                " repetitions"
-            )
-    each = zip(names, campaigns, strict=True)
-    return warnings + [
-        f"{name}: {warning}" for name, campaign in each for warning in campaign.warnings
-    ]
+            yield SingleRepetition(name)
+    for name, campaign in zip(names, campaigns, strict=True):
+        yield from (OfCampaign(name, note) for note in campaign.warnings)
+    yield UnknownDailyVariation()
 
 
 # Statistics

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from typing import Any
 
+from hil.batch.messages import batch_lines
 from hil.fleet.trend import FleetTrend, QuantityTrend, RobotTrend
 
 
@@ -34,7 +35,7 @@ def as_dict(fleet: FleetTrend) -> dict[str, Any]:
         "all_robots": [_together(robot) for robot in fleet.together],
         "broken": [each.as_json() for each in fleet.broken],
         "skipped": [each.as_json() for each in fleet.skipped],
-        "warnings": list(fleet.warnings),
+        "warnings": batch_lines(fleet.warnings),
     }
 
 

@@ -14,7 +14,7 @@ from hil.batch.archive_discovery import ArchiveRef, LogImport, cell_in, discover
 from hil.batch.archive_reduction import Summary, has_summary, summarise
 from hil.batch.cache import CacheLocation
 from hil.batch.cluster import Cluster, ClusterTask, SkippedArchive
-from hil.batch.estimates import warning_lines
+from hil.batch.estimates import frequent_notes
 from hil.batch.graph import archives_for_settings, cached_settings, decide_settings
 from hil.fleet.conditions import Conditions
 from hil.fleet.naming import RobotNaming
@@ -27,6 +27,7 @@ from hil.fleet.series import (
     moment_of,
 )
 from hil.fleet.trend import FleetTrend
+from hil.pipeline.notes import Note
 from hil.pipeline.options import Options
 from identification import RobotModel
 from identification.selection.settings import Settings
@@ -44,7 +45,7 @@ class EstimatedFleet:
     simulated: bool
     broken: tuple[SkippedArchive, ...]
     skipped: tuple[SkippedArchive, ...]
-    warnings: tuple[str, ...] = ()  #: about recordings that were used
+    warnings: tuple[Note, ...] = ()  #: about recordings that were used
 
     def judged(self, trend: FleetTrend) -> FleetTrend:
         """Return the trend of these series with what is known of their recordings."""
@@ -110,7 +111,7 @@ def estimated_fleet(
         simulated=all(ref.simulated for ref in used),
         broken=tuple(broken),
         skipped=found.skipped,
-        warnings=warning_lines([each for fits in types for each in fits.warned]),
+        warnings=frequent_notes([each for fits in types for each in fits.warned]),
     )
 
 
@@ -156,7 +157,7 @@ class _TypeFits:
         return [summary.ref for summaries in self.by_robot.values() for summary in summaries]
 
     @property
-    def warned(self) -> list[tuple[ArchiveRef, Sequence[str]]]:
+    def warned(self) -> list[tuple[ArchiveRef, Sequence[Note]]]:
         """The recordings with the warnings about each."""
         every = [summary for summaries in self.by_robot.values() for summary in summaries]
         return [(summary.ref, summary.warnings) for summary in every]

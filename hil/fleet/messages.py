@@ -7,6 +7,7 @@ from datetime import datetime
 from typing import Final
 
 from hil.base.terminal_text import plural
+from hil.batch.messages import batch_lines
 from hil.fleet.covariates import is_heat, is_since_start
 from hil.fleet.trend import FleetTrend, LimitReached, QuantityTrend, RobotTrend
 from identification.text import percentage
@@ -140,4 +141,4 @@ def notes(fleet: FleetTrend) -> Iterator[str]:
     if fleet.dated_by_file:
         recordings = plural(fleet.dated_by_file, "recording")
         yield f"{recordings} dated by the file alone, which a copy changes; see --robot"
-    yield from fleet.warnings
+    yield from batch_lines(fleet.warnings)

@@ -27,6 +27,7 @@ from hil.fleet.series import (
 )
 from hil.fleet.series_changes import MIN_SIBLINGS, Course, common_course, courses, scattered
 from hil.fleet.trend_limits import TrendLimit
+from hil.pipeline.notes import Note
 
 _FORECAST_MONTHS: Final = 240.0  # months within which a limit is foreseen
 _SEASON: Final = ("cosine of a year", "sine of a year")
@@ -178,7 +179,7 @@ class FleetTrend:
     simulated: bool = False
     broken: tuple[SkippedArchive, ...] = ()
     skipped: tuple[SkippedArchive, ...] = ()
-    warnings: tuple[str, ...] = ()
+    warnings: tuple[Note, ...] = ()
 
     @property
     def recordings(self) -> int:

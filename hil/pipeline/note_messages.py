@@ -26,10 +26,12 @@ from hil.pipeline.notes import (
     Note,
     NotEssential,
     NotJudged,
+    OtherMeaning,
     PoorlySeparated,
     PositionNoise,
     PriorContradicted,
     RejectedArchive,
+    RepairedArchive,
     RestPredicted,
     ReweightingNotConverged,
     StatedText,
@@ -78,6 +80,8 @@ def _line(note: Note) -> str:
             | RejectedArchive()
             | EndedEarly()
             | NotJudged()
+            | RepairedArchive()
+            | OtherMeaning()
             | RestPredicted()
             | LastHeldOut()
         ):
@@ -94,7 +98,14 @@ def _line(note: Note) -> str:
 
 
 def _of_recordings(
-    note: StatedText | RejectedArchive | EndedEarly | NotJudged | RestPredicted | LastHeldOut,
+    note: StatedText
+    | RejectedArchive
+    | EndedEarly
+    | NotJudged
+    | RepairedArchive
+    | OtherMeaning
+    | RestPredicted
+    | LastHeldOut,
 ) -> str:
     match note:
         case StatedText(text, recording):
@@ -108,6 +119,10 @@ def _of_recordings(
                 f"{recording} is not in its campaign's manifest.json: the run was killed before the"
                 " quality of the recording was checked"
             )
+        case RepairedArchive():
+            return "it was repaired with loss"
+        case OtherMeaning(_, words, next_step):
+            return f"{words}: {next_step}"
         case RestPredicted(fitted):
             return (
                 f"the first {percentage(fitted)} of one recording were fitted and the rest was"

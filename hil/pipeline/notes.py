@@ -56,6 +56,20 @@ class NotJudged(Note):
 
 
 @dataclass(frozen=True)
+class RepairedArchive(Note):
+    """An archive that was repaired with loss."""
+
+
+@dataclass(frozen=True)
+class OtherMeaning(Note):
+    """What a recording is other than described, by a finding of its own."""
+
+    key: str  #: of the finding
+    words: str  #: as `finding_messages` words it
+    next_step: str
+
+
+@dataclass(frozen=True)
 class AssumedTorqueConstants(Note):
     """Torque constants of the cell are assumed."""
 

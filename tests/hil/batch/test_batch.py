@@ -35,6 +35,7 @@ from hil.batch.cache import CacheLocation
 from hil.batch.cluster import Cluster
 from hil.batch.estimates import BatchEstimator
 from hil.batch.graph import reidentify
+from hil.batch.notes import DifferentSetups
 from hil.campaign.identified_campaign import identify_campaign
 from hil.cell import Cell
 from hil.cli import app
@@ -468,7 +469,8 @@ class TestWarnings:
         result = batch(tmp_path)
         (pooled,) = result.pooled
         assert (pooled.repetitions, pooled.setup) == (2, "")
-        assert "cells state different payloads" in pooled.warnings[0]
+        (setups,) = (note for note in pooled.warnings if isinstance(note, DifferentSetups))
+        assert sorted(setups.setups) == sorted(each.setup for each in result.campaigns)
         command = ["batch", str(tmp_path), "--cache", "none", "--json", *NOTHING_OPEN]
         (arm,) = json.loads(CliRunner().invoke(app, command).stdout)["arms"].values()
         for setups in (

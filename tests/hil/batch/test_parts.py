@@ -40,6 +40,7 @@ from hil.batch.graph import ARCHIVES_PER_TASK, BatchResult, _Campaign
 from hil.batch.table import COLUMNS, write_tables
 from hil.cell import Cell
 from hil.cell.schema import PayloadTable, TorsionSpringTable
+from hil.pipeline.notes import StatedText
 from identification.factor.factor import Factor
 from identification.selection.averaging import AveragedBandwidth
 from identification.selection.settings import Candidate, Choice, Settings, Strength
@@ -394,7 +395,7 @@ def result():
         sha256="ab" * 32,
         estimate=open_estimate,
         when="",
-        warnings=("stood still at first", "two gaps"),
+        warnings=(StatedText("stood still at first"), StatedText("two gaps")),
     )
     pooled = replace(first, level="pooled", campaign="", unseen_rms=0.1 * first.torque_rms)
     return BatchResult(

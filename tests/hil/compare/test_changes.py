@@ -32,6 +32,9 @@ from hil.compare.comparison import (
     holm,
     quantities,
 )
+from hil.compare.messages import verdict_line
+from hil.compare.notes import OtherSetups, SingleRepetition
+from hil.pipeline.notes import StatedText
 from identification.model.motion import Motion
 from tests.hil import arm_histories
 from tests.hil.arm_histories import FRICTION, Condition
@@ -88,7 +91,7 @@ class TestRecorded:
         (change,) = comparison.changed
         assert abs(change.change) - change.half < abs((factor - 1.0) * change.before)
         assert change.after / change.before == pytest.approx(factor, abs=0.02)
-        assert comparison.verdict == "Changed: friction of shoulder"
+        assert verdict_line(comparison.changed) == "Changed: friction of shoulder"
 
     def test_json_has_numbers_and_an_exit_status(self, folders, tmp_path):
         pair = [str(folders["march"]), str(folders["june"])]
@@ -218,7 +221,9 @@ class TestInMemory:
         assert [name[:6] for name in judged(folders).names] == ["cold/b", "warm/b"]
         laden = replace(other, setup="carries 3 kg", campaign=first.campaign)
         comparison = judged([first, laden])
-        assert "carries 3 kg" in comparison.names[1] and "carries 3 kg" in comparison.warnings[0]
+        assert "carries 3 kg" in comparison.names[1]
+        setups = zip(comparison.names, ("", "carries 3 kg"), strict=True)
+        assert comparison.warnings[0] == OtherSetups(tuple(setups))
 
     def test_a_page_of_hostile_names_is_inert(self):
         comparison = in_memory(1.3)
@@ -233,7 +238,7 @@ class TestInMemory:
                 replace(change, parameter=HOSTILE, axis=HOSTILE, campaign=HOSTILE)
                 for change in comparison.changes
             ),
-            warnings=(HOSTILE,),
+            warnings=(StatedText(HOSTILE),),
         )
         assert_stands_alone(comparison_page(comparison).decode())
         assert_inert(Page(comparison_page(spoilt).decode()), charts=False)
@@ -244,7 +249,7 @@ class TestInMemory:
         unknown = replace(second, estimate=replace(second.estimate, covariance=infinite))
         again = judged([first, unknown], lambda level: [level.estimate.values])
         assert not again.changed
-        assert any("one repetition" in warning for warning in again.warnings)
+        assert {SingleRepetition(name) for name in again.names} <= {*again.warnings}
         assert "nan" not in Page(comparison_page(again).decode()).text
         json.dumps(again.document, allow_nan=False)
 

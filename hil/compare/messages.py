@@ -1,0 +1,57 @@
+"""A comparison of campaigns in words."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from typing import TYPE_CHECKING
+
+from hil.batch.messages import batch_lines
+from hil.pipeline.notes import Note
+
+from .notes import (
+    OfCampaign,
+    OtherSetups,
+    SingleRepetition,
+    UnknownDailyVariation,
+    UnusableArchive,
+)
+
+if TYPE_CHECKING:
+    from .comparison import QuantityChange
+
+
+def verdict_line(changed: Iterable[QuantityChange]) -> str:
+    """Return one line: what changed, friction by axis."""
+    names = dict.fromkeys(
+        f"friction of {change.axis}" if change.kind == "friction" else change.parameter
+        for change in changed
+    )
+    return f"Changed: {', '.join(names)}" if names else "No significant change"
+
+
+def comparison_lines(notes: Iterable[Note]) -> list[str]:
+    """Return sentences on what limits a comparison, without full stops."""
+    return [line for note in notes for line in _lines(note)]
+
+
+def _lines(note: Note) -> list[str]:
+    match note:
+        case UnusableArchive(archive):
+            return [f"{archive.path} could not be used: {archive.message}"]
+        case OtherSetups(setups):
+            stated = "; ".join(f"{name}: {setup or 'nothing'}" for name, setup in setups)
+            return [f"the cells state different payloads or delays, compensated ({stated})"]
+        case SingleRepetition(campaign):
+            return [
+                f"{campaign}: with one repetition, uncertainty includes noise only, not the"
+                " scatter of repetitions"
+            ]
+        case OfCampaign(campaign, inner):
+            return [f"{campaign}: {line}" for line in batch_lines([inner])]
+        case UnknownDailyVariation():
+            return [
+                "the normal variation from day to day is not known from a few campaigns: friction"
+                " of a cold arm is tens of per cent higher, so compare campaigns at the same"
+                " temperature"
+            ]
+    return batch_lines([note])

@@ -1,0 +1,33 @@
+"""What limits a comparison of campaigns: each note has words."""
+
+from __future__ import annotations
+
+import pytest
+
+from hil.batch.cluster import SkippedArchive
+from hil.compare import notes
+from hil.compare.messages import comparison_lines
+from hil.pipeline.notes import Note, RepairedArchive
+
+WORDS: dict[Note, str] = {
+    notes.UnusableArchive(SkippedArchive("a.mcap", "it is damaged")): (
+        "a.mcap could not be used: it is damaged"
+    ),
+    notes.OtherSetups((("march", ""), ("june", "carries 3 kg"))): (
+        "different payloads or delays, compensated (march: nothing; june: carries 3 kg)"
+    ),
+    notes.SingleRepetition("march"): "march: with one repetition, uncertainty includes noise only",
+    notes.OfCampaign("march", RepairedArchive()): "march: it was repaired with loss",
+    notes.UnknownDailyVariation(): "compare campaigns at the same temperature",
+}
+
+
+@pytest.mark.parametrize(("note", "words"), WORDS.items(), ids=list(WORDS.values()))
+def test_each_note_has_words(note: Note, words: str) -> None:
+    (line,) = comparison_lines([note])
+    assert words in line
+
+
+def test_every_kind_is_worded_here() -> None:
+    kinds = {kind for kind in Note.__subclasses__() if kind.__module__ == notes.__name__}
+    assert kinds == {*map(type, WORDS)}
