@@ -6,6 +6,7 @@ import json
 
 import pytest
 
+from hil.batch import notes as batch_notes
 from hil.batch.messages import batch_lines
 from hil.batch.notes import (
     ARCHIVE_NOTES,
@@ -52,3 +53,8 @@ WORDS: dict[Note, str] = {
 def test_each_note_has_words(note: Note, words: str) -> None:
     (line,) = batch_lines([note])
     assert line.endswith(words)
+
+
+def test_every_kind_is_worded_here() -> None:
+    kinds = {kind for kind in Note.__subclasses__() if kind.__module__ == batch_notes.__name__}
+    assert kinds < {*map(type, WORDS)}
