@@ -26,6 +26,7 @@ from .motion_runner import RunArchives, Runner, RunOptions
 from .operator import RunWatch
 from .quality import Rejected
 from .quality_messages import replaced_words
+from .record_messages import gravity_lines, precision_line
 from .state import CampaignState
 from .warm_up_stage import WarmUpStage
 
@@ -259,10 +260,13 @@ class _CampaignRun:
             validations=campaign.progress("validation"),
             complete=not campaign.missing(),
             cycles=archives.cycles,
-            precision="" if precision is None else precision.message,
+            precision="" if precision is None else precision_line(precision),
             notes=(
                 *archives.notes,
-                *(f"dry run: {text}" for text in (() if dry_run is None else dry_run.warnings)),
+                *(
+                    f"dry run: {text}"
+                    for text in (() if dry_run is None else gravity_lines(dry_run))
+                ),
                 *self._warm_up.notes,
                 *(() if replaced is None else (replaced_words(replaced),)),
                 *self._watch.problems,

@@ -18,7 +18,6 @@ from hil.base.arrays import Array
 from hil.base.errors import ArchiveError
 from identification.model.motion import Motion
 
-from .errors import AgainstGravityError, DryRunError
 from .folder import CampaignFolder, save_record
 from .state import CampaignState
 
@@ -31,11 +30,6 @@ FORMAT_VERSION: Final = 2  # 1 had no check of torques
 _FIELDS: Final = (
     *("cycle", "gap", "position", "target_position", "target_current", "torque"),
     "commanded_position",
-)
-AGAINST: Final = "measured torque runs against the model's gravity"
-_CAUSES: Final = "joint_sign, URDF or torque sign may be wrong"
-_CAUSES_WITH_PAYLOAD: Final = (
-    "the assumed centre of mass of the payload (--payload-centre) may be wrong; if it is right, "
 )
 # Magnitude of a correlation of torque and gravity that is significant
 MIN_GRAVITY_CORRELATION: Final = 0.5
@@ -231,17 +225,6 @@ class DryRunRecord:
             assumed_payload=cell.assumes_payload,
         )
 
-    @property
-    def warnings(self) -> tuple[str, ...]:
-        """Warnings, in sentences."""
-        return tuple(f"{joint}: {self.contradiction}" for joint in self.against_gravity)
-
-    @property
-    def contradiction(self) -> str:
-        """What a torque against gravity may mean, the likeliest first."""
-        first = _CAUSES_WITH_PAYLOAD if self.assumed_payload else ""
-        return f"{AGAINST}: {first}{_CAUSES}"
-
     def save(self, path: Path) -> None:
         """Write the file (OutputError if the disk refuses)."""
         save_record(path, self, FORMAT_VERSION)
@@ -254,18 +237,3 @@ class DryRunRecord:
             user = "unknown"
         at = datetime.now(UTC).isoformat(timespec="seconds")
         return replace(self, accepted=Acceptance(user, at))
-
-
-def not_accepted(
-    folder: CampaignFolder, record: DryRunRecord, against: Sequence[str] = ()
-) -> DryRunError:
-    """Return the error of a dry run that is not accepted, or of joints that were not named."""
-    if against:
-        correct = "correct the cell file and rehearse again"
-        if record.assumed_payload:
-            correct = "weigh it under another name (--payload) with its --payload-centre"
-        return AgainstGravityError(
-            folder.root, against, record.contradiction, correct, folder.run_command
-        )
-    how = f"if the motions looked right, run `{folder.run_command} --accept-dry-run`"
-    return DryRunError(folder.root, "was done, but is not accepted", how)

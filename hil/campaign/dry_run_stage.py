@@ -8,9 +8,10 @@ from dataclasses import replace
 from hil.base.errors import OperatorStopError
 from hil.control.motions import CampaignMotion
 
-from .dry_run_record import MAX_DRY_RUN_OVERRIDE, DryRunRecord, DryRunState, is_from, not_accepted
+from .dry_run_record import MAX_DRY_RUN_OVERRIDE, DryRunRecord, DryRunState, is_from
 from .motion_runner import RunArchives, Runner, RunOptions
 from .operator import RunWatch
+from .record_messages import not_accepted
 from .state import CampaignState
 
 

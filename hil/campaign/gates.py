@@ -12,10 +12,11 @@ from hil.cell import Cell
 from hil.control.connection import Connection, narrower_limits
 from hil.control.link import MotionLink
 
-from .dry_run_record import DryRunRecord, not_accepted, yes_or_no
+from .dry_run_record import DryRunRecord, yes_or_no
 from .errors import DryRunError, NotRehearsedError
 from .folder import CampaignFolder
 from .motion_runner import RunOptions
+from .record_messages import not_accepted
 from .rehearsal_record import Rehearsal
 from .state import CampaignState
 

@@ -23,7 +23,6 @@ from hil.archive.campaign_archives import load_record
 from hil.base.arrays import Array
 from hil.cell import Cell
 from identification.model.motion import Motion
-from identification.text import percentage
 from planner import FourierSeries, PiecewiseCubic
 
 from .folder import save_record
@@ -131,16 +130,6 @@ class WarmUpRecord:
         """Return a new warm-up after the arm cooled down."""
         earlier = (*self.earlier, *self.motions)
         return replace(self, motions=(), outcome="going on", earlier=earlier)
-
-    @property
-    def sentence(self) -> str:
-        """Its state in a sentence; it has had a motion."""
-        done = len(self.motions)
-        change = self.changes[-1]
-        return (
-            f"warm-up: friction changes by {percentage(change, 2)} a motion after {done} motions, "
-            f"below {percentage(self.threshold, 2)} the arm is warm: {self.outcome}"
-        )
 
     def rest_before(self, now: float) -> float | None:
         """Return how long the arm has rested [s]; None if that is unknown."""

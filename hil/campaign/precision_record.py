@@ -8,7 +8,6 @@ from pathlib import Path
 from typing import Final, Literal, Self
 
 from hil.archive.campaign_archives import load_record
-from hil.base.terminal_text import plural
 from hil.precision.requirements import Requirement, requirements_from
 
 from .folder import save_record
@@ -50,18 +49,6 @@ class Reached:
     def ratio(self) -> float:
         """Interval over the required one."""
         return self.half / self.wanted.value
-
-    def message(self, repetitions: int) -> str:
-        """Return the state after a number of repetitions: "I5yy 7.1 % of 5 %, about 6 more"."""
-        wanted = self.wanted
-        text = f"{self.worst} {wanted.shown(self.half)} of {wanted.shown(wanted.value)}"
-        if self.ratio <= 1.0:
-            return f"{text}, met"
-        if repetitions == 1:  # what differs between repetitions is not known
-            return text
-        if self.more is None:
-            return f"{text}, which more repetitions do not improve enough"
-        return f"{text}, about {self.more} more"
 
 
 @dataclass(frozen=True)
@@ -144,31 +131,6 @@ class PrecisionRecord:
     def ended(self) -> bool:
         """Whether no more repetitions are run."""
         return self.outcome != "going on"
-
-    @property
-    def message(self) -> str:
-        """Its last look as a sentence without full stop."""
-        if not self.looks:
-            return f"no {self.unit} was measured yet"
-        look = self.looks[-1]
-        worst = look.worst.message(look.repetitions)
-        text = f"precision after {plural(look.repetitions, self.unit)}: {worst}"
-        if self.outcome == "met":
-            return f"{text}: all requirements are met, no more {self.unit}s"
-        if self.outcome == "out of reach" and self.unit == "pair":
-            remains = "that is more than repetitions in [campaign]"
-            if look.worst.more is None:
-                remains = (
-                    "what remains is the scale of the torque (weigh a known load with hil "
-                    "torque-constants, or state torque_uncertainty)"
-                )
-            return f"{text}: no more pairs; {remains}"
-        if self.outcome == "out of reach":
-            return (
-                f"{text}: no more repetitions; another motion adds what this one does not show "
-                "(hil design --given, with the same --precision)"
-            )
-        return text
 
 
 def _is_overdue(before: Sequence[PrecisionLook], look: PrecisionLook, index: int) -> bool:

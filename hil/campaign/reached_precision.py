@@ -48,6 +48,7 @@ from identification.reduction.reduction import MAX_UNMODELLED_REPETITIONS, Reduc
 from identification.signals.samples import Samples
 
 from .precision_record import MIN_CONSECUTIVE_MET, PrecisionLook, PrecisionRecord, Reached
+from .record_messages import precision_line
 from .state import CampaignState
 
 
@@ -314,7 +315,7 @@ class PrecisionStage:
         """Measure the precision after another repetition, and report it."""
         self._look(len(self._campaign.folder.completed("excitation")))
         self._record.save(self._path)
-        self._reporter.say(self._record.message)
+        self._reporter.say(precision_line(self._record))
 
     def _look(self, count: int) -> None:
         paths = self._campaign.folder.completed("excitation")[:count]

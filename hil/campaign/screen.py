@@ -33,6 +33,7 @@ from hil.base.terminal_text import plural, printable
 from hil.campaign.dry_run_record import DryRunRecord
 from hil.campaign.operator import RunStatus
 from hil.campaign.operator_keys import ACTIONS, HELP, KEY_POLL_PERIOD, Keyboard, after, can_read
+from hil.campaign.record_messages import gravity_lines
 from hil.cell import Cell
 from hil.control.motion_watch import REFUSED, MotionProgress, OperatorRequest, Stop
 from identification.text import percentage
@@ -148,7 +149,7 @@ def ask(console: Console, title: str, dry_run: DryRunRecord, stop: Stop) -> bool
     link = f"{plural(dry_run.missed, 'packet')} missed, {plural(dry_run.late, 'reply')} late"
     table.caption = Text(printable(f"{link}; {', '.join(dry_run.archives)}"))
     console.print(table)
-    for warning in dry_run.warnings:
+    for warning in gravity_lines(dry_run):
         console.print(warning, style="bold red", markup=False, highlight=False)
     what = "the simulated arm" if dry_run.simulated else "the arm"
     word = " ".join(dry_run.against_gravity) or "yes"

@@ -3,29 +3,47 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, Final, Literal
+from typing import Any, Literal, get_args
 
 from hil.archive import ArchiveName, open_archive
 from hil.base.errors import HilError
 from hil.base.safe_input import path_exists
-from hil.base.terminal_text import plural, typed
+from hil.base.terminal_text import typed
 from hil.cell import Cell
 from hil.design.result import RESULT, DesignResult
 from hil.results.results import ExecutionLogResult, PrecisionResult, Results, StepResult
-from identification.text import percentage
 
+from .campaign_steps import (
+    DesignedPlan,
+    DryRunDone,
+    EndedRecording,
+    Identified,
+    LeftOut,
+    MadeRecordings,
+    NoDryRun,
+    NoReport,
+    NotIdentified,
+    NotRehearsed,
+    NoWarmUp,
+    PlannedRecordings,
+    Rehearsed,
+    RepeatedKind,
+    Reported,
+    StepOutcome,
+    UnreadableStep,
+    WarmUpDone,
+)
 from .dry_run_record import DryRunRecord
 from .folder import PAYLOAD_RESULT, PAYLOADS, SIDES, CampaignFolder
 from .joint_warm_up import WarmUpRecord, drift_wanted
 from .precision_record import PrecisionRecord
-from .rehearsal_messages import rehearsal_line
 from .rehearsal_record import Rehearsal
 from .state import CampaignState
+from .status_messages import step_details, step_line
 
 State = Literal["done", "next", "blocked"]
-NOT_REQUIRED: Final = "not required (warmup_drift)"
 
 
 @dataclass(frozen=True)
@@ -34,24 +52,41 @@ class CampaignStep:
 
     Attributes:
         state: done, next, or blocked by an earlier step.
-        sentence: its result, or what is missing.
+        found: its result, or what is missing.
         command: to do it; "" for a step that is done, or for which there is no command.
-        details: more sentences, for the report.
         warning: whether what follows was recorded in spite of it.
         name: of the step.
+        waits_for: the step that blocks it; "" if none does.
     """
 
     state: State
-    sentence: str
+    found: StepOutcome
     command: str = ""
-    details: tuple[str, ...] = ()
     warning: bool = False
     name: str = ""
+    waits_for: str = ""
 
     @property
     def done(self) -> bool:
         """Whether it is done."""
         return self.state == "done"
+
+    @property
+    def sentence(self) -> str:
+        """Its result, or what is missing, in words."""
+        waits = f"; waits for: {self.waits_for}" if self.waits_for else ""
+        return f"{step_line(self.found)}{waits}"
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return the step for JSON."""
+        return {
+            "state": self.state,
+            "sentence": self.sentence,
+            "command": self.command,
+            "details": step_details(self.found),
+            "warning": self.warning,
+            "name": self.name,
+        }
 
 
 @dataclass(frozen=True)
@@ -86,7 +121,16 @@ class CampaignStatus:
 
     def to_dict(self) -> dict[str, Any]:
         """Return the status for JSON."""
-        return asdict(self) | {"complete": self.complete, "next_command": self.next_command}
+        return {
+            "root": self.root,
+            "plan_hash": self.plan_hash,
+            "steps": [step.to_dict() for step in self.steps],
+            "weighed": self.weighed,
+            "weighing": self.weighing,
+            "only_weighs": self.only_weighs,
+            "complete": self.complete,
+            "next_command": self.next_command,
+        }
 
 
 def status_of(campaign: CampaignState) -> CampaignStatus:
@@ -103,8 +147,8 @@ def status_of(campaign: CampaignState) -> CampaignStatus:
         ("rehearse", lambda: _gate(campaign, _rehearsal(folder), folder.rehearsal), again),
         ("dry run", lambda: _gate(campaign, _dry_run(campaign), folder.dry_run), ""),
         ("warm-up", lambda: _warmed(campaign), ""),
-        ("repetitions", lambda: _motions(campaign, "excitation", "repetitions"), ""),
-        ("validation", lambda: _motions(campaign, "validation", "validation motions"), ""),
+        ("repetitions", lambda: _motions(campaign, "excitation"), ""),
+        ("validation", lambda: _motions(campaign, "validation"), ""),
         ("identify", lambda: _identified(folder), "identify {}"),
         ("report", lambda: _reported(folder), "report {}"),
     ]
@@ -115,7 +159,7 @@ def status_of(campaign: CampaignState) -> CampaignStatus:
         if step.done:
             step = replace(step, command="")
         elif first:
-            step = replace(step, state="blocked", sentence=f"{step.sentence}; waits for: {first}")
+            step = replace(step, state="blocked", waits_for=first)
         first = first or ("" if step.done else name)
         command = f"hil {step.command.replace('{}', at)}" if step.command else ""
         steps.append(replace(step, command=command))
@@ -149,7 +193,7 @@ def _step(evaluate: Callable[[], CampaignStep], repair: str = "") -> CampaignSte
     try:
         return evaluate()
     except HilError as error:  # a damaged file of one step does not affect the others
-        return CampaignStep("next", str(error).rstrip("."), repair)
+        return CampaignStep("next", UnreadableStep(str(error)), repair)
 
 
 def _design(campaign: CampaignState) -> CampaignStep:
@@ -157,28 +201,18 @@ def _design(campaign: CampaignState) -> CampaignStep:
     folder = campaign.folder
     if folder.manifest():  # before the first recording a rehearsal accepts changes
         folder.require_unchanged()
-    motions = plural(len(campaign.plan.validation), "validation motion")
-    return CampaignStep(
-        "done", f"an excitation of {excitation.trajectory.duration:.1f} s and {motions}"
-    )
+    found = DesignedPlan(excitation.trajectory.duration, len(campaign.plan.validation))
+    return CampaignStep("done", found)
 
 
 def _rehearsal(folder: CampaignFolder) -> CampaignStep:
     rehearsal = Rehearsal.load(folder)
     if rehearsal is None:
-        return CampaignStep("next", "not rehearsed on the simulated arm", "rehearse {}")
+        return CampaignStep("next", NotRehearsed(is_of_another_plan=False), "rehearse {}")
     if rehearsal.plan_hash != folder.plan_hash:
-        message = "rehearsed with another cell, URDF or plan than it has now"
-        return CampaignStep("next", message, "rehearse {}")
-    return CampaignStep(
-        "done" if rehearsal.passed else "next",
-        rehearsal_line(rehearsal),
-        "rehearse {}",
-        (
-            *(criterion.sentence for criterion in rehearsal.criteria),
-            *(f"not detectable by it: {sentence}" for sentence in rehearsal.not_seen),
-        ),
-    )
+        return CampaignStep("next", NotRehearsed(is_of_another_plan=True), "rehearse {}")
+    state: State = "done" if rehearsal.passed else "next"
+    return CampaignStep(state, Rehearsed(rehearsal), "rehearse {}")
 
 
 def _dry_run(campaign: CampaignState) -> CampaignStep:
@@ -190,51 +224,34 @@ def _dry_run(campaign: CampaignState) -> CampaignStep:
         simulated=campaign.cell.only_simulated,
     )
     if record is None and folder.dry_run.exists():
-        problem = "of another plan or kind of arm, or its archives are missing"
-        return CampaignStep("next", f"the recorded one is not valid: {problem}", "run {} --dry-run")
+        return CampaignStep("next", NoDryRun(is_invalid=True), "run {} --dry-run")
     return _accepted(record)
 
 
 def _accepted(record: DryRunRecord | None) -> CampaignStep:
     if record is None:
-        return CampaignStep(
-            "next", "not done: every motion at 20 % of its speed", "run {} --dry-run"
-        )
+        return CampaignStep("next", NoDryRun(), "run {} --dry-run")
     if record.accepted is None:
         names = "".join(f" --accept-torque {joint}" for joint in record.against_gravity)
-        but = "".join(f"; {warning}" for warning in record.warnings)
-        message = f"done ({record.duration:.0f} s), but not accepted{but}"
-        return CampaignStep("next", message, f"run {{}} --accept-dry-run{names}")
-    shares = zip(record.joint_names, record.current_share, strict=True)
-    currents = ", ".join(f"{joint} {percentage(share)}" for joint, share in shares)
-    return CampaignStep(
-        "done",
-        f"accepted by {record.accepted.by} at {record.accepted.at}",
-        details=(
-            f"largest current, of its limit: {currents}",
-            f"{plural(len(record.archives), 'motion')} at {percentage(record.override)} of their "
-            "speed",
-            f"{plural(record.missed, 'packet')} missed, {plural(record.late, 'reply')} late",
-            *(f"{warning}; it was accepted by name" for warning in record.warnings),
-        ),
-    )
+        return CampaignStep("next", DryRunDone(record), f"run {{}} --accept-dry-run{names}")
+    return CampaignStep("done", DryRunDone(record))
 
 
 def _gate(campaign: CampaignState, step: CampaignStep, record: Path) -> CampaignStep:
     """Return a step, done if a simulated arm has left it out and run everything at full speed."""
     if step.done or record.exists() or not campaign.cell.only_simulated:
         return step
-    if all(_motions(campaign, kind, kind).done for kind in ("excitation", "validation")):
-        return CampaignStep("done", "skipped, as the arm is simulated")
+    if all(_motions(campaign, kind).done for kind in get_args(RepeatedKind)):
+        return CampaignStep("done", LeftOut(as_simulated=True))
     return step
 
 
 def _warmed(campaign: CampaignState) -> CampaignStep:
     if not drift_wanted(campaign.cell):
-        return CampaignStep("done", NOT_REQUIRED)
+        return CampaignStep("done", NoWarmUp(is_required=False))
     warm = WarmUpRecord.load(campaign.folder.warmup, campaign.folder.plan_hash)
-    if warm is None and _motions(campaign, "excitation", "repetitions").done:
-        return CampaignStep("done", "left out")
+    if warm is None and _motions(campaign, "excitation").done:
+        return CampaignStep("done", LeftOut(as_simulated=False))
     over = warm is not None and warm.outcome != "going on"
     return replace(_warm_up(warm), state="done" if over else "next")
 
@@ -242,50 +259,46 @@ def _warmed(campaign: CampaignState) -> CampaignStep:
 def _warm_up(record: WarmUpRecord | None) -> CampaignStep:
     """Return the step for the report: done if the arm was warm."""
     if record is None:
-        return CampaignStep("next", "not done", "run {}")
-    message = f"{record.outcome} after {plural(len(record.motions), 'motion')}"
-    cold = record.outcome == "not warm" and bool(record.motions)
+        return CampaignStep("next", NoWarmUp(is_required=True), "run {}")
     state: State = "done" if record.outcome == "warm" else "next"
-    details = (record.sentence,) if cold else ()
-    return CampaignStep(state, message, "run {}", details, warning=record.outcome == "not warm")
+    is_cold = record.outcome == "not warm"
+    return CampaignStep(state, WarmUpDone(record), "run {}", warning=is_cold)
 
 
 def _conducted_warm_up(folder: CampaignFolder) -> CampaignStep:
     """Return the step for the report: done if the arm was warm, or no warm-up was wanted."""
     warm = WarmUpRecord.load(folder.warmup, folder.plan_hash)
     if warm is None and not drift_wanted(Cell.load(folder.cell)):
-        return CampaignStep("done", NOT_REQUIRED)
+        return CampaignStep("done", NoWarmUp(is_required=False))
     return _warm_up(warm)
 
 
-def _motions(campaign: CampaignState, kind: str, plural_kind: str) -> CampaignStep:
+def _motions(campaign: CampaignState, kind: RepeatedKind) -> CampaignStep:
     whole, total = campaign.progress(kind)
     state: State = "done" if whole >= total else "next"
     precision = campaign.precision if kind == "excitation" else None
-    details = () if precision is None else (precision.message,)
-    return CampaignStep(state, f"{whole} of {total} {plural_kind} complete", "run {}", details)
+    return CampaignStep(state, PlannedRecordings(kind, whole, total, precision), "run {}")
 
 
 def _identified(folder: CampaignFolder) -> CampaignStep:
     if not path_exists(folder.results):
-        return CampaignStep("next", "not identified yet", "identify {}")
+        return CampaignStep("next", NotIdentified(), "identify {}")
     results = Results.load(folder.results)
     used = {*results.repetitions, *(prediction.archive for prediction in results.validation)}
     kinds = ("excitation", "validation")
-    new = [path.name for kind in kinds for path in folder.completed(kind) if path.name not in used]
-    if new:
-        message = f"identified without {len(new)} of the archives ({new[0]})"
-        return CampaignStep("next", message, "identify {}")
-    return CampaignStep("done", results.verdict.line)
+    names = [path.name for kind in kinds for path in folder.completed(kind)]
+    if new := tuple(name for name in names if name not in used):
+        return CampaignStep("next", NotIdentified(new), "identify {}")
+    return CampaignStep("done", Identified(results.verdict.line))
 
 
 def _reported(folder: CampaignFolder) -> CampaignStep:
     if not folder.report.exists():
-        return CampaignStep("next", "no report yet", "report {}")
+        return CampaignStep("next", NoReport(is_outdated=False), "report {}")
     written = folder.report.stat().st_mtime
     if folder.results.exists() and folder.results.stat().st_mtime > written + 1.0:
-        return CampaignStep("next", "older than the results", "report {}")
-    return CampaignStep("done", str(folder.report))
+        return CampaignStep("next", NoReport(is_outdated=True), "report {}")
+    return CampaignStep("done", Reported(folder.report))
 
 
 def execution_log_of(folder: CampaignFolder) -> ExecutionLogResult:
@@ -294,25 +307,21 @@ def execution_log_of(folder: CampaignFolder) -> ExecutionLogResult:
     Raises:
         CampaignFolderError: the manifest cannot be read.
     """
+    record = _precision(folder)
     steps = {
         "rehearsal": _step(lambda: _rehearsal(folder)),
         "dry run": _step(lambda: _accepted(DryRunRecord.load(folder))),
         "warm-up": _step(lambda: _conducted_warm_up(folder)),
-        "repetitions": _recorded(folder, "excitation"),
+        "repetitions": _recorded(folder, "excitation", record),
         "validation": _recorded(folder, "validation"),
     }
-    record = _precision(folder)
-    if record is not None:
-        repeated = steps["repetitions"]
-        details = (*repeated.details, record.message)
-        steps["repetitions"] = replace(repeated, details=details)
     return ExecutionLogResult(
         steps=[
             StepResult(
                 step=name,
                 done=step.done,
                 words=step.sentence,
-                details=[*step.details],
+                details=step_details(step.found),
                 warning=step.warning,
             )
             for name, step in steps.items()
@@ -346,29 +355,32 @@ def _over_repetitions(folder: CampaignFolder, record: PrecisionRecord) -> list[P
     ]
 
 
-def _end_of_killed(path: Path) -> str:
-    """Return how an archive ended that no program entered into the manifest."""
+def _killed(path: Path) -> EndedRecording:
+    """Return a recording that no program entered into the manifest."""
     try:
         outcome = open_archive(path).outcome
     except HilError:
         outcome = None
     if outcome is None:
-        return "it was never closed: the program or the computer stopped"
-    return f"the program ended before it checked the motion ({outcome.outcome}: {outcome.reason})"
+        return EndedRecording(path.name, "killed", "")
+    return EndedRecording(path.name, "killed", outcome.reason, outcome.outcome)
 
 
-def _recorded(folder: CampaignFolder, kind: str) -> CampaignStep:
+def _recorded(
+    folder: CampaignFolder, kind: RepeatedKind, precision: PrecisionRecord | None = None
+) -> CampaignStep:
     """Return how many motions of a kind are complete, with the reasons of the others."""
     entries = [entry for entry in folder.manifest() if entry.kind == kind]
-    bad = [f"{e.name} {e.outcome}: {e.reason}" for e in entries if e.outcome != "completed"]
-    good = len(entries) - len(bad)
+    ended = [
+        EndedRecording(entry.name, entry.outcome, entry.reason)
+        for entry in entries
+        if entry.outcome != "completed"
+    ]
+    good = len(entries) - len(ended)
     entered = {entry.name for entry in entries}
-    names = sorted(path.name for path in folder.archives.glob("*.mcap") if path.name not in entered)
-    for name in names:
-        parsed = ArchiveName.parse(name)
+    for path in folder.archives.glob("*.mcap"):
+        parsed = None if path.name in entered else ArchiveName.parse(path.name)
         if parsed is not None and parsed.kind == kind:
-            bad.append(f"{name} killed: {_end_of_killed(folder.archives / name)}")
-    rejected = f"; {len(bad)} rejected or ended early" if bad else ""
-    return CampaignStep(
-        "done" if good else "next", f"{good} complete{rejected}", details=(*sorted(bad),)
-    )
+            ended.append(_killed(path))
+    found = MadeRecordings(good, tuple(sorted(ended, key=lambda each: each.archive)), precision)
+    return CampaignStep("done" if good else "next", found)

@@ -13,6 +13,7 @@ from .motion_runner import RunArchives, Runner
 from .operator import ExpectedMotion, RunWatch
 from .quality_messages import rest_words
 from .quality_problems import ColdStart
+from .record_messages import warm_up_line
 from .state import CampaignState
 
 
@@ -47,7 +48,7 @@ class WarmUpStage:
         record = self._stored()
         if record is None or record.outcome != "not warm":
             return self._pauses
-        cold = f"the arm was not warm when the repetitions began ({record.sentence})"
+        cold = f"the arm was not warm when the repetitions began ({warm_up_line(record)})"
         return [cold, *self._pauses]
 
     def next_motion(self) -> list[CampaignMotion]:
@@ -80,7 +81,7 @@ class WarmUpStage:
             state = state.with_motion(name, friction, settings.warmup_least, settings.warmup_most)
             state = replace(state, moved_at=time.time())
             state.save(self._path)
-            self._reporter.say(state.sentence)
+            self._reporter.say(warm_up_line(state))
 
     def rewarm(self, runner: Runner) -> None:
         """Warm up again if the joints have cooled down."""

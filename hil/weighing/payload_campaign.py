@@ -33,6 +33,7 @@ from hil.campaign.gates import require_rehearsed
 from hil.campaign.plan import CampaignPlan
 from hil.campaign.precision_record import PrecisionLook, PrecisionRecord, Reached
 from hil.campaign.reached_precision import further_repetitions
+from hil.campaign.record_messages import precision_line
 from hil.cell import Cell
 from hil.cell.cell import ASSUMED_PAYLOAD
 from hil.cell.schema import CellFile
@@ -161,11 +162,11 @@ class Weighed:
 
     @property
     def _reached(self) -> list[str]:
-        return [] if self.precision is None else ["", self.precision.message]
+        return [] if self.precision is None else ["", precision_line(self.precision)]
 
     def as_json(self) -> dict[str, Any]:
         """Return all values as JSON data."""
-        precision = None if self.precision is None else self.precision.message
+        precision = None if self.precision is None else precision_line(self.precision)
         return self.payload.as_json() | {"pairs": self.pairs, "precision": precision}
 
 
@@ -299,7 +300,7 @@ class PayloadCampaign:
             if record is not None and result is not None and record.measured < pairs:
                 record = record.with_look(_look(result, pairs, requirements[0]), self.limit)
                 record.save(self._precision)
-                reporter.say(record.message)
+                reporter.say(precision_line(record))
             if pairs >= MIN_PAIRS and (
                 record is None or (record.ended and record.measured == pairs)
             ):

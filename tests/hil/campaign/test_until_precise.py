@@ -20,6 +20,7 @@ from hil.campaign.reached_precision import (
     noise_shares,
     requirements_of,
 )
+from hil.campaign.record_messages import precision_line
 from hil.cli import app
 from hil.control.motion_watch import Stop
 from identification.estimators.elasticity import ElasticTorque
@@ -186,8 +187,8 @@ class TestRecord:
         record = PrecisionRecord("hash", ("parameters 5 %",))
         for count in (2, 3, 4):
             record = record.with_look(PrecisionLook(count, (reached(0.051, 1),)), limit=30)
-        assert "which more repetitions do not improve enough" in record.message
-        assert "another motion" in record.message
+        assert "which more repetitions do not improve enough" in precision_line(record)
+        assert "another motion" in precision_line(record)
 
     def test_one_requirement_in_reach_continues(self) -> None:
         """The one that repetitions do not meet is no reason to leave the other unmet."""
@@ -197,7 +198,10 @@ class TestRecord:
     def test_the_message_names_the_worst(self) -> None:
         look = PrecisionLook(4, (reached(0.071, 6), reached(1.0, 0, "torque 2 N·m")))
         record = PrecisionRecord("hash", ()).with_look(look, limit=30)
-        assert record.message == "precision after 4 repetitions: I2m 7.1 % of 5 %, about 6 more"
+        assert (
+            precision_line(record)
+            == "precision after 4 repetitions: I2m 7.1 % of 5 %, about 6 more"
+        )
 
     def test_it_survives_its_file(self, tmp_path) -> None:
         record = PrecisionRecord(
