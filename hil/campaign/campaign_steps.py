@@ -59,7 +59,7 @@ class DryRunDone:
 
 
 @dataclass(frozen=True)
-class LeftOut:
+class SkippedStep:
     """A gate that a simulated arm does not need, or a warm-up that was not done."""
 
     as_simulated: bool
@@ -144,7 +144,7 @@ StepOutcome = (
     | Rehearsed
     | NoDryRun
     | DryRunDone
-    | LeftOut
+    | SkippedStep
     | NoWarmUp
     | WarmUpDone
     | PlannedRecordings

@@ -99,7 +99,7 @@ class UnseenError:
 
 
 @dataclass(frozen=True)
-class NotIdentified:
+class UndeterminedCriterion:
     """A criterion of an identification that failed."""
 
     criterion: str
@@ -114,7 +114,7 @@ Judged = (
     | Undetermined
     | ParameterErrors
     | UnseenError
-    | NotIdentified
+    | UndeterminedCriterion
 )
 
 
@@ -146,7 +146,7 @@ def judgement_of(judged: Judged) -> Judgement:
             return _judgement("parameters", largest, allowed)
         case UnseenError(ratio):
             return _judgement("unseen motion", ratio, MAX_ERROR_RATIO)
-        case NotIdentified(name, allowed):
+        case UndeterminedCriterion(name, allowed):
             return Judgement(name, None, allowed)
 
 
@@ -270,7 +270,7 @@ def of_estimate(twin: Twin, folder: CampaignFolder, reporter: Reporter) -> list[
         prepared = prepare_sources(gather_sources(paths, FIXED.split), FIXED, reporter)
         estimation = estimate_with(prepared, FIXED, reporter)
     except (InputError, IdentificationError, RecordingError) as error:
-        return [NotIdentified(name, bound, str(error)) for name, bound in bounds.items()]
+        return [UndeterminedCriterion(name, bound, str(error)) for name, bound in bounds.items()]
     model = twin.cell.model
     estimate = estimation.result.pooled
     undetermined = estimate.undetermined

@@ -18,15 +18,15 @@ from .rehearsal_criteria import (
     CurrentShare,
     FailedMotion,
     Judged,
-    NotIdentified,
     ParameterErrors,
     SpeedShare,
     Undetermined,
+    UndeterminedCriterion,
     UnseenError,
     WorstMotion,
     judgement_of,
 )
-from .rehearsal_record import EFFECTS, Rehearsal, RehearsalCriterion
+from .rehearsal_record import EFFECTS, RehearsalCriterion
 from .twin import (
     Assumption,
     CurrentNoise,
@@ -54,16 +54,6 @@ def criterion_record(judged: Judged, cell: Cell) -> RehearsalCriterion:
         passed=judgement.passed,
         sentence=f"{facts}: {remedy}" if remedy else facts,
     )
-
-
-def rehearsal_line(rehearsal: Rehearsal) -> str:
-    """Return the result of a rehearsal in one sentence."""
-    if rehearsal.passed:
-        return (
-            f"the rehearsal passed all {len(rehearsal.criteria)} criteria; what it cannot detect "
-            "is in rehearsal.json (not_seen)"
-        )
-    return f"the rehearsal failed: {'; '.join(rehearsal.failures)}"
 
 
 def assumption_words(assumption: Assumption) -> str:
@@ -151,7 +141,7 @@ def _facts(judged: Judged, cell: Cell) -> str:
                 f"{run}: {_joint(worst, cell)} moved at {percentage(share)} of its speed limit "
                 f"({worst.archive.name}), at most {percentage(MAX_SPEED_SHARE)} is allowed"
             )
-        case NotIdentified(name, _, problem):
+        case UndeterminedCriterion(name, _, problem):
             return f"{name}: cannot be determined: the identification failed ({problem})"
         case Undetermined(undetermined):
             return (
@@ -182,7 +172,7 @@ def _remedy(judged: Judged, cell: Cell) -> str:
         case SpeedShare(run, _, worst):
             redesign = "lower velocity_deg in [limits] of the cell file, and design again"
             return _motion_remedy(run, worst, cell, redesign)
-        case NotIdentified():
+        case UndeterminedCriterion():
             return ""
         case Undetermined():
             return "design a motion that moves every joint"

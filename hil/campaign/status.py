@@ -20,7 +20,6 @@ from .campaign_steps import (
     DryRunDone,
     EndedRecording,
     Identified,
-    LeftOut,
     MadeRecordings,
     NoDryRun,
     NoReport,
@@ -31,6 +30,7 @@ from .campaign_steps import (
     Rehearsed,
     RepeatedKind,
     Reported,
+    SkippedStep,
     StepOutcome,
     UnreadableStep,
     WarmUpDone,
@@ -242,7 +242,7 @@ def _gate(campaign: CampaignState, step: CampaignStep, record: Path) -> Campaign
     if step.done or record.exists() or not campaign.cell.only_simulated:
         return step
     if all(_motions(campaign, kind).done for kind in get_args(RepeatedKind)):
-        return CampaignStep("done", LeftOut(as_simulated=True))
+        return CampaignStep("done", SkippedStep(as_simulated=True))
     return step
 
 
@@ -251,7 +251,7 @@ def _warmed(campaign: CampaignState) -> CampaignStep:
         return CampaignStep("done", NoWarmUp(is_required=False))
     warm = WarmUpRecord.load(campaign.folder.warmup, campaign.folder.plan_hash)
     if warm is None and _motions(campaign, "excitation").done:
-        return CampaignStep("done", LeftOut(as_simulated=False))
+        return CampaignStep("done", SkippedStep(as_simulated=False))
     over = warm is not None and warm.outcome != "going on"
     return replace(_warm_up(warm), state="done" if over else "next")
 

@@ -13,7 +13,6 @@ from .campaign_steps import (
     DryRunDone,
     EndedRecording,
     Identified,
-    LeftOut,
     MadeRecordings,
     NoDryRun,
     NoReport,
@@ -24,12 +23,12 @@ from .campaign_steps import (
     Rehearsed,
     RepeatedKind,
     Reported,
+    SkippedStep,
     StepOutcome,
     UnreadableStep,
     WarmUpDone,
 )
 from .record_messages import gravity_lines, precision_line, warm_up_line
-from .rehearsal_messages import rehearsal_line
 
 _MOTIONS: Final[Mapping[RepeatedKind, str]] = {
     "excitation": "repetitions",
@@ -51,7 +50,7 @@ def step_line(found: StepOutcome) -> str:
                 return "rehearsed with another cell, URDF or plan than it has now"
             return "not rehearsed on the simulated arm"
         case Rehearsed(rehearsal):
-            return rehearsal_line(rehearsal)
+            return rehearsal.line
         case NoDryRun(is_invalid):
             if is_invalid:
                 return (
@@ -64,7 +63,7 @@ def step_line(found: StepOutcome) -> str:
                 return f"accepted by {record.accepted.by} at {record.accepted.at}"
             but = "".join(f"; {line}" for line in gravity_lines(record))
             return f"done ({record.duration:.0f} s), but not accepted{but}"
-        case LeftOut(as_simulated):
+        case SkippedStep(as_simulated):
             return "skipped, as the arm is simulated" if as_simulated else "left out"
         case NoWarmUp(is_required):
             return "not done" if is_required else "not required (warmup_drift)"

@@ -15,6 +15,7 @@ from hil.base.terminal_text import printable
 from hil.batch.cluster import Cluster
 from hil.cli.arguments import JsonOption, QuietOption, VerboseOption, print_json
 from hil.compare import comparison as comparing
+from hil.compare.documents import comparison_document
 from hil.compare.messages import comparison_lines, verdict_line
 from identification.text import percentage, unit_text
 
@@ -47,7 +48,7 @@ def compare(
         make_folder(output.parent)
         write_files(output.parent, {output.name: comparison_page(comparison)})
     if json:
-        print_json(comparison.document)
+        print_json(comparison_document(comparison))
     else:
         lines = [] if quiet else _lines(comparison)
         lines = [f"{verdict_line(comparison.changed)}.", *lines]

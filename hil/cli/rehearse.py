@@ -11,7 +11,6 @@ from hil.base.one_screen import brief
 from hil.base.progress import reporter as make_reporter
 from hil.base.progress import say
 from hil.campaign import Campaign, stop_on_interrupt
-from hil.campaign.rehearsal_messages import rehearsal_line
 from hil.campaign.rehearsal_record import Rehearsal
 from hil.cli.arguments import CampaignArgument, JsonOption, QuietOption, VerboseOption
 
@@ -49,7 +48,7 @@ def rehearse(
         lines = [] if quiet else _lines(rehearsal, verbose=verbose)
         if rehearsal.passed and not quiet:
             lines.append(f"next: {opened.folder.run_command}")
-        result = rehearsal_line(rehearsal)
+        result = rehearsal.line
         for line in [*lines, result] if verbose else brief([result, *lines]):
             say(line)
     if not rehearsal.passed:

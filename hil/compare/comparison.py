@@ -9,10 +9,10 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass, replace
 from os.path import commonpath
 from pathlib import Path
-from typing import Any, Final, NamedTuple
+from typing import Final, NamedTuple
 
 import numpy as np
 import scipy
@@ -31,7 +31,6 @@ from identification import RobotModel
 from identification.distributions import student_limit, student_tail
 from identification.factor.estimate import Estimate
 
-from .messages import comparison_lines, verdict_line
 from .notes import (
     OfCampaign,
     OtherSetups,
@@ -123,32 +122,6 @@ class ArmComparison:
             if change.kind == "friction" and math.isfinite(change.relative_half)
         )
         return tuple(sorted(known, key=lambda change: change.relative_half))
-
-    @property
-    def document(self) -> dict[str, Any]:
-        """JSON data, None for unknown values."""
-        numbers = [asdict(change) for change in self.changes]
-        return {
-            "arm": self.arm,
-            "simulated": self.simulated,
-            "dated": self.dated,
-            "verdict": verdict_line(self.changed),
-            "changed": bool(self.changed),
-            "campaigns": [
-                {
-                    "name": name,
-                    "folder": campaign.campaign,
-                    "when": campaign.when or None,
-                    "setup": campaign.setup,
-                }
-                for name, campaign in zip(self.names, self.campaigns, strict=True)
-            ],
-            "parameters": [
-                {name: None if value != value else value for name, value in row.items()}
-                for row in numbers
-            ],
-            "warnings": comparison_lines(self.warnings),
-        }
 
 
 def compare(places: Sequence[str], cluster: Cluster, reporter: Reporter) -> ArmComparison:

@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
-from typing import TYPE_CHECKING
 
 from hil.batch.messages import batch_lines
 from hil.pipeline.notes import Note
 
+from .comparison import QuantityChange
 from .notes import (
     OfCampaign,
     OtherSetups,
@@ -15,9 +15,6 @@ from .notes import (
     UnknownDailyVariation,
     UnusableArchive,
 )
-
-if TYPE_CHECKING:
-    from .comparison import QuantityChange
 
 
 def verdict_line(changed: Iterable[QuantityChange]) -> str:

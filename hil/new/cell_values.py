@@ -36,12 +36,12 @@ from .found_shapes import check_by_found_shapes
 from .notes import (
     CellNote,
     ClosedAxes,
+    CollisionExceptions,
     EveryPostureInContact,
     FromSimulation,
     HomeNotChecked,
     NoFloor,
     ShapesNotFound,
-    UncheckedPairs,
     UnsupportedCycle,
 )
 
@@ -169,7 +169,7 @@ def clear_home(urdf: str, cell_values: CellValues, mesh_folders: Sequence[str]) 
             values: dict[str, Any] = {"campaign.home_deg": _degrees(postures[clear[0]])}
             notes = list[CellNote]()
             if any(check.exceptions):
-                notes.append(UncheckedPairs(check.exceptions))
+                notes.append(CollisionExceptions(check.exceptions))
             if check.links:
                 notes.append(ShapesNotFound(tuple(check.links)))
             if floor is None:

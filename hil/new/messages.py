@@ -32,7 +32,7 @@ def _note_words(note: CellNote) -> str:
         case (
             notes.NoCollisionShapes()
             | notes.HomeNotChecked()
-            | notes.UncheckedPairs()
+            | notes.CollisionExceptions()
             | notes.ShapesNotFound()
             | notes.NoFloor()
             | notes.EveryPostureInContact()
@@ -109,7 +109,7 @@ def _joints_words(note: notes.LiftingJoints | notes.GripperJoints | notes.Severa
 def _collision_words(
     note: notes.NoCollisionShapes
     | notes.HomeNotChecked
-    | notes.UncheckedPairs
+    | notes.CollisionExceptions
     | notes.ShapesNotFound
     | notes.NoFloor
     | notes.EveryPostureInContact,
@@ -123,7 +123,7 @@ def _collision_words(
             )
         case notes.HomeNotChecked(problem):
             return f"campaign.home_deg was not checked for collisions: {problem}"
-        case notes.UncheckedPairs(exceptions):
+        case notes.CollisionExceptions(exceptions):
             return unchecked_text(exceptions) or ""
         case notes.ShapesNotFound(links):
             return (

@@ -78,7 +78,7 @@ class HomeNotChecked:
 
 
 @dataclass(frozen=True)
-class UncheckedPairs:
+class CollisionExceptions:
     """Pairs of bodies that are not checked for collisions, or with a smaller margin."""
 
     exceptions: PairExceptions
@@ -158,7 +158,7 @@ CellNote = (
     | SeveralBranches
     | NoCollisionShapes
     | HomeNotChecked
-    | UncheckedPairs
+    | CollisionExceptions
     | ShapesNotFound
     | NoFloor
     | EveryPostureInContact

@@ -58,7 +58,7 @@ NOT_MET: dict[Judged, tuple[str, str]] = {
     criteria.Undetermined(("I1zz", "m2")): ("I1zz, m2", "design a motion that moves every joint"),
     criteria.ParameterErrors(12, 9.0, "I1zz", 5.1): ("9 standard", "`--again --seed 2`"),
     criteria.UnseenError(1.7, 0): ("1.70 times", "`hil design`"),
-    criteria.NotIdentified("excitation", 0.0, "no rows"): (
+    criteria.UndeterminedCriterion("excitation", 0.0, "no rows"): (
         "excitation: cannot be determined",
         "(no rows)",
     ),

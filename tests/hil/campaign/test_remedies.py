@@ -76,7 +76,6 @@ TYPED = {
     "begin a new campaign folder (`hil design`)": "test_a_link_to_another_kind_of_arm",
     "design a better excitation (`hil design`)": "test_an_excitation_that_determines_too_little",
     "FIELD workers of Dask did not start": "test_workers_that_do_not_start",
-    "the scaled condition number is FIELD": "test_parameters_that_are_poorly_separated",
     "give --joint and --by": "test_an_axis_alone_without_a_joint",
     "leave it out, or run against `hil simulate`": "test_a_live_view_in_virtual_time",
 }  # fmt: skip
@@ -96,6 +95,7 @@ ELSEWHERE = {  # files below tests/hil, and what no test can type
     "give one of --udp, --can and --link": "control/test_simulate.py",
     "leave --priority out, or raise the limit": "a user without the right to a priority",
     "or add --link rtde:HOST": "control/test_ur_recording.py",
+    "by chance: `--again --seed 2` shows which": "an error that one rehearsal in a thousand has",
 }
 
 

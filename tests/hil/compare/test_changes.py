@@ -32,6 +32,7 @@ from hil.compare.comparison import (
     holm,
     quantities,
 )
+from hil.compare.documents import comparison_document
 from hil.compare.messages import verdict_line
 from hil.compare.notes import OtherSetups, SingleRepetition
 from hil.pipeline.notes import StatedText
@@ -251,7 +252,7 @@ class TestInMemory:
         assert not again.changed
         assert {SingleRepetition(name) for name in again.names} <= {*again.warnings}
         assert "nan" not in Page(comparison_page(again).decode()).text
-        json.dumps(again.document, allow_nan=False)
+        json.dumps(comparison_document(again), allow_nan=False)
 
 
 class TestStatistics:

@@ -38,7 +38,7 @@ WORDS: dict[CellNote, str] = {
     ),
     notes.NoCollisionShapes(): "`hil design --show-settings gradient`",
     notes.HomeNotChecked("no mesh"): "was not checked for collisions: no mesh",
-    notes.UncheckedPairs(PAIRS): "base and link1 (0.000 to 0.001 m)",
+    notes.CollisionExceptions(PAIRS): "base and link1 (0.000 to 0.001 m)",
     notes.ShapesNotFound(("tool",)): "the collision shapes of tool were not found",
     notes.NoFloor(): "no posture tried is clear of a floor at 0 m",
     notes.EveryPostureInContact(): "correct campaign.home_deg",
