@@ -22,7 +22,6 @@ from hil.base.files import digest, file_digest, json_digest
 from hil.base.progress import Reporter
 from hil.base.terminal_text import typed
 from hil.cell import Cell
-from hil.pipeline.prepared import stated_delay
 from identification.selection.settings import Settings
 
 from .cache import JSON, CacheError, CacheLocation, code_digest
@@ -37,6 +36,7 @@ from .places import (
     text_at,
 )
 from .recording_search import KindsOfLogs, find_recordings
+from .setup import NO_SETUP, Setup
 
 USES: Final = ("excitation", "validation", "standstill")
 """Uses of archives in a batch; archives of other kinds are skipped."""
@@ -71,7 +71,7 @@ class GroupKey(NamedTuple):
 
     arm: str  #: digest of URDF, model, friction law and drive train
     campaign: str  #: the folder the archives were recorded into
-    setup: str = ""  #: delay and payload stated by their cells, as text; "" for neither
+    setup: Setup = NO_SETUP  #: stated by their cells
 
 
 @dataclass(frozen=True, slots=True)
@@ -90,7 +90,7 @@ class ArchiveRef:
     cell: str  #: digest of the texts of cell file and URDF
     motion: str  #: digest of the planned motion, "" where unknown
     when: str = ""  #: time of recording, ISO 8601; "" in simulation
-    setup: str = ""
+    setup: Setup = NO_SETUP
     stamp: Stamp = _UNKNOWN  #: of the file when it was hashed
     kind: str = ""  #: as in its metadata
     attempt: int = 0  #: 0 where the archive does not number them
@@ -131,7 +131,7 @@ class ArchiveRef:
         return GroupKey(self.arm, self.campaign, self.setup)
 
     @property
-    def order(self) -> tuple[str, str, str, str, str, int, str, str]:
+    def order(self) -> tuple[str, str, str, str, Setup, int, str, str]:
         """Sort key: sums are added in this order."""
         return self.type_key, self.robot, *self.key, self.index, self.name, self.sha256
 
@@ -356,7 +356,7 @@ def _cell_from(text: str, urdf: str, friction: str) -> Cell:
 def arm_digest(cell: Cell, drive_train: bytes | None, *, simulated: bool = False) -> str:
     """Return the digest that identifies a robot: links, joints, friction law, drives.
 
-    Payload and delay are not part of it (see :func:`describe_setup`). The drive
+    Payload and delay are not part of it (see :class:`Setup`). The drive
     train of the archive has precedence over that of the cell.
     """
     drives = cell.file.drive_train
@@ -369,22 +369,6 @@ def arm_digest(cell: Cell, drive_train: bytes | None, *, simulated: bool = False
     }
     # Users store it in tables, so the text must not change.
     return digest(json.dumps(parts, sort_keys=True, separators=(",", ":")))
-
-
-def describe_setup(cell: Cell) -> str:
-    """Return torque delay and payload of a cell as text, with all digits; "" for neither."""
-
-    def row(figures: Iterable[float]) -> str:
-        return f"({', '.join(f'{figure:.12g}' for figure in figures)})"
-
-    delay = stated_delay(cell)
-    payload = cell.file.robot.payload
-    phrases = [f"torque lags by {1e3 * delay:.12g} ms"] if delay else []
-    if payload is not None and (payload.mass or any(payload.inertia)):
-        frame = f" in {payload.frame}" if payload.frame else ""
-        phrases.append(f"carries {payload.mass:.12g} kg at {row(payload.centre)} m{frame}")
-        phrases += [f"{row(payload.inertia)} kg·m²"] if any(payload.inertia) else []
-    return ", ".join(phrases)
 
 
 def inspect_archives(
@@ -484,7 +468,7 @@ def described_archive(place: str, cache: CacheLocation, source: str = "") -> Arc
         if not cache.has(origin, key, JSON):
             cache.put(origin, key, CellTexts(cell.text, cell.urdf))
         arm = arm_digest(cell, drives, simulated=ref.simulated)
-        ref = replace(ref, arm=arm, cell=key, setup=describe_setup(cell))
+        ref = replace(ref, arm=arm, cell=key, setup=Setup.of(cell))
     if stamp_of(place) != stamp:
         raise changed_error(place)
     return ref

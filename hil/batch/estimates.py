@@ -40,6 +40,7 @@ from .archive_reduction import (
 from .cache import CacheLocation
 from .cluster import SkippedArchive
 from .notes import DifferentSetups, MoreNotes, OfSomeArchives
+from .setup import NO_SETUP, Setup
 
 Level = Literal["repetition", "campaign", "pooled", "siblings"]
 BatchEstimator = Literal["auto", "wls", "consistent"]
@@ -79,9 +80,7 @@ class BatchEstimate:
     unseen_torque_rms: Array  #: torque per joint (n,) there; NaN if none
     settings: str  #: digest of the settings; "" where campaigns with different ones are pooled
     warnings: tuple[Note, ...] = ()  #: about the archives and the estimate
-    #: payload and delay that the cell states, as text; "" if neither, or if campaigns with
-    #: different ones are pooled
-    setup: str = ""
+    setup: Setup = NO_SETUP  #: that the cell states; empty if campaigns with others are pooled
     #: location and digest of the archive of a repetition; "" otherwise
     archive: str = ""
     sha256: str = ""
@@ -113,7 +112,7 @@ class EstimateGroup:
     #: every archive, with the warnings about it
     warned: tuple[tuple[ArchiveRef, tuple[Note, ...]], ...] = ()
     settings: frozenset[str] = frozenset()  #: digests
-    setups: frozenset[str] = frozenset()  #: payloads and delays that the cells state
+    setups: frozenset[Setup] = frozenset()  #: that the cells state
 
     @classmethod
     def of(cls, reduced: ReducedArchives, settings: Settings) -> EstimateGroup:
@@ -412,7 +411,7 @@ class Estimator:
             unseen_torque_rms=_rms(unseen),
             settings=next(iter(group.settings)) if len(group.settings) == 1 else "",
             warnings=(*warnings, *frequent_notes(group.warned)),
-            setup=next(iter(group.setups)) if len(group.setups) == 1 else "",
+            setup=next(iter(group.setups)) if len(group.setups) == 1 else NO_SETUP,
         )
 
 

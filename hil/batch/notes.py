@@ -15,6 +15,8 @@ from hil.pipeline.notes import (
     StatedText,
 )
 
+from .setup import Setup
+
 ARCHIVE_NOTES: Final[Mapping[str, type[Note]]] = {
     kind.__name__: kind
     for kind in (AssumedTorqueConstants, MergedSamples, OtherMeaning, RepairedArchive, StatedText)
@@ -43,7 +45,7 @@ class MoreNotes(Note):
 class DifferentSetups(Note):
     """Campaigns whose cells state different payloads or delays are pooled."""
 
-    setups: tuple[str, ...]  #: "" where a cell states neither
+    setups: tuple[Setup, ...]
 
 
 def note_as_json(note: Note) -> list[Any]:

@@ -16,7 +16,7 @@ from hil.batch.graph import BatchResult
 from identification.factor.messages import method_words
 
 from .estimates import BatchEstimate, relative_error
-from .messages import batch_lines
+from .messages import batch_lines, setup_words
 
 Row = dict[str, Any]
 
@@ -125,7 +125,7 @@ def _levels(result: BatchResult) -> Iterator[tuple[BatchEstimate, Row]]:
             "robot": result.arms[level.arm].robot,
             "arm_type": result.arms[level.arm].arm_type or level.arm,
             "campaign": level.campaign,
-            "setup": level.setup,
+            "setup": setup_words(level.setup),
             "archive": level.archive,
             "archive_sha256": level.sha256,
             "when": parse_time(level.when),

@@ -19,7 +19,7 @@ from hil.batch import graph as run
 from hil.batch.cluster import SkippedArchive
 from hil.batch.estimates import BatchEstimate, BatchEstimator, relative_error
 from hil.batch.graph import BatchResult
-from hil.batch.messages import batch_lines
+from hil.batch.messages import batch_lines, setup_words
 from hil.batch.table import write_tables
 from hil.cli.arguments import JsonOption, QuietOption, VerboseOption, print_json, with_options
 from hil.cli.fleet_options import Fleet, RecordingsArgument, last, map_lines, skipped_line
@@ -152,7 +152,9 @@ def result_lines(result: BatchResult) -> Iterator[str]:
 def _line(campaign: BatchEstimate) -> str:
     """Format a campaign."""
     named = ", ".join(
-        text for text in (campaign.campaign, campaign.setup, campaign.when[:10]) if text
+        text
+        for text in (campaign.campaign, setup_words(campaign.setup), campaign.when[:10])
+        if text
     )
     error = relative_error(
         campaign.estimate.noise_std, campaign.torque_rms, campaign.estimate.samples
@@ -175,9 +177,10 @@ def as_dict(result: BatchResult, written: Sequence[Path]) -> dict[str, Any]:
         "arms": {
             arm.name: {
                 "campaigns": {
-                    estimate.campaign
-                    + (
-                        f" ({estimate.setup})" if folders[digest, estimate.campaign] > 1 else ""
+                    (
+                        f"{estimate.campaign} ({setup_words(estimate.setup)})"
+                        if folders[digest, estimate.campaign] > 1
+                        else estimate.campaign
                     ): _level(estimate)
                     for estimate in result.campaigns
                     if estimate.arm == digest
@@ -198,7 +201,7 @@ def as_dict(result: BatchResult, written: Sequence[Path]) -> dict[str, Any]:
 def _level(level: BatchEstimate) -> dict[str, Any]:
     return {
         "when": level.when or None,
-        "setup": level.setup,
+        "setup": setup_words(level.setup),
         "repetitions": level.repetitions,
         "method": method_words(level.estimate.method),
         "parameters": {

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from hil.base.version import software
+from hil.batch.messages import setup_words
 from hil.compare.comparison import (
     FALSE_ALARM_RATE,
     MIN_RELATIVE_CHANGE,
@@ -25,6 +26,7 @@ def comparison_page(comparison: ArmComparison) -> bytes:
         found=comparison,
         verdict=verdict_line(comparison.changed),
         notes=comparison_lines(comparison.warnings),
+        setups=[setup_words(campaign.setup) for campaign in comparison.campaigns],
         rules=rules,
         software=software(),
     )

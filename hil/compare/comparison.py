@@ -24,6 +24,7 @@ from hil.batch import graph as run
 from hil.batch.archive_discovery import ArchiveRef, Discovery, cell_in, open_ref
 from hil.batch.cluster import Cluster
 from hil.batch.estimates import BatchArm, BatchEstimate
+from hil.batch.messages import setup_words
 from hil.pipeline.notes import Note
 from hil.pipeline.options import Options
 from hil.pipeline.sources import arm_differences
@@ -314,7 +315,7 @@ def _names(campaigns: Sequence[BatchEstimate]) -> list[str]:
     names = []
     for campaign in campaigns:
         setup = (
-            f", {campaign.setup or 'nothing stated'}"
+            f", {setup_words(campaign.setup) or 'nothing stated'}"
             if folders.count(campaign.campaign) > 1
             else ""
         )

@@ -5,6 +5,8 @@ from __future__ import annotations
 from dataclasses import asdict
 from typing import Any
 
+from hil.batch.messages import setup_words
+
 from .comparison import ArmComparison
 from .messages import comparison_lines, verdict_line
 
@@ -23,7 +25,7 @@ def comparison_document(comparison: ArmComparison) -> dict[str, Any]:
                 "name": name,
                 "folder": campaign.campaign,
                 "when": campaign.when or None,
-                "setup": campaign.setup,
+                "setup": setup_words(campaign.setup),
             }
             for name, campaign in zip(comparison.names, comparison.campaigns, strict=True)
         ],

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 
-from hil.batch.messages import batch_lines
+from hil.batch.messages import batch_lines, setup_words
 from hil.pipeline.notes import Note
 
 from .comparison import QuantityChange
@@ -36,7 +36,9 @@ def _lines(note: Note) -> list[str]:
         case UnusableArchive(archive):
             return [f"{archive.path} could not be used: {archive.message}"]
         case OtherSetups(setups):
-            stated = "; ".join(f"{name}: {setup or 'nothing'}" for name, setup in setups)
+            stated = "; ".join(
+                f"{name}: {setup_words(setup) or 'nothing'}" for name, setup in setups
+            )
             return [f"the cells state different payloads or delays, compensated ({stated})"]
         case SingleRepetition(campaign):
             return [

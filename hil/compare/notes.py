@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from hil.batch.cluster import SkippedArchive
+from hil.batch.setup import Setup
 from hil.pipeline.notes import Note
 
 
@@ -19,7 +20,7 @@ class UnusableArchive(Note):
 class OtherSetups(Note):
     """Campaigns whose cells state different payloads or delays."""
 
-    setups: tuple[tuple[str, str], ...]  #: campaign and what its cell states, "" for nothing
+    setups: tuple[tuple[str, Setup], ...]  #: campaign and what its cell states
 
 
 @dataclass(frozen=True)

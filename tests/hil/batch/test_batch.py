@@ -35,7 +35,9 @@ from hil.batch.cache import CacheLocation
 from hil.batch.cluster import Cluster
 from hil.batch.estimates import BatchEstimator
 from hil.batch.graph import reidentify
+from hil.batch.messages import setup_words
 from hil.batch.notes import DifferentSetups
+from hil.batch.setup import Setup
 from hil.campaign.identified_campaign import identify_campaign
 from hil.cell import Cell
 from hil.cli import app
@@ -468,13 +470,13 @@ class TestWarnings:
         laden.rename(tmp_path / "line" / "a" / "excitation_001_a1.mcap")
         result = batch(tmp_path)
         (pooled,) = result.pooled
-        assert (pooled.repetitions, pooled.setup) == (2, "")
+        assert (pooled.repetitions, pooled.setup) == (2, Setup())
         (setups,) = (note for note in pooled.warnings if isinstance(note, DifferentSetups))
         assert sorted(setups.setups) == sorted(each.setup for each in result.campaigns)
         command = ["batch", str(tmp_path), "--cache", "none", "--json", *NOTHING_OPEN]
         (arm,) = json.loads(CliRunner().invoke(app, command).stdout)["arms"].values()
         for setups in (
-            [campaign.setup for campaign in result.campaigns],
+            [setup_words(campaign.setup) for campaign in result.campaigns],
             [campaign["setup"] for campaign in arm["campaigns"].values()],
         ):
             assert sorted("carries 3 kg" in text for text in setups) == [False, True]
@@ -570,7 +572,7 @@ class TestGroups:
         first, second = found_in(tmp_path).refs
         assert (first.arm, first.campaign) == (second.arm, second.campaign)
         assert first.key != second.key
-        setups = {ref.name: ref.setup for ref in (first, second)}
+        setups = {ref.name: setup_words(ref.setup) for ref in (first, second)}
         assert setup in setups["b.mcap"]
         assert setup not in setups["a.mcap"]
 

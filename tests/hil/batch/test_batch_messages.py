@@ -16,6 +16,7 @@ from hil.batch.notes import (
     note_as_json,
     note_of_json,
 )
+from hil.batch.setup import Setup
 from hil.pipeline import notes
 from hil.pipeline.notes import Note
 
@@ -42,8 +43,8 @@ WORDS: dict[Note, str] = {
         "2 of 4 archives, such as spring/a.mcap: two gaps"
     ),
     MoreNotes(3): "3 more warnings are listed with the repetitions",
-    DifferentSetups(("", "carries 3 kg")): (
-        "different payloads or delays, which are compensated: nothing; carries 3 kg"
+    DifferentSetups((Setup(), Setup(0.002, 3.0, (0.0, 0.0, 0.1), frame="tool0"))): (
+        "compensated: nothing; torque lags by 2 ms, carries 3 kg at (0, 0, 0.1) m in tool0"
     ),
     notes.RepairedArchive(): "it was repaired with loss",
 }

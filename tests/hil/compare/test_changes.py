@@ -18,6 +18,7 @@ from hil.base.errors import InputError
 from hil.base.progress import Silent
 from hil.batch.cluster import Cluster
 from hil.batch.estimates import BatchArm
+from hil.batch.setup import Setup
 from hil.campaign import Campaign
 from hil.campaign.plan import design
 from hil.cell import Cell
@@ -220,10 +221,11 @@ class TestInMemory:
         first, other = levels_of(Condition(), Condition())
         folders = [replace(first, campaign="/runs/cold/b"), replace(other, campaign="/runs/warm/b")]
         assert [name[:6] for name in judged(folders).names] == ["cold/b", "warm/b"]
-        laden = replace(other, setup="carries 3 kg", campaign=first.campaign)
+        carried = Setup(mass=3.0, centre=(0.0, 0.0, 0.1))
+        laden = replace(other, setup=carried, campaign=first.campaign)
         comparison = judged([first, laden])
         assert "carries 3 kg" in comparison.names[1]
-        setups = zip(comparison.names, ("", "carries 3 kg"), strict=True)
+        setups = zip(comparison.names, (Setup(), carried), strict=True)
         assert comparison.warnings[0] == OtherSetups(tuple(setups))
 
     def test_a_page_of_hostile_names_is_inert(self):
@@ -232,7 +234,8 @@ class TestInMemory:
             comparison,
             arm=comparison.arm + HOSTILE,
             campaigns=tuple(
-                replace(o, campaign=HOSTILE, setup=HOSTILE) for o in comparison.campaigns
+                replace(o, campaign=HOSTILE, setup=Setup(centre=(0.0,), frame=HOSTILE))
+                for o in comparison.campaigns
             ),
             names=(HOSTILE, HOSTILE),
             changes=tuple(

@@ -5,6 +5,7 @@ from __future__ import annotations
 import pytest
 
 from hil.batch.cluster import SkippedArchive
+from hil.batch.setup import Setup
 from hil.compare import notes
 from hil.compare.messages import comparison_lines
 from hil.pipeline.notes import Note, RepairedArchive
@@ -13,8 +14,8 @@ WORDS: dict[Note, str] = {
     notes.UnusableArchive(SkippedArchive("a.mcap", "it is damaged")): (
         "a.mcap could not be used: it is damaged"
     ),
-    notes.OtherSetups((("march", ""), ("june", "carries 3 kg"))): (
-        "different payloads or delays, compensated (march: nothing; june: carries 3 kg)"
+    notes.OtherSetups((("march", Setup()), ("june", Setup(delay=0.002)))): (
+        "different payloads or delays, compensated (march: nothing; june: torque lags by 2 ms)"
     ),
     notes.SingleRepetition("march"): "march: with one repetition, uncertainty includes noise only",
     notes.OfCampaign("march", RepairedArchive()): "march: it was repaired with loss",
