@@ -77,13 +77,18 @@ class CampaignStep:
         waits = f"; waits for: {self.waits_for}" if self.waits_for else ""
         return f"{step_line(self.found)}{waits}"
 
+    @property
+    def details(self) -> tuple[str, ...]:
+        """More sentences, for the report."""
+        return tuple(step_details(self.found))
+
     def to_dict(self) -> dict[str, Any]:
         """Return the step for JSON."""
         return {
             "state": self.state,
             "sentence": self.sentence,
             "command": self.command,
-            "details": step_details(self.found),
+            "details": self.details,
             "warning": self.warning,
             "name": self.name,
         }
@@ -321,7 +326,7 @@ def execution_log_of(folder: CampaignFolder) -> ExecutionLogResult:
                 step=name,
                 done=step.done,
                 words=step.sentence,
-                details=step_details(step.found),
+                details=[*step.details],
                 warning=step.warning,
             )
             for name, step in steps.items()
