@@ -117,7 +117,7 @@ class TestRecorded:
         page = tmp_path / "compare.html"
         pair = [str(folders["march"]), str(folders["june"])]
         done = CliRunner().invoke(app, ["compare", *pair, "-o", str(page)])
-        assert "compared with march: june" in done.stdout
+        assert "june compared with march: " in done.stdout
         assert "95 % interval of a change of friction: ±" in done.stdout
         assert done.stdout.count("compare.html") == 1
 
