@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import textwrap
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -14,6 +15,9 @@ MAX_JOINT_ROWS: Final = 8
 TAIL_LINES: Final = 3
 """Lines at the end of a long list: files, what was skipped, counts."""
 _ELLIPSIS: Final = " ..."
+_CONTINUED: Final = " \\"
+_COMMAND: Final = re.compile(r"(?:^|[:>,] |then )(hil [a-z][^;()`]*)$")
+_COMMAND_LINES: Final = 12  # at most, of a command to copy
 
 
 @dataclass(frozen=True)
@@ -27,15 +31,7 @@ class Paragraph:
 
     def lines(self, count: int) -> list[str]:
         """Return the text on at most `count` lines, cut at the end of a word."""
-        return textwrap.wrap(
-            " ".join(self.text.split()),
-            SCREEN_COLUMNS,
-            initial_indent=self.label,
-            subsequent_indent=" " * len(self.label),
-            max_lines=count,
-            placeholder=_ELLIPSIS,
-            break_on_hyphens=False,
-        )
+        return _broken(" ".join(self.text.split()), self.label, most=count)
 
     @property
     def whole(self) -> int:
@@ -84,9 +80,13 @@ def brief(lines: Sequence[str], last: int = 1) -> list[str]:
     if (more := len(shown) - SCREEN_LINES) > 0:
         head = shown[: SCREEN_LINES - last - 1]
         shown = [*head, f"{more + 1} more lines: -v", *shown[len(shown) - last :]]
-    return one_screen(
-        [line if len(line) <= SCREEN_COLUMNS else Paragraph(line, _indent(line)) for line in shown]
-    )
+    return one_screen([line if len(line) <= SCREEN_COLUMNS else _paragraph(line) for line in shown])
+
+
+def _paragraph(line: str) -> Paragraph:
+    if _COMMAND.search(line) is None:
+        return Paragraph(line, _indent(line))
+    return Paragraph(line, _indent(line), _COMMAND_LINES, complete=True)
 
 
 def _indent(line: str) -> str:
@@ -99,13 +99,34 @@ def _cut(line: str) -> str:
 
 def wrapped(text: str) -> str:
     """Return text whose long lines are broken between words, at `SCREEN_COLUMNS`."""
-    broken = (
-        [line]
-        if len(line) <= SCREEN_COLUMNS
-        else textwrap.wrap(line, SCREEN_COLUMNS, break_on_hyphens=False, break_long_words=False)
-        for line in text.split("\n")
-    )
+    broken = ([line] if len(line) <= SCREEN_COLUMNS else _broken(line) for line in text.split("\n"))
     return "\n".join(part for parts in broken for part in parts)
+
+
+def _broken(text: str, label: str = "", *, most: int | None = None) -> list[str]:
+    """Return text on lines of `SCREEN_COLUMNS`, a command at its end as a shell continues it.
+
+    At most `most` lines, the last one cut at the end of a word.
+    """
+    command = _COMMAND.search(text)
+    lines = textwrap.wrap(
+        text,
+        SCREEN_COLUMNS - (len(_CONTINUED) if command else 0),
+        initial_indent=label,
+        subsequent_indent=" " * len(label),
+        max_lines=most,
+        placeholder=_ELLIPSIS,
+        break_on_hyphens=False,
+        break_long_words=most is not None,
+    )
+    if command is None:
+        return lines
+    shown = 0
+    for k, line in enumerate(lines[:-1]):
+        shown += len(line) - len(label) + 1
+        if shown > command.start(1):
+            lines[k] += _CONTINUED
+    return lines
 
 
 def columns(rows: Sequence[Sequence[str]], *, left: int = 1) -> list[str]:

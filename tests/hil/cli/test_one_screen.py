@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+import shlex
 import textwrap
 from collections import Counter
 from collections.abc import Callable, Mapping
@@ -53,6 +54,20 @@ class TestText:
         command = Paragraph("word " * 30 + "end", complete=True)
         shown = one_screen([Paragraph("first " * 60), *["row"] * 20, command])
         assert len(shown) == SCREEN_LINES and shown[-1].endswith("word end")
+
+    @pytest.mark.parametrize("lead", ["  ", "weigh the load: ", "record without it, then "])
+    def test_a_command_is_broken_as_a_shell_continues_it(self, lead: str) -> None:
+        """What is copied from the screen is what was meant."""
+        command = f"hil torque-constants {' '.join(f'march/{k}.mcap' for k in range(20))} --mass 4"
+        for shown in (brief([lead + command]), wrapped(lead + command).split("\n")):
+            require_one_screen("\n".join(shown))
+            copied = "\n".join(shown)
+            copied = copied[copied.index("hil torque-constants") :]
+            assert shlex.split(copied.replace("\\\n", "")) == command.split()
+
+    def test_prose_about_a_command_has_no_marks(self) -> None:
+        prose = f"give them to hil torque-constants (as {'many ' * 40} files); or measure"
+        assert "\\" not in "".join(brief([prose])) + wrapped(prose)
 
     def test_empty_lines_go_before_text_is_cut(self) -> None:
         parts = [Paragraph("word " * 60), "", *["row"] * 21, ""]
