@@ -437,9 +437,13 @@ def test_archives_of_a_folder_are_used(currents: Path, tmp_path: Path) -> None:
 
 @pytest.mark.long
 def test_gravity_of_a_slow_real_arm_points_down(shared_data: Path, tmp_path: Path) -> None:
-    """Stated to be on a wall, it stands upright; pushed upwards by bodies it would fit alike."""
+    """Stated to be on a wall, it stands upright; pushed upwards by bodies it would fit alike.
+
+    Without a map the import would see it.
+    """
     logs = [shared_data / "lwr4" / f"measurements_{number}.npz" for number in (1, 2)]
     stated = ["--urdf", str(shared_data / "lwr4/kuka_lwr4.urdf"), "--gravity", "9.81", "0", "0"]
+    stated += ["--map", str(shared_data / "lwr4/map.toml")]
     archives = [str(tmp_path / f"{log.stem}.mcap") for log in logs]
     for log, archive in zip(logs, archives, strict=True):
         line = ["import", "log", str(log), *stated, "-o", archive]
