@@ -65,6 +65,7 @@ OURS: Final[Mapping[str, str]] = {
     "hil.control.simulator_process": "the last error that the simulated controller printed",
     "hil.report.numbers": "figures are typeset",
     "hil.campaign.screen": "the colour of a refusal, which begins with one word in capitals",
+    "hil.base.one_screen": "where a command begins, whose lines a shell continues",
     "hil.base.terminal_text": "joints get their names in what the drivers say",
     "identification.export.parameter_files": "a comment is made safe for spreadsheets",
 }
