@@ -99,10 +99,8 @@ def test_it_is_found_and_nothing_else(case: str) -> None:
     assert 2 in readings.unseen_zeros
 
 
-@pytest.mark.parametrize(
-    "joints",
-    [(0, 1), *(pytest.param(pair, marks=pytest.mark.long) for pair in ((0, 2), (1, 2)))],
-)
+@pytest.mark.long
+@pytest.mark.parametrize("joints", [(0, 1), (0, 2), (1, 2)])
 def test_two_torques_without_their_sign_are_found_at_once(joints: tuple[int, ...]) -> None:
     q, torque, _ = motion()
     sign = np.where(np.isin(range(3), joints), -1.0, 1.0)

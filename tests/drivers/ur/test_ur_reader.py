@@ -121,6 +121,7 @@ def test_a_port_where_nobody_listens_names_the_remedy() -> None:
         RtdeReader.connect(RtdeSpec(HOST, port))
 
 
+@pytest.mark.long
 def test_another_server_is_no_controller() -> None:
     with UrServer(SimulatedUr()).running() as server, pytest.raises(DriverError, match="RTDE"):
         RtdeReader.connect(RtdeSpec(HOST, server.ports["dashboard"]))

@@ -17,7 +17,6 @@ from hil.base.errors import HilError
 from hil.cli import app
 from tests.hil.importers.moving_log import URDF
 from tests.hil.simulated_logs import write_log, write_moving_log
-from tests.tiers import quick_ones
 
 Floats = NDArray[np.float64]
 Table = Mapping[str, Floats]
@@ -255,7 +254,8 @@ def test_two_clocks_are_chosen_from(tmp_path: Path, urdf: Path, table: Table) ->
         assert result.exit_code == 0, result.exception
 
 
-@pytest.mark.parametrize("joint", quick_ones([2], [0, 2]))
+@pytest.mark.long
+@pytest.mark.parametrize("joint", [0, 2])
 def test_a_torque_of_zero_throughout_ends_in_a_verdict(
     tmp_path: Path, urdf: Path, table: Table, joint: int
 ) -> None:

@@ -292,6 +292,7 @@ class TestOtherTopics:
         assert "/velocity_controller/commands: it" in imported.text
         assert "not used as commanded positions" in imported.text
 
+    @pytest.mark.long
     def test_a_trajectory_is_interpolated(self, tmp_path, urdf) -> None:
         """With velocities by cubics, from the measured position on, and held at its end."""
         messages = Messages()

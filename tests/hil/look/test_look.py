@@ -370,8 +370,9 @@ class TestConclusions:
 
     @pytest.mark.parametrize(
         "mounted",
-        [(0.0, 9.81, 0.0), pytest.param((0.0, 0.0, 0.0), marks=pytest.mark.long)],
+        [(0.0, 9.81, 0.0), (0.0, 0.0, 0.0)],
     )
+    @pytest.mark.long
     def test_another_gravity_is_stated_wrongly(
         self,
         tmp_path: Path,
@@ -624,7 +625,7 @@ class TestTerminal:
         os.close(leader)
         return status, screen.decode()
 
-    @pytest.mark.parametrize(("answer", "status"), quick_ones([("2", 0)], [("0", 2), ("2", 0)]))
+    @pytest.mark.parametrize(("answer", "status"), quick_ones([], [("0", 2), ("2", 0)]))
     def test_it_asks_which_of_two(
         self, tmp_path: Path, urdf: Path, table: Mapping[str, Floats], answer: str, status: int
     ) -> None:

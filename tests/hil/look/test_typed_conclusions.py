@@ -178,14 +178,8 @@ def without_messages(value: Any) -> Any:
     return kept
 
 
-@pytest.mark.parametrize(
-    "log",
-    [
-        pytest.param("exchanged torques", marks=pytest.mark.long),
-        "degrees and milliseconds",
-        pytest.param("motor side", marks=pytest.mark.long),
-    ],
-)
+@pytest.mark.long
+@pytest.mark.parametrize("log", ["exchanged torques", "degrees and milliseconds", "motor side"])
 def test_sentences_decide_nothing(
     tmp_path: Path, urdf: Path, columns: tuple[Floats, ...], log: str
 ) -> None:

@@ -704,6 +704,7 @@ class TestLoad:
         (factor,) = re.findall(r"--columns 'torque=NAME\*([\d.]+)'", output)
         assert float(factor) == pytest.approx(1.0 / float(ratio), rel=0.1)
 
+    @pytest.mark.long
     def test_the_factor_makes_a_torque_of_it(self, lerobot_log: Path) -> None:
         torque, output = imported_torque(lerobot_log, "--columns", "torque={}.load*0.002941")
         assert torque is not None and "left out" not in output

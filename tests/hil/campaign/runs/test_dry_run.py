@@ -32,7 +32,7 @@ pytestmark = pytest.mark.safety
 @pytest.mark.parametrize(
     ("real", "message"),
     [
-        (False, r"was not done, and there is no .*--dry-run`"),
+        (False, r"was not done, and there is no .*simulated.*--accept-dry-run`"),
         (True, DRY_RUN_NOT_DONE),
     ],
 )

@@ -54,7 +54,7 @@ def test_a_motion_that_fails_after_a_stop_is_a_fault(campaign, monkeypatch, outc
 def test_a_script_without_a_terminal_reads_json(campaign: Campaign) -> None:
     refused = summary_of(hil_run(campaign, "--json"), 3)
     assert refused["exit_code"] == 3
-    assert "--dry-run" in refused["error"]
+    assert "--accept-dry-run" in refused["error"]
     assert not list(campaign.folder.archives.iterdir())
     slow = summary_of(hil_run(campaign, "--dry-run", "--json"))
     assert (slow["dry_run"], slow["complete"]) == ("to be accepted", False)
