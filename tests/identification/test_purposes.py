@@ -43,7 +43,6 @@ from tests.identification.two_link import (
     simulated,
     truth,
 )
-from tests.tiers import quick_ones
 
 
 def an_estimate(values: Array | None = None, covariance: Array | None = None) -> Estimate:
@@ -178,7 +177,8 @@ def peaks_of(duration: float, seed: int) -> Array:
     return size[: len(size) // rows * rows].reshape(-1, rows, 2).max(axis=1)
 
 
-@pytest.mark.parametrize("duration", quick_ones([60.0], [15.0, 60.0, 400.0]))
+@pytest.mark.long
+@pytest.mark.parametrize("duration", [15.0, 60.0, 400.0])
 def test_a_threshold_holds_its_rate(duration: float) -> None:
     later = peaks_of(4000.0, 99)
     rates = []

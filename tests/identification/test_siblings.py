@@ -49,10 +49,8 @@ def test_the_spread_between_arms_is_estimated():
     np.testing.assert_allclose(np.mean(np.square(spreads), axis=0), SPREAD**2, rtol=0.3, atol=0.02)
 
 
-@pytest.mark.parametrize(
-    "count",
-    [pytest.param(4, marks=pytest.mark.long), 10, pytest.param(20, marks=pytest.mark.long)],
-)
+@pytest.mark.long
+@pytest.mark.parametrize("count", [4, 10, 20])
 def test_values_are_nearer_to_the_truth_and_intervals_cover_it(count):
     """At least 95 %, also where the spread is smaller than the errors."""
     std = np.array([1.0, 0.5, 0.4])

@@ -169,6 +169,7 @@ def test_it_identifies_the_arm_in_units_of_the_stated_constants(
     np.testing.assert_allclose(coulomb, truth.plant.coulomb * units, rtol=0.1)
 
 
+@pytest.mark.long
 def test_a_batch_has_the_mean_temperature_of_each_joint(recorded: Path, tmp_path: Path) -> None:
     """Which may explain a change of its friction."""
     cache = CacheLocation(str(tmp_path))

@@ -131,6 +131,7 @@ def test_a_moving_arm_states_no_constants(tmp_path: Path, monkeypatch: pytest.Mo
     assert "--from-controller" not in str(refused.value)
 
 
+@pytest.mark.long
 def test_a_pause_of_its_program_is_waited_for(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
