@@ -61,7 +61,7 @@ def servo_series_bytes(series: Sequence[ServoSeries]) -> bytes:
 
 
 def load_servo_series(folder: Path, results: ServoResults) -> list[ServoSeries]:
-    """Read the motions in a folder of results, without those of the engines.
+    """Read the motions in a folder of results; what the engines simulated is left out.
 
     Raises:
         InputError: there are none, or of another number of joints.

@@ -11,7 +11,7 @@ from identification.arrays import Array
 
 
 class ErrorRatios(NamedTuple):
-    """Errors of blocks over those of another prediction.
+    """Errors of blocks, each over the error of another prediction.
 
     Attributes:
         joints: ratio of the errors of all blocks (n,), 1 where none is compared.

@@ -23,8 +23,8 @@ class LinkMotion:
 
     with the twist s_i of joint i per unit speed, and the *spatial* acceleration a_i, minus gravity
     at the base. `motion` is velocity and acceleration of the links (n, 2, 2, 3, size), `twists`
-    per link those of the a joints that move it, base first (a, 2, 3, size); without `all_twists`
-    that of its own joint alone. `states` are q, qd and qdd of the joints (3, n, size).
+    per link the twists of the a joints that move it, base first (a, 2, 3, size); without
+    `all_twists` the twist of its own joint alone. `states` are q, qd and qdd of the joints (3, n, size).
     """
 
     def __init__(
@@ -65,7 +65,7 @@ class LinkForces:
     r"""Torques of the joints from the wrenches of the links, as Newton and Euler add them up.
 
     From the last link to the first, the wrench of link i about the origin of its frame, in its
-    axes, is its own and those of the links that it carries:
+    axes, is the sum of its own and of what the links that it carries pass on:
 
     .. math:: f_i = m_i + \sum_c X_c^T f_c, \qquad \tau_i = s_i^T f_i
 
@@ -80,7 +80,7 @@ class LinkForces:
         self._parents = chain.parents.tolist()
 
     def torque(self) -> Array:
-        """Return the torques (n, size); the wrenches become those of all that each link carries."""
+        """Return the torques (n, size); `own` then includes what each link carries."""
         torque = np.empty((len(self.own), self.own.shape[-1]))
         for joint in reversed(range(len(torque))):
             step = self.motion.steps[joint]

@@ -81,7 +81,7 @@ class RowFaults:
 
 
 def by_kind(faults: Sequence[RowFault]) -> tuple[RowFaults, ...]:
-    """Return faults with those of one kind together."""
+    """Group faults by kind."""
     of_kind = {
         kind: tuple(sorted((f for f in faults if f.kind is kind), key=lambda fault: fault.time))
         for kind in RowFaultKind
