@@ -24,7 +24,8 @@ class LinkMotion:
     with the twist s_i of joint i per unit speed, and the *spatial* acceleration a_i, minus gravity
     at the base. `motion` is velocity and acceleration of the links (n, 2, 2, 3, size), `twists`
     per link the twists of the a joints that move it, base first (a, 2, 3, size); without
-    `all_twists` the twist of its own joint alone. `states` are q, qd and qdd of the joints (3, n, size).
+    `all_twists` the twist of its own joint alone. `states` are q, qd and qdd of the joints
+    (3, n, size).
     """
 
     def __init__(
