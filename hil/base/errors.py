@@ -143,12 +143,9 @@ class UndecidedError(SourceError):
         aspect: what is open.
     """
 
-    aspect: str = ""
-
-    def of(self, aspect: str) -> Self:
-        """Return the error with what is open."""
+    def __init__(self, path: Path, problem: str, *, field: str, remedy: str, aspect: str) -> None:
+        super().__init__(path, problem, field=field, remedy=remedy)
         self.aspect = aspect
-        return self
 
 
 class UnrecordedJointError(SourceError):
@@ -160,18 +157,21 @@ class UnrecordedJointError(SourceError):
         channels: names of the channels, which may say a side of the robot.
     """
 
-    count = 0
-    joints: tuple[str, ...] = ()
-    channels: tuple[str, ...] = ()
-
-    def of(
-        self, count: int, joints: Iterable[str] = (), channels: Iterable[str] = ()
-    ) -> UnrecordedJointError:
-        """Return this error with what was recorded."""
+    def __init__(
+        self,
+        path: Path,
+        problem: str,
+        *,
+        field: str,
+        remedy: str,
+        count: int,
+        joints: Iterable[str] = (),
+        channels: Iterable[str] = (),
+    ) -> None:
+        super().__init__(path, problem, field=field, remedy=remedy)
         self.count = count
         self.joints = tuple(joints)
         self.channels = tuple(channels)
-        return self
 
 
 class OutputError(HilError):

@@ -6,9 +6,9 @@ Nothing reads the words back: what follows from a conclusion follows from its fi
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from enum import Enum, StrEnum, auto
-from typing import Literal
+from typing import Literal, Self
 
 from hil.cell.arms import Links
 from hil.importers.units import Kind
@@ -557,3 +557,8 @@ class Examined:
 
     found: tuple[Conclusion, ...]
     warnings: tuple[Conclusion, ...]
+
+    def without(self, kind: type[Conclusion]) -> Self:
+        """Return the results without the warnings of one kind."""
+        warnings = tuple(each for each in self.warnings if not isinstance(each, kind))
+        return replace(self, warnings=warnings)

@@ -191,9 +191,15 @@ class _Search:
                 "joint of each column"
             )
             raise SourceError(self._folder, problem, field=kind, remedy=remedy)
-        refusal = UnrecordedJointError(self._folder, problem, field=kind, remedy=NOT_RECORDED)
-        named = [joint for joint in self._joints if any(joint in name for name in each.names)]
-        raise refusal.of(each.size, named, each.names)
+        raise UnrecordedJointError(
+            self._folder,
+            problem,
+            field=kind,
+            remedy=NOT_RECORDED,
+            count=each.size,
+            joints=[joint for joint in self._joints if any(joint in name for name in each.names)],
+            channels=each.names,
+        )
 
     def _given(self, kind: Kind, name: str) -> list[_Held]:
         """Return the file that an option names for a quantity."""

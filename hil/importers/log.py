@@ -629,8 +629,8 @@ class _Log:
         if len(columns) < len(self.joints):
             problem = f"has {len(columns)} entries"
             remedy = f"one for each of the joints {', '.join(self.joints)}; or {NOT_RECORDED}"
-            raise UnrecordedJointError(self.path, problem, field=field, remedy=remedy).of(
-                len(columns)
+            raise UnrecordedJointError(
+                self.path, problem, field=field, remedy=remedy, count=len(columns)
             )
         self._check_count(columns, field)
         units = [file.unit(column) for column in columns]
@@ -701,15 +701,17 @@ class _Log:
         missing = [name for name in chosen if not has(name)]
         if missing:
             joint = chosen.index(missing[0])
-            refusal = UnrecordedJointError(
+            named = [joint for joint, name in zip(self.joints, by_joint, strict=True) if has(name)]
+            raise UnrecordedJointError(
                 self.path,
                 f"there is no {what[:-1]} {missing[0]!r} for {self.joints[joint]}, joint "
                 f"{joint + 1} of {count}; there are {', '.join(available) or 'none'}",
                 field=field,
                 remedy=f"{NOT_RECORDED}, list the joints of the log in joints, or list its {what}",
+                count=len(named) or sum(map(has, names)),
+                joints=named,
+                channels=filter(has, names),
             )
-            named = [joint for joint, name in zip(self.joints, by_joint, strict=True) if has(name)]
-            raise refusal.of(len(named) or sum(map(has, names)), named, filter(has, names))
         present = [name for name in names if has(name)]
         if len(present) > count:
             raise SourceError(
@@ -733,18 +735,18 @@ class _Log:
             along = "rows" if matrix.shape[0] < matrix.shape[1] else "columns"
         upright = matrix.T if along == "rows" else matrix
         if upright.shape[1] != count:
-            is_fewer = upright.shape[1] < count
-            refusal = (UnrecordedJointError if is_fewer else SourceError)(
-                path,
+            recorded = upright.shape[1]
+            problem = (
                 f"{name} has the shape {matrix.shape}, joints along its {along}, and there are "
-                f"{count} joints: {', '.join(self.joints)}",
-                field=name,
-                remedy=f"{NOT_RECORDED}, list the joints of the log in joints, or give the columns "
-                "of the joints",
+                f"{count} joints: {', '.join(self.joints)}"
             )
-            if isinstance(refusal, UnrecordedJointError):
-                refusal.of(upright.shape[1])
-            raise refusal
+            remedy = (
+                f"{NOT_RECORDED}, list the joints of the log in joints, or give the columns of the "
+                "joints"
+            )
+            if recorded < count:
+                raise UnrecordedJointError(path, problem, field=name, remedy=remedy, count=recorded)
+            raise SourceError(path, problem, field=name, remedy=remedy)
         return upright
 
     def _file(self, name: str | None, field: str) -> TextTable | ArrayFile:
@@ -774,16 +776,21 @@ class _Log:
         """Return the column of the log of each joint of the robot."""
         missing = [name for name in robot.joint_names if name not in self.joints]
         if missing or len(set(self.joints)) < len(self.joints):
-            refusal = (UnrecordedJointError if missing else SourceError)(
-                self.path,
-                f"the map names the joints {', '.join(self.joints)}",
-                field="joints",
-                remedy=f"the robot's joints are {', '.join(robot.joint_names)}; name each once, or "
-                f"{NOT_RECORDED}",
+            problem = f"the map names the joints {', '.join(self.joints)}"
+            remedy = (
+                f"the robot's joints are {', '.join(robot.joint_names)}; name each once, or "
+                f"{NOT_RECORDED}"
             )
-            if isinstance(refusal, UnrecordedJointError):
-                refusal.of(len(self.joints), self.joints)
-            raise refusal
+            if not missing:
+                raise SourceError(self.path, problem, field="joints", remedy=remedy)
+            raise UnrecordedJointError(
+                self.path,
+                problem,
+                field="joints",
+                remedy=remedy,
+                count=len(self.joints),
+                joints=self.joints,
+            )
         return [self.joints.index(name) for name in robot.joint_names]
 
     def _motor_from_joint(self) -> Array:

@@ -446,12 +446,16 @@ class _Search:
             absent, which = self._absent(group)
             options = " ".join(f"--locked {name}" for name in absent)
             remedy = f"fix the joints that were not recorded, {which} with {options}"
-            refusal = UnrecordedJointError(
-                self._log, problem, field=kind, remedy=f"{remedy}; {otherwise}"
-            )
             recorded = [name for name in self._recorded if name in self._joints]
-            named = recorded or group.joints(self._joints)
-            raise refusal.of(len(recorded) or count, named, group.names)
+            raise UnrecordedJointError(
+                self._log,
+                problem,
+                field=kind,
+                remedy=f"{remedy}; {otherwise}",
+                count=len(recorded) or count,
+                joints=recorded or group.joints(self._joints),
+                channels=group.names,
+            )
         some = ",".join(group.names[: len(self._joints)])
         remedy = "give the URDF of this arm"
         if len(group.names) == count:

@@ -323,9 +323,14 @@ class _States:
         if missing:
             problem = f"joint {missing[0]} was not recorded; recorded are {recorded}"
             remedy = f"give a URDF with the recorded names, or {NOT_RECORDED}"
-            refusal = UnrecordedJointError(self._source, problem, field="joints", remedy=remedy)
-            names = [self._renamed.get(name, name) for name in self._recorded]
-            raise refusal.of(len(present), names)
+            raise UnrecordedJointError(
+                self._source,
+                problem,
+                field="joints",
+                remedy=remedy,
+                count=len(present),
+                joints=[self._renamed.get(name, name) for name in self._recorded],
+            )
         whole = [part for part in parts if len(part.joints) == len(self._joints)]
         if whole:
             others = sum(len(part.numbers) for part in parts) - len(whole[0].numbers)

@@ -14,7 +14,7 @@ from hil.base.errors import RefusedRecordingError, SourceError, UndecidedError
 from hil.base.safe_input import parse_toml
 from hil.base.terminal_text import typed
 from hil.cell import Cell
-from hil.importers.conclusions import Certainty
+from hil.importers.conclusions import Certainty, TorqueSize
 from hil.importers.imported_robot import Robot
 from hil.importers.messages import sentence
 from hil.importers.plausibility import constant_torques
@@ -237,7 +237,8 @@ class Asking:
             if isinstance(error, UndecidedError) and error.aspect == "side":
                 # so that commands ask the same of the archive
                 archive = with_entry(imported.archive, TORQUE_SIDE, UNDECIDED)
-                return replace(imported, archive=archive)
+                examined = imported.examined.without(TorqueSize)  # the question says it
+                return replace(imported, archive=archive, examined=examined)
             return imported
 
 
@@ -350,13 +351,13 @@ def undecided(
         found = sentences(contradictions.found)
         problem = f"may not be of the arm of the URDF: {found}; and {problem}"
         remedy = f"{_REMEDY}; or {remedy}"
-        return UndecidedError(source, problem, field="--urdf", remedy=remedy).of(aspect)
+        return UndecidedError(source, problem, field="--urdf", remedy=remedy, aspect=aspect)
     if aspect in _OF_AXES:
         remedy += "; if none of these is the case, give the URDF of this arm"
     if aspect == "side":
         problem = f"its torque is too small for the joints of this arm; {problem}"
         remedy += "; a map without them reads it as the torque of the joints"
-    return UndecidedError(source, problem, field=aspect, remedy=remedy).of(aspect)
+    return UndecidedError(source, problem, field=aspect, remedy=remedy, aspect=aspect)
 
 
 def _not_of_arm(source: Path, found: Finding) -> RefusedRecordingError:

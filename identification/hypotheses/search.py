@@ -574,6 +574,7 @@ class _Search:
         self._changes: list[Change] = []
         self.score = score_of(model, samples)
         self._trials: list[Trial] | None = None
+        self._excluded: frozenset[Change] = frozenset()
         self._tries: dict[Change, Trial] = {}
         self._fitted: list[_Joints] = []
 
@@ -903,16 +904,16 @@ class _Search:
 
     def unseen_zeros(self) -> tuple[int, ...]:
         """Return the joints whose zeros may also be others."""
+        self.tried()
         joints = np.flatnonzero(self.model.chain.revolute).tolist()
         angles = (-45.0 * DEGREE, 45.0 * DEGREE)
-        return tuple(
-            joint
-            for joint in joints
-            if any(
-                self._try(Change("zero", (joint,), angle)).against.sigmas < SEPARATE_SIGMAS
-                for angle in angles
-            )
+        possible = (
+            zero
+            for zero in (Change("zero", (joint,), angle) for joint in joints for angle in angles)
+            if zero not in self._excluded
         )
+        unseen = (zero for zero in possible if self._try(zero).against.sigmas < SEPARATE_SIGMAS)
+        return tuple(dict.fromkeys(joint for zero in unseen for joint in zero.joints))
 
     def _are_alike(self, trial: Trial, best: Trial) -> bool:
         """Whether two changes fit alike, so that the recording does not choose one."""
@@ -983,6 +984,9 @@ class _Search:
             fits = _Fits(self.model, _thinned(self.samples, _FIRST_TRIAL_ROWS), self._mountings)
             errors = fits.errors([AS_READ, *self._to_try()])
             excluded = errors.pop(AS_READ) + SURE_SIGMAS**2 * ROWS_PER_FACT / fits.rows
+            self._excluded = frozenset(
+                change for change, error in errors.items() if error >= excluded
+            )
             trials = [self._try(change) for change in to_compare(errors, excluded)]
             self._trials = [*trials, *self._orders(trials, fits)]
         return self._trials

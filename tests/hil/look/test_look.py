@@ -251,6 +251,7 @@ class TestCommand:
         imported = hil("import", "log", path, "--urdf", urdf, "-o", archive)
         assert imported.exit_code == 0
         assert "too small for the joints of this arm; two explanations" in imported.output
+        assert "check their unit" not in imported.output  # it asks instead
         of_log = hil("identify", path, "--urdf", urdf).exception
         assert isinstance(of_log, UndecidedError)
         assert of_log.aspect == of_log.field == "side"
