@@ -36,8 +36,7 @@ from hil.look.servo_load import may_be_load, servo_load, torques_without_sign, w
 from hil.look.torque_sample import SUSPECT_ERROR, TorqueSample, explained
 from hil.pipeline.sources import cell_of
 from identification.hypotheses.diagnosis import UNEXPLAINED, TorqueDiagnosis
-from identification.hypotheses.scores import Score, compare, score_of
-from identification.hypotheses.search import SURE_SIGMAS
+from identification.hypotheses.scores import SURE_SIGMAS, Score, compare, score_of
 from identification.signals.samples import Samples
 from identification.text import percentage
 from identification.validation.finding import Finding

@@ -48,8 +48,9 @@ from identification.estimators.delay import DelayEstimate, estimate_delay
 from identification.hypotheses.diagnosis import UNEXPLAINED, few_rows, torque_of
 from identification.hypotheses.inertia_scale import retimed
 from identification.hypotheses.joint_changes import Axes
-from identification.hypotheses.scores import score_of
-from identification.hypotheses.search import EXPLAINED_ERROR, Readings, find_readings
+from identification.hypotheses.readings import Readings
+from identification.hypotheses.scores import EXPLAINED_ERROR, score_of
+from identification.hypotheses.search import find_readings
 from identification.hypotheses.torque_low_pass import TorqueLowPass, torque_low_pass
 from identification.model.robot import RobotModel
 from identification.signals.recording import RIGID_RATE, Recording, RecordingError

@@ -77,8 +77,8 @@ from identification.hypotheses.joint_changes import (
     Meaning,
 )
 from identification.hypotheses.mirror_images import SignRival, Signs
-from identification.hypotheses.scores import is_backwards
-from identification.hypotheses.search import EXPLAINED_ERROR, SEPARATE_SIGMAS, Readings, Step
+from identification.hypotheses.readings import Readings, Step
+from identification.hypotheses.scores import EXPLAINED_ERROR, SEPARATE_SIGMAS, is_backwards
 from identification.hypotheses.torque_low_pass import TorqueLowPass
 from identification.model.link_wrenches import LINK_SYMBOLS
 from identification.model.motion import Motion

@@ -26,23 +26,19 @@ from identification.hypotheses.column_search import (
 from identification.hypotheses.gravity_share import has_part_of_gravity
 from identification.hypotheses.inertia_scale import InertiaScale, find_inertia_scale
 from identification.hypotheses.joint_changes import Change, changed_samples
+from identification.hypotheses.readings import Readings, Step
 from identification.hypotheses.scores import (
+    EXPLAINED_ERROR,
     ROWS_PER_FACT,
+    SEPARATE_SIGMAS,
+    SURE_SIGMAS,
     Comparison,
     Score,
     compare,
     is_backwards,
     score_of,
 )
-from identification.hypotheses.search import (
-    EXPLAINED_ERROR,
-    SEPARATE_SIGMAS,
-    SURE_SIGMAS,
-    Readings,
-    Step,
-    find_readings,
-    find_zeros_and_scales,
-)
+from identification.hypotheses.search import find_readings, find_zeros_and_scales
 from identification.hypotheses.torque_rate import is_rate
 from identification.model.motion import Motion
 from identification.model.nominal_masses import mass_fault

@@ -21,8 +21,15 @@ import numpy as np
 
 from identification.estimators.prior import nominal_ratio
 from identification.factor.factor import Factor
-from identification.hypotheses.scores import Comparison, Score, compare, score_of
-from identification.hypotheses.search import EXPLAINED_ERROR, SEPARATE_SIGMAS, SURE_SIGMAS
+from identification.hypotheses.scores import (
+    EXPLAINED_ERROR,
+    SEPARATE_SIGMAS,
+    SURE_SIGMAS,
+    Comparison,
+    Score,
+    compare,
+    score_of,
+)
 from identification.model.nominal_masses import mass_fault
 from identification.model.robot import RobotModel
 from identification.signals.samples import Samples

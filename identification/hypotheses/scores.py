@@ -22,6 +22,19 @@ from identification.model.motion import Motion
 from identification.model.robot import RobotModel
 from identification.signals.samples import Samples
 
+SURE_SIGMAS: Final = 4.5
+"""Standard errors over the blocks of a reading that is sure, whatever the number tried: with 19
+degrees of freedom one of 4 000 exceeds it by chance."""
+SEPARATE_SIGMAS: Final = 3.0
+"""Standard errors by which the second best reading is worse."""
+EXPLAINED_ERROR: Final = 0.15
+"""Error of the torque above which no reading is sure: the arm does not explain the torque."""
+LARGE_REDUCTION: Final = 0.15
+"""Relative reduction of the error that chance alone does not make."""
+ALIKE_REDUCTION: Final = 0.05
+"""Relative reduction of the error between readings that fit alike."""
+MIN_REDUCTION: Final = 0.02
+"""Relative reduction of the error by a reading that is adopted."""
 DRIVING_FRICTION_SIGMAS: Final = 4.0  # standard errors of a friction that drives a joint
 _MIN_FRICTION_SHARE: Final = 0.02  # of the torque of a joint
 _BLOCKS: Final = 20
@@ -90,6 +103,17 @@ class Comparison(NamedTuple):
     ratio: float
     sigmas: float  # negative if the first is better
     joints: Array  # (n,) by column of the recorded torque
+
+    @property
+    def is_much_better(self) -> bool:
+        """Whether the first reduces the error by more than chance ever does."""
+        return self.ratio < 1.0 - LARGE_REDUCTION and self.sigmas < -SEPARATE_SIGMAS
+
+    @property
+    def is_better(self) -> bool:
+        """Whether the first is better, and that is no chance, as the best of many hypotheses."""
+        is_certain = self.ratio < 1.0 - MIN_REDUCTION and self.sigmas < -SURE_SIGMAS
+        return self.is_much_better or is_certain
 
 
 def _factor(model: RobotModel, samples: Samples) -> Factor:
@@ -206,6 +230,12 @@ def compare(score: Score, other: Score, model: RobotModel) -> Comparison:
         return Comparison(1.0, 0.0, joints)
     changes = ratios.changes[ratios.some_blocks].mean(axis=1)
     return Comparison(geometric_mean(joints[counts]), sigmas_of(changes), joints)
+
+
+def fits_alike(score: Score, other: Score, model: RobotModel) -> bool:
+    """Return whether a reading predicts about as well as another, or better."""
+    is_near = score.overall < (1.0 + ALIKE_REDUCTION) * other.overall
+    return is_near and compare(score, other, model).sigmas < SEPARATE_SIGMAS
 
 
 def sigmas_of(changes: Array) -> float:

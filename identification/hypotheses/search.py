@@ -18,15 +18,17 @@ from typing import Final
 import numpy as np
 
 from identification.arrays import Array
-from identification.estimators.prior import TorqueSums, body_priors
-from identification.factor.columns import every_torque_factor
-from identification.factor.factor import MIN_NOISE, Factor
+from identification.hypotheses.few_row_fits import (
+    ORDER_STARTS,
+    FewRowFits,
+    best_orders,
+    to_compare,
+)
 from identification.hypotheses.gravity_share import has_part_of_gravity
 from identification.hypotheses.joint_changes import (
     AS_READ,
     COUPLED,
     DEGREE,
-    GRAVITIES,
     ORDERS,
     SIGNS,
     SIZED,
@@ -35,32 +37,35 @@ from identification.hypotheses.joint_changes import (
     Change,
     Meaning,
     alternatives_to,
-    change_of_motion,
     changed_samples,
     coupled_pairs,
     differs,
-    kind_of,
     mounted_model,
     order_change,
     whole_order,
 )
 from identification.hypotheses.joint_fit import (
     JointFit,
-    PositionScales,
     candidates,
     find_joints,
     fit_joints,
     position_scales,
     starting_at,
 )
-from identification.hypotheses.little_torque import little_torque
 from identification.hypotheses.mirror_images import SignRival, Signs, mirror_images
+from identification.hypotheses.readings import Adequacy, Readings, Step, is_disputed
 from identification.hypotheses.scores import (
+    ALIKE_REDUCTION,
+    EXPLAINED_ERROR,
+    LARGE_REDUCTION,
+    MIN_REDUCTION,
     ROWS_PER_FACT,
+    SEPARATE_SIGMAS,
+    SURE_SIGMAS,
     Comparison,
     Score,
     compare,
-    friction_columns,
+    fits_alike,
     inertial_torque,
     score_of,
     sigmas_of,
@@ -68,27 +73,12 @@ from identification.hypotheses.scores import (
 from identification.model.robot import RobotModel
 from identification.signals.samples import Samples
 
-SURE_SIGMAS: Final = 4.5
-"""Standard errors over the blocks of a reading that is sure, whatever the number tried: with 19
-degrees of freedom one of 4 000 exceeds it by chance."""
-SEPARATE_SIGMAS: Final = 3.0
-"""Standard errors by which the second best reading is worse."""
-EXPLAINED_ERROR: Final = 0.15
-"""Error of the torque above which no reading is sure: the arm does not explain the torque."""
-_LARGE_REDUCTION: Final = 0.15  # relative reduction of the error that chance alone does not make
-_MIN_ERROR_REDUCTION: Final = 0.02  # relative reduction of the error of a reading that is adopted
-_ALIKE_REDUCTION: Final = 0.05  # the same, of readings that fit alike
 _MAX_JOINT_ERROR_RATIO: Final = 1.1  # error ratio of a joint beyond which a reading spoils it
 _HALVED_ERROR_RATIO: Final = 0.5  # error ratio over all joints from which it may
 _MAX_ROWS: Final = 700
 _FIRST_TRIAL_ROWS: Final = 250  # on which all readings are tried first
-# Of the search for an order: as read, then at random until the best order is reached twice. From a
-# third of the starts the right one is reached: ten miss it in 2 % of the cases.
-_ORDER_STARTS: Final = 10
 # error ratio of one exchange from which a whole order is searched for
 _EXCHANGE_ERROR_RATIO: Final = 0.98
-_COMPARED_ORDERS: Final = 2  # best orders of each kind that are compared
-_COMPARED_CHANGES: Final = 12  # changes of least error on fewer rows, which are compared
 _MAX_STEPS: Final = 6
 _SAME_SIZE_TOLERANCE: Final = 0.3  # rad, or of a scale: difference of two fits that are one
 # error ratio to a zero far away, of which no better fit is expected
@@ -96,18 +86,9 @@ _FAR_ZERO_ERROR_RATIO: Final = 0.5
 _MIN_ZERO_SEPARATION: Final = 60.0 * DEGREE  # between two zeros that are not one
 _FAR_ZERO_STARTS: Final = 2  # zeros far from what is stated at which a fit starts
 _NEEDED_SIGMAS: Final = 2.0  # standard errors of one of several zeros and scales that its fit needs
-_ADEQUATE_ERROR_RATIO: Final = 1.2  # error ratio to a free fit, of a reading that explains the rows
-# The same of each joint, as a mean hides one that is not explained: of four joints that share one
-# error the mean reaches 1.2 where that of one alone is 2.
-_ADEQUATE_JOINT_ERROR_RATIO: Final = 2.0
-# A joint turned by more than a right angle is nearer to its reverse, so that its sign and a nearer
-# zero may look alike.
-_FAR_ZERO: Final = 90.0 * DEGREE
 # signs of least error, compared together with zeros and scales
 _COMPARED_SIGNS: Final = 3
 _MAX_NEGATED_JOINTS: Final = 8  # that move, up to which every combination of their signs is tried
-_RIDGE: Final = 1e-6  # of the squares of a column, where others say the same
-_FITS_AT_ONCE: Final = 24  # fits, so that their sums stay in the processor's cache
 # deg, near which a fit starts
 _START_ZEROS_DEGREES: Final = (-135.0, -90.0, -45.0, 45.0, 90.0, 135.0, 180.0)
 
@@ -121,118 +102,6 @@ class Trial:
     samples: Samples
     score: Score
     against: Comparison  # with the reading before
-
-
-@dataclass(frozen=True, eq=False)
-class Step:
-    """An adopted change, and the changes that fit equally well.
-
-    `error` and `before` are errors over all joints with and without it; `alike` are other changes
-    with their errors, of which only knowledge of the arm can choose.
-    """
-
-    change: Change
-    error: float
-    before: float
-    ratio: float
-    sigmas: float
-    alike: tuple[tuple[Change, float], ...] = ()
-    is_adequate: bool = True  # whether no free fit explains the rows much better
-
-    @property
-    def is_clear(self) -> bool:
-        """Whether the arm explains the torque with it, and certainly worse without."""
-        is_certain = not self.by_friction and self.sigmas < -SURE_SIGMAS
-        return self.error < EXPLAINED_ERROR and is_certain
-
-    @property
-    def is_explained(self) -> bool:
-        """Whether that is so, and no free fit explains the torque much better."""
-        return self.is_clear and self.is_adequate
-
-    @property
-    def is_far(self) -> bool:
-        """Whether it is a zero that no assembly has."""
-        return self.change.meaning == "zero" and abs(self.change.size) > _FAR_ZERO
-
-    @property
-    def by_friction(self) -> bool:
-        """Whether friction supports it, and the error little or not at all."""
-        return self.ratio > 1.0 - _ALIKE_REDUCTION
-
-    @property
-    def sure(self) -> bool:
-        """Whether nothing else fits alike, and the arm explains the torque as a free fit does.
-
-        Friction, or a slightly smaller error, says it of a whole arm; of one joint a lag of the
-        torque looks the same.
-        """
-        slight = self.ratio > 1.0 - _LARGE_REDUCTION and len(self.change.joints) == 1
-        if self.change.meaning in SIZED:
-            slight = self.sigmas > -SEPARATE_SIGMAS
-        return not self.alike and self.error < EXPLAINED_ERROR and not slight and self.is_adequate
-
-
-@dataclass(frozen=True)
-class Adequacy:
-    """How a reading compares with a free fit of the same rows.
-
-    The free fit has any zero and scale of each joint, and hardly believes the masses of the URDF.
-
-    Attributes:
-        ratio: error with the reading over that of the free fit, mean over the joints.
-        largest: of the joints.
-        agrees: whether the free fit has the same zeros and scales.
-    """
-
-    ratio: float
-    largest: float
-    agrees: bool
-
-    @property
-    def is_enough(self) -> bool:
-        """Whether the reading explains the rows about as well."""
-        return (
-            self.agrees
-            and self.ratio < _ADEQUATE_ERROR_RATIO
-            and self.largest < _ADEQUATE_JOINT_ERROR_RATIO
-        )
-
-
-@dataclass(frozen=True, eq=False)
-class Readings:
-    """How a recording is to be read.
-
-    Attributes:
-        steps: changes of what was recorded, in order.
-        model: with the gravity that was found.
-        samples: few rows, as read.
-        score: of these.
-        nearest: by meaning, the change that comes nearest to the reading found, compared with it.
-        unseen_zeros: joints of which the torque shows no zero: others fit alike.
-        adequacy: whether nothing else explains the rows much better.
-        rivals: signs of the joints that explain the rows alike, fewest changes first.
-        no_better: changes that fit best, by no more than chance: the recording is read without.
-        scales: of the positions, where the numbers alone say their unit.
-    """
-
-    steps: tuple[Step, ...]
-    model: RobotModel
-    samples: Samples
-    score: Score
-    nearest: Mapping[Meaning, tuple[Change, Comparison]]
-    unseen_zeros: tuple[int, ...] = ()
-    adequacy: Adequacy = Adequacy(1.0, 1.0, agrees=True)
-    rivals: tuple[SignRival, ...] = ()
-    no_better: tuple[Change, ...] = ()
-    scales: PositionScales | None = None
-
-    @property
-    def disputed_signs(self) -> tuple[Step, ...]:
-        """The signs that were found, and are others where the rows are explained alike."""
-        axes = Axes.of((step.change for step in self.steps), self.model.n_joints)
-        signs = Signs.of(axes)
-        return tuple(step for step in self.steps if _is_disputed(step, signs, self.rivals))
 
 
 def find_readings(
@@ -257,41 +126,59 @@ def find_readings(
         search.change(changes)
         return search
 
-    search, steps = _one_by_one(started)
-    adequacy = search.adequacy()
-    is_doubted = not adequacy.is_enough or any(not step.sure or step.is_far for step in steps)
-    if is_doubted and (steps or search.score.overall > EXPLAINED_ERROR):
-        search, steps = _with_a_sign(started, search, steps)
-    has_signs = any(step.change.meaning in SIGNS for step in steps)
-    is_several = has_signs and len(steps) > 1
-    if (is_doubted or is_several) and (steps or search.score.overall > EXPLAINED_ERROR):
-        search, steps = _with_signs(started, search, steps)
+    search, steps = _searched(started)
     search, steps, no_better = _without_chance(started, search, steps)
-    has_signs = any(step.change.meaning in SIGNS for step in steps)
-    rivals = search.sign_rivals()
-    if has_signs and rivals and len(rivals[0].signs.changes) < len(search.signs.changes):
-        search.change([Change("axis sign", rivals[0].flipped)])
-        rivals = search.sign_rivals()
+    rivals = _fewest_signs(search, steps)
     search, steps = _signs_together(started, search, steps)
-    adequacy = search.adequacy()
-    nearest = search.nearest()
-    score = score_of(search.model, search.samples, search.score.columns)
     steps = _without_adopted(steps)
     # What a change explains shows only together with the others.
     steps = [step if step.alike else replace(step, error=search.score.overall) for step in steps]
     found = Readings(
-        tuple(steps),
-        search.model,
-        search.samples,
-        score,
-        nearest,
-        search.unseen_zeros(),
-        adequacy,
-        rivals,
-        no_better,
-        position_scales(search.model, search.samples) if unit_is_open else None,
+        steps=tuple(steps),
+        model=search.model,
+        samples=search.samples,
+        score=score_of(search.model, search.samples, search.score.columns),
+        nearest=search.nearest(),
+        unseen_zeros=search.unseen_zeros(),
+        adequacy=search.adequacy(),
+        rivals=rivals,
+        no_better=no_better,
+        scales=position_scales(search.model, search.samples) if unit_is_open else None,
     )
     return replace(found, steps=tuple(_judged(started, search, found)))
+
+
+def _searched(started: Callable[..., _Search]) -> tuple[_Search, list[Step]]:
+    """Return the best hypothesis, and its steps: one change after the other, then signs at once.
+
+    Signs are tried together with zeros and scales, and all of them together, where a change is
+    doubted or the arm does not explain the torque.
+    """
+    search, steps = _one_by_one(started)
+    if not steps and search.score.overall <= EXPLAINED_ERROR:
+        return search, steps
+    is_enough = search.adequacy().is_enough
+    is_doubted = not is_enough or any(not step.sure or step.is_far for step in steps)
+    if is_doubted:
+        search, steps = _with_a_sign(started, search, steps)
+    if is_doubted or (_has_signs(steps) and len(steps) > 1):
+        search, steps = _with_signs(started, search, steps)
+    return search, steps
+
+
+def _has_signs(steps: Sequence[Step]) -> bool:
+    return any(step.change.meaning in SIGNS for step in steps)
+
+
+def _fewest_signs(search: _Search, steps: Sequence[Step]) -> tuple[SignRival, ...]:
+    """Adopt the mirror image with the fewest changed signs; return the other images."""
+    rivals = search.sign_rivals()
+    if _has_signs(steps) and rivals:
+        fewest = rivals[0]
+        if len(fewest.signs.changes) < len(search.signs.changes):
+            search.change([Change("axis sign", fewest.flipped)])
+            return search.sign_rivals()
+    return rivals
 
 
 def _judged(started: Callable[..., _Search], search: _Search, found: Readings) -> list[Step]:
@@ -310,7 +197,7 @@ def _judged(started: Callable[..., _Search], search: _Search, found: Readings) -
     has_other_scales = found.scales is not None and bool(found.scales.other)
     return [
         replace(step, is_adequate=False)
-        if _is_disputed(step, search.signs, found.rivals)
+        if is_disputed(step, search.signs, found.rivals)
         or (has_other_scales and step.change.meaning in SIZED)  # which may imitate them
         else step
         for step in steps
@@ -331,23 +218,11 @@ def _without_chance(
     rest = [step for step in steps if not step.alike]
     without = started([step.change for step in rest])
     drives_more = without.score.driven.sum() > search.score.driven.sum()
-    if drives_more or _is_better(compare(search.score, without.score, search.model)):
+    if drives_more or compare(search.score, without.score, search.model).is_better:
         return search, steps, ()
     alike = (pair[0] for step in open_steps for pair in step.alike)
     no_better = dict.fromkeys([*(step.change for step in open_steps), *alike])
     return without, rest, tuple(no_better)
-
-
-def _is_disputed(step: Step, signs: Signs, rivals: Sequence[SignRival]) -> bool:
-    """Return whether a step is of signs that are others where the rows are explained alike.
-
-    So is the zero of a position that was negated, as its direction is.
-    """
-    joints = list(step.change.joints)
-    is_of_negated = step.change.meaning == "zero" and bool((signs.position[joints] < 0.0).any())
-    return (step.change.meaning in SIGNS or is_of_negated) and not all(
-        signs.agrees(rival.signs, joints) for rival in rivals
-    )
 
 
 def _with_signs(
@@ -367,12 +242,8 @@ def _with_signs(
     if not tried:
         return found, steps
     best, more = min(tried, key=lambda each: each[0].score.overall)
-    against = compare(best.score, found.score, found.model)
-    is_alike = (
-        against.sigmas < SEPARATE_SIGMAS
-        and best.score.overall < (1.0 + _ALIKE_REDUCTION) * found.score.overall
-    )
-    is_better = against.ratio < 1.0 - _LARGE_REDUCTION and against.sigmas < -SEPARATE_SIGMAS
+    is_alike = fits_alike(best.score, found.score, found.model)
+    is_better = compare(best.score, found.score, found.model).is_much_better
     count = len(best.signs.changes) + len(more), sum(step.is_far for step in more)
     is_simpler = count < (len(steps), sum(step.is_far for step in steps))
     if not is_better and not (is_alike and is_simpler):
@@ -462,12 +333,8 @@ def _with_a_sign(
     if not tried:
         return found, steps
     change, best, more = min(tried, key=lambda each: each[1].score.overall)
-    against = compare(best.score, found.score, found.model)
-    is_alike = (
-        against.sigmas < SEPARATE_SIGMAS
-        and best.score.overall < (1.0 + _ALIKE_REDUCTION) * found.score.overall
-    )
-    is_better = against.ratio < 1.0 - _LARGE_REDUCTION and against.sigmas < -SEPARATE_SIGMAS
+    is_alike = fits_alike(best.score, found.score, found.model)
+    is_better = compare(best.score, found.score, found.model).is_much_better
     if not is_better and not (is_alike and len(more) + 1 < len(steps)):
         is_other = is_alike and not _contains([step.change for step in more], steps)
         if not is_other or any(step.change == change for step in steps):
@@ -477,9 +344,7 @@ def _with_a_sign(
     without = started([step.change for step in more])
     alone = compare(best.score, without.score, found.model)
     is_alone = not any(
-        other != change
-        and compare(again.score, best.score, found.model).sigmas < SEPARATE_SIGMAS
-        and again.score.overall < (1.0 + _ALIKE_REDUCTION) * best.score.overall
+        other != change and fits_alike(again.score, best.score, found.model)
         for other, again, _ in tried
     )
     sign = Step(
@@ -522,7 +387,7 @@ def _doubted(steps: Sequence[Step], found: _Search, as_recorded: _Search) -> lis
     if not steps:
         return []
     without = as_recorded.free_fit()
-    is_beyond = found.stated_fit().ratio_to(without) < 1.0 - _LARGE_REDUCTION
+    is_beyond = found.stated_fit().ratio_to(without) < 1.0 - LARGE_REDUCTION
     return [
         replace(
             step,
@@ -622,7 +487,7 @@ class _Search:
         trials = [self._try(Change(kind, joints)) for kind in kinds]
         best = min(trials, key=lambda trial: trial.against.ratio)
         if not everywhere and (
-            best.against.ratio > 1.0 + _ALIKE_REDUCTION or best.against.sigmas > SURE_SIGMAS
+            best.against.ratio > 1.0 + ALIKE_REDUCTION or best.against.sigmas > SURE_SIGMAS
         ):
             return []
         return [self._adopt(best, trials)]
@@ -635,12 +500,12 @@ class _Search:
             trial
             for trial in better
             if trial.change.meaning not in SIZED
-            and _is_better(trial.against)
+            and trial.against.is_better
             and not self._is_spoilt(trial)
         ]
         joints = self._best_joints(better)
         if joints is not None and all(
-            compare(joints.score, trial.score, self.model).ratio < 1.0 - _ALIKE_REDUCTION
+            compare(joints.score, trial.score, self.model).ratio < 1.0 - ALIKE_REDUCTION
             for trial in good
         ):
             others = [trial for trial in better if trial.change.meaning not in SIZED]
@@ -679,7 +544,7 @@ class _Search:
         moved = np.flatnonzero(np.ptp(self.samples.motion.position, axis=0) > 0.0)
         if len(moved) > _MAX_NEGATED_JOINTS:
             return []
-        fits = _Fits(self.model, _thinned(self.samples, _FIRST_TRIAL_ROWS), self._mountings)
+        fits = self._few_row_fits()
         positions = []
         for negated in product((1.0, -1.0), repeat=len(moved)):
             position = np.ones(self.model.n_joints)
@@ -689,6 +554,10 @@ class _Search:
         errors = fits.of_signs(signs)
         best = [signs[k] for k in np.argsort(errors, kind="stable")[:_COMPARED_SIGNS]]
         return list({each.changes: each for each in map(fits.with_best_torques, best)}.values())
+
+    def _few_row_fits(self) -> FewRowFits:
+        few = _thinned(self.samples, _FIRST_TRIAL_ROWS)
+        return FewRowFits(self.model, few, self._mountings)
 
     def sign_rivals(self) -> tuple[SignRival, ...]:
         """Return the signs of mirror images of the arm that fit alike, fewest changes first."""
@@ -713,9 +582,7 @@ class _Search:
         """Add the joints that may be negated as well, with the error then."""
         for joints in tried:
             trial = self._try(Change("axis sign", joints))
-            if trial.against.sigmas < SEPARATE_SIGMAS and (
-                trial.score.overall < (1.0 + _ALIKE_REDUCTION) * self.score.overall
-            ):
+            if fits_alike(trial.score, self.score, self.model):
                 alike[joints] = trial.score.overall
 
     def _singles(self, but: _Joints | None = None) -> list[Trial]:
@@ -800,7 +667,7 @@ class _Search:
         if best is not None:
             self._fitted.append(best)
         zeros = [trial for trial in trials if trial.change.meaning == "zero"]
-        zeros = [trial for trial in zeros if trial.against.ratio < 1.0 - _LARGE_REDUCTION]
+        zeros = [trial for trial in zeros if trial.against.ratio < 1.0 - LARGE_REDUCTION]
         for far in sorted(zeros, key=lambda trial: trial.against.ratio)[:_FAR_ZERO_STARTS]:
             if (
                 best is not None
@@ -818,7 +685,8 @@ class _Search:
                 if other is not None:
                     self._fitted.append(other)
                 if other is not None and (
-                    best is None or _is_clearly_better(other.score, best.score, self.model)
+                    best is None
+                    or compare(other.score, best.score, self.model).ratio < 1.0 - ALIKE_REDUCTION
                 ):
                     best = other
         return best
@@ -835,7 +703,7 @@ class _Search:
             is_needed = [each.sigmas < -_NEEDED_SIGMAS for each in against]
             if all(is_needed):
                 whole = compare(score, self.score, self.model)
-                if whole.ratio > 1.0 - _MIN_ERROR_REDUCTION or whole.sigmas > -SEPARATE_SIGMAS:
+                if whole.ratio > 1.0 - MIN_REDUCTION or whole.sigmas > -SEPARATE_SIGMAS:
                     return None
                 return _Joints(fit, changes, samples, score, whole, tuple(against))
             free = np.zeros(2 * n, dtype=np.bool_)
@@ -862,8 +730,7 @@ class _Search:
         alike = tuple(
             (trial.change, trial.score.overall)
             for trial in others
-            if compare(trial.score, joints.score, self.model).sigmas < SEPARATE_SIGMAS
-            and trial.score.overall < (1.0 + _ALIKE_REDUCTION) * joints.score.overall
+            if fits_alike(trial.score, joints.score, self.model)
         )
         steps = [
             Step(
@@ -885,8 +752,7 @@ class _Search:
         trials = [
             trial
             for trial in tried
-            if compare(trial.score, score, self.model).sigmas < SEPARATE_SIGMAS
-            and trial.score.overall < (1.0 + _ALIKE_REDUCTION) * score.overall
+            if fits_alike(trial.score, score, self.model)
             and trial.score.driven.sum() <= score.driven.sum()
         ]
         if not trials:
@@ -919,12 +785,12 @@ class _Search:
         """Whether two changes fit alike, so that the recording does not choose one."""
         if compare(trial.score, best.score, self.model).sigmas > SEPARATE_SIGMAS:
             return False
-        if trial.score.overall < (1.0 + _ALIKE_REDUCTION) * best.score.overall:
+        if trial.score.overall < (1.0 + ALIKE_REDUCTION) * best.score.overall:
             return True
         more = trial.score.squares.sum(axis=1) - best.score.squares.sum(axis=1)
         return sigmas_of(more) < SEPARATE_SIGMAS
 
-    def _orders(self, trials: Sequence[Trial], fits: _Fits) -> Iterator[Trial]:
+    def _orders(self, trials: Sequence[Trial], fits: FewRowFits) -> Iterator[Trial]:
         """Yield whole orders: from several starts, the best exchange while the error falls."""
         is_poor = self.score.overall > EXPLAINED_ERROR
         for kind in ORDERS:
@@ -934,7 +800,7 @@ class _Search:
             ):
                 continue
             tried = {whole_order(trial.change, self.model.n_joints) for trial in trials_of_kind}
-            for order in _best_orders(fits, kind, _ORDER_STARTS if is_poor else 1):
+            for order in best_orders(fits, kind, ORDER_STARTS if is_poor else 1):
                 change = order_change(kind, order)
                 if change.joints and order not in tried:
                     yield self._try(change)
@@ -981,7 +847,7 @@ class _Search:
     def tried(self) -> list[Trial]:
         """Return the changes of least error, tried on all rows."""
         if self._trials is None:
-            fits = _Fits(self.model, _thinned(self.samples, _FIRST_TRIAL_ROWS), self._mountings)
+            fits = self._few_row_fits()
             errors = fits.errors([AS_READ, *self._to_try()])
             excluded = errors.pop(AS_READ) + SURE_SIGMAS**2 * ROWS_PER_FACT / fits.rows
             self._excluded = frozenset(
@@ -1026,209 +892,9 @@ class _Search:
         return self._tries[change]
 
 
-class _Fits:
-    """Fits to all of few rows under changes of a reading.
-
-    A motion is reduced once for all torques: orders and signs of torques are parts of its sums.
-    """
-
-    def __init__(
-        self, model: RobotModel, samples: Samples, mountings: Mapping[str, RobotModel]
-    ) -> None:
-        self.model = model
-        self._samples = samples
-        self._mountings = mountings
-        torque = np.sqrt(np.square(samples.torque).sum(axis=0))
-        self._counts = ~little_torque(torque, ~np.array(model.chain.revolute))
-        self._sums: dict[Change, Factor] = {}  # of every torque, by the change of the motion
-
-    @property
-    def rows(self) -> int:
-        """Number of rows."""
-        return len(self._samples.torque)
-
-    def errors(self, changes: Sequence[Change]) -> dict[Change, float]:
-        """Return logarithms of the squared errors of fits, each summed over the torques.
-
-        Small ones are aside: a fit makes their share as small as it likes.
-        """
-        errors: dict[Change, float] = {}
-        by_gravity: dict[str | None, list[Change]] = {}
-        for change in changes:
-            gravity = change.name if change.meaning in GRAVITIES else None
-            by_gravity.setdefault(gravity, []).append(change)
-        for alike in by_gravity.values():
-            model = mounted_model(self.model, alike[0], self._mountings)
-            for first in range(0, len(alike), _FITS_AT_ONCE):
-                errors.update(self._errors(model, alike[first : first + _FITS_AT_ONCE]))
-        return errors
-
-    def _errors(self, model: RobotModel, changes: Sequence[Change]) -> dict[Change, float]:
-        """Return the errors of changes under one gravity."""
-        motions = [change_of_motion(change) for change in changes]
-        axes = [Axes.of([change], self.model.n_joints) for change in changes]
-        errors = self._errors_as_read(model, motions, axes)
-        return dict(zip(changes, errors, strict=True))
-
-    def _reduce(self, model: RobotModel, motions: Sequence[Change]) -> None:
-        """Reduce each motion once, for all torques."""
-        if new := list(dict.fromkeys(motion for motion in motions if motion not in self._sums)):
-            moved = [changed_samples(self.model, self._samples, motion) for motion in new]
-            factor = every_torque_factor(model, moved)
-            for block, motion in enumerate(new):
-                self._sums[motion] = factor.blocks(slice(block, block + 1))
-
-    def by_friction(self, positions: Sequence[Array]) -> list[Signs]:
-        """Complete position signs (n,) with the torque signs that make friction dissipate energy.
-
-        Each joint is fitted alone, as the other torques may have any sign.
-        """
-        columns = friction_columns(self.model, self._samples)
-        motions = [_negated_positions(position) for position in positions]
-        for first in range(0, len(motions), _FITS_AT_ONCE):
-            self._reduce(self.model, motions[first : first + _FITS_AT_ONCE])
-        signs = []
-        for position, motion in zip(positions, motions, strict=True):
-            torque = np.ones(len(position))
-            factor = self._sums[motion]
-            for joint, (matrix,) in enumerate(factor.matrices):
-                width = len(matrix) - factor.n_joints
-                own = matrix[:width, :width]
-                ridge = _RIDGE * np.diag(own.diagonal() + np.finfo(np.float64).tiny)
-                fitted = np.linalg.solve(own + ridge, matrix[:width, width + joint])
-                friction = columns[joint, factor.columns[joint][:width]] @ fitted
-                torque[joint] = -1.0 if friction < 0.0 else 1.0
-            signs.append(Signs(position, torque))
-        return signs
-
-    def with_best_torques(self, signs: Signs) -> Signs:
-        """Return the signs after flipping torque signs one by one while the fit improves."""
-        (error,) = self.of_signs([signs])
-        while True:
-            torques = signs.torque * (1.0 - 2.0 * np.eye(len(signs.torque)))
-            others = [signs._replace(torque=torque) for torque in torques]
-            errors = self.of_signs(others)
-            best = int(np.argmin(errors))
-            if errors[best] >= error:
-                return signs
-            signs, error = others[best], errors[best]
-
-    def of_signs(self, signs: Sequence[Signs]) -> list[float]:
-        """Return the error of each combination of joint signs."""
-        errors: list[float] = []
-        for first in range(0, len(signs), _FITS_AT_ONCE):
-            some = signs[first : first + _FITS_AT_ONCE]
-            motions = [_negated_positions(each.position) for each in some]
-            axes = [Axes.of(each.changes, self.model.n_joints) for each in some]
-            errors += self._errors_as_read(self.model, motions, axes)
-        return errors
-
-    def _errors_as_read(
-        self, model: RobotModel, motions: Sequence[Change], axes: Sequence[Axes]
-    ) -> list[float]:
-        """Return the errors of motions, each with the torque as its axes read it."""
-        self._reduce(model, motions)
-        sums = of_torques([self._sums[motion] for motion in motions], axes)
-        priors = body_priors(model, sums)
-        errors = []
-        for each, read, mean, information in zip(sums.each(), axes, *priors, strict=True):
-            values, _ = each.posterior(mean, ROWS_PER_FACT * information, MIN_NOISE)
-            squares = each.squared_errors(values)[self._counts[read.torque_order]]
-            errors.append(float(np.log(np.where(squares > 0.0, squares, 1.0)).sum()))
-        return errors
-
-
-def to_compare(errors: Mapping[Change, float], excluded: float) -> list[Change]:
-    """Return the changes to compare on all rows: the best ones, and the best of each kind.
-
-    Of changes that the fits exclude, only the best of each meaning: it shows how certain they are.
-
-    Args:
-        errors: of fits to few rows.
-        excluded: error from which a change is certainly worse than none.
-    """
-    chosen: list[Change] = []
-    kinds: set[object] = set()
-    meanings: set[Meaning] = set()
-    for place, change in enumerate(sorted(errors, key=lambda change: errors[change])):
-        is_new = place < _COMPARED_CHANGES or kind_of(change) not in kinds
-        if (is_new and errors[change] < excluded) or change.meaning not in meanings:
-            chosen.append(change)
-        kinds.add(kind_of(change))
-        meanings.add(change.meaning)
-    return chosen
-
-
-def _negated_positions(sign: Array) -> Change:
-    """Return the change of the motion to positions with signs (n,)."""
-    joints = tuple(np.flatnonzero(sign < 0.0).tolist())
-    return Change("position sign", joints) if joints else AS_READ
-
-
-def of_torques(every: Sequence[Factor], axes: Sequence[Axes]) -> TorqueSums:
-    """Return the sums of [W | y], y as axes read it, by those of every torque."""
-    n = every[0].n_joints
-    p = every[0].n_parameters + 1 - n
-    gram = np.zeros((len(every), n, p + 1, p + 1))
-    for factor, read, parts in zip(every, axes, gram, strict=True):
-        for joint, (part, (matrix,)) in enumerate(zip(parts, factor.matrices, strict=True)):
-            width = len(matrix) - n
-            columns = factor.columns[joint][:width]
-            torque = width + read.torque_order[joint]
-            part[columns[:, None], columns] = matrix[:width, :width]
-            part[columns, p] = part[p, columns] = read.torque_sign[joint] * matrix[torque, :width]
-            part[p, p] = matrix[torque, torque]
-    return TorqueSums(gram, np.array([factor.samples for factor in every]))
-
-
-def _best_orders(fits: _Fits, kind: Meaning, starts: int) -> list[tuple[int, ...]]:
-    """Return the orders of least error on few rows."""
-    errors: dict[tuple[int, ...], float] = {}
-
-    def best_of(orders: Sequence[tuple[int, ...]]) -> tuple[int, ...]:
-        new = {order: order_change(kind, order) for order in orders if order not in errors}
-        found = fits.errors(list(dict.fromkeys(new.values())))
-        errors.update((order, found[change]) for order, change in new.items())
-        return min(orders, key=errors.__getitem__)
-
-    n = fits.model.n_joints
-    rng = np.random.default_rng(0)
-    reached: list[tuple[int, ...]] = []
-    for start in range(starts):
-        order = tuple(range(n)) if start == 0 else tuple(rng.permutation(n).tolist())
-        while True:
-            others = [_exchanged(order, pair) for pair in combinations(range(n), 2)]
-            best = best_of([order, *others])
-            if best == order:
-                break
-            order = best
-        reached.append(order)
-        if reached.count(best_of(reached)) > 1:
-            break
-    return sorted(errors, key=lambda order: errors[order])[:_COMPARED_ORDERS]
-
-
-def _exchanged(order: tuple[int, ...], pair: tuple[int, int]) -> tuple[int, ...]:
-    places = list(order)
-    first, second = pair
-    places[first], places[second] = places[second], places[first]
-    return tuple(places)
-
-
 def _apart(angle: float, other: float) -> float:
     """Return the size of the angle between two [rad], at most half a turn."""
     return float(abs((angle - other + np.pi) % (2.0 * np.pi) - np.pi))
-
-
-def _is_better(against: Comparison) -> bool:
-    """Whether a change reduces the error by more than chance, of all that are tried."""
-    if against.ratio < 1.0 - _LARGE_REDUCTION and against.sigmas < -SEPARATE_SIGMAS:
-        return True
-    return against.ratio < 1.0 - _MIN_ERROR_REDUCTION and against.sigmas < -SURE_SIGMAS
-
-
-def _is_clearly_better(score: Score, other: Score, model: RobotModel) -> bool:
-    return compare(score, other, model).ratio < 1.0 - _ALIKE_REDUCTION
 
 
 def _changes_of(fit: JointFit) -> tuple[Change, ...]:

@@ -7,8 +7,13 @@ from dataclasses import dataclass, replace
 from typing import Final
 
 from identification.estimators.torque_channel import possible_low_passes
-from identification.hypotheses.scores import Score, compare, score_of
-from identification.hypotheses.search import SEPARATE_SIGMAS, SURE_SIGMAS
+from identification.hypotheses.scores import (
+    SEPARATE_SIGMAS,
+    SURE_SIGMAS,
+    Score,
+    compare,
+    score_of,
+)
 from identification.model.robot import RobotModel
 from identification.signals.recording import Recording
 from identification.signals.samples import Preprocessing, Smoothed, prepare

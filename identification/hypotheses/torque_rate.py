@@ -7,8 +7,7 @@ from typing import Final
 
 import numpy as np
 
-from identification.hypotheses.scores import Score, score_of
-from identification.hypotheses.search import EXPLAINED_ERROR
+from identification.hypotheses.scores import EXPLAINED_ERROR, Score, score_of
 from identification.model.robot import RobotModel
 from identification.signals.samples import Samples
 

@@ -12,8 +12,8 @@ from identification.factor.factor import Factor
 from identification.hypotheses.column_search import ExplainedFit, find_columns
 from identification.hypotheses.diagnosis import TorqueDiagnosis, diagnose
 from identification.hypotheses.joint_changes import Change
+from identification.hypotheses.readings import Adequacy
 from identification.hypotheses.scores import ROWS_PER_FACT
-from identification.hypotheses.search import Adequacy
 from identification.signals.samples import Preprocessing, prepare
 from identification.validation.findings.diagnosis import of_diagnosis
 from tests.identification.three_axes import HIP, KNEE, NAMES, TIME, model, motion

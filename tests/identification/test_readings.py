@@ -12,6 +12,7 @@ from identification import Recording
 from identification.estimators.prior import TorqueSums, body_prior, body_priors
 from identification.factor.columns import every_torque_factor
 from identification.factor.factor import Factor
+from identification.hypotheses.few_row_fits import of_torques, to_compare
 from identification.hypotheses.joint_changes import (
     SIGNS,
     Axes,
@@ -19,7 +20,8 @@ from identification.hypotheses.joint_changes import (
     change_of_motion,
     changed_samples,
 )
-from identification.hypotheses.search import Step, find_readings, of_torques, to_compare
+from identification.hypotheses.readings import Step
+from identification.hypotheses.search import find_readings
 from identification.signals.samples import Preprocessing, prepare
 from tests.identification.three_axes import HIP, KNEE, NAMES, TIME, model, motion
 from tests.tiers import quick_ones

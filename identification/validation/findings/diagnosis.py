@@ -8,7 +8,7 @@ import numpy as np
 
 from identification.distributions import SIGNIFICANT_SIGMAS
 from identification.hypotheses.diagnosis import RigidTorque, TorqueDiagnosis
-from identification.hypotheses.search import Step
+from identification.hypotheses.readings import Step
 from identification.validation.evidence import Evidence
 from identification.validation.finding import Finding, RemedyKey, Thresholds, Value
 
