@@ -47,7 +47,8 @@ TYPED = {
     "see `hil design --show-settings gradient`": "test_settings_that_are_none",
     "design it again (`hil design`)": "test_a_design_that_was_edited",
     "run `hil rehearse FIELD`": "test_each_refusal_names_the_next_command",
-    "run `FIELD --dry-run`": "test_each_refusal_names_the_next_command",
+    "the arm is simulated: accept it with `FIELD --accept-dry-run`":
+        "test_a_simulated_arm_needs_no_dry_run",
     "if the motions looked right, run `FIELD --accept-dry-run`":
         "test_each_refusal_names_the_next_command",
     "`FIELD --accept-dry-runFIELD`": "test_each_refusal_names_the_next_command",
@@ -80,6 +81,7 @@ TYPED = {
     "leave it out, or run against `hil simulate`": "test_a_live_view_in_virtual_time",
 }  # fmt: skip
 ELSEWHERE = {  # files below tests/hil, and what no test can type
+    "run `FIELD --dry-run`": "campaign/runs/test_dry_run.py, of a real arm",
     "find the torque constants with `hil torque-constants`": "importers/test_importers.py",
     "hil run FIELD --payload FIELD": "weighing/test_payload_campaign.py",
     "stopped before the end of the search": "design/test_design_command.py, interrupted",
@@ -285,9 +287,13 @@ class TestCampaign:
 
     def test_each_refusal_names_the_next_command(self, designed: Path) -> None:
         type_printed(refusal("run", designed))
-        type_printed(refusal("run", designed))
+        accepted("run", designed, "--dry-run")
         type_printed(refusal("run", designed))
         assert (designed / "results.json").exists()
+
+    def test_a_simulated_arm_needs_no_dry_run(self, rehearsed: Path) -> None:
+        type_printed(refusal("run", rehearsed))
+        assert (rehearsed / "results.json").exists()
 
     def test_a_cell_edited_after_it(self, designed: Path) -> None:
         accepted("rehearse", designed)
