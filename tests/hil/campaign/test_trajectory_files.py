@@ -49,7 +49,7 @@ def new_cell(folder: Path, urdf: str) -> tuple[Path, dict[str, Any]]:
 
 
 @pytest.mark.parametrize(
-    "wanted", [["--quick", "--precision", "parameters 5 %"], ["--for", "payload"]]
+    "wanted", [["--quick", "--precision", "parameters 5 % absolute"], ["--for", "payload"]]
 )
 def test_a_cell_for_designs_has_motions_for_a_precision(tmp_path: Path, wanted: list[str]) -> None:
     cell, _ = new_cell(tmp_path, WITH_SPEED)
