@@ -16,6 +16,11 @@ TAIL_LINES: Final = 3
 """Lines at the end of a long list: files, what was skipped, counts."""
 _ELLIPSIS: Final = " ..."
 _CONTINUED: Final = " \\"
+_SENTENCE_END: Final = re.compile(r"(?<=[\w)%]\.) (?=[A-Z])")
+_CLAUSE_END: Final = re.compile(r"[;,](?= )")
+_LEAST_SHOWN: Final = (
+    0.6  # of the text that fits, where it is cut at the end of a sentence or clause
+)
 _COMMAND: Final = re.compile(r"(?:^|[:>,] |then )(hil [a-z][^;()`]*)$")
 _COMMAND_LINES: Final = 12  # at most, of a command to copy
 
@@ -30,8 +35,10 @@ class Paragraph:
     complete: bool = False  #: whether it is never cut, such as a command to copy
 
     def lines(self, count: int) -> list[str]:
-        """Return the text on at most `count` lines, cut at the end of a word."""
-        return _broken(" ".join(self.text.split()), self.label, most=count)
+        """Return the text on at most `count` lines, cut after a sentence, a clause or a word."""
+        text = " ".join(self.text.split())
+        whole = _broken(text, self.label, most=len(text) + 1)
+        return whole if len(whole) <= count else _cut_to(text, self.label, count)
 
     @property
     def whole(self) -> int:
@@ -127,6 +134,19 @@ def _broken(text: str, label: str = "", *, most: int | None = None) -> list[str]
         if shown > command.start(1):
             lines[k] += _CONTINUED
     return lines
+
+
+def _cut_to(text: str, label: str, count: int) -> list[str]:
+    """Return the beginning of a text on `count` lines; half a sentence says little."""
+    cut = _broken(text, label, most=count)
+    least = _LEAST_SHOWN * sum(map(len, cut))
+    for end, mark in ((_SENTENCE_END, ""), (_CLAUSE_END, _ELLIPSIS)):
+        starts = (text[: each.start()] + mark for each in end.finditer(text))
+        parts = (_broken(start, label, most=len(text)) for start in starts)
+        fitting = [lines for lines in parts if len(lines) <= count]
+        if fitting and sum(map(len, fitting[-1])) >= least:
+            return fitting[-1]
+    return cut
 
 
 def columns(rows: Sequence[Sequence[str]], *, left: int = 1) -> list[str]:

@@ -50,6 +50,19 @@ class TestText:
         assert shown[0].startswith("found  word") and shown[1].startswith("       word")
         assert shown[1].endswith(" ...")
 
+    @pytest.mark.parametrize(
+        ("start", "last"),
+        [
+            ("word " * 12 + "It follows the arm. Then ", "It follows the arm."),
+            ("word " * 12 + "wrong sign of joint 3; ", "wrong sign of joint 3 ..."),
+            ("It stops. Then ", "word ..."),
+        ],
+    )
+    def test_text_is_cut_after_a_sentence_or_a_clause(self, start: str, last: str) -> None:
+        """Half a sentence says little, unless most of the line would stay empty."""
+        (shown,) = one_screen([Paragraph(start + "word " * 60)], lines=1)
+        assert shown.endswith(last)
+
     def test_a_command_to_copy_is_never_cut(self) -> None:
         command = Paragraph("word " * 30 + "end", complete=True)
         shown = one_screen([Paragraph("first " * 60), *["row"] * 20, command])
