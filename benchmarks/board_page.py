@@ -135,28 +135,29 @@ def page_text(rows: Sequence[Mapping[str, Any]], commit: str) -> str:
 
 
 _TEXT: Final = """\
-Every recording of a real arm that was ever tried, losses first. An error is ‖τ - τ̂‖ / ‖τ‖ over
-all joints and every row of what was predicted, of the torque as it was recorded.
+All recordings of real arms that were ever tried, losses first. Errors are ‖τ - τ̂‖ / ‖τ‖ of the
+recorded torque, over all joints and all predicted rows.
 
-*hil* has its default settings. *Ordinary* is an ordinary fit (`benchmarks/plain_fit.py`: base
-parameters, Coulomb and viscous friction, offset, rotor inertia; its cut-off chosen on the fitted
-part). *Nominal* is the URDF's model as it is, behind the first stroke with fitted rotor inertia and
-friction, behind the second with the scale of each joint's torque as well. *Ratio* is hil over
-ordinary: above 1 is a loss. *Inside* is the share of held-out means of torque in their 95 %
-intervals, *s* seconds of processor.
+*hil* uses its default settings. *Ordinary* is an ordinary fit (`benchmarks/plain_fit.py`) of base
+parameters, Coulomb and viscous friction, offset and rotor inertia, with a cut-off frequency
+chosen on the fitted part. *Nominal* is the URDF's model: first unchanged, after the first slash
+with fitted rotor inertia and friction, after the second slash with a fitted torque scale of each
+joint as well. *Ratio* is hil over ordinary: above 1, hil is worse. *Inside* is the fraction of
+held-out torque means within their 95 % intervals, and *s* is the processor time in seconds.
 
-Measured at {commit} on {splits} splits of real arms ({arms} arms): geometric mean of the ratios
-{mean:.2f}, {behind} of {splits} behind an ordinary fit or the nominal model. The page is renewed by
+Measured at {commit} on {splits} splits of real arms ({arms} arms): the geometric mean of the
+ratios is {mean:.2f}, and {behind} of {splits} are worse than an ordinary fit or the nominal
+model. These commands collect the recordings and renew the page:
 """
 _AFTER: Final = """\
-`--fetch` takes what the named folders and the package index offer, by SHA-256
-(`benchmarks/recordings/*.toml`), and names the repository of what it cannot reach. The index
-offers only URDFs (`example-robot-data`): recordings come from a folder.
+`--fetch` collects what the named folders and the package index offer, checked by SHA-256
+(`benchmarks/recordings/*.toml`), and names the repository of each file that it cannot find. The
+index offers only URDFs (`example-robot-data`); recordings come from a folder.
 
-Rows *measured elsewhere* are of arms whose recordings are reserved for acceptance and are not
-here. Their figures are those reported for the commit in the row (`benchmarks/elsewhere.toml`),
-which is older than heavy rotors and the test of low-passes, and were not repeated since;
-a range covers a group of rows. Sources that the report does not name are *not named*.
+Rows *measured elsewhere* are arms whose recordings are reserved for acceptance and not available
+here. Their figures were reported for the commit in the row (`benchmarks/elsewhere.toml`), which
+predates heavy rotors and the test of low-passes, and were not measured again. A range covers a
+group of rows. The report does not name the sources marked *not named*.
 """
 _COMMANDS: Final = """\
 ```text
@@ -191,8 +192,8 @@ def _wrapped(text: str) -> Iterator[str]:
 
 def _tables(losses: Sequence[Line], others: Sequence[Line]) -> Iterator[str]:
     for title, lines in (
-        ("## Behind an ordinary fit or the nominal model", losses),
-        ("## Not behind", others),
+        ("## Worse than an ordinary fit or the nominal model", losses),
+        ("## At least as good", others),
     ):
         yield title
         yield ""
@@ -205,23 +206,25 @@ def _tables(losses: Sequence[Line], others: Sequence[Line]) -> Iterator[str]:
 
 
 _CHOICES: Final = """\
-Each cell is the error without a choice over that with all of them: above 1 the choice pays, below
-it costs; empty within 0.5 %. A choice that is left out has its first candidate. *Mean* is
-geometric, over robots. *Others* is the mean where each robot follows what the other robots prefer,
-which is the judgement leave-one-robot-out: at 1 no robot would drop the choice. *Reversal* is for
-logs of simulators, whose friction reverses smoothly: without it, one with tanh(v / 0.05 rad/s) is
-said to be filtered (`tests/hil/identified/test_clean_logs.py`).
+Each cell is the error without a choice divided by the error with all choices: above 1 the choice
+helps, below 1 it hurts; differences within 0.5 % are left empty. A choice that is left out has
+its first candidate. *Mean* is the geometric mean over robots. *Others* is the mean if each robot
+follows the preference of the other robots (leave-one-robot-out): at 1 no robot would drop the
+choice. *Reversal* is for logs of simulators, whose friction reverses smoothly: without it, `hil`
+takes the torque of a simulator with tanh(v / 0.05 rad/s) for a filtered one
+(`tests/hil/identified/test_clean_logs.py`).
 """
 
 _AVERAGING: Final = """\
-Each cell is the error with averaged answers (`benchmarks/averaging.py`) over that as it is: below
-1 averaging pays, above it costs; empty within 0.5 %. *Mean* is geometric, over robots. *Others* is
-the mean where each robot averages if that is better on the other robots: at 1 none would.
+Each cell is the error with averaged answers (`benchmarks/averaging.py`) divided by the present
+error: below 1 averaging helps, above 1 it hurts; differences within 0.5 % are left empty. *Mean*
+is the geometric mean over robots. *Others* is the mean if each robot averages when that is better
+for the other robots: at 1 no robot would.
 
-With all answers averaged but those about the prior, each question by itself, the error over that of
-an ordinary fit has the geometric mean {averaged.mean:.3f}, is {averaged.worst:.3f} at worst and
-above 1 in {averaged.losses} of {averaged.rows} rows. As it is, these are {now.mean:.3f},
-{now.worst:.3f} and {now.losses}.
+If all answers except those about the prior are averaged, each question by itself, the error
+relative to an ordinary fit has a geometric mean of {averaged.mean:.3f} and a maximum of
+{averaged.worst:.3f}, and exceeds 1 in {averaged.losses} of {averaged.rows} rows. At present these
+figures are {now.mean:.3f}, {now.worst:.3f} and {now.losses}.
 """
 
 
@@ -254,7 +257,7 @@ def _judged(title: str, text: str, rows: Sequence[Mapping[str, Any]], key: str) 
     yield ""
     unused = ", ".join(name for name in judged if name not in used)
     if unused:
-        yield f"Without effect on every row: {unused}."
+        yield f"No effect on any row: {unused}."
         yield ""
 
 

@@ -120,7 +120,7 @@ class TestPage:
     def test_losses_are_first_and_the_worst_of_them_at_the_top(self) -> None:
         rows = [row(0.05), row(0.12), row(0.09, nominal=0.08)]
         text = board_page.page_text(rows, "abc")
-        behind, others = text.split("## Behind")[1].split("## Not behind")
+        behind, others = text.split("## Worse")[1].split("## At least as good")
         assert re.findall(r"\| a to b \| 10 % \| \S+ ?%? \| (\S+) %", behind) == ["12", "9"]
         assert re.findall(r"\| a to b \| 10 % \| \S+ ?%? \| (\S+) %", others) == ["5"]
         ratios = [float(ratio) for ratio in re.findall(r"% \| (\d+\.\d\d) \|", behind)]
@@ -143,14 +143,14 @@ class TestPage:
         assert "| row | rows | velocity |" in section
         assert "| gen3, a to b | 1.20 | 0.90 |" in section
         assert "| gen3, a to b | 1.10 |  |" in section
-        assert "bandwidth" in section.split("Without effect on every row:")[1]
+        assert "bandwidth" in section.split("No effect on any row:")[1]
 
     def test_averaged_answers_are_shown_where_they_change_a_row(self) -> None:
         rows = [row(0.05, averaged=dict.fromkeys(COLUMNS, 1.0) | {"rows": 1.2, ALL: 0.9})]
         section = board_page.page_text(rows, "abc").split("## With averaged answers")[1]
         assert "| row | rows | all but the prior |" in section
         assert "| gen3, a to b | 1.20 | 0.90 |" in section
-        assert "bandwidth" in section.split("Without effect on every row:")[1]
+        assert "bandwidth" in section.split("No effect on any row:")[1]
 
     def test_without_choices_there_is_no_such_section(self) -> None:
         assert "Without each choice" not in board_page.page_text([row(0.05)], "abc")
