@@ -65,10 +65,10 @@ from hil.weighing.payload_campaign import (
     MIN_PAIRS,
     PayloadCampaign,
     PayloadMounting,
-    Weighed,
     assumed_payload,
     loaded_cell,
 )
+from hil.weighing.weighed import Weighed
 from identification.estimators.payload_estimate import NAMES, figures_of, identify_payload
 from identification.estimators.payload_problem import KnownArm, Run
 from identification.estimators.prior import body_prior, design_effect_of, fit_posterior

@@ -14,6 +14,12 @@ from hil.base.progress import reporter as make_reporter
 from hil.cli.arguments import JsonOption, QuietOption, VerboseOption, figures
 from hil.cli.identify_options import DelayOption, delay_from
 from hil.payload.payload_by_model import weigh_by_model
+from hil.payload.payload_messages import (
+    outside_lines,
+    payload_as_json,
+    payload_lines,
+    step_lines,
+)
 from hil.payload.payload_run import find_payload
 from hil.pipeline.options import Options
 
@@ -63,10 +69,13 @@ def payload(
         options = Options(estimator="wls", delay=delay_from(delay))
         result = find_payload(bare, loaded or [], reporter, frame=frame, options=options)
     outside = result.outside(wanted)
-    remedies = result.remedy(wanted) if outside else []
-    fields = result.as_json() | {"checked": wanted, "outside": outside, "next_steps": remedies}
-    text = json_module.dumps(fields, indent=1, ensure_ascii=False)
-    lines = result.lines(wanted, outside, settings=verbose)
-    typer.echo(text if json else "\n".join(lines if verbose else brief(lines)))
+    if json:
+        steps = step_lines(result.next_steps(wanted) if outside else ())
+        more = {"checked": wanted, "outside": outside_lines(outside), "next_steps": steps}
+        fields = payload_as_json(result) | more
+        typer.echo(json_module.dumps(fields, indent=1, ensure_ascii=False))
+    else:
+        lines = payload_lines(result, wanted, settings=verbose)
+        typer.echo("\n".join(lines if verbose else brief(lines)))
     if outside or result.is_doubtful:
         raise typer.Exit(ExitStatus.NEGATIVE_RESULT)

@@ -18,6 +18,7 @@ from hil.base.progress import say
 from hil.base.toml_text import comment_lines, inline
 from hil.cli.arguments import JsonOption, QuietOption, numbers, print_json
 from hil.cli.identify_options import delay_from
+from hil.pipeline.note_messages import finding_lines
 from hil.pipeline.sources import archives_in
 from hil.pipeline.torque_constant_fit import GainsFound, find_gains
 from identification.estimators.current_gains import (
@@ -79,7 +80,7 @@ def torque_constants(
         print_json(as_dict(result) | {"assumed": assumed})
     else:
         typer.echo(_as_toml(result, assumed))
-        for warning in result.warnings:
+        for warning in finding_lines(result.otherwise, result.joints):
             say(f"warning: {warning}", err=True)
     if not result.gains.determined.all():
         raise typer.Exit(ExitStatus.NEGATIVE_RESULT)
@@ -183,5 +184,5 @@ def as_dict(result: GainsFound) -> dict[str, object]:
         "unit": "N·m/A",
         "side": "motor" if result.motor_side else "joint",
         "payload_kg": loads,
-        "warnings": list(result.warnings),
+        "warnings": finding_lines(result.otherwise, result.joints),
     }

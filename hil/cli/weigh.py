@@ -21,6 +21,7 @@ from hil.campaign.operator_keys import can_read
 from hil.campaign.screen import confirmed
 from hil.cli.arguments import PAYLOAD, numbers, print_json
 from hil.precision.requirements import Requirement
+from hil.weighing.messages import weighed_as_json, weighed_lines
 from hil.weighing.payload_campaign import (
     DEFAULT_CENTRE,
     Execute,
@@ -148,10 +149,10 @@ def weigh(
         return weighed.dry_run(execute, mounting, choices)
     result = weighed.run(execute, mounting, reporter, requirements=requirements, choices=choices)
     if json:
-        print_json(result.as_json())
+        print_json(weighed_as_json(result))
     else:
         file = f"{weighed.root / PAYLOAD_RESULT}: all figures, for programs"
-        lines = [*(result.lines if verbose else result.summary), file]
+        lines = [*weighed_lines(result, settings=verbose), file]
         typer.echo("\n".join(lines if verbose else brief(lines)))
     if result.payload.is_doubtful:
         raise typer.Exit(ExitStatus.NEGATIVE_RESULT)

@@ -9,9 +9,8 @@ from hil.archive import open_archive
 from hil.base.errors import ArchiveError, InputError
 from hil.base.progress import Reporter
 from hil.pipeline.estimating import Estimation, estimate_with
-from hil.pipeline.note_messages import note_lines
 from hil.pipeline.options import Options
-from hil.pipeline.other_meanings import in_a_sentence, require_weight
+from hil.pipeline.other_meanings import require_weight
 from hil.pipeline.prepared import Prepared, prepare_sources, samples_of
 from hil.pipeline.sources import (
     Source,
@@ -23,14 +22,8 @@ from hil.pipeline.sources import (
 from hil.pipeline.torque_scale import torque_scale
 from identification.estimators.payload_problem import KnownArm, Run
 
-from .payload_run import (
-    PayloadContradictions,
-    PayloadFound,
-    doubtful_mounting,
-    flange_of,
-    weighed,
-    weight_per_mass,
-)
+from .payload_found import BareDoubts, PayloadFound
+from .payload_run import doubtful_mounting, flange_of, weighed, weight_per_mass
 
 
 def weigh_by_model(
@@ -83,14 +76,11 @@ def weigh_by_model(
     sides = {False: of_arm, True: paths}
     of_both = (*prepared.sources.training, *others.training)
     meanings = require_weight(cell.model, prepared.fitted, of_both, of_arm[0])
-    otherwise = tuple(in_a_sentence(each) for each in meanings if each.level == "wrong")
-    doubtful = [in_a_sentence(each) for each in meanings if each.level != "wrong"]
     mounting = doubtful_mounting(cell.model, prepared.fitted)
-    contradictions = PayloadContradictions(mounting, otherwise)
+    doubts = BareDoubts(tuple(cell.model.joint_names), mounting, meanings)
     estimate, body = weighed(
-        cell.model, runs, scale, frame, sides, others.training, contradictions, known_arm
+        cell.model, runs, scale, frame, sides, others.training, doubts, known_arm
     )
-    sentences = note_lines((*prepared.sources.warnings, *others.warnings))
     return PayloadFound(
         estimate=estimate,
         body=body,
@@ -99,11 +89,10 @@ def weigh_by_model(
         bare=(),
         loaded=tuple(source.name for source in others.training),
         scale=scale,
-        mounting=mounting,
-        otherwise=otherwise,
+        doubts=doubts,
         typed=((), tuple(loaded)),
         with_currents=all(recording.motor_current is not None for recording in recordings),
-        warnings=tuple(dict.fromkeys((*sentences, *doubtful))),
+        warnings=(*prepared.sources.warnings, *others.warnings),
     )
 
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from typing import Final, assert_never
 
 from hil.pipeline.notes import (
@@ -46,7 +46,8 @@ from identification.estimators.delay_messages import delay_line
 from identification.estimators.torque_scale import described
 from identification.signals.messages import ROW_REASONS, clock_lines, time_lines
 from identification.text import joined, number, percentage
-from identification.validation.finding_messages import consistency_words
+from identification.validation.finding import Finding, TestedOn
+from identification.validation.finding_messages import Naming, consistency_words, worded
 
 SCALE_SOURCES: Final = {
     ScaleSource.COLUMN_MAP: "torque_uncertainty of the column map",
@@ -65,6 +66,14 @@ _WHY_NOT_APPLIED: Final = {
 def note_lines(notes: Iterable[Note]) -> list[str]:
     """Return sentences without their full stops, one for most notes."""
     return [line for note in notes for line in _lines(note)]
+
+
+def finding_lines(findings: Iterable[Finding], joints: Sequence[str]) -> list[str]:
+    """Return what recordings of these joints are other than described, with what to do."""
+    naming = Naming(tuple(joints), TestedOn.RECORDINGS)
+    return [
+        f"{each.words}: {each.next_step}" for each in (worded(found, naming) for found in findings)
+    ]
 
 
 def _lines(note: Note) -> list[str]:

@@ -12,25 +12,16 @@ from identification.hypotheses.diagnosis import TorqueDiagnosis, diagnose
 from identification.hypotheses.joint_changes import Change
 from identification.model.robot import RobotModel
 from identification.signals.samples import Samples
-from identification.validation.finding import Finding, TestedOn
-from identification.validation.finding_messages import Naming, WordedFinding, worded
+from identification.validation.finding import Finding
+from identification.validation.finding_messages import Naming, worded
 from identification.validation.findings.diagnosis import of_diagnosis, without_bodies
 from identification.validation.findings.faults import fault_keys
 
 
-def other_meanings(
-    model: RobotModel, found: TorqueDiagnosis, sources: Sequence[Source]
-) -> tuple[WordedFinding, ...]:
+def other_meanings(found: TorqueDiagnosis, sources: Sequence[Source]) -> tuple[Finding, ...]:
     """Return what recordings are other than described, and what to do about each."""
-    naming = Naming(tuple(model.joint_names), TestedOn.RECORDINGS)
     certain = [_certain(step.change) for step in found.discrete if step.sure]
-    findings = (*row_findings(sources), *certain, *of_diagnosis(found))
-    return tuple(worded(each, naming) for each in findings)
-
-
-def in_a_sentence(finding: WordedFinding) -> str:
-    """Return a finding with what to do about it."""
-    return f"{finding.words}: {finding.next_step}"
+    return (*row_findings(sources), *certain, *of_diagnosis(found))
 
 
 def _certain(change: Change) -> Finding:
@@ -41,7 +32,7 @@ def _certain(change: Change) -> Finding:
 
 def require_weight(
     model: RobotModel, recordings: Sequence[Samples], sources: Sequence[Source], path: Path | None
-) -> tuple[WordedFinding, ...]:
+) -> tuple[Finding, ...]:
     """Return what bare recordings are other than described; gravity must be in their torque.
 
     A controller that removes the weight of its arm may remove that of the load it knows as well,
@@ -69,4 +60,4 @@ def require_weight(
         )
         remedy = "record the torque before gravity is removed from it"
         raise RefusedRecordingError(path, problem, field="torque", remedy=remedy)
-    return other_meanings(model, found, sources)
+    return other_meanings(found, sources)

@@ -24,9 +24,10 @@ from identification.model.robot import RobotModel
 from identification.selection.settings import Settings
 from identification.signals.recording import RecordingError
 from identification.signals.samples import Samples
+from identification.validation.finding import Finding
 
 from .options import FIXED
-from .other_meanings import in_a_sentence, other_meanings
+from .other_meanings import other_meanings
 from .prepared import motor_from_joint, samples_of, stated_settings
 from .sources import Source, aligned, cell_of, source_of
 
@@ -38,7 +39,8 @@ class GainsFound:
     gains: Gains
     loads: dict[str, Payload | None]  #: payload by archive name (by path if names are not unique)
     motor_side: bool  #: whether gear ratios are known; otherwise gains include them
-    warnings: tuple[str, ...] = ()  #: what the recordings are other than described
+    joints: tuple[str, ...]  #: names of the arm's
+    otherwise: tuple[Finding, ...]  #: what the recordings are other than described
 
 
 def find_gains(
@@ -103,7 +105,8 @@ def find_gains(
     prepared = _prepared([*zip(sources, cells, lags, carried, strict=True)], model)
     gains = identify_gains(model, _reduced(prepared, model, turns, reporter))
     has_gears = not np.array_equal(turns, np.eye(len(turns)))
-    return GainsFound(gains, loads, has_gears, _warnings(prepared, model, turns, gains, sources))
+    otherwise = _otherwise(prepared, model, turns, gains, sources)
+    return GainsFound(gains, loads, has_gears, tuple(model.joint_names), otherwise)
 
 
 class _Prepared(NamedTuple):
@@ -149,13 +152,13 @@ def _reduced(
     return factors
 
 
-def _warnings(
+def _otherwise(
     prepared: Sequence[_Prepared],
     model: RobotModel,
     turns: Array,
     gains: Gains,
     sources: Sequence[Source],
-) -> tuple[str, ...]:
+) -> tuple[Finding, ...]:
     """Return what recordings without a load are other than described, by the torque found."""
     bare = [each for each in prepared if each.load is None]
     known = gains.determined
@@ -167,8 +170,7 @@ def _warnings(
         replace(each.samples, torque=torque, usable=each.samples.usable & has_torque)
         for each, torque in zip(bare, torques, strict=True)
     ]
-    found = other_meanings(model, diagnose(model, samples), sources)
-    return tuple(map(in_a_sentence, found))
+    return other_meanings(diagnose(model, samples), sources)
 
 
 def _name_in(path: Path, paths: Sequence[Path]) -> str:

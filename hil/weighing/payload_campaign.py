@@ -43,12 +43,16 @@ from hil.control.messages import refusal_words
 from hil.control.motion_checks import MotionChecks
 from hil.control.motion_watch import Stop
 from hil.control.simulated_cell import simulated_link
-from hil.payload.payload_run import NoPayloadError, PayloadFound, find_payload, flange_of
+from hil.payload.payload_found import PayloadFound
+from hil.payload.payload_run import NoPayloadError, find_payload, flange_of
 from hil.precision.requirements import Requirement
 from identification import IdentificationError
 from identification.estimators.payload_estimate import ball_radius
 from identification.model.known_payload import Payload
 from identification.model.pseudo_inertia import body
+
+from .messages import weighed_as_json, weighed_lines
+from .weighed import Weighed
 
 DEFAULT_CENTRE: Final = (0.0, 0.0, 0.1)
 """Centre of mass of a payload in the frame of the flange [m] where it is not stated."""
@@ -134,40 +138,6 @@ class PayloadMounting:
     @staticmethod
     def _confirmation(loaded: bool) -> str:
         return f"--mounted {'yes' if loaded else 'no'}"
-
-
-@dataclass(frozen=True, eq=False)
-class Weighed:
-    """A payload that was weighed.
-
-    Attributes:
-        payload: as by `hil payload`.
-        pairs: of recordings without and with it.
-        precision: of the mass, if one was required.
-    """
-
-    payload: PayloadFound
-    pairs: int
-    precision: PrecisionRecord | None
-
-    @property
-    def lines(self) -> list[str]:
-        """What `hil payload` prints, and the precision."""
-        return [*self.payload.lines(), *self._reached]
-
-    @property
-    def summary(self) -> list[str]:
-        """The same without the commands of controllers."""
-        return [*self.payload.lines(settings=False), *self._reached]
-
-    @property
-    def _reached(self) -> list[str]:
-        return [] if self.precision is None else ["", precision_line(self.precision)]
-
-    def as_json(self) -> dict[str, Any]:
-        """Return all values as JSON data."""
-        precision = None if self.precision is None else precision_line(self.precision)
-        return self.payload.as_json() | {"pairs": self.pairs, "precision": precision}
 
 
 @dataclass(frozen=True, eq=False)
@@ -308,9 +278,9 @@ class PayloadCampaign:
         result = result or self._weighed(pairs, reporter)
         sides = ((self.bare.folder.root,), (self.loaded.folder.root,))
         weighed = Weighed(replace(result, typed=sides), pairs, record)
-        text = json.dumps(weighed.as_json(), indent=1, ensure_ascii=False)
+        text = json.dumps(weighed_as_json(weighed), indent=1, ensure_ascii=False)
         write_output(self.root / PAYLOAD_RESULT, text + "\n")
-        write_output(self.root / "payload.txt", "\n".join(weighed.lines) + "\n")
+        write_output(self.root / "payload.txt", "\n".join(weighed_lines(weighed)) + "\n")
         return weighed
 
     def _record_side(

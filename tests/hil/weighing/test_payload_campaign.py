@@ -31,14 +31,15 @@ from hil.control.simulated_cell import simulated_controller
 from hil.control.virtual_link import VirtualLink
 from hil.payload.payload_run import find_payload
 from hil.precision.requirements import requirements_from
+from hil.weighing.messages import weighed_lines
 from hil.weighing.payload_campaign import (
     MountingError,
     PayloadCampaign,
     PayloadMounting,
-    Weighed,
     assumed_payload,
     loaded_cell,
 )
+from hil.weighing.weighed import Weighed
 from identification.estimators.payload_estimate import PayloadError
 from identification.model.known_payload import Payload
 from tests.hil.fast_cell import fast_campaign, fast_cell, pass_rehearsal
@@ -160,7 +161,7 @@ class TestRecording:
         stored = json.loads((weighed.root / "payload.json").read_text())
         assert stored["figures"]["mass"]["value"] == pytest.approx(payload.payload.body.mass)
         text = (weighed.root / "payload.txt").read_text()
-        assert text == "\n".join(payload.lines) + "\n"
+        assert text == "\n".join(weighed_lines(payload)) + "\n"
         assert "$TOOL_MASS := 1." in text or "$TOOL_MASS := 2." in text
         printed = CliRunner().invoke(
             app,
@@ -267,7 +268,7 @@ class TestPrecision:
         assert found.pairs == 2
         assert found.precision.outcome == "met"
         assert any("precision after 2 pairs: mass" in line for line in heard.lines)
-        assert "no more pairs" in found.lines[-1]
+        assert "no more pairs" in weighed_lines(found)[-1]
 
     def test_it_ends_when_more_pairs_do_not_help(self, designed) -> None:
         weighed = begun(designed, "strict")
