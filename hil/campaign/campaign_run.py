@@ -7,13 +7,13 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, nullcontext
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass, fields
 from typing import Any
 
 from hil.base.progress import Reporter
 from hil.campaign.reached_precision import PrecisionStage
 from hil.control.cell_link import cell_link
-from hil.control.connection import active_checks, narrower_limits
+from hil.control.connection import active_checks, lower_limits
 from hil.control.link import MotionLink
 from hil.control.motion_checks import MotionChecks
 from hil.control.motions import CampaignMotion, CheckedMoves, require_allowed
@@ -24,9 +24,11 @@ from .dry_run_stage import DryRunStage
 from .gates import require_as_rehearsed, require_dry_run, require_gates
 from .motion_runner import RunArchives, Runner, RunOptions
 from .operator import RunWatch
+from .precision_record import PrecisionRecord
 from .quality import Rejected
-from .quality_messages import replaced_words
-from .record_messages import gravity_lines, precision_line
+from .record_messages import precision_line
+from .run_messages import run_lines
+from .run_notes import AgainstGravity, LowerCurrentLimits, RunNote
 from .state import CampaignState
 from .warm_up_stage import WarmUpStage
 
@@ -47,7 +49,7 @@ class RunResult:
         repetitions, validations: how many are complete now, and how many there are to be.
         complete: whether no motion is missing.
         cycles: archived by this run.
-        precision: what the repetitions reached of a required precision; "" if none was required.
+        precision: what the repetitions reached of a required one; None if none was required.
         notes: what a reader must know.
     """
 
@@ -65,13 +67,19 @@ class RunResult:
     validations: tuple[int, int]
     complete: bool
     cycles: int
-    precision: str
-    notes: tuple[str, ...]
+    precision: PrecisionRecord | None
+    notes: tuple[RunNote, ...]
 
     def to_dict(self) -> dict[str, Any]:
         """Return the result for JSON."""
-        rejected = [{"archive": each.archive, "reason": each.reason} for each in self.rejected]
-        return {**asdict(self), "rejected": rejected}
+        return {
+            **{field.name: getattr(self, field.name) for field in fields(self)},
+            "rejected": [
+                {"archive": each.archive, "reason": each.reason} for each in self.rejected
+            ],
+            "precision": "" if self.precision is None else precision_line(self.precision),
+            "notes": run_lines(self.notes),
+        }
 
 
 def run_motions(
@@ -186,10 +194,8 @@ class _CampaignRun:
             narrowed = active_checks(cell, link.connection, checks)
             if narrowed is not checks:  # the controller's own limits are known only now
                 require_allowed(sent, narrowed)
-            if below := narrower_limits(cell, link.connection, "current_limit"):
-                self._archives.notes.append(
-                    f"the controller's own, lower current limits were used ({'; '.join(below)})"
-                )
+            if below := lower_limits(cell, link.connection, "current_limit"):
+                self._archives.notes.append(LowerCurrentLimits(below))
             # Dry run and warm-up use the moves of the motions that they are made of.
             straight = CheckedMoves(cell, narrowed)
             joined = straight.with_moves([*slow, *full], start)
@@ -243,7 +249,6 @@ class _CampaignRun:
         campaign = self._campaign
         archives = self._archives
         dry_run = self._dry_run.record()
-        precision = campaign.precision
         replaced = archives.review.replaced
         return RunResult(
             campaign=str(campaign.folder.root),
@@ -260,15 +265,12 @@ class _CampaignRun:
             validations=campaign.progress("validation"),
             complete=not campaign.missing(),
             cycles=archives.cycles,
-            precision="" if precision is None else precision_line(precision),
+            precision=campaign.precision,
             notes=(
                 *archives.notes,
-                *(
-                    f"dry run: {text}"
-                    for text in (() if dry_run is None else gravity_lines(dry_run))
-                ),
+                *((AgainstGravity(dry_run),) if dry_run and dry_run.against_gravity else ()),
                 *self._warm_up.notes,
-                *(() if replaced is None else (replaced_words(replaced),)),
-                *self._watch.problems,
+                *(() if replaced is None else (replaced,)),
+                *self._watch.faults,
             ),
         )

@@ -9,8 +9,9 @@ from hil.archive import open_archive
 from hil.base.errors import ArchiveError, CampaignFolderError
 from hil.base.terminal_text import typed
 from hil.cell import Cell
-from hil.control.connection import Connection, narrower_limits
+from hil.control.connection import Connection, lower_limits
 from hil.control.link import MotionLink
+from hil.control.messages import lower_limit_words
 
 from .dry_run_record import DryRunRecord, yes_or_no
 from .errors import DryRunError, NotRehearsedError
@@ -174,13 +175,13 @@ def require_as_rehearsed(campaign: CampaignState, connection: Connection) -> Non
         NotRehearsedError: names joints with a narrower following-error threshold in the
             controller, and both thresholds.
     """
-    below = narrower_limits(campaign.cell, connection, "following_error")
+    below = lower_limits(campaign.cell, connection, "following_error")
     if not below:
         return
     raise NotRehearsedError(
         campaign.folder.root,
         "was planned and rehearsed with wider following-error thresholds than the "
-        f"controller announces ({'; '.join(below)})",
+        f"controller announces ({'; '.join(map(lower_limit_words, below))})",
         "write the controller's into [drive_train] following_error of the cell file and rehearse, "
         "or widen them in the controller",
     )

@@ -36,6 +36,7 @@ from .operator import ExpectedMotion, RunWatch
 from .quality import ArchiveReview
 from .quality_messages import problem_words
 from .quality_problems import QualityProblem
+from .run_notes import RunNote
 from .state import CampaignState
 
 
@@ -83,7 +84,7 @@ class RunArchives:
         self.plan_hash = plan_hash
         self.simulated = (campaign.cell if link is None else link).only_simulated
         self.names = list[str]()
-        self.notes = list[str]()
+        self.notes = list[RunNote]()
         self.cycles = 0
         in_file = link is None and campaign.cell.controller.transport == "simulated"
         virtual = in_file or (link is not None and link.is_virtual)

@@ -77,6 +77,24 @@ class Operator(Protocol):
         ...
 
 
+@dataclass(frozen=True)
+class ScreenFailed:
+    """An operator's screen that failed, and showed nothing from then on."""
+
+    error: str  #: type and message
+
+
+@dataclass(frozen=True)
+class RequestUnread:
+    """A request of the operator that could not be read."""
+
+    error: str  #: type and message
+    ended_hold: bool  #: whether a hold could not be released, so that the run was stopped
+
+
+OperatorFault = ScreenFailed | RequestUnread
+
+
 SECONDS_BETWEEN_MOTIONS: Final = 0.6  # s between two motions, to open and close the axes
 _MIN_OVERRIDE: Final = 0.01  # override at which the time left is computed, at least
 
@@ -102,7 +120,7 @@ class RunWatch:
     _in_dry_run: bool = False
     _override_after: float = 1.0
     _request: OperatorRequest = OperatorRequest()
-    _problems: dict[str, str] = field(default_factory=dict)
+    _faults: dict[str, OperatorFault] = field(default_factory=dict)
 
     def expect(self, motions: Sequence[ExpectedMotion]) -> None:
         """Add motions that are to be run."""
@@ -157,22 +175,17 @@ class RunWatch:
                 raise TypeError(f"{request!r} is no OperatorRequest")
             self._request = request
         except Exception as error:  # the arm moves: a screen must not decide how it ends
-            became = "the last request remained active"
-            if self._request.held and not self.stop.requested:
+            ends_hold = self._request.held and not self.stop.requested
+            if ends_hold:
                 self.stop.requested = True
-                became = "the arm was held and could not be released: the run was stopped"
-                self._problems.pop("request", None)
-            self._problems.setdefault(
-                "request",
-                f"the operator's request could not be read ({type(error).__name__}: {error}); "
-                f"{became}",
-            )
+                self._faults.pop("request", None)
+            self._faults.setdefault("request", RequestUnread(_described(error), ends_hold))
         return self._request
 
     @property
-    def problems(self) -> tuple[str, ...]:
-        """Errors of the operator's screen, in sentences."""
-        return tuple(self._problems.values())
+    def faults(self) -> tuple[OperatorFault, ...]:
+        """Errors of the operator's screen."""
+        return tuple(self._faults.values())
 
     def _show(self, progress: MotionProgress | None, **changes: Any) -> None:
         done = 0.0 if progress is None or progress.motion_time is None else progress.motion_time
@@ -182,10 +195,13 @@ class RunWatch:
         remaining = max(remaining, 0.0) + SECONDS_BETWEEN_MOTIONS * len(self._expected)
         remaining += sum(one.time(override if one.dry_run else after) for one in self._expected)
         self.status = replace(self.status, motion=progress, time_left=remaining, **changes)
-        if "show" in self._problems:
+        if "show" in self._faults:
             return
         try:
             self.operator.show(self.status)
         except Exception as error:  # nor what is shown
-            text = f"{type(error).__name__}: {error}"
-            self._problems["show"] = f"the operator's screen failed ({text}); nothing was shown"
+            self._faults["show"] = ScreenFailed(_described(error))
+
+
+def _described(error: Exception) -> str:
+    return f"{type(error).__name__}: {error}"

@@ -14,6 +14,7 @@ from .operator import ExpectedMotion, RunWatch
 from .quality_messages import rest_words
 from .quality_problems import ColdStart
 from .record_messages import warm_up_line
+from .run_notes import NotWarm, RunNote, WarmedUpAgain
 from .state import CampaignState
 
 
@@ -33,7 +34,7 @@ class WarmUpStage:
         self._archives = archives
         self._watch = watch
         self._reporter = reporter
-        self._pauses: list[str] = []
+        self._pauses: list[WarmedUpAgain] = []
         self._threshold = drift_wanted(campaign.cell, only_simulated=archives.simulated)
 
     @property
@@ -43,13 +44,12 @@ class WarmUpStage:
         return "none" if record is None else record.outcome
 
     @property
-    def notes(self) -> list[str]:
+    def notes(self) -> list[RunNote]:
         """What a reader of the results must know."""
         record = self._stored()
         if record is None or record.outcome != "not warm":
-            return self._pauses
-        cold = f"the arm was not warm when the repetitions began ({warm_up_line(record)})"
-        return [cold, *self._pauses]
+            return [*self._pauses]
+        return [NotWarm(record), *self._pauses]
 
     def next_motion(self) -> list[CampaignMotion]:
         """Return the next motion of a warm-up; none where no warm-up is wanted."""
@@ -123,8 +123,8 @@ class WarmUpStage:
         """Return the warm-up to continue; a new one if the joints have cooled down."""
         state = self._state()
         if state.motions and state.cold(time.time()):
-            rested = rest_words(state.rest_before(time.time()))
-            self._reporter.say(f"{rested} and is assumed to be cold: warming up again")
-            self._pauses.append(f"{rested} during the campaign, and was warmed up again")
+            rest = state.rest_before(time.time())
+            self._reporter.say(f"{rest_words(rest)} and is assumed to be cold: warming up again")
+            self._pauses.append(WarmedUpAgain(rest))
             return state.cooled()
         return state

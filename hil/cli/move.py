@@ -29,8 +29,9 @@ from hil.campaign import Campaign, MotionLink, stop_on_interrupt
 from hil.cell import AngleFrame, Cell
 from hil.cli.arguments import JsonOption
 from hil.control.cell_link import cell_link
-from hil.control.connection import active_checks, narrower_limits
+from hil.control.connection import active_checks, lower_limits
 from hil.control.errors import SlippedError
+from hil.control.messages import lower_limit_words
 from hil.control.motion_watch import MotionProgress, OperatorRequest
 from hil.control.move import (
     POSTURE_TOLERANCE,
@@ -242,8 +243,11 @@ def _described(move: CheckedMove, cell: Cell, link: MotionLink) -> str:
         f"{move.duration:.2f} s at {100.0 * move.speed:.3g} % of the joints' speeds, {frame.whose};"
         f" checked against limits, motor currents, floor, walls and self-collision; to {who}"
     )
-    below = narrower_limits(cell, link.connection, "following_error")
-    lines += [f"the smaller following-error threshold applies, {note}" for note in below]
+    below = lower_limits(cell, link.connection, "following_error")
+    lines += [
+        f"the smaller following-error threshold applies, {lower_limit_words(each)}"
+        for each in below
+    ]
     unchecked = unchecked_text(move.checks.checker.exceptions)
     return wrapped("\n".join(filter(None, [*lines, unchecked])))
 

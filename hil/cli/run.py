@@ -21,6 +21,8 @@ from hil.campaign import Campaign, MotionFailedError, stop_on_interrupt
 from hil.campaign.campaign_run import RunResult
 from hil.campaign.folder import CampaignFolder
 from hil.campaign.reached_precision import requirements_of
+from hil.campaign.record_messages import precision_line
+from hil.campaign.run_messages import run_lines
 from hil.campaign.screen import Screen
 from hil.cli.arguments import (
     CampaignArgument,
@@ -200,8 +202,8 @@ def _print(result: RunResult, *, verbose: bool, json: bool) -> None:
         f"{result.campaign}: dry run {result.dry_run}, repetitions {done} of {requested}, "
         f"validation {tested} of {tests}, {len(result.rejected)} rejected"
     ]
-    lines += [result.precision] if result.precision else []
-    lines += result.notes
+    lines += [] if result.precision is None else [precision_line(result.precision)]
+    lines += run_lines(result.notes)
     for rejection in result.rejected:
         name = ArchiveName.parse(rejection.archive)
         what = rejection.archive if name is None else f"{name.motion} ({rejection.archive})"

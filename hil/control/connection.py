@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from typing import Final, Literal
+from typing import Final
 
 import numpy as np
 
@@ -20,7 +20,7 @@ from drivers.events import (
 )
 from drivers.exchange.event_log import EventsLost, ExchangeEvent
 from drivers.guard import Guard
-from drivers.init_check import float32_text, is_narrower
+from drivers.init_check import is_narrower
 from drivers.states import State
 from hil.archive import ArchiveSpec
 from hil.base.arrays import Array
@@ -29,6 +29,7 @@ from hil.base.terminal_text import plural
 from hil.cell import Cell
 from hil.control.errors import refusal_text
 from hil.control.motion_checks import MotionChecks
+from hil.control.motion_refusals import Limit, LowerLimit
 from hil.control.motion_watch import REFUSED
 
 START_TIMEOUT: Final = 60.0  # s within which an accepted motion must have started
@@ -262,11 +263,8 @@ def active_checks(
     return checks.within(_stated(cell, connection.init, "current_limit"))
 
 
-Limit = Literal["current_limit", "following_error"]
-
-
-def narrower_limits(cell: Cell, connection: Connection, limit: Limit) -> tuple[str, ...]:
-    """Return a sentence for each limit of the controller that is below the cell's.
+def lower_limits(cell: Cell, connection: Connection, limit: Limit) -> tuple[LowerLimit, ...]:
+    """Return the limits of the controller that are below the cell's.
 
     No model predicts the following error of a servo: motions cannot be checked against it.
     """
@@ -274,10 +272,8 @@ def narrower_limits(cell: Cell, connection: Connection, limit: Limit) -> tuple[s
         return ()
     stated = _stated(cell, connection.init, limit)
     cell_limit = getattr(cell.drive_table, limit)
-    unit = "A" if limit == "current_limit" else "motor revolutions"
     return tuple(
-        f"{cell.joint_names[joint]}: {float32_text(stated[joint])} {unit} in the controller, "
-        f"{cell_limit[joint]:.9g} in the cell file"
+        LowerLimit(cell.joint_names[joint], limit, float(stated[joint]), float(cell_limit[joint]))
         for joint in np.flatnonzero(is_narrower(stated, np.array(cell_limit)))
     )
 

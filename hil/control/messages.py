@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from dataclasses import replace
 from typing import Final, assert_never
 
@@ -18,6 +19,8 @@ from .motion_refusals import (
     MAX_SINES,
     BrokenConstraint,
     FixedDistance,
+    Limit,
+    LowerLimit,
     MotionRefusal,
     NarrowerLimit,
     NoRamp,
@@ -27,6 +30,10 @@ from .motion_refusals import (
     TooManySines,
 )
 
+_LIMIT_UNITS: Final[Mapping[Limit, str]] = {
+    "current_limit": "A",
+    "following_error": "motor revolutions",
+}
 _UNITS: Final = {
     "position": " deg",
     "velocity": " deg/s",
@@ -95,6 +102,15 @@ def slip_words(jump: PositionJump) -> str:
     return (
         f"the measured position of {jump.joint} slipped by {math.degrees(abs(jump.size)):.2g}°"
         f" {jump.time:.2f} s after the archive begins, which no motion of the arm explains"
+    )
+
+
+def lower_limit_words(lower: LowerLimit) -> str:
+    """Return a limit of the controller that is below the cell's, with both."""
+    unit = _LIMIT_UNITS[lower.limit]
+    return (
+        f"{lower.joint}: {float32_text(lower.controller)} {unit} in the controller,"
+        f" {lower.cell:.9g} in the cell file"
     )
 
 

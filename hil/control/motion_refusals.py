@@ -9,6 +9,7 @@ from identification.excitation import Violation
 from planner import NotSmooth
 
 Rate = Literal["velocity", "acceleration", "jerk"]
+Limit = Literal["current_limit", "following_error"]
 MAX_MOTION_SECONDS: Final = 600.0
 """Longest motion, s: checks take time and memory in proportion, and a failed motion is repeated."""
 MAX_SINES: Final = 20
@@ -66,6 +67,16 @@ class NarrowerLimit:
     """A motor whose current limit in the controller is not that of the cell file [A]."""
 
     controller: float
+    cell: float
+
+
+@dataclass(frozen=True)
+class LowerLimit:
+    """A limit of the controller that is below the one of the cell file."""
+
+    joint: str
+    limit: Limit
+    controller: float  #: [A], or motor revolutions of the following error
     cell: float
 
 

@@ -30,7 +30,14 @@ from drivers.states import State
 from hil.archive import Archive, ArchiveSpec, ArchiveWriter, open_archive
 from hil.base.errors import ControllerError
 from hil.campaign import Stop
-from hil.campaign.operator import SECONDS_BETWEEN_MOTIONS, ExpectedMotion, RunStatus, RunWatch
+from hil.campaign.operator import (
+    SECONDS_BETWEEN_MOTIONS,
+    ExpectedMotion,
+    RequestUnread,
+    RunStatus,
+    RunWatch,
+    ScreenFailed,
+)
 from hil.cell import Cell
 from hil.control.connection import StartTimeout
 from hil.control.link import Standstill
@@ -408,12 +415,14 @@ def test_a_screen_that_fails_is_asked_all_the_same() -> None:
     assert operator.shown == 1
     operator.answer = OperatorRequest(0.4, held=True)
     assert watch.request() == operator.answer
-    (problem,) = watch.problems
-    assert "no picture" in problem
+    (fault,) = watch.faults
+    assert isinstance(fault, ScreenFailed)
+    assert "no picture" in fault.error
     for answer, expected in ((0.4, 0.4), (None, 0.4), (0.3, 0.3)):
         operator.answer = None if answer is None else OperatorRequest(answer)
         assert watch.request() == OperatorRequest(expected)
-    assert "None is no OperatorRequest" in watch.problems[-1]
+    error = "TypeError: None is no OperatorRequest"
+    assert watch.faults[-1] == RequestUnread(error, ended_hold=False)
     assert not watch.stop.requested
     # A hold that cannot be released any more becomes a stop.
     operator.answer = OperatorRequest(held=True)
@@ -422,7 +431,7 @@ def test_a_screen_that_fails_is_asked_all_the_same() -> None:
     operator.answer = None
     assert watch.request().held
     assert watch.stop.requested
-    assert "the run was stopped" in watch.problems[-1]
+    assert watch.faults[-1] == RequestUnread(error, ended_hold=True)
 
 
 def test_an_override_is_counted_once_in_the_time_left() -> None:

@@ -21,11 +21,13 @@ from hil.campaign import (
     VirtualLink,
 )
 from hil.campaign.dry_run_record import DryRunRecord
+from hil.campaign.run_notes import LowerCurrentLimits
 from hil.campaign.folder import CampaignFolder
 from hil.campaign.gates import require_rehearsed
 from hil.campaign.rehearsal_record import Rehearsal
 from hil.control.connection import active_checks
 from hil.control.motion_checks import MotionChecks
+from hil.control.motion_refusals import LowerLimit
 from hil.control.motion_watch import Stop
 from hil.control.move import plan_move, send
 from hil.control.simulated_cell import simulated_controller, simulated_link
@@ -166,8 +168,8 @@ def test_wider_limits_change_nothing_and_narrower_ones_are_noted(copied: Campaig
     checks = MotionChecks.of(copied.cell)
     assert active_checks(copied.cell, wider.connection, checks) is checks
     narrower = link_to_controller_with(copied, drive_train__current_limit=[19.5, 12.0])
-    (note,) = [run_note for run_note in copied.run(narrower).notes if "limits" in run_note]
-    assert "were used (shoulder: 19.5 A in the controller, 20 in the cell file)" in note
+    lower = LowerLimit("shoulder", "current_limit", 19.5, 20.0)
+    assert LowerCurrentLimits((lower,)) in copied.run(narrower).notes
 
 
 def test_a_single_move_respects_the_controllers_current_limit(

@@ -23,6 +23,7 @@ from hil.campaign.errors import (
 )
 from hil.campaign.quality import FIELDS, Executed, RepetitionCheck
 from hil.campaign.quality_problems import (
+    ReplacedRepetitions,
     IncompleteArchive,
     MissedPackets,
     OtherRepetition,
@@ -47,7 +48,7 @@ from tests.hil.campaign.runs.rig import (
     slowing,
 )
 from tests.hil.fast_cell import fast_cell, set_points
-from tests.messages import DISTURBED_ALIKE, OTHERS_AGREE
+from tests.messages import OTHERS_AGREE
 
 pytestmark = pytest.mark.safety
 
@@ -110,7 +111,9 @@ def test_a_disturbed_first_repetition_rejects_no_others(make: Make, undisturbed:
         "000_a1",
     ]
     assert OTHERS_AGREE in result.rejected[2].reason
-    assert any("excitation_000_a1.mcap was the only accepted repetition" in note for note in result.notes)
+    (replaced,) = result.notes
+    assert isinstance(replaced, ReplacedRepetitions)
+    assert replaced.archives == ("excitation_000_a1.mcap",)
     good = [path.name[11:-5] for path in campaign.folder.completed("excitation")]
     assert good == ["000_a2", "001_a3", "002_a1"]
     touched = open_archive(campaign.folder.archives / "excitation_000_a1.mcap")
@@ -240,7 +243,9 @@ class TestMissedPackets:
             *("002_a1", "002_a2", "000_a1", "001_a1"),
         ]
         assert messages.MISSED_IN_IT_ONLY in result.rejected[-1].reason
-        assert any(DISTURBED_ALIKE in note for note in result.notes)
+        (replaced,) = result.notes
+        assert isinstance(replaced, ReplacedRepetitions)
+        assert replaced.archives == ("excitation_000_a1.mcap", "excitation_001_a1.mcap")
         good = [path.name[11:-5] for path in campaign.folder.completed("excitation")]
         assert good == ["000_a2", "001_a2", "002_a3"]
 

@@ -21,6 +21,7 @@ from hil.campaign.joint_warm_up import (
     change_per_motion,
 )
 from hil.campaign.operator import RunStatus
+from hil.campaign.run_notes import NotWarm, WarmedUpAgain
 from hil.campaign.warm_up_stage import WarmUpStage
 from hil.control.motion_checks import MotionChecks
 from hil.control.planted_arm import planted_truth
@@ -132,7 +133,8 @@ def test_an_arm_that_rests_for_hours_is_warmed_up_again(
     cold = ["excitation"] if when == "held" else []
     assert made == [*["warmup"] * 4, "excitation", *cold, *["warmup"] * 4, "excitation"]
     assert len(result.rejected) == len(cold)
-    assert any("rested for 120 min during the campaign" in note for note in result.notes)
+    rests = [note.rest for note in result.notes if isinstance(note, WarmedUpAgain)]
+    assert rests == [pytest.approx(7200.0, abs=30.0)]
 
 
 def test_a_slowed_warm_up_motion_gives_no_friction(make: Make) -> None:
@@ -143,7 +145,7 @@ def test_a_slowed_warm_up_motion_gives_no_friction(make: Make) -> None:
     assert [motion.archive for motion in warm_up_of(campaign).motions] == [
         "warmup_000_a2.mcap", "warmup_001_a1.mcap", "warmup_002_a1.mcap"
     ]  # fmt: skip
-    assert any("not warm" in note for note in result.notes)
+    assert [type(note) for note in result.notes] == [NotWarm]
     assert result.warm_up == "not warm" and result.complete
 
 
