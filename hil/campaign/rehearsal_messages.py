@@ -34,7 +34,7 @@ from .twin import (
     NoLostPackets,
     ZeroNominal,
 )
-from .undetected import CopiedDrives, CopiedScales, CopiedShapes, UncheckedPairs, Undetected
+from .undetected import CopiedDrives, CopiedFigures, UncheckedPairs, Undetected
 
 _CORRECT: Final = (
     "correct the cause, by [limits] or [drive_train] of the cell file, or the tables of the "
@@ -89,12 +89,12 @@ def assumption_words(assumption: Assumption) -> str:
 def undetected_words(undetected: Undetected) -> str:
     """Return what a rehearsal cannot detect, and why."""
     match undetected:
-        case CopiedScales():
+        case CopiedFigures.SCALES:
             return (
                 "torque constants and current limits: the simulated motors take them from the cell"
                 " file"
             )
-        case CopiedShapes():
+        case CopiedFigures.SHAPES:
             return (
                 "floor, walls and shapes: they are checked, but as the cell file and the URDF have"
                 " them"

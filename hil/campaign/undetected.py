@@ -3,20 +3,18 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from enum import Enum, auto
 
 from hil.cell import Cell
 from hil.control.motion_checks import collision_checker
 from identification.excitation.collision import PairExceptions
 
 
-@dataclass(frozen=True)
-class CopiedScales:
-    """Errors of torque constants and current limits: the simulated motors have them."""
+class CopiedFigures(Enum):
+    """Errors of figures that the simulated arm has as well, whatever the cell file states."""
 
-
-@dataclass(frozen=True)
-class CopiedShapes:
-    """Errors of floor, walls and shapes."""
+    SCALES = auto()  #: torque constants and current limits
+    SHAPES = auto()  #: floor, walls and shapes
 
 
 @dataclass(frozen=True)
@@ -33,12 +31,12 @@ class CopiedDrives:
     fields: tuple[str, ...]
 
 
-Undetected = CopiedScales | CopiedShapes | UncheckedPairs | CopiedDrives
+Undetected = CopiedFigures | UncheckedPairs | CopiedDrives
 
 
 def undetected_of(cell: Cell) -> list[Undetected]:
     """Return what no simulation of this cell file can detect."""
-    found: list[Undetected] = [CopiedScales(), CopiedShapes()]
+    found: list[Undetected] = [*CopiedFigures]
     exceptions = collision_checker(cell).exceptions
     if any(exceptions):
         found.append(UncheckedPairs(exceptions))

@@ -46,11 +46,9 @@ from .notes import (
     FixedMimic,
     FixedOutside,
     FixedPrismatic,
-    GeometryOfArm,
-    GeometryOfTable,
     GripperJoints,
     LiftingJoints,
-    NoCollisionShapes,
+    PlainNote,
     SeveralBranches,
 )
 
@@ -326,7 +324,7 @@ def cell_of_dh(path: Path, convention: Convention, fixed: Mapping[str, float]) -
     """Return the cell of a table of DH parameters, with a URDF to write, or raise InputError."""
     text = urdf_of_dh(path, convention)
     made = _cell_of(path, text, fixed, moved=True)
-    values = CellValues(notes=(GeometryOfTable(),)) | made.values
+    values = CellValues(notes=(PlainNote.GEOMETRY_OF_TABLE,)) | made.values
     return replace(made, urdf=made.urdf or text, values=values)
 
 
@@ -336,7 +334,9 @@ def cell_of_parameters(
     """Return the cell of DH parameters by name (`urdf_of_parameters`), with a URDF to write."""
     text = urdf_of_parameters(name, joints, parameters)
     made = _cell_of(Path(name), text, {}, moved=True)
-    return replace(made, urdf=text, values=CellValues(notes=(GeometryOfArm(),)) | made.values)
+    return replace(
+        made, urdf=text, values=CellValues(notes=(PlainNote.GEOMETRY_OF_ARM,)) | made.values
+    )
 
 
 def cell_of_urdf(
@@ -458,7 +458,7 @@ def _cell_of(path: Path, text: str, fixed: Mapping[str, float], *, moved: bool) 
     notes += _branches(used, moving_chain)
     shapes = _COLLISION.findall(text)
     if not shapes:
-        notes.append(NoCollisionShapes())
+        notes.append(PlainNote.NO_COLLISION_SHAPES)
     name = re.search(r"<robot\b[^>]*\bname\s*=\s*[\"']([^\"']*)[\"']", used)
     return NewCell(
         name=(name[1].strip()[:80] if name else "") or path.stem,

@@ -37,10 +37,9 @@ from .notes import (
     CellNote,
     ClosedAxes,
     CollisionExceptions,
-    EveryPostureInContact,
     FromSimulation,
     HomeNotChecked,
-    NoFloor,
+    PlainNote,
     ShapesNotFound,
     UnsupportedCycle,
 )
@@ -174,9 +173,9 @@ def clear_home(urdf: str, cell_values: CellValues, mesh_folders: Sequence[str]) 
                 notes.append(ShapesNotFound(tuple(check.links)))
             if floor is None:
                 values["workspace.floor"] = "none"
-                notes.append(NoFloor())
+                notes.append(PlainNote.NO_FLOOR)
             return CellValues.of_origin(ASSUMED, values, notes)
-    return CellValues(notes=(EveryPostureInContact(),))
+    return CellValues(notes=(PlainNote.EVERY_POSTURE_IN_CONTACT,))
 
 
 def _turned(home: Array, limits: JointLimits) -> Iterator[Array]:

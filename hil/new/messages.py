@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
-from typing import assert_never
+from collections.abc import Iterable, Mapping
+from typing import Final, assert_never
 
 from drivers.ur.torque_constants import RELATIVE_UNCERTAINTY
 from hil.cell.arms import MAX_NAMES
@@ -13,7 +13,35 @@ from identification.text import percentage
 
 from . import notes
 from .found_shapes import MIN_FRAME_HEIGHT
-from .notes import CellNote
+from .notes import CellNote, PlainNote
+
+_PLAIN: Final[Mapping[PlainNote, str]] = {
+    PlainNote.GEOMETRY_OF_TABLE: (
+        "the URDF contains the geometry of the DH parameters only: no masses, no limits"
+    ),
+    PlainNote.GEOMETRY_OF_ARM: (
+        "the URDF contains the calibrated geometry that the arm states: no masses; one with masses"
+        " (--urdf) gives the estimate a prior"
+    ),
+    PlainNote.NO_COLLISION_SHAPES: (
+        "the URDF has no <collision> shapes: add some (boxes, cylinders or spheres). Without them"
+        " only a design works, with collision = false in the settings that `hil design"
+        " --show-settings gradient` prints"
+    ),
+    PlainNote.NO_FLOOR: "no posture tried is clear of a floor at 0 m: no floor is assumed",
+    PlainNote.EVERY_POSTURE_IN_CONTACT: (
+        "every posture tried is in contact: correct campaign.home_deg"
+    ),
+    PlainNote.UNKNOWN_TORQUE_CONSTANTS: (
+        "the torque constants of some joints are unknown: hold the arm still in a posture in which"
+        " gravity loads every joint but the first, and run this command again"
+    ),
+    PlainNote.TORQUE_CONSTANTS_OF_ARM: (
+        "the torque constants come from the arm's own model, uncertain by"
+        f" {percentage(RELATIVE_UNCERTAINTY)}: weigh a known payload (`hil torque-constants`), then"
+        " correct torque_uncertainty"
+    ),
+}
 
 
 def note_lines(of_cell: Iterable[CellNote]) -> list[str]:
@@ -23,43 +51,20 @@ def note_lines(of_cell: Iterable[CellNote]) -> list[str]:
 
 def _note_words(note: CellNote) -> str:
     match note:
-        case notes.GeometryOfTable() | notes.GeometryOfArm():
-            return _geometry_words(note)
+        case PlainNote():
+            return _PLAIN[note]
         case notes.FixedOutside() | notes.FixedPrismatic() | notes.FixedMimic():
             return _fixed_words(note)
         case notes.LiftingJoints() | notes.GripperJoints() | notes.SeveralBranches():
             return _joints_words(note)
-        case (
-            notes.NoCollisionShapes()
-            | notes.HomeNotChecked()
-            | notes.CollisionExceptions()
-            | notes.ShapesNotFound()
-            | notes.NoFloor()
-            | notes.EveryPostureInContact()
-        ):
+        case notes.HomeNotChecked() | notes.CollisionExceptions() | notes.ShapesNotFound():
             return _collision_words(note)
         case notes.UnsupportedCycle() | notes.ClosedAxes() | notes.FromSimulation():
             return _controller_words(note)
-        case (
-            notes.NotAsked()
-            | notes.UnknownTorqueConstants()
-            | notes.TorqueConstantsOfArm()
-            | notes.PayloadWithoutFrame()
-        ):
+        case notes.NotAsked() | notes.PayloadWithoutFrame():
             return _arm_words(note)
         case never:
             assert_never(never)
-
-
-def _geometry_words(note: notes.GeometryOfTable | notes.GeometryOfArm) -> str:
-    match note:
-        case notes.GeometryOfTable():
-            return "the URDF contains the geometry of the DH parameters only: no masses, no limits"
-        case notes.GeometryOfArm():
-            return (
-                "the URDF contains the calibrated geometry that the arm states: no masses; one"
-                " with masses (--urdf) gives the estimate a prior"
-            )
 
 
 def _fixed_words(note: notes.FixedOutside | notes.FixedPrismatic | notes.FixedMimic) -> str:
@@ -107,20 +112,9 @@ def _joints_words(note: notes.LiftingJoints | notes.GripperJoints | notes.Severa
 
 
 def _collision_words(
-    note: notes.NoCollisionShapes
-    | notes.HomeNotChecked
-    | notes.CollisionExceptions
-    | notes.ShapesNotFound
-    | notes.NoFloor
-    | notes.EveryPostureInContact,
+    note: notes.HomeNotChecked | notes.CollisionExceptions | notes.ShapesNotFound,
 ) -> str:
     match note:
-        case notes.NoCollisionShapes():
-            return (
-                "the URDF has no <collision> shapes: add some (boxes, cylinders or spheres)."
-                " Without them only a design works, with collision = false in the settings that"
-                " `hil design --show-settings gradient` prints"
-            )
         case notes.HomeNotChecked(problem):
             return f"campaign.home_deg was not checked for collisions: {problem}"
         case notes.CollisionExceptions(exceptions):
@@ -131,10 +125,6 @@ def _collision_words(
                 f" their frames are {MIN_FRAME_HEIGHT * 100:g} cm off the floor, and nothing else"
                 " about them was checked"
             )
-        case notes.NoFloor():
-            return "no posture tried is clear of a floor at 0 m: no floor is assumed"
-        case notes.EveryPostureInContact():
-            return "every posture tried is in contact: correct campaign.home_deg"
 
 
 def _controller_words(
@@ -152,26 +142,10 @@ def _controller_words(
             return f"{archive} was recorded from a simulated controller"
 
 
-def _arm_words(
-    note: notes.NotAsked
-    | notes.UnknownTorqueConstants
-    | notes.TorqueConstantsOfArm
-    | notes.PayloadWithoutFrame,
-) -> str:
+def _arm_words(note: notes.NotAsked | notes.PayloadWithoutFrame) -> str:
     match note:
         case notes.NotAsked(problem):
             return f"not asked: {problem}"
-        case notes.UnknownTorqueConstants():
-            return (
-                "the torque constants of some joints are unknown: hold the arm still in a posture"
-                " in which gravity loads every joint but the first, and run this command again"
-            )
-        case notes.TorqueConstantsOfArm():
-            return (
-                "the torque constants come from the arm's own model, uncertain by"
-                f" {percentage(RELATIVE_UNCERTAINTY)}: weigh a known payload (`hil"
-                " torque-constants`), then correct torque_uncertainty"
-            )
         case notes.PayloadWithoutFrame(mass):
             return (
                 f"the controller is set to a payload of {mass:g} kg, and the URDF has no link "

@@ -3,19 +3,22 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from enum import Enum, auto
 
 from hil.cell.arms import Links
 from identification.excitation.collision import PairExceptions
 
 
-@dataclass(frozen=True)
-class GeometryOfTable:
-    """A URDF with the geometry of a table of DH parameters, and nothing else."""
+class PlainNote(Enum):
+    """Notes without figures."""
 
-
-@dataclass(frozen=True)
-class GeometryOfArm:
-    """A URDF with the calibrated geometry that an arm states, and nothing else."""
+    GEOMETRY_OF_TABLE = auto()  #: a URDF with the geometry of a table of DH parameters alone
+    GEOMETRY_OF_ARM = auto()  #: a URDF with the calibrated geometry that an arm states alone
+    NO_COLLISION_SHAPES = auto()  #: in the URDF
+    NO_FLOOR = auto()  #: none is assumed, as no posture that was tried is clear of it
+    EVERY_POSTURE_IN_CONTACT = auto()  #: no posture that was tried is clear
+    UNKNOWN_TORQUE_CONSTANTS = auto()  #: the arm at rest does not show them
+    TORQUE_CONSTANTS_OF_ARM = auto()  #: by the arm's own model
 
 
 @dataclass(frozen=True)
@@ -66,11 +69,6 @@ class SeveralBranches:
 
 
 @dataclass(frozen=True)
-class NoCollisionShapes:
-    """A URDF without collision shapes."""
-
-
-@dataclass(frozen=True)
 class HomeNotChecked:
     """A home posture that could not be checked for collisions."""
 
@@ -89,16 +87,6 @@ class ShapesNotFound:
     """Links whose collision shapes were not found, so that only their height was checked."""
 
     links: tuple[str, ...]
-
-
-@dataclass(frozen=True)
-class NoFloor:
-    """No floor is assumed, as no posture that was tried is clear of it."""
-
-
-@dataclass(frozen=True)
-class EveryPostureInContact:
-    """No posture that was tried is clear."""
 
 
 @dataclass(frozen=True)
@@ -131,16 +119,6 @@ class NotAsked:
 
 
 @dataclass(frozen=True)
-class UnknownTorqueConstants:
-    """Torque constants that the arm at rest does not show."""
-
-
-@dataclass(frozen=True)
-class TorqueConstantsOfArm:
-    """Torque constants by the arm's own model."""
-
-
-@dataclass(frozen=True)
 class PayloadWithoutFrame:
     """A payload of the controller whose frame is not in the URDF."""
 
@@ -148,25 +126,19 @@ class PayloadWithoutFrame:
 
 
 CellNote = (
-    GeometryOfTable
-    | GeometryOfArm
+    PlainNote
     | FixedOutside
     | FixedPrismatic
     | FixedMimic
     | LiftingJoints
     | GripperJoints
     | SeveralBranches
-    | NoCollisionShapes
     | HomeNotChecked
     | CollisionExceptions
     | ShapesNotFound
-    | NoFloor
-    | EveryPostureInContact
     | UnsupportedCycle
     | ClosedAxes
     | FromSimulation
     | NotAsked
-    | UnknownTorqueConstants
-    | TorqueConstantsOfArm
     | PayloadWithoutFrame
 )

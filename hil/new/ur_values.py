@@ -29,8 +29,7 @@ from .notes import (
     CellNote,
     NotAsked,
     PayloadWithoutFrame,
-    TorqueConstantsOfArm,
-    UnknownTorqueConstants,
+    PlainNote,
 )
 
 JOINT_NAMES: Final = (
@@ -293,7 +292,7 @@ def _following_error(arm: UrArmStatements) -> list[float]:
 def _notes(arm: UrArmStatements, urdf: str) -> Iterator[CellNote]:
     yield from map(NotAsked, arm.identity.unreachable)
     is_unknown = np.isnan(constants_of(arm)).any()
-    yield UnknownTorqueConstants() if is_unknown else TorqueConstantsOfArm()
+    yield PlainNote.UNKNOWN_TORQUE_CONSTANTS if is_unknown else PlainNote.TORQUE_CONSTANTS_OF_ARM
     mass = _payload_mass(arm)
     if mass and _flange(urdf) is None:
         yield PayloadWithoutFrame(mass)

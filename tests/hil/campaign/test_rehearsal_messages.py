@@ -73,8 +73,8 @@ ASSUMED: dict[twin.Assumption, str] = {
     ),
 }
 UNDETECTED: dict[undetected.Undetected, str] = {
-    undetected.CopiedScales(): "torque constants and current limits",
-    undetected.CopiedShapes(): "floor, walls and shapes",
+    undetected.CopiedFigures.SCALES: "torque constants and current limits",
+    undetected.CopiedFigures.SHAPES: "floor, walls and shapes",
     undetected.UncheckedPairs(
         PairExceptions((ClosePair("base", "link1", 0.0, 0.001),))
     ): "base and link1 (0.000 to 0.001 m)",

@@ -9,13 +9,13 @@ import pytest
 from hil.cell.arms import Links
 from hil.new import notes
 from hil.new.messages import note_lines
-from hil.new.notes import CellNote
+from hil.new.notes import CellNote, PlainNote
 from identification.excitation.collision import ClosePair, PairExceptions
 
 PAIRS = PairExceptions((ClosePair("base", "link1", 0.0, 0.001),))
 WORDS: dict[CellNote, str] = {
-    notes.GeometryOfTable(): "the geometry of the DH parameters only: no masses, no limits",
-    notes.GeometryOfArm(): "the calibrated geometry that the arm states: no masses",
+    PlainNote.GEOMETRY_OF_TABLE: "the geometry of the DH parameters only: no masses, no limits",
+    PlainNote.GEOMETRY_OF_ARM: "the calibrated geometry that the arm states: no masses",
     notes.FixedOutside(Links(tip="left_wrist"), ("head", "right_w2")): (
         "fixed, as they do not lie between the root and left_wrist: head, right_w2"
     ),
@@ -36,18 +36,18 @@ WORDS: dict[CellNote, str] = {
     notes.SeveralBranches(("head", "left_wrist")): (
         "the joints form 2 branches, with the last moving links head, left_wrist: choose one arm"
     ),
-    notes.NoCollisionShapes(): "`hil design --show-settings gradient`",
+    PlainNote.NO_COLLISION_SHAPES: "`hil design --show-settings gradient`",
     notes.HomeNotChecked("no mesh"): "was not checked for collisions: no mesh",
     notes.CollisionExceptions(PAIRS): "base and link1 (0.000 to 0.001 m)",
     notes.ShapesNotFound(("tool",)): "the collision shapes of tool were not found",
-    notes.NoFloor(): "no posture tried is clear of a floor at 0 m",
-    notes.EveryPostureInContact(): "correct campaign.home_deg",
+    PlainNote.NO_FLOOR: "no posture tried is clear of a floor at 0 m",
+    PlainNote.EVERY_POSTURE_IN_CONTACT: "correct campaign.home_deg",
     notes.UnsupportedCycle(4): "the cycle of the controller is 4 ms; supported are 1 and 2",
     notes.ClosedAxes((2, 5), 1): "axes 2, 5 of arm 1 are not open in the controller",
     notes.FromSimulation("a.mcap"): "a.mcap was recorded from a simulated controller",
     notes.NotAsked("port 30001 is closed"): "not asked: port 30001 is closed",
-    notes.UnknownTorqueConstants(): "hold the arm still",
-    notes.TorqueConstantsOfArm(): "uncertain by 10 %: weigh a known payload",
+    PlainNote.UNKNOWN_TORQUE_CONSTANTS: "hold the arm still",
+    PlainNote.TORQUE_CONSTANTS_OF_ARM: "uncertain by 10 %: weigh a known payload",
     notes.PayloadWithoutFrame(2.5): "set to a payload of 2.5 kg, and the URDF has no link",
 }
 
@@ -60,3 +60,4 @@ def test_each_note_has_words(note: CellNote, words: str) -> None:
 
 def test_the_table_has_every_note() -> None:
     assert {type(note) for note in WORDS} == {*get_args(CellNote)}
+    assert WORDS.keys() >= {*PlainNote}
