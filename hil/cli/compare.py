@@ -16,7 +16,7 @@ from hil.batch.cluster import Cluster
 from hil.cli.arguments import JsonOption, QuietOption, VerboseOption, print_json
 from hil.compare import comparison as comparing
 from hil.compare.documents import comparison_document
-from hil.compare.messages import comparison_lines, verdict_line
+from hil.compare.messages import campaign_words, comparison_lines, verdict_line
 from identification.text import percentage, unit_text
 
 
@@ -63,7 +63,7 @@ def compare(
 def _lines(comparison: comparing.ArmComparison) -> list[str]:
     """Return the changes, the most significant first, and what limits the comparison."""
     changes = [
-        f"{change.parameter} in {change.campaign}:"
+        f"{change.parameter} in {campaign_words(change.campaign)}:"
         f" {change.after:.4g} instead of {change.before:.4g} {unit_text(change.unit)}, "
         f"change {change.change:+.3g} ± {change.half:.2g} (95 %), p {change.p_value:.1g}"
         for change in sorted(comparison.changed, key=lambda change: change.p_value)
@@ -78,7 +78,8 @@ def _scope(comparison: comparing.ArmComparison) -> list[str]:
     kinds = [change.kind for change in comparison.changes if change.campaign == others[0]]
     inertial, friction = kinds.count("inertia"), kinds.count("friction")
     lines = [
-        f"{', '.join(others)} compared with {reference}: {inertial} inertial parameters and the "
+        f"{', '.join(map(campaign_words, others))} compared with {campaign_words(reference)}:"
+        f" {inertial} inertial parameters and the "
         f"friction of {friction} joints"
     ]
     if known := comparison.known_friction:

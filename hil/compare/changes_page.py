@@ -10,7 +10,7 @@ from hil.compare.comparison import (
     MIN_REPETITIONS,
     ArmComparison,
 )
-from hil.compare.messages import comparison_lines, verdict_line
+from hil.compare.messages import campaign_words, comparison_lines, verdict_line
 from hil.report.rendering import environment, page_bytes
 
 
@@ -24,6 +24,7 @@ def comparison_page(comparison: ArmComparison) -> bytes:
     template = environment().get_template("changes.html.j2")
     text = template.render(
         found=comparison,
+        named=campaign_words,
         verdict=verdict_line(comparison.changed),
         notes=comparison_lines(comparison.warnings),
         setups=[setup_words(campaign.setup) for campaign in comparison.campaigns],

@@ -24,7 +24,6 @@ from hil.batch import graph as run
 from hil.batch.archive_discovery import ArchiveRef, Discovery, cell_in, open_ref
 from hil.batch.cluster import Cluster
 from hil.batch.estimates import BatchArm, BatchEstimate
-from hil.batch.messages import setup_words
 from hil.pipeline.notes import Note
 from hil.pipeline.options import Options
 from hil.pipeline.sources import arm_differences
@@ -33,6 +32,7 @@ from identification.distributions import student_limit, student_tail
 from identification.factor.estimate import Estimate
 
 from .notes import (
+    CampaignName,
     OfCampaign,
     OtherSetups,
     SingleRepetition,
@@ -79,7 +79,7 @@ class QuantityChange:
     axis: str  #: joint; "" if it is none of one axis
     kind: str  #: "friction" or "inertia"
     unit: str
-    campaign: str  #: name
+    campaign: CampaignName
     before: float
     before_std: float
     after: float
@@ -105,7 +105,7 @@ class ArmComparison:
     simulated: bool
     dated: bool  #: whether campaigns are in chronological order
     campaigns: tuple[BatchEstimate, ...]
-    names: tuple[str, ...]  #: of the campaigns, with their days if known
+    names: tuple[CampaignName, ...]  #: of the campaigns
     changes: tuple[QuantityChange, ...]  #: of all quantities, by campaign
     warnings: tuple[Note, ...]
 
@@ -242,7 +242,7 @@ def compare_campaigns(
         simulated=False,
         dated=all(campaign.when for campaign in campaigns),
         campaigns=tuple(campaigns),
-        names=tuple(names),
+        names=names,
         changes=changes,
         warnings=tuple(_notes(names, campaigns, repetitions)),
     )
@@ -308,24 +308,22 @@ def projected(estimate: Estimate, weights: Array) -> tuple[Array, Array]:
     return value, np.where(determined, variance, np.nan)
 
 
-def _names(campaigns: Sequence[BatchEstimate]) -> list[str]:
+def _names(campaigns: Sequence[BatchEstimate]) -> tuple[CampaignName, ...]:
     """Return names of campaigns: folder below the common one, setup if ambiguous, and day."""
     folders = [campaign.campaign for campaign in campaigns]
     shared = commonpath([Path(folder).parent for folder in folders])
-    names = []
-    for campaign in campaigns:
-        setup = (
-            f", {setup_words(campaign.setup) or 'nothing stated'}"
-            if folders.count(campaign.campaign) > 1
-            else ""
+    return tuple(
+        CampaignName(
+            str(Path(campaign.campaign).relative_to(shared)),
+            campaign.setup if folders.count(campaign.campaign) > 1 else None,
+            campaign.when[:10],
         )
-        day = f" ({campaign.when[:10]})" if campaign.when else ""
-        names.append(f"{Path(campaign.campaign).relative_to(shared)}{setup}{day}")
-    return names
+        for campaign in campaigns
+    )
 
 
 def _notes(
-    names: Sequence[str],
+    names: Sequence[CampaignName],
     campaigns: Sequence[BatchEstimate],
     repetitions: Sequence[Sequence[BatchEstimate]],
 ) -> Iterator[Note]:

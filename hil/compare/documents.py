@@ -8,12 +8,15 @@ from typing import Any
 from hil.batch.messages import setup_words
 
 from .comparison import ArmComparison
-from .messages import comparison_lines, verdict_line
+from .messages import campaign_words, comparison_lines, verdict_line
 
 
 def comparison_document(comparison: ArmComparison) -> dict[str, Any]:
     """Return a comparison as JSON data, None for unknown values."""
-    numbers = [asdict(change) for change in comparison.changes]
+    numbers = [
+        asdict(change) | {"campaign": campaign_words(change.campaign)}
+        for change in comparison.changes
+    ]
     return {
         "arm": comparison.arm,
         "simulated": comparison.simulated,
@@ -22,7 +25,7 @@ def comparison_document(comparison: ArmComparison) -> dict[str, Any]:
         "changed": bool(comparison.changed),
         "campaigns": [
             {
-                "name": name,
+                "name": campaign_words(name),
                 "folder": campaign.campaign,
                 "when": campaign.when or None,
                 "setup": setup_words(campaign.setup),

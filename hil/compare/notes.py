@@ -10,6 +10,15 @@ from hil.pipeline.notes import Note
 
 
 @dataclass(frozen=True)
+class CampaignName:
+    """Name of a campaign among the ones it is compared with."""
+
+    folder: str  #: below the folder that all are in
+    setup: Setup | None = None  #: what its cell states, where several campaigns have this folder
+    day: str = ""  #: of its recordings, ISO 8601; "": unknown
+
+
+@dataclass(frozen=True)
 class UnusableArchive(Note):
     """An archive that could not be used."""
 
@@ -20,21 +29,21 @@ class UnusableArchive(Note):
 class OtherSetups(Note):
     """Campaigns whose cells state different payloads or delays."""
 
-    setups: tuple[tuple[str, Setup], ...]  #: campaign and what its cell states
+    setups: tuple[tuple[CampaignName, Setup], ...]  #: campaign and what its cell states
 
 
 @dataclass(frozen=True)
 class SingleRepetition(Note):
     """A campaign without the scatter of repetitions in its intervals."""
 
-    campaign: str
+    campaign: CampaignName
 
 
 @dataclass(frozen=True)
 class OfCampaign(Note):
     """A note on the archives or the estimate of one campaign."""
 
-    campaign: str
+    campaign: CampaignName
     note: Note
 
 

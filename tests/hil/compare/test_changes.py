@@ -35,7 +35,7 @@ from hil.compare.comparison import (
 )
 from hil.compare.documents import comparison_document
 from hil.compare.messages import verdict_line
-from hil.compare.notes import OtherSetups, SingleRepetition
+from hil.compare.notes import CampaignName, OtherSetups, SingleRepetition
 from hil.pipeline.notes import StatedText
 from identification.model.motion import Motion
 from tests.hil import arm_histories
@@ -85,7 +85,7 @@ class TestRecorded:
     def test_changed_friction_is_found_on_its_axis_only(self, folders, order):
         """The first campaign given is the reference."""
         comparison = compared(*(folders["march"].parent / name for name in order))
-        assert comparison.names == tuple(name.split("/")[0] for name in order)
+        assert comparison.names == tuple(CampaignName(name.split("/")[0]) for name in order)
         factor = MORE if order[0] == "march" else 1.0 / MORE
         assert {(entry.kind, entry.axis) for entry in comparison.changed} == {
             ("friction", "shoulder")
@@ -220,11 +220,12 @@ class TestInMemory:
     def test_names_have_folders_and_stated_payloads(self):
         first, other = levels_of(Condition(), Condition())
         folders = [replace(first, campaign="/runs/cold/b"), replace(other, campaign="/runs/warm/b")]
-        assert [name[:6] for name in judged(folders).names] == ["cold/b", "warm/b"]
+        names = judged(folders).names
+        assert [(name.folder, name.setup) for name in names] == [("cold/b", None), ("warm/b", None)]
         carried = Setup(mass=3.0, centre=(0.0, 0.0, 0.1))
         laden = replace(other, setup=carried, campaign=first.campaign)
         comparison = judged([first, laden])
-        assert "carries 3 kg" in comparison.names[1]
+        assert [name.setup for name in comparison.names] == [Setup(), carried]
         setups = zip(comparison.names, (Setup(), carried), strict=True)
         assert comparison.warnings[0] == OtherSetups(tuple(setups))
 
@@ -237,9 +238,9 @@ class TestInMemory:
                 replace(o, campaign=HOSTILE, setup=Setup(centre=(0.0,), frame=HOSTILE))
                 for o in comparison.campaigns
             ),
-            names=(HOSTILE, HOSTILE),
+            names=(CampaignName(HOSTILE), CampaignName(HOSTILE)),
             changes=tuple(
-                replace(change, parameter=HOSTILE, axis=HOSTILE, campaign=HOSTILE)
+                replace(change, parameter=HOSTILE, axis=HOSTILE, campaign=CampaignName(HOSTILE))
                 for change in comparison.changes
             ),
             warnings=(StatedText(HOSTILE),),
