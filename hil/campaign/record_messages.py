@@ -1,4 +1,4 @@
-"""Records of a campaign in words: its dry run, its warm-up, and the precision it has reached."""
+"""Records of a campaign in words: rehearsal, dry run, warm-up, and the precision it has reached."""
 
 from __future__ import annotations
 
@@ -12,6 +12,17 @@ from .errors import AgainstGravityError, DryRunError
 from .folder import CampaignFolder
 from .joint_warm_up import WarmUpRecord
 from .precision_record import PrecisionRecord, Reached
+from .rehearsal_record import Rehearsal
+
+
+def rehearsal_line(rehearsal: Rehearsal) -> str:
+    """Return the result of a rehearsal, without full stop."""
+    if rehearsal.passed:
+        return (
+            f"the rehearsal passed all {len(rehearsal.criteria)} criteria; what it cannot detect is"
+            " in rehearsal.json (not_seen)"
+        )
+    return f"the rehearsal failed: {'; '.join(rehearsal.failures)}"
 
 
 def contradiction(record: DryRunRecord) -> str:

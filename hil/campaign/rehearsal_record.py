@@ -84,15 +84,5 @@ class Rehearsal(Frozen):
 
     @property
     def failures(self) -> tuple[str, ...]:
-        """Criteria that were not met, in sentences."""
+        """Criteria that were not met, in the sentences of the file."""
         return tuple(criterion.sentence for criterion in self.criteria if not criterion.passed)
-
-    @property
-    def line(self) -> str:
-        """Its result, in one sentence."""
-        if self.passed:
-            return (
-                f"the rehearsal passed all {len(self.criteria)} criteria; what it cannot detect "
-                "is in rehearsal.json (not_seen)"
-            )
-        return f"the rehearsal failed: {'; '.join(self.failures)}"

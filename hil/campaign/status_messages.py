@@ -28,7 +28,7 @@ from .campaign_steps import (
     UnreadableStep,
     WarmUpDone,
 )
-from .record_messages import gravity_lines, precision_line, warm_up_line
+from .record_messages import gravity_lines, precision_line, rehearsal_line, warm_up_line
 
 _MOTIONS: Final[Mapping[RepeatedKind, str]] = {
     "excitation": "repetitions",
@@ -50,7 +50,7 @@ def step_line(found: StepOutcome) -> str:
                 return "rehearsed with another cell, URDF or plan than it has now"
             return "not rehearsed on the simulated arm"
         case Rehearsed(rehearsal):
-            return rehearsal.line
+            return rehearsal_line(rehearsal)
         case NoDryRun(is_invalid):
             if is_invalid:
                 return (

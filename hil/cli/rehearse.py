@@ -11,6 +11,7 @@ from hil.base.one_screen import brief
 from hil.base.progress import reporter as make_reporter
 from hil.base.progress import say
 from hil.campaign import Campaign, stop_on_interrupt
+from hil.campaign.record_messages import rehearsal_line
 from hil.campaign.rehearsal_record import Rehearsal
 from hil.cli.arguments import CampaignArgument, JsonOption, QuietOption, VerboseOption
 
@@ -48,7 +49,7 @@ def rehearse(
         lines = [] if quiet else _lines(rehearsal, verbose=verbose)
         if rehearsal.passed and not quiet:
             lines.append(f"next: {opened.folder.run_command}")
-        result = rehearsal.line
+        result = rehearsal_line(rehearsal)
         for line in [*lines, result] if verbose else brief([result, *lines]):
             say(line)
     if not rehearsal.passed:
