@@ -136,9 +136,8 @@ def mounting_words(gravity: GravityDirection) -> str:
     )
     return (
         f"with gravity ({best}) m/s² in base axes, {angle:.0f}° from the declared ({declared})"
-        f" m/s², the bare recordings are predicted with {np.sqrt(gravity.ratio):.2f} times the "
-        f"error;"
-        f" {MOUNTING_STEP}, and import the recordings again; if it is right, check the zero"
+        f" m/s², the bare recordings are predicted with {np.sqrt(gravity.ratio):.2f} times the"
+        f" error; {MOUNTING_STEP}, and import the recordings again; if it is right, check the zero"
         " positions of the joints"
     )
 
@@ -178,11 +177,10 @@ def _summary(found: PayloadFound) -> list[str]:
     if estimate.is_beyond_reach:
         distance = float(np.linalg.norm(body.centre))
         lines.append(
-            f"A load of {body.mass:.3g} kg whose centre of mass is {distance:.2g} m from the"
-            " frame would be larger than a block of foam: the difference may be a change of "
-            "the arm itself. Record both on a warm arm, one after the other, and check with a "
-            "load of"
-            " known mass."
+            f"A load of {body.mass:.3g} kg with its centre of mass {distance:.2g} m from the"
+            " frame is implausible, as even foam of that mass would be smaller: the difference"
+            " may be a change of the arm itself. Record both on a warm arm, one after the"
+            " other, and check with a load of known mass."
         )
     if found.doubts.mounting is not None:
         mounting = mounting_words(found.doubts.mounting)
