@@ -15,7 +15,7 @@ from . import notes
 from .found_shapes import MIN_FRAME_HEIGHT
 from .notes import CellNote, PlainNote
 
-_PLAIN: Final[Mapping[PlainNote, str]] = {
+_WORDS: Final[Mapping[PlainNote, str]] = {
     PlainNote.GEOMETRY_OF_TABLE: (
         "the URDF contains the geometry of the DH parameters only: no masses, no limits"
     ),
@@ -52,7 +52,7 @@ def note_lines(of_cell: Iterable[CellNote]) -> list[str]:
 def _note_words(note: CellNote) -> str:
     match note:
         case PlainNote():
-            return _PLAIN[note]
+            return _WORDS[note]
         case notes.FixedOutside() | notes.FixedPrismatic() | notes.FixedMimic():
             return _fixed_words(note)
         case notes.LiftingJoints() | notes.GripperJoints() | notes.SeveralBranches():

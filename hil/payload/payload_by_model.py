@@ -22,7 +22,7 @@ from hil.pipeline.sources import (
 from hil.pipeline.torque_scale import torque_scale
 from identification.estimators.payload_problem import KnownArm, Run
 
-from .payload_found import BareDoubts, PayloadFound
+from .payload_found import BareCheck, PayloadFound
 from .payload_run import doubtful_mounting, flange_of, weighed, weight_per_mass
 
 
@@ -77,9 +77,9 @@ def weigh_by_model(
     of_both = (*prepared.sources.training, *others.training)
     meanings = require_weight(cell.model, prepared.fitted, of_both, of_arm[0])
     mounting = doubtful_mounting(cell.model, prepared.fitted)
-    doubts = BareDoubts(tuple(cell.model.joint_names), mounting, meanings)
+    check = BareCheck(tuple(cell.model.joint_names), mounting, meanings)
     estimate, body = weighed(
-        cell.model, runs, scale, frame, sides, others.training, doubts, known_arm
+        cell.model, runs, scale, frame, sides, others.training, check, known_arm
     )
     return PayloadFound(
         estimate=estimate,
@@ -89,7 +89,7 @@ def weigh_by_model(
         bare=(),
         loaded=tuple(source.name for source in others.training),
         scale=scale,
-        doubts=doubts,
+        bare_check=check,
         typed=((), tuple(loaded)),
         with_currents=all(recording.motor_current is not None for recording in recordings),
         warnings=(*prepared.sources.warnings, *others.warnings),

@@ -78,7 +78,7 @@ NextStep = PlainStep | ScaledTorque | CorrectMapScale | EstimateConstants
 
 
 @dataclass(frozen=True)
-class BareDoubts:
+class BareCheck:
     """What the bare recordings are other than described."""
 
     joints: tuple[str, ...]  #: names of the arm's
@@ -107,7 +107,7 @@ class PayloadFound:
     bare: tuple[str, ...]  #: names of the archives without payload
     loaded: tuple[str, ...]  #: names of the archives with payload
     scale: TorqueScale  #: how well the torques are known
-    doubts: BareDoubts
+    bare_check: BareCheck
     #: as typed: archives or folders without and with payload
     typed: tuple[tuple[Path, ...], tuple[Path, ...]]
     with_currents: bool  #: whether all archives hold motor currents
@@ -136,7 +136,7 @@ class PayloadFound:
     @property
     def is_doubtful(self) -> bool:
         """Whether the recordings are other than described, so that nothing should be set."""
-        return self.doubts.mounting is not None or bool(self.doubts.certain)
+        return self.bare_check.mounting is not None or bool(self.bare_check.certain)
 
     def determines(self, *names: str) -> bool:
         """Return whether all figures are determined."""

@@ -23,7 +23,7 @@ from identification.hypotheses.gravity_direction import GravityDirection
 from identification.validation.finding_messages import MOUNTING_STEP
 
 from .payload_found import (
-    BareDoubts,
+    BareCheck,
     CorrectMapScale,
     EstimateConstants,
     NextStep,
@@ -71,7 +71,7 @@ def payload_as_json(found: PayloadFound) -> dict[str, Any]:
     """Return all values as JSON data; infinite ends and undetermined values are null."""
     torque = found.wrist_torque
     estimate = found.estimate
-    mounting = found.doubts.mounting
+    mounting = found.bare_check.mounting
 
     def figure(value: float | None, low: float, high: float, unit: str) -> dict[str, Any]:
         interval = [end if np.isfinite(end) else None for end in (low, high)]
@@ -91,7 +91,7 @@ def payload_as_json(found: PayloadFound) -> dict[str, Any]:
             "source": SCALE_SOURCES[found.scale.source],
         },
         "mounting": None if mounting is None else mounting_words(mounting),
-        "otherwise": certain_lines(found.doubts),
+        "otherwise": certain_lines(found.bare_check),
         "least_squares": estimate.parameters.tolist(),
         "method": _method(found),
         "controllers": controller_commands(found),
@@ -142,9 +142,9 @@ def mounting_words(gravity: GravityDirection) -> str:
     )
 
 
-def certain_lines(doubts: BareDoubts) -> list[str]:
+def certain_lines(check: BareCheck) -> list[str]:
     """Return what bare recordings certainly are other than described, with remedies."""
-    return finding_lines(doubts.certain, doubts.joints)
+    return finding_lines(check.certain, check.joints)
 
 
 def _summary(found: PayloadFound) -> list[str]:
@@ -182,16 +182,18 @@ def _summary(found: PayloadFound) -> list[str]:
             " may be a change of the arm itself. Record both on a warm arm, one after the"
             " other, and check with a load of known mass."
         )
-    if found.doubts.mounting is not None:
-        mounting = mounting_words(found.doubts.mounting)
+    if found.bare_check.mounting is not None:
+        mounting = mounting_words(found.bare_check.mounting)
         lines.append(f"The mounting is doubtful: {mounting}. No controller settings.")
-    lines += [f"Doubtful: {each}. No controller settings." for each in certain_lines(found.doubts)]
+    lines += [
+        f"Doubtful: {each}. No controller settings." for each in certain_lines(found.bare_check)
+    ]
     return lines
 
 
 def _warnings(found: PayloadFound) -> list[str]:
-    doubts = found.doubts
-    lines = [*note_lines(found.warnings), *finding_lines(doubts.uncertain, doubts.joints)]
+    check = found.bare_check
+    lines = [*note_lines(found.warnings), *finding_lines(check.uncertain, check.joints)]
     return [*dict.fromkeys(lines)]
 
 

@@ -40,7 +40,7 @@ from identification.model.robot import STANDARD_GRAVITY, RobotModel
 from identification.signals.samples import Samples
 from identification.validation.finding import Thresholds
 
-from .payload_found import BareDoubts, PayloadFound
+from .payload_found import BareCheck, PayloadFound
 from .payload_messages import certain_lines, mounting_words
 
 _MIN_CENTRE_LIMIT: Final = 0.5  # m, of a hand tool on an arm that is shorter itself
@@ -97,8 +97,8 @@ def find_payload(
     with reporter.task("weighing", 2) as task:
         mounting = doubtful_mounting(cell.model, prepared.fitted)
         task.advance(1)
-        doubts = BareDoubts(tuple(cell.model.joint_names), mounting, meanings)
-        estimate, body = weighed(cell.model, runs, scale, frame, sides, training, doubts)
+        check = BareCheck(tuple(cell.model.joint_names), mounting, meanings)
+        estimate, body = weighed(cell.model, runs, scale, frame, sides, training, check)
         task.advance(1)
     return PayloadFound(
         estimate=estimate,
@@ -108,7 +108,7 @@ def find_payload(
         bare=tuple(source.name for source in first),
         loaded=tuple(source.name for source in last),
         scale=scale,
-        doubts=doubts,
+        bare_check=check,
         typed=(tuple(bare), tuple(loaded)),
         with_currents=all(recording.motor_current is not None for recording in recordings),
         warnings=(*prepared.sources.warnings, *by_side[True].warnings),
@@ -120,19 +120,19 @@ class NoPayloadError(InputError):
 
 
 def _no_payload(
-    estimate: PayloadEstimate, doubts: BareDoubts, loaded: Sequence[Path]
+    estimate: PayloadEstimate, check: BareCheck, loaded: Sequence[Path]
 ) -> NoPayloadError:
     """Return the error of loaded recordings without a payload, which names the first of them."""
     low, high = estimate.intervals[0]
     others = f", like {len(loaded) - 1} more given as loaded" if len(loaded) > 1 else ""
     problem = f"shows no payload{others}: its mass is between {low:.3g} and {high:.3g} kg"
     remedy = "give recordings made with the payload here, and the ones without it as bare"
-    if doubts.mounting is not None:
+    if check.mounting is not None:
         problem += ", as the arm is stated to be mounted"
-        remedy = f"the mounting is doubtful: {mounting_words(doubts.mounting)}; then {remedy}"
-    if doubts.certain:
+        remedy = f"the mounting is doubtful: {mounting_words(check.mounting)}; then {remedy}"
+    if check.certain:
         problem += ", with the recordings as described"
-        remedy = "; ".join([*certain_lines(doubts), f"then {remedy}"])
+        remedy = "; ".join([*certain_lines(check), f"then {remedy}"])
     return NoPayloadError(loaded[0], problem, remedy=remedy)
 
 
@@ -192,7 +192,7 @@ def weighed(
     frame: str,
     sides: Mapping[bool, Sequence[Path]],
     training: Sequence[Source],
-    doubts: BareDoubts,
+    check: BareCheck,
     arm: KnownArm | None = None,
 ) -> tuple[PayloadEstimate, Body]:
     """Return the payload of reduced recordings.
@@ -204,7 +204,7 @@ def weighed(
         frame: of the payload.
         sides: the bare and the loaded archives.
         training: their recordings.
-        doubts: about the bare recordings.
+        check: of the bare recordings.
         arm: what is known of it.
 
     Raises:
@@ -214,7 +214,7 @@ def weighed(
     """
     estimate = identify_payload(model, runs, scale.std, arm)
     if estimate.body is None:
-        raise _no_payload(estimate, doubts, sides[True])
+        raise _no_payload(estimate, check, sides[True])
     _require_agreement(model, runs, estimate, frame, sides, training, arm)
     positions = [np.abs(source.recording.position).max(axis=0) for source in training]
     travel = np.max(positions, axis=0)

@@ -11,7 +11,7 @@ import pytest
 
 from hil.base.errors import InputError
 from hil.payload.payload_found import (
-    BareDoubts,
+    BareCheck,
     CorrectMapScale,
     EstimateConstants,
     NextStep,
@@ -36,7 +36,7 @@ from identification.validation.finding import Finding
 
 BODY = Body(4.0, np.array([0.0, 0.09, 0.12]), np.diag([0.01, 0.02, 0.015]))
 HALVES = np.array([0.1, *[0.002] * 3, *[0.001] * 6])
-NO_DOUBTS = BareDoubts(("one", "two"), None, ())
+SOUND = BareCheck(("one", "two"), None, ())
 WALL = GravityDirection(np.array([0.0, 0.0, -9.81]), np.array([0.0, -9.81, 0.0]), 0.04)
 SILENT = Finding("no torque", "wrong", "resolve the torque", joints=(1,))
 STEPS: dict[NextStep, str] = {
@@ -49,7 +49,7 @@ LOAD = dict(zip(NAMES[:4], (5.0, 0.0, 0.09, 0.12), strict=True))
 COMMAND = EstimateConstants((Path("a.mcap"),), (Path("b c.mcap"),), "tool0", LOAD)
 
 
-def found(doubts: BareDoubts = NO_DOUBTS, undetermined: tuple[str, ...] = ()) -> PayloadFound:
+def found(check: BareCheck = SOUND, undetermined: tuple[str, ...] = ()) -> PayloadFound:
     values = np.array([4.0, 0.0, 0.09, 0.12, 0.01, 0.02, 0.015, 0.0, 0.0, 0.0])
     intervals = np.column_stack([values - HALVES, values + HALVES])
     estimate = PayloadEstimate(
@@ -63,7 +63,7 @@ def found(doubts: BareDoubts = NO_DOUBTS, undetermined: tuple[str, ...] = ()) ->
         bare=("a.mcap",),
         loaded=("b.mcap",),
         scale=TorqueScale(np.array([0.03, 0.03]), by_currents=True, source=ScaleSource.DATA_SHEET),
-        doubts=doubts,
+        bare_check=check,
         typed=((Path("a.mcap"),), (Path("b.mcap"),)),
         with_currents=True,
         warnings=(),
@@ -91,7 +91,7 @@ class TestExpected:
         assert by_torque.next_steps({"mass": 5.0}) == (scaled, CorrectMapScale(1.25))
         assert by_model.next_steps({"mass": 5.0}) == (scaled, PlainStep.RECORD_BARE)
 
-    def test_the_known_load_has_the_expected_mass_and_the_found_centre(self) -> None:
+    def test_the_known_load_has_expected_mass_and_found_centre(self) -> None:
         _, step = found().next_steps({"mass": 5.0, "cx": 0.01})
         assert isinstance(step, EstimateConstants)
         assert step.load["mass"] == 5.0
@@ -122,7 +122,7 @@ class TestExpected:
 
 class TestDoubts:
     def test_another_mounting_leaves_no_settings(self) -> None:
-        on_wall = found(replace(NO_DOUBTS, mounting=WALL))
+        on_wall = found(replace(SOUND, mounting=WALL))
         document = payload_as_json(on_wall)
         assert on_wall.is_doubtful
         assert controller_commands(on_wall) == document["controllers"] == {}
@@ -134,8 +134,8 @@ class TestDoubts:
         )
 
     def test_what_is_certain_forbids_settings_and_the_rest_warns(self) -> None:
-        certain = found(replace(NO_DOUBTS, findings=(SILENT,)))
-        uncertain = found(replace(NO_DOUBTS, findings=(replace(SILENT, level="doubtful"),)))
+        certain = found(replace(SOUND, findings=(SILENT,)))
+        uncertain = found(replace(SOUND, findings=(replace(SILENT, level="doubtful"),)))
         (line,) = payload_as_json(certain)["otherwise"]
         assert certain.is_doubtful and not uncertain.is_doubtful
         assert line.startswith("the measured torque of two is zero")
