@@ -87,7 +87,7 @@ class BareCheck:
 
     @property
     def certain(self) -> tuple[Finding, ...]:
-        """Findings of which there is no doubt."""
+        """Findings that are certain."""
         return tuple(each for each in self.findings if each.level == "wrong")
 
     @property
