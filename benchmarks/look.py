@@ -45,11 +45,11 @@ _NEAR: Final = 10.0  # deg
 _LATE: Final = 0.03  # s
 _AHEAD: Final = 0.025  # s
 _EXPECTED: Final = {
-    "order": "joints in the order of the URDF",
+    "order": "order of the URDF",
     "signs": "as the URDF's axes",
     "angle unit": "unit as read",
     "zero": "as the URDF",
-    "coupling": "no angle contains another's",
+    "coupling": "uncoupled",
     "gravity": "torque with gravity",
     "mounting": "as stated, else upright",
     "side": "joint side",
@@ -152,7 +152,7 @@ def plants(arm: Arm) -> Iterator[Planted]:
     degrees = None if v is None else np.degrees(v)
     yield of("degrees", "position, angle unit", "deg", position=np.degrees(q), velocity=degrees)
     yield of("low-passed", "low-pass", "low-passed at", torque=_low_passed(t, tau))
-    yield of("delayed", "delay", "behind", torque=_shifted(t, tau, -_LATE))
+    yield of("delayed", "delay", "lags", torque=_shifted(t, tau, -_LATE))
     smooth = _shifted(t, _low_passed(t, q, both=True), _AHEAD)
     yield of("commanded", "positions", "commanded", position=smooth)
     yield of("wrapped", "wraps", "wrapped", position=_wrapped(q))
@@ -160,7 +160,7 @@ def plants(arm: Arm) -> Iterator[Planted]:
     relative = np.eye(n)
     relative[third, 1] = 1.0
     yield of(
-        "coupled", "coupling", f"{names[third]} is recorded plus the angle of {names[1]}",
+        "coupled", "coupling", f"recorded {names[third]} is {names[third]} plus {names[1]}",
         position=q @ relative.T, velocity=None if v is None else v @ relative.T,
     )  # fmt: skip
     for joint, angle in ((1, 0.6), (2, -0.6), (3, np.pi / 2.0)):
@@ -237,7 +237,7 @@ def _says(text: str, phrase: str) -> bool:
     angle, _, joint = phrase.partition(" deg: ")
     if not joint:
         return phrase in text
-    if joint in text.partition("not shown: ")[2].split(" (")[0].split(", "):
+    if joint in text.partition("unseen in ")[2].split(" (")[0].split(", "):
         return True
     said = [
         float(size) for size, name in re.findall(r"(-?\d+) deg: ([\w.-]+)", text) if name == joint

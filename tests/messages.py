@@ -44,7 +44,7 @@ MOTION_NOT_AT_FAULT: Final = (
     "the motion is not at fault; correct delay and elasticity in [simulation]"
 )
 NAME_LOCAL_ADDRESS: Final = "give an address of this computer"
-NONE_AS_DEGREES: Final = 'as degrees read as radians, none would: write [position] unit = "deg"'
+NONE_AS_DEGREES: Final = 'read as degrees, none would: write [position] unit = "deg"'
 NOTHING_RECEIVED: Final = "nothing was received from the controller"
 NOTHING_WAS_SENT: Final = "went off before the motion began; nothing was sent"
 NOT_IN_MANIFEST: Final = "not listed in its campaign's manifest.json"

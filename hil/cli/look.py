@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Sequence
+from itertools import zip_longest
 from pathlib import Path
-from textwrap import shorten
+from textwrap import shorten, wrap
 from typing import Annotated, Final
 
 import typer
@@ -94,9 +95,9 @@ def whole(result: Look) -> list[str]:
 
 def screen(result: Look) -> list[str]:
     """Return one screen: what is unusual, one line for all that is as the URDF says, next steps."""
-    parts: list[Part] = [*summary(result.rows)]
+    parts: list[Part] = []
     if result.groups:
-        parts += ["", "this recording can determine", *determined(result.groups)]
+        parts += ["", *determined(result.groups)]
     steps = [
         Paragraph(row_text(row).decide, f"next  {row.aspect}: ", 2)
         for row in sorted(result.rows, key=lambda row: not row.is_fault)
@@ -107,11 +108,15 @@ def screen(result: Look) -> list[str]:
         for choices in result.questions
         for part in question(choices, of_archive=result.is_of_archive)
     ]
-    parts += ["", *questions, *_options(result), "reasons, and all rows: -v"]
-    lines_left = SCREEN_LINES - len([part for part in parts if part])
-    if not questions:
-        parts[-1:-1] = steps[: max(1, min(_MAX_STEPS, lines_left))]
-    return one_screen(parts)
+    room = SCREEN_LINES - len(summary(result.rows, 0)) - _lines_of(parts)
+    steps = [] if questions else steps[: max(1, min(_MAX_STEPS, room - len(_options(result)) - 1))]
+    parts += ["", *questions, *steps, *_options(result), "all reasons and rows: -v"]
+    return one_screen([*summary(result.rows, SCREEN_LINES - _lines_of(parts)), *parts])
+
+
+def _lines_of(parts: Sequence[Part]) -> int:
+    """Return the lines of parts that are not empty, each as long as it is."""
+    return sum(part.whole if isinstance(part, Paragraph) else bool(part) for part in parts)
 
 
 def question(choices: Sequence[TiedReading], *, of_archive: bool) -> list[Paragraph]:
@@ -162,9 +167,9 @@ def table(rows: Sequence[Row]) -> list[str]:
 
 _CERTAINTY_COLUMNS: Final = max(map(len, Certainty))
 _MEANING_COLUMNS: Final = 42  # columns
-_EVIDENCE_WORDS: Final = 6  # of the evidence
+_MAX_CELL_LINES: Final = 4
 _MAX_STEPS: Final = 3
-_MAX_JOINT_NAMES: Final = 4  # of joints
+_MAX_JOINT_NAMES: Final = 3  # of joints
 _EXPECTED_FACTS: Final = frozenset(
     {
         Fact.EVERY_JOINT_MOVES,
@@ -185,47 +190,65 @@ _EXPECTED_FACTS: Final = frozenset(
 )
 
 
-def summary(rows: Sequence[Row]) -> list[str]:
-    """Return a line for each row, and one for all rows that agree with the URDF."""
+def summary(rows: Sequence[Row], most: int = SCREEN_LINES) -> list[str]:
+    """Return the table of rows on at most `most` lines, with one for all that agree with the URDF.
+
+    Long cells take a second line as far as there is room, of uncertain rows first.
+    """
     usual = [
         row for row in rows if isinstance(row.reading, Fact) and row.reading in _EXPECTED_FACTS
     ]
-    width = max(len("channel"), *(len(row.aspect) for row in rows))
-    lines = [
-        f"{'channel':{width}}  {'meaning':{_MEANING_COLUMNS}}  "
-        f"{'certainty':{_CERTAINTY_COLUMNS}}  evidence"
+    shown = [row for row in rows if row not in usual]
+    width = max(len("channel"), *(len(row.aspect) for row in shown), 0)
+    head = _table_line(width, "channel", "meaning", "certainty", "evidence")
+    evidence_columns = SCREEN_COLUMNS - len(head) + len("evidence")
+    agreeing = [
+        f"{', '.join(names)} ({certainty})"
+        for certainty in Certainty
+        if (names := [row.aspect for row in usual if row.certainty is certainty])
     ]
-    for row in rows:
-        if row not in usual:
-            text = row_text(row)
-            meaning = shorten(text.reading, _MEANING_COLUMNS, placeholder=" ...")
-            certainty_cell = f"{row.certainty:{_CERTAINTY_COLUMNS}}"
-            first = f"{row.aspect:{width}}  {meaning:{_MEANING_COLUMNS}}  {certainty_cell}  "
-            lines.append(first + short_evidence(text.reason, SCREEN_COLUMNS - len(first)))
-    for certainty in Certainty:
-        names = ", ".join(row.aspect for row in usual if row.certainty is certainty)
-        if names:
-            lines.append(f"as the URDF says, {certainty}: {names}")
-    return lines
+    last = wrap(f"as the URDF says: {'; '.join(agreeing)}", SCREEN_COLUMNS) if agreeing else []
+    texts = [row_text(row) for row in shown]
+    cells = [
+        (_cell(text.reading, _MEANING_COLUMNS), _cell(text.evidence, evidence_columns))
+        for text in texts
+    ]
+    spare = most - 1 - len(shown) - len(last)
+    by_need = sorted(range(len(shown)), key=lambda k: -[*Certainty].index(shown[k].certainty))
+    for k in by_need:
+        more = max(map(len, cells[k])) - 1
+        if more > max(spare, 0):
+            meaning = shorten(texts[k].reading, _MEANING_COLUMNS, placeholder=" ...")
+            cells[k] = [meaning], [shorten(texts[k].evidence, evidence_columns, placeholder=" ...")]
+        else:
+            spare -= more
+    lines = [head]
+    for row, (meanings, reasons) in zip(shown, cells, strict=True):
+        lines += [
+            _table_line(width, *line)
+            for line in zip_longest([row.aspect], meanings, [row.certainty], reasons, fillvalue="")
+        ]
+    return [*lines, *last]
 
 
-def short_evidence(reason: str, width: int) -> str:
-    """Return the first words of a reason, at most `width` characters, with dots where it is cut."""
-    words = reason.split()
-    if len(words) <= _EVIDENCE_WORDS:
-        return shorten(reason, width, placeholder=" ...")
-    first = " ".join(words[:_EVIDENCE_WORDS]).rstrip(":;,")
-    return shorten(f"{first} ...", width, placeholder=" ...")
+def _cell(text: str, columns: int) -> list[str]:
+    """Return the lines of a cell of the table."""
+    return wrap(text, columns, max_lines=_MAX_CELL_LINES, placeholder=" ...")
 
 
-def determined(groups: Sequence[ParameterGroup]) -> list[str]:
+def _table_line(width: int, aspect: str, meaning: str, certainty: str, evidence: str) -> str:
+    cells = f"{aspect:{width}}  {meaning:{_MEANING_COLUMNS}}  {certainty:{_CERTAINTY_COLUMNS}}"
+    return f"{cells}  {evidence}".rstrip()
+
+
+def determined(groups: Sequence[ParameterGroup]) -> list[Paragraph]:
     """Return three lines: what the recording determines well, weakly, and not."""
     numbers = {
         "well": [group.identifiable for group in groups],
         "weakly": [group.weak for group in groups],
         "not": [group.missing for group in groups],
     }
-    lines = []
+    lines: list[Paragraph] = []
     for title, counts in numbers.items():
         parts = []
         for quantity, name in (("friction", "friction"), ("body", "bodies")):
@@ -235,7 +258,8 @@ def determined(groups: Sequence[ParameterGroup]) -> list[str]:
             joints = "all joints" if len(names) == len(alike) else joined(names, _MAX_JOINT_NAMES)
             if names:
                 parts.append(f"{name} {sum(counts[k] for k in alike)} of {total} ({joints})")
-        lines.append(f"  {title:6}  {'; '.join(parts) or 'nothing'}")
+        label = "determines" if not lines else ""
+        lines.append(Paragraph("; ".join(parts) or "nothing", f"{label:10}  {title:6}  "))
     return lines
 
 

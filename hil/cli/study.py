@@ -30,9 +30,9 @@ def study(
 ) -> None:
     """Compare the paper's methods A and B and the default of `hil design` on the simulated NS 16.
 
-    Searches several excitations by each, of equal duration, runs them and predicts held-out motions
-    under errors of the model. Writes `report.html`, `results.json` and all archives to OUTPUT.
-    After Ctrl-C or SIGTERM the same command resumes.
+    Searches several excitations of equal duration by each method, runs them and predicts held-out
+    motions in the presence of model errors. Prints the conclusion first. Writes `report.html`,
+    `results.json` and all archives to OUTPUT. After Ctrl-C or SIGTERM the same command resumes.
 
     **Examples:**
 
@@ -47,7 +47,7 @@ def study(
         repetitions: Repetitions of each excitation. Default: 2.
         motions: Held-out motions, half of each class. Default: 30, with --quick 8.
         seed: Seed of the study; the result depends on nothing else. Default: 1.
-        effects: Add errors of the model, one by one and all together.
+        effects: Add model errors, one by one and all together.
         workers: Number of processes. Default: one per processor.
     """
     reporter = make_reporter(quiet=quiet or json)
@@ -67,3 +67,4 @@ def study(
         print_json(result.summary)
     else:
         typer.echo("\n".join(result.conclusion))
+        reporter.say(f"report: {output / 'report.html'}")

@@ -96,9 +96,10 @@ class JointOrder(Conclusion):
 
 @dataclass(frozen=True)
 class FixedFingers(Conclusion):
-    """Joints of a gripper that was not recorded, and where they are held [rad or m]."""
+    """Joints of a gripper that was not recorded, where they are held, and in which unit."""
 
     positions: Mapping[str, float]
+    units: Mapping[str, str]
 
 
 class UnitsFrom(Enum):
@@ -363,9 +364,10 @@ class TooFewSamples(Conclusion):
 
 @dataclass(frozen=True)
 class LockedJoints(Conclusion):
-    """Joints that are no part of the model, and where they are held [rad or m]."""
+    """Joints that are no part of the model, where they are held, and in which unit."""
 
     positions: Mapping[str, float]
+    units: Mapping[str, str]
 
 
 @dataclass(frozen=True)
@@ -395,18 +397,20 @@ class UnusualRate(Conclusion):
 
 @dataclass(frozen=True)
 class SameStamp(Conclusion):
-    """Samples of one stamp that are far apart [rad or m], and how many stamps have such."""
+    """Samples of one stamp that are far apart [unit], and how many stamps have such."""
 
     apart: float
     count: int
+    unit: str
 
 
 @dataclass(frozen=True)
 class Alternation(Conclusion):
-    """Samples that go to and fro between two sequences, and how far apart they are [rad or m]."""
+    """Samples that go to and fro between two sequences, and how far apart they are [unit]."""
 
     apart: float
     count: int
+    unit: str
 
 
 class Within(Enum):
@@ -436,9 +440,10 @@ class OutsideLimits(Conclusion):
 
 @dataclass(frozen=True)
 class LittleMotion(Conclusion):
-    """The farthest that any joint moves [rad or m]."""
+    """The farthest that any joint moves [rad or m], and whether that joint is revolute."""
 
     travel: float
+    turns: bool
 
 
 @dataclass(frozen=True)
@@ -538,12 +543,14 @@ class StoppedJoint(Conclusion):
     Attributes:
         joint: name.
         time: from which on, after the start [s].
-        travel: of the command after that [rad or m].
+        travel: of the command after that.
+        unit: of the travel, rad or m.
     """
 
     joint: str
     time: float
     travel: float
+    unit: str
 
 
 @dataclass(frozen=True)

@@ -73,17 +73,17 @@ _BASIS: Final[Mapping[NameBasis, str]] = {
     NameBasis.UNIT: "by the unit",
     NameBasis.WORD: "by a word in the name",
     NameBasis.WORDS: "by a word in the names, joints in the order of the log",
-    NameBasis.FILE: "by the name of the file",
+    NameBasis.FILE: "by the file name",
     NameBasis.OPTION: "as given with --columns",
     NameBasis.MESSAGE: "by the field of the joint states; joints by their names",
 }
 _OMITTED: Final[Mapping[Omitted, str]] = {
-    Omitted.ZERO_TIMES: "rows at the start with the time 0",
-    Omitted.NO_STAMPS: "messages at the start without a stamp",
-    Omitted.HEADERS: "lines that repeat the header",
+    Omitted.ZERO_TIMES: "leading rows with time 0",
+    Omitted.NO_STAMPS: "leading messages without a stamp",
+    Omitted.HEADERS: "repeated header lines",
     Omitted.EMPTY_LINES: "empty lines between the rows",
-    Omitted.CUT_ROW: "last row, which is cut off",
-    Omitted.SOME_JOINTS: "messages with some of the joints only",
+    Omitted.CUT_ROW: "truncated last row",
+    Omitted.SOME_JOINTS: "messages with only some of the joints",
 }
 _MAP_CHECK: Final = "check unit, sign and zero in the column map"
 
@@ -116,7 +116,7 @@ def reason_of(meaning: ChannelMeaning) -> str:
     if basis is NameBasis.READY_MAP:
         return f"{meaning.unit}, as in the ready map {meaning.origin}"
     if basis is NameBasis.COMMANDS:
-        return f"rad or m, {meaning.origin}"
+        return f"rad (m of sliding joints), {meaning.origin}"
     if basis is NameBasis.MESSAGE:
         return f"{meaning.unit}, {_BASIS[basis]}"
     if basis is NameBasis.OPTION:
@@ -133,8 +133,8 @@ def _unit_of(meaning: ChannelMeaning) -> str:
     if meaning.unit_basis is UnitBasis.LOG:
         return f"{meaning.unit} as the log states"
     if meaning.unit_basis is UnitBasis.CUSTOM:
-        return f"no unit stated, read as {next(iter(UNITS[meaning.kind]))}"
-    return "no unit stated, inferred from the numbers"
+        return f"{next(iter(UNITS[meaning.kind]))} assumed"
+    return "unit inferred from the numbers"
 
 
 @worded.register
@@ -149,10 +149,10 @@ def _(order: JointOrder) -> str:
 
 _UNITS_FROM: Final[Mapping[UnitsFrom, str]] = {
     UnitsFrom.OPTION: "as stated (--units)",
-    UnitsFrom.ENCODER: "by the steps of the encoders",
-    UnitsFrom.CALIBRATION: "as degrees would be outside the calibrated range",
-    UnitsFrom.BEYOND_RANGE: "as numbers beyond 100 occur",
-    UnitsFrom.BEYOND_LIMITS: "as degrees would be outside the limits of the URDF",
+    UnitsFrom.ENCODER: "as the steps are an encoder's",
+    UnitsFrom.CALIBRATION: "as degrees would leave the calibrated range",
+    UnitsFrom.BEYOND_RANGE: "as some numbers exceed 100",
+    UnitsFrom.BEYOND_LIMITS: "as degrees would leave the limits of the URDF",
 }
 
 
@@ -174,8 +174,10 @@ def _(fixed: FixedFingers) -> str:
 
 def places_of(fixed: FixedFingers) -> str:
     """Return where the joints of a gripper are fixed, and why."""
-    places = ", ".join(number(place) for place in fixed.positions.values())
-    return f"at {places} (rad or m): a gripper that was not recorded"
+    places = ", ".join(
+        f"{number(place)} {fixed.units[name]}" for name, place in fixed.positions.items()
+    )
+    return f"at {places}: a gripper that was not recorded"
 
 
 @worded.register
@@ -211,33 +213,33 @@ def source_of(unit: StatedUnit | ConcludedUnit) -> str:
     none = "no unit is stated; read as"
     if isinstance(unit, EncoderTicks):
         return (
-            f"{none} ticks of an encoder of {unit.ticks}, with zero at {unit.middle}: within the "
-            "limits of the URDF, which they would exceed in radians and in degrees"
+            f"{none} encoder ticks ({unit.ticks} per turn, zero at {unit.middle}): within the "
+            "limits of the URDF, which radians and degrees would exceed"
         )
     if unit.kind == "time":
         return f"{none} {unit.unit}, which gives a usual rate"
     if unit.kind == "velocity":
-        return f"{none} degrees per second, the slope of the positions"
-    return f"{none} degrees, within the limits of the URDF, far outside of them in radians"
+        return f"{none} degrees per second, which match the slope of the positions"
+    return f"{none} degrees: within the limits of the URDF, where radians would be far outside"
 
 
 @worded.register
 def _(left_out: LeftOut) -> str:
-    return f"left out: {_OMITTED[left_out.what]} ({left_out.count})"
+    return f"dropped: {_OMITTED[left_out.what]} ({left_out.count})"
 
 
 @worded.register
 def _(excerpt: Excerpt) -> str:
     return (
-        f"{excerpt.count} of {excerpt.total} rows are used, {excerpt.stretches} stretches over the "
-        "whole recording in which the arm moves (`hil import log` reads every row)"
+        f"used {excerpt.count} of {excerpt.total} rows: {excerpt.stretches} stretches of motion "
+        "spread over the whole recording (`hil import log` reads every row)"
     )
 
 
 @worded.register
 def _(missing: MissingNumbers) -> str:
     return (
-        f"left out: rows in which a number is missing ({missing.count} of {missing.total}, "
+        f"dropped: rows with a missing number ({missing.count} of {missing.total}, "
         f"the first after {missing.before} rows)"
     )
 
@@ -245,7 +247,7 @@ def _(missing: MissingNumbers) -> str:
 @worded.register
 def _(continued: CounterContinued) -> str:
     times = f"{continued.times} times" if continued.times > 1 else "once"
-    return f"time: {continued.clock} wrapped {times} and was continued"
+    return f"time: {continued.clock} wrapped {times} and was unwrapped"
 
 
 @worded.register
@@ -253,15 +255,15 @@ def _(swapped: SortedSamples) -> str:
     many = swapped.count > 1
     count = f"{swapped.count} {swapped.sample}s" if many else f"one {swapped.sample}"
     of_log = "time: " if swapped.sample == "row" else ""
-    return f"{of_log}{count} that came before an older one: sorted by stamp"
+    return f"{of_log}{count} out of order: sorted by stamp"
 
 
 @worded.register
 def _(publisher: SecondPublisher) -> str:
     where = ", ".join(number(angle) for angle in publisher.pose) or "0"
     return (
-        f"{publisher.count} of {publisher.total} {publisher.sample}s have {where} for all positions"
-        " between others that do not; dropped, as they come from a second publisher"
+        f"dropped {publisher.count} of {publisher.total} {publisher.sample}s that come from a"
+        f" second publisher: all their positions are {where}"
     )
 
 
@@ -289,55 +291,53 @@ def _(copied: CopiedCommands) -> str:
         options = " or ".join(f"--columns 'position={name}'" for name in copied.measured)
         remedy = f"if they are measured, choose {options}"
     return (
-        f"the positions equal {copied.commands} bit for bit: they are commands, which the arm "
-        f"follows late and never exactly; {remedy}"
+        f"the positions equal {copied.commands} bit for bit: they are commands, and a real arm "
+        f"lags behind its commands; {remedy}"
     )
 
 
 @worded.register
 def _(counter: RowCounter) -> str:
     return (
-        f"{counter.column} counts the rows, and the map reads it in {counter.unit}: right only if "
-        f"the controller's cycle is one {counter.unit}; else state sample_rate and no [time]"
+        f"{counter.column} counts rows, and the map reads it in {counter.unit}: right only if the "
+        f"controller's cycle is one {counter.unit}; otherwise state sample_rate and no [time]"
     )
 
 
 @worded.register
 def _(base: OneTimeBase) -> str:
     counts = ", ".join(f"{name} {count}" for name, count in base.counts.items())
-    some = f"; {base.left_out} of these have no neighbour in time" if base.left_out else ""
+    some = f"; dropped {base.left_out} of these without a neighbour" if base.left_out else ""
     return (
-        f"quantities with time stamps of their own ({counts} samples) were interpolated to the "
-        f"times of "
-        f"the {base.base.replace('_', ' ')}{some}"
+        f"quantities with their own time stamps ({counts} samples) were interpolated to the times "
+        f"of the {base.base.replace('_', ' ')}{some}"
     )
 
 
 @worded.register
 def _(clock: OtherClock) -> str:
     return (
-        f"commands are on another clock: moved by {clock.offset:.3f} s, at which speeds of "
-        f"commands and positions match best; their delay is then unknown"
+        f"commands have another clock: shifted by {clock.offset:.3f} s, where commanded and "
+        f"measured speeds match best; the delay between them is then unknown"
     )
 
 
 @worded.register
 def _(velocity: PartialVelocity) -> str:
     joints = ", ".join(velocity.joints)
-    problem = f"joint {joints} has no value in any message, the others have one"
-    return f"velocity: {problem}: left out for all"
+    return f"velocity: not used, as no message has a value for {joints}"
 
 
 @worded.register
 def _(commands: NotCommands) -> str:
-    return f"{commands.topic}: {commands.problem}: not used as commanded positions"
+    return f"{commands.topic}: not used as commanded positions: {commands.problem}"
 
 
 @worded.register
 def _(different: DifferentCommands) -> str:
     first, second = different.topics
     remedy = f"choose one: --command-topic {first} or {second}"
-    return f"{first} and {second} carry different commands: neither is used; {remedy}"
+    return f"{first} and {second} carry different commands, so neither is used; {remedy}"
 
 
 @worded.register
@@ -352,8 +352,11 @@ def _(few: TooFewSamples) -> str:
 
 @worded.register
 def _(locked: LockedJoints) -> str:
-    held = [f"{name} at {number(place, 4)}" for name, place in locked.positions.items()]
-    return f"locked, rad or m: {', '.join(held)}"
+    held = [
+        f"{name} at {number(place, 4)} {locked.units[name]}"
+        for name, place in locked.positions.items()
+    ]
+    return f"locked: {', '.join(held)}"
 
 
 @worded.register
@@ -380,18 +383,18 @@ def _(unusual: UnusualRate) -> str:
 @worded.register
 def _(same: SameStamp) -> str:
     return (
-        f"samples with the same time stamp are up to {same.apart:.3g} rad or m apart ({same.count}"
-        " such stamps): two sources write this log, or its clock stood still or is much coarser"
-        " than its samples"
+        f"samples with the same time stamp are up to {same.apart:.3g} {same.unit} apart"
+        f" ({same.count} such stamps): two sources write this log, or its clock stood still or"
+        " ticks much more slowly than it samples"
     )
 
 
 @worded.register
 def _(alternation: Alternation) -> str:
     return (
-        f"samples alternate between two sequences up to {number(alternation.apart)} "
-        f"rad or m apart ({alternation.count} samples): two sources write these joints, one of "
-        f"them with other or older samples; record only one"
+        f"samples alternate between two sequences up to {number(alternation.apart)}"
+        f" {alternation.unit} apart ({alternation.count} samples): two sources write these joints,"
+        " one of them with other or older samples; record only one"
     )
 
 
@@ -414,11 +417,11 @@ def remedy_of(outside: OutsideLimits) -> str:
     """Return what would keep positions within the limits of the URDF."""
     if outside.within is Within.DEGREES:
         entry = '[position] unit = "deg" in the column map'
-        return f"as degrees read as radians, none would: write {entry}"
+        return f"read as degrees, none would: write {entry}"
     if outside.within is Within.ORDER:
         order = ", ".join(outside.order)
         return (
-            f"with the columns in the order {order}, none would: check the order of the joints, or "
+            f"with the columns in the order {order}, none would: check the joint order, or "
             f"{_MAP_CHECK}"
         )
     return _MAP_CHECK
@@ -431,11 +434,14 @@ def _percent(share: float) -> str:
 
 @worded.register
 def _(little: LittleMotion) -> str:
-    return (
-        f"no joint moves further than {number(little.travel, 2)} rad or m "
-        f"({number(math.degrees(little.travel), 2)} if these were degrees): check the unit of the"
-        " positions"
-    )
+    return f"no joint moves further than {_travel(little)}: check the unit of the positions"
+
+
+def _travel(little: LittleMotion) -> str:
+    if not little.turns:
+        return f"{number(little.travel, 2)} m"
+    as_degrees = number(math.degrees(little.travel), 2)
+    return f"{number(little.travel, 2)} rad ({as_degrees} if the log is in degrees)"
 
 
 @worded.register
@@ -449,9 +455,9 @@ def _(fast: FastJoint) -> str:
 @worded.register
 def _(other: VelocityOrder) -> str:
     return (
-        "the velocities are in another order than the positions: as mapped they differ from the "
+        "the velocities have another order than the positions: as mapped they differ from the "
         f"slopes by {other.deviation:.0f} %, in the order {', '.join(other.order)} by "
-        f"{other.least:.0f} %: list the columns of both in the same order"
+        f"{other.least:.0f} %: list both kinds of columns in the same order"
     )
 
 
@@ -469,8 +475,8 @@ def _(scaled: ScaledVelocity) -> str:
         f"{number(factor, 4)} for {name}" for name, factor in scaled.factors.items()
     )
     return (
-        f"the velocity is the slope of the position times {factors}: check units, signs "
-        "and gears of both, and the unit of the time"
+        f"the velocity is the slope of the position times {factors}: check the units, signs "
+        "and gears of both, and the time unit"
     )
 
 
@@ -478,7 +484,7 @@ def _(scaled: ScaledVelocity) -> str:
 def _(none: NoTorque) -> str:
     use = "nothing can be identified from it"
     if none.is_commanded:
-        use = "bodies cannot be identified, servo and friction are"
+        use = "servo and friction are identified, bodies cannot be"
     return f"the log has neither torque nor motor current: {use}"
 
 
@@ -525,8 +531,8 @@ def _(size: TorqueSize) -> str:
 def _(stopped: StoppedJoint) -> str:
     return (
         f"the position of {stopped.joint} stays the same from {stopped.time:.3f} s to the end "
-        f"while its command moves by {stopped.travel:.3g} rad or m: it is assumed to stand still; "
-        "if it moved, its encoder failed"
+        f"while its command moves by {stopped.travel:.3g} {stopped.unit}: it is assumed to stand "
+        "still; if it moved, its encoder failed"
     )
 
 

@@ -46,7 +46,7 @@ from hil.importers.messages import problem_of, remedy_of
 from hil.importers.publishers import MIN_SAMPLE_DISTANCE, alternating_samples
 from hil.importers.stamps import MAX_SAMPLING_RATE, MIN_SAMPLING_RATE
 from identification.model.motion import Motion
-from identification.model.urdf_text import urdf_tree
+from identification.model.urdf_text import position_units
 from identification.signals.angle_wraps import (
     unwrap,
 )
@@ -95,9 +95,10 @@ def examine(
     """
     time = np.asarray((samples.stamp - samples.stamp[0]) * 1e-9)
     limits = urdf_limits(urdf, joint_names)
-    turning = _turning(urdf, joint_names)
+    units = np.array([*position_units(urdf, joint_names).values()])
+    turning = units == "rad"
     position = in_turns(samples.position, limits, turning)
-    held = (LockedJoints(locked),) if locked else ()
+    held = (LockedJoints(locked, position_units(urdf, locked)),) if locked else ()
     if len(time) < 2:
         return Examined((TooFewSamples(len(time)), *held), ())
     base = time_base(time)
@@ -105,7 +106,7 @@ def examine(
     warnings: list[Conclusion] = []
     if not MIN_SAMPLING_RATE <= base.rate <= MAX_SAMPLING_RATE:
         warnings += [UnusualRate(base.rate)]
-    several = _of_one_stamp(time, position) or alternating_samples(position)
+    several = _of_one_stamp(time, position, units) or alternating_samples(position, units)
     warnings += [several] if several else []
     warnings += _positions(time, position, joint_names, limits, turning, has_speed=not several)
     is_plausible = not warnings  # torques are compared only if the motion is plausible
@@ -115,7 +116,7 @@ def examine(
     if is_plausible:
         warnings += _torque_size(samples, joint_names, limits.effort, nominal)
     warnings += _constant(position, joint_names, held_joints)
-    warnings += _stopped(time, position, samples.commanded_position, joint_names)
+    warnings += _stopped(time, position, samples.commanded_position, joint_names, units)
     return Examined((RecordedClock(base), *held, *ranges), tuple(warnings))
 
 
@@ -131,12 +132,16 @@ def _constant(position: Array, names: Sequence[str], held: Collection[str]) -> I
 
 
 def _stopped(
-    time: Array, position: Array, commanded: Array | None, names: Sequence[str]
+    time: Array,
+    position: Array,
+    commanded: Array | None,
+    names: Sequence[str],
+    units: NDArray[np.str_],
 ) -> Iterator[Conclusion]:
     """Yield a warning for each joint that moved, and at the end rests against its command."""
     if commanded is None:
         return
-    for name, places, commands in zip(names, position.T, commanded.T, strict=True):
+    for name, places, commands, unit in zip(names, position.T, commanded.T, units, strict=True):
         changes = np.flatnonzero(np.diff(places))
         first = int(changes[-1]) + 1 if len(changes) else len(places)
         if len(places) - first < _MIN_FINAL_REST_SHARE * len(places):
@@ -144,12 +149,11 @@ def _stopped(
         known = commands[first:][np.isfinite(commands[first:])]
         travel = float(np.ptp(known)) if len(known) else 0.0
         if travel > MIN_MOVEMENT:
-            yield StoppedJoint(name, float(time[first]), travel)
+            yield StoppedJoint(name, float(time[first]), travel, str(unit))
 
 
 def _turning(urdf: str, names: Sequence[str]) -> NDArray[np.bool_]:
-    kinds = {joint.get("name"): joint.get("type") for joint in urdf_tree(urdf).findall("joint")}
-    return np.array([kinds[name] != "prismatic" for name in names])
+    return np.array([unit == "rad" for unit in position_units(urdf, names).values()])
 
 
 def _range(name: str, position: Array, turns: bool, lower: float, upper: float) -> JointRange:
@@ -338,9 +342,10 @@ def _positions(
         yield outside
     low = position.min(axis=0)
     high = position.max(axis=0)
-    travel = float((high - low).max())
-    if travel < _MIN_TRAVEL:
-        yield LittleMotion(travel)
+    travel = high - low
+    if travel.max() < _MIN_TRAVEL:
+        farthest = int(travel.argmax())
+        yield LittleMotion(float(travel[farthest]), turns=bool(turning[farthest]))
     # Longer steps, in which noise and late stamps are negligible.
     block = min(_BLOCK_SECONDS * len(time) / float(time[-1] - time[0]), len(time) / _MIN_BLOCKS)
     stride = max(1, len(time) // _MAX_BLOCKS, round(block))
@@ -355,14 +360,16 @@ def _positions(
             yield FastJoint(name, float(speed), float(limit))
 
 
-def _of_one_stamp(time: Array, position: Array) -> SameStamp | None:
+def _of_one_stamp(time: Array, position: Array, units: NDArray[np.str_]) -> SameStamp | None:
     """Return how far apart positions (m, n) of one stamp are, None if they are near."""
     starts = np.flatnonzero(np.diff(time, prepend=time[0] - 1.0))
     highest = np.maximum.reduceat(position, starts)
     lowest = np.minimum.reduceat(position, starts)
-    apart = (highest - lowest).max(axis=1)
-    count = np.count_nonzero(apart > MIN_SAMPLE_DISTANCE)
-    return SameStamp(float(apart.max()), int(count)) if count else None
+    apart = (highest - lowest).max(axis=0)
+    count = np.count_nonzero((highest - lowest).max(axis=1) > MIN_SAMPLE_DISTANCE)
+    if not count:
+        return None
+    return SameStamp(float(apart.max()), int(count), str(units[apart.argmax()]))
 
 
 def _velocities(

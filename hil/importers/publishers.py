@@ -58,7 +58,7 @@ def _of_one_pose(position: Array) -> NDArray[np.bool_]:
     )
 
 
-def alternating_samples(position: Array) -> Alternation | None:
+def alternating_samples(position: Array, units: NDArray[np.str_]) -> Alternation | None:
     """Return how far apart two sequences are that positions (m, n) go to and fro between."""
     steps = np.abs(np.diff(position, axis=0)).max(axis=1)
     if len(steps) < 2:
@@ -71,4 +71,6 @@ def alternating_samples(position: Array) -> Alternation | None:
     count = np.count_nonzero(alternate)
     if count <= max(2 * MAX_MESSAGES_PER_STAMP, _MIN_ALTERNATING_SHARE * len(position)):
         return None
-    return Alternation(float(there_and_back[alternate].max()), int(count))
+    row = int(np.argmax(np.where(alternate, there_and_back, 0.0)))
+    joint = int(np.argmax(np.abs(position[row + 1] - position[row])))
+    return Alternation(float(there_and_back[row]), int(count), str(units[joint]))

@@ -41,6 +41,7 @@ from hil.importers.recording_content import RecordingContent, Use, require_writa
 from hil.importers.rosbag2 import Effort, joint_state_topics, read_rosbag2, recorded_joints
 from hil.importers.text_table import TextTable
 from hil.importers.units import UNITS, Kind
+from identification.model.urdf_text import position_units
 
 _BAGS: Final = (".db3", ".bag", ".mcap", ".zstd", ".zst")
 _FACTOR: Final = re.compile(r"\*\s*([-+]?\d*\.?\d+(?:[eE][-+]?\d+)?)\s*\Z")
@@ -476,7 +477,9 @@ class _OfRecordedJoints:
         fixed = [name for name in robot.joint_names if name not in gripping.joint_names]
         if fixed and error.count <= len(gripping.joint_names):
             self._steps.append(lambda robot: robot.without_gripper(error.joints))
-            fingers = FixedFingers({name: gripping.locked[name] for name in fixed})
+            fingers = FixedFingers(
+                {name: gripping.locked[name] for name in fixed}, position_units(robot.urdf, fixed)
+            )
             self.concluded = (*self.concluded, fingers)
             return True
         arm = self._arm(robot, error)

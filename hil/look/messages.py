@@ -43,6 +43,7 @@ from hil.look.readings import (
     Either,
     ErrorAsRead,
     ErrorRatio,
+    Evidence,
     ExplainedTorque,
     Fact,
     FilterShape,
@@ -68,6 +69,7 @@ from hil.look.readings import (
     OtherScales,
     OtherTimes,
     ReadAsGiven,
+    Reading,
     RigidShare,
     RowsReading,
     Setting,
@@ -92,8 +94,15 @@ from hil.look.readings import (
 from hil.look.result import ChangedReading, Look, Row, TiedReading
 from identification.estimators.delay_messages import undetermined_words
 from identification.hypotheses.joint_changes import COUPLED, ORDERS, Meaning
-from identification.signals.messages import clock_lines, faults_words, jump_words, time_lines
+from identification.signals.messages import (
+    clock_lines,
+    faults_words,
+    jump_words,
+    time_lines,
+    times_words,
+)
 from identification.signals.row_faults import by_kind
+from identification.signals.sample_times import SampleTimes, TimeBase
 from identification.text import number, percentage
 
 _FACTS: Final[Mapping[Fact, str]] = {
@@ -102,8 +111,8 @@ _FACTS: Final[Mapping[Fact, str]] = {
     Fact.WITHIN_LIMITS: "within the limits of the URDF",
     Fact.COMMANDED: "commanded",
     Fact.MEASURED: "measured",
-    Fact.SLOPE: "slope of the position, same unit, sign and order",
-    Fact.SCALED_SLOPE: "times the slope of the position",
+    Fact.SLOPE: "position slope: unit, sign, order agree",
+    Fact.SCALED_SLOPE: "scaled slope of the position",
     Fact.SLOPE_IN_DEGREES: "deg/s, positions in rad",
     Fact.SLOPE_OF_DEGREES: "rad/s, positions in deg",
     Fact.NEGATED_SLOPE: "negated",
@@ -111,12 +120,12 @@ _FACTS: Final[Mapping[Fact, str]] = {
     Fact.NOT_EXAMINED: "not examined",
     Fact.TIMES_UNSEEN: "as stated, or twice or half as long",
     Fact.BACKWARDS: "rows that run backwards in time",
-    Fact.ORDER_OF_URDF: "joints in the order of the URDF",
+    Fact.ORDER_OF_URDF: "order of the URDF",
     Fact.SIGNS_OF_URDF: "as the URDF's axes",
     Fact.UNIT_AS_READ: "unit as read",
     Fact.ZERO_OF_URDF: "as the URDF",
-    Fact.ZERO_STATED: "as the map states where the torque does not show it",
-    Fact.UNCOUPLED: "no angle contains another's",
+    Fact.ZERO_STATED: "as in the map where the torque does not show it",
+    Fact.UNCOUPLED: "uncoupled",
     Fact.WITH_GRAVITY: "torque with gravity",
     Fact.WITHOUT_GRAVITY: "torque without gravity",
     Fact.STATED_MOUNTING: "as stated, else upright",
@@ -124,60 +133,60 @@ _FACTS: Final[Mapping[Fact, str]] = {
     Fact.JOINT_TORQUE: "joint side, a torque",
     Fact.LARGE_TORQUE: "larger than the arm needs",
     Fact.MOTOR_SIDE: "motor side (before the gears), or a current",
-    Fact.SMALL_TORQUE: "smaller than the arm needs, by more than any gear",
+    Fact.SMALL_TORQUE: "too small for the arm with any gear",
     Fact.PAYLOAD_UNDETERMINED: "none stated; not determined",
     Fact.PAYLOAD_IN_LAST_BODY: "none stated; part of the last body",
-    Fact.NO_TORQUE: "none, and no motor current",
-    Fact.SERVO_LOAD: "none; the load or the duty of a servo",
+    Fact.NO_TORQUE: "no torque and no motor current",
+    Fact.SERVO_LOAD: "none; a servo's load or duty cycle",
     Fact.MOTOR_CURRENT: "none; motor currents",
-    Fact.TORQUE_UNEXAMINED: "side, gravity, signs and order of the joints not examined",
+    Fact.TORQUE_UNEXAMINED: "side, gravity, signs, joint order not examined",
     Fact.DELAY_UNDETERMINED: "not determined",
     Fact.NO_DELAY: "none",
     Fact.NO_DELAY_SEEN: "none seen",
     Fact.NO_LOW_PASS: "none in the torque",
-    Fact.NO_BODIES: "almost nothing of the bodies: a model was subtracted from the torque",
-    Fact.RATE_OF_TORQUE: "the rate of a torque (N·m/s)",
+    Fact.NO_BODIES: "almost no rigid-body torque: a model was subtracted",
+    Fact.RATE_OF_TORQUE: "torque rate (N·m/s)",
     Fact.NONE_FITS: "no tested explanation fits; the nearest are above",
     Fact.OTHER_ARM: "may not be the arm of the URDF",
 }
 _BASES: Final[Mapping[Basis, str]] = {
-    Basis.ESTIMATED_TIMES: "the stamps are not the times of the samples, which were estimated",
+    Basis.ESTIMATED_TIMES: "stamps are not sample times; times estimated",
     Basis.MAP: "by the column map",
     Basis.GIVEN_RATE: "at the rate that was given",
     Basis.MESSAGE_TYPE: "by the message type",
-    Basis.DATA_SET: "as of every data set of LeRobot",
+    Basis.DATA_SET: "as in every LeRobot data set",
     Basis.USUAL_RATE: "that unit gives a usual rate",
-    Basis.STATED_UNIT: "by the name and the unit that is stated",
+    Basis.STATED_UNIT: "by name and stated unit",
     Basis.NAME_AND_RATE: "by the name; a usual rate",
     Basis.ROW_NAMES: "in the order of the names in the rows",
-    Basis.NO_TURN: "no jump by a full turn",
-    Basis.TURNS: "jumps by a full turn",
+    Basis.NO_TURN: "no full-turn jumps",
+    Basis.TURNS: "full-turn jumps",
     Basis.EVERY_ROW: "every row of every joint",
     Basis.POSITIONS_ALONE: "by the positions alone",
     Basis.LIMITS: "limits of the URDF",
     Basis.NAME: "by the name",
     Basis.NAME_OR_UNIT: "by name or unit",
     Basis.CHANNELS: "by the channels",
-    Basis.ENCODER_NOISE: "noise of an encoder at all frequencies",
-    Basis.SMALL_NOISE: "small noise at all frequencies, more than rounding",
+    Basis.ENCODER_NOISE: "broadband encoder noise",
+    Basis.SMALL_NOISE: "small broadband noise",
     Basis.NO_NOISE: "no noise above that frequency",
     Basis.NO_MOTION: "no joint moves",
-    Basis.DRIVING_FRICTION: "otherwise friction would add energy to the joint",
-    Basis.DISSIPATION: "friction takes energy in every joint",
+    Basis.DRIVING_FRICTION: "otherwise friction would add energy",
+    Basis.DISSIPATION: "friction dissipates energy in every joint",
     Basis.NOT_EXAMINED: "not examined",
-    Basis.SIZE_UNTESTED: "no masses in the URDF and little weight: size not tested",
+    Basis.SIZE_UNTESTED: "size not tested: no masses, little weight",
     Basis.CELL: "by the cell",
-    Basis.LAST_BODY_UNDETERMINED: "the motion determines no parameter of the last body",
-    Basis.NO_GEOMETRY: "the torque shows them only together with the arm's geometry",
+    Basis.LAST_BODY_UNDETERMINED: "motion determines nothing of the last body",
+    Basis.NO_GEOMETRY: "the torque shows them only with geometry",
     Basis.NO_ROW: "no usable row",
-    Basis.NO_FILTER_BETTER: "none predicts it better",
-    Basis.FREE_PARAMETERS: "with free parameters, before a fit of the friction law",
+    Basis.NO_FILTER_BETTER: "no low-pass predicts it better",
+    Basis.FREE_PARAMETERS: "free fit, no friction law",
     Basis.NO_BODIES: "friction torque does not show it",
     Basis.NO_GRAVITY: "torque without gravity does not show it",
-    Basis.LITTLE_INERTIA: "too little inertia in the torque to tell",
-    Basis.RATE: "the rate of a torque does not show it",
+    Basis.LITTLE_INERTIA: "too little inertia to tell",
+    Basis.RATE: "a torque rate does not show it",
     Basis.INTEGRAL: "its integral follows the arm",
-    Basis.INERTIA: "the torque's inertia fits other times, its weight fits the URDF",
+    Basis.INERTIA: "weight fits the URDF, inertia other times",
 }
 _STEPS: Final[Mapping[NextStep, str]] = {
     NextStep.STATE_UNIT_OR_GEARS: "state unit, sign or gears of both",
@@ -194,7 +203,7 @@ _STEPS: Final[Mapping[NextStep, str]] = {
     NextStep.CHECK_COLUMNS: "check the order of the columns of both",
     NextStep.MOVE_ALL_OR_LOCK: "record a motion of all joints, or fix these (--locked NAME)",
     NextStep.MOVE_EACH_JOINT: "move the joints one by one",
-    NextStep.REVERSE_THE_ROWS: "reverse the order of the rows, but not the times",
+    NextStep.REVERSE_THE_ROWS: "reverse the order of the rows, but not of the times",
     NextStep.STATE_RATE: "state the rate of the controller (--sample-rate HZ)",
     NextStep.PUSH_A_JOINT: "push one joint by hand and watch its torque",
     NextStep.COMPARE_A_POSTURE: (
@@ -230,7 +239,7 @@ _CHANGES: Final[Mapping[Meaning, str]] = {
     "radians": "radians",
     "no gravity": "without gravity",
     "angle sum": "plus",
-    "angle difference": "less",
+    "angle difference": "minus",
 }
 
 
@@ -240,6 +249,7 @@ class RowText(NamedTuple):
     reading: str
     reason: str
     decide: str  #: what would decide it; "" if there is nothing
+    evidence: str  #: the first reason
 
 
 def row_text(row: Row) -> RowText:
@@ -247,7 +257,16 @@ def row_text(row: Row) -> RowText:
     decide = "" if row.decider is None else worded(row.decider)
     if isinstance(row.decider, OutsideLimits):
         decide = import_messages.remedy_of(row.decider)
-    return RowText(worded(row.reading), "; ".join(map(worded, row.evidence)), decide)
+    reasons = [*filter(None, (_reason(each, row.reading) for each in row.evidence))]
+    return RowText(worded(row.reading), "; ".join(reasons), decide, next(iter(reasons), ""))
+
+
+def _reason(evidence: Evidence, reading: Reading) -> str:
+    """Return evidence in words; the second of two explanations is not repeated."""
+    is_either = isinstance(evidence, NextBest) and isinstance(reading, Either)
+    if is_either and evidence.change == reading.change:
+        return f"the second: {evidence.ratio:.2f} × error"
+    return worded(evidence)
 
 
 def choice_text(choice: TiedReading) -> str:
@@ -313,14 +332,14 @@ def described(change: ArmChange) -> str:
     if meaning == "mounting":
         text = f"mounted {change.change.name}"
     elif meaning == "zero":
-        text = f"zero moved by {np.degrees(change.change.size):.0f} deg"
+        text = f"zero shifted by {np.degrees(change.change.size):.0f} deg"
     elif meaning == "scale":
-        text = f"torque recorded {number(1.0 + change.change.size)} times"
+        text = f"torque scaled by {number(1.0 + change.change.size)}"
     else:
         text = _CHANGES[meaning]
     if meaning in COUPLED:
         joint, other = _names(change)
-        return f"the angle of {joint} is recorded {text} the angle of {other}"
+        return f"recorded {joint} is {joint} {text} {other}"
     if meaning in ORDERS:
         return f"{text} {_exchanged(change)}"
     if not change.change.joints:
@@ -351,7 +370,8 @@ def sentences(found: Sequence[Contradiction]) -> str:
 
 
 def _expected(size: SizeRatio | BeyondMasses) -> str:
-    return "the URDF's masses" if size.by_masses else "the masses of arms of its reach"
+    masses = "the URDF's masses" if size.by_masses else "arms of its reach"
+    return f"what {masses} need"
 
 
 # --- one function for each type
@@ -386,14 +406,24 @@ def _(step: NextStep) -> str:
 def _(clock: ClockReading) -> str:
     unit = "stamps of the messages; " if clock.of_messages else ""
     unit = f"{clock.unit}; " if clock.unit is not None else unit
-    return f"{unit}{'; '.join(clock_lines(clock.base))}"
+    return f"{unit}{clock_lines(clock.base)[0]}"
+
+
+@_worded.register
+def _(base: TimeBase) -> str:
+    return "; ".join(clock_lines(base)[1:])
 
 
 @_worded.register
 def _(rows: RowsReading) -> str:
-    times = () if rows.times is None else time_lines(rows.times)
+    times = () if rows.times is None else filter(None, [times_words(rows.times)])
     jumps = [jump_words(jump) for jump in rows.jumps[:_MAX_JUMPS]]
     return "; ".join([*jumps, *map(faults_words, by_kind(rows.faults)), *times])
+
+
+@_worded.register
+def _(times: SampleTimes) -> str:
+    return "; ".join(time_lines(times))
 
 
 @_worded.register
@@ -428,7 +458,7 @@ def _(joints: StillJoints) -> str:
 
 @_worded.register
 def _(wrapped: Wrapped) -> str:
-    return f"wrapped by a turn, continued: {wrapped.joints}"
+    return f"wrapped at a full turn, unwrapped: {wrapped.joints}"
 
 
 @_worded.register
@@ -473,7 +503,7 @@ def _(either: Either) -> str:
 
 @_worded.register
 def _(zeros: UnseenZeros) -> str:
-    return f"as the URDF where the torque shows it; not shown: {', '.join(zeros.joints)}"
+    return f"as the URDF; unseen in {', '.join(zeros.joints)}"
 
 
 @_worded.register
@@ -488,15 +518,15 @@ def _(payload: StatedPayload) -> str:
 
 @_worded.register
 def _(error: ErrorAsRead) -> str:
-    return f"torque predicted to {number(100.0 * error.error, 2)} % from other parts"
+    return f"other parts predict the torque to {number(100.0 * error.error, 2)} %"
 
 
 @_worded.register
 def _(delay: TorqueDelay) -> str:
     if delay.confirmed:
-        return f"torque {1e3 * delay.delay:.0f} ms behind the position"
-    side = "behind" if delay.delay > 0.0 else "before"
-    return f"perhaps: torque {1e3 * abs(delay.delay):.0f} ms {side} the position"
+        return f"torque lags the position by {1e3 * delay.delay:.0f} ms"
+    verb = "lags" if delay.delay > 0.0 else "leads"
+    return f"torque perhaps {verb} position by {1e3 * abs(delay.delay):.0f} ms"
 
 
 @_worded.register
@@ -564,32 +594,33 @@ def _(slope: SlopeFactors) -> str:
 
 @_worded.register
 def _(velocity: LateVelocity) -> str:
-    return f"the velocity comes {1e3 * velocity.lag:.0f} ms after their slope"
+    return f"the velocity lags this slope by {1e3 * velocity.lag:.0f} ms"
 
 
 @_worded.register
 def _(error: ErrorRatio) -> str:
-    return f"{error.ratio:.2f} times the error as recorded ({-error.sigmas:.0f} standard errors)"
+    return f"{error.ratio:.2f} × error ({-error.sigmas:.0f} std. errors)"
 
 
 @_worded.register
 def _(nearest: NextBest) -> str:
-    return f"next best: {described(nearest.change)} (error {nearest.ratio:.2f} times as large)"
+    return f"next best {nearest.ratio:.2f} × error: {described(nearest.change)}"
 
 
 @_worded.register
 def _(nearest: NearestZero) -> str:
-    return f"{described(nearest.change)}: error {nearest.ratio:.2f} times as large"
+    degrees = np.degrees(nearest.change.change.size)
+    return f"{', '.join(_names(nearest.change))} {degrees:+.0f}°: {nearest.ratio:.2f} × error"
 
 
 @_worded.register
 def _(image: MirrorImage) -> str:
-    return f"its mirror image moves alike, with {described(image.change)}"
+    return f"its mirror image moves the same way, with {described(image.change)}"
 
 
 @_worded.register
 def _(unseen: UnseenFriction) -> str:
-    return f"no friction is visible in {', '.join(unseen.joints)}"
+    return f"no friction visible in {', '.join(unseen.joints)}"
 
 
 @_worded.register
@@ -602,13 +633,13 @@ def _(scales: OtherScales) -> str:
     if not scales.factors:
         return "the torque does not show the scale of most positions"
     factors = ", ".join(f"{joint} {number(factor, 2)}" for joint, factor in scales.factors)
-    return f"the torque fits positions multiplied by another factor better: {factors}"
+    return f"the torque fits better with scaled positions: {factors}"
 
 
 @_worded.register
 def _(found: NoBetter) -> str:
     changes = " or ".join(map(described, found.changes))
-    return f"{changes} explains no more than chance does"
+    return f"{changes} explains no more than chance"
 
 
 @_worded.register
@@ -621,28 +652,25 @@ def _(rigid: RigidShare) -> str:
 
 @_worded.register
 def _(fit: FreeFit) -> str:
-    return f"{number(fit.ratio, 2)} times the error of a fit of any masses, zeros and scales"
+    return f"{number(fit.ratio, 2)} times the error of a fit with free masses, zeros and scales"
 
 
 @_worded.register
 def _(size: SizeRatio) -> str:
-    return f"measured over expected by {_expected(size)}: {number(size.ratio, 2)}"
+    return f"{number(size.ratio, 2)} times {_expected(size)}"
 
 
 @_worded.register
 def _(body: LastBody) -> str:
-    return (
-        f"the motion determines {body.determined} of the {body.total} parameters of the body of"
-        f" {body.joint}, including everything it carried"
-    )
+    return f"{body.determined} of {body.total} of its parameters known"
 
 
 @_worded.register
 def _(interval: DelayInterval) -> str:
-    text = f"± {1e3 * interval.half:.1g} ms"
+    text = f"± {number(1e3 * interval.half, 1)} ms"
     if interval.delay is not None:
         return f"{1e3 * interval.delay:.1f} {text}"
-    return f"{text}; other parts are not predicted better" if interval.unconfirmed else text
+    return f"{text}; predicts no better" if interval.unconfirmed else text
 
 
 @_worded.register
@@ -652,10 +680,10 @@ def _(problem: DelayProblem) -> str:
 
 @_worded.register
 def _(shape: FilterShape) -> str:
-    kind = f"order {shape.order}, {'causal' if shape.causal else 'without phase'}"
+    kind = f"{'causal' if shape.causal else 'zero-phase'} order {shape.order}"
     if shape.confirmed:
         return f"{kind}, fits better"
-    return f"{kind}; a delay, or friction that reverses smoothly, predicts as well"
+    return f"{kind}; a delay or smooth friction reversal predicts as well"
 
 
 @_worded.register
@@ -676,7 +704,7 @@ def _(found: BeyondEffort) -> str:
 
 @_worded.register
 def _(found: BeyondMasses) -> str:
-    return f"the torque is {number(found.ratio, 2)} times the torque of {_expected(found)}"
+    return f"the torque is {number(found.ratio, 2)} times {_expected(found)}"
 
 
 @_worded.register
@@ -689,17 +717,17 @@ def _(lengths: OtherLengths) -> str:
 
 @_worded.register
 def _(times: OtherTimes) -> str:
-    return f"times that are {times.factor:.3g} times the true ones"
+    return f"recorded times are {times.factor:.3g} times the true times"
 
 
 @_worded.register
 def _(torque: UnexplainedTorque) -> str:
-    return f"{percentage(torque.error)} of the torque stays unexplained, whatever the masses"
+    return f"no masses explain {percentage(torque.error)} of the torque"
 
 
 @_worded.register
 def _(axes: OtherAxes) -> str:
-    return f"the torque follows it with other {' and '.join(axes.aspects)} only"
+    return f"the torque follows it only with other {' and '.join(axes.aspects)}"
 
 
 @_worded.register
@@ -822,6 +850,6 @@ def _(changed: ChangedReading) -> str:
 @import_messages.worded.register
 def _(time: DoubtfulTime) -> str:
     return (
-        f"warning: recorded times are {time.factor:.3g} times the true ones: "
-        f"{_BASES[Basis.INERTIA]}; {_STEPS[NextStep.STATE_RATE]}"
+        f"warning: recorded times are {time.factor:.3g} times the true times: the torque's inertia"
+        f" fits other times, its weight fits the URDF; {_STEPS[NextStep.STATE_RATE]}"
     )

@@ -572,6 +572,8 @@ Evidence = (
     | FilterShape
     | Contradiction
     | NoJointTorque
+    | SampleTimes
+    | TimeBase
 )
 """From what a row concludes."""
 

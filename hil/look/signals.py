@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from typing import Final
 
 import numpy as np
@@ -62,7 +63,7 @@ from identification.signals.recording import (
     MIN_MOVEMENT,
     Recording,
 )
-from identification.signals.sample_times import time_base
+from identification.signals.sample_times import TimeBase, time_base
 
 _MAX_RATIO_DEVIATION: Final = 0.1  # relative deviation of their ratio
 _MAX_LAG_SECONDS: Final = 0.1  # s
@@ -93,17 +94,20 @@ def rows(source: Source, imported: ImportedRecording, arm: Cell | None) -> list[
     concluded = imported.concluded
     units = [each for each in imported.examined.found if isinstance(each, _UNIT_CONCLUSIONS)]
     by_map = "time" in parse_toml(imported.map_text or "")
-    table = [_time(recording, concluded, units, by_map=by_map)]
+    base = time_base(recording.time, recording.gap_before)
+    clock = _time(base, concluded, units, by_map=by_map)
+    table = [replace(clock, evidence=(base, *clock.evidence))]
     jumps = position_steps(recording, source.name).jumps
     if source.faults or source.retimed or jumps:
-        found = RowsReading(source.faults, source.times if source.retimed else None, jumps)
+        times = source.times if source.retimed else None
+        found = RowsReading(source.faults, times, jumps)
         step = NextStep.CHECK_ENCODER if jumps else None
         table.append(
             Row(
                 "rows",
                 found,
                 Certainty.CERTAIN,
-                (Basis.POSITIONS_ALONE,),
+                (Basis.POSITIONS_ALONE, *(() if times is None else (times,))),
                 step,
                 is_fault=bool(jumps),
             )
@@ -123,9 +127,8 @@ def rows(source: Source, imported: ImportedRecording, arm: Cell | None) -> list[
 
 
 def _time(
-    recording: Recording, concluded: Sequence[Conclusion], units: Sequence[_Unit], *, by_map: bool
+    base: TimeBase, concluded: Sequence[Conclusion], units: Sequence[_Unit], *, by_map: bool
 ) -> Row:
-    base = time_base(recording.time, recording.gap_before)
     meanings = [each for each in concluded if isinstance(each, ChannelMeaning)]
     stated = next((each for each in meanings if each.kind == "time"), None)
     unit = next((each for each in units if each.kind == "time"), None)

@@ -317,12 +317,12 @@ def _resolution(prepared: Prepared) -> Iterator[Finding]:
                 reversing[j] = max(step, reversing[j])
     if coarse.any():
         found = _doubtful("coarse positions", "record more digits", limit=_MAX_ROUNDING_SHARE)
-        yield found.about(coarse > 0.0, step=coarse)
+        yield found.about(coarse > 0.0, step=coarse, unit=model.chain.position_units)
     elif reversing.any():
         presliding = max(law.presliding or 0.0 for law in model.friction.laws)
         remedy: RemedyKey = "record more digits, or leave slow rows out"
         found = _doubtful("coarse positions at rest", remedy, presliding=presliding)
-        yield found.about(reversing > 0.0, step=reversing)
+        yield found.about(reversing > 0.0, step=reversing, unit=model.chain.position_units)
 
 
 def _sampling_rate(prepared: Prepared, estimate: Estimate) -> Iterator[Finding]:

@@ -430,6 +430,11 @@ def _usable(archive: Archive, cell: Cell, recording: Recording) -> Source:
     useful = useful_part(archive, recording)
     if useful is not None:
         recording = recording.between(useful.start, useful.stop)
+    units = dict(zip(cell.joint_names, cell.model.chain.position_units, strict=True))
+    if all(name in units for name in recording.joint_names):
+        recording = replace(
+            recording, joint_units=tuple(units[name] for name in recording.joint_names)
+        )
     timed = recording
     times = stamps = None
     faults: tuple[RowFault, ...] = ()

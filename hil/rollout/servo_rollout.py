@@ -177,7 +177,7 @@ def _result(
         cell=cell.name,
         simulated=sources.header.only_simulated,
         joint_names=names,
-        units=["rad" if turns else "m" for turns in arm.model.chain.revolute],
+        units=[*arm.model.chain.position_units],
         parameters="",
         drive="a servo that was identified from commanded and measured positions",
         tool=flange_name(chain),

@@ -123,7 +123,7 @@ def roll_out(model: IdentifiedModel, options: RolloutOptions, reporter: Reporter
         cell=model.name,
         simulated=prepared.sources.header.only_simulated,
         joint_names=list(arm.model.joint_names),
-        units=["rad" if turns else "m" for turns in arm.model.chain.revolute],
+        units=[*arm.model.chain.position_units],
         parameters=model.parameters_digest,
         drive=drive,
         tool=flange_name(chain),

@@ -364,7 +364,6 @@ def _results(
         options: of the identification.
     """
     cell = sources.cell
-    turning = cell.model.chain.revolute
     estimate = found.fit.estimate
     names = cell.joint_names
     fitted_files = _files_of(sources.training)
@@ -374,7 +373,7 @@ def _results(
         cell=cell.name,
         simulated=sources.header.only_simulated,
         joint_names=list(names),
-        joint_units=["rad" if turns else "m" for turns in turning],
+        joint_units=[*cell.model.chain.position_units],
         software=software(),
         archives=fitted_files,
         predicted=[name for name in _files_of(sources.held_out) if name not in fitted_files],

@@ -1,4 +1,4 @@
-"""The conclusion of a study in sentences, and the sizes of the errors of the model in words."""
+"""The conclusion of a study in sentences, and the sizes of the model errors in words."""
 
 from __future__ import annotations
 
@@ -40,14 +40,14 @@ _WORSE: Final = ("worse", "slightly worse")
 def condition_words(condition: ConditionResult) -> str:
     """Name a condition."""
     if condition.error == "none":
-        return "no error of the model"
+        return "no model error"
     if condition.error == "all":
-        return "all errors together"
+        return "all model errors together"
     return f"{condition.error} x {condition.size}"
 
 
 def effect_words(cell: Cell) -> list[str]:
-    """Describe the errors of the model at size 1."""
+    """Describe the model errors at size 1."""
     simulation = cell.simulation
     ripple = percentage(simulation.torque_ripple)
     drift = percentage(simulation.friction_drift)
@@ -70,23 +70,22 @@ def effect_words(cell: Cell) -> list[str]:
 
 
 def conclusion_of(results: StudyResults) -> list[str]:
-    """Return the conclusion in at most ten sentences of at most 100 characters."""
+    """Return at most ten sentences of at most 100 characters, the conclusion first."""
     by_key = {condition.key: condition for condition in results.conditions}
     none = by_key[NONE.key]
     worst = by_key.get(ALL.key, none)
-    sentences = [f"Error of B over A, exact model: {_b_over_a(none, decimals=3)}."]
+    sentences = [_for_design(results.conditions)]
+    if results.quick:
+        sentences.append("The quick setting is too small to compare the methods.")
+    sentences.append(f"Error of B relative to A, exact model: {_b_over_a(none, decimals=3)}.")
     if worst is not none:
-        sentences.append(f"The same with {condition_words(worst)}: {_b_over_a(worst)}.")
+        sentences.append(f"With {condition_words(worst)}: {_b_over_a(worst)}.")
     printed = _b_over_a(worst, printed_sizes=True)
-    sentences.append(f"The same, A from 2000 rows as in the paper: {printed}.")
+    sentences.append(f"With A from 2000 rows, as in the paper: {printed}.")
     if worst is not none:
         sentences.append(_by_error(results.conditions))
     sentences.append(_of_default(worst))
-    sentences += [_of_criterion(results, criterion) for criterion in get_args(Criterion)]
-    sentences.append(_for_design(results.conditions))
-    if results.quick:
-        sentences.append("The quick setting supports no conclusion about the methods.")
-    return sentences
+    return [*sentences, *(_of_criterion(results, criterion) for criterion in get_args(Criterion))]
 
 
 def _b_over_a(condition: ConditionResult, *, printed_sizes: bool = False, decimals: int = 2) -> str:
@@ -111,7 +110,7 @@ def _by_error(conditions: Sequence[ConditionResult]) -> str:
     b = [1.0 - row.ratio for row in cases if row.verdict in _BETTER]
     a = [1.0 - 1.0 / row.ratio for row in cases if row.verdict in _WORSE]
     return (
-        f"Errors one by one: of {len(cases)} cases B is better in {len(b)}"
+        f"With single model errors: B is better in {len(b)} of {len(cases)} cases"
         f"{_at_most(b)}, A in {len(a)}{_at_most(a)}."
     )
 
@@ -161,7 +160,7 @@ def _for_design(conditions: Sequence[ConditionResult]) -> str:
         )
     ]
     if not helped:
-        return "Under no error of the model is B better than both A and the default of hil design."
+        return "B beats both A and the default of hil design under none of the model errors."
     words = condition_words(helped[0])
     more = f" and {len(helped) - 1} more" if len(helped) > 1 else ""
-    return f"B is better than both A and the default of hil design with {words}{more}."
+    return f"B beats both A and the default of hil design under {words}{more}."

@@ -101,7 +101,6 @@ def run_study(
     study = _results(root.resolve().name, cell, settings, parts)
     study = study.model_copy(update={"conclusion": conclusion_of(study)})
     write_files(root, {"results.json": study.to_json(), "report.html": study_page(study)})
-    reporter.say(f"report: {root / 'report.html'}")
     return study
 
 

@@ -14,18 +14,18 @@ def undetermined_words(estimate: DelayEstimate) -> str:
             return "the motion does not separate a delay from the other parameters"
         case UndeterminedDelay.WIDE_INTERVAL:
             return (
-                f"95 % interval of ± {estimate.half_interval * 1e3:.2g} ms: the torques change too"
-                " slowly, or are too noisy"
+                f"± {estimate.half_interval * 1e3:.2g} ms (95 %): torques change too slowly or are"
+                " too noisy"
             )
         case UndeterminedDelay.AT_LIMIT:
-            return "the residual decreases up to the longest delay tested"
+            return "the residual still decreases at the longest delay tested"
         case UndeterminedDelay.OTHER_MINIMUM:
             return f"a delay of {estimate.other * 1e3:.0f} ms explains the torques as well"
 
 
 def delay_line(estimate: DelayEstimate) -> str:
     """Return the delay with its interval."""
-    return f"delay of the torque behind the position, {_delay_words(estimate)}"
+    return f"torque delay behind the position, {_delay_words(estimate)}"
 
 
 def _delay_words(estimate: DelayEstimate) -> str:

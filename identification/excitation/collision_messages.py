@@ -10,7 +10,7 @@ def unchecked_text(exceptions: PairExceptions) -> str | None:
     unchecked, reduced = exceptions
     groups = {
         "not checked for collisions, as they are always closer than the margin": unchecked,
-        "checked with a smaller margin, as they are hardly ever further apart": reduced,
+        "checked with a smaller margin, as they are rarely further apart": reduced,
     }
     parts = [
         f"{text}: {'; '.join(map(_pair_text, pairs))}" for text, pairs in groups.items() if pairs

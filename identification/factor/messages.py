@@ -22,10 +22,10 @@ from identification.text import number
 
 WIDENINGS: Final[Mapping[Widening, str]] = {
     "torque_scale": "with the uncertain scale of torques",
-    "friction_form": "with an uncertain form of friction",
-    "friction_drift": "with friction that changes",
+    "friction_form": "with an uncertain friction law",
+    "friction_drift": "with friction drift",
     "elastic_gears": "with elastic gears",
-    "siblings": "with a common prior of the arms of its type",
+    "siblings": "with a prior shared by all arms of its type",
 }
 _LOSSES: Final[Mapping[LossName, str]] = {
     "squares": "squares",
@@ -64,11 +64,11 @@ def prior_words(origin: PriorOrigin | None) -> str:
     elif origin.fault is MassFault.UNRELATED:
         ratio = number(origin.scale, 2)
         text = (
-            "bodies of the size of the torque, as the torque is"
+            "bodies scaled to the torque, as the torque is"
             f" {ratio} times the torque of the described bodies"
         )
     else:
-        text = f"bodies of the size of the torque, as {mass_fault_words(origin.fault)}"
+        text = f"bodies scaled to the torque, as {mass_fault_words(origin.fault)}"
     if origin.stated:
         text += f", {origin.stated} values given"
     return text if origin.weight == 1.0 else f"{text}, with {origin.weight:g} times the weight"
@@ -76,7 +76,7 @@ def prior_words(origin: PriorOrigin | None) -> str:
 
 def status_words(fits: bool) -> str:
     """Return the outcome of a physically consistent fit."""
-    return "optimal" if fits else "optimal (no consistent parameters fit the data to their noise)"
+    return "optimal" if fits else "optimal (no consistent parameters fit the data within noise)"
 
 
 def _fit_words(fit: LeastSquares | Reweighted | Instrumental | PriorAndData) -> str:

@@ -121,6 +121,11 @@ class Chain:
     frames: dict[str, LinkFrame] = field(default_factory=dict, repr=False)
 
     @property
+    def position_units(self) -> tuple[str, ...]:
+        """Unit of each joint's position (n,): rad, or m of prismatic joints."""
+        return tuple("rad" if turns else "m" for turns in self.revolute)
+
+    @property
     def n_joints(self) -> int:
         """Number n of joints."""
         return len(self.joint_names)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from typing import Final
 from xml.etree.ElementTree import Element, TreeBuilder
 from xml.parsers import expat
@@ -31,6 +31,12 @@ def urdf_tree(urdf: str, *, comments: bool = False) -> Element:
         raise ModelError(f"the robot description is not XML: {problem}") from problem
     root: Element = builder.close()
     return root
+
+
+def position_units(urdf: str, joints: Iterable[str]) -> dict[str, str]:
+    """Return the unit of the position of joints by name: rad, or m of prismatic joints."""
+    kinds = {joint.get("name"): joint.get("type") for joint in urdf_tree(urdf).findall("joint")}
+    return {name: "m" if kinds[name] == "prismatic" else "rad" for name in joints}
 
 
 MAX_CHARACTERS: Final = 20_000_000

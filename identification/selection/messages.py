@@ -32,9 +32,9 @@ def candidate_words(candidates: Sequence[Candidate]) -> list[str]:
 def strength_words(strength: Strength) -> tuple[str, ...]:
     """Return the strength of a prior as phrases."""
     return (
-        f"described bodies weigh {strength.weight:g} times",
-        "physically consistent" if strength.consistent else "not restricted to possible bodies",
-        "rotors as heavy as the torque allows" if strength.wide_rotors else "rotors like the links",
+        f"prior of the bodies weighted {strength.weight:g} times",
+        "physically consistent" if strength.consistent else "physical consistency not required",
+        "wide prior of the rotors" if strength.wide_rotors else "prior of the rotors as of links",
     )
 
 
@@ -71,7 +71,7 @@ def cut_words(elimination: Elimination) -> str:
     )
     if elimination.refused:
         refused = ", ".join(elimination.refused)
-        text += f"; without any of the following, the error on held-out motion rises: {refused}"
+        text += f"; removing any of these would raise the error on held-out motion: {refused}"
     elif chosen.spread < elimination.rule.spread:
         text += f", less than {elimination.rule.spread:g}"
     return (

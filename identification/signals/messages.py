@@ -15,12 +15,12 @@ from identification.text import duration_text, number, percentage
 
 ROW_REASONS: Final[Mapping[RowReason, str]] = {
     RowReason.EDGE: "next to a gap or an end of the recording",
-    RowReason.UNMEASURED: "torque of the joint zero throughout",
+    RowReason.UNMEASURED: "joint torque zero throughout",
     RowReason.SATURATED: "torque or current saturated",
     RowReason.REST: "at rest",
-    RowReason.STANDSTILL: "slower than standstill",
+    RowReason.STANDSTILL: "below the standstill speed",
     RowReason.REVERSAL: "near a velocity reversal",
-    RowReason.SPIKE: "torque or current stands out alone",
+    RowReason.SPIKE: "isolated spike of torque or current",
 }
 
 
@@ -29,18 +29,16 @@ def clock_lines(clock: TimeBase) -> list[str]:
     lines = [f"{clock.samples} samples in {clock.duration:.6g} s, {clock.rate:.6g} Hz"]
     if clock.largest_deviation > MAX_STEP_DEVIATION:
         lines.append(
-            f"uneven: steps scatter by {percentage(clock.jitter, 1)} of the usual one, at most"
+            f"uneven: steps vary by {percentage(clock.jitter, 1)} of the usual step, at most"
             f" {percentage(clock.largest_deviation)}"
         )
     if clock.repeated:
-        lines.append(f"{clock.repeated} samples repeat the time stamp before them")
+        lines.append(f"{clock.repeated} samples repeat the previous time stamp")
     if clock.backward:
-        lines.append(f"{clock.backward} samples are older than their predecessors")
+        lines.append(f"{clock.backward} time stamps are earlier than the previous one")
     if clock.dropped:
         lines.append(
-            "1 single sample is missing"
-            if clock.dropped == 1
-            else f"{clock.dropped} single samples are missing"
+            "1 sample missing" if clock.dropped == 1 else f"{clock.dropped} samples missing"
         )
     if gaps := clock.gaps - clock.pauses:
         lines.append(f"{gaps} gap{'s' if gaps > 1 else ''}")
@@ -57,8 +55,7 @@ def time_lines(times: SampleTimes) -> list[str]:
     lines = []
     if times.removed:
         lines.append(
-            f"{times.removed} rows repeat the sample before them while the arm moves and were"
-            " removed"
+            f"dropped {times.removed} rows that repeat the previous sample while the arm moves"
         )
     if times.even or not np.isnan(times.share):
         used = f"even times, {times.missing} missing samples counted"
@@ -66,18 +63,27 @@ def time_lines(times: SampleTimes) -> list[str]:
         if not times.certain or (times.share < 0.5 and not times.even):
             used += " (positions are inconclusive)"
         lines.append(
-            f"the time stamps scatter by {percentage(times.scatter, 1)} of a step;"
-            f" share confirmed by the positions: {times.share:.2f} ± {times.deviation:.1g};"
-            f" high-frequency residual in multiples of noise: {times.residuals[0]:.3g} with the"
-            f" stamps, {times.residuals[1]:.3g} with even times; used: {used}"
+            f"the time stamps vary by {percentage(times.scatter, 1)} of a step; the positions"
+            f" confirm a fraction of {times.share:.2f} ± {times.deviation:.1g} of this;"
+            f" high-frequency residual over noise: {times.residuals[0]:.3g} with the stamps,"
+            f" {times.residuals[1]:.3g} with even times; used: {used}"
         )
     return lines
+
+
+def times_words(times: SampleTimes) -> str:
+    """Return the times that are used in a few words; "" for even stamps without repetition."""
+    parts = [f"dropped {times.removed} repeated rows"] if times.removed else []
+    if times.even or not np.isnan(times.share):
+        used = "even times used" if times.even else "stamps used"
+        parts.append(f"stamps vary by {percentage(times.scatter, 1)}: {used}")
+    return "; ".join(parts)
 
 
 def jump_words(jump: PositionJump) -> str:
     """Return what is wrong with a step of a position."""
     return (
-        f"the position of {jump.joint} jumps by {number(jump.size, 2)} rad or m at"
+        f"the position of {jump.joint} jumps by {number(jump.size, 2)} {jump.unit} at"
         f" {number(jump.time, 4)} s, faster than an arm can move"
     )
 
@@ -92,16 +98,16 @@ def faults_words(faults: RowFaults) -> str:
             longest = max(fault.duration for fault in faults.faults)
             return (
                 f"the log repeats one row {at} for up to {duration_text(longest)} while the arm"
-                f" moved on: {faults.rows} rows were left out"
+                f" keeps moving: dropped {faults.rows} rows"
             )
         case RowFaultKind.WRITTEN_TWICE:
-            return f"{faults.rows} rows {at} were written before, bit for bit, and were left out"
+            return f"dropped {faults.rows} rows {at} that repeat earlier rows bit for bit"
         case RowFaultKind.DISPLACED:
-            largest = max(fault.size for fault in faults.faults)
+            largest = max(faults.faults, key=lambda fault: fault.size)
             return (
-                f"the position of {', '.join(faults.joints)} is displaced by up to"
-                f" {number(largest, 2)} rad or m {at}, and where it was afterwards:"
-                f" {faults.rows} rows were left out"
+                f"the position of {', '.join(faults.joints)} is off by up to"
+                f" {number(largest.size, 2)} {largest.unit} {at} and then returns:"
+                f" dropped {faults.rows} rows"
             )
         case RowFaultKind.JUMP:
             return (
@@ -118,17 +124,17 @@ def _fault_words(fault: RowFault) -> str:
         case RowFaultKind.FROZEN:
             return (
                 f"the log repeats one row for {duration_text(fault.duration)} {at} while the arm"
-                f" moved on: {fault.rows} rows were left out"
+                f" keeps moving: dropped {fault.rows} rows"
             )
         case RowFaultKind.WRITTEN_TWICE:
-            return f"{fault.rows} rows {at} were written before, bit for bit, and were left out"
+            return f"dropped {fault.rows} rows {at} that repeat earlier rows bit for bit"
         case RowFaultKind.DISPLACED:
             one = fault.rows == 1
             return (
-                f"the position of {', '.join(fault.joints)} is displaced by up to"
-                f" {number(fault.size, 2)} rad or m in {fault.rows} row{'' if one else 's'}, and"
-                f" where it was after {'it' if one else 'them'}{', first' if not one else ''} {at}:"
-                f" {'it was' if one else 'they were'} left out"
+                f"the position of {', '.join(fault.joints)} is off by up to"
+                f" {number(fault.size, 2)} {fault.unit} in {fault.rows} row{'' if one else 's'}"
+                f" {at if one else f'(first {at})'} and then returns: dropped"
+                f" {'this row' if one else 'these rows'}"
             )
         case RowFaultKind.JUMP:
             return (

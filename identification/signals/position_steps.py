@@ -49,6 +49,7 @@ class PositionJump:
     joint: str
     time: float  # of the sample after the step [s], since the recording began
     size: float  # [rad or m], without the motion
+    unit: str = "rad"  # of `size`
 
 
 class PositionSteps(NamedTuple):
@@ -171,7 +172,11 @@ def _steps_of(
         row = int(found.after[k])
         jump = float(found.size[k, joint])
         position_jump = PositionJump(
-            name, recording.joint_names[joint], float(time[row] - time[0]), jump
+            name,
+            recording.joint_names[joint],
+            float(time[row] - time[0]),
+            jump,
+            recording.unit_of(joint),
         )
         by_log = every[k] or (by_whole_steps[k, joint] and often)
         tolerance = _PATH_TOLERANCE_SHARE * abs(jump) + float(rounded[joint])

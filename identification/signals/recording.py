@@ -45,6 +45,7 @@ class Recording:
     commanded_position: Array | None = None  #: (m, n) [rad or m], NaN where nothing was commanded
     gap_before: NDArray[np.bool_] | None = None  #: (m,) whether samples are missing before
     held_joints: tuple[str, ...] = ()  #: joints that are clamped or switched off
+    joint_units: tuple[str, ...] = ()  #: rad or m for each joint; empty if unknown
     provenance: Mapping[str, str] = field(default_factory=dict)  #: origin of the recording
 
     def __post_init__(self) -> None:
@@ -56,6 +57,10 @@ class Recording:
                 raise ShapeError(name, array.shape, f"{shape} (samples, joints)")
         if self.gap_before is not None and self.gap_before.shape != self.time.shape:
             raise ShapeError("gap_before", self.gap_before.shape, f"{self.time.shape}")
+
+    def unit_of(self, joint: int) -> str:
+        """Return the unit of a joint's position, as far as it is known."""
+        return self.joint_units[joint] if self.joint_units else "rad or m"
 
     @property
     def n_samples(self) -> int:

@@ -47,6 +47,7 @@ class RowFault:
         rows: how many were left out; 0 at a jump, which separates two motions.
         joints: whose positions jump, or are displaced.
         size: of the step into displaced rows, the largest [rad or m].
+        unit: of the size.
     """
 
     kind: RowFaultKind
@@ -55,6 +56,7 @@ class RowFault:
     rows: int
     joints: tuple[str, ...] = ()
     size: float = 0.0
+    unit: str = "rad"
 
 
 @dataclass(frozen=True)
@@ -169,6 +171,7 @@ def _displacements(recording: Recording, found: Sequence[Excursion]) -> Iterator
             sum(each.stop - each.start for each in own),
             (recording.joint_names[joint],),
             max(abs(each.size) for each in own),
+            recording.unit_of(joint),
         )
 
 

@@ -49,7 +49,7 @@ ARM: Final = "arm of the URDF"
 """Name of the check whether the model describes the arm of the URDF."""
 FORM: Final = "form of friction"
 """Name of the check whether a friction law lacks a term."""
-LEFT_OPEN: Final = "left open by the motion"
+LEFT_OPEN: Final = "undetermined by the motion"
 """Name of the check whether models of the same fit predict alike."""
 
 _ELEMENTS: Final = "a spring, a balancer or a hydraulic counterweight"
@@ -200,7 +200,7 @@ class _Text(string.Formatter):
                 return _change(value, self._naming)
             case PositionJump():
                 after = f"after {value.time:.3f} s of {value.recording}"
-                size = "" if format_spec == "time" else f"by {value.size:+.3g} rad or m "
+                size = "" if format_spec == "time" else f"by {value.size:+.3g} {value.unit} "
                 return f"{value.joint} {size}{after}"
             case RowFaults():
                 return faults_words(value)
@@ -255,7 +255,7 @@ def _change(change: Change, naming: Naming) -> str:
         done = "negated" if change.meaning in SIGNS else "interchanged"
         return f"{_QUANTITIES[change.meaning]} of {joints} {done}"
     joint, other = (naming.joints[index] for index in change.joints)
-    sign = "plus" if change.meaning == "angle sum" else "less"
+    sign = "plus" if change.meaning == "angle sum" else "minus"
     return f"the angle of {joint} {sign} the angle of {other}"
 
 
@@ -276,14 +276,14 @@ _CONSTANT: Final = (
 _EXCEEDS: Final = "the torque error on {motion} exceeds {limit:pc0}"
 _SLOW: Final = "the torque error on {motion} beyond noise exceeds {limit:pc1}: {each}"
 _ROWS_EQUAL: Final = (
-    "the residual is correlated over {memory:.3g} ms (median axis), {rows} rows are worth"
-    " {worth:.0f} independent ones, for {parameters} parameters"
+    "the residual is correlated over {memory:.3g} ms (median axis): {rows} rows carry as much as"
+    " {worth:.0f} independent rows, for {parameters} parameters"
 )
 _OF_RESIDUAL: Final = (
     "({error:+.3g} {torque_unit} about {at:.2g} {unit}, {relative:pc1} of its torque)"
 )
 _RIPPLE: Final = "({harmonic} per motor turn, {relative:pc1} of its torque)"
-_COARSE: Final = "the positions have a coarse resolution [rad or m]: {each}"
+_COARSE: Final = "the position resolution is coarse: {each}"
 _LAW: Final = "the friction law is {law}, chosen by inner prediction; the recordings state {stated}"
 _NEAREST: Final = "none of the tested explanations fits the recording; the nearest is"
 _TORQUE_LAGS: Final = "the torque lags the position by {delay:.3g} ± {half_interval:.2g} ms"
@@ -305,46 +305,46 @@ SENTENCES: Final[Mapping[FindingKey, Sentence]] = {
     "faulty rows": Sentence("rows", "{recording}: {faults}"),
     "spikes": Sentence(
         "rows",
-        "samples of the torque stand out alone and are left out of fit and error: {each} of {rows}"
-        " of the fitted motion",
+        "isolated torque spikes are excluded from fit and error: {each} of {rows} samples of the"
+        " fitted motion",
         "{count:g}",
     ),
     "commanded positions": Sentence(
         "positions",
-        "the positions of {recordings:6} are the commands, bit for bit: the arm follows them late"
-        "{lag}, and every speed and acceleration belongs to the plan, not to the arm",
-        optional={"lag": Optional(", here by about {delay:.0f} ms")},
+        "the positions of {recordings:6} equal the commands bit for bit: the real arm lags behind"
+        " them{lag}, and every speed and acceleration is the plan's, not the arm's",
+        optional={"lag": Optional(" by about {delay:.0f} ms")},
     ),
     "counted rows": Sentence(
         "time",
-        "the times of {recording} count its rows, and the map reads them in {unit}: with another"
-        " cycle of the controller, speeds and accelerations are wrong by the same factor in all"
-        " joints",
+        "the times of {recording} count rows, and the map reads them in {unit}: unless the"
+        " controller's cycle is one {unit}, all speeds and accelerations are wrong by the same"
+        " factor",
     ),
     "retimed": Sentence("clock", "{recordings:6}: {times}"),
     "repeated samples": Sentence(
         "clock",
-        "the log repeats or delays position samples, or lacks rows: {samples:6} (first:"
-        " {first:time}); the arm moved on",
+        "the log repeats or delays position samples, or lacks rows, while the arm moves:"
+        " {samples:6} (first: {first:time})",
     ),
     "unwrapped angles": Sentence(
-        "wrapped angles", "angles that wrap at a whole turn were unwrapped: {angles:6}"
+        "wrapped angles", "angles that wrap at a full turn were unwrapped: {angles:6}"
     ),
     "coarse positions": Sentence(
         "resolution",
-        f"{_COARSE}; more than {{limit:pc0}} of the accelerations is rounding error",
-        "{step:.2g}",
+        f"{_COARSE}; rounding makes up more than {{limit:pc0}} of the acceleration",
+        "{step:.2g} {unit}",
     ),
     "coarse positions at rest": Sentence(
         "resolution",
-        f"{_COARSE}; friction reverses over {{presliding:.2g}}, so that rounding decides its"
-        " direction at rest",
-        "{step:.2g}",
+        f"{_COARSE}; friction reverses over {{presliding:.2g}}, so rounding decides its direction"
+        " at rest",
+        "{step:.2g} {unit}",
     ),
     "folded noise": Sentence(
         "sampling rate",
-        "at {rate:.3g} Hz the torque has noise up to half this rate; sampling folds it to below"
-        " {bandwidth:g} Hz, where it is {noise:pc0} of the squared residual",
+        "sampled at {rate:.3g} Hz, the torque has noise up to half this rate; aliasing moves it"
+        " below {bandwidth:g} Hz, where it makes up {noise:pc0} of the squared residual",
     ),
     "saturation": Sentence(
         "saturation",
@@ -355,8 +355,8 @@ SENTENCES: Final[Mapping[FindingKey, Sentence]] = {
     "undetermined": Sentence("excitation", "the motion does not determine {parameters}"),
     "undetermined in one direction": Sentence(
         "excitation",
-        "the motion determines only the sum of Coulomb friction and offset of the torque of"
-        " {joints}, which moved in one direction only: {each}",
+        "{joints} moved in one direction only, so the motion determines just the sum of Coulomb"
+        " friction and torque offset: {each}",
         "{coulomb} and {offset}",
     ),
     "poor excitation": Sentence(
@@ -367,8 +367,8 @@ SENTENCES: Final[Mapping[FindingKey, Sentence]] = {
     ),
     "one direction": Sentence(
         "excitation",
-        "{joints} moved in one direction only on the fitted motion: Coulomb friction and offset of"
-        " the torque are one column of the regressor there, and only their sum is determined",
+        "{joints} moved in one direction only on the fitted motion: Coulomb friction and torque"
+        " offset share one regressor column there, so only their sum is determined",
     ),
     "good excitation": Sentence(
         "excitation",
@@ -377,66 +377,65 @@ SENTENCES: Final[Mapping[FindingKey, Sentence]] = {
     ),
     "no bodies": Sentence(
         NO_BODIES,
-        "the torque contains almost nothing of the bodies, at most {over_friction:pc0} of its "
-        "friction on any axis, and {scale:.2g} times what the masses of the URDF need: a model of"
-        " the arm was subtracted from it, as by a controller that reports external torque",
+        "the torque contains almost no rigid-body part: at most {over_friction:pc0} of the friction"
+        " on any axis, and {scale:.2g} times what the URDF's masses need; a model of the arm was"
+        " subtracted from it, as by a controller that reports external torque",
     ),
     "no gravity": Sentence(
         "gravity",
-        "gravity was removed from the torque: without it, the fitted motion is predicted with"
-        " {ratio:.2f} times the error",
+        "gravity was removed from the torque: a model without gravity predicts the fitted motion"
+        " with {ratio:.2f} times the error",
     ),
     "part of gravity": Sentence(
         "gravity",
-        "most of gravity was removed from the torque, by a model that does not fit this arm:"
-        " without gravity, the fitted motion is predicted with {ratio:.2f} times the error, and a"
-        " part of it is left",
+        "most of gravity was removed from the torque, by a model that does not fit this arm: a"
+        " model without gravity predicts the fitted motion with {ratio:.2f} times the error, but"
+        " some gravity is left",
     ),
     "rate of a torque": Sentence(
         RATE_OF_TORQUE,
-        "the recorded torque is the rate of a torque (N·m/s): its integral over time follows the"
-        " arm, and the torque itself does not",
+        "the recorded torque is a torque rate (N·m/s): its time integral follows the arm, the"
+        " recorded signal does not",
     ),
     "other times": Sentence(
         OTHER_TIMES,
-        "the recorded times are {time:.3g} times the true ones: with these, inertia and weight in "
-        "the torque fit the arm of the URDF",
+        "the recorded times are {time:.3g} times the true times, with which inertia and weight in"
+        " the torque fit the arm of the URDF",
     ),
     "torque of another run": Sentence(
         TORQUE_AND_MOTION,
-        "whatever the masses, {error:pc0} of the torque of {motion} stays unexplained: it is from "
-        "another run than the positions, from another arm, or its columns are read wrongly",
+        "no masses explain {error:pc0} of the torque of {motion}: it comes from another run than"
+        " the positions, from another arm, or its columns are misread",
     ),
     "rows backwards": Sentence(
         "time",
-        "the rows run backwards in time: friction would drive every axis, while gravity and"
-        " inertia have the right sign",
+        "the rows run backwards in time: as recorded, friction would add energy to every axis,"
+        " while gravity and inertia have the right sign",
     ),
     "zeros": Sentence(
         "zeros",
-        "the zeros of joints differ from the URDF: {each} to be added; with that, rows"
-        " that did not choose it are predicted with {error:pc0} of the error",
+        "joint zeros differ from the URDF: add {each}; this leaves {error:pc0} of the error on rows"
+        " that were not used for the choice",
         "{degrees:+.1f}°",
     ),
     "zeros, not all certain": Sentence(
         "zeros",
-        "zeros of joints differ from the URDF, not all of them certainly: {each} to be added; with"
-        " that, rows that did not choose it are predicted with {error:pc0} of the error",
+        "joint zeros differ from the URDF, though not all of them certainly: add {each}; this"
+        " leaves {error:pc0} of the error on rows that were not used for the choice",
         "{degrees:+.1f}°",
     ),
     "zeros, nearest": Sentence(
         "zeros",
-        f"{_NEAREST} zeros of joints that differ from the URDF ({{each}})",
+        f"{_NEAREST} joint zeros that differ from the URDF ({{each}})",
         "{degrees:+.1f}°",
     ),
     "alike": Sentence(
         "{change:check}",
-        "several explanations fit equally well: {alike:or}; with each of them, rows that did not "
-        "choose"
-        " it are predicted with {error:pc0} of the error",
+        "several explanations fit equally well: {alike:or}; each leaves {error:pc0} of the error on"
+        " rows that were not used for the choice",
     ),
     "nearest": Sentence("{change:check}", f"{_NEAREST} {{change}}"),
-    "another arm": Sentence(ARM, "its masses would be {scale:.2g} times the described ones"),
+    "another arm": Sentence(ARM, "the arm would have {scale:.2g} times the masses of the URDF"),
     "gravity": Sentence(
         "gravity",
         "with gravity ({best}) m/s² in base axes, {angle:.0f}° from the declared ({declared})"
@@ -444,7 +443,7 @@ SENTENCES: Final[Mapping[FindingKey, Sentence]] = {
     ),
     "scale of the torque": Sentence(
         "scale of the torque",
-        "measured torque over the torque of the nominal inertias (expected: 1): {each}",
+        "ratio of measured to nominal inertial torque (expected: 1): {each}",
         "{scale:.3g} ± {tolerance:.2g}",
     ),
     "all torques opposite": Sentence(
@@ -488,8 +487,8 @@ SENTENCES: Final[Mapping[FindingKey, Sentence]] = {
         "friction grows with the load, by {size:.3g} ± {half_interval:.2g} of the transmitted"
         " torque (median axis)",
     ),
-    "torque sign": _fault(_SIGN, "the torque of {axes} has probably the wrong sign"),
-    "position sign": _fault(_SIGN, "the position of {axes} has probably the wrong sign"),
+    "torque sign": _fault(_SIGN, "the torque of {axes} probably has the wrong sign"),
+    "position sign": _fault(_SIGN, "the position of {axes} probably has the wrong sign"),
     "axis sign": _fault(
         _SIGN, "{axes} probably turns opposite to the URDF: wrong sign of gear ratio or direction"
     ),
@@ -502,7 +501,7 @@ SENTENCES: Final[Mapping[FindingKey, Sentence]] = {
     ),
     "angle difference": _fault(
         _COUPLED_ANGLES,
-        "the recorded angle of {joint} is probably its own less the angle of {other}",
+        "the recorded angle of {joint} is probably its own minus the angle of {other}",
     ),
     "payload of a part": _fault(
         "sameness",
@@ -525,19 +524,19 @@ SENTENCES: Final[Mapping[FindingKey, Sentence]] = {
     ),
     "load": Sentence(
         "load",
-        "on {motion} the arm carried {load} the fitted motion: a body on the last link explains"
+        "on {motion} the arm carried {load} on the fitted motion: a body on the last link explains"
         " {explained:pc0} of the additional error",
         optional={
             "interval": Optional(" ± {half_interval:.2g}"),
             "load": Optional(
-                "{mass:.3g}{interval} kg {difference:more} than on",
-                "a load for a part of the time that it did not carry on",
+                "{mass:.3g}{interval} kg {difference:more} than",
+                "a load part of the time that it did not carry",
             ),
         },
     ),
     "changed torque": Sentence(
         "sameness",
-        "the torque on {motion} differs from the torque on the fitted motion by a factor: {each}",
+        "ratio of the torque on {motion} to the torque on the fitted motion: {each}",
         "{factor:.3g} ± {half_interval:.2g}",
     ),
     "changed friction": Sentence(
@@ -601,10 +600,10 @@ SENTENCES: Final[Mapping[FindingKey, Sentence]] = {
     ),
     "left open by the motion": Sentence(
         LEFT_OPEN,
-        "parameters that fit the recording equally well (to {fitted:pc1}) deviate by {open:pc1} of"
-        " the torque on {motion}, since the fitted motion leaves them open; the error of"
-        " {overall:pc1} there may come from a fault with such an effect (low sampling rate, "
-        "coarse resolution, small payload) or from chance",
+        "parameters that fit the recording equally well (to {fitted:pc1}) differ by {open:pc1} of"
+        " the torque on {motion}, as the fitted motion does not determine them; the error of"
+        " {overall:pc1} there may come from a fault with such an effect (low sampling rate, coarse"
+        " resolution, small payload) or from chance",
     ),
     "nothing explained": Sentence(
         "variance explained (R²)",
@@ -682,8 +681,8 @@ SENTENCES: Final[Mapping[FindingKey, Sentence]] = {
     "suspected delay": Sentence(
         "delay",
         "the torque probably lags the position by {delay:.3g} ± {half_interval:.2g} ms"
-        " ({assumed:.3g} ms assumed); this was not compensated, as the interval is wide and parts"
-        " of the fitted motion are not predicted clearly better",
+        " ({assumed:.3g} ms assumed); this was not compensated: the interval is wide, and parts of"
+        " the fitted motion are not predicted clearly better with it",
     ),
     "other delay": Sentence(
         "delay",
@@ -765,9 +764,9 @@ _COVER: Final = (
 _WARM_UP: Final = "warm the arm up by moving it before recording"
 _ALL_SIGNS: Final = "check the sign of the torque and the direction of each axis"
 _COUPLED: Final = (
-    "turn one joint alone and watch which angles change; if so, state it in the column map of the"
-    " log: coupled = [[{numbers}, FACTOR]] in [position] and [velocity] (joints by their columns,"
-    " from 1)"
+    "turn one joint alone and watch which angles change; if both do, state in the column map of"
+    " the log: coupled = [[{numbers}, FACTOR]] in [position] and [velocity] (columns counted from"
+    " 1)"
 )
 
 MOUNTING_STEP: Final = (
@@ -795,12 +794,12 @@ REMEDIES: Final[Mapping[RemedyKey, str]] = {
     "find why the logger stopped": (
         "find out why the logger stopped; the rest of the recording is used"
     ),
-    "check what wrote rows twice": "check what wrote rows twice; they were used once",
+    "check what wrote rows twice": "find out what wrote rows twice; each was used once",
     "check what displaced rows": (
         "check encoder and cable of the joint; all other rows of the recording are used"
     ),
     "separate the motions": (
-        "give the motions as files of their own if they are of different days"
+        "split the log into one file per motion if the motions are from different days"
     ),
     "check for damaged packets": "check for damaged packets; all other samples are used",
     "record the positions": (
@@ -808,12 +807,12 @@ REMEDIES: Final[Mapping[RemedyKey, str]] = {
     ),
     "state the sampling rate": ("state the rate of the controller: sample_rate = HZ and no [time]"),
     "log the time": "log the controller's time with each sample",
-    "log each sample once": ("log every sample of the controller once, with the controller's time"),
+    "log each sample once": "log each sample of the controller once, with the controller's time",
     "record more digits": (
         "record positions with more digits, or identify with a lower --bandwidth"
     ),
     "record more digits, or leave slow rows out": (
-        "record positions with more digits, or leave slow rows out (`hil identify --exclude-rows"
+        "record positions with more digits, or exclude slow rows (`hil identify --exclude-rows"
         " slow`)"
     ),
     "log at a higher rate": (
@@ -836,14 +835,14 @@ REMEDIES: Final[Mapping[RemedyKey, str]] = {
         "record torques and positions in one run, and compare the columns of both recordings"
     ),
     "reverse the rows": (
-        "reverse the order of the rows but not the times, and check the program that wrote them"
+        "reverse the order of the rows, but not of the times, and check the program that wrote them"
     ),
     "correct the zeros": (
         "correct them: [position] offset = [{offsets:.4f}] (rad) in the column map; compare with a"
         " posture of the arm"
     ),
     "correct the zeros if so": (
-        "compare a posture of the arm with the URDF at the same angles; if it is so: [position]"
+        "compare a posture of the arm with the URDF at the same angles; if they differ: [position]"
         " offset = [{offsets:.4f}] (rad) in the column map"
     ),
     "compare a posture": "compare a posture of the arm with the URDF at the same angles",
@@ -872,7 +871,7 @@ REMEDIES: Final[Mapping[RemedyKey, str]] = {
     ),
     "check the positions for steps": (
         "check the positions for steps: the predicted torque jumps there and the measured one does"
-        " not, as of play in gear or coupling, a slipping encoder or rounded positions"
+        " not, as with play in a gear or coupling, a slipping encoder or rounded positions"
     ),
     "use the delay found": ("run `hil identify --delay auto`, or correct the delay at its source"),
     "check the constant": (
@@ -943,8 +942,8 @@ REMEDIES: Final[Mapping[RemedyKey, str]] = {
     "check the drives and the unit": f"{_DRIVES}, and the unit of the torque",
     "move faster": "move {joints} faster and further, so that the torque exceeds the noise",
     "check for missing effects": (
-        "check for effects that the model lacks: friction curves of the report, elasticity, springs"
-        " or balancers ([[robot.elements]] of the cell file), temperature"
+        "check for effects that the model lacks: friction (see its curves in the report),"
+        " elasticity, springs or balancers ([[robot.elements]] of the cell file), temperature"
     ),
     "repeat the motion": "record the same motion three times or more (one of them is held out)",
     "check the coupling": "check sign, gear ratio, coupling and torque constant of {joints}",

@@ -93,7 +93,7 @@ def test_words_have_no_full_stop_and_no_capital(text: str) -> None:
         (
             Finding("position jumps", "wrong", values={"jumps": (FIRST,) * 5}),
             "the measured position jumped faster than an arm can move: "
-            + ", ".join(["one by +0.25 rad or m after 1.500 s of a.mcap"] * 3)
+            + ", ".join(["one by +0.25 rad after 1.500 s of a.mcap"] * 3)
             + " and 2 more",
             "",
         ),
@@ -103,8 +103,8 @@ def test_words_have_no_full_stop_and_no_capital(text: str) -> None:
                 "doubtful",
                 values={"samples": (RepeatedSamples("one", 3, "a.mcap"),), "first": FIRST},
             ),
-            "the log repeats or delays position samples, or lacks rows: one 3 in a.mcap (first:"
-            " one after 1.500 s of a.mcap); the arm moved on",
+            "the log repeats or delays position samples, or lacks rows, while the arm moves: one 3"
+            " in a.mcap (first: one after 1.500 s of a.mcap)",
             "",
         ),
         (
@@ -120,11 +120,10 @@ def test_words_have_no_full_stop_and_no_capital(text: str) -> None:
             Finding(
                 "angle difference", "wrong", "state the coupled difference", joints=(2, 1)
             ),
-            "the recorded angle of three is probably its own less the angle of two",
-            "turn one joint alone and watch which angles change; if so, state it in the column "
-            "map of"
-            " the log: coupled = [[3, 2, -1]] in [position] and [velocity] (joints by their"
-            " columns, from 1)",
+            "the recorded angle of three is probably its own minus the angle of two",
+            "turn one joint alone and watch which angles change; if both do, state in the column"
+            " map of the log: coupled = [[3, 2, -1]] in [position] and [velocity] (columns counted"
+            " from 1)",
         ),
         (
             Finding(
@@ -140,8 +139,8 @@ def test_words_have_no_full_stop_and_no_capital(text: str) -> None:
             ),
             "several explanations fit equally well: position and torque of one negated or the "
             "angle of two"
-            " plus the angle of one; with each of them, rows that did not choose it are predicted"
-            " with 50 % of the error",
+            " plus the angle of one; each leaves 50 % of the error on rows that were not used for"
+            " the choice",
             "jog one and compare direction, order and torque with the column map",
         ),
         (
@@ -153,23 +152,23 @@ def test_words_have_no_full_stop_and_no_capital(text: str) -> None:
                 joints=(1,),
                 each={"degrees": (5.73,)},
             ),
-            "the zeros of joints differ from the URDF: two +5.7° to be added; with"
-            " that, rows that did not choose it are predicted with 25 % of the error",
+            "joint zeros differ from the URDF: add two +5.7°; this leaves 25 % of the error on"
+            " rows that were not used for the choice",
             "correct them: [position] offset = [0.0000, 0.1000] (rad) in the column map; compare"
             " with a posture of the arm",
         ),
         (
             Finding("commanded positions", "wrong", values={"recordings": ("a", "b")}),
-            "the positions of a, b are the commands, bit for bit: the arm follows them late, and"
-            " every speed and acceleration belongs to the plan, not to the arm",
+            "the positions of a, b equal the commands bit for bit: the real arm lags behind them,"
+            " and every speed and acceleration is the plan's, not the arm's",
             "",
         ),
         (
             Finding(
                 "commanded positions", "wrong", values={"recordings": ("a",), "delay": 80.0}
             ),
-            "the positions of a are the commands, bit for bit: the arm follows them late, here by"
-            " about 80 ms, and every speed and acceleration belongs to the plan, not to the arm",
+            "the positions of a equal the commands bit for bit: the real arm lags behind them by"
+            " about 80 ms, and every speed and acceleration is the plan's, not the arm's",
             "",
         ),
     ],

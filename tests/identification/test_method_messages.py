@@ -48,7 +48,7 @@ WORDS: dict[EstimationMethod, str] = {
         " unconstrained estimate: weighted least squares, cluster-robust"
     ),
     EstimationMethod(LeastSquares(), BLOCKS).widened("friction_drift").widened("torque_scale"): (
-        "0.25 s, with friction that changes, with the uncertain scale of torques"
+        "0.25 s, with friction drift, with the uncertain scale of torques"
     ),
 }
 PRIORS: dict[PriorOrigin, str] = {
@@ -58,7 +58,7 @@ PRIORS: dict[PriorOrigin, str] = {
     replace(ORIGIN, fault=MassFault.NONE): "as the description has no masses",
     replace(ORIGIN, fault=MassFault.EQUAL): "as all bodies of the description have the same mass",
     replace(ORIGIN, fault=MassFault.UNRELATED, scale=20.0): (
-        "bodies of the size of the torque, as the torque is 20 times the torque of the described"
+        "bodies scaled to the torque, as the torque is 20 times the torque of the described"
     ),
 }
 

@@ -401,7 +401,7 @@ class TestJudgement:
             diagnosis=caused("torque sign", 1), purposes=purposes, asked=("feed-forward",)
         )
         assert not verdict.good
-        assert "torque of two has probably the wrong sign" in verdict.line
+        assert "torque of two probably has the wrong sign" in verdict.line
         assert "feed-forward" not in verdict.line
 
     @pytest.mark.parametrize(

@@ -83,16 +83,16 @@ def commands(time: Any, position: Any, torque: Any) -> tuple[Any, ...]:
 
 
 AXES = ("t", "q{}", "tau{}")
-NOTHING = "almost nothing of the bodies"
+NOTHING = "almost no rigid-body"
 FAULTS = {
     "gravity": Fault(without_gravity, "torque without gravity", "gravity was removed", True),
     "order": Fault(exchanged, "torque columns are of", "interchanged"),
-    "sign": Fault(negated, "torque negated", "has probably the wrong sign"),
-    "zeros": Fault(other_zeros, "zero moved by", "differ from the URDF"),
+    "sign": Fault(negated, "torque negated", "probably has the wrong sign"),
+    "zeros": Fault(other_zeros, "zero shifted by", "differ from the URDF"),
     "bodies": Fault(only_friction, NOTHING, NOTHING, True),
-    "stamps": Fault(jittered, "stamps scatter", "the time stamps scatter"),
+    "stamps": Fault(jittered, "stamps vary by", "the time stamps vary by"),
     "commands": Fault(
-        commands, "commanded", "commands, bit for bit",
+        commands, "commanded", "the commands bit for bit",
         columns=("t", "measured_position_{}", "commanded_position_{}", "measured_torque_{}"),
     ),
 }  # fmt: skip

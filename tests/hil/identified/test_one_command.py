@@ -66,7 +66,7 @@ class TestProposedMap:
         )
         torque = ChannelMeaning("tau1 .. tau3", "torque", NameBasis.NAME, None, UnitBasis.CUSTOM)
         assert torque in proposal.concluded
-        assert sentence(torque) == "tau1 .. tau3: torque, by the name; no unit stated, read as N.m"
+        assert sentence(torque) == "tau1 .. tau3: torque, by the name; N.m assumed"
 
     def test_its_text_is_the_map(self, tmp_path: Path, urdf: Path) -> None:
         path = log(tmp_path / "a.csv", ["t", "q{}", "tau{}"], TIME, POSITION, TORQUE)
@@ -373,7 +373,7 @@ class TestIdentify:
         before = (folder / "results.json").stat().st_mtime_ns
         everything = hil("identify", first, "--urdf", urdf, "--predict", second, "-v").output
         assert f"report: {report}" in everything
-        assert "a.csv: tau1 .. tau3: torque, by the name; no unit stated, read as N.m" in everything
+        assert "a.csv: tau1 .. tau3: torque, by the name; N.m assumed" in everything
         names = {path.name for path in folder.iterdir()}
         assert names >= {"a.mcap", "b.mcap", "map.toml", "results.json", "report.html", SOURCES}
         assert (folder / "results.json").stat().st_mtime_ns > before
@@ -468,7 +468,7 @@ class TestGripperThatWasNotRecorded:
         imported = import_recording(path, tmp_path / "a.mcap", lambda _: Robot.from_urdf(urdf))
         locked = cell_of(imported.archive).file.robot.locked
         assert locked == {"finger_joint": pytest.approx(0.03)}
-        said = "finger_joint: fixed at 0.03 (rad or m): a gripper that was not recorded"
+        said = "finger_joint: fixed at 0.03 m: a gripper that was not recorded"
         assert said in map(sentence, imported.concluded)
 
     def test_the_map_reads_the_log_again(self, tmp_path: Path, urdf: Path) -> None:

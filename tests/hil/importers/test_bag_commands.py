@@ -556,7 +556,7 @@ class TestServo:
             ["look", str(tmp_path / "bag.db3"), "--urdf", str(tmp_path / "robot.urdf")],
         )
         assert look.exit_code == 0, look.exception
-        assert "none, and no motor current" in " ".join(look.output.split())
+        assert "no torque and no motor current" in " ".join(look.output.split())
 
 
 class TestTemperatures:

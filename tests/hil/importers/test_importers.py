@@ -875,7 +875,7 @@ class TestDhCommands:
         arguments += ["--map", str(tmp_path / "map.toml"), "--dh", str(path), "--lock-others"]
         result = CliRunner().invoke(app, [*arguments, "--convention", "modified"])
         assert result.exit_code == 0, result.exception
-        assert "locked, rad or m: slide at 0" in result.output
+        assert "locked: slide at 0 m" in result.output
         archive = open_archive(tmp_path / "log.mcap")
         assert archive.joint_names == ("turn", "elbow", "wrist")
         assert np.array_equal(archive.columns["position"], q)
@@ -924,7 +924,7 @@ def factors(warning: str) -> dict[str, float]:
 
 ORDER = [0, 1, 2, 5, 4, 3, 6]
 ERRORS = {
-    "degrees": ({"position": DEGREES}, "degrees read as radians"),
+    "degrees": ({"position": DEGREES}, "read as degrees, none would"),
     "degrees of rad": ({"position": 1 / DEGREES}, "no joint moves further than"),
     "no velocity": ({"velocity": 0.0}, "does not follow its position"),
     "torque": ({"torque": 1000.0}, "its limit in the URDF is 150 N·m (or N): check its unit"),
@@ -1246,7 +1246,7 @@ class TestRobotOptions:
         assert "--lock-others" in self.refused(place, kind, *self.URDF)
         result = self.run(place, kind, *self.LOCKED)
         assert result.exit_code == 0, result.exception
-        assert "locked, rad or m: shoulder at 0" in result.output
+        assert "locked: shoulder at 0 rad" in result.output
         assert open_archive(place / "o.mcap").joint_names == ("elbow",)
 
     @pytest.mark.long

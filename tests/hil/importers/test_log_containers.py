@@ -120,7 +120,7 @@ def test_a_line_of_json_that_is_cut_off_is_left_out(tmp_path: Path, urdf: Path) 
     assert imported(source, urdf) == ""
     check(source, without=(COUNT - 1,))
     found = open_archive(tmp_path / "out.mcap").header.findings.lines
-    assert any("last row, which is cut off" in line for line in found)
+    assert any("truncated last row" in line for line in found)
 
 
 @pytest.mark.parametrize(

@@ -75,7 +75,7 @@ def test_rows_of_a_long_log_are_those_of_the_file(robot: Robot, tmp_path: Path) 
     (said,) = [each for each in imported.examined.found if isinstance(each, Excerpt)]
     assert (said.count, said.stretches) == (len(rows) + 1, 3)  # the header is a line as well
     assert said.total == ROWS + 1
-    assert f"{said.count} of {said.total} rows are used" in sentence(said)
+    assert f"used {said.count} of {said.total} rows" in sentence(said)
     assert not any("pause" in sentence(each) for each in imported.examined.found)
     assert not any(isinstance(each, Excerpt) for each in whole.examined.found)
 

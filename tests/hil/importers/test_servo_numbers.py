@@ -129,7 +129,7 @@ class TestTicks:
         archive = read(source)
         assert archive.columns["position"] == near(POSITION, abs=0.51 * turn / count)
         (line,) = (line for line in archive.header.findings.lines if "ticks" in line)
-        assert f"an encoder of {count}, with zero at {middle}" in line
+        assert f"encoder ticks ({count} per turn, zero at {middle})" in line
 
     def test_the_map_states_another_zero(self, tmp_path: Path, urdf: Path) -> None:
         source = write(tmp_path, ("tau{}", TORQUE), ticks(4096, 1000))

@@ -260,7 +260,7 @@ def test_damaged_samples_of_torque_are_left_out_and_counted(cases: Path, tmp_pat
     line = ("identify", damaged, "--urdf", cases / "arm.urdf", "-o", tmp_path / "found", "-v")
     code, shown = typed(*line)
     assert code == 0
-    (count,) = re.findall(r"left out of fit and error: j2 (\d) of \d+ of the fitted motion", shown)
+    (count,) = re.findall(r"excluded from fit and error: j2 (\d) of \d+ samples", shown)
     assert count == "4"
     assert "isolated outliers" not in shown
 
