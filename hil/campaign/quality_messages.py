@@ -36,26 +36,26 @@ def problem_words(problem: QualityProblem) -> str:
             )
         case StuckJoint(joint, start, commanded):
             return (
-                f"{joint} is stuck: its position does not change from {start:.2f} s after the"
-                f" start on while it is commanded to move by {commanded:.3g} rad"
+                f"{joint} is stuck: its position stops changing {start:.2f} s after the start,"
+                f" while its command moves by {commanded:.3g} rad"
             )
         case SaturatedCurrent(joint, duration):
             return f"the current of {joint} was at its limit for {duration * 1e3:.0f} ms"
         case IncompleteArchive(archived, cycles):
-            return f"{archived} of its {cycles} cycles are archived"
+            return f"only {archived} of its {cycles} cycles are archived"
         case HeldOrSlowed(time):
             return (
-                f"it was held or slowed about {time:.1f} s after its start, so it is no"
-                " repetition; leave the override at 100 %"
+                f"it was held or slowed about {time:.1f} s after its start, so it does not count"
+                " as a repetition; leave the override at 100 %"
             )
         case MovedAtRest(joint, speed, allowed):
             return (
-                f"{joint} moved at {speed:.2g} rad/s while the arm was to stand still; at most"
+                f"{joint} moved at {speed:.2g} rad/s when the arm should stand still; at most"
                 f" {allowed:.2g} rad/s are allowed"
             )
         case OtherRepetition(quantity, joint, repetitions, difference, allowed):
             return (
-                f"the {quantity} of {joint} differs from the {repetitions} repetitions before by"
+                f"the {quantity} of {joint} differs from the {repetitions} previous repetitions by"
                 f" {percentage(difference, 2)} of {_SCALES[quantity]} (rms);"
                 f" {percentage(allowed, 2)} are allowed"
             )
@@ -83,8 +83,8 @@ def replaced_words(replaced: ReplacedRepetitions) -> str:
             " it was disturbed, or the arm was changed after it"
         )
     return (
-        f"packets were missed in {', '.join(names)}, all accepted ones; they were rejected because"
-        f" {later} them, in which none was missed: all of them were disturbed, or the arm was"
+        f"packets were missed in all accepted repetitions ({', '.join(names)}); they were rejected"
+        f" because {later} them, and missed none: all of them were disturbed, or the arm was"
         " changed after them"
     )
 

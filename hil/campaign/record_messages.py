@@ -47,8 +47,8 @@ def gravity_lines(record: DryRunRecord) -> list[str]:
 def warm_up_line(record: WarmUpRecord) -> str:
     """Return the state of a warm-up that has had a motion."""
     return (
-        f"warm-up: friction changes by {percentage(record.changes[-1], 2)} a motion after"
-        f" {len(record.motions)} motions, below {percentage(record.threshold, 2)} the arm is warm:"
+        f"warm-up: friction changes by {percentage(record.changes[-1], 2)} per motion after"
+        f" {len(record.motions)} motions (warm below {percentage(record.threshold, 2)}):"
         f" {record.outcome}"
     )
 
@@ -63,7 +63,7 @@ def precision_line(record: PrecisionRecord) -> str:
     if record.outcome == "met":
         return f"{text}: all requirements are met, no more {record.unit}s"
     if record.outcome == "out of reach" and record.unit == "pair":
-        remains = "that is more than repetitions in [campaign]"
+        remains = "that exceeds repetitions in [campaign]"
         if look.worst.more is None:
             remains = (
                 "what remains is the scale of the torque (weigh a known load with hil "
@@ -72,7 +72,7 @@ def precision_line(record: PrecisionRecord) -> str:
         return f"{text}: no more pairs; {remains}"
     if record.outcome == "out of reach":
         return (
-            f"{text}: no more repetitions; another motion adds what this one does not show "
+            f"{text}: no more repetitions; another motion adds what this one lacks "
             "(hil design --given, with the same --precision)"
         )
     return text

@@ -73,7 +73,7 @@ def assumption_words(assumption: Assumption) -> str:
                 " delay"
             )
         case ZeroNominal(fields):
-            return f"[nominal] has only zeros for {', '.join(fields)}: so has the arm"
+            return f"[nominal] has only zeros for {', '.join(fields)}, and so has the simulated arm"
         case NoLostPackets(joint, turns, allowed, cycle_ms):
             return (
                 f"no packet is lost: at full speed the motor of {joint} turns by {turns:.2g}"
@@ -96,7 +96,7 @@ def undetected_words(undetected: Undetected) -> str:
             )
         case CopiedFigures.SHAPES:
             return (
-                "floor, walls and shapes: they are checked, but as the cell file and the URDF have"
+                "floor, walls and shapes: they are checked, but as the cell file and the URDF state"
                 " them"
             )
         case UncheckedPairs(exceptions):

@@ -47,15 +47,15 @@ def step_line(found: StepOutcome) -> str:
             )
         case NotRehearsed(is_of_another_plan):
             if is_of_another_plan:
-                return "rehearsed with another cell, URDF or plan than it has now"
+                return "rehearsed with another cell, URDF or plan than the campaign has now"
             return "not rehearsed on the simulated arm"
         case Rehearsed(rehearsal):
             return rehearsal_line(rehearsal)
         case NoDryRun(is_invalid):
             if is_invalid:
                 return (
-                    "the recorded one is not valid: of another plan or kind of arm, or its archives"
-                    " are missing"
+                    "the recorded dry run is not valid: it belongs to another plan or kind of arm,"
+                    " or its archives are missing"
                 )
             return "not done: every motion at 20 % of its speed"
         case DryRunDone(record):

@@ -116,6 +116,6 @@ def lower_limit_words(lower: LowerLimit) -> str:
 
 def _narrower_words(limit: NarrowerLimit) -> str:
     return (
-        f"the controller has {float32_text(limit.controller)} A as the limit of that motor, the"
-        f" cell file {limit.cell:.9g} A: write the controller's into [drive_train] current_limit"
+        f"the controller limits that motor to {float32_text(limit.controller)} A, the cell file to"
+        f" {limit.cell:.9g} A: enter the controller's value as [drive_train] current_limit"
     )

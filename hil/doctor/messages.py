@@ -116,7 +116,7 @@ def _of_scheduling(found: Scheduling) -> CheckWords:
     name = "real-time priority"
     limited = "no limit" if found.limit < 0 else f"rtprio limit {found.limit}"
     if found.is_real_time:
-        return CheckWords(name, f"{found.given} given ({limited})")
+        return CheckWords(name, f"{found.given} granted ({limited})")
     remedy = _limit_lines("rtprio", "98")
     if not 0 <= found.limit < RealTimeSettings().priority:
         remedy += ("cat /proc/sys/kernel/sched_rt_runtime_us   # 0 forbids real-time programs",)
@@ -129,7 +129,7 @@ def _of_memory(found: MemoryLock) -> CheckWords:
     remedy = _limit_lines("memlock", "unlimited")
     match found.extent:
         case LockedMemory.ALL:
-            return CheckWords("memory lock", f"given ({limited})")
+            return CheckWords("memory lock", f"granted ({limited})")
         case LockedMemory.IN_USE_AT_START:
             facts = f"only what is in use at the start; {limited}"
             return CheckWords("memory lock", facts, remedy)

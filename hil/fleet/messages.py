@@ -128,7 +128,7 @@ def notes(fleet: FleetTrend) -> Iterator[str]:
     """Yield what limits the result."""
     if not fleet.covariates:
         yield (
-            "no recording has a temperature: warm-up and season count as noise from day to day"
+            "no recording has a temperature, so warm-up and season count as day-to-day noise"
             + (", except for changes that all robots share" if fleet.seasonal else "")
         )
     for robot, places in fleet.twice.items():
@@ -140,5 +140,5 @@ def notes(fleet: FleetTrend) -> Iterator[str]:
         yield f"no recording has a column {name!r} of numbers"
     if fleet.dated_by_file:
         recordings = plural(fleet.dated_by_file, "recording")
-        yield f"{recordings} dated by the file alone, which a copy changes; see --robot"
+        yield f"{recordings} dated only by the file's time, which copying changes; see --robot"
     yield from batch_lines(fleet.warnings)

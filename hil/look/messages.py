@@ -263,9 +263,9 @@ def row_text(row: Row) -> RowText:
 
 def _reason(evidence: Evidence, reading: Reading) -> str:
     """Return evidence in words; the second of two explanations is not repeated."""
-    is_either = isinstance(evidence, NextBest) and isinstance(reading, Either)
-    if is_either and evidence.change == reading.change:
-        return f"the second: {evidence.ratio:.2f} × error"
+    match evidence, reading:
+        case NextBest(change, ratio), Either(change=second) if change == second:
+            return f"the second: {ratio:.2f} × error"
     return worded(evidence)
 
 

@@ -120,7 +120,7 @@ def _of_recordings(
         case StatedText(text, recording):
             return f"{recording}: {text}" if recording else text
         case RejectedArchive(recording, reason):
-            return f"{recording} was rejected and left out: {reason}"
+            return f"{recording} was rejected and is not used: {reason}"
         case EndedEarly(recording, outcome):
             return f"{recording} ended {outcome}"
         case NotJudged(recording):
@@ -129,7 +129,7 @@ def _of_recordings(
                 " quality of the recording was checked"
             )
         case RepairedArchive():
-            return "it was repaired with loss"
+            return "data were lost when it was repaired"
         case OtherMeaning(_, words, next_step):
             return f"{words}: {next_step}"
         case RestPredicted(fitted):
@@ -153,9 +153,9 @@ def _of_rows(note: MergedSamples | UnevenClock | PositionNoise | FittedRows) -> 
         case UnevenClock(recording, base):
             return f"{recording}: {'; '.join(clock_lines(base))}"
         case PositionNoise(at_standstill=True):
-            return "the noise of the positions was measured at standstill"
+            return "position noise was measured at standstill"
         case PositionNoise():
-            return "the noise of the positions was estimated from their high-frequency part"
+            return "position noise was estimated from the high frequencies of the positions"
         case FittedRows(rows, excluded):
             fitted = percentage(1.0 - sum(excluded.values()), 1)
             parts = ", ".join(
@@ -163,7 +163,7 @@ def _of_rows(note: MergedSamples | UnevenClock | PositionNoise | FittedRows) -> 
                 for reason, share in excluded.items()
             )
             return (
-                f"of {rows} rows (one joint at one sample) {fitted} were fitted; excluded: {parts}"
+                f"{fitted} of {rows} rows (one joint at one sample) were fitted; excluded: {parts}"
             )
     assert_never(note)
 
@@ -178,8 +178,8 @@ def _of_cell(note: AssumedTorqueConstants | AssumedPayload) -> str:
             )
         case AssumedPayload():
             return (
-                "the figures of the payload are assumed ([robot.payload]): their errors are in the"
-                " parameters of the last link (weigh it with `hil payload`)"
+                "mass and centre of the payload are assumed ([robot.payload]); their errors are in"
+                " the parameters of the last link (weigh it with `hil payload`)"
             )
     assert_never(note)
 
@@ -190,10 +190,14 @@ def _of_delay(note: EstimatedDelay | NoOtherDelay | CompensatedDelay | DelayNotA
             return delay_line(estimate)
         case NoOtherDelay(assumed, beside_low_pass):
             low_pass = " in addition to the low-pass of the torque" * beside_low_pass
-            return f"no other delay than the assumed {1e3 * assumed:.3g} ms was applied{low_pass}"
+            return f"no delay other than the assumed {1e3 * assumed:.3g} ms was applied{low_pass}"
         case CompensatedDelay(delay, stated):
-            beside = "" if stated is None else f", by this and the stated {1e3 * stated:.3g} ms"
-            return f"a delay of {1e3 * delay:.3g} ms of all axes was compensated{beside}"
+            combined = (
+                ""
+                if stated is None
+                else f", the estimate combined with the stated {1e3 * stated:.3g} ms"
+            )
+            return f"a delay of {1e3 * delay:.3g} ms of all axes was compensated{combined}"
         case DelayNotApplied(estimate, reason):
             return f"{delay_line(estimate)}; not applied, as {_WHY_NOT_APPLIED[reason]}"
     assert_never(note)
@@ -203,16 +207,16 @@ def _of_estimate(note: Note) -> str:
     match note:
         case LoadNotConverged(change, passes):
             return (
-                "the friction that grows with load still changed the torque by"
-                f" {percentage(change, 1)} in pass {passes}"
+                f"load-dependent friction still changed the torque by {percentage(change, 1)} in"
+                f" pass {passes}"
             )
         case IntervalUnits(scale):
             return (
-                "the intervals of the parameters are in units of the torque of this arm; absolute"
-                f" ones are computed {scale_words(scale)}"
+                "parameter intervals are in units of this arm's torque; absolute intervals are"
+                f" computed {scale_words(scale)}"
             )
         case ElasticGears():
-            return "they allow for elastic gears between motors and links"
+            return "the intervals allow for elastic gears between motors and links"
         case PoorlySeparated(condition, from_sums):
             how = (
                 ", and sums of squares lose digits there; `hil identify` on these archives uses QR"
@@ -224,7 +228,7 @@ def _of_estimate(note: Note) -> str:
                 f" parameters poorly{how}"
             )
         case UnrestrictedBodies(reason):
-            return f"all bodies were allowed because {reason}"
+            return f"physically impossible bodies were allowed because {reason}"
         case ManyOutliers(joint, share):
             return (
                 f"{percentage(share)} of the rows of {joint} deviate by more than four standard"

@@ -56,7 +56,7 @@ def verdict_of(results: ServoResults) -> ServoVerdict:
     line = (
         f"The servo model {'predicts' if good else 'does not predict'} {results.tested_on} from its"
         f" commands: position error of {figures} {unit} RMS ({_judged(worst)[1]:.3g} {unit} if the"
-        " arm were where it is commanded)."
+        " arm followed its commands exactly)."
     )
     if results.stuck:
         warnings.append(
@@ -174,7 +174,7 @@ def _held(contacts: Sequence[ServoContact]) -> str:
     """Return when something held the arm, and which joints."""
     joints = ", ".join(dict.fromkeys(contact.joint for contact in contacts))
     spans = _times(held_spans(contacts))
-    return f"something held the arm from {spans} (beyond all friction of {joints})"
+    return f"something held the arm from {spans} (more than friction of {joints} explains)"
 
 
 def _times(spans: Sequence[tuple[float, float]]) -> str:

@@ -167,7 +167,7 @@ def test_a_repetition_with_a_stuck_joint_is_run_again(tmp_path: Path) -> None:
     first = open_archive(seen.folder / "archives" / "excitation_000_a1.mcap").outcome
     assert first is not None
     assert first.outcome == "rejected"
-    assert first.reason.startswith("joint_1 is stuck: its position does not change from 0.")
+    assert first.reason.startswith("joint_1 is stuck: its position stops changing 0.")
     # The arm may need a further attempt to come to rest.
     assert {"excitation_000_a2.mcap", "excitation_000_a3.mcap"} & {*seen.found.pooled}
 

@@ -46,7 +46,7 @@ WORDS: dict[Note, str] = {
     DifferentSetups((Setup(), Setup(0.002, 3.0, (0.0, 0.0, 0.1), frame="tool0"))): (
         "compensated: nothing; torque lags by 2 ms, carries 3 kg at (0, 0, 0.1) m in tool0"
     ),
-    notes.RepairedArchive(): "it was repaired with loss",
+    notes.RepairedArchive(): "data were lost when it was repaired",
 }
 
 

@@ -183,7 +183,7 @@ def test_the_page_has_rehearsal_dry_run_warm_up_and_rejections(folder: CampaignF
     assert "shoulder 30 %, elbow 12 %" in steps["dry run"].details[0]
     assert not steps["warm-up"].done and steps["warm-up"].words == "not warm after 3 motions"
     (drifting,) = steps["warm-up"].details
-    assert "changes by 11.11 % a motion after 3 motions, below 0.20 %" in drifting
+    assert "changes by 11.11 % per motion after 3 motions (warm below 0.20 %)" in drifting
     assert "1 rejected" in steps["repetitions"].words
     assert steps["repetitions"].details == [f"{name} rejected: it was held"]
 

@@ -15,15 +15,15 @@ from tests import messages
 WORDS: dict[QualityProblem, str] = {
     problems.MissedPackets(31, 1000): "31 of 1000 packets were missed; 1 % are allowed",
     problems.StuckJoint("elbow", 0.2, 0.0312): (
-        "elbow is stuck: its position does not change from 0.20 s after the start on while it is"
-        " commanded to move by 0.0312 rad"
+        "elbow is stuck: its position stops changing 0.20 s after the start, while its command"
+        " moves by 0.0312 rad"
     ),
     problems.SaturatedCurrent("elbow", 0.01): "the current of elbow was at its limit for 10 ms",
-    problems.IncompleteArchive(400, 1000): "400 of its 1000 cycles are archived",
+    problems.IncompleteArchive(400, 1000): "only 400 of its 1000 cycles are archived",
     problems.HeldOrSlowed(1.23): "it was held or slowed about 1.2 s after its start",
-    problems.MovedAtRest("elbow", 0.0123, 0.001): "elbow moved at 0.012 rad/s while the arm was to",
+    problems.MovedAtRest("elbow", 0.0123, 0.001): "elbow moved at 0.012 rad/s when the arm should",
     problems.OtherRepetition("position", "elbow", 3, 0.06, 0.05): (
-        "the position of elbow differs from the 3 repetitions before by 6.00 % of the"
+        "the position of elbow differs from the 3 previous repetitions by 6.00 % of the"
         " following-error threshold (rms); 5.00 % are allowed"
     ),
     problems.OtherRepetition("current", "elbow", 3, 0.2, 0.1): "20.00 % of its rms current (rms)",
@@ -52,7 +52,7 @@ def test_the_table_has_every_problem() -> None:
     ("archives", "words"),
     [
         (("a.mcap",), "a.mcap was the only accepted repetition, and was rejected because 3 later"),
-        (("a.mcap", "b.mcap"), "packets were missed in a.mcap, b.mcap, all accepted ones"),
+        (("a.mcap", "b.mcap"), "packets were missed in all accepted repetitions (a.mcap, b.mcap)"),
     ],
 )
 def test_replaced_repetitions_are_named(archives: tuple[str, ...], words: str) -> None:

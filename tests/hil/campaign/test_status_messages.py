@@ -42,7 +42,7 @@ LINES: list[tuple[StepOutcome, str]] = [
     (steps.NotRehearsed(is_of_another_plan=True), "rehearsed with another cell, URDF or plan"),
     (steps.Rehearsed(FAILED), "the rehearsal failed: I1zz is not determined"),
     (steps.NoDryRun(), "not done: every motion at 20 % of its speed"),
-    (steps.NoDryRun(is_invalid=True), "is not valid: of another plan or kind of arm"),
+    (steps.NoDryRun(is_invalid=True), "is not valid: it belongs to another plan or kind of arm"),
     (steps.DryRunDone(DRY_RUN), "done (61 s), but not accepted; shoulder: measured torque runs"),
     (steps.DryRunDone(ACCEPTED), "accepted by ada at 2026-03-01"),
     (steps.SkippedStep(as_simulated=True), "skipped, as the arm is simulated"),
@@ -118,8 +118,7 @@ def test_details_are_for_the_report(found: StepOutcome, details: list[str]) -> N
 
 def test_a_warm_up_states_its_change() -> None:
     assert warm_up_line(WARM) == (
-        "warm-up: friction changes by 0.00 % a motion after 4 motions, below 0.20 % the arm is"
-        " warm: warm"
+        "warm-up: friction changes by 0.00 % per motion after 4 motions (warm below 0.20 %): warm"
     )
 
 

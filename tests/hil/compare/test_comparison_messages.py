@@ -21,7 +21,7 @@ WORDS: dict[Note, str] = {
         "different payloads or delays, compensated (march: nothing; june: torque lags by 2 ms)"
     ),
     notes.SingleRepetition(MARCH): "march: with one repetition, uncertainty includes noise only",
-    notes.OfCampaign(MARCH, RepairedArchive()): "march: it was repaired with loss",
+    notes.OfCampaign(MARCH, RepairedArchive()): "march: data were lost when it was repaired",
     notes.UnknownDailyVariation(): "compare campaigns at the same temperature",
 }
 

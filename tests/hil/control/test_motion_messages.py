@@ -31,7 +31,7 @@ WORDS: dict[MotionRefusal, tuple[str, ...]] = {
     ),
     refusals.BrokenConstraint(CURRENT, narrower=NarrowerLimit(4.5, 9.0)): (
         "at most 4.5 A",
-        "the controller has 4.5 A as the limit of that motor, the cell file 9 A: write the",
+        "the controller limits that motor to 4.5 A, the cell file to 9 A: enter the",
     ),
     refusals.BrokenConstraint(CONTACT, FIXED): (
         "link1 and floor: 0.01 m, must be at least 0.05 m",

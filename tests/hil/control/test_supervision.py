@@ -533,7 +533,7 @@ def test_noise_recorded_while_the_arm_moved_is_recorded_again(tmp_path: Path) ->
     result = pushed.run(faulty_link(cell, f"push@{cycle}x20:axis=1"), unrehearsed=True)
     (rejected,) = result.rejected
     assert rejected.archive == "standstill_000_a1.mcap"
-    assert re.search(r"moved at .* rad/s while the arm was to stand still", rejected.reason)
+    assert re.search(r"moved at .* rad/s when the arm should stand still", rejected.reason)
     again = [path.name for path in pushed.folder.completed("standstill")]
     assert again == ["standstill_000_a2.mcap"]
 

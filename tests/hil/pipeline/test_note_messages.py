@@ -29,12 +29,14 @@ TIMES = SampleTimes(3, True, 2, 250.0, 0.1, 0.2, 0.01, (4.0, 1.5))
 SCALE = TorqueScale(np.array([0.03]), by_currents=True, source=ScaleSource.DATA_SHEET)
 WORDS: dict[Note, str] = {
     notes.StatedText("a chunk is missing", "a.mcap"): "a.mcap: a chunk is missing",
-    notes.RejectedArchive("a.mcap", "it was held"): "a.mcap was rejected and left out: it was held",
+    notes.RejectedArchive(
+        "a.mcap", "it was held"
+    ): "a.mcap was rejected and is not used: it was held",
     notes.EndedEarly("a.mcap", "stopped"): "a.mcap ended stopped",
     notes.NotJudged("a.mcap"): "a.mcap is not in its campaign's manifest.json",
     notes.AssumedTorqueConstants(can_be_weighed=True): "`hil torque-constants`",
     notes.AssumedPayload(): "[robot.payload]",
-    notes.RepairedArchive(): "it was repaired with loss",
+    notes.RepairedArchive(): "data were lost when it was repaired",
     notes.OtherMeaning("torque sign", "all torques are negative", "correct it"): (
         "all torques are negative: correct it"
     ),
@@ -75,7 +77,7 @@ def test_rows_that_are_left_out_have_their_reasons() -> None:
     every = dict.fromkeys(RowReason, 0.01)
     (line,) = note_lines([notes.FittedRows(2000, every)])
     fitted = 100 - len(RowReason)
-    assert line.startswith(f"of 2000 rows (one joint at one sample) {fitted}.0 % were fitted")
+    assert line.startswith(f"{fitted}.0 % of 2000 rows (one joint at one sample) were fitted")
     assert line.count("1.00 %") == len(RowReason)
 
 

@@ -47,7 +47,7 @@ def make_results(**changes):
         "estimator": {"name": "wls", "words": "weighted least squares (eq. 4)",
                       "prior": "nominal parameters to 10 %", "condition": 26.4,
                       "grouping": "40 of 66 standard parameters are independent."},
-        "notes": ["the noise of the positions was measured at standstill"],
+        "notes": ["position noise was measured at standstill"],
         "parameters": [
             {"name": row.pivot or row.parameter, "expression": row.parameter,
              "unit": _unit(row.pivot or row.parameter), "table2_id": row.id, "truth": truth[i],

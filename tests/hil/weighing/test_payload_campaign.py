@@ -196,7 +196,7 @@ class TestRecording:
         """What the assumed payload is wrong by is in the last link."""
         weighed, _, _ = done
         warnings = weighed.loaded.identify().results.verdict.warnings
-        assert any("the figures of the payload are assumed" in warning for warning in warnings)
+        assert any("mass and centre of the payload are assumed" in warning for warning in warnings)
 
 
 class TestInterrupted:
