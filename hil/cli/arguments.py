@@ -32,7 +32,7 @@ ArchivesArgument = Annotated[
 ]
 QuietOption = Annotated[bool, typer.Option("--quiet", "-q", help="Print only the result.")]
 VerboseOption = Annotated[
-    bool, typer.Option("--verbose", "-v", help="Print everything, not one screen.")
+    bool, typer.Option("--verbose", "-v", help="Print everything, not just one screen.")
 ]
 JsonOption = Annotated[bool, typer.Option("--json", help="Print one JSON object.")]
 DhOption = Annotated[

@@ -50,7 +50,7 @@ def batch(
     verbose: VerboseOption = False,
     json: JsonOption = False,
 ) -> None:
-    """Identify every arm from all recordings below given folders, campaign by campaign.
+    """Identify every arm from all recordings in the given folders, campaign by campaign.
 
     Recordings are archives, and with --urdf also logs and bags. One column map describes all logs
     with the same channels: --map, or one inferred from the first of them, as by `hil identify`.

@@ -28,7 +28,7 @@ def compare(
     verbose: VerboseOption = False,
     json: JsonOption = False,
 ) -> None:
-    """Compare campaigns of one arm: parameters of friction and inertia that changed, by axis.
+    """Compare campaigns of one arm: which friction and inertial parameters changed, by axis.
 
     The reference is the earliest campaign, or the first one named if not all have a recording time.
     Archives are read as by `hil batch`. Exit status 0 for any result, unless --fail-on-change

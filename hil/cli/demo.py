@@ -63,7 +63,7 @@ def demo(
         effects: Simulate effects that the model does not contain: torque ripple, friction drift,
             elasticity, delay.
         excitation: Run this excitation (a result of `hil design` for the NS 16 cell) instead of
-            searching one for a few seconds.
+            searching for one for a few seconds.
         force: Replace an earlier campaign in OUTPUT.
         resume: Continue an interrupted campaign in OUTPUT.
     """

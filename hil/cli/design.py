@@ -126,16 +126,16 @@ def design(
             [campaign].
         given: Archive or campaign folder of earlier recordings of this arm (repeatable): the motion
             adds what they lack; criteria are computed for all recordings together.
-        precision: Required halves of 95 % intervals, such as "parameters 5 %, torque 2": the motion
-            minimises the largest ratio of predicted to required interval.
+        precision: Required half-widths of 95 % intervals, such as "parameters 5 %, torque 2": the
+            motion minimises the largest ratio of predicted to required interval.
         purpose: payload: a motion of at most ten seconds that weighs a payload (`hil payload`), for
             a known arm, preferably from --given.
-        payload_mass: With --for payload: expected mass; currents stay within their limits with it,
-            too. Default: 5 kg.
+        payload_mass: With --for payload: expected mass, with which the currents also stay within
+            their limits. Default: 5 kg.
         payload_centre: Its expected centre of mass, m in the frame of the flange. Default:
             0,0,0.1.
         repetitions: Number of repetitions of the motion. Default: as in [campaign].
-        seed: Seed of the search, on which alone the result depends. Default: as in the settings.
+        seed: Seed of the search; the same seed gives the same result. Default: as in the settings.
         workers: Number of processes; the result does not depend on it. Default: one per processor.
         limits_only: Check joint limits only and do not return to the home posture; for comparison
             with the paper, not for a robot.

@@ -60,9 +60,10 @@ def identify(
 
     A log (CSV and other text, .npz, .mat, .mcap) or a bag needs the URDF of its arm; the meaning of
     its channels is inferred from names and units, and printed. Archives contain all inputs.
-    Validation runs are predicted, never fitted. Commanded positions without torque give servo and
-    friction of each joint. Exit status 5 if the model is not good for the purposes of --for, or,
-    without it, predicts unseen motion neither to a tenth of the torque nor to twice its noise.
+    Validation runs are predicted, never fitted. From commanded positions without torque it
+    identifies servo and friction of each joint. Exit status 5 if the model fails a purpose of
+    --for; without --for, if its error on unseen motion exceeds both a tenth of the torque and twice
+    the noise.
 
     **Examples:** `hil identify log.csv --urdf arm.urdf`, `hil identify runs/demo`
 
@@ -71,10 +72,10 @@ def identify(
             next to the first recording, named after it.
         predict: Recording to predict instead of fit (repeatable).
         paper: Filter torques and regressor in the same way, as in the paper.
-        split: Fraction fitted without a validation run.
+        split: Fraction of a recording to fit if there is no validation run.
         fit_all: Hold nothing out; no model is then judged good.
         annotate: Also write archives with predicted torque, for viewers.
-        compare: MJCF to compare servo parameters with, without torque.
+        compare: MJCF whose servo parameters to compare with, for recordings without torque.
     """
     reporter = make_reporter(quiet=quiet or json, messages=verbose)
     stated = {"in_sample": fit_all, "estimator": estimator, **required.options()}

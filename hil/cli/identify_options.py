@@ -29,8 +29,8 @@ DelayOption = Annotated[
     str | None,
     typer.Option(
         metavar="SECONDS",
-        help="Delay of the torque after the position, s; or auto, stated. Default: as in the "
-        "cell, unless contradicted.",
+        help="Time by which the torque lags the position, s; or auto, stated. Default: as in the "
+        "cell, unless the data contradict it.",
         rich_help_panel=ESTIMATION,
     ),
 ]
@@ -64,7 +64,7 @@ class Identifying:
         Literal["auto", "position", "measured"],
         typer.Option(
             metavar="SOURCE",
-            help="From position (smoothed) or measured.",
+            help="Velocity source: position (smoothed) or measured.",
             rich_help_panel=ESTIMATION,
         ),
     ] = "auto"
@@ -80,7 +80,7 @@ class Identifying:
         str,
         typer.Option(
             metavar="HZ",
-            help="Low-pass that the recorded torque went through; or none, auto.",
+            help="Bandwidth to which the torque was filtered before recording; or none, auto.",
             rich_help_panel=ESTIMATION,
         ),
     ] = "auto"

@@ -1,4 +1,4 @@
-"""`hil look`: what a recording contains, and what it can determine."""
+"""`hil look`: show what a recording contains and what it can determine."""
 
 from __future__ import annotations
 

@@ -75,8 +75,8 @@ def new(
     with a "?" is refused with a list of all unknown values and where to find each of them. For an
     arm with known Denavit-Hartenberg parameters and no URDF use --dh.
 
-    A Universal Robots arm (--controller ur --host HOST) states type, serial number, calibration,
-    limits, payload and its torque constants: nothing moves, and nothing is claimed. Without --urdf
+    With --controller ur --host HOST, a Universal Robots arm gives its type, serial number,
+    calibration, limits, payload and torque constants; nothing moves or is claimed. Without --urdf
     its own kinematics are used, without masses.
 
     **Examples:** `hil new --urdf robot.urdf --from-controller 10.2.12.150 -o cell.toml`, `hil new
@@ -96,7 +96,7 @@ def new(
         wait: Time to wait for the controller, s.
         base: Link from which the arm starts, of a robot with several arms; joints outside it are
             fixed. Default: the root of the URDF.
-        tip: Last link of the arm, such as the flange before a gripper. Default: every end.
+        tip: Last link of the arm, such as the flange before a gripper. Default: all ends.
         fix: Joint to fix, at a position in rad or m (default 0; repeatable). Prismatic joints are
             fixed, except along gravity in a cell for recordings.
         design_only: For an arm moved by another controller: no drive train and no link; values that

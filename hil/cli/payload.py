@@ -40,8 +40,8 @@ def payload(
     Fits the difference between recordings without and with the payload, on one model of the arm.
     With -v prints the values in the form that controllers of COMAU, UR, Franka, KUKA, ABB and FANUC
     expect.
-    Exit status 5 if a value of --check lies outside its interval, or if the bare recordings are
-    certainly other than described, such as of another mounting of the arm or with other zeros.
+    Exit status 5 if a value of --check lies outside its interval, or if the bare recordings
+    certainly contradict the description of the arm, such as another mounting or other zeros.
 
     **Examples:**
 

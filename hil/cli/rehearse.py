@@ -28,7 +28,7 @@ def rehearse(
 
     Masses, inertias, rotor inertias and friction of the simulated arm differ by up to 10 % from the
     nominal ones, its currents are noisy, and its link loses a packet now and then. The rehearsal
-    passes if the estimate contains the simulated parameters, held-out motion is predicted down to
+    passes if the intervals contain the simulated parameters, held-out motion is predicted down to
     the noise, no motion is refused and no motor comes near its limit. Everything is then run again
     with ripple, drift, elasticity and delay. `hil run` requires a rehearsal of the same cell, URDF
     and plan. It takes one to two minutes, on a busy computer up to five.

@@ -64,7 +64,7 @@ def rollout(
 
     Windows start at measured states; after 0.1, 0.2, 0.5 and 1 s the positions are compared with
     the measured ones, for the identified arm, the nominal one, and arms drawn from the posterior.
-    The arm is driven by the recorded torque and a light feedback, or by a servo. Parameters and
+    The arm is driven by the recorded torque and weak feedback, or by a servo. Parameters and
     settings come from results.json and parameters.json in a folder, as for `hil export`; its report
     gets a section. Archives without torque are simulated on a servo, which is identified with
     friction and rotors from commanded and measured positions, with the masses of the URDF. Writes

@@ -77,7 +77,7 @@ def run(
         dry_run: Run only the dry run: every motion at 20 % of its speed.
         accept_dry_run: Confirm that the dry run was watched and its motions are clear. On a
             simulated controller no earlier dry run is needed.
-        accept_torque: Joint whose torque had a known reason to oppose gravity in the dry run.
+        accept_torque: Joint whose torque opposed gravity in the dry run for a known reason.
         no_identify: Only run; no parameters and no report.
         until_precise: End the repetitions when the required precision is reached, or when more of
             them do not help. Their number in [campaign] is the limit.

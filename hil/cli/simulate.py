@@ -173,7 +173,7 @@ def simulate(
         cell: Cell file; without a [simulation] table the arm has the values of [nominal].
         udp: Address of the PC program.
         can: CAN bus in place of UDP, in python-can names, such as socketcan:can0.
-        link: Either of them, such as udp:127.0.0.1:2001; or rtde:HOST[:PORT].
+        link: UDP or CAN address in one option, such as udp:127.0.0.1:2001; or rtde:HOST[:PORT].
         cycle: Cycle, ms. Default: as in the cell.
         mode: Open mode: 1, 2, 4, 5, 7, 8 or 9. Default: as in the cell.
         stagger: Cycles between two axes entering open mode.

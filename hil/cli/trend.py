@@ -1,4 +1,4 @@
-"""`hil trend`: what changes over time in the robots of a fleet."""
+"""`hil trend`: show what changes over time in the robots of a fleet."""
 
 from __future__ import annotations
 
@@ -69,8 +69,8 @@ def trend(
         limit: Change whose date is predicted, such as 'friction +50 %' (repeatable).
         covariate: Column that may explain a change, such as a payload (repeatable). Temperatures
             and the time since the start are found by their names.
-        conditions: CSV file of what the logs lack, by date (column when) and,
-            unless it is the same for all, robot: columns of numbers such as ambient temperature.
+        conditions: CSV file of conditions that the logs lack, such as ambient temperature: a column
+            when (date), robot (unless the same for all), and columns of numbers.
         fail_on_change: Return exit status 5 if something has changed.
     """
     limits = [TrendLimit.parse(text) for text in limit or []]

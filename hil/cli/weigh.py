@@ -43,7 +43,7 @@ class WeighingOptions:
         typer.Option(
             metavar="NAME",
             help="Weigh a payload with the motion of CAMPAIGN: two pairs of recordings, and with "
-            "--precision as many as it takes. They are in payload/NAME.",
+            "--precision as many as it takes. They go into payload/NAME.",
             rich_help_panel=PAYLOAD,
         ),
     ] = None

@@ -291,7 +291,7 @@ def precision_charts(results: Results) -> list[Chart]:
         count = np.array(requirement.repetitions, np.float64)
         ratio = np.array(requirement.ratio)
         note = f"{requirement.worst} is worst"
-        what = "95 % interval over the required one, over repetitions"
+        what = "ratio of the 95 % interval to the required one, over repetitions"
         x_range = 0.5, float(count.max()) + 0.5
         traces = [rule(1.0, x_range)]
         shown = [*ratio, 0.0, 1.1]

@@ -265,7 +265,7 @@ def _outliers(series: ReportSeries, joint: Joint) -> Chart | None:
             [RESIDUAL.trace(error), Trace(error[far], SECOND, 4.0, **marks)],
         ),
     )  # fmt: skip
-    what = f"torque of held-out motion, low-passed; {int(far.sum())} samples that stand out"
+    what = f"torque of held-out motion, low-passed; {int(far.sum())} isolated samples"
     return Chart(
         Caption(f"o{joint.number}", joint.name, "", what), time, plots, joint=joint.number,
         x_range=(0.0, max(float(time[-1]), 1e-9)),

@@ -32,12 +32,12 @@ MEANINGS: Final = {
     "coulomb": "dry friction of a moving joint",
     "static": "additional dry friction at rest",
     "speed": "velocity at which static friction has faded to 37 %",
-    "load": "dry friction for each N·m (N) that the bodies load the joint with",
+    "load": "dry friction per N·m (N) of load from the bodies",
     "limit": "largest torque of the servo",
-    "dead_band": "position error up to which the servo exerts nothing",
+    "dead_band": "position error up to which the servo exerts no torque",
     "acceleration": "largest acceleration of the set-point on its way to a command",
     "delay": "time from a command to the servo",
-    "offset": "zero of the servo above the encoder's",
+    "offset": "servo zero relative to the encoder's zero",
 }
 HELD: Final = "something held the arm"
 _MOTIONS: Final = 4  # on a page

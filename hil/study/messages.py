@@ -81,7 +81,7 @@ def conclusion_of(results: StudyResults) -> list[str]:
     if worst is not none:
         sentences.append(f"With {condition_words(worst)}: {_b_over_a(worst)}.")
     printed = _b_over_a(worst, printed_sizes=True)
-    sentences.append(f"With A from 2000 rows, as in the paper: {printed}.")
+    sentences.append(f"A fitted to 2000 rows, as in the paper: {printed}.")
     if worst is not none:
         sentences.append(_by_error(results.conditions))
     sentences.append(_of_default(worst))

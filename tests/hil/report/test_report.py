@@ -536,7 +536,7 @@ class TestParameters:
         page = rendered(make_results(essential=ESSENTIAL, consistency=CONSISTENCY))
         for phrase in (
             "2 of 58 are essential",
-            "left out: f0_2",
+            "removed: f0_2",
             "needed for held-out motion",
             "by more than three standard deviations: mc2x, f0_1.",
             *CONSISTENCY["bounds"],
@@ -563,7 +563,7 @@ class TestParameters:
         html = render(make_results(parameters=parameters, essential=essential))
         table = Page(html[html.index('<section id="trust">') :]).table("With all parameters")
         remarks = [row["Remark"].replace("\xa0", " ") for row in table]
-        assert remarks == ["beyond 3σ by the selection", "beyond 3σ, with all parameters, too", ""]
+        assert remarks == ["beyond 3σ by the selection", "beyond 3σ, also with all parameters", ""]
         assert "the others absorb the effect" in Page(html).text
 
 
