@@ -262,4 +262,4 @@ def execution_of(
             return Execution(source, n_joints, settle_cycles, stop_cycles)
     except BaseException as error:
         return f"the motion source cannot be inspected: {error_text(error)}"
-    return f"a {type(source).__name__} is no source of a motion"
+    return f"a {type(source).__name__} is not a motion source"

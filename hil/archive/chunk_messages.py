@@ -158,7 +158,7 @@ class ChunkParser:
             opcode, end = verified_records.record_bounds(chunk, at, offset)
             if opcode == verified_records.MESSAGE:
                 if end - at < HEAD.itemsize:
-                    raise Damage(offset, "(chunk) ends within a record")
+                    raise Damage(offset, "(chunk) ends in the middle of a record")
                 head = chunk[at : at + _FIXED.size]
                 if head in recent and self._learn([*recent][recent.index(head) :]):
                     recent.clear()

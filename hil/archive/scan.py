@@ -160,7 +160,7 @@ class Scan:
         used = [*(head.offset for head in self.heads), self.size]
         for offset, reason in sorted(self.damages.items()):
             end = used[bisect_left(used, offset)]
-            left_out = f" (bytes {offset} to {end} are left out)" if end > offset else ""
+            left_out = f" (bytes {offset} to {end} are skipped)" if end > offset else ""
             sentences.append(f"the record at byte {offset} {reason}{left_out}")
         return [*sentences, *self.shortfalls]
 

@@ -132,7 +132,7 @@ def record_bounds(data: bytes | memoryview, at: int, offset: int) -> tuple[int, 
         end = at + RECORD.size + length
         if end <= len(data):
             return opcode, end
-    raise Damage(offset, "(chunk) ends within a record")
+    raise Damage(offset, "(chunk) ends in the middle of a record")
 
 
 def split_records(data: bytes, offset: int) -> Iterator[Record]:
@@ -169,7 +169,7 @@ def heads(stream: BinaryIO, size: int, only: Collection[int] = range(256)) -> It
             raise Damage(offset, "is cut off")
         opcode, length = RECORD.unpack(head)
         if not opcode:  # a sparse file would have as many records as bytes
-            raise Damage(offset, "is zeros, where one must begin")
+            raise Damage(offset, "is zeros where a record must begin")
         end = offset + RECORD.size + length
         if end > size:
             raise Damage(offset, "is cut off, or its length is corrupt")

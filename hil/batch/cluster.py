@@ -368,7 +368,7 @@ class Cluster:
         (future,) = self.completed(iter([self.submit(task, archives=archives)]))
         result: T | SkippedArchive | Death = self.outcome_of(future)
         if isinstance(result, Death):
-            return SkippedArchive(task.path, "ended the process that read it, twice")
+            return SkippedArchive(task.path, "crashed the process that read it, twice")
         return result
 
 

@@ -113,7 +113,7 @@ class _Search:
             self.logs.add(path.as_posix())
         elif not os.path.isfile(path):  # noqa: PTH113 - False where it cannot be reached
             self.refused.append(
-                SkippedArchive(path.as_posix(), "is no regular file that can be read")
+                SkippedArchive(path.as_posix(), "is not a regular file that can be read")
             )
         elif self._kinds is None:
             if named and path.suffix.lower() != SUFFIX:

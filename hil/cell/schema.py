@@ -371,7 +371,7 @@ class DriveTrainTable(Table):
     encoder_counts_per_revolution: Whole = field("encoder counts per motor turn", gt=0)
 
 
-_NO_CLASSIC: Final = "classic CAN is not supported any more: its frames do not carry packets whole"
+_NO_CLASSIC: Final = "classic CAN is no longer supported: its frames cannot hold a whole packet"
 
 
 class CanTable(Table):

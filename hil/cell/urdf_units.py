@@ -52,7 +52,7 @@ def unit_problem(urdf: str) -> UnitProblem | None:
             for each in wrong
         ]
     )
-    problem = f"has {found}: read in SI units no arm is like this ({places})"
+    problem = f"has {found}: in SI units no arm has such values ({places})"
     return UnitProblem(problem, _place(wrong[0]), f"write {steps}")
 
 

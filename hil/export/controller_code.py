@@ -119,7 +119,7 @@ def export_code(
     if output.suffix != f".{to}" or not _IDENTIFIER.match(name):
         raise InputError(
             output,
-            "is no name for code of a controller",
+            "cannot name controller code",
             field="--output",
             remedy=f"give NAME.{to} with NAME of lower-case letters, digits and _; names of all"
             " functions begin with it",

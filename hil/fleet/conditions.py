@@ -99,7 +99,7 @@ def _seconds(path: Path, row: int, text: str | None) -> float:
     except ValueError:
         found = date_in(stated)
         if found is None:
-            problem = f"row {row}: {stated!r} is no date"
+            problem = f"row {row}: {stated!r} is not a date"
             raise InputError(path, problem, field=_FIELD, remedy="write it as 2026-03-15") from None
         date = datetime.fromisoformat(found)
     return (date if date.tzinfo is not None else date.replace(tzinfo=UTC)).timestamp()
@@ -112,5 +112,5 @@ def _number(path: Path, row: int, name: str, text: str | None) -> float:
     try:
         return float(stated)
     except ValueError:
-        problem = f"row {row}: {stated!r} of {name} is no number"
+        problem = f"row {row}: {stated!r} of {name} is not a number"
         raise InputError(path, problem, field=_FIELD, remedy="leave it empty if unknown") from None

@@ -111,7 +111,7 @@ class RobotNaming:
         if stated := named.get("date"):
             when = date_in(stated)
             if when is None:
-                problem = f"{stated!r} is no date"
+                problem = f"{stated!r} is not a date"
                 remedy = f"name it such as 2026-03-15, or write * in place of {DATE}"
                 raise InputError(ref.origin, problem, field=_FIELD, remedy=remedy)
             # A clock that agrees has the time of day as well.

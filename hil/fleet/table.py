@@ -213,7 +213,7 @@ class _Entry(NamedTuple):
             raise InputError(path, problem, field="quantity", remedy="leave such rows out")
         when = _date(row["when"])
         if when is None:
-            problem = f"row {number}: {row['when']!r} is no date"
+            problem = f"row {number}: {row['when']!r} is not a date"
             raise InputError(path, problem, field="when", remedy="write it as 2026-03-15")
         followed = FollowedQuantity(
             str(row["joint"]), quantity, str(row.get("unit") or ""), _number(row.get("speed"))

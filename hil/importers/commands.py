@@ -208,8 +208,8 @@ def _commands_of(bag: Bag, topic: str, measured: Measured) -> Commands:
     if (wrong > np.maximum(deviation, _MAX_COMMAND_DIFFERENCE)).any():
         joint = int(np.argmax(wrong / np.maximum(deviation, _MAX_COMMAND_DIFFERENCE)))
         raise _NotCommandsError(
-            f"it does not follow the positions of {measured.joints[joint]} ({wrong[joint]:.3g} rad"
-            f" or m apart, which move by {deviation[joint]:.3g})"
+            f"it does not follow the positions of {measured.joints[joint]}: they differ by"
+            f" {wrong[joint]:.3g} (rms, rad or m) and move by {deviation[joint]:.3g}"
         )
     if known.all():
         return Commands(values, topic, reading)

@@ -219,8 +219,8 @@ class DataSet:
 
 
 _CALIBRATE: Final = (
-    "state --units deg or --units rad; or --units range, of LeRobot's calibration of the arm"
-    " (--calibration FILE.json), without one of the URDF"
+    "state --units deg or --units rad; or --units range, with LeRobot's calibration of the arm"
+    " (--calibration FILE.json) or, without it, the ranges of the URDF"
 )
 
 

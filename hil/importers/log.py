@@ -808,7 +808,7 @@ class _Log:
         matrix = np.array(drive.motor_from_joint or diagonal.tolist(), np.float64)
         self._set_terms(matrix, drive.coupling, "drive.coupling")
         if np.linalg.matrix_rank(matrix) < n:
-            problem = "no motor would move one of the joints"
+            problem = "one of the joints is moved by no motor"
             remedy = "give each joint a ratio that is not zero, by which one motor turns it"
             raise SourceError(self.path, problem, field="drive.gear_ratio", remedy=remedy)
         return matrix
@@ -857,7 +857,7 @@ def _check_lengths(
     if len({len(array) for array in arrays.values()}) > 1:
         listing = ", ".join(f"{name} {len(array)}" for name, array in arrays.items())
         problem = f"the {what} differ in length: {listing}"
-        raise SourceError(path, problem, field=field, remedy="cut them alike")
+        raise SourceError(path, problem, field=field, remedy="cut them to the same length")
 
 
 def _joint_side(values: dict[str, Array], columns: ColumnMap, log: _Log) -> dict[str, Array]:

@@ -82,12 +82,15 @@ def require_commands(archive: Archive, recording: Path, *, fitted: bool) -> None
         remedy = "record motion from commands, or name their channels (--columns)"
         raise SourceError(recording, problem, field=field, remedy=remedy)
     if np.ptp(position, axis=0).any() and np.mean((position == commanded).all(axis=1)) >= _COPIED:
-        problem = "the positions are the commands, bit for bit: they were not measured"
+        problem = "the positions equal the commands bit for bit: they were not measured"
         remedy = "record or name measured positions (--columns 'position=NAME{}')"
         raise SourceError(recording, problem, field="position", remedy=remedy)
     if (later := _samples_later(position, commanded)) is not None:
         samples = "the next sample" if later == 1 else f"{later} samples later"
-        problem = f"the commands are the positions of {samples}, bit for bit: nobody commanded them"
+        problem = (
+            f"the commands are the positions of {samples}, bit for bit: they were copied, not"
+            " commanded"
+        )
         remedy = "record the commands themselves (of LeRobot: what was sent to the motors)"
         raise SourceError(recording, problem, field=field, remedy=remedy)
     size = command_size(position, commanded)

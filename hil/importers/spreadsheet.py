@@ -47,7 +47,7 @@ def text_of_sheet(path: Path, form: Format) -> str:
     try:
         sheets = _sheets_of(path)
     except Exception as error:  # of calamine on a file in any state
-        problem = f"is no spreadsheet that can be read ({error or type(error).__name__})"
+        problem = f"cannot be read as a spreadsheet ({error or type(error).__name__})"
         raise SourceError(path, problem, remedy="save its table as CSV") from error
     sizes = {name: sum(map(len, rows)) for name, rows in sheets.items()}
     chosen = form.sheet or max(sizes, key=lambda name: sizes[name])

@@ -290,7 +290,7 @@ def _of_this_arm(
     if not contradictions.is_doubtful:
         return imported
     if len(found) > _MAX_WARNED_CONTRADICTIONS:
-        problem = f"is not of the arm of the URDF: {sentences(found)}"
+        problem = f"was not recorded on the arm of the URDF: {sentences(found)}"
         raise RefusedRecordingError(source, problem, field="--urdf", remedy=_REMEDY)
     return replace(imported, concluded=(*imported.concluded, DoubtfulArm(found)))
 
@@ -348,14 +348,14 @@ def undecided(
     problem = f"{fit_alike(choices)}: {readings}"
     if contradictions.is_doubtful:
         found = sentences(contradictions.found)
-        problem = f"may not be of the arm of the URDF: {found}; and {problem}"
+        problem = f"may not be from the arm of the URDF: {found}; and {problem}"
         remedy = f"{_REMEDY}; or {remedy}"
         return UndecidedError(source, problem, field="--urdf", remedy=remedy, aspect=aspect)
     if aspect in _OF_AXES:
         remedy += "; if none of these is the case, give the URDF of this arm"
     if aspect == "side":
         problem = f"its torque is too small for the joints of this arm; {problem}"
-        remedy += "; a map without them reads it as the torque of the joints"
+        remedy += "; a map without them reads it as joint torque"
     return UndecidedError(source, problem, field=aspect, remedy=remedy, aspect=aspect)
 
 
@@ -383,8 +383,8 @@ def _without_sign(source: Path, count: int) -> RefusedRecordingError:
 
 def _other_arm(source: Path, error: float) -> RefusedRecordingError:
     problem = (
-        "its torque does not follow the arm of the URDF: whatever the masses, "
-        f"{percentage(error)} of it stays unexplained, and no other unit, sign or order of the "
-        "joints helps: it is of another arm, or of another run than the positions"
+        "its torque does not follow the arm of the URDF: no masses explain"
+        f" {percentage(error)} of it, and no other unit, sign or joint order helps; it comes from"
+        " another arm, or from another run than the positions"
     )
     return RefusedRecordingError(source, problem, field="--urdf", remedy=_REMEDY)

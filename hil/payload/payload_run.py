@@ -156,7 +156,7 @@ def _sources_of(sides: Mapping[bool, Sequence[Path]]) -> dict[bool, Sources]:
     bare = sources[False].cell
     loaded = sources[True].cell
     if differing := arm_differences(bare, loaded):
-        problem = f"is of another arm than {bare.path}: {' and '.join(differing)} differ"
+        problem = f"belongs to another arm than {bare.path}: {' and '.join(differing)} differ"
         remedy = "give bare and loaded recordings of one arm"
         raise ArchiveError(sides[True][0], problem, field="--loaded", remedy=remedy)
     for source in (*sources[False].training, *sources[True].training):

@@ -54,9 +54,9 @@ def require_weight(
     if found.is_weightless or found.is_partly_weightless:
         assert found.weightless is not None
         problem = (
-            "gravity was removed from the torque: without it, the bare recordings are predicted"
-            f" with {found.weightless.ratio:.2f} times the error; of a load that the controller"
-            " knows, the weight is missing as well"
+            "gravity was removed from the torque: a model without gravity predicts the bare"
+            f" recordings with {found.weightless.ratio:.2f} times the error; the weight of a load"
+            " that the controller knows is missing as well"
         )
         remedy = "record the torque before gravity is removed from it"
         raise RefusedRecordingError(path, problem, field="torque", remedy=remedy)

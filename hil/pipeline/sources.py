@@ -402,7 +402,7 @@ def source_of(archive: Archive, cell: Cell, *, to_fit: bool = True) -> Source:
         problem = "is of a log whose torque is too small for the joints of this arm"
         remedy = (
             f"choose what it is by `hil look {typed(archive.path.name)}`, and import the log again"
-            " with that line in its map; a map without it reads it as the torque of the joints"
+            " with that line in its map; a map without it reads it as joint torque"
         )
         raise ArchiveError(archive.path, problem, field="side", remedy=remedy)
     return _usable(archive, cell, recording)

@@ -186,7 +186,9 @@ def stored_identification(
     if archive_digests(provenance) != archive_digests(present):
         raise NotReusableError("its archives are not the ones that were identified")
     if provenance.get("verdict") != one_line(present["verdict"]):
-        raise NotReusableError(f"{RESULTS} and {PARAMETERS_JSON} are not of one identification")
+        raise NotReusableError(
+            f"{RESULTS} and {PARAMETERS_JSON} do not belong to one identification"
+        )
     try:
         used = settings.decided()
     except ValueError as error:

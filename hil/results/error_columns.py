@@ -39,7 +39,7 @@ def error_columns(judgement: JudgementResult, *, limits: bool = False) -> list[E
         ErrorColumn("relative", "fitted", f"{error}, on fitted motion: nothing was held out")
         if judgement.in_sample
         else ErrorColumn("relative", "in motion", f"{error}, on held-out motion"),
-        ErrorColumn("fitted_relative", "fitted", "the same on the motion that was fitted"),
+        ErrorColumn("fitted_relative", "fitted", "the same on the fitted motion"),
         ErrorColumn(
             "noise_relative",
             "noise",

@@ -360,7 +360,7 @@ def _about(motion: RecordedMotion, prepared: Prepared) -> list[str]:
     if prepared.sources.in_sample:
         notes.append("the windows are of the fitted motion: nothing was held out")
     if any(samples.torque_bandwidth is not None for samples in motion.samples):
-        notes.append("the torque that the record's low-pass removed is added, by each arm's model")
+        notes.append("each arm's model adds the torque that the recording's low-pass removed")
     return notes
 
 

@@ -33,7 +33,9 @@ def maker_parameters(path: Path, joints: Sequence[str]) -> Array:
     try:
         root = ElementTree.fromstring(read_input(path, _REMEDY))
     except ElementTree.ParseError as error:
-        raise InputError(path, f"is no XML ({error})", field="--compare", remedy=_REMEDY) from error
+        raise InputError(
+            path, f"is not XML ({error})", field="--compare", remedy=_REMEDY
+        ) from error
     defaults = _defaults(root)
     elements = dict(_joints(root, defaults))
     actuators = _actuators(root, defaults)

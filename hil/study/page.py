@@ -113,11 +113,11 @@ def _ratios(results: StudyResults, motions: str) -> Panel:
     margin = 0.04 * (high - low) or 0.1
     low, high = low - margin, high + margin
     ticks = [tick for tick in _ticks(low, high) if low <= math.log10(tick) <= high]
-    what = "error of torque with B and with the gradient over that with A, by error of the model"
+    what = "torque error with B and with the gradient relative to A, by model error"
     chart = Chart(
         Caption(f"r{motions}", motions, "", what), np.empty(0),
         [Plot(22.0 * len(rows), "", traces, limits=y_limits, names=rows)],
-        f"error over A's, {motions}", x_range=(low, high),
+        f"error relative to A, {motions}", x_range=(low, high),
         ticks=[math.log10(tick) for tick in ticks], tick_names=[f"{tick:g}" for tick in ticks],
     )  # fmt: skip
     return chart_panel(chart, width=560.0, left=_NAME_WIDTH)

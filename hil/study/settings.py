@@ -45,9 +45,9 @@ class StudySettings(Frozen):
     shortest: float = Field(
         gt=0.0, le=1.0, description="share of it that a motion through via points takes at least"
     )
-    effects: bool = Field(description="whether to study errors of the model")
-    effort_a: Effort = Field(description="for each open choice of method A")
-    effort_b: Effort = Field(description="for each open choice of method B")
+    effects: bool = Field(description="whether to study model errors")
+    effort_a: Effort = Field(description="for each free choice of method A")
+    effort_b: Effort = Field(description="for each free choice of method B")
     effort_gradient: Effort = Field(description="of the genetic search before the gradient")
     gradient_steps: Count = Field(description="of method gradient")
     cell: str = Field(default="", description="digest of the cell, empty for the paper's NS 16")

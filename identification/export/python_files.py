@@ -139,7 +139,7 @@ def require_values(text: str, actuators: Actuators, names: Mapping[str, Quantity
     try:
         body = ast.parse(text).body
     except SyntaxError as error:
-        raise WriteBackError(f"the file is no Python: {error}") from error
+        raise WriteBackError(f"the file is not Python: {error}") from error
     stated = {
         node.targets[0].id: node.value
         for node in body

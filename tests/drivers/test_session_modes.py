@@ -66,7 +66,7 @@ class TestEveryMode:
 
     @pytest.mark.parametrize("source", [None, object(), 3, "begin"])
     def test_what_is_no_source_is_refused(self, source):
-        message = f"a {type(source).__name__} is no source of a motion"
+        message = f"a {type(source).__name__} is not a motion source"
         with pytest.raises(RequestError, match=message):
             Rig().session.request(source)
 

@@ -236,7 +236,7 @@ class TestLosses:
         begin = written.chunks[1].offset
         end = written.chunks[2].offset
         path.write_bytes(written.changed(written.chunks[1], -5))
-        assert f"(bytes {begin} to {end} are left out)" in repair(path).losses[0]
+        assert f"(bytes {begin} to {end} are skipped)" in repair(path).losses[0]
 
     def test_losses_of_several_repairs_add_up(self, path, written):
         _, first = repaired_twice(path, written.changed(written.chunks[3], -5))

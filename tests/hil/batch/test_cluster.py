@@ -74,7 +74,7 @@ def test_tasks_that_fail_or_end_their_process_affect_no_other():
         results = cluster.results(tasks, done.append)
     assert sum(done) == 8
     assert [results[k] for k in (0, 1, 3, 5, 6)] == [0, 1, 3, 5, 6]
-    work.check_unused(results[2], "crash-2.mcap", "ended the process that read it, twice")
+    work.check_unused(results[2], "crash-2.mcap", "crashed the process that read it, twice")
     work.check_unused(results[4], "absent-4.mcap", "No such file")
     work.check_unused(results[7], "faulty-7.mcap", "IndexError")
 

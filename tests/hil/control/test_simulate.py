@@ -337,7 +337,7 @@ def invoke(*options: str) -> Any:
     ("options", "complaint"),
     [
         (["--can", "virtual:0:fd", "--cycle", "1"], "135.7 % of a cycle of 1 ms"),
-        (["--can", "virtual:0:classic"], "classic CAN is not supported any more"),
+        (["--can", "virtual:0:classic"], "classic CAN is no longer supported"),
         (["--can", "virtual:can0:foo"], "INTERFACE:CHANNEL:fd"),
         (["--udp", "127.0.0.1:2001", "--fault", "lose@1x100000000000000000000"], "KIND@CYCLE"),
         ([], "give one of --udp, --can"),

@@ -352,7 +352,7 @@ class TestReuse:
         content["provenance"]["verdict"] = "good: of another day"
         path.write_text(json.dumps(content))
         shown = command("export", folder, "--to", "urdf").stdout
-        assert "are not of one identification" in shown
+        assert "do not belong to one identification" in shown
 
 
 def test_dates_and_free_fields_reach_every_output(

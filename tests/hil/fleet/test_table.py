@@ -98,7 +98,7 @@ class TestTable:
 
     @pytest.mark.parametrize(
         ("column", "value", "problem"),
-        [("quantity", "heat", "'heat' is none of"), ("when", "soon", "'soon' is no date")],
+        [("quantity", "heat", "'heat' is none of"), ("when", "soon", "'soon' is not a date")],
     )
     def test_a_row_that_cannot_be_read_is_named(self, tmp_path, column, value, problem):
         path = tmp_path / "wrong.csv"
@@ -170,7 +170,7 @@ class TestConditions:
         [
             ("robot,ambient\nr1,20\n", "has the columns robot, ambient"),
             ("when,robot\n2024-01-01,r1\n", "has the columns when, robot"),
-            ("when,ambient\nsoon,20\n", "row 2: 'soon' is no date"),
+            ("when,ambient\nsoon,20\n", "row 2: 'soon' is not a date"),
             ("when,ambient\n2024-01-01,warm\n", "row 2: 'warm' of ambient is no number"),
         ],
     )

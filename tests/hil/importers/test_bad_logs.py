@@ -171,7 +171,7 @@ CASES: list[tuple[Callable[[Path, Table], Path], str, str]] = [
     (a_urdf, "is a robot description (URDF), not a recording", "LOG --urdf arm.urdf"),
     (xml, "is XML, not a table of numbers", "give a table of numbers"),
     (starts_with(b"PK\x03\x04"), "is a zip file", "unzip log.csv"),
-    (starts_with(b"\xd0\xcf\x11\xe0"), "is no spreadsheet that can be read", "as CSV"),
+    (starts_with(b"\xd0\xcf\x11\xe0"), "cannot be read as a spreadsheet", "as CSV"),
     (starts_with(b"\x1f\x8b\x08"), "cut off or damaged", "zcat log.csv > part.csv"),
     (starts_with(b"ARROW1\0\0"), "is Feather", "pandas.read_feather"),
     (starts_with(b"\x80\x05\x95"), "is a pickle of Python", "pandas.read_pickle"),

@@ -182,7 +182,7 @@ REFUSED: list[tuple[str, dict[str, Any], str]] = [
     ("a.csv", {"torque": {"columns": (4, 5, 9)}}, "torque.columns: there is no column 9"),
     ("a.csv", {"torque": {"columns": (4, 5)}}, "has 2 entries; one for each of the joints hip"),
     ("a.csv", {"joints": ("a", "b", "c")}, "names the joints a, b, c; the robot's joints are hip"),
-    ("a.csv", {"drive": {"gear_ratio": (1, 0, 2)}}, "no motor would move one of the joints"),
+    ("a.csv", {"drive": {"gear_ratio": (1, 0, 2)}}, "one of the joints is moved by no motor"),
     ("a.csv", {"torque": {"columns": "tau{}", "file": "t.csv"}}, r"t\.csv: cannot be read"),
     ("a.csv", {"torque": {"columns": "tau{}", "file": "short.csv"}},
      "differ in length: position 20, torque 19"),

@@ -510,7 +510,7 @@ class TestOtherArm:
         choices = (TiedReading("zero", MOVED, 0.13, GravityOption((0.0, 0.0, 0.0))),) * 2
         refusal = undecided(tmp_path / "a.csv", choices, size)
         assert refusal.field == "--urdf"
-        assert "may not be of the arm of the URDF: a moves 75°" in refusal.problem
+        assert "may not be from the arm of the URDF: a moves 75°" in refusal.problem
         assert "two explanations fit equally well" in refusal.problem
 
     def test_readings_of_an_axis_that_are_not_so_are_another_arm(self, tmp_path: Path) -> None:

@@ -500,7 +500,7 @@ class TestMakerFile:
     @pytest.mark.parametrize(
         ("text", "problem"),
         [
-            ("no xml", "is no XML"),
+            ("no xml", "is not XML"),
             ("<mujoco/>", "no position actuator of joint a"),
             ('<default><position kp="none"/></default>', "no number"),
             ('<default><position kp="-1"/></default>', "stiffness of -1"),
