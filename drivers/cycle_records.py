@@ -186,8 +186,14 @@ class RingReader:
 class CycleRing(RingReader):
     """The last `capacity` cycle records, written in place; `shared` ones can be read elsewhere.
 
-    If records are not drained in time, the oldest are overwritten. `state` is the layout of the
-    arm's state in them (`ControllerProtocol.state`); shared memory states it itself.
+    If records are not drained in time, the oldest are overwritten.
+
+    Args:
+        n_joints: number of joints.
+        capacity: number of records.
+        state: layout of the arm's state (`ControllerProtocol.state`); shared memory states
+            its own.
+        fd: descriptor of shared memory to map; None for memory of its own.
 
     Attributes:
         fd: descriptor of the memory, -1 for its own memory.

@@ -184,12 +184,16 @@ class Check(Enum):
 class GuardError(RefusalError):
     """A quantity outside its bound.
 
-    Attributes:
+    Args:
         check: the one that failed.
-        unit: of value and bound.
         joint: index from 0.
         value: what was found.
         bound: largest magnitude allowed (or the nearer position limit).
+        cycle: in which it was found.
+
+    Attributes:
+        check, joint, value, bound: as given.
+        unit: of value and bound.
     """
 
     def __init__(

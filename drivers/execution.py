@@ -31,7 +31,11 @@ _SET_POINT: Final = ("position", "velocity")
 class Execution:
     """Set-points of a `MotionSource`.
 
-    The end is held for `settle_cycles`; a stop or hold may take `stop_cycles`.
+    Args:
+        source: of the set-points.
+        n_joints: number of joints.
+        settle_cycles: for which the end is held.
+        stop_cycles: that a stop or hold may take.
 
     Attributes:
         started: the first set-point was sent.

@@ -290,6 +290,12 @@ class SetPointGenerator:
     Methods that check or send something raise `GuardError` or `SourceFailed`; `reply` raises
     nothing.
 
+    Args:
+        guard: checks each set-point.
+        wire: packets of the controller.
+        motors: joint and motor side.
+        max_gap: missed packets in a row that a motion tolerates.
+
     Attributes:
         set_point: (n,) rad, the one sent last.
         rejected: replies that were not used according to the last packet.

@@ -44,7 +44,14 @@ class PlanningError(PlannerError):
 
 
 class LimitExceeded(PlanningError):
-    """The planned motion would break a limit of one joint (SI units)."""
+    """The planned motion would break a limit of one joint (SI units).
+
+    Args:
+        quantity: such as velocity.
+        joint: index from 0.
+        value: that is reached.
+        bound: its limit.
+    """
 
     def __init__(self, quantity: str, joint: int, value: float, bound: float) -> None:
         self.quantity = quantity
@@ -57,7 +64,14 @@ class LimitExceeded(PlanningError):
 
 
 class NotSmooth(PlanningError):
-    """The planned motion would jump between two of its pieces (SI units)."""
+    """The planned motion would jump between two of its pieces (SI units).
+
+    Args:
+        quantity: such as velocity.
+        joint: index from 0.
+        time: of the jump [s].
+        jump: its size.
+    """
 
     def __init__(self, quantity: str, joint: int, time: float, jump: float) -> None:
         self.quantity = quantity
@@ -75,7 +89,14 @@ class UnsupportedSolver(PlannerError, RuntimeError):
 
 
 class StartMismatch(PlannerError):
-    """A joint is farther from the start or resume point of a motion than the tolerance [rad]."""
+    """A joint is farther from the start or resume point of a motion than the tolerance [rad].
+
+    Args:
+        joint: index from 0.
+        value: position of the joint [rad].
+        expected: position in the motion [rad].
+        tolerance: largest distance [rad].
+    """
 
     def __init__(self, joint: int, value: float, expected: float, tolerance: float) -> None:
         self.joint = joint

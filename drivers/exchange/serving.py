@@ -122,8 +122,17 @@ class CommandHandler:
 
     Runs the commands of the supervisor and publishes state and events.
 
-    `terminated` returns whether the process is to end: stop on the path, leave open mode,
-    end. With `needs_archive` motions are stopped and refused while the archive is not written.
+    Args:
+        session: that is served.
+        transport: its link.
+        ring: records of its cycles.
+        events: where its events go.
+        control: state shared with the supervisor.
+        channel: socket of the supervisor.
+        terminated: returns whether the process is to end: stop on the path, leave open
+            mode, end.
+        needs_archive: whether motions are stopped and refused while the archive is not
+            written.
 
     Attributes:
         reason: why the process ends or is about to; empty otherwise.

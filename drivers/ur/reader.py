@@ -50,7 +50,14 @@ class OutputFrames(NamedTuple):
 
 
 class RtdeReader(RtdeConnection):
-    """Connection that reads all outputs of a recipe, from the first frame on."""
+    """Connection that reads all outputs of a recipe, from the first frame on.
+
+    Args:
+        connection: to the controller.
+        required: outputs without which nothing is read.
+        optional: outputs that are read if the controller has them.
+        clock: for time-outs [s].
+    """
 
     def __init__(
         self,

@@ -137,6 +137,12 @@ class UrTransport:
 
     A reply is a frame of inputs, with a program behind it if one is to run.
 
+    Args:
+        connection: socket of RTDE.
+        primary: socket of the primary interface.
+        agreed: recipes agreed on that connection.
+        description: of the arm.
+
     Attributes:
         arrived: time at which the kernel received the last frame, on the clock of `now`; None if
             unknown, and of a frame that was read together with a later one.

@@ -117,7 +117,12 @@ class Job:
 class ArchiveProcess:
     """Transfers records and events to archives as commanded by the supervisor.
 
-    `exchange` is a pidfd of the exchange process.
+    Args:
+        ring: records of the exchange process.
+        events: of the exchange process.
+        control: shared state.
+        commands: of the supervisor.
+        exchange: pidfd of the exchange process.
     """
 
     def __init__(

@@ -71,7 +71,14 @@ def _restored(kind: type[HilError], args: tuple[Any, ...], state: dict[str, Any]
 
 
 class InputError(HilError):
-    """Invalid input of the user: file (or None), field in it, problem with the value, remedy."""
+    """Invalid input of the user.
+
+    Args:
+        path: file with the input; None if it is in no file.
+        problem: what is wrong, as a clause.
+        field: field or option; "" for the whole file.
+        remedy: what to do.
+    """
 
     exit_code: ClassVar[int] = ExitStatus.BAD_INPUT
 

@@ -19,6 +19,12 @@ class DryRunStage:
     """Runs every motion that is to be sent at full speed once slowly, and has it accepted.
 
     `state` is "accepted", "to be accepted", or "left out" where the caller did without.
+
+    Args:
+        campaign: whose motions are run.
+        archives: of this run.
+        watch: progress and requests of the operator.
+        options: of this run.
     """
 
     def __init__(

@@ -26,7 +26,15 @@ class DryRunError(UnsafeError):
 
 
 class AgainstGravityError(DryRunError):
-    """A dry run with torques against gravity of the model; `joints` must be accepted by name."""
+    """A dry run with torques against gravity of the model; `joints` must be accepted by name.
+
+    Args:
+        campaign: its folder.
+        joints: that must be accepted by name.
+        problem: what the torques contradict.
+        correct: what to do if the cell is wrong.
+        command: that continues the run.
+    """
 
     def __init__(
         self, campaign: Path, joints: Sequence[str], problem: str, correct: str, command: str

@@ -66,6 +66,12 @@ class RunOptions:
 class RunArchives:
     """Archives of one run: what each contains, and the check before it is entered.
 
+    Args:
+        campaign: that is run.
+        link: to the controller; None without one.
+        options: of this run.
+        plan_hash: of cell, URDF and plan.
+
     Attributes:
         names: file names so far, whatever their outcome.
         notes: what a reader must know.

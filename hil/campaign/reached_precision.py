@@ -274,7 +274,14 @@ def further_repetitions(repetitions: int, ratio: float, share: float) -> int | N
 
 
 class PrecisionStage:
-    """Measures each repetition of a run, and ends the repetitions when they are enough."""
+    """Measures each repetition of a run, and ends the repetitions when they are enough.
+
+    Args:
+        campaign: that is run.
+        requirements: on its precision.
+        plan_hash: of cell, URDF and plan.
+        reporter: of progress.
+    """
 
     def __init__(
         self,

@@ -19,7 +19,14 @@ from .state import CampaignState
 
 
 class WarmUpStage:
-    """Repeats the excitation until friction hardly changes any more."""
+    """Repeats the excitation until friction hardly changes any more.
+
+    Args:
+        campaign: that is run.
+        archives: of this run.
+        watch: progress and requests of the operator.
+        reporter: of progress.
+    """
 
     def __init__(
         self,

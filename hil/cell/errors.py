@@ -13,7 +13,15 @@ from hil.cell.field_error import FieldError
 
 
 class CellError(InputError):
-    """The cell file is invalid: path, dotted `field` ("" for the whole file), invalid `value`."""
+    """The cell file is invalid.
+
+    Args:
+        path: the cell file.
+        field: dotted name; "" for the whole file.
+        value: the invalid one.
+        problem: what is wrong, as a clause.
+        remedy: what to do.
+    """
 
     def __init__(self, path: Path, field: str, value: object, problem: str, remedy: str) -> None:
         self.value = value

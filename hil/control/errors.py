@@ -26,6 +26,13 @@ class MotionRefusedError(UnsafeError):
 class MotionFailedError(ExecutionError):
     """A motion ended otherwise than planned; what was recorded is archived.
 
+    Args:
+        motion: its name.
+        outcome: "stopped", "refused" by this PC, or "lost".
+        reason: why, as a clause.
+        archive: name of its archive; None if there is none.
+        refused: the refusal, if this PC refused it.
+
     Attributes:
         outcome: "stopped", "refused" by this PC, or "lost".
         sentence: motion, archive, outcome and reason.

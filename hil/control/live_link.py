@@ -186,6 +186,14 @@ class ExchangeMonitor:
 class LivePort:
     """An exchange process and an archive process; see `ControllerPort`.
 
+    Args:
+        cell: of the controller.
+        exchange: the exchange process.
+        archive: the archive process.
+        heart: heartbeat of this process.
+        finish: asks the controller to end the session.
+        only_simulated: whether only a simulated arm can move.
+
     Attributes:
         heart: heartbeat of this process.
         finish: asks the controller to end the session; only a simulated one can be asked.

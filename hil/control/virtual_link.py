@@ -41,6 +41,12 @@ _LINK_ENDED: Final = "the link ended"
 class VirtualPort:
     """A session on a transport with its recorder; see `ControllerPort`.
 
+    Args:
+        transport: in virtual time.
+        session: on it.
+        ring: records of its cycles.
+        finish: asks the controller to end the session.
+
     Attributes:
         finish: asks the controller to end the session.
     """
@@ -289,7 +295,15 @@ class _Archiving:
 
 
 class VirtualLink(MotionLink):
-    """A `MotionLink` over a session and its transport in virtual time."""
+    """A `MotionLink` over a session and its transport in virtual time.
+
+    Args:
+        transport: in virtual time.
+        session: on it.
+        ring: records of its cycles.
+        cell: of the controller.
+        finish: asks the controller to end the session.
+    """
 
     port: VirtualPort
 

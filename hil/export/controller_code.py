@@ -205,7 +205,14 @@ def checked(
 
 
 class CompiledArm:
-    """The functions of compiled code; the library's file may go once it is open."""
+    """The functions of compiled code; the library's file may go once it is open.
+
+    Args:
+        library: shared library.
+        name: with which its functions begin.
+        n_joints: number of joints.
+        precision: of its numbers.
+    """
 
     def __init__(self, library: Path, name: str, n_joints: int, precision: Precision) -> None:
         self.library = ctypes.CDLL(str(library))

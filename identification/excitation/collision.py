@@ -100,8 +100,13 @@ class CollisionChecker:
     apart whose largest distance there is about the margin, or less and not excluded as above, but
     not a touch, are checked with that distance less 5 mm. `exceptions` has all of these.
 
-    Meshes of the robot description, in `mesh_folders` of `package://` paths, are replaced by their
-    convex hulls. Random postures are within limits, if given, else ± half a turn.
+    Meshes of the robot description are replaced by their convex hulls.
+
+    Args:
+        urdf: text of the robot description.
+        workspace: floor, walls, boxes and margin.
+        limits: of the joints; random postures are within them, else ± half a turn.
+        mesh_folders: folders of `package://` paths.
 
     Attributes:
         separation: distance bounds of the p pairs.

@@ -46,8 +46,12 @@ class JournalError(IdentificationError, ValueError):
 class NoFeasibleMotionError(IdentificationError):
     """None of `tried` motions satisfies all constraints and excites all parameters.
 
-    `rejected` has their number and `nearest` the smallest violation by kind of constraint;
-    `unexciting` motions satisfy all constraints; `stopped`: the search was stopped before its end.
+    Args:
+        rejected: number of motions, by the kind of constraint that excludes them.
+        nearest: smallest violation by kind of constraint.
+        tried: number of motions; None if unknown.
+        unexciting: motions that satisfy all constraints without exciting all parameters.
+        stopped: whether the search was stopped before its end.
     """
 
     def __init__(

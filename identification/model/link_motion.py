@@ -23,9 +23,14 @@ class LinkMotion:
 
     with the twist s_i of joint i per unit speed, and the *spatial* acceleration a_i, minus gravity
     at the base. `motion` is velocity and acceleration of the links (n, 2, 2, 3, size), `twists`
-    per link the twists of the a joints that move it, base first (a, 2, 3, size); without
-    `all_twists` the twist of its own joint alone. `states` are q, qd and qdd of the joints
-    (3, n, size).
+    per link the twists of the a joints that move it, base first (a, 2, 3, size).
+
+    Args:
+        chain: of n joints.
+        gravity: in base axes (3,) [m/s²].
+        states: q, qd and qdd of the joints (3, n, size).
+        all_twists: whether `twists` has those of all joints that move a link, not its own
+            alone.
     """
 
     def __init__(
@@ -96,7 +101,14 @@ class LinkStep:
     """Recursion over one joint, from slots of its parent (c, 2, 3, size) to its own, one more.
 
     All views are created once: a view costs as much as the arithmetic on a few hundred samples.
-    `rotation` (3, 3, size) is into the child's axes, `motion` q, qd and qdd of the joint (3, size).
+
+    Args:
+        chain: of n joints.
+        joint: index from 0.
+        before: slots of the parent (c, 2, 3, size).
+        rotation: into the child's axes (3, 3, size).
+        after: slots of the child (c + 1, 2, 3, size).
+        motion: q, qd and qdd of the joint (3, size).
     """
 
     def __init__(

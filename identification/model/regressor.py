@@ -57,11 +57,17 @@ class RegressorPlan:
 
     The torque of joint j is the power of the wrenches of its links on their twists per unit speed
     of joint j (:class:`LinkMotion`).
-    Per joint `links` are the used :data:`LINK_SYMBOLS` (0..9), rising, and `rotors` whether its
-    rotor inertia has a column; `couplings` are the pairs of joints with a column for their coupling
-    inertia. Gravity is an acceleration in base axes (3,) [m/s²]. `columns` has the parameter
-    indices of each joint's columns (c_j,); parameters are numbered link by link (inertial, rotor),
-    then coupling inertias, friction, springs and balancers.
+    `columns` has the parameter indices of each joint's columns (c_j,); parameters are numbered link
+    by link (inertial, rotor), then coupling inertias, friction, springs and balancers.
+
+    Args:
+        chain: of n joints.
+        gravity: acceleration in base axes (3,) [m/s²].
+        links: used :data:`LINK_SYMBOLS` (0..9) of each link, rising.
+        rotors: whether the rotor inertia of each joint has a column.
+        friction: of the joints; None for none.
+        couplings: pairs of joints with a column for their coupling inertia.
+        elements: springs and balancers; None for none.
     """
 
     def __init__(

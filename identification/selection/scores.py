@@ -85,7 +85,14 @@ class SettingDecision(NamedTuple):
 
 
 class SettingsTrial:
-    """Scores of settings, with cached factors."""
+    """Scores of settings, with cached factors.
+
+    Args:
+        model: of the arm.
+        ready: prepared recordings.
+        stated: settings that are not searched.
+        ripples: candidates of torque ripple.
+    """
 
     def __init__(
         self,

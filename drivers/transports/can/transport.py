@@ -285,9 +285,13 @@ def lock_bus(interface: str, channel: str) -> int | None:
 
 
 class CanTransport(CanLink):
-    """The PC's end of the CAN profile on an open bus, which is closed with it, as is `lock`.
+    """The PC's end of the CAN profile on an open bus.
 
-    `clock` is that of `CanLink`.
+    Args:
+        bus: open; closed with the link.
+        rates: of the bus.
+        clock: of `CanLink`.
+        lock: descriptor of the bus's lock, closed with the link.
     """
 
     def __init__(
