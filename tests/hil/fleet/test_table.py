@@ -171,7 +171,7 @@ class TestConditions:
             ("robot,ambient\nr1,20\n", "has the columns robot, ambient"),
             ("when,robot\n2024-01-01,r1\n", "has the columns when, robot"),
             ("when,ambient\nsoon,20\n", "row 2: 'soon' is not a date"),
-            ("when,ambient\n2024-01-01,warm\n", "row 2: 'warm' of ambient is no number"),
+            ("when,ambient\n2024-01-01,warm\n", "row 2: 'warm' of ambient is not a number"),
         ],
     )
     def test_that_cannot_be_read_are_refused(self, file, text, problem):

@@ -308,8 +308,7 @@ class TestRemedies:
         archive = imported(tmp_path / "log.csv", HOLES[kind], urdf, **entries)
         assert_right(archive, without=() if "note" in kind else (49,))
         assert any(
-            "rows in which a number is missing (1 of" in line
-            for line in archive.header.findings.lines
+            "rows with a missing number (1 of" in line for line in archive.header.findings.lines
         )
 
     @pytest.mark.parametrize("cut", [1, 3, 9, 20])

@@ -203,7 +203,7 @@ def of_another_run(table: Any) -> Any:
         (twice_as_long, OTHER_TIMES, ""),
         (drifting, "zeros", ""),
         (its_rate, RATE_OF_TORQUE, "is a torque rate"),
-        (of_another_run, TORQUE_AND_MOTION, "of another run than the positions"),
+        (of_another_run, TORQUE_AND_MOTION, "from another run than the positions"),
     ],
     ids=["times", "drift", "rate", "another run"],
 )

@@ -141,11 +141,11 @@ def late(table: Mapping[str, Floats]) -> dict[str, Floats]:
             marks=pytest.mark.long,
         ),
         (of_motors, "side", "motor side (before the gears), or a current"),
-        pytest.param(late, "delay", "torque 4", marks=pytest.mark.long),
+        pytest.param(late, "delay", "position by 4", marks=pytest.mark.long),
         pytest.param(
             to_the_ground,
             "coupling",
-            f"{JOINTS[1]} is recorded plus the angle of {JOINTS[0]}",
+            f"recorded {JOINTS[1]} is {JOINTS[1]} plus {JOINTS[0]}",
             marks=pytest.mark.long,
         ),
     ],
@@ -329,7 +329,7 @@ class TestConclusions:
         write_log(path, ["t", "q{}", "v{}", "tau{}"], *planted.values())
         result = hil("identify", path, "--urdf", urdf, "--output", tmp_path / "o")
         first, second = JOINTS[:2]
-        sentence = f"the angle of {second} is recorded plus the angle of {first}, inferred"
+        sentence = f"recorded {second} is {second} plus {first}, inferred"
         assert sentence in " ".join(result.output.split())
         assert hil("look", path, "--urdf", urdf, "-o", target).exit_code == 0
         archive = tmp_path / "a.mcap"
@@ -442,7 +442,7 @@ class TestOtherArm:
         other = self.described(tmp_path / "other.urdf", self.weak(self.narrow(URDF)))
         result = hil("identify", path, "--urdf", other)
         assert isinstance(result.exception, SourceError)
-        assert "is not of the arm of the URDF: " in str(result.exception)
+        assert "was not recorded on the arm of the URDF: " in str(result.exception)
         assert sorted(tmp_path.iterdir()) == [path, other]
 
     def test_positions_and_torques_of_the_motor_side_do_not(

@@ -78,7 +78,7 @@ class TestNamesOfChannels:
         assert isinstance(nearest, NextBest)
         assert nearest.ratio > 3.0
         result = hil("look", path, "--urdf", urdf, "-v")
-        assert re.search(r"next best: \w+ \(error \d+\.\d+ times", result.output)
+        assert re.search(r"next best \d+\.\d+ × error: \w+", result.output)
 
     @pytest.mark.long
     def test_the_recorded_arm_has_a_row_of_its_own(self, tmp_path: Path) -> None:

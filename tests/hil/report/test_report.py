@@ -564,7 +564,7 @@ class TestParameters:
         table = Page(html[html.index('<section id="trust">') :]).table("With all parameters")
         remarks = [row["Remark"].replace("\xa0", " ") for row in table]
         assert remarks == ["beyond 3σ by the selection", "beyond 3σ, also with all parameters", ""]
-        assert "the others absorb the effect" in Page(html).text
+        assert "absorb the effect of the removed parameters" in Page(html).text
 
 
 class TestFigures:

@@ -145,7 +145,7 @@ def link_to_controller_with(campaign: Campaign, **figures: Any) -> VirtualLink:
     ("figures", "error", "message"),
     [
         ({"drive_train__current_limit": [3.0, 12.0]}, MotionRefusedError,
-         r"motor of shoulder: \S+ A, .*controller has 3 A .*cell file 20 A: write"),
+         r"motor of shoulder: \S+ A, .*controller limits that motor to 3 A, .*cell file to 20 A: enter"),
         ({"drive_train__following_error": [1.0, 0.01]}, NotRehearsedError,
          r"elbow: 0\.01 motor revolutions in the controller, 1 in the cell file.*rehearse"),
         ({"controller__cycle_ms": 1}, ControllerError,
