@@ -69,8 +69,8 @@ def trend(
         limit: Change whose date is predicted, such as 'friction +50 %' (repeatable).
         covariate: Column that may explain a change, such as a payload (repeatable). Temperatures
             and the time since the start are found by their names.
-        conditions: CSV file of conditions that the logs lack, such as ambient temperature: a column
-            when (date), robot (unless the same for all), and columns of numbers.
+        conditions: CSV file of conditions that the logs lack, such as ambient temperature: columns
+            when (date), robot (unless the same for all), and numbers.
         fail_on_change: Return exit status 5 if something has changed.
     """
     limits = [TrendLimit.parse(text) for text in limit or []]
