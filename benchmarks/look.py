@@ -144,7 +144,9 @@ def plants(arm: Arm) -> Iterator[Planted]:
     while np.any(order == np.arange(n)):
         order = rng.permutation(n)
     listing = ", ".join(names[k] for k in order)
-    yield of("torques permuted", "order", f"torque columns are of {listing}", torque=tau[:, order])
+    yield of(
+        "torques permuted", "order", f"torque columns belong to {listing}", torque=tau[:, order]
+    )
     yield of(
         "joints permuted", "order", listing,
         position=q[:, order], velocity=None if v is None else v[:, order], torque=tau[:, order],

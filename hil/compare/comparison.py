@@ -187,8 +187,8 @@ def _require_campaigns_of_one_arm(discovery: Discovery) -> None:
             differing = arm_differences(here.cell, there.cell) or other
             raise InputError(
                 campaign.campaign,
-                f"is of another arm ({here.name}) than {first.campaign} ({there.name}): they differ"
-                f" in {' and '.join(differing)}",
+                f"belongs to another arm ({here.name}) than {first.campaign} ({there.name}): they"
+                f" differ in {' and '.join(differing)}",
                 remedy="compare campaigns of one arm",
             )
     if len(campaigns) < 2:

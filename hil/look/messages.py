@@ -480,7 +480,7 @@ def _(change: ArmChange) -> str:
 def _(order: ColumnOrder) -> str:
     columns = {"torque": order.torque, "position": order.position}
     return "; ".join(
-        f"{kind} columns are of {', '.join(joints)}"
+        f"{kind} columns belong to {', '.join(joints)}"
         for kind, joints in columns.items()
         if joints is not None
     )

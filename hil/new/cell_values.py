@@ -225,7 +225,7 @@ def from_archive(path: str | PathLike[str], joint_names: Sequence[str]) -> CellV
 
     if archive.joint_names != tuple(joint_names):
         raise refusal(
-            f"is of an arm with joints {', '.join(archive.joint_names)}",
+            f"belongs to an arm with joints {', '.join(archive.joint_names)}",
             remedy=f"the URDF has {', '.join(joint_names)}",
         )
     cell_values = CellValues()

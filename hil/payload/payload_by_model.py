@@ -59,7 +59,7 @@ def weigh_by_model(
     sources = gather_sources(fitted or of_arm, options.split, in_sample=True)
     others = gather_sources(paths, options.split, in_sample=True)
     if differing := arm_differences(sources.cell, others.cell):
-        problem = f"is of another arm than {arm[0]}: {' and '.join(differing)} differ"
+        problem = f"belongs to another arm than {arm[0]}: {' and '.join(differing)} differ"
         remedy = "give recordings of the arm of the model"
         raise ArchiveError(paths[0], problem, remedy=remedy)
     _require_usable(sources.cell.file.robot.payload is not None, "carries a known payload", arm[0])

@@ -399,7 +399,7 @@ def source_of(archive: Archive, cell: Cell, *, to_fit: bool = True) -> Source:
             remedy += "; `hil identify` finds servo and friction from positions alone"
         raise ArchiveError(archive.path, problem, remedy=remedy)
     if to_fit and recording.provenance.get(TORQUE_SIDE) == UNDECIDED:
-        problem = "is of a log whose torque is too small for the joints of this arm"
+        problem = "comes from a log whose torque is too small for the joints of this arm"
         remedy = (
             f"choose what it is by `hil look {typed(archive.path.name)}`, and import the log again"
             " with that line in its map; a map without it reads it as joint torque"

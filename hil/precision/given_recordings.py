@@ -33,7 +33,7 @@ def given_sources(cell: Cell, paths: Sequence[Path]) -> tuple[Source, ...]:
     if differing := arm_differences(cell, sources.cell):
         raise SettingsError(
             paths[0],
-            f"is of another arm than {cell.path}: {' and '.join(differing)} differ",
+            f"belongs to another arm than {cell.path}: {' and '.join(differing)} differ",
             field="--given",
             remedy="give recordings of this arm",
         )

@@ -94,8 +94,8 @@ def verdict_of(results: ServoResults) -> ServoVerdict:
     if scale:
         warnings.append(
             f"the torque scale of {', '.join(scale)} is not determined: gravity and inertia of the"
-            " bodies hardly show in the positions, or parts of the motion disagree; gains and"
-            " friction are valid only together"
+            " bodies have little effect on the positions, or parts of the motion disagree; gains"
+            " and friction are valid only together"
         )
     return ServoVerdict(good=good, line=line, warnings=warnings, next_steps=steps)
 

@@ -86,7 +86,7 @@ AXES = ("t", "q{}", "tau{}")
 NOTHING = "almost no rigid-body"
 FAULTS = {
     "gravity": Fault(without_gravity, "torque without gravity", "gravity was removed", True),
-    "order": Fault(exchanged, "torque columns are of", "interchanged"),
+    "order": Fault(exchanged, "torque columns belong to", "interchanged"),
     "sign": Fault(negated, "torque negated", "probably has the wrong sign"),
     "zeros": Fault(other_zeros, "zero shifted by", "differ from the URDF"),
     "bodies": Fault(only_friction, NOTHING, NOTHING, True),

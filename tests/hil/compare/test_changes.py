@@ -124,7 +124,7 @@ class TestRecorded:
     @pytest.mark.parametrize(
         ("other", "why"),
         [
-            ("other", r"(march|other): is of another arm.*\[drive_train\]"),
+            ("other", r"(march|other): belongs to another arm.*\[drive_train\]"),
             ("march", r"march.*only campaign.*give two"),
         ],
     )

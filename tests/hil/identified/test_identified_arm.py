@@ -170,7 +170,7 @@ class TestWhatWasRead:
         place = arm.save(tmp_path / "exchanged")
         (read,) = Results.load(place / "results.json").recordings
         assert (read.file, read.use) == ("recording.csv", "fitted")
-        assert any("torque columns are of" in change for change in read.changes), read.changes
+        assert any("torque columns belong to" in change for change in read.changes), read.changes
         assert any(line.startswith("tau1 .. tau3: torque") for line in read.channels)
         assert read.changes[0] in (place / "report.html").read_text()
 

@@ -23,6 +23,6 @@ def test_an_identification_corrects_what_a_look_is_certain_of(tmp_path: Path) ->
     torque = simulated.torque[:, EXCHANGED]
     log = write_log(tmp_path / "log.csv", ["t", "q{}", "tau{}"], TIME, simulated.position, torque)
     arm = arm_from(log, urdf, None, (), None, None, None)
-    order = "torque columns are of a1, a2, a3, a4, a6, a5, a7"
+    order = "torque columns belong to a1, a2, a3, a4, a6, a5, a7"
     (read,) = arm.results.recordings
     assert any(order in change for change in read.changes), read.changes

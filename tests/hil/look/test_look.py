@@ -137,7 +137,7 @@ def late(table: Mapping[str, Floats]) -> dict[str, Floats]:
         pytest.param(
             exchanged,
             "order",
-            f"torque columns are of {JOINTS[1]}, {JOINTS[0]}, {JOINTS[2]}",
+            f"torque columns belong to {JOINTS[1]}, {JOINTS[0]}, {JOINTS[2]}",
             marks=pytest.mark.long,
         ),
         (of_motors, "side", "motor side (before the gears), or a current"),
@@ -313,7 +313,7 @@ class TestConclusions:
         write_log(path, ["t", "q{}", "v{}", "tau{}"], *{**table, **exchanged(table)}.values())
         result = hil("identify", path, "--urdf", urdf)
         first, second, third = JOINTS
-        order = f"order: torque columns are of {second}, {first}, {third}, inferred"
+        order = f"order: torque columns belong to {second}, {first}, {third}, inferred"
         assert order in " ".join(result.output.split())
         text = (tmp_path / "a" / "map.toml").read_text()
         assert 'columns = ["tau2", "tau1", "tau3"]' in text

@@ -66,7 +66,7 @@ def test_the_same_motion_again_has_the_same_criteria(campaign, given):
 
 def test_archives_of_another_arm_are_refused(campaign):
     other = Cell.load(CELL_PATH).with_values({"robot.rotor_inertia": False})
-    with pytest.raises(InputError, match=r"is of another arm .*\[robot\]"):
+    with pytest.raises(InputError, match=r"belongs to another arm .*\[robot\]"):
         given_of(other, [campaign.folder.root])
 
 
