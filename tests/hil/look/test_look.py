@@ -289,7 +289,7 @@ class TestCommand:
         path = write_log(tmp_path / "a.csv", ["t", "q{}", "v{}", "tau{}"], *table.values())
         result = hil("look", path)
         assert result.exit_code == 0, (result.output, result.exception)
-        assert "slope of the position" in result.output
+        assert "position slope" in result.output
         assert "add --urdf ARM.urdf" in result.output
 
     def test_commands_in_a_file_of_their_own_are_no_joints(
@@ -643,7 +643,7 @@ class TestTerminal:
 
 def rows_of(count: int) -> list[Row]:
     """Return rows whose meaning takes three lines of the table, the last one undetermined."""
-    still = StillJoints(tuple(f"joint_{k}" for k in range(12)))
+    still = StillJoints(tuple(f"joint_{k}" for k in range(9)))
     certain = [Row("motion", still, Certainty.CERTAIN, (Basis.POSITIONS_ALONE,))] * (count - 1)
     return [*certain, Row("order", still, Certainty.UNDETERMINED, (Basis.SMALL_NOISE,))]
 
