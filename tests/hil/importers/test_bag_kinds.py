@@ -263,7 +263,7 @@ class TestMissingQuantities:
         velocity[:, 1] = np.nan
         typed = Typed(urdf, [message(k, velocity=velocity) for k in range(COUNT)])
         assert "velocity" not in typed.archive.columns
-        assert "velocity: joint knee has no value in any message" in typed.message
+        assert "velocity: not used, as no message has a value for knee" in typed.message
 
 
 @pytest.mark.usefixtures("each_kind")
