@@ -145,7 +145,7 @@ class TestDoubts:
 
     def test_a_note_of_both_recordings_is_written_once(self) -> None:
         both = replace(found(), warnings=(RepairedArchive(), RepairedArchive()))
-        assert payload_as_json(both)["warnings"] == ["it was repaired with loss"]
+        assert payload_as_json(both)["warnings"] == ["data were lost when it was repaired"]
 
 
 def test_figures_that_are_not_determined_have_no_value() -> None:
