@@ -79,7 +79,7 @@ BY_CHECK: Final[Mapping[str, Picture]] = {
     "sameness": "torque",
     "error on unseen motion": "torque",
     "unexplained error": "torque",
-    "left open by the motion": "torque",
+    "undetermined by the motion": "torque",
     "generalisation": "torque",
     "systematic error": "torque",
     "repetitions": "torque",
