@@ -1,15 +1,17 @@
 """Archives to measure with: a repeated excitation of the NS 16 as the controller would send it.
 
 The values are those of the wire: motor positions in whole encoder counts, velocities as their
-differences, currents in steps of 5 mA with noise, all rounded to 32 bits before they become joint
-values. What compresses, and how well, is therefore that of a recording.
+differences, currents of the arm's torque in steps of 5 mA with noise, all rounded to 32 bits before
+they become joint values. What compresses, and how well, is therefore that of a recording.
 """
 
 from __future__ import annotations
 
+from functools import cache
 from pathlib import Path
 
 import numpy as np
+import pinocchio as pin
 from numpy.typing import NDArray
 
 from drivers import DriveTrain
@@ -28,6 +30,9 @@ JOINTS = 6
 _COUNTS = 8192  # of the encoder per motor revolution
 _CURRENT_STEP = 0.005  # A
 _CURRENT_NOISE = 0.02  # A, standard deviation
+_COULOMB = np.array([30.0, 40.0, 20.0, 4.0, 4.0, 2.0])  # N·m
+_VISCOUS = np.array([20.0, 30.0, 12.0, 2.0, 2.0, 1.0])  # N·m·s
+_REVERSAL = 1000.0  # s/rad, so that friction reverses within a step of the encoder
 _BATCH = 100
 _FIRST = 3000  # cycle in which an excitation of a campaign begins, about
 
@@ -58,7 +63,7 @@ def records(repetition: int) -> NDArray[np.void]:
     """16 s of cycle records at 1 kHz; repetitions differ in their noise."""
     random = np.random.default_rng(repetition)
     drive = drive_train()
-    position, velocity = _motion()
+    position, velocity, acceleration = _motion()
     period = PERIOD
     revolutions = drive.motor_revolutions(position)
     # The arm lags a few cycles behind its targets.
@@ -80,7 +85,7 @@ def records(repetition: int) -> NDArray[np.void]:
     rows["target_velocity"] = drive.joint_velocity(_wire(per_cycle), period)
     rows["position"] = drive.joint_position(_wire(measured))
     rows["velocity"] = drive.joint_velocity(_wire(steps), period)
-    current = 1.5 * np.sin(position) + 0.4 * velocity + 0.5 * np.tanh(50.0 * velocity)
+    current = drive.motor_current(_torque(position, velocity, acceleration))
     rows["model_current"] = _wire(current)
     demanded = current + random.normal(scale=_CURRENT_NOISE, size=current.shape)
     rows["target_current"] = _wire(np.rint(demanded / _CURRENT_STEP) * _CURRENT_STEP)
@@ -93,7 +98,7 @@ def drive_train() -> DriveTrain:
     return Cell.load(CELL_PATH).drive_train
 
 
-def _motion() -> tuple[Array, Array]:
+def _motion() -> tuple[Array, Array, Array]:
     """A sum of sines per joint that begins and ends at rest."""
     random = np.random.default_rng(16)
     t = np.arange(CYCLES)[:, None, None] * PERIOD
@@ -101,7 +106,22 @@ def _motion() -> tuple[Array, Array]:
     amplitude = random.uniform(0.05, 0.25, (5, JOINTS))
     position = (amplitude * (1.0 - np.cos(frequency * t))).sum(axis=1)
     velocity = (amplitude * frequency * np.sin(frequency * t)).sum(axis=1)
-    return position, velocity
+    acceleration = (amplitude * frequency**2 * np.cos(frequency * t)).sum(axis=1)
+    return position, velocity, acceleration
+
+
+def _torque(position: Array, velocity: Array, acceleration: Array) -> Array:
+    """Torque of the bodies of the URDF, and of friction, the same in all repetitions."""
+    model = _bodies()
+    data = model.createData()
+    rows = zip(position, velocity, acceleration, strict=True)
+    torque = np.array([pin.rnea(model, data, *row) for row in rows])
+    return np.asarray(torque + _COULOMB * np.tanh(_REVERSAL * velocity) + _VISCOUS * velocity)
+
+
+@cache
+def _bodies() -> pin.Model:
+    return pin.buildModelFromXML(Cell.load(CELL_PATH).urdf)
 
 
 def _wire(values: object) -> Array:

@@ -90,29 +90,36 @@ class ToReduce(NamedTuple):
 
     ref: ArchiveRef
     unmodelled: bool = False  #: whether it is one of those that show what the model lacks
+    examined: bool = False  #: whether to ask what it is other than stated
     parts: int = 1  #: parts of its own total, more of few archives, whose friction may drift
 
 
 def to_reduce(refs: Sequence[ArchiveRef]) -> list[ToReduce]:
     """Return the archives of a campaign with what it needs of each.
 
-    The first of each motion show what the model lacks; of unknown motions the first of all.
+    The first of each motion show what the model lacks; of unknown motions the first of all. What a
+    recording is other than stated, repetitions of a motion have in common; logs have not.
     """
     fitted = [ref for ref in refs if ref.use == "excitation"]
     seen: Counter[str] = Counter()
-    shown = set()
+    shown, examined = set(), set()
     for ref in fitted:
+        if not seen[ref.motion] or ref.kind == "imported":
+            examined.add(ref)
         seen[ref.motion] += 1
         if seen[ref.motion] <= MAX_UNMODELLED_REPETITIONS:
             shown.add(ref)
     # Some of them may turn out to be unusable.
     parts = TREND_PIECES if len(fitted) < 2 * TREND_PIECES else 1
-    return [ToReduce(ref, ref in shown, parts if ref.use == "excitation" else 1) for ref in refs]
+    return [
+        ToReduce(ref, ref in shown, ref in examined, parts if ref.use == "excitation" else 1)
+        for ref in refs
+    ]
 
 
 def reduction_key(archives: Sequence[ToReduce], settings: Settings) -> str:
     """Return the key of archives that are reduced, and added in this order."""
-    each = [(one.ref.sha256, one.unmodelled, one.parts) for one in archives]
+    each = [(one.ref.sha256, one.unmodelled, one.examined, one.parts) for one in archives]
     return json_digest(["sum", each, settings_digest(settings)])
 
 
@@ -159,7 +166,7 @@ def reduced_archive(wanted: ToReduce, settings: Settings) -> tuple[Summary, Redu
     merged = [MergedSamples(source.merged)] if source.merged else []
     stated = map(StatedText, archive.header.findings.warnings)
     warnings: list[Note] = [*known_warnings(cell, archive), *stated, *merged]
-    if is_fitted and (archive.kind == "imported" or wanted.unmodelled):
+    if wanted.examined:
         warnings += _other_meanings(model, versions[0], source, ref.origin)
     if archive.outcome is not None and archive.outcome.repaired:
         warnings.append(RepairedArchive())
@@ -229,7 +236,8 @@ def summarise(
             known = None
         if known is None:
             try:
-                summary = reduced_archive(ToReduce(ref), settings)[0]
+                wanted = ToReduce(ref, examined=ref.kind == "imported")
+                summary = reduced_archive(wanted, settings)[0]
             except Exception as error:
                 summaries.append(SkippedArchive(ref.origin, reason_of(error, ref.origin)))
                 continue
