@@ -184,7 +184,7 @@ def test_a_gripper_that_a_bag_has_not_is_fixed_by_every_import(tmp_path: Path) -
         output = tmp_path / f"{number}.mcap"
         result = hil(*command, source, "--urdf", path, "-o", output)
         assert result.exit_code == 0, (result.output, result.exception)
-        assert "finger_j1: fixed at 0 m: a gripper that was not recorded" in result.output
+        assert "finger_j1: fixed at 0 rad: a gripper that was not recorded" in result.output
         assert joints_of(output) == names
 
 
