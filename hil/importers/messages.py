@@ -330,7 +330,7 @@ def _(velocity: PartialVelocity) -> str:
 
 @worded.register
 def _(commands: NotCommands) -> str:
-    return f"{commands.topic}: not used as commanded positions: {commands.problem}"
+    return f"{commands.topic}: {commands.problem}; not used as commanded positions"
 
 
 @worded.register
