@@ -79,11 +79,11 @@ def test_tasks_that_fail_or_end_their_process_affect_no_other():
     work.check_unused(results[7], "faulty-7.mcap", "IndexError")
 
 
-def test_workers_are_named_on_a_terminal_only(capfd):
-    """What is piped is the result."""
+def test_what_is_piped_is_the_result(capfd):
+    """Workers and their dashboard are progress: on standard error, if they take a second."""
     with Cluster(1, reporter=Messages()) as cluster:
         assert cluster.results([work.task(work.number, 3)]) == [3]
-    assert capfd.readouterr() == ("", "")
+    assert capfd.readouterr().out == ""
 
 
 @pytest.mark.parametrize(
