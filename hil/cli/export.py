@@ -47,11 +47,11 @@ from hil.export.servo_files import (
     ExportedServo,
     ServoFormatName,
     export_servo,
-    servo_folder,
 )
 from hil.pipeline.identified_model import IdentifiedModel
 from hil.pipeline.options import Options
 from hil.pipeline.stored_identification import read_or_identify
+from hil.pipeline.stored_servo import servo_folder
 from identification.export.controller.c_source import Precision
 
 ExportName = Literal[FormatName, CodeName, ServoFormatName]

@@ -66,9 +66,10 @@ def rollout(
     the measured ones, for the identified arm, the nominal one, and arms drawn from the posterior.
     The arm is driven by the recorded torque and weak feedback, or by a servo. Parameters and
     settings come from results.json and parameters.json in a folder, as for `hil export`; its report
-    gets a section. Archives without torque are simulated on a servo, which is identified with
-    friction and rotors from commanded and measured positions, with the masses of the URDF. Writes
-    rollout.json and rollout.png. Exit status 5 if the model is not good.
+    gets a section. Archives without torque are simulated on the servo of the folder's results, or
+    on one that is identified with friction and rotors from commanded and measured positions, with
+    the masses of the URDF. Writes rollout.json and rollout.png. Exit status 5 if the model is not
+    good.
 
     **Example:** `hil rollout runs/demo`
 
@@ -97,8 +98,7 @@ def rollout(
         if servo is not None:
             problem = "cannot be given for recordings without torque, from which it is identified"
             raise InputError(archives[0], problem, field="--servo", remedy="omit it")
-        good = True
-        simulated = roll_out_servo(archives, predict or (), split, reporter)
+        simulated, good = roll_out_servo(archives, predict or (), split, reporter, reuse=as_usual)
     else:
         arm = read_or_identify(archives, options, reporter, reuse=as_usual, predict=predict or ())
         good = arm.good

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Final, Literal, NamedTuple
 
@@ -12,16 +12,14 @@ import numpy as np
 
 from hil.base.errors import InputError
 from hil.base.files import make_folder, write_files
-from hil.base.safe_input import path_exists, read_input
+from hil.base.safe_input import read_input
 from hil.cell import Cell
 from hil.export.drive_files import OWN_FILE, URDF, WhatToExport
-from hil.pipeline.identified_model import arm_with, impossible_bodies
-from hil.pipeline.options import friction_from
-from hil.pipeline.sources import Source, gather_sources
+from hil.pipeline.sources import Source
+from hil.pipeline.stored_servo import actuators_of, servo_arm, servo_sources
 from hil.results.provenance import RESULTS
-from hil.results.servo_result import ServoResults, SimulatorServo, is_servo_result
-from identification.export.actuators import Actuators, FieldRange, Quantity, ranges_of
-from identification.export.exported_arm import ExportedArm
+from hil.results.servo_result import ServoResults
+from identification.export.actuators import Actuators, Quantity, ranges_of
 from identification.export.patching import PatchError, patched
 from identification.export.playback import played_back
 from identification.export.python_files import (
@@ -39,8 +37,6 @@ from identification.export.simulators import (
     read_back,
 )
 from identification.export.urdf import WriteBackError
-from identification.servo.intervals import sampled
-from identification.servo.parameters import NAMES, PLACE
 
 ServoFormatName = Literal["mjcf", "urdf", "isaaclab", "genesis"]
 
@@ -55,16 +51,6 @@ MJCF: Final[Mapping[str, Quantity]] = {
 }
 """Quantities of the fields of an MJCF; the offset is no field of it: it is added to commands."""
 
-_TERMS: Final[Mapping[Quantity, str]] = {
-    "stiffness": "kp",
-    "limit": "limit",
-    "friction": "coulomb",
-    "viscous": "viscous",
-    "armature": "armature",
-    "delay": "delay",
-    "offset": "offset",
-}
-_MIN_INTERVAL_DRAWS: Final = 2000  # for the interval of a sum
 _MILLI: Final = 1e3
 
 
@@ -124,13 +110,6 @@ class ExportedServo:
         }
 
 
-def servo_folder(paths: Sequence[Path]) -> Path | None:
-    """Return the folder of results of an arm without torque, None if this is none."""
-    if len(paths) == 1 and paths[0].is_dir() and is_servo_result(paths[0] / RESULTS):
-        return paths[0]
-    return None
-
-
 def export_servo(folder: Path, to: str, export: WhatToExport) -> tuple[ExportedServo, bool]:
     """Write an arm without torque for a simulator; also return whether its verdict is good.
 
@@ -151,7 +130,8 @@ def export_servo(folder: Path, to: str, export: WhatToExport) -> tuple[ExportedS
         raise InputError(folder, problem, field="--to", remedy=remedy)
     form = SERVO_FORMATS[to]
     servo = results.simulators[form.engine]
-    cell, held_out = _archives(folder, results)
+    sources = servo_sources(folder, results)
+    cell, held_out = sources.cell, sources.held_out
     actuators = actuators_of(servo, cell, results.windows, export.count or 0, export.seed)
     remarks = _remarks(results)
     target = export.output or export.into or folder / f"identified{form.suffix}"
@@ -177,97 +157,6 @@ def export_servo(folder: Path, to: str, export: WhatToExport) -> tuple[ExportedS
     write_files(target.parent, files)
     paths = tuple(target.parent / name for name in files)
     return ExportedServo(paths, checked, played, results.verdict.line), results.verdict.good
-
-
-def actuators_of(
-    servo: SimulatorServo, cell: Cell, windows: int, count: int, seed: int
-) -> Actuators:
-    """Return the servo with the terms of an engine as fields of simulators, with draws.
-
-    A limit of the torque that the motion does not determine is infinite.
-
-    Args:
-        servo: with the terms of the engine.
-        cell: of the arm.
-        windows: that were fitted.
-        count: number of draws.
-        seed: of the draws.
-    """
-    names = cell.joint_names
-    rows = {(value.name, value.joint): value for value in servo.servo}
-
-    def field(term: str) -> FieldRange:
-        values = [rows[term, joint] for joint in names]
-        return FieldRange(
-            np.array([value.value for value in values]),
-            np.array([value.lower for value in values]),
-            np.array([value.upper for value in values]),
-            np.array([value.determined for value in values]),
-        )
-
-    fields = {quantity: field(term) for quantity, term in _TERMS.items()}
-    limit = fields["limit"]
-    # A limit that no motion reached is none: the fit's own is where positions would show one.
-    value, upper = (np.where(limit.from_data, end, np.inf) for end in (limit.value, limit.upper))
-    limit = fields["limit"] = replace(limit, value=value, upper=upper)
-    posterior = servo.posterior
-    posterior_samples = sampled(
-        np.array(posterior.coordinates),
-        np.array(posterior.present),
-        np.array(posterior.covariance),
-        max(1, windows - 1),
-        max(count, _MIN_INTERVAL_DRAWS),
-        seed,
-    )
-    delays = posterior_samples[:, :, PLACE["delay"]]
-    np.maximum(delays, 0.0, out=delays)
-    by_term = dict(zip(NAMES, np.moveaxis(posterior_samples, 2, 0), strict=True))
-    draws = {quantity: by_term[term][:count] for quantity, term in _TERMS.items()}
-    if count:
-        draws["limit"] = np.where(limit.from_data, draws["limit"], np.inf)
-    above = field("static")
-    resting = by_term["coulomb"] + by_term["static"]
-    lower, upper = np.quantile(resting, [0.025, 0.975], axis=0)
-    fields["static"] = FieldRange(
-        fields["friction"].value + above.value,
-        lower,
-        upper,
-        fields["friction"].from_data & (above.from_data | (above.value == 0.0)),
-    )
-    draws["static"] = resting[:count]
-    turning = np.asarray(cell.model.chain.revolute, np.bool_)
-    return Actuators(tuple(names), turning, fields, draws if count else {})
-
-
-def _archives(folder: Path, results: ServoResults) -> tuple[Cell, tuple[Source, ...]]:
-    """Return the cell of the archives of a result, and its held-out recordings."""
-    fitted = [folder / name for name in results.archives]
-    predicted = [folder / name for name in results.predicted]
-    for path in (*fitted, *predicted):
-        if not path_exists(path):
-            remedy = "keep archives and results in one folder, or identify again"
-            raise InputError(path, "is missing: the results were computed from it", remedy=remedy)
-    sources = gather_sources(
-        fitted, results.split, predicted, in_sample=results.in_sample, with_torque=False
-    )
-    return sources.cell, sources.held_out
-
-
-def servo_arm(cell: Cell, actuators: Actuators) -> ExportedArm:
-    """Return the arm with the URDF's bodies, and with friction and rotors of actuators."""
-    cell = cell.with_friction(**friction_from("coulomb,viscous"))
-    model = cell.model
-    standard = model.nominal.copy()
-    standard[model.layout.rotors] = actuators.value("armature")
-    values = np.zeros(model.n_parameters)
-    values[: model.base.rank] = model.base.grouping @ standard
-    friction = {"f0": actuators.value("friction"), "f1": actuators.value("viscous")}
-    values[model.friction_part] = [
-        friction[term.symbol][term.owner] if term.symbol in friction else 0.0
-        for term in model.friction.terms
-    ]
-    arm = arm_with(cell, standard, values, [])
-    return replace(arm, balanced=bool(impossible_bodies(model, standard)))
 
 
 def _description(

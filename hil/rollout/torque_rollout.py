@@ -24,6 +24,7 @@ from hil.pipeline.identified_model import (
 from hil.pipeline.prepared import Prepared
 from hil.pipeline.sources import Source
 from hil.report.output_files import REPORT, is_of_report, rewrite_report
+from hil.results.provenance import RESULTS
 from hil.results.rollout_result import (
     JUDGED_HORIZON,
     ROLLOUT,
@@ -31,6 +32,7 @@ from hil.results.rollout_result import (
     PolishResult,
     RolloutResult,
 )
+from hil.results.servo_result import is_servo_result
 from hil.rollout.polishing import polish
 from identification import IdentificationError, Samples
 from identification.estimators.ensemble import Ensemble
@@ -381,6 +383,8 @@ def write_rollout(folder: Path, rollout: Rollout) -> str:
         text = form.write(rollout.polished, result.cell, remarks)
         read_back(text, form, rollout.polished)
     write_files(folder, {ROLLOUT: result.to_json(), POLISHED: text})
+    if is_servo_result(folder / RESULTS):
+        return f"{REPORT} has no section about it: it shows the motions from first to last sample"
     if not result.parameters:
         return f"{REPORT} has no section about it: the arm was identified for this rollout alone"
     if not is_of_report(folder, result):

@@ -53,17 +53,23 @@ class RecordedMotion:
                 position = stretch.motion.position
                 rate = stretch.after
             else:
-                position, rate = command_of(stretch, servo.delay)
+                position, rate = command_of(stretch, servo.delays)
             change = stretch.after - stretch.motion.velocity
             parts.append(simulated.force(beside, position, rate, change))
         force = windows.cut(parts)
         return force if servo is None else force + self._held(servo)
 
     def _held(self, servo: PositionServo) -> Array:
-        """Return the constant torque in addition to a servo in each window (w, 1, n)."""
+        """Return the constant torque in addition to a servo in each window (w, 1, n).
+
+        Where the offset is not known, the torque at the start of a window shows it, with all that
+        the servo's law lacks at that instant.
+        """
+        if servo.offset is not None:
+            return np.asarray(servo.kp * servo.offset)[None, None]
         torque = []
         for stretch in self.windows.stretches:
-            position, rate = command_of(stretch, servo.delay)
+            position, rate = command_of(stretch, servo.delays)
             error = position - stretch.motion.position
             slip = rate - stretch.after
             torque.append(stretch.torque - servo.kp * error - servo.kd * slip)

@@ -33,15 +33,27 @@ class PositionServo(NamedTuple):
     kp: Array  # (n,) [N·m/rad or N/m]
     kd: Array  # (n,) [N·m·s/rad or N·s/m]
     delay: float  # of the command [s]
+    # what it adds to commands (n,) [rad or m]; None: the constant is the one that a window needs
+    offset: Array | None = None
+    lag: Array | float = 0.0  # of each joint in addition to the delay (n,) [s]
+
+    @property
+    def delays(self) -> Array | float:
+        """Delay of the command of each joint (n,), or of all [s]."""
+        return np.maximum(self.delay + self.lag, 0.0)
 
 
 def lead_of(servo: PositionServo | None) -> float:
     """Return how long before a window the command of a servo must be known [s]."""
-    return 0.0 if servo is None else max(servo.delay, MAX_SERVO_DELAY)
+    return 0.0 if servo is None else max(float(np.max(servo.delays)), MAX_SERVO_DELAY)
 
 
-def command_of(stretch: Stretch, delay: float) -> tuple[Array, Array]:
+def command_of(stretch: Stretch, delay: Array | float) -> tuple[Array, Array]:
     """Return the delayed command, and its rate half a step after each instant (g, n).
+
+    Args:
+        stretch: of a recording.
+        delay: of the command of each joint (n,), or of all [s].
 
     Raises:
         NoServoError: the recording has no commanded positions.
@@ -50,9 +62,13 @@ def command_of(stretch: Stretch, delay: float) -> tuple[Array, Array]:
         raise NoServoError("the recordings have no commanded positions")
     time = stretch.motion.time
     half = 0.5 * float(time[1] - time[0])
+    delays = np.broadcast_to(delay, stretch.commanded.shape[1])
     position, later, earlier = (
         np.column_stack(
-            [np.interp(time - delay + shift, time, column) for column in stretch.commanded.T]
+            [
+                np.interp(time - late + shift, time, column)
+                for late, column in zip(delays, stretch.commanded.T, strict=True)
+            ]
         )
         for shift in (0.0, 2.0 * half, 0.0)
     )

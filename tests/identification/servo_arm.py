@@ -51,10 +51,14 @@ def on_its_servo(
     order = [int(model.joint(name).dofadr[0]) for name in arm.model.joint_names]
     time = np.arange(0.0, duration, step)
     command = four_sines(time, 0.5)
+    delays = np.broadcast_to(servo.delays, N)
     late = [
-        np.column_stack([np.interp(time - servo.delay, time, column) for column in values.T])
+        np.column_stack(
+            [np.interp(time - delay, time, column)
+             for delay, column in zip(delays, values.T, strict=True)]
+        )
         for values in (command.position, command.velocity)
-    ]
+    ]  # fmt: skip
     white = np.random.default_rng(seed).standard_normal(command.position.shape)
     coloured = scipy.signal.lfilter([1.0], [1.0, -np.exp(-step / 0.02)], white, axis=0)
     torque = disturbance * coloured / coloured.std(axis=0)

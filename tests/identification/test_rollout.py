@@ -263,12 +263,16 @@ class TestStepOnServo:
     """At 5 ms arms on servos of any stiffness move as at 0.2 ms."""
 
     def errors(self, arm: ExportedArm, servo: PositionServo, moved, step: float):
-        """Errors of an arm on a servo, in windows of a motion on it."""
+        """Errors of an arm on a servo, in windows of a motion on it.
+
+        Only where the offset is not known does the torque count.
+        """
         time, position, velocity, command = moved
         motion = Motion(time, position, velocity, np.gradient(velocity, time, axis=0))
         samples = as_samples(MODEL, motion, np.zeros_like(position))
-        torque = samples.predicted_torque(MODEL, an_arm(coulomb=1.0).values)
-        samples = replace(samples, torque=torque)
+        if servo.offset is None:
+            torque = samples.predicted_torque(MODEL, an_arm(coulomb=1.0).values)
+            samples = replace(samples, torque=torque)
         stretches, owners = recorded_stretches(MODEL, [(samples, command)], step)
         windows = windows_of(stretches, step, 1.0, 0.2, lead_of(servo))
         motion_on_servo = RecordedMotion(windows, tuple(owners), servo)
@@ -288,6 +292,24 @@ class TestStepOnServo:
         errors = self.errors(arm, servo, moved, 0.005)
         assert errors.unstable == 0
         assert errors.joints.max() < 1e-4  # rad, of a motion of one
+
+    def test_a_known_offset_and_delays_of_the_joints(self) -> None:
+        """A constant torque that holds each window would be that of a torque of zero here."""
+        arm = an_arm(coulomb=1.0)
+        inertia = joint_inertia(arm, 0.005)
+        rate = 0.5 / 0.005
+        servo = PositionServo(
+            *(rate**2 * inertia, 0.4 * rate * inertia, 0.012),
+            offset=np.array([0.02, -0.03]),
+            lag=np.array([-0.008, 0.008]),
+        )
+        time, position, velocity, command = on_its_servo(arm, duration=3.5, step=2e-4, servo=servo)
+        moved = time, position, velocity, command - servo.offset
+        errors = self.errors(arm, servo, moved, 0.005)
+        assert errors.unstable == 0
+        assert errors.joints.max() < 1e-4  # rad, of a motion of one
+        for changed in (servo._replace(lag=0.0), servo._replace(offset=np.zeros(2))):
+            assert self.errors(arm, changed, moved, 0.005).joints[-1].min() > 5e-3
 
     def test_a_stiff_servo_makes_no_light_arm_unstable(self) -> None:
         """Such as a nominal arm without rotor inertias, on the servo of the real one."""

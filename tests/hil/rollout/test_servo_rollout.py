@@ -1,6 +1,7 @@
 """A log with commanded and measured positions and no torque, from the command line."""
 
 import re
+import shutil
 from pathlib import Path
 
 import numpy as np
@@ -80,14 +81,53 @@ def test_the_servo_is_identified_as_far_as_determined(archive: Path, tmp_path: P
     assert "nan" not in (tmp_path / ROLLOUT).read_text().lower()
 
 
-@pytest.mark.long
-def test_an_identification_finds_the_servo(archive: Path, tmp_path: Path) -> None:
-    done = run("identify", archive, "-o", tmp_path / "out")
+@pytest.fixture(scope="module")
+def identified(archive: Path) -> Path:
+    """The folder of an archive with what `hil identify` writes."""
+    folder = archive.with_name("out")
+    folder.mkdir()
+    shutil.copy(archive, folder)
+    done = run("identify", folder / archive.name, "-o", folder)
     assert done.exit_code in (0, 5), done.exception
-    results = ServoResults.load(tmp_path / "out" / RESULTS)
+    return folder
+
+
+@pytest.mark.long
+def test_an_identification_finds_the_servo(identified: Path) -> None:
+    results = ServoResults.load(identified / RESULTS)
     gains = {row.joint: row for row in results.servo if row.name == "kp"}
     for joint, planted in zip(results.joint_names, KP, strict=True):
         assert gains[joint].lower < planted < gains[joint].upper
+
+
+@pytest.mark.long
+def test_the_servo_of_an_identification_is_simulated(identified: Path) -> None:
+    """Its values and its verdict hold, and windows are closer than the whole motion."""
+    done = run("rollout", identified)
+    results = ServoResults.load(identified / RESULTS)
+    assert done.exit_code == (0 if results.verdict.good else 5), done.exception
+    rolled_out = RolloutResult.load(identified / ROLLOUT)
+    stored = results.simulators["mujoco"]
+    values = {(row.name, row.joint): row.value for row in stored.servo}
+    assert rolled_out.servo is not None
+    rows = {parameter.name: parameter.value for parameter in rolled_out.servo.parameters}
+    terms = {"kp": "kp", "Im": "armature", "f0": "coulomb", "f1": "viscous"}
+    for number, joint in enumerate(results.joint_names, 1):
+        for name, term in terms.items():
+            assert rows[f"{name}_{number}"] == values[term, joint]
+    (played,) = stored.validation
+    # Windows start as the arm moved; from the first sample on, it starts at rest.
+    assert 1e3 * rolled_out.identified.overall(3) < played.position_error_mrad
+    assert "nan" not in (identified / ROLLOUT).read_text().lower()
+
+
+@pytest.mark.long
+def test_the_servo_of_an_identification_is_found_anew_on_demand(identified: Path) -> None:
+    done = run("rollout", identified, "--again", "-o", identified.with_name("again"))
+    assert done.exit_code == 0, done.exception
+    again = RolloutResult.load(identified.with_name("again") / ROLLOUT)
+    assert again.servo is not None
+    assert "kd_1" in {parameter.name for parameter in again.servo.parameters}
 
 
 def test_an_identification_of_a_log_asks_for_the_commands(log: Path, tmp_path: Path) -> None:
