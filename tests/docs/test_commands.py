@@ -90,6 +90,7 @@ NOT_TYPED = {
     "hil identify chirp_sweep": "needs recordings; tests/hil/servo/test_servo_command.py",
     "hil identify '~/.cache": "needs a data set; tests/hil/importers/test_lerobot.py writes some",
     "hil export out": "needs recordings; tests/hil/servo/test_servo_command.py exports",
+    "hil rollout out": "needs recordings; tests/hil/rollout/test_servo_rollout.py types it",
     "hil batch /data": "needs other people's archives",
     "hil trend logs": "needs logs; tests/hil/fleet/test_trend.py types it",
     "hil batch 'logs/": "needs logs; tests/hil/fleet/test_logs.py types it",
