@@ -211,7 +211,7 @@ class GuardError(RefusalError):
         )
         if not math.isfinite(value):
             check = Check.FINITE
-            message = f"joint {joint + 1} has {value} where a number must be"
+            message = f"joint {joint + 1} is {value}, not a finite number"
         super().__init__(message, cycle)
         self.check = check
         self.remedy = check.remedy

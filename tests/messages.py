@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from typing import Final
 
-AGAINST_GRAVITY: Final = "runs against the model's gravity"
+AGAINST_GRAVITY: Final = "opposes the model's gravity"
 ALL_REQUIREMENTS_MET: Final = "all requirements are met, no more"
 ALL_TORQUES_OPPOSITE: Final = "The model must not be relied on: all torques have the opposite sign"
 ANOTHER_CELL_OR_PLAN: Final = "another cell, URDF or plan"
@@ -51,7 +51,7 @@ NOT_IN_MANIFEST: Final = "not listed in its campaign's manifest.json"
 NOT_IN_REPORT: Final = "report.html has no section about it"
 NO_CAMPAIGN_FOLDER: Final = "is not a campaign folder"
 NO_CAMPAIGN_PLAN: Final = "is not a campaign plan"
-NUMBER_NEEDED: Final = "where a number must be"
+NUMBER_NEEDED: Final = "not a finite number"
 OPEN_MODE_BEING_LEFT: Final = "open mode is being left"
 OTHERS_AGREE: Final = "agree with each other, not with this"
 PAYLOAD_NAME_INVALID: Final = "not a valid name of a payload"

@@ -34,13 +34,13 @@ def contradiction(record: DryRunRecord) -> str:
         else ""
     )
     return (
-        f"measured torque runs against the model's gravity: {of_payload}joint_sign, URDF or torque"
+        f"measured torque opposes the model's gravity: {of_payload}joint_sign, URDF or torque"
         " sign may be wrong"
     )
 
 
 def gravity_lines(record: DryRunRecord) -> list[str]:
-    """Return a line for each joint whose torque runs against the model's gravity."""
+    """Return a line for each joint whose torque opposes the model's gravity."""
     return [f"{joint}: {contradiction(record)}" for joint in record.against_gravity]
 
 

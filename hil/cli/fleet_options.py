@@ -46,7 +46,7 @@ class Fleet:
         str | None,
         typer.Option(
             metavar="WHERE",
-            help="Where robots are named: folder, column=NAME, metadata=KEY, or a path's pattern "
+            help="What names the robot: folder, column=NAME, metadata=KEY, or a path pattern "
             "such as '{robot}/{date}.csv'. Default: one robot.",
         ),
     ] = None

@@ -53,7 +53,7 @@ def payload(
             archives recorded with it.
         loaded: Archive recorded with the payload, or campaign folder (repeatable).
         model: Campaign folder, or archive, of the bare arm in any motion (repeatable): the payload
-            is the difference to its model, and friction is free to scale.
+            is the difference from its model; the scale of friction is estimated too.
         frame: URDF link in whose frame the values are given. Default: tool0 or flange if fixed to
             the last joint, else the link of this joint.
         check: Known value, such as mass=4.0 (kg): exit status 5 if it lies outside its 95 %

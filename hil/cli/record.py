@@ -73,8 +73,8 @@ def record(
     ended the recording before --duration, or the wait for the controller.
 
     With a Universal Robots arm (transport rtde, or --link), this PC only listens: in any mode,
-    while programs and other clients run. It claims nothing, and nothing waits for it. Every output
-    is archived; a missing frame shows as a gap in the time stamps.
+    while programs and other clients run. It takes no control of the arm and blocks no
+    other client. Every output is archived; a missing frame leaves a gap in the time stamps.
 
     Options:
         cell: The cell file.

@@ -146,7 +146,7 @@ def screen(result: RolloutResult, files: Sequence[str] = ()) -> list[str]:
     written = [Paragraph(file, complete=True) for file in files]
     spare = SCREEN_LINES - len(parts) - sum(file.least for file in written) - 1
     parts += [Paragraph(text, most=2) for text in remarks if text][:spare]
-    return one_screen([*parts, *written, "drawn arms and what drives the arm: -v"])
+    return one_screen([*parts, *written, "arms drawn and driving torques: -v"])
 
 
 def _row(result: RolloutResult, joint: int, arms: Sequence[tuple[str, ArmErrors]]) -> list[str]:
@@ -174,4 +174,4 @@ def _write(output: Path, simulated: Rollout) -> list[str]:
     lines = [f"{output / PICTURE}: the errors over time; {output / ROLLOUT}: all figures"]
     if simulated.polished is not None:
         lines.append(f"{output / POLISHED}: the polished arm, for MuJoCo")
-    return [*lines, missing or f"{output / REPORT}: the report has a section about it now"]
+    return [*lines, missing or f"{output / REPORT}: now has a section on the rollout"]

@@ -426,8 +426,8 @@ def _replies(served: Served) -> str:
         text = "each with a valid reply in time"
     if summary.read_late:
         text += (
-            f"; {plural(summary.read_late, 'reply')} counted as in time, but read later than that: "
-            "this computer was busy"
+            f"; {plural(summary.read_late, 'reply')} arrived in time but were read late: this "
+            "computer was busy"
         )
     unused = {
         "too late": summary.late,

@@ -37,7 +37,7 @@ def study(
     **Examples:**
 
     - `hil study --quick --output runs/quick`: some minutes
-    - `hil study --output runs/study`: ten searches of each, about 20 minutes on two processors
+    - `hil study --output runs/study`: ten searches of each method, about 20 minutes on two cores
 
     Options:
         output: Folder for the study.

@@ -98,7 +98,7 @@ class Connection:
                 self._rejected += event.count
                 packets = plural(self._rejected, "packet")
                 self.no_reply = event.reason
-                self.not_understood = f"{packets} came and were not replied to: {event.reason}"
+                self.not_understood = f"{packets} arrived and got no reply: {event.reason}"
 
     def reset_motion(self) -> None:
         """Forget the last motion: another one is about to be requested."""

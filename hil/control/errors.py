@@ -104,7 +104,7 @@ def refusal_text(cell: Cell, error: RefusalError) -> str:
     name = cell.joint_names[joint]
     cycle = f"(cycle {error.cycle})"
     if check is Check.FINITE:
-        return f"{name} has {error.value} where a number must be {cycle}"
+        return f"{name} is {error.value}, not a finite number {cycle}"
     value = error.value
     bound = error.bound
     if unit.startswith("rad"):

@@ -128,7 +128,7 @@ _FACTS: Final[Mapping[Fact, str]] = {
     Fact.UNCOUPLED: "uncoupled",
     Fact.WITH_GRAVITY: "torque with gravity",
     Fact.WITHOUT_GRAVITY: "torque without gravity",
-    Fact.STATED_MOUNTING: "as stated, else upright",
+    Fact.STATED_MOUNTING: "as stated, or upright",
     Fact.JOINT_SIDE: "joint side",
     Fact.JOINT_TORQUE: "joint side, a torque",
     Fact.LARGE_TORQUE: "larger than the arm needs",

@@ -18,13 +18,13 @@ from identification.signals.samples import Samples
 Estimator = Literal["auto", "wls", "ols", "huber", "tukey", "prior", "consistent", "iv"]
 
 ESTIMATORS: Final[dict[Estimator, str]] = {
-    "auto": "posterior of a prior on bodies, drives and friction, as strong as the residuals and "
-    "inner prediction say",
+    "auto": "posterior of a prior on bodies, drives and friction; residuals and inner prediction "
+    "set its strength",
     "wls": "weighted least squares (eq. 4), residuals weighted by the noise of their joint",
     "ols": "ordinary least squares, equal weights of all joints",
     "huber": "iteratively reweighted least squares, Huber loss",
     "tukey": "iteratively reweighted least squares, Tukey's bisquare loss",
-    "prior": "posterior of the bodies of the URDF to the uncertainty of [nominal]",
+    "prior": "posterior of the URDF's bodies, with the uncertainty that [nominal] states",
     "consistent": "weighted least squares over physically consistent parameters",
     "iv": "instrumental variables, with the commanded motion as instruments",
 }

@@ -203,7 +203,7 @@ class RolloutResult(Frozen):
         most = max(self.identified.unstable_joints)
         if 2 * most > self.windows:
             return f"{self.leading_joint} makes {most} of {self.windows} windows unstable; {cause}."
-        return f"{self.leading_joint} contributes most to the error of the flange; {cause}."
+        return f"{self.leading_joint} contributes most to the flange error; {cause}."
 
     @property
     def band_message(self) -> str:

@@ -321,7 +321,7 @@ def random_states(arm: ExportedArm, count: int = RANDOM_STATES) -> Motion:
 
 _BEYOND: Final = "where it differs from its value at the typical load, which is written"
 _ACCELERATES: Final = "where its coefficient is negative and would accelerate a joint"
-_REVERSALS: Final = "dry friction between the two directions (velocity reversals, standstill)"
+_REVERSALS: Final = "the transition of dry friction at velocity reversals and standstill"
 _ROUNDED: Final = "effect of rounded angles of the URDF on the base parameters"
 _MAX_COMPARED_ROWS: Final = 200  # rows that show whether there is one
 

@@ -8,6 +8,7 @@ from enum import Enum, auto
 from typing import Final, Literal
 
 import numpy as np
+import scipy
 from numpy.typing import NDArray
 
 from identification.arrays import Array
@@ -225,9 +226,11 @@ def spiking(values: Array, segments: Sequence[slice]) -> Rows:
         part = values[segment]
         if len(part) < MIN_STRETCH_SAMPLES:
             continue
-        padded = np.pad(part, ((side, side), (0, 0)), mode="edge")
-        windows = np.lib.stride_tricks.sliding_window_view(padded, 2 * side + 1, axis=0)
-        apart = np.abs(part - np.median(windows, axis=-1))
+        medians = (  # of one column at a time, which takes half the time of all
+            scipy.ndimage.median_filter(np.ascontiguousarray(column), 2 * side + 1, mode="nearest")
+            for column in part.T
+        )
+        apart = np.abs(part - np.column_stack(list(medians)))
         spread = MAD_TO_STD * np.median(apart, axis=0)
         low, high = np.quantile(part, [_TAIL_QUANTILE, 1.0 - _TAIL_QUANTILE], axis=0)
         least = np.maximum(_SPIKE_SIGMAS * spread, _SPIKE_RANGE_SHARE * (high - low))

@@ -431,7 +431,7 @@ class TestClosing:
             text = self.lines(**counts)
             assert "each with a valid reply in time" not in text
             assert "each with a valid reply" in text
-        assert "2 replies counted as in time, but read later" in text
+        assert "2 replies arrived in time but were read late" in text
 
     def test_percentiles_of_long_times_are_not_the_longest(self) -> None:
         times = Latencies()
