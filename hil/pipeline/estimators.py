@@ -24,7 +24,7 @@ ESTIMATORS: Final[dict[Estimator, str]] = {
     "ols": "ordinary least squares, equal weights of all joints",
     "huber": "iteratively reweighted least squares, Huber loss",
     "tukey": "iteratively reweighted least squares, Tukey's bisquare loss",
-    "prior": "posterior of the URDF's bodies, with the uncertainty that [nominal] states",
+    "prior": "posterior of the URDF's bodies, as uncertain as stated in [nominal]",
     "consistent": "weighted least squares over physically consistent parameters",
     "iv": "instrumental variables, with the commanded motion as instruments",
 }
