@@ -29,7 +29,7 @@ DelayOption = Annotated[
     str | None,
     typer.Option(
         metavar="SECONDS",
-        help="Time by which the torque lags the position, s; or auto, stated. Default: as in the "
+        help="Lag of the torque behind the position, s; or auto, stated. Default: as in the "
         "cell, unless the data contradict it.",
         rich_help_panel=ESTIMATION,
     ),
@@ -64,7 +64,7 @@ class Identifying:
         Literal["auto", "position", "measured"],
         typer.Option(
             metavar="SOURCE",
-            help="Velocity source: position (smoothed) or measured.",
+            help="Velocity: position (smoothed) or measured.",
             rich_help_panel=ESTIMATION,
         ),
     ] = "auto"
@@ -72,7 +72,7 @@ class Identifying:
         Literal["auto", "rests", "halts", "slow", "none"],
         typer.Option(
             metavar="ROWS",
-            help="Rows excluded from the fit: rests, halts, slow, none or auto.",
+            help="Rows not fitted: rests, halts, slow, none.",
             rich_help_panel=ESTIMATION,
         ),
     ] = "auto"

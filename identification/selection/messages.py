@@ -32,9 +32,9 @@ def candidate_words(candidates: Sequence[Candidate]) -> list[str]:
 def strength_words(strength: Strength) -> tuple[str, ...]:
     """Return the strength of a prior as phrases."""
     return (
-        f"prior of the bodies weighted {strength.weight:g} times",
+        f"body prior weighted {strength.weight:g} times",
         "physically consistent" if strength.consistent else "physical consistency not required",
-        "wide prior of the rotors" if strength.wide_rotors else "prior of the rotors as of links",
+        "wide rotor prior" if strength.wide_rotors else "rotor prior as for links",
     )
 
 

@@ -348,7 +348,7 @@ class TestTimeBase:
         assert base.dropped == 3
         assert not base.uniform
         description = " ".join(clock_lines(base))
-        for part in ("repeat", "older", "missing", "gap"):
+        for part in ("repeat", "earlier", "missing", "gap"):
             assert part in description
         reported = np.arange(100) == 50  # without a time step
         assert time_base(np.arange(100) * 1e-3, reported).gaps == 1

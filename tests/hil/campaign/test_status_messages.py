@@ -43,7 +43,7 @@ LINES: list[tuple[StepOutcome, str]] = [
     (steps.Rehearsed(FAILED), "the rehearsal failed: I1zz is not determined"),
     (steps.NoDryRun(), "not done: every motion at 20 % of its speed"),
     (steps.NoDryRun(is_invalid=True), "is not valid: it belongs to another plan or kind of arm"),
-    (steps.DryRunDone(DRY_RUN), "done (61 s), but not accepted; shoulder: measured torque runs"),
+    (steps.DryRunDone(DRY_RUN), "done (61 s), but not accepted; shoulder: measured torque opposes"),
     (steps.DryRunDone(ACCEPTED), "accepted by ada at 2026-03-01"),
     (steps.SkippedStep(as_simulated=True), "skipped, as the arm is simulated"),
     (steps.SkippedStep(as_simulated=False), "left out"),

@@ -184,7 +184,7 @@ def test_a_count_that_grows_is_no_other_reason(cell: Cell) -> None:
     port = ScriptedPort((1.0, came(290)), (3.0, came(1)), (4.0, came(11)), end)
     lines = said_until_ended(cell, port, stop)
     (line,) = lines
-    assert "290 packets came" in line
+    assert "290 packets arrived" in line
 
 
 def test_an_end_names_joints_as_the_cell_does(cell: Cell) -> None:
