@@ -122,7 +122,7 @@ def screen(result: RolloutResult, files: Sequence[str] = ()) -> list[str]:
         arms[1:] = [("polished", result.polish.errors)]
     shown = [(name, arm) for name, arm in arms if arm is not None]
     joints = range(min(MAX_JOINT_ROWS, len(result.joint_names)))
-    more = len(result.joint_names) - len(joints)
+    hidden = len(result.joint_names) - len(joints)
     heads = [text for name, _ in shown for text in (name, *[""] * (len(result.horizons) - 1))]
     lines = columns(
         [
@@ -134,19 +134,21 @@ def screen(result: RolloutResult, files: Sequence[str] = ()) -> list[str]:
         left=2,
     )
     parts: list[Part] = [
-        Paragraph(result.message),
+        Paragraph(result.message, complete=True),
         f"{result.windows} windows; position error of each arm after",
         *lines,
     ]
-    if more > 0:
-        parts.append(f"{more} more joints: -v")
-    servo = [] if result.servo is None else result.servo.lines(result.joint_names)
+    if hidden > 0:
+        parts.append(f"{hidden} more joints: -v")
+    table = [] if result.servo is None else result.servo.table(result.joint_names)
+    servo = [] if result.servo is None else result.servo.notes
     warning = f"warning: {result.band_message}" if result.band_message else ""
     remarks = [*servo, *result.stability(), warning, *result.notes]
     written = [Paragraph(file, complete=True) for file in files]
-    spare = SCREEN_LINES - len(parts) - sum(file.least for file in written) - 1
-    parts += [Paragraph(text, most=2) for text in remarks if text][:spare]
-    return one_screen([*parts, *written, "arms drawn and driving torques: -v"])
+    taken = [part.least for part in (*parts, *written) if isinstance(part, Paragraph)]
+    spare = SCREEN_LINES - sum(taken) - sum(isinstance(part, str) for part in parts) - 1
+    more: list[Part] = [*table, *(Paragraph(text, most=2) for text in remarks if text)]
+    return one_screen([*parts, *more[:spare], *written, "arms drawn and driving torques: -v"])
 
 
 def _row(result: RolloutResult, joint: int, arms: Sequence[tuple[str, ArmErrors]]) -> list[str]:

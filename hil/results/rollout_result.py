@@ -81,7 +81,13 @@ class ServoResult(Frozen):
         )
         return f"{text} Not determined: {', '.join(unknown)}." if unknown else text
 
-    def lines(self, joint_names: Sequence[str]) -> list[str]:
+    @property
+    def notes(self) -> list[str]:
+        """Delay of the command, and what is determined."""
+        spread = "" if self.delay_deviation is None else f" ± {milli(self.delay_deviation)}"
+        return [f"delay of the command: {milli(self.delay)}{spread} ms", self.message]
+
+    def table(self, joint_names: Sequence[str]) -> list[str]:
         """Return a row for each joint, with the number that ends its parameters' names."""
         by_joint: dict[str, dict[str, ServoParameter]] = {}
         for parameter in self.parameters:
@@ -96,8 +102,7 @@ class ServoResult(Frozen):
         for label, row in zip(labels, by_joint.values(), strict=True):
             figures = "".join(f"{_with_deviation(row[name]):>20}" for name in names)
             rows.append(f"{label:{width}}{figures}")
-        spread = "" if self.delay_deviation is None else f" ± {milli(self.delay_deviation)}"
-        return [*rows, f"delay of the command: {milli(self.delay)}{spread} ms", self.message]
+        return rows
 
 
 def _with_deviation(parameter: ServoParameter) -> str:
@@ -240,7 +245,8 @@ class RolloutResult(Frozen):
         lines = [
             f"{self.windows} windows of {self.cell}, driven by {self.drive}",
             *self.notes,
-            *([] if self.servo is None else self.servo.lines(self.joint_names)),
+            *([] if self.servo is None else self.servo.table(self.joint_names)),
+            *([] if self.servo is None else self.servo.notes),
             f"{'position error (rms)':42}{columns}",
         ]
         arms = {"identified": self.identified, "nominal": self.nominal}
