@@ -145,8 +145,8 @@ def screen(result: RolloutResult, files: Sequence[str] = ()) -> list[str]:
     warning = f"warning: {result.band_message}" if result.band_message else ""
     remarks = [*servo, *result.stability(), warning, *result.notes]
     written = [Paragraph(file, complete=True) for file in files]
-    taken = [part.least for part in (*parts, *written) if isinstance(part, Paragraph)]
-    spare = SCREEN_LINES - sum(taken) - sum(isinstance(part, str) for part in parts) - 1
+    least = sum(1 if isinstance(part, str) else part.least for part in (*parts, *written))
+    spare = SCREEN_LINES - least - 1
     more: list[Part] = [*table, *(Paragraph(text, most=2) for text in remarks if text)]
     return one_screen([*parts, *more[:spare], *written, "arms drawn and driving torques: -v"])
 
