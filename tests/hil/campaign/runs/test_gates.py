@@ -177,7 +177,7 @@ def test_a_single_move_respects_the_controllers_current_limit(
 ) -> None:
     link = link_to_controller_with(dry, drive_train__current_limit=[0.5, 12.0])
     move = plan_move(dry.cell, link.connect(Stop()), dry.cell.home)
-    with pytest.raises(MotionRefusedError, match=r"the motion .*controller has 0\.5 A"):
+    with pytest.raises(MotionRefusedError, match=r"the motion .*controller limits that motor to 0\.5 A"):
         send(move, dry.cell, link, tmp_path / "move.mcap", stop=Stop())
     assert not (tmp_path / "move.mcap").exists()
 
