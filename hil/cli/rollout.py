@@ -134,7 +134,7 @@ def screen(result: RolloutResult, files: Sequence[str] = ()) -> list[str]:
         left=2,
     )
     parts: list[Part] = [
-        Paragraph(result.message, most=2, complete=True),
+        Paragraph(result.message, most=3, complete=True),
         f"{result.windows} windows; position error of each arm after",
         *lines,
     ]
