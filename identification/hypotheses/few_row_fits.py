@@ -179,7 +179,7 @@ def _negated_positions(sign: Array) -> Change:
 
 
 def of_torques(every: Sequence[Factor], axes: Sequence[Axes]) -> TorqueSums:
-    """Return the sums of [W | y], y as axes read it, by those of every torque."""
+    """Return the sums of [W | y], y as axes read it, from the sums of every torque."""
     n = every[0].n_joints
     p = every[0].n_parameters + 1 - n
     gram = np.zeros((len(every), n, p + 1, p + 1))

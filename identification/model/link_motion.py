@@ -29,8 +29,8 @@ class LinkMotion:
         chain: of n joints.
         gravity: in base axes (3,) [m/s²].
         states: q, qd and qdd of the joints (3, n, size).
-        all_twists: whether `twists` has those of all joints that move a link, not its own
-            alone.
+        all_twists: whether `twists` contains all joints that move a link, not only the link's
+            own joint.
     """
 
     def __init__(
