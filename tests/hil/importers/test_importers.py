@@ -840,8 +840,11 @@ class TestDhErrors:
             (["--dh", "dh.csv", "--urdf", "r.urdf"], "--urdf and --dh: exclude each other"),
         ],
     )
-    def test_options_that_do_not_fit(self, options: list[str], sentence: str) -> None:
-        result = CliRunner().invoke(app, ["new", *options])
+    def test_options_that_do_not_fit(
+        self, options: list[str], sentence: str, tmp_path: Path
+    ) -> None:
+        output = tmp_path / "cell.toml"
+        result = CliRunner().invoke(app, ["new", *options, "-o", str(output)])
         assert isinstance(result.exception, InputError)
         assert sentence in str(result.exception)
 

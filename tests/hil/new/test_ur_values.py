@@ -169,8 +169,9 @@ def test_without_services_a_urdf_is_needed(tmp_path: Path, monkeypatch: pytest.M
 
 
 @pytest.mark.parametrize("options", [(), ("--host", ""), ("--host", "arm:x")])
-def test_an_address_is_needed(options: tuple[str, ...]) -> None:
-    result = CliRunner().invoke(app, ["new", "--controller", "ur", *options])
+def test_an_address_is_needed(options: tuple[str, ...], tmp_path: Path) -> None:
+    output = tmp_path / "cell.toml"
+    result = CliRunner().invoke(app, ["new", "--controller", "ur", "-o", str(output), *options])
     assert isinstance(result.exception, InputError)
     assert "--host" in str(result.exception)
 
