@@ -49,7 +49,7 @@ def info(files: Files, as_json: JsonOption = False, verbose: VerboseOption = Fal
 
 @app.command("check")
 def check(files: Files, as_json: JsonOption = False) -> None:
-    """Check whether all of a file can be used, by the rules that readers and repairs follow.
+    """Check whether a whole file can be used, by the same rules as reading and repair.
 
     Exit status: 0 all conform, 5 at least one does not, 2 at least one is not an archive.
     """

@@ -55,8 +55,8 @@ def torque_constants(
             a [robot.payload] were recorded with it, the others without payload.
         loaded: Archive or folder recorded with the payload of --mass (repeatable).
         mass: Mass of that payload, kg.
-        centre: Its centre of mass in the frame, x,y,z in m. Default: the origin of the frame, which
-            the output repeats: the constants are wrong if it is elsewhere.
+        centre: Its centre of mass in the frame, x,y,z in m. Default: the origin of the frame;
+            if the centre is elsewhere, the constants are wrong.
         inertia: Its inertia tensor about the centre of mass, xx,xy,xz,yy,yz,zz in kg·m² in the axes
             of the frame.
         frame: URDF link of that frame. Default: the link of the last joint.
