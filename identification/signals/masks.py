@@ -226,23 +226,22 @@ def spiking(values: Array, segments: Sequence[slice]) -> Rows:
         part = values[segment]
         if len(part) < MIN_STRETCH_SAMPLES:
             continue
-        medians = (  # of one column at a time, which takes half the time of all
-            scipy.ndimage.median_filter(np.ascontiguousarray(column), 2 * side + 1, mode="nearest")
-            for column in part.T
-        )
-        apart = np.abs(part - np.column_stack(list(medians)))
-        spread = MAD_TO_STD * np.median(apart, axis=0)
         low, high = np.quantile(part, [_TAIL_QUANTILE, 1.0 - _TAIL_QUANTILE], axis=0)
-        least = np.maximum(_SPIKE_SIGMAS * spread, _SPIKE_RANGE_SHARE * (high - low))
-        beyond = np.maximum(part - high, low - part) > 0.5 * _SPIKE_RANGE_SHARE * (high - low)
-        for joint, far in enumerate(((apart > least) & beyond).T):
+        span = high - low
+        beyond = np.maximum(part - high, low - part) > 0.5 * _SPIKE_RANGE_SHARE * span
+        for joint in np.flatnonzero(beyond.any(axis=0)):
+            column = np.ascontiguousarray(part[:, joint])
+            apart = np.abs(
+                column - scipy.ndimage.median_filter(column, 2 * side + 1, mode="nearest")
+            )
+            spread = MAD_TO_STD * np.median(apart)
+            least = max(_SPIKE_SIGMAS * spread, _SPIKE_RANGE_SHARE * span[joint])
+            far = (apart > least) & beyond[:, joint]
             for start, stop in runs_of(far):
                 if stop - start > _MAX_SPIKE_SAMPLES:
                     continue
-                around = np.delete(part[:, joint], slice(start, stop))[
-                    max(0, start - 2) : start + 2
-                ]
-                if np.ptp(around) < _MAX_NEIGHBOUR_SHARE * apart[start:stop, joint].min():
+                around = np.delete(column, slice(start, stop))[max(0, start - 2) : start + 2]
+                if np.ptp(around) < _MAX_NEIGHBOUR_SHARE * apart[start:stop].min():
                     found[segment.start + start : segment.start + stop, joint] = True
     return found
 
