@@ -294,7 +294,7 @@ def with_readings(
     if _is_predicted(score, rows, noise):
         readings = find_zeros_and_scales(model, rows)
     else:
-        readings = find_readings(model, rows, unit_is_open=False)
+        readings = find_readings(model, rows, unit_is_open=False, with_nearest=False)
     return replace(found, readings=readings, error=readings.score.overall)
 
 
