@@ -32,7 +32,6 @@ from identification.model.robot import RobotModel
 from identification.reduction.reduction import MAX_UNMODELLED_REPETITIONS, Reduction, Unmodelled
 from identification.selection.settings import Settings
 from identification.signals.samples import Samples
-from identification.validation.finding import TestedOn
 from identification.validation.finding_messages import Naming, worded
 from identification.validation.findings.diagnosis import of_diagnosis
 
@@ -190,9 +189,7 @@ def _other_meanings(
     if found.is_otherwise:
         finding = worded(of_diagnosis(found)[0], Naming(names))
         raise ArchiveError(origin, finding.words, field="torque", remedy=finding.next_step)
-    naming = Naming(names, TestedOn.RECORDINGS)
-    findings = [worded(each, naming) for each in other_meanings(found, [source])]
-    return tuple(OtherMeaning(each.key, each.words, each.next_step) for each in findings)
+    return tuple(OtherMeaning(each, names) for each in other_meanings(found, [source]))
 
 
 def _temperatures(archive: Archive) -> dict[str, float]:

@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from typing import Any, Final
 
+from hil.base.type_adapter import adapter_of
 from hil.pipeline.notes import (
     AssumedTorqueConstants,
     MergedSamples,
@@ -14,6 +15,11 @@ from hil.pipeline.notes import (
     RepairedArchive,
     StatedText,
 )
+from identification.hypotheses.joint_changes import Change
+from identification.signals.position_steps import PositionJump
+from identification.signals.row_faults import RowFaults
+from identification.signals.sample_times import SampleTimes
+from identification.validation.finding import Figure, Finding, RepeatedSamples
 
 from .setup import Setup
 
@@ -48,9 +54,29 @@ class DifferentSetups(Note):
     setups: tuple[Setup, ...]
 
 
+_Values = Mapping[
+    str,
+    Figure
+    | Change
+    | RowFaults
+    | SampleTimes
+    | tuple[str, ...]
+    | tuple[int, ...]
+    | tuple[float, ...]
+    | tuple[Change, ...]
+    | tuple[PositionJump, ...]
+    | tuple[RepeatedSamples, ...],
+]
+"""Values of findings about a recording; findings about an estimate have further ones."""
+
+
 def note_as_json(note: Note) -> list[Any]:
     """Return one of `ARCHIVE_NOTES` as JSON data."""
-    return [type(note).__name__, asdict(note)]
+    content = asdict(note)
+    if isinstance(note, OtherMeaning):
+        values = adapter_of(_Values).dump_python(note.finding.values, mode="json")
+        content["finding"]["values"] = values
+    return [type(note).__name__, content]
 
 
 def note_of_json(content: tuple[str, Mapping[str, Any]]) -> Note:
@@ -60,4 +86,13 @@ def note_of_json(content: tuple[str, Mapping[str, Any]]) -> Note:
         KeyError, TypeError, ValueError: it is none.
     """
     kind, fields = content
-    return ARCHIVE_NOTES[kind](**fields)
+    if kind != OtherMeaning.__name__:
+        return ARCHIVE_NOTES[kind](**fields)
+    finding = Finding(**fields["finding"])
+    finding = replace(
+        finding,
+        values=adapter_of(_Values).validate_python(finding.values),
+        joints=tuple(finding.joints),
+        each={name: tuple(figures) for name, figures in finding.each.items()},
+    )
+    return OtherMeaning(finding, tuple(fields["joints"]))

@@ -130,8 +130,9 @@ def _of_recordings(
             )
         case RepairedArchive():
             return "data were lost when it was repaired"
-        case OtherMeaning(_, words, next_step):
-            return f"{words}: {next_step}"
+        case OtherMeaning(finding, joints):
+            said = worded(finding, Naming(joints, TestedOn.RECORDINGS))
+            return f"{said.words}: {said.next_step}"
         case RestPredicted(fitted):
             return (
                 f"the first {percentage(fitted)} of one recording were fitted and the rest was"

@@ -14,6 +14,7 @@ from identification.estimators.delay import DelayEstimate
 from identification.signals.masks import RowReason
 from identification.signals.sample_times import SampleTimes, TimeBase
 from identification.validation.consistency import ConsistencyCheck
+from identification.validation.finding import Finding
 
 
 @dataclass(frozen=True)
@@ -64,9 +65,11 @@ class RepairedArchive(Note):
 class OtherMeaning(Note):
     """What a recording is other than described, by a finding of its own."""
 
-    key: str  #: of the finding
-    words: str  #: as `finding_messages` words it
-    next_step: str
+    finding: Finding
+    joints: tuple[str, ...]  #: names of the arm's joints, which the finding numbers
+
+    def __hash__(self) -> int:  # a finding has mappings
+        return hash((self.finding.key, self.finding.joints, self.joints))
 
 
 @dataclass(frozen=True)

@@ -15,7 +15,9 @@ from identification.estimators.delay import DelayEstimate
 from identification.signals.masks import RowReason
 from identification.signals.sample_times import SampleTimes, time_base
 from identification.validation.consistency import ConsistencyCheck
+from identification.validation.finding import Finding
 
+BACKWARDS = Finding("rows backwards", "wrong", "reverse the rows", "cause")
 DELAY = DelayEstimate(
     delay=4e-3,
     std=1e-4,
@@ -37,9 +39,7 @@ WORDS: dict[Note, str] = {
     notes.AssumedTorqueConstants(can_be_weighed=True): "`hil torque-constants`",
     notes.AssumedPayload(): "[robot.payload]",
     notes.RepairedArchive(): "data were lost when it was repaired",
-    notes.OtherMeaning("torque sign", "all torques are negative", "correct it"): (
-        "all torques are negative: correct it"
-    ),
+    notes.OtherMeaning(BACKWARDS, ("shoulder", "elbow")): "backwards in time: as recorded",
     notes.RestPredicted(0.7): "the first 70 %",
     notes.LastHeldOut("a.mcap"): "the last recording, a.mcap, was held out",
     notes.MergedSamples(3, "a.mcap"): "a.mcap: 3 samples",
