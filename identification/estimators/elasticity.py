@@ -266,7 +266,8 @@ def with_elastic_gears(
     lost = times * np.tensordot(weights, torque.lost, axes=1)
     errors = errors + moved.T @ (lost if excess is None else lost - excess)
     # Correlated compliances cannot be cut off at zero one by one.
-    mean = solve_non_negative(np.linalg.inv(covariance), errors / design_effect)
+    information = np.asarray(np.linalg.inv(covariance))
+    mean = solve_non_negative(information, errors / design_effect)
     added = moved @ (np.outer(mean, mean) + covariance) @ moved.T
     return replace(
         estimate,
