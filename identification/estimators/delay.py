@@ -60,11 +60,16 @@ _MAX_ITERATIONS: Final = 12
 _FIRST_ITERATIONS: Final = 3  # iterations
 # Half a 95 % interval that less noise of the positions may make that of a determined delay.
 _REACHABLE_HALF_INTERVAL: Final = 3e-3  # s
-_CONVERGED_SECONDS = 1e-6  # s
-_CONVERGED_STD_SHARE = 0.1  # share of the standard deviation
+# s, a tenth of `CLOSED_LOOP_BIAS`
+_CONVERGED_SECONDS: Final = 1e-5
+_CONVERGED_STD_SHARE: Final = 0.1  # share of the standard deviation
+# Rows of low-passed torques in a period of their bandwidth, which lose nothing: at half that rate
+# the smoother leaves a hundredth of an amplitude.
+_ROWS_PER_PERIOD: Final = 6.5
 # difference of log variance up to which two minima are equally good
 _EQUAL_LOG_VARIANCE: Final = 0.05
 _SAME_NUISANCES_STEP: Final = 1e-3  # s, step of the delay that hardly moves what resembles it
+_SAME_WEIGHTS_STEP: Final = 1e-4  # s, step that hardly changes the residuals
 _TIME_BLOCKS: Final = 80  # blocks of time
 _ROWS_AT_ONCE: Final = 8192
 _FALSE_DELAY_PROBABILITY: Final = 0.005  # one-sided probability of a false delay
@@ -297,9 +302,12 @@ def _estimated(
     assumed = options.torque_delay
     samples = prepare(recording, model, noise_variance=noise_variance, options=options)
     ends = (-MAX_ESTIMATED_DELAY - assumed, MAX_ESTIMATED_DELAY - assumed)
-    reader, (grid, heights, values) = _profiled(model, samples, ends)
+    # Where the fit's own smoother is the low-pass, measured torques have passed it as well.
+    narrow = samples.torque_bandwidth if options.smooth_torque else None
+    reader, (grid, heights, values) = _profiled(model, samples, narrow, ends)
     shift = float(grid[np.argmin(heights)])
     beside: Nuisances | None = None
+    is_weighted = True  # by residuals of a fit nearby
     for iteration in range(_MAX_ITERATIONS):
         blocks = reader.linearised(shift, values, beside=beside)
         solution = blocks.solution()
@@ -310,10 +318,10 @@ def _estimated(
         # The first values are of a fit without what resembles a delay.
         is_near = iteration > 0 and abs(shift - previous) < _SAME_NUISANCES_STEP
         beside = blocks.beside if is_near else None
-        if abs(shift - previous) <= max(
-            _CONVERGED_SECONDS, _CONVERGED_STD_SHARE * float(np.sqrt(solution.inverse[p, p]))
-        ):
+        tolerance = _CONVERGED_STD_SHARE * float(np.sqrt(solution.inverse[p, p]))
+        if is_weighted and abs(shift - previous) <= max(_CONVERGED_SECONDS, tolerance):
             break
+        is_weighted = abs(shift - previous) < _SAME_WEIGHTS_STEP
         # What is far from determined need not settle, and often does not.
         if iteration >= _FIRST_ITERATIONS and blocks.delay_std(solution)[0] > MAX_HALF_INTERVAL:
             break
@@ -360,14 +368,14 @@ def _narrow(options: Preprocessing) -> Preprocessing:
 
 
 def _profiled(
-    model: RobotModel, samples: Samples, ends: tuple[float, float]
+    model: RobotModel, samples: Samples, bandwidth: Array | None, ends: tuple[float, float]
 ) -> tuple[_Reader, _Profile]:
     """Return a reader of the samples, with their load, and its profile between two shifts."""
     # Friction that grows with load resembles a delay of some milliseconds.
     loaded = fit_with_load(
-        model, (samples,), lambda parts: _Reader.of(model, parts[0]).whole_profile(ends)
+        model, (samples,), lambda parts: _Reader.of(model, parts[0], bandwidth).whole_profile(ends)
     )
-    return _Reader.of(model, loaded.samples[0]), loaded.result
+    return _Reader.of(model, loaded.samples[0], bandwidth), loaded.result
 
 
 def _other_minimum(grid: Array, heights: Array, shift: float, height: float) -> float:
@@ -501,6 +509,11 @@ class _ShiftedRows(NamedTuple):
     torque: Array  # without that of known payloads (m, n)
     usable: Rows  # (m, n)
 
+    def of(self, rows: slice) -> _ShiftedRows:
+        """Return some of the rows."""
+        blocks = [block[rows] for block in self.blocks]
+        return _ShiftedRows(blocks, self.torque[rows], self.usable[rows])
+
 
 class _Profile(NamedTuple):
     """Fits at K common shifts."""
@@ -520,10 +533,11 @@ class _Reader:
     parts: tuple[tuple[slice, slice], ...]  # per segment its rows of `samples` and of `binned`
     clear: Rows  # bins away from standstill and reversals (m, n)
     cycle: float  # usual step of the clock [s]
+    summed: slice  # bins that the sums need
 
     @classmethod
-    def of(cls, model: RobotModel, samples: Samples) -> _Reader:
-        """Prepare the samples of a recording."""
+    def of(cls, model: RobotModel, samples: Samples, bandwidth: Array | None) -> _Reader:
+        """Prepare the samples of a recording, whose torque may have a bandwidth (n,) [Hz]."""
         motion = samples.motion
         # Around the step of dry friction arm and servo answer faster than the low-pass, and later
         # than it: with half of this reach a UR at a third of its speed had 2 ms less than it has.
@@ -558,7 +572,12 @@ class _Reader:
             mask=None,
             parent=None,
         )
-        return cls(model, samples, binned, tuple(parts), every(clear), cycle)
+        step = 1
+        if bandwidth is not None:
+            rate = _ROWS_PER_PERIOD * float(bandwidth.max())
+            step = max(1, int(1.0 / (rate * size * cycle)))
+        summed = slice(step // 2, None, step)
+        return cls(model, samples, binned, tuple(parts), every(clear), cycle, summed)
 
     def at(self, shift: float) -> Samples:
         """Return the bins with the motion of an earlier time, by a shift."""
@@ -580,14 +599,18 @@ class _Reader:
         return replace(result, torque=result.torque - result.known_torque(self.model))
 
     def rows_at(self, shift: float) -> _ShiftedRows:
-        """Return the rows at a shift."""
+        """Return the rows at a shift that the sums need."""
+        return self._every_row_at(shift).of(self.summed)
+
+    def _every_row_at(self, shift: float) -> _ShiftedRows:
         samples = self.at(shift)
         return _ShiftedRows(samples.regressor(self.model).blocks, samples.torque, samples.usable)
 
     def rows_behind(self, shift: float) -> _ShiftedRows:
-        """Return the rows at a shift by whole bins: the unshifted rows, earlier by that many bins.
+        """Return the rows that the sums need, at a shift by whole bins.
 
-        The low-pass of the torque, which both have, does not depend on time.
+        These are unshifted rows, earlier by that many bins. The low-pass of the torque, which both
+        have, does not depend on time.
         """
         count = round(shift / self.bin)
         start, torque, _ = self._unshifted
@@ -596,13 +619,16 @@ class _Reader:
         for _, b in self.parts:
             source[b] = np.clip(source[b] - count, b.start, b.stop - 1)
             there[b] = np.arange(b.start, b.stop) == source[b] + count
-        usable = self.binned.usable & self.clear[source] & there[:, None]
+        kept = self.summed
+        source = source[kept]
+        usable = self.binned.usable[kept] & self.clear[source] & there[kept, None]
         load = (self.binned.torque - torque)[source]
-        return _ShiftedRows([block[source] for block in start], self.binned.torque - load, usable)
+        blocks = [block[source] for block in start]
+        return _ShiftedRows(blocks, self.binned.torque[kept] - load, usable)
 
     @cached_property
     def _unshifted(self) -> _ShiftedRows:
-        return self.rows_at(0.0)
+        return self._every_row_at(0.0)
 
     @property
     def bin(self) -> float:
@@ -667,20 +693,22 @@ class _Reader:
         blocks, columns = samples.regressor(model)
         load = samples.known_torque(model)
         beside = beside or nuisances(model, samples, values[:p])
+        usable = samples.usable[self.summed]
         tables = []
         for j, (block, used) in enumerate(zip(blocks, columns, strict=True)):
             torque = load[:, j] + block @ values[used]
             rate = predicted_rate(samples, torque)
-            table = np.column_stack([block, -rate, beside.columns[j], samples.torque[:, j]])
-            tables.append(np.where(samples.usable[:, j], table.T, 0.0))
-        index = np.arange(len(samples.usable)) * _TIME_BLOCKS // max(1, len(samples.usable))
+            parts = block, -rate, beside.columns[j], samples.torque[:, j]
+            table = np.column_stack([part[self.summed] for part in parts])
+            tables.append(np.where(usable[:, j], table.T, 0.0))
+        index = np.arange(len(usable)) * _TIME_BLOCKS // max(1, len(usable))
         places = tuple(
             np.concatenate([used, [p + joint], p + n + others])
             for joint, (used, others) in enumerate(zip(columns, beside.places, strict=True))
         )
         delays = tuple(f"delay {name}" for name in model.joint_names)
         names = (*model.parameter_names, *delays, *beside.names)
-        counts = count_by_block(index, samples.usable)
+        counts = count_by_block(index, usable)
         factor = Factor.of_rows([(index, tables)], counts, places, names)
         if weights is None:
             unmoved = np.zeros(len(names))
