@@ -325,8 +325,7 @@ def _estimated(
         # What is far from determined need not settle, and often does not.
         if iteration >= _FIRST_ITERATIONS and blocks.delay_std(solution)[0] > MAX_HALF_INTERVAL:
             break
-    height = reader.profile(np.array([shift]), reader.rows_at).heights[0]
-    other = _other_minimum(grid, heights, shift, height)
+    other = _other_minimum(reader, grid, heights, shift)
     std, count = blocks.delay_std(solution)
     factor, by_chance = (
         float(student_limit(share, count - 1)) for share in (0.025, _FALSE_DELAY_PROBABILITY)
@@ -378,13 +377,16 @@ def _profiled(
     return _Reader.of(model, loaded.samples[0], bandwidth), loaded.result
 
 
-def _other_minimum(grid: Array, heights: Array, shift: float, height: float) -> float:
-    """Return another minimum of the profile that is as deep, NaN without one."""
+def _other_minimum(reader: _Reader, grid: Array, heights: Array, shift: float) -> float:
+    """Return another minimum of a profile that is as deep as the one found, NaN without one."""
     padded = np.concatenate([[np.inf], heights, [np.inf]])
     valley = (heights <= padded[:-2]) & (heights <= padded[2:])
-    other = np.abs(grid - shift) > grid[1] - grid[0]
-    valleys = np.flatnonzero(valley & other & (heights < height + _EQUAL_LOG_VARIANCE))
-    return float(grid[valleys[np.argmin(heights[valleys])]]) if valleys.size else float("nan")
+    valleys = np.flatnonzero(valley & (np.abs(grid - shift) > grid[1] - grid[0]))
+    if not valleys.size:
+        return float("nan")
+    lowest = valleys[np.argmin(heights[valleys])]
+    height = reader.profile(np.array([shift]), reader.rows_at).heights[0]
+    return float(grid[lowest]) if heights[lowest] < height + _EQUAL_LOG_VARIANCE else float("nan")
 
 
 def _undetermined_reason(
