@@ -286,16 +286,18 @@ def _departures(time: Array, position: Array) -> tuple[Array, Array, Array]:
     steps = np.diff(time)[:, None]
     speed = np.diff(position, axis=0) / steps
     padded = np.pad(speed, ((_NEIGHBOUR_STEPS, _NEIGHBOUR_STEPS), (0, 0)), mode="edge")
-    windows = np.lib.stride_tricks.sliding_window_view(padded, 2 * _NEIGHBOUR_STEPS + 1, axis=0)
-    # One joint at a time, since the windows are copied.
-    sides = slice(None, _NEIGHBOUR_STEPS), slice(_NEIGHBOUR_STEPS + 1, None)
-    before, after = (
-        np.column_stack([np.median(joint[:, side], axis=-1) for joint in windows.swapaxes(0, 1)])
-        for side in sides
-    )
+    medians = _medians_of_four(padded)
+    before, after = medians[: len(speed)], medians[_NEIGHBOUR_STEPS + 1 :]
     # The mean of both sides' medians follows a steady acceleration and ignores single jumps.
     usual = 0.5 * (before + after)
     return (speed - usual) * steps, usual, np.abs(after - before) * steps
+
+
+def _medians_of_four(values: Array) -> Array:
+    """Return the medians of `_NEIGHBOUR_STEPS` successive rows (m - 3, n) of values (m, n)."""
+    low = np.minimum(values[:-1], values[1:])
+    high = np.maximum(values[:-1], values[1:])
+    return 0.5 * (np.maximum(low[:-2], low[2:]) + np.minimum(high[:-2], high[2:]))
 
 
 def _without_clock(departure: Array, speed: Array, steps: Array) -> tuple[Array, NDArray[np.bool_]]:
