@@ -28,7 +28,8 @@ from hil.importers.conclusions import Certainty
 from hil.importers.imported_robot import Robot
 from hil.importers.recording_import import ImportOptions, RobotOf, import_recording
 from hil.look import Look, look_at
-from hil.look.messages import choice_text, row_text
+from hil.look.messages import choice_text, row_text, worded
+from hil.look.readings import Fact
 from hil.pipeline.sources import cell_of, source_of
 from identification.estimators.prior import body_prior, fit_posterior
 from identification.factor.factor import Factor
@@ -45,16 +46,19 @@ _NEAR: Final = 10.0  # deg
 _LATE: Final = 0.03  # s
 _AHEAD: Final = 0.025  # s
 _EXPECTED: Final = {
-    "order": "order of the URDF",
-    "signs": "as the URDF's axes",
-    "angle unit": "unit as read",
-    "zero": "as the URDF",
-    "coupling": "uncoupled",
-    "gravity": "torque with gravity",
-    "mounting": "as stated, else upright",
-    "side": "joint side",
+    aspect: worded(fact)
+    for aspect, fact in {
+        "order": Fact.ORDER_OF_URDF,
+        "signs": Fact.SIGNS_OF_URDF,
+        "angle unit": Fact.UNIT_AS_READ,
+        "zero": Fact.ZERO_OF_URDF,
+        "coupling": Fact.UNCOUPLED,
+        "gravity": Fact.WITH_GRAVITY,
+        "mounting": Fact.STATED_MOUNTING,
+        "side": Fact.JOINT_SIDE,
+    }.items()
 }
-"""What a sure row says of a recording as it is."""
+"""What a certain row says of a recording as it is."""
 
 
 @dataclass(frozen=True, eq=False)

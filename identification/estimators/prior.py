@@ -115,7 +115,13 @@ class TorqueSums(NamedTuple):
         return map(TorqueSums, self.gram, self.samples)
 
     def posterior(
-        self, mean: Array, precision: Array, smallest_noise: float, start: Array | None = None
+        self,
+        mean: Array,
+        precision: Array,
+        smallest_noise: float,
+        start: Array | None = None,
+        *,
+        rounds: int = _NOISE_ROUNDS,
     ) -> tuple[Array, Array]:
         """Return parameters (p,) of one torque and the weights of the joints (n,).
 
@@ -126,6 +132,7 @@ class TorqueSums(NamedTuple):
             precision: its information times the rows that count as one (p, p).
             smallest_noise: of the factor.
             start: weights from which the iteration starts (n,).
+            rounds: at most, of the noise.
         """
         gram, samples = self
         flat = gram.reshape(len(gram), -1)
@@ -139,7 +146,7 @@ class TorqueSums(NamedTuple):
             variance = np.where(start > 0.0, 1.0 / np.where(start > 0.0, start, 1.0), variance)
         # A torque that is zero throughout was not measured.
         has_rows = (samples > 0) & (gram[:, -1, -1] > 0.0)
-        for _ in range(_NOISE_ROUNDS):
+        for _ in range(rounds):
             weights = np.where(has_rows, 1.0 / np.maximum(variance, floor), 0.0)
             # One product of flat matrices: a general sum takes several times as long.
             total = (weights @ flat).reshape(gram.shape[1:])

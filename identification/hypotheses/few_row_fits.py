@@ -35,7 +35,9 @@ ORDER_STARTS: Final = 10
 From a third of the starts the right one is reached: ten miss it in 2 % of the cases."""
 _COMPARED_ORDERS: Final = 2  # best orders of each kind that are compared
 _COMPARED_CHANGES: Final = 12  # changes of least error on fewer rows, which are compared
+_SAME_ERROR_DIGITS: Final = 6  # of the logarithm of two errors that are one
 _RIDGE: Final = 1e-6  # of the squares of a column, where others say the same
+_NOISE_ROUNDS: Final = 3  # from the noise as read: a fit that is far off need not settle
 _FITS_AT_ONCE: Final = 24  # fits, so that their sums stay in the processor's cache
 
 
@@ -54,6 +56,7 @@ class FewRowFits:
         torque = np.sqrt(np.square(samples.torque).sum(axis=0))
         self._counts = ~little_torque(torque, ~np.array(model.chain.revolute))
         self._sums: dict[Change, Factor] = {}  # of every torque, by the change of the motion
+        self._weights: Array | None = None  # of the recorded torques, as they are read
 
     @property
     def rows(self) -> int:
@@ -145,16 +148,34 @@ class FewRowFits:
         priors = body_priors(model, sums)
         errors = []
         for each, read, mean, information in zip(sums.each(), axes, *priors, strict=True):
-            values, _ = each.posterior(mean, ROWS_PER_FACT * information, MIN_NOISE)
+            values, _ = each.posterior(
+                mean,
+                ROWS_PER_FACT * information,
+                MIN_NOISE,
+                self._weights_as_read()[read.torque_order],
+                rounds=_NOISE_ROUNDS,
+            )
             squares = each.squared_errors(values)[self._counts[read.torque_order]]
             errors.append(float(np.log(np.where(squares > 0.0, squares, 1.0)).sum()))
         return errors
+
+
+    def _weights_as_read(self) -> Array:
+        """Return the weights of the recorded torques (n,) in a fit of the rows as they are read."""
+        if self._weights is None:
+            self._reduce(self.model, [AS_READ])
+            sums = of_torques([self._sums[AS_READ]], [Axes.of([], self.model.n_joints)])
+            ((mean,), (information,)) = body_priors(self.model, sums)
+            (only,) = sums.each()
+            _, self._weights = only.posterior(mean, ROWS_PER_FACT * information, MIN_NOISE)
+        return self._weights
 
 
 def to_compare(errors: Mapping[Change, float], excluded: float) -> list[Change]:
     """Return the changes to compare on all rows: the best ones, and the best of each kind.
 
     Of changes that the fits exclude, only the best of each meaning: it shows how certain they are.
+    Of zeros of one joint that fit exactly alike, as about the vertical, one is enough.
 
     Args:
         errors: of fits to few rows.
@@ -163,7 +184,13 @@ def to_compare(errors: Mapping[Change, float], excluded: float) -> list[Change]:
     chosen: list[Change] = []
     kinds: set[object] = set()
     meanings: set[Meaning] = set()
+    zeros: set[tuple[tuple[int, ...], float]] = set()
     for place, change in enumerate(sorted(errors, key=lambda change: errors[change])):
+        if change.meaning == "zero":
+            fit = change.joints, round(errors[change], _SAME_ERROR_DIGITS)
+            if fit in zeros:
+                continue
+            zeros.add(fit)
         is_new = place < _COMPARED_CHANGES or kind_of(change) not in kinds
         if (is_new and errors[change] < excluded) or change.meaning not in meanings:
             chosen.append(change)

@@ -147,7 +147,7 @@ def _name(symbol: str, joint: int) -> str:
 
 STANDARD_GRAVITY = (0.0, 0.0, -9.81)
 
-_RANDOM_STATES = 300  # random states, enough for any arm
+_RANDOM_STATES: Final = 100  # each has a row for each joint, which has twelve columns at most
 _SEED = 20140901
 _NO_LAWS: Final[Mapping[str, FrictionLaw]] = MappingProxyType({})
 _NOT_LOCKED: Final[Mapping[str, float]] = MappingProxyType({})
