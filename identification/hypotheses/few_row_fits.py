@@ -159,7 +159,6 @@ class FewRowFits:
             errors.append(float(np.log(np.where(squares > 0.0, squares, 1.0)).sum()))
         return errors
 
-
     def _weights_as_read(self) -> Array:
         """Return the weights of the recorded torques (n,) in a fit of the rows as they are read."""
         if self._weights is None:
