@@ -621,12 +621,11 @@ class _Reader:
         for _, b in self.parts:
             source[b] = np.clip(source[b] - count, b.start, b.stop - 1)
             there[b] = np.arange(b.start, b.stop) == source[b] + count
-        kept = self.summed
-        source = source[kept]
-        usable = self.binned.usable[kept] & self.clear[source] & there[kept, None]
+        source, there = source[self.summed], there[self.summed]
+        usable = self.binned.usable[self.summed] & self.clear[source] & there[:, None]
         load = (self.binned.torque - torque)[source]
         blocks = [block[source] for block in start]
-        return _ShiftedRows(blocks, self.binned.torque[kept] - load, usable)
+        return _ShiftedRows(blocks, self.binned.torque[self.summed] - load, usable)
 
     @cached_property
     def _unshifted(self) -> _ShiftedRows:
