@@ -62,7 +62,14 @@ class SvgRenderer(RendererBase):
         transform: Transform,
         rgbFace: ColorType | None = None,
     ) -> None:
-        """Draw lines, or an area."""
+        """Draw lines, or an area.
+
+        Args:
+            gc: width, colour and dashes of the lines.
+            path: vertices.
+            transform: of the vertices to pixels.
+            rgbFace: colour of an area.
+        """
         is_line = rgbFace is None
         shown = path.cleaned(
             transform,
@@ -92,7 +99,16 @@ class SvgRenderer(RendererBase):
         trans: Transform,
         rgbFace: ColorType | None = None,
     ) -> None:
-        """Draw dots, which all markers of pages are: lines of no length with round ends."""
+        """Draw dots, which all markers of pages are: lines of no length with round ends.
+
+        Args:
+            gc: that clips them.
+            marker_path: a circle.
+            marker_trans: of its vertices to pixels.
+            path: places of the dots.
+            trans: of the places to pixels.
+            rgbFace: colour of the dots.
+        """
         places = self._places(trans.transform(path.vertices))
         places = places[np.all((places >= 0.0) & (places <= self._size), axis=1)]
         if rgbFace is None or not len(places):
@@ -113,7 +129,15 @@ class SvgRenderer(RendererBase):
         im: Any,
         transform: Affine2DBase | None = None,
     ) -> None:
-        """Draw an image (h, w, 4) with a square for each value."""
+        """Draw an image with a square for each value.
+
+        Args:
+            gc: that clips it.
+            x: of its corner [px].
+            y: of its corner [px].
+            im: values (h, w, 4).
+            transform: of a unit square to pixels.
+        """
         if transform is None:
             raise NotImplementedError("an image that matplotlib has scaled")
         height, width = im.shape[:2]

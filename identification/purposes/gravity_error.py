@@ -75,7 +75,14 @@ def mixture_limit(std: Array, share: float) -> float:
         tails = 2.0 * scipy.special.ndtr(-limit / spread)
         return float(tails.sum()) / len(std) - (1.0 - share)
 
-    return float(scipy.optimize.brentq(beyond, 0.0, 40.0 * float(finite.max())))
+    # By bisection to the last digit: `scipy.optimize` takes longer to import.
+    low, high = 0.0, 40.0 * float(finite.max())
+    while low < (middle := 0.5 * (low + high)) < high:
+        if beyond(middle) > 0.0:
+            low = middle
+        else:
+            high = middle
+    return high
 
 
 def dry_friction(model: RobotModel, values: Array, postures: Array) -> Array:

@@ -8,7 +8,6 @@ from enum import Enum, auto
 from typing import Final, Literal
 
 import numpy as np
-import scipy
 from numpy.typing import NDArray
 
 from identification.arrays import Array
@@ -227,23 +226,30 @@ def spiking(values: Array, segments: Sequence[slice]) -> Rows:
         if len(part) < MIN_STRETCH_SAMPLES:
             continue
         low, high = np.quantile(part, [_TAIL_QUANTILE, 1.0 - _TAIL_QUANTILE], axis=0)
-        span = high - low
-        beyond = np.maximum(part - high, low - part) > 0.5 * _SPIKE_RANGE_SHARE * span
-        for joint in np.flatnonzero(beyond.any(axis=0)):
-            column = np.ascontiguousarray(part[:, joint])
-            apart = np.abs(
-                column - scipy.ndimage.median_filter(column, 2 * side + 1, mode="nearest")
-            )
+        beyond = np.maximum(part - high, low - part) > 0.5 * _SPIKE_RANGE_SHARE * (high - low)
+        for joint in np.flatnonzero(beyond.any(axis=0)).tolist():  # none in most recordings
+            column = part[:, joint]
+            apart = np.abs(column - _running_median(column, side))
             spread = MAD_TO_STD * np.median(apart)
-            least = max(_SPIKE_SIGMAS * spread, _SPIKE_RANGE_SHARE * span[joint])
-            far = (apart > least) & beyond[:, joint]
-            for start, stop in runs_of(far):
+            least = max(_SPIKE_SIGMAS * spread, _SPIKE_RANGE_SHARE * (high - low)[joint])
+            for start, stop in runs_of((apart > least) & beyond[:, joint]):
                 if stop - start > _MAX_SPIKE_SAMPLES:
                     continue
-                around = np.delete(column, slice(start, stop))[max(0, start - 2) : start + 2]
+                others = np.delete(column, slice(start, stop))
+                around = others[max(0, start - 2) : start + 2]
                 if np.ptp(around) < _MAX_NEIGHBOUR_SHARE * apart[start:stop].min():
                     found[segment.start + start : segment.start + stop, joint] = True
     return found
+
+
+def _running_median(values: Array, side: int) -> Array:
+    """Return the median of each sample (m,) and of `side` samples on both sides of it.
+
+    `scipy.ndimage` takes longer to import.
+    """
+    extended = np.concatenate([np.full(side, values[0]), values, np.full(side, values[-1])])
+    windows = np.lib.stride_tricks.sliding_window_view(extended, 2 * side + 1)
+    return np.asarray(np.partition(windows, side, axis=1)[:, side])
 
 
 def near_reversal(time: Array, speed: Array, reach: Array) -> Rows:
