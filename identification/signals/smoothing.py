@@ -228,9 +228,11 @@ class _Problem:
         """
         factor, correction = self._corrected(penalty, roughness)
         residual = closest - self.design.rows @ correction
-        variance = max(float(np.mean(residual**2)), np.finfo(np.float64).tiny)
+        variance = max(float(residual @ residual) / len(residual), np.finfo(np.float64).tiny)
         bending = roughness + _roughness(correction)
-        sensitivity = float(bending @ _banded_solution(factor, bending))
+        # Half of the solution of b' A^-1 b, in a third of the time.
+        half = scipy.linalg.lapack.dtbtrs(factor, bending[:, None], uplo="L")[0]
+        sensitivity = float(np.vdot(half, half))
         return variance, 2.0 * penalty**2 * sensitivity / (len(residual) * variance)
 
 
@@ -277,9 +279,13 @@ def _rows(
         part = slice(first, first + ROWS_AT_ONCE)
         x = (np.asarray(time[part], dtype=np.float64) - start) / spacing
         interval = np.clip(np.floor(x).astype(np.int32), 0, intervals - 1)
-        powers = np.vander(x - interval, len(pieces), increasing=True)
-        weights[part] = powers @ pieces / spacing**derivative
-        columns[part] = interval[:, None] + np.arange(SPLINE_ORDER)
+        x -= interval
+        powers = np.ones((len(pieces), len(x)))  # `np.vander` takes three times as long
+        for power in range(1, len(pieces)):
+            np.multiply(powers[power - 1], x, out=powers[power])
+        np.matmul(powers.T, pieces, out=weights[part])
+        weights[part] /= spacing**derivative
+        columns[part] = interval[:, None] + np.arange(SPLINE_ORDER, dtype=np.int32)
     ends = np.arange(0, SPLINE_ORDER * m + 1, SPLINE_ORDER, dtype=np.int32)
     return scipy.sparse.csr_array(
         (weights.ravel(), columns.ravel(), ends), shape=(m, intervals + SPLINE_DEGREE)
@@ -288,14 +294,14 @@ def _rows(
 
 def _gram_band(rows: scipy.sparse.csr_array) -> Array:
     """Return the lower band (6, k) of rows' rows, in the order of LAPACK."""
-    columns = rows.indices.reshape(-1, SPLINE_ORDER)
-    weights = rows.data.reshape(-1, SPLINE_ORDER)
+    first = rows.indices[::SPLINE_ORDER].astype(np.intp)
+    weights = np.ascontiguousarray(rows.data.reshape(-1, SPLINE_ORDER).T)
+    intervals = rows.shape[1] - SPLINE_DEGREE
     band = np.zeros((SPLINE_ORDER, rows.shape[1]), order="F")
     for k in range(SPLINE_ORDER):
         for offset in range(SPLINE_ORDER - k):
-            band[offset] += np.bincount(
-                columns[:, k], weights[:, k] * weights[:, k + offset], minlength=rows.shape[1]
-            )
+            products = weights[k] * weights[k + offset]
+            band[offset, k : k + intervals] += np.bincount(first, products, minlength=intervals)
     return band
 
 
