@@ -282,19 +282,21 @@ def leverage_corrected(
     squares = float(unbiased.sum())
     leverage = float(np.einsum("bii,b->", shares, regular.astype(np.float64)))
     rows = [corrected[regular]]
-    added = []
-    factors = _without_by_eigenvectors if symmetric else _without_by_singular_vectors
-    for b in dependent:
-        u, singular, vt = factors(shares[b])
+    added = np.zeros((0, scores.shape[1]))
+    if dependent:
+        factors = _without_by_eigenvectors if symmetric else _without_by_singular_vectors
+        u, singular, vt = factors(shares[dependent])
         trusted = _trusted(1.0 - singular)
-        without_own = (u.T @ scores[b]) / np.maximum(singular, 1.0 - _HIGH_LEVERAGE) ** power
+        own = (scores[dependent][:, None] @ u)[:, 0]
+        without_own = own / np.maximum(singular, 1.0 - _HIGH_LEVERAGE) ** power
         squares += float((trusted * without_own**2 * singular ** (2.0 * power - 1.0)).sum())
         leverage += float((trusted * (1.0 - singular)).sum())
-        rows.append(((np.sqrt(trusted) * without_own) @ vt)[None])
+        rows.append(((np.sqrt(trusted) * without_own)[:, None] @ vt)[:, 0])
         replaced = np.sqrt((1.0 - trusted) * np.maximum(1.0 - singular, 0.0))
-        added.append((replaced[:, None] * vt)[trusted < 1.0])
+        uncertain = trusted < 1.0
+        added = replaced[uncertain][:, None] * vt[uncertain]
     effect = max(1.0, squares / leverage) if leverage > 0.0 else 1.0
-    return np.concatenate([*rows, *(np.sqrt(effect) * vectors for vectors in added)])
+    return np.concatenate([*rows, np.sqrt(effect) * added])
 
 
 def _trusted(leverage: Array) -> Array:
@@ -302,16 +304,17 @@ def _trusted(leverage: Array) -> Array:
     return np.clip((_HIGH_LEVERAGE - leverage) / (_HIGH_LEVERAGE - _LOW_LEVERAGE), 0.0, 1.0)
 
 
-def _without_by_singular_vectors(share: Array) -> tuple[Array, Array, Array]:
-    """Return u, s and v' with ``1 - H = u s v'`` of a share H (k, k)."""
-    u, singular, vt = np.linalg.svd(np.eye(len(share)) - share)
+def _without_by_singular_vectors(shares: Array) -> tuple[Array, Array, Array]:
+    """Return u (B, k, k), s (B, k) and v' (B, k, k) with ``1 - H = u s v'`` of shares (B, k, k)."""
+    u, singular, vt = np.linalg.svd(np.eye(shares.shape[1]) - shares)
     return u, singular, vt
 
 
-def _without_by_eigenvectors(share: Array) -> tuple[Array, Array, Array]:
-    """Return the same of a symmetric share, in half the time."""
-    eigenvalues, vectors = np.linalg.eigh(share)
-    return vectors * np.sign(1.0 - eigenvalues), np.abs(1.0 - eigenvalues), vectors.T
+def _without_by_eigenvectors(shares: Array) -> tuple[Array, Array, Array]:
+    """Return the same of symmetric shares, in half the time."""
+    eigenvalues, vectors = np.linalg.eigh(shares)
+    apart = 1.0 - eigenvalues
+    return vectors * np.sign(apart)[:, None], np.abs(apart), vectors.transpose(0, 2, 1)
 
 
 def _regular(
