@@ -71,12 +71,14 @@ class ElasticTorque:
         for rows, tables in augmented_rows(model, samples):
             for joint, (table, used) in enumerate(zip(tables, model.plan.columns, strict=True)):
                 usable = samples.usable[rows, joint]
-                effect = torque[rows][usable, joint]
-                without = missing[rows][usable, joint]
-                products[joint][used] += table[:-1, usable] @ effect
+                effect = np.where(usable[:, None], torque[rows, joint], 0.0)
+                without = np.where(usable, missing[rows, joint], 0.0)
+                # The table is zero where unusable: copies of its usable columns take longer.
+                sums = table @ np.column_stack([effect, without])
+                products[joint][used] += sums[:-1, :-1]
                 squares[joint] += effect.T @ effect
-                measured[joint] += effect.T @ (table[-1, usable] - without)
-                lost[joint][used] += table[:-1, usable] @ without
+                measured[joint] += sums[-1, :-1] - effect.T @ without
+                lost[joint][used] += sums[:-1, -1]
         return cls(products, squares, measured, lost, compliance)
 
     def plus(self, other: ElasticTorque) -> ElasticTorque:
