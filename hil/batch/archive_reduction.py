@@ -399,8 +399,10 @@ def _triangles(factor: Factor) -> Array:
     """
     joints = []
     for matrices in factor.matrices:
-        row, column = np.triu_indices(matrices.shape[1])
-        joints.append(matrices[:, row, column])
+        width = matrices.shape[1]
+        row, column = np.triu_indices(width)
+        flat = matrices.reshape(len(matrices), -1)
+        joints.append(np.take(flat, row * width + column, axis=1))
     return np.ascontiguousarray(np.concatenate(joints, axis=1))
 
 
