@@ -302,7 +302,7 @@ def parse_chunk(record: Record) -> Chunk:
 
 
 def parse_chunk_index(record: Record) -> ChunkIndex:
-    """Return the index of a chunk; eight times as fast as the library, for a hundred per archive."""
+    """Return the index of a chunk; eight times as fast as the library."""
     body = record.body
     try:
         first, last, start, length, places_length = _CHUNK_INDEX_HEAD.unpack_from(body)
