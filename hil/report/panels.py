@@ -2,19 +2,22 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import io
+import re
+from collections.abc import Mapping, Sequence
 from contextlib import AbstractContextManager
 from dataclasses import dataclass
 from functools import lru_cache
-from typing import Final, NamedTuple
+from typing import Final
+from xml.etree import ElementTree
 
 import numpy as np
 from markupsafe import Markup
 from matplotlib.axes import Axes
-from matplotlib.axis import Axis
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.ticker import MaxNLocator
+from matplotlib.transforms import offset_copy
 
 from hil.base.arrays import Array
 from hil.base.terminal_text import one_line
@@ -30,7 +33,6 @@ from hil.report.chart import (
     label,
 )
 from hil.report.chart_picture import draw_plot
-from hil.report.svg_renderer import SvgRenderer
 
 TICK_SIZE: Final = 10.5  # px, as all lengths here: a picture has 72 of them per inch
 TEXT_SIZE: Final = 11.0
@@ -51,13 +53,12 @@ _MAX_CELL_SIDE: Final = 26.0
 _POINTS_PER_INCH: Final = 72.0
 _GRID_WIDTH: Final = 0.8
 _NAME_GAP: Final = 4.0  # between a matrix and its names
-_TICK_GAP: Final = 9.5  # between the vertical axis and its numbers
-_HEAD_RISE: Final = 5.0  # of the base line of the quantity above its axis
-_TICK_DROP: Final = 17.4  # of the base line of the numbers below the horizontal axis
-_FOOT_DROP: Final = 32.0
-_TICK_ROUNDING: Final = 1e-10  # of the length of an axis
 _GRID_ORDER: Final = 0.5  # over shades, under curves
 _GOLDEN_RATIO: Final = 0.6180339887498949
+_DECIMALS: Final = re.compile(r"(\.\d)\d+")
+_SVG: Final = "{http://www.w3.org/2000/svg}"
+_LINK: Final = "{http://www.w3.org/1999/xlink}href"
+_COORDINATES: Final = frozenset({"x", "y", "width", "height", "transform", "points"})
 
 
 @dataclass(frozen=True)
@@ -85,23 +86,17 @@ def chart_panel(
     heights = tuple(plot.height for plot in chart.plots)
     height = _TOP_MARGIN + sum(heights) + _PLOT_GAP * (len(heights) - 1) + _BOTTOM_MARGIN
     has_names = bool(chart.ticks) or any(plot.names for plot in chart.plots)
-    renderer = SvgRenderer(width, height, chart.caption.key)
-    with _page():
+    with _page(chart.caption.key):
         sheet = _new_sheet if has_names else _sheet
         figure, rows = sheet(width, left, height, heights, chart.log)
         for axes, plot in zip(rows, chart.plots, strict=True):
-            for artist in (*axes.lines, *axes.patches, *axes.collections):
+            for artist in (*axes.lines, *axes.patches, *axes.collections, *axes.texts):
                 artist.remove()
             draw_plot(axes, plot, chart, 1.0, bins)
-            x_ticks, y_ticks = _Ticks.of(axes.xaxis), _Ticks.of(axes.yaxis)
-            _draw_grid(axes, x_ticks.major, y_ticks.major)
-            _write_y_ticks(renderer, axes, y_ticks)
-            _write_head(renderer, axes, plot.heading)
-            if axes is rows[-1]:
-                _write_x_ticks(renderer, axes, x_ticks)
-                _write_foot(renderer, axes, chart.foot)
-        figure.draw(renderer)
-    return _panel(renderer, chart.caption, chart.joint)
+            _draw_grid(axes)
+            _head(axes, plot.heading)
+        _foot(rows[-1], chart.foot)
+        return _panel(figure, chart.caption, width, height, chart.joint)
 
 
 def _new_sheet(
@@ -116,108 +111,28 @@ def _new_sheet(
         if not is_log:
             axes.xaxis.set_major_locator(_round_ticks(6))
             axes.yaxis.set_major_locator(_round_ticks(4, _MIN_TICKS))
+        axes.tick_params(labelbottom=len(rows) == len(heights) - 1)
+        axes.grid(visible=False)
         rows.append(axes)
         top += each + _PLOT_GAP
     return figure, rows
 
 
-# Axes take as long to build as to draw, and the charts of all joints have the same.
+# Axes and their ticks take as long to build as to draw, and the charts of all joints have the same.
 _sheet = lru_cache(maxsize=8)(_new_sheet)
 
 
-class _Ticks(NamedTuple):
-    """Ticks of an axis within its limits."""
-
-    major: list[float]
-    texts: list[tuple[float, str]]  # of these and the minor ones, by their share of the axis
-    factor: str  # of all numbers, or what is added to them
-
-    @classmethod
-    def of(cls, axis: Axis) -> _Ticks:
-        """Return the ticks of an axis."""
-        formatter = axis.get_major_formatter()
-        major, minor = axis.get_majorticklocs().tolist(), axis.get_minorticklocs().tolist()
-        names = [*formatter.format_ticks(major), *axis.get_minor_formatter().format_ticks(minor)]
-        values = np.array([*major, *minor])
-        low, high = axis.get_transform().transform(np.sort(axis.get_view_interval()))
-        shares = (axis.get_transform().transform(values) - low) / (high - low)
-        inside = (shares >= -_TICK_ROUNDING) & (shares <= 1.0 + _TICK_ROUNDING)
-        return cls(
-            [value for value, is_inside in zip(major, inside, strict=False) if is_inside],
-            [(shares[k], names[k]) for k in np.flatnonzero(inside).tolist() if names[k]],
-            formatter.get_offset(),
-        )
-
-
-def _draw_grid(axes: Axes, columns: Sequence[float], rows: Sequence[float]) -> None:
-    """Draw the lines of ticks as one artist: one for each takes longer than the curves."""
+def _draw_grid(axes: Axes) -> None:
+    """Draw the lines of all ticks as one artist: one for each takes longer than the curves."""
     x_limits, y_limits = axes.get_xlim(), axes.get_ylim()
+    columns = [x for x in axes.get_xticks() if x_limits[0] <= x <= x_limits[1]]
+    rows = [y for y in axes.get_yticks() if y_limits[0] <= y <= y_limits[1]]
     x = [value for x in columns for value in (x, x, np.nan)]
     y = [value for _ in columns for value in (*y_limits, np.nan)]
     x += [value for _ in rows for value in (*x_limits, np.nan)]
     y += [value for y in rows for value in (y, y, np.nan)]
     colour = style.colour("grid")
-    axes.add_artist(Line2D(x, y, linewidth=_GRID_WIDTH, color=colour, zorder=_GRID_ORDER))
-
-
-def _write_x_ticks(renderer: SvgRenderer, axes: Axes, ticks: _Ticks) -> None:
-    """Write the numbers or names below the horizontal axis."""
-    frame = _frame(axes)
-    for share, name in ticks.texts:
-        renderer.write(
-            name, frame.left + share * (frame.right - frame.left), frame.bottom + _TICK_DROP,
-            size=TICK_SIZE, colour=INK, anchor="middle",
-        )  # fmt: skip
-    if ticks.factor:
-        renderer.write(
-            ticks.factor, frame.right, frame.bottom + _FOOT_DROP,
-            size=TICK_SIZE, colour=INK, anchor="end",
-        )  # fmt: skip
-
-
-def _write_y_ticks(renderer: SvgRenderer, axes: Axes, ticks: _Ticks) -> None:
-    """Write the numbers or names to the left of the vertical axis."""
-    frame = _frame(axes)
-    right = frame.left - _TICK_GAP
-    for share, name in ticks.texts:
-        renderer.write(
-            name, right, frame.bottom - share * (frame.bottom - frame.top),
-            size=TICK_SIZE, colour=INK, anchor="end", centred=True,
-        )  # fmt: skip
-    if ticks.factor:
-        renderer.write(
-            ticks.factor, right, frame.top - _HEAD_RISE, size=TICK_SIZE, colour=INK, anchor="end"
-        )
-
-
-def _write_head(renderer: SvgRenderer, axes: Axes, text: str) -> None:
-    """Write the quantity of the vertical axis above its upper end."""
-    frame = _frame(axes)
-    renderer.write(one_line(text), frame.left, frame.top - _HEAD_RISE, size=TEXT_SIZE, colour=MUTED)
-
-
-def _write_foot(renderer: SvgRenderer, axes: Axes, text: str) -> None:
-    """Write the quantity of the horizontal axis below its numbers."""
-    frame = _frame(axes)
-    renderer.write(
-        one_line(text), 0.5 * (frame.left + frame.right), frame.bottom + _FOOT_DROP,
-        size=TEXT_SIZE, colour=MUTED, anchor="middle",
-    )  # fmt: skip
-
-
-class _Frame(NamedTuple):
-    """Sides of axes [px], from the upper left corner of their figure."""
-
-    left: float
-    right: float
-    top: float
-    bottom: float
-
-
-def _frame(axes: Axes) -> _Frame:
-    box = axes.bbox
-    height = float(axes.figure.bbox.height)
-    return _Frame(box.x0, box.x1, height - box.y1, height - box.y0)
+    axes.add_line(Line2D(x, y, linewidth=_GRID_WIDTH, color=colour, zorder=_GRID_ORDER))
 
 
 def box_panel(boxes: Boxes) -> Panel:
@@ -230,8 +145,7 @@ def box_panel(boxes: Boxes) -> Panel:
     middle = float(np.median(every))
     low = min(float(every.min()), 0.9 * middle)
     high = max(float(every.max()), 1.1 * middle)
-    renderer = SvgRenderer(width, _BOX_HEIGHT + bottom, boxes.caption.key)
-    with _page():
+    with _page(boxes.caption.key):
         figure = _figure(width, _BOX_HEIGHT + bottom)
         axes = _axes(
             figure,
@@ -251,15 +165,11 @@ def box_panel(boxes: Boxes) -> Panel:
             )
         axes.set_xlim(0.4, len(names) + 0.6)
         axes.set_xticks(range(1, len(names) + 1), names)
+        axes.xaxis.grid(visible=False)
         axes.set_ylim(max(0.0, low - 0.06 * (high - low)), high + 0.06 * (high - low) or 1.0)
         axes.yaxis.set_major_locator(_round_ticks(5, _MIN_TICKS))
-        y_ticks = _Ticks.of(axes.yaxis)
-        _draw_grid(axes, (), y_ticks.major)
-        _write_y_ticks(renderer, axes, y_ticks)
-        _write_x_ticks(renderer, axes, _Ticks.of(axes.xaxis))
-        _write_head(renderer, axes, boxes.heading)
-        figure.draw(renderer)
-    return _panel(renderer, boxes.caption)
+        _head(axes, boxes.heading)
+        return _panel(figure, boxes.caption, width, _BOX_HEIGHT + bottom)
 
 
 def _box(axes: Axes, row: int, values: Array) -> None:
@@ -283,32 +193,50 @@ def matrix_panel(matrix: Matrix) -> Panel:
     cell = min(max(_MATRIX_SIDE / len(names), _MIN_CELL_SIDE), _MAX_CELL_SIDE)
     side = cell * len(names)
     whole = _LABEL_WIDTH + side + 6.0
-    renderer = SvgRenderer(whole, whole, matrix.caption.key)
-    with _page():
+    with _page(matrix.caption.key):
         figure = _figure(whole, whole)
         axes = _axes(figure, _LABEL_WIDTH, _LABEL_WIDTH, side, side)
         axes.imshow(
             np.nan_to_num(matrix.values), cmap="gist_yarg", vmin=0.0, vmax=1.0, interpolation="none"
         )
+        axes.grid(visible=False)
         axes.spines[:].set_visible(True)
-        figure.draw(renderer)
-    size = min(TICK_SIZE, 0.76 * cell)
-    edge = _LABEL_WIDTH - _NAME_GAP
-    for k, name in enumerate(names):
-        place = _LABEL_WIDTH + (k + 0.5) * cell
-        renderer.write(name, place, edge, size=size, colour=INK, centred=True, upwards=True)
-        renderer.write(name, edge, place, size=size, colour=INK, anchor="end", centred=True)
-    return _panel(renderer, matrix.caption)
+        size = min(TICK_SIZE, 0.76 * cell)
+        axes.set(xticks=[], yticks=[])
+        # A text takes a fraction of the time of a tick.
+        columns, rows = axes.get_xaxis_transform(), axes.get_yaxis_transform()
+        above = offset_copy(columns, figure, 0.0, _NAME_GAP, units="points")
+        before = offset_copy(rows, figure, -_NAME_GAP, 0.0, units="points")
+        for k, name in enumerate(names):
+            axes.text(
+                k, 1.0, name, transform=above, fontsize=size, color=style.colour(INK),
+                rotation=90.0, ha="center", va="bottom",
+            )  # fmt: skip
+            axes.text(
+                0.0, k, name, transform=before, fontsize=size, color=style.colour(INK),
+                ha="right", va="center_baseline",
+            )  # fmt: skip
+        return _panel(figure, matrix.caption, whole, whole)
 
 
-def _page() -> AbstractContextManager[None]:
-    """Return the settings of a panel."""
-    return style.page(**{"axes.edgecolor": style.colour("muted"), "axes.linewidth": 0.8})
+def _page(key: str) -> AbstractContextManager[None]:
+    """Return the settings of a picture; the key alone determines the ids in its SVG."""
+    grid = style.colour("grid")
+    muted = style.colour("muted")
+    ink = style.colour("ink")
+    return style.page(
+        **{"svg.hashsalt": key, "xtick.labelsize": TICK_SIZE, "ytick.labelsize": TICK_SIZE},
+        **{"xtick.labelcolor": ink, "ytick.labelcolor": ink},
+        **{"xtick.color": muted, "ytick.color": muted, "axes.edgecolor": muted},
+        **{"grid.color": grid, "grid.linewidth": _GRID_WIDTH, "axes.linewidth": 0.8},
+        # Lines of the grid mark the ticks.
+        **{"xtick.bottom": False, "ytick.left": False, "figure.dpi": _POINTS_PER_INCH},
+        **{"xtick.major.pad": 6.0, "ytick.major.pad": 6.0},
+    )
 
 
 def _figure(width: float, height: float) -> Figure:
-    size = width / _POINTS_PER_INCH, height / _POINTS_PER_INCH
-    return Figure(size, _POINTS_PER_INCH, frameon=False)
+    return Figure((width / _POINTS_PER_INCH, height / _POINTS_PER_INCH), frameon=False)
 
 
 def _axes(figure: Figure, left: float, top: float, width: float, height: float) -> Axes:
@@ -319,8 +247,23 @@ def _axes(figure: Figure, left: float, top: float, width: float, height: float) 
     axes = figure.add_axes(rectangle)
     axes.patch.set_visible(False)
     for axis in (axes.xaxis, axes.yaxis):
-        axis.set_visible(False)  # the text of a tick takes longer than a curve
+        axis.set_label_coords(0.0, 0.0)  # no label, whose place would take every text's extent
     return axes
+
+
+def _head(axes: Axes, text: str) -> None:
+    """Write the quantity of the vertical axis above its upper end."""
+    axes.annotate(
+        one_line(text), (0.0, 1.0), (0.0, 5.0), "axes fraction", "offset points",
+        color=style.colour(MUTED), fontsize=TEXT_SIZE,
+    )  # fmt: skip
+
+
+def _foot(axes: Axes, text: str) -> None:
+    axes.annotate(
+        one_line(text), (0.5, 0.0), (0.0, -32.0), "axes fraction", "offset points",
+        color=style.colour(MUTED), fontsize=TEXT_SIZE, ha="center",
+    )  # fmt: skip
 
 
 def _round_ticks(most: int, fewest: int = 1) -> MaxNLocator:
@@ -328,8 +271,84 @@ def _round_ticks(most: int, fewest: int = 1) -> MaxNLocator:
     return MaxNLocator(most, steps=[1.0, 2.0, 5.0, 10.0], min_n_ticks=fewest)
 
 
-def _panel(renderer: SvgRenderer, caption: Caption, joint: int | None = None) -> Panel:
-    """Return a drawing as a panel with its text alternative."""
+def _panel(
+    figure: Figure, caption: Caption, width: float, height: float, joint: int | None = None
+) -> Panel:
+    """Return a figure as a panel with its text alternative."""
     note = f"; {caption.note}" if caption.note else ""
-    svg = renderer.svg(one_line(f"{caption.title}: {caption.what}{note}."))
-    return Panel(caption.title, caption.note, svg, caption.key, joint)
+    content = io.BytesIO()
+    without = dict.fromkeys(("Date", "Creator", "Format", "Type"))
+    figure.savefig(content, format="svg", metadata=without)
+    svg = _of_page(ElementTree.fromstring(content.getvalue()))
+    svg.attrib.clear()
+    svg.attrib |= {
+        "viewBox": f"0 0 {width:g} {height:g}",
+        "style": f"max-width: {1.3 * width:.0f}px",
+        "role": "img",
+        "aria-label": one_line(f"{caption.title}: {caption.what}{note}."),
+    }
+    text = ElementTree.tostring(svg, encoding="unicode")
+    return Panel(caption.title, caption.note, Markup(text), caption.key, joint)
+
+
+def _of_page(svg: ElementTree.Element) -> ElementTree.Element:
+    """Return matplotlib's SVG with the colours and the font of the page, without what it repeats.
+
+    Colours of the palette become its variables, so that a dark page uses the dark palette;
+    groups lose their ids, which would not be unique in the page, and coordinates their further
+    digits.
+    """
+    variables = {value: f"var(--{name})" for name, value in reversed([*style.palette().items()])}
+    (cleaned,) = _cleaned(svg, variables)
+    return cleaned
+
+
+def _cleaned(
+    element: ElementTree.Element, variables: Mapping[str, str]
+) -> list[ElementTree.Element]:
+    """Return what is left of an element, or of a group without attributes its children."""
+    tag = element.tag.removeprefix(_SVG)
+    if tag == "style":
+        return []
+    children = [left for child in element for left in _cleaned(child, variables)]
+    cleaned = ElementTree.Element(tag)
+    cleaned.text = element.text if tag == "text" else None
+    for name, value in element.attrib.items():
+        if (tag == "g" and name == "id") or value.startswith("rotate(-0 "):
+            continue
+        if name == "style":
+            value = _style(value, variables)
+        elif name == "d":
+            value = _path(value)
+        elif name in _COORDINATES:
+            value = _DECIMALS.sub(r"\1", value)
+        cleaned.set("href" if name == _LINK else name, value)
+    dots = [child for child in children if child.tag == "use"]
+    styles = {dot.get("style", "") for dot in dots}
+    if tag == "g" and len(dots) > 1 and len(styles) == 1:
+        cleaned.set("style", *styles)
+        for dot in dots:
+            del dot.attrib["style"]
+    if tag in ("g", "defs") and not children:
+        return []
+    if tag == "g" and not cleaned.attrib:
+        return children
+    cleaned.extend(children)
+    return [cleaned]
+
+
+def _path(data: str) -> str:
+    """Return a path with one digit behind the point; lines after its start need no letter."""
+    short = " ".join(_DECIMALS.sub(r"\1", data).split()).replace(".0 ", " ")
+    has_curves = "C" in short or "Q" in short
+    return short if has_curves else short.replace(" L ", " ")
+
+
+def _style(text: str, variables: Mapping[str, str]) -> str:
+    """Return declarations of a style with the palette's variables, in the font of the page."""
+    declarations = (part.partition(":") for part in text.split(";"))
+    return ";".join(
+        f"{name.strip()}:{variables.get(value.strip(), value.strip())}"
+        for name, _, value in declarations
+        if value and name.strip() != "font-family"
+    )

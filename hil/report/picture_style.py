@@ -65,33 +65,21 @@ def page(**changes: Any) -> Iterator[None]:
 
     The settings of matplotlib are global.
     """
-    settings: Any = mpl.rcParams
-    with _settings, warnings.catch_warnings():
+    with _settings, warnings.catch_warnings(), mpl.rc_context():
         # A name may have glyphs that are missing in DejaVu.
         warnings.filterwarnings("ignore", message=r"Glyph \d+")
-        before = _settings_now()
-        try:
-            dict.update(settings, _checked_settings(**changes))
-            yield
-        finally:
-            dict.update(settings, before)
+        settings: Any = mpl.rcParams
+        dict.update(settings, _checked_settings())
+        settings.update(changes)
+        yield
 
 
 @cache
-def _checked_settings(**changes: Any) -> dict[str, Any]:
-    """Return the settings of pictures, which matplotlib checks one by one: here, once."""
+def _checked_settings() -> dict[str, Any]:
+    """Return the settings of all pictures, which matplotlib checks one by one: here, once."""
     settings: Any = mpl.rcParams
     with mpl.rc_context():
-        dict.update(settings, mpl.rcParamsDefault)
+        mpl.rcdefaults()
         settings.update({"svg.fonttype": "none", "svg.hashsalt": "hil", "text.parse_math": False})
         settings.update(_STYLE)
-        settings.update(changes)
-        checked = _settings_now()
-    del checked["backend"]  # the user's, of which pictures have no need
-    return checked
-
-
-def _settings_now() -> dict[str, Any]:
-    """Return the settings of matplotlib; `rcParams["backend"]` would load pyplot."""
-    settings: Any = mpl.rcParams
-    return dict(dict.items(settings))
+        return dict(settings)

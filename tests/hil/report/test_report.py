@@ -749,11 +749,6 @@ class TestPictures:
         ]
         assert [line[0] for line in upright] == pytest.approx(columns, abs=0.2)
 
-    def test_have_the_factor_of_small_numbers_beside_the_quantity(self):
-        panel = chart_panel(one_chart([0.0, 1e-9]))
-        assert "1e−9" in texts_of(panel, "end")
-        assert "torque [N·m]" in texts_of(panel, "start")
-
     def test_interrupt_a_line_at_nan(self):
         panel = chart_panel(one_chart([0.0, 1.0, np.nan, 1.0, 0.0]))
         (line,) = re.findall(r'd="([^"]*)"[^>]*stroke:var\(--ink\)', panel.svg)
