@@ -17,7 +17,6 @@ from numpy.typing import NDArray
 from hil.base.arrays import Array
 from hil.base.errors import SourceError
 from hil.importers.conclusions import OneTimeBase
-from identification.signals.cubic_spline import MIN_SAMPLES, CubicSpline
 from identification.signals.recording import GAP_STEPS
 
 Stamps = NDArray[np.int64]
@@ -25,6 +24,7 @@ Stamps = NDArray[np.int64]
 _MEASURED: Final = ("position", "torque", "motor_current")
 """Quantities of which one gives the stamps; the others may be fewer."""
 _SMOOTH: Final = ("position", "velocity")
+_MIN_CUBIC_SAMPLES: Final = 4  # samples of a cubic
 
 
 class Timed(NamedTuple):
@@ -63,8 +63,10 @@ def at_stamps(
         return np.full((len(stamp), values.shape[1]), np.nan)
     time = 1e-9 * (known - known[0])
     at = 1e-9 * (stamp - known[0])
-    if smooth and len(known) >= MIN_SAMPLES:
-        result = CubicSpline.through(time, values)(at)
+    if smooth and len(known) >= _MIN_CUBIC_SAMPLES:
+        from scipy.interpolate import CubicSpline  # only for quantities at times of their own
+
+        result = CubicSpline(time, values)(at)
     else:
         result = np.column_stack([np.interp(at, time, column) for column in values.T])
     after = np.clip(np.searchsorted(known, stamp), 1, len(known) - 1)
@@ -112,7 +114,7 @@ def are_interleaved(finite: Sequence[NDArray[np.bool_]]) -> bool:
     """
     together = np.count_nonzero(np.all(finite, axis=0))
     fewest = min(np.count_nonzero(each) for each in finite)
-    return bool(fewest >= MIN_SAMPLES and together < 0.5 * fewest)
+    return bool(fewest >= _MIN_CUBIC_SAMPLES and together < 0.5 * fewest)
 
 
 def _columns(part: Timed) -> list[tuple[Stamps, Array]]:

@@ -8,12 +8,12 @@ from functools import cached_property
 from typing import Final
 
 import numpy as np
+import scipy
 from numpy.typing import NDArray
 
 from identification.arrays import Array
 from identification.errors import IdentificationError
 from identification.model.motion import Motion
-from identification.signals.cubic_spline import MIN_SAMPLES, CubicSpline
 from identification.signals.masks import runs_of
 from identification.signals.samples import Samples
 
@@ -21,6 +21,7 @@ STEP_SECONDS: Final = 5e-3
 """Time step of a simulation [s]."""
 WINDOW_STRIDE: Final = 0.1
 """Time between the starts of simulations [s]."""
+_MIN_SAMPLES: Final = 4  # of a stretch that is interpolated
 
 
 class NoWindowError(IdentificationError):
@@ -133,11 +134,11 @@ def stretches_of(
     for part in parts:
         motion = samples.motion.rows(part)
         time = motion.time
-        if len(time) < MIN_SAMPLES or time[-1] - time[0] < 2.0 * step:
+        if len(time) < _MIN_SAMPLES or time[-1] - time[0] < 2.0 * step:
             continue
         count = int((time[-1] - time[0]) / step - 1.0 + 1e-9) + 1
         grid = time[0] + step * (0.5 + np.arange(count))
-        spline = CubicSpline.through(time, motion.position)
+        spline = scipy.interpolate.CubicSpline(time, motion.position)
         on_grid = Motion(grid, spline(grid), spline(grid, 1), spline(grid, 2))
         before, after = (spline(grid + shift, 1) for shift in (-0.5 * step, 0.5 * step))
         command = None
