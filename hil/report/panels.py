@@ -248,6 +248,8 @@ def _axes(figure: Figure, left: float, top: float, width: float, height: float) 
     axes.patch.set_visible(False)
     for axis in (axes.xaxis, axes.yaxis):
         axis.set_label_coords(0.0, 0.0)  # no label, whose place would take every text's extent
+    # Before the quantity, which stands above the axis.
+    axes.yaxis.get_offset_text().set_horizontalalignment("right")
     return axes
 
 

@@ -749,6 +749,13 @@ class TestPictures:
         ]
         assert [line[0] for line in upright] == pytest.approx(columns, abs=0.2)
 
+    def test_have_the_factor_of_small_numbers_before_the_quantity(self):
+        panel = chart_panel(one_chart([0.0, 1e-9]))
+        (factor,) = re.findall(
+            r'<text style="[^"]*text-anchor:end[^"]*"[^>]*>([^<]*e−9)<', panel.svg
+        )
+        assert factor == "1e−9"
+
     def test_interrupt_a_line_at_nan(self):
         panel = chart_panel(one_chart([0.0, 1.0, np.nan, 1.0, 0.0]))
         (line,) = re.findall(r'd="([^"]*)"[^>]*stroke:var\(--ink\)', panel.svg)
