@@ -112,11 +112,6 @@ class ColumnScore(NamedTuple):
             np.sqrt(mine[positive] / least[positive])
         ) <= (_SEPARATE_ERROR_RATIO)
 
-    def fit_ratio_to(self, other: ColumnScore) -> float:
-        """Return the ratio of the errors of the fits, geometric mean over the joints."""
-        positive = (self.fitted > 0.0) & (other.fitted > 0.0)
-        return geometric_mean(error_ratio(self.fitted, other.fitted)[positive])
-
     def ratio_to(self, other: ColumnScore) -> tuple[float, float]:
         """Return the error ratio, geometric mean over the joints, and its upper limit by blocks."""
         ratios = ErrorRatios.of(self.squares, other.squares)
@@ -127,6 +122,44 @@ class ColumnScore(NamedTuple):
         counts = np.count_nonzero(ratios.tested[some], axis=1)
         mean, error = mean_and_error(ratios.changes[some].sum(axis=1) / counts)
         return ratio, float(np.exp(mean + SIGNIFICANT_SIGMAS * error))
+
+
+def fit_ratio(fitted: Array, other: Array) -> float:
+    """Return the ratio of the errors of two fits by their squares (n,), a mean over the joints."""
+    positive = (fitted > 0.0) & (other > 0.0)
+    return geometric_mean(error_ratio(fitted, other)[positive])
+
+
+def separate_errors(tables: ColumnSums, target: Array, part: Array) -> Array:
+    """Return the squared errors (n,) of a fit with separate parameters in some of the blocks.
+
+    The errors of `column_score` with the parameters as added columns, without predicted blocks.
+
+    Args:
+        tables: of the blocks.
+        target: of each joint (n, q).
+        part: 1 for the blocks with parameters of their own, 0 for the others (B,).
+    """
+    count = tables.n_parameters + 1
+    ends = tables.gram @ target[:, :, None]
+    torque = np.swapaxes(ends, 2, 3) @ target[:, :, None]
+    total = np.zeros((2, len(target), count, count))
+    for blocks, side in zip((part, 1.0 - part), total, strict=True):
+        side[:, :-1, :-1] = np.tensordot(blocks, tables.of_parameters, 1)
+        side[:, :-1, -1] = np.tensordot(blocks, ends[..., : count - 1, 0], 1)
+        side[:, -1, :-1] = side[:, :-1, -1]
+        side[:, -1, -1] = np.tensordot(blocks, torque[..., 0, 0], 1)
+    floor = 1e-12 * total[:, :, -1, -1].sum(axis=0) + np.finfo(np.float64).tiny
+
+    def errors(weights: Array) -> Array:
+        squares = np.zeros(len(target))
+        for side in total:
+            values = np.append(-_solved(np.tensordot(weights, side, 1)), 1.0)
+            squares += (side @ values) @ values
+        return np.asarray(np.maximum(squares, floor))
+
+    usual = errors(np.ones(len(target)))
+    return errors(np.maximum(tables.rows.sum(axis=0), 1) / usual)
 
 
 def column_score(

@@ -22,7 +22,9 @@ from identification.hypotheses.column_scores import (
     ColumnScore,
     ScorePrior,
     column_score,
+    fit_ratio,
     rough_size,
+    separate_errors,
 )
 from identification.hypotheses.joint_changes import Change, Meaning, Part, changed_samples
 from identification.hypotheses.sizes import estimated_size
@@ -281,20 +283,20 @@ class _Search:
         before = self._before
         usual = self._score(before)
         noise = self._noise
-        separate: dict[Part | None, ColumnScore] = {}
+        separate: dict[Part, ColumnScore | None] = {}
         trials = []
         for change in self._changes():
             if change.part is not None:
                 if change.part not in separate:
-                    separate[change.part] = self._score(before, Change("arm", part=change.part))
-                # All that may have changed is within separate parameters.
-                if separate[change.part].fit_ratio_to(usual) > 1.0 - _MIN_ERROR_REDUCTION:
+                    separate[change.part] = self._separate(change.part, before, usual)
+                if separate[change.part] is None:
                     continue
             added = self._columns(change)
             if not added.any():
                 continue  # such as friction of a frictionless joint
             score = self._score(before, change)
-            explains = score.explains(change.joints, usual, noise, separate.get(change.part))
+            of_part = None if change.part is None else separate[change.part]
+            explains = score.explains(change.joints, usual, noise, of_part)
             size, std = rough_size(change, score, tables)
             if change.meaning == "load friction" and (size or 0.0) <= 0.0:
                 continue  # friction dissipates
@@ -310,6 +312,22 @@ class _Search:
                 _Trial(found, highest, added.shape[3], score.values.mean(axis=0), explains)
             )
         return trials
+
+    def _separate(self, part: Part, before: Array, usual: ColumnScore) -> ColumnScore | None:
+        """Return the score of separate parameters of a part, None if they hardly fit better.
+
+        All that may have changed in the part is within them.
+        """
+        arm = Change("arm", part=part)
+        score = self._score(before, arm) if self.known else None
+        if score is None:  # the two sides have nothing in common: a tenth of the time
+            mask = self.tables.mask_of(arm)
+            fitted = separate_errors(self.tables, self.tables.torques, mask)
+        else:
+            fitted = score.fitted
+        if fit_ratio(fitted, usual.fitted) > 1.0 - _MIN_ERROR_REDUCTION:
+            return None
+        return self._score(before, arm) if score is None else score
 
     def _resized(self, explanation: Explanation, values: Array | None = None) -> Explanation:
         """Return an explanation with the size that is most probable, by a fit with it (p,)."""
