@@ -15,7 +15,6 @@ from typing import IO, TYPE_CHECKING, Any, Final
 
 import zstandard
 from rosbags.interfaces import MessageDefinitionFormat
-from rosbags.typesys import Stores, get_typestore
 
 from hil.archive.verified_records import MAX_COMPRESSION_RATIO
 from hil.base.errors import SourceError
@@ -239,6 +238,7 @@ class _ReaderPart(_Part):
 @contextmanager
 def _reader_part(file: Path, path: Path) -> Iterator[_ReaderPart]:
     from rosbags.highlevel import AnyReader  # only for bags
+    from rosbags.typesys import Stores, get_typestore
 
     try:
         reader = AnyReader([path], default_typestore=get_typestore(Stores.ROS2_HUMBLE))

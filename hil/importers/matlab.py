@@ -17,9 +17,9 @@ import numpy as np
 import scipy
 from numpy.typing import NDArray
 
+import planner  # its worker, with all that plans, is loaded for a .mat alone
 from hil.base.safe_input import read_text
 from planner.errors import PlannerCrashed, PlanningTimedOut
-from planner.worker import WorkerProcess
 
 P = ParamSpec("P")
 T = TypeVar("T")
@@ -141,7 +141,7 @@ def _in_child(function: Callable[P, T], *args: P.args, **kwargs: P.kwargs) -> T:
     """Call a reader of .mat files in a child process: a damaged file can crash it."""
     with _lock:
         if not _readers:
-            _readers.append(WorkerProcess(timeout=_TIMEOUT))
+            _readers.append(planner.WorkerProcess(timeout=_TIMEOUT))
         try:
             return _readers[0].call(_within_memory, partial(function, *args, **kwargs))
         except PlannerCrashed as error:
@@ -157,7 +157,7 @@ def _within_memory(read: Callable[[], T]) -> T:
 
 
 _lock = threading.Lock()
-_readers: list[WorkerProcess] = []
+_readers: list[planner.WorkerProcess] = []
 
 
 @atexit.register

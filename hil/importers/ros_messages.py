@@ -6,15 +6,16 @@ from collections.abc import Callable, Iterator, Sequence
 from dataclasses import MISSING, dataclass, fields, is_dataclass
 from functools import lru_cache
 from operator import attrgetter
-from typing import Any, Final
+from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 from numpy.typing import NDArray
 from rosbags.interfaces import Nodetype
-from rosbags.typesys import Stores, get_types_from_idl, get_types_from_msg, get_typestore
-from rosbags.typesys.store import Typestore
 
 from hil.importers.xcdr2 import in_version_1, is_version_2
+
+if TYPE_CHECKING:
+    from rosbags.typesys.store import Typestore
 
 JOINT_STATE: Final = "sensor_msgs/msg/JointState"
 CONTROLLER_STATE: Final = "control_msgs/msg/JointTrajectoryControllerState"
@@ -48,11 +49,18 @@ def typestore_of(kind: str, definition: str, encoding: str) -> Typestore:
     Raises:
         MessageError: the definition is invalid.
     """
-    ros2_store = get_typestore(Stores.ROS2_HUMBLE)
+    from rosbags import typesys  # only for messages
+    from rosbags.typesys.store import Typestore
+
+    ros2_store = typesys.get_typestore(typesys.Stores.ROS2_HUMBLE)
     if not definition.strip() and kind in ros2_store.types:
         return ros2_store
     try:
-        read = get_types_from_idl(definition) if "idl" in encoding else _of_msg(definition, kind)
+        if "idl" in encoding:
+            read = typesys.get_types_from_idl(definition)
+        else:
+            name = kind if "/msg/" in kind else _with_msg(kind)
+            read = typesys.get_types_from_msg(definition, name)
         for _, described in read.values():
             for _, node in described:
                 _check_size(node)
@@ -82,10 +90,6 @@ def definitions_of(kind: str, definition: str) -> tuple[str, ...]:
         )
         for single, several in _CONTROLLER_STATES
     )
-
-
-def _of_msg(definition: str, kind: str) -> dict[str, Any]:
-    return dict(get_types_from_msg(definition, kind if "/msg/" in kind else _with_msg(kind)))
 
 
 def _with_msg(kind: str) -> str:

@@ -7,10 +7,12 @@ strings or of structures before it (OMG DDS-XTypes 1.3, 7.4.3.5).
 from __future__ import annotations
 
 import struct
-from typing import Any, Final
+from typing import TYPE_CHECKING, Any, Final
 
 from rosbags.interfaces import Nodetype
-from rosbags.typesys.store import Typestore
+
+if TYPE_CHECKING:
+    from rosbags.typesys.store import Typestore
 
 _SIMPLE: Final = (b"\x00\x06", b"\x00\x07")
 _DELIMITED: Final = (b"\x00\x08", b"\x00\x09")

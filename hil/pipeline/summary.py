@@ -15,14 +15,14 @@ from hil.cell import Cell
 from hil.results import results
 from identification import Factor, RobotModel
 from identification.estimators.torque_scale import absolute
-from identification.excitation import (
+from identification.excitation.criteria import (
     Criteria,
-    Excitation,
     correlation,
     coupling_index_max,
     friction_of_excitation,
     information,
 )
+from identification.excitation.excitation import Excitation
 from identification.factor.messages import method_words, prior_words, status_words
 from identification.model.elements import TorqueRipple
 from identification.selection.essential import Elimination
@@ -38,7 +38,7 @@ from identification.validation.prediction import (
     prediction_error,
 )
 from identification.validation.residuals import Profile
-from planner import FourierSeries
+from planner.fourier import FourierSeries
 from sim_fixtures.ns16 import TABLE2, URDF_PATH
 
 from .estimating import Estimation

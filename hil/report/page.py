@@ -21,7 +21,8 @@ from hil.results.provenance import RESULTS
 from hil.results.results import ChoiceResult, ParameterResult, Results, by_id, outside_mark
 from hil.results.rollout_result import RolloutResult
 from hil.results.series import ReportSeries
-from identification.excitation import CRITERIA, METHODS
+from identification.excitation.criteria import CRITERIA
+from identification.excitation.searches.methods import METHODS
 from identification.validation.purpose_messages import TITLES, figure, requirement
 
 _MAX_CANDIDATES: Final = 6

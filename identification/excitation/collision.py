@@ -28,7 +28,9 @@ from identification.excitation.separation import (
 )
 from identification.model.kinematics import Chain, chain_from_urdf
 from identification.model.workspace import Workspace
-from planner import FourierSeries, JointLimits, PiecewiseCubic
+from planner.fourier import FourierSeries
+from planner.limits import JointLimits
+from planner.piecewise_cubic import PiecewiseCubic
 
 # Another contact may be deeper by this: in given postures, and along a motion [m].
 _DEPTH_TOLERANCE: Final = 0.005

@@ -20,9 +20,10 @@ from identification.excitation.violation import (
 )
 from identification.model.motion import Motion
 from identification.model.robot import RobotModel
-from planner import FourierSeries, JointLimits, NotSmooth, PiecewiseCubic, Trajectory, check_rest
-from planner.limits import position_rounding
-from planner.piecewise_cubic import Extrema
+from planner.errors import NotSmooth
+from planner.fourier import FourierSeries
+from planner.limits import JointLimits, position_rounding
+from planner.piecewise_cubic import Extrema, PiecewiseCubic, Trajectory, check_rest
 
 # Checks sample both ends of a motion, criteria the middles of the steps: at rest at an end
 # sgn(qd) is 0 or, after rounding, ±1. From 1 to 8 ms log det of random motions of the NS 16 changes

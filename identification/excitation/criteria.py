@@ -22,8 +22,8 @@ from identification.factor.factor import Factor
 from identification.model.friction import JointFriction
 from identification.model.motion import Motion
 from identification.model.robot import RobotModel
-from planner import Trajectory
 from planner.arrays import Whole, strict
+from planner.piecewise_cubic import Trajectory
 
 
 def information(factor: Factor) -> Array:

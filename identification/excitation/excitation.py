@@ -8,8 +8,10 @@ from typing import Any, Self
 
 from identification.arrays import Array
 from identification.excitation.criteria import Criteria
-from planner import FourierSeries, Move, PiecewiseCubic
 from planner.arrays import DAMAGED_DATA_ERRORS, Whole, numbers, strict
+from planner.fourier import FourierSeries
+from planner.moves import Move
+from planner.piecewise_cubic import PiecewiseCubic
 
 
 @dataclass(frozen=True, eq=False)

@@ -1,0 +1,30 @@
+"""All public names of `sim_fixtures`, imported when the first of them is used."""
+
+from __future__ import annotations
+
+from sim_fixtures.arm import UnmodelledEffects
+from sim_fixtures.controller import Phase, SimulatedController
+from sim_fixtures.drive import SimulatedDrive
+from sim_fixtures.plant import ElasticPlant, Plant, PlantTruth
+from sim_fixtures.settings import (
+    ControllerSettings,
+    PlantDiverged,
+    ServoSettings,
+    SettingError,
+    SimulationError,
+)
+
+__all__ = [
+    "SimulatedController",
+    "ControllerSettings",
+    "ServoSettings",
+    "Phase",
+    "SimulatedDrive",
+    "Plant",
+    "ElasticPlant",
+    "PlantTruth",
+    "UnmodelledEffects",
+    "SimulationError",
+    "SettingError",
+    "PlantDiverged",
+]
