@@ -317,7 +317,7 @@ ELASTIC: Final = ("products", "squares", "measured", "lost", "compliance")
 """Arrays of the torque of elastic gears."""
 
 FIT: Final = ("values", "covariance", "noise_std", "samples")
-"""Arrays of the estimate of an archive. It outlives the sum, and so has copies of its own."""
+"""Arrays of an estimate. It outlives what it is read from, and so has copies of its own."""
 
 
 def cached_reduction(
@@ -353,8 +353,7 @@ def _packed(reduced: ReducedArchives) -> tuple[dict[str, Any], Arrays]:
         "totals": np.concatenate([_triangles(summary.total) for summary in summaries]),
     }
     fits = [summary.fit for summary in summaries if summary.fit is not None]
-    for name in FIT:
-        arrays[name] = np.array([getattr(fit, name) for fit in fits])
+    stated_fits = iter(packed_estimates(fits, arrays))
     scatters = [summary.scatter for summary in summaries if summary.scatter is not None]
     if scatters:
         arrays["scatter"] = np.concatenate([scatter.rows for scatter in scatters])
@@ -362,10 +361,52 @@ def _packed(reduced: ReducedArchives) -> tuple[dict[str, Any], Arrays]:
         "parameters": first.parameter_names,
         "units": fits[0].units if fits else (),
         "columns": [columns.tolist() for columns in first.columns],
-        "archives": [_entry(summary) for summary in summaries],
+        "archives": [
+            _entry(summary) | ({} if summary.fit is None else {"fit": next(stated_fits)})
+            for summary in summaries
+        ],
         "sum": None if reduced.total is None else _packed_sum(reduced.total, arrays),
     }
     return content, arrays
+
+
+def packed_estimates(estimates: Sequence[Estimate], arrays: Arrays) -> list[dict[str, Any]]:
+    """Add the arrays of estimates to others, and return what is no array as JSON data.
+
+    Names and units of the parameters are not among it.
+    """
+    for name in FIT:
+        arrays[name] = np.array([getattr(estimate, name) for estimate in estimates])
+    return [
+        {
+            "method": estimate.method.as_json(),
+            "condition": estimate.condition,
+            "undetermined": estimate.undetermined,
+            "interval_factor": estimate.interval_factor,
+        }
+        for estimate in estimates
+    ]
+
+
+def unpacked_estimates(
+    stated: Sequence[Mapping[str, Any]],
+    arrays: Arrays,
+    names: tuple[str, ...],
+    units: tuple[str, ...],
+) -> list[Estimate]:
+    """Return the estimates of :func:`packed_estimates`, with names and units of the parameters."""
+    return [
+        Estimate(
+            names=names,
+            units=units,
+            **{name: arrays[name][number].copy() for name in FIT},
+            method=EstimationMethod.of_json(each["method"]),
+            condition=each["condition"],
+            undetermined=tuple(each["undetermined"]),
+            interval_factor=each["interval_factor"],
+        )
+        for number, each in enumerate(stated)
+    ]
 
 
 def _packed_sum(total: Reduction, arrays: Arrays) -> dict[str, Any]:
@@ -428,21 +469,14 @@ def _places(widths: tuple[int, ...]) -> tuple[NDArray[np.intp], ...]:
 
 
 def _entry(summary: Summary) -> dict[str, Any]:
-    """Return what is no array of an archive, as JSON data."""
-    fit = summary.fit
+    """Return what is no array of an archive and no estimate, as JSON data."""
     scatter = summary.scatter
     entry: dict[str, Any] = {
         "warnings": [*map(note_as_json, summary.warnings)],
         "blocks": len(summary.total),
         "facts": dict(summary.facts),
     }
-    if fit is not None and scatter is not None:
-        entry["fit"] = {
-            "method": fit.method.as_json(),
-            "condition": fit.condition,
-            "undetermined": fit.undetermined,
-            "interval_factor": fit.interval_factor,
-        }
+    if scatter is not None:
         entry["scatter"] = {
             "rows": len(scatter.rows),
             "interval_factor": scatter.interval_factor,
@@ -461,8 +495,9 @@ def _unpacked(
     units = tuple(map(intern, content["units"]))
     columns = tuple(np.array(joint, dtype=np.intp) for joint in content["columns"])
     totals = _matrices(arrays["totals"], columns)
+    stated_fits = [entry["fit"] for entry in content["archives"] if "fit" in entry]
+    fits = iter(unpacked_estimates(stated_fits, arrays, names, units))
     summaries = []
-    fit_number = 0
     scatter_begin = 0
     block_begin = 0
     for ref, entry in zip(refs, content["archives"], strict=True):
@@ -471,16 +506,7 @@ def _unpacked(
         fit = None
         scatter = None
         if "fit" in entry:
-            stated = entry["fit"]
-            fit = Estimate(
-                names=names,
-                units=units,
-                **{name: arrays[name][fit_number].copy() for name in FIT},
-                method=EstimationMethod.of_json(stated["method"]),
-                condition=stated["condition"],
-                undetermined=tuple(stated["undetermined"]),
-                interval_factor=stated["interval_factor"],
-            )
+            fit = next(fits)
             scattered = entry["scatter"]
             scatter_end = scatter_begin + scattered["rows"]
             scatter = ScoreScatter(
@@ -488,7 +514,6 @@ def _unpacked(
                 interval_factor=scattered["interval_factor"],
                 blocks=TimeBlocks(**scattered["blocks"]),
             )
-            fit_number += 1
             scatter_begin = scatter_end
         summaries.append(
             Summary(

@@ -5,13 +5,14 @@ from __future__ import annotations
 import math
 from collections import Counter
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, replace
-from typing import Final, Literal
+from dataclasses import asdict, dataclass, field, replace
+from typing import Final, Literal, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from hil.base.arrays import Array
+from hil.base.files import json_digest
 from hil.cell import Cell
 from hil.pipeline.estimating import posterior_of
 from hil.pipeline.estimators import fit_of
@@ -33,11 +34,13 @@ from .archive_reduction import (
     Summary,
     ToReduce,
     added,
+    packed_estimates,
     plus,
     reduce_archives,
     settings_digest,
+    unpacked_estimates,
 )
-from .cache import CacheLocation
+from .cache import Arrays, CacheLocation, code_digest
 from .cluster import SkippedArchive
 from .notes import DifferentSetups, MoreNotes, OfSomeArchives
 from .setup import NO_SETUP, Setup
@@ -113,10 +116,17 @@ class EstimateGroup:
     warned: tuple[tuple[ArchiveRef, tuple[Note, ...]], ...] = ()
     settings: frozenset[str] = frozenset()  #: digests
     setups: frozenset[Setup] = frozenset()  #: that the cells state
+    key: tuple[str, ...] = ()  #: of all that the estimate of the campaigns follows from
 
     @classmethod
-    def of(cls, reduced: ReducedArchives, settings: Settings) -> EstimateGroup:
-        """Return the group of one campaign, without the estimates from each archive."""
+    def of(cls, reduced: ReducedArchives, settings: Settings, key: str) -> EstimateGroup:
+        """Return the group of one campaign, without the estimates from each archive.
+
+        Args:
+            reduced: archives of the campaign.
+            settings: of the campaign.
+            key: of the archives and how they were reduced.
+        """
         fitted = [summary for summary in reduced.summaries if summary.ref.use == "excitation"]
         group = cls(
             refs=tuple(summary.ref for summary in fitted),
@@ -124,6 +134,7 @@ class EstimateGroup:
             warned=tuple((summary.ref, summary.warnings) for summary in reduced.summaries),
             settings=frozenset({settings_digest(settings)}),
             setups=frozenset(summary.ref.setup for summary in fitted),
+            key=(key, *(summary.ref.sha256 for summary in reduced.summaries)),
         )
         for summary in reduced.summaries:
             if summary.ref.use != "excitation":
@@ -140,6 +151,7 @@ class EstimateGroup:
             warned=self.warned + other.warned,
             settings=self.settings | other.settings,
             setups=self.setups | other.setups,
+            key=self.key + other.key,
         )
 
 
@@ -158,6 +170,8 @@ class CampaignResult:
 
 def estimate_campaign(
     parts: Sequence[ReducedArchives | SkippedArchive],
+    key: str,
+    cache: CacheLocation,
     arm: ArmModel,
     settings: Settings,
     campaign: str,
@@ -166,28 +180,31 @@ def estimate_campaign(
 
     Args:
         parts: archives, reduced or skipped.
+        key: of all these archives.
+        cache: of the estimates.
         arm: model of the arm.
         settings: of the campaign, with its own noise.
         campaign: its name.
+
+    Raises:
+        CacheError: the cache cannot be written.
     """
     reduced = added(part for part in parts if isinstance(part, ReducedArchives))
     estimator = Estimator(arm)
-    group = EstimateGroup.of(reduced, settings)
+    group = EstimateGroup.of(reduced, settings, key)
     estimates: list[BatchEstimate] = []
     broken = [*reduced.broken, *(part for part in parts if isinstance(part, SkippedArchive))]
     if group.total is not None:
         try:
-            posterior, notes = estimator.posterior(group.total.factor)
-            share = 1.0 / len(group.refs)
-            digest = settings_digest(settings)
             fitted = [each for each in reduced.summaries if each.ref.use == "excitation"]
-            repetitions = [
-                estimator.repetition(summary, digest, posterior, share) for summary in fitted
+            found = estimator.cached(group, fitted, cache)
+            digest = settings_digest(settings)
+            *singles, whole = found.estimates
+            group = replace(group, values=tuple(each.values for each in singles))
+            estimates = [
+                *map(estimator.repetition, fitted, singles, [digest] * len(fitted)),
+                estimator.sum("campaign", group, whole, found.notes),
             ]
-            group = replace(group, values=tuple(each.estimate.values for each in repetitions))
-            recordings = [summary.total for summary in fitted]
-            whole = estimator.sum("campaign", group, posterior, notes, recordings)
-            estimates = [*repetitions, whole]
         except IdentificationError as error:
             broken.append(SkippedArchive(campaign, str(error)))
     result = CampaignResult(tuple(estimates), tuple(broken), reduced.read, reduced.cached)
@@ -196,6 +213,7 @@ def estimate_campaign(
 
 def estimate_cached(
     partitions: Sequence[Sequence[ToReduce]],
+    key: str,
     cache: CacheLocation,
     arm: ArmModel,
     settings: Settings,
@@ -207,16 +225,17 @@ def estimate_cached(
 
     Args:
         partitions: archives whose sums are cached together.
-        cache: of the sums.
+        key: of all these archives.
+        cache: of the sums and estimates.
         arm: model of the arm.
         settings: of the campaign, with its own noise.
         campaign: its name.
 
     Raises:
-        CacheError: a damaged sum is computed again, and the cache cannot be written.
+        CacheError: the cache cannot be written.
     """
     parts = [reduce_archives(partition, settings, cache) for partition in partitions]
-    return estimate_campaign(parts, arm, settings, campaign)
+    return estimate_campaign(parts, key, cache, arm, settings, campaign)
 
 
 def result_of(
@@ -240,9 +259,13 @@ def group_of(
 
 
 def estimate_arm(
-    parts: Sequence[EstimateGroup], arm: ArmModel
+    parts: Sequence[EstimateGroup], cache: CacheLocation, arm: ArmModel
 ) -> BatchEstimate | SkippedArchive | None:
-    """Estimate an arm from sums over its campaigns; None if there is no excitation."""
+    """Estimate an arm from sums over its campaigns; None if there is no excitation.
+
+    Raises:
+        CacheError: the cache cannot be written.
+    """
     group = sum(parts, EstimateGroup())
     if group.total is None:
         return None
@@ -251,8 +274,8 @@ def estimate_arm(
         notes.append(DifferentSetups(tuple(sorted(group.setups))))
     estimator = Estimator(arm)
     try:
-        posterior, others = estimator.posterior(group.total.factor)
-        return estimator.sum("pooled", group, posterior, [*others, *notes])
+        found = estimator.cached(group, (), cache)
+        return estimator.sum("pooled", group, found.estimates[-1], [*found.notes, *notes])
     except IdentificationError as error:
         return SkippedArchive(f"arm {arm.digest[:8]}", str(error))
 
@@ -260,18 +283,71 @@ def estimate_arm(
 # Estimates
 
 
+class GroupEstimates(NamedTuple):
+    """Estimates from each of some archives, then from their sum, and notes on the estimator."""
+
+    estimates: tuple[Estimate, ...]
+    notes: tuple[UnrestrictedBodies, ...] = ()
+
+
 class Estimator:
     """An estimator for one arm."""
 
     def __init__(self, arm: ArmModel) -> None:
         settings = arm.settings
+        self._key = json_digest([arm.estimator, arm.cell, arm.urdf, asdict(settings)])
         self.name = arm.estimator
         self.cell = cell_from(arm.cell, arm.urdf, settings.friction)
         self.model = self.cell.model
         self._delay_variance = settings.delay_variance
         self._strength = settings.strength
 
-    def posterior(self, total: Factor) -> tuple[Posterior, list[Note]]:
+    def cached(
+        self, group: EstimateGroup, fitted: Sequence[Summary], cache: CacheLocation
+    ) -> GroupEstimates:
+        """Return the estimates from each of `fitted` and from the group, from the cache if there.
+
+        Raises:
+            IdentificationError: there is no estimate.
+            CacheError: the cache cannot be written.
+        """
+        place = group.refs[0].origin
+        levels = [len(fitted), *sorted(group.settings), *group.key]
+        key = json_digest(["estimates", self._key, levels, code_digest()])
+        model = self.cell.model
+        entry = cache.read(place, key)
+        try:
+            if entry is not None:
+                content, arrays = entry
+                each = unpacked_estimates(
+                    content["estimates"], arrays, model.parameter_names, model.units
+                )
+                return GroupEstimates(tuple(each), tuple(map(UnrestrictedBodies, content["notes"])))
+        except (KeyError, ValueError, TypeError, IndexError):  # not an entry of this program
+            pass
+        found = self.of_each(group, fitted)
+        numbers: Arrays = {}
+        stated = packed_estimates(found.estimates, numbers)
+        notes = [note.reason for note in found.notes]
+        cache.write(place, key, {"estimates": stated, "notes": notes}, numbers)
+        return found
+
+    def of_each(self, group: EstimateGroup, fitted: Sequence[Summary]) -> GroupEstimates:
+        """Estimate from each of `fitted` and from the group.
+
+        Raises:
+            IdentificationError: there is no estimate.
+        """
+        assert group.total is not None
+        posterior, notes = self.posterior(group.total.factor)
+        share = 1.0 / len(group.refs)
+        singles = [self.of_archive(summary, posterior, share) for summary in fitted]
+        if singles:
+            group = replace(group, values=tuple(each.values for each in singles))
+        whole = self.of_group(group, posterior, [summary.total for summary in fitted])
+        return GroupEstimates((*singles, whole), tuple(notes))
+
+    def posterior(self, total: Factor) -> tuple[Posterior, list[UnrestrictedBodies]]:
         """Return the posterior of a sum and its archives, and notes.
 
         Raises:
@@ -339,20 +415,10 @@ class Estimator:
         exact = np.zeros(self.model.n_joints)  # in units of the torque of the arm
         return widened(estimate, total, posterior, precision, exact, recordings).estimate
 
-    def repetition(
-        self, summary: Summary, settings: str, posterior: Posterior, share: float
-    ) -> BatchEstimate:
-        """Return the estimate of one archive.
-
-        Args:
-            summary: of the archive.
-            settings: digest of them.
-            posterior: of the campaign.
-            share: of the archive in its campaign.
-        """
+    def repetition(self, summary: Summary, estimate: Estimate, settings: str) -> BatchEstimate:
+        """Return the estimate from one archive, with the digest of the settings."""
         ref = summary.ref
         nothing = np.full(self.model.n_joints, np.nan)
-        estimate = self.of_archive(summary, posterior, share)
         return BatchEstimate(
             level="repetition",
             arm=ref.arm,
@@ -372,28 +438,18 @@ class Estimator:
         )
 
     def sum(
-        self,
-        level: Level,
-        group: EstimateGroup,
-        posterior: Posterior,
-        warnings: Sequence[Note],
-        recordings: Sequence[Factor] = (),
+        self, level: Level, group: EstimateGroup, estimate: Estimate, warnings: Sequence[Note]
     ) -> BatchEstimate:
-        """Return the estimate of a campaign, or of all campaigns of the arm.
+        """Return the estimate from a campaign, or from all campaigns of the arm.
 
         Args:
             level: of the estimate.
             group: what is summed.
-            posterior: of the estimator.
+            estimate: from the sum.
             warnings: on the recordings.
-            recordings: factors of a campaign, over which friction may drift.
-
-        Raises:
-            IdentificationError: there is no estimate.
         """
         assert group.total is not None
         refs = group.refs
-        estimate = self.of_group(group, posterior, recordings)
         unseen = Factor.zero(self.model) if group.unseen is None else group.unseen
         is_poor = not estimate.undetermined and estimate.condition > MAX_GRAM_CONDITION
         if self.name != "auto" and is_poor:

@@ -1,9 +1,9 @@
 """The batch: find archives, decide settings, and estimate by one graph of Dask tasks.
 
-archive -> factor (cached) -> sum -> estimate: a task reduces up to `ARCHIVES_PER_TASK` archives of
-a campaign, each of which is cached, and adds their factors; one task adds these sums, which it
-reads itself if all of them are cached, and estimates the campaign; others pool the campaigns of an
-arm.
+archive -> factor (cached) -> sum -> estimate (cached): a task reduces up to `ARCHIVES_PER_TASK`
+archives of a campaign, each of which is cached, and adds their factors; one task adds these sums,
+which it reads itself if all of them are cached, and estimates the campaign; others pool the
+campaigns of an arm.
 """
 
 from __future__ import annotations
@@ -430,9 +430,10 @@ class _Batch:
         for campaign in arm.campaigns:
             place = campaign.key.campaign
             partitions = campaign.partitions
-            estimated = (arm.model, campaign.ready, place)
+            keys = [reduction_key(partition, campaign.ready) for partition in partitions]
+            estimated = (json_digest(keys), self.cache, arm.model, campaign.ready, place)
             if all(self._has(partition, campaign) for partition in partitions):
-                pair = submit(place, estimate_cached, partitions, self.cache, *estimated)
+                pair = submit(place, estimate_cached, partitions, *estimated)
                 receivers[id(pair)] = _advance(advance, sum(map(len, partitions)), place)
                 yield pair
             else:
@@ -449,7 +450,9 @@ class _Batch:
             yield result
         if arm.has_pooled:
             sums = [submit("", group_of, chunk) for chunk in _chunks(campaigns)]
-            pooled = submit(f"arm {arm.model.digest[:8]}", estimate_arm, sums, arm.model)
+            pooled = submit(
+                f"arm {arm.model.digest[:8]}", estimate_arm, sums, self.cache, arm.model
+            )
             receivers[id(pooled)] = self._receive_pooled(arm)
             yield pooled
 

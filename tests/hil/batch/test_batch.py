@@ -22,7 +22,7 @@ from hil.archive import ArchiveWriter, ImportedSamples, write_samples
 from hil.archive.repair import repair, repaired_name
 from hil.base.errors import ArchiveError, InputError
 from hil.base.progress import Silent
-from hil.batch import archive_discovery, archive_reduction
+from hil.batch import archive_discovery, archive_reduction, estimates
 from hil.batch import graph as batch_run
 from hil.batch.archive_discovery import discover, open_ref
 from hil.batch.archive_reduction import (
@@ -296,6 +296,28 @@ class TestCache:
         assert bits(second) == bits(first)
         assert Spied.tasks[-2:] == ["estimate_cached", "result_of"]
         assert "reduce_archives" not in Spied.tasks
+
+    @pytest.mark.long
+    @pytest.mark.parametrize("estimator", ["auto", "wls", "consistent"])
+    def test_of_estimates_serves_the_same_archives_only(
+        self, folder, estimator, tmp_path, monkeypatch
+    ):
+        cache = CacheLocation(str(tmp_path / "cache"))
+        first = batch(folder, cache=cache, estimator=estimator)
+        with monkeypatch.context() as patch:
+            patch.setattr(estimates.Estimator, "of_each", pytest.fail)
+            second = batch(folder, cache=cache, estimator=estimator)
+        for level in ("repetitions", "campaigns", "pooled"):
+            for one, other in zip(getattr(first, level), getattr(second, level), strict=True):
+                assert one.warnings == other.warnings
+                for name in ("values", "covariance", "noise_std", "samples"):
+                    known = getattr(one.estimate, name)
+                    assert known.tobytes() == getattr(other.estimate, name).tobytes()
+                for name in ("names", "units", "method", "condition", "interval_factor"):
+                    assert getattr(one.estimate, name) == getattr(other.estimate, name)
+        fewer = batch(*excitations(folder)[1:], cache=cache, estimator=estimator)
+        (before,), (after,) = first.campaigns, fewer.campaigns
+        assert before.estimate.values.tobytes() != after.estimate.values.tobytes()
 
     def test_preserves_the_blocks_of_long_recordings(self, folder, tmp_path, monkeypatch):
         """Which are longer than those of short ones, and are merged before they are added."""
