@@ -394,7 +394,14 @@ def unpacked_estimates(
     names: tuple[str, ...],
     units: tuple[str, ...],
 ) -> list[Estimate]:
-    """Return the estimates of :func:`packed_estimates`, with names and units of the parameters."""
+    """Return the estimates of :func:`packed_estimates`.
+
+    Args:
+        stated: what is no array.
+        arrays: by name.
+        names: of the parameters (p,).
+        units: of the parameters (p,).
+    """
     return [
         Estimate(
             names=names,
