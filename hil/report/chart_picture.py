@@ -4,13 +4,15 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
-from typing import Final
+from typing import Final, Literal
 
+import numpy as np
 from matplotlib.artist import Artist
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
-from matplotlib.patches import Patch
+from matplotlib.patches import Patch, PathPatch
+from matplotlib.path import Path
 from matplotlib.ticker import NullFormatter, NullLocator, StrMethodFormatter
 
 from hil.report import picture_style as style
@@ -122,10 +124,13 @@ def draw_plot(axes: Axes, plot: Plot, chart: Chart, scale: float, bins: int | No
         bins: intervals of x, in each of which a line has at most two points; None: all.
     """
     if plot.shaded:  # one artist, as a call for each would take longer than all else
-        spans = [(start, stop - start) for start, stop in plot.shaded]
-        whole = axes.get_xaxis_transform()
-        colour = style.colour("band")
-        axes.broken_barh(spans, (0, 1), transform=whole, color=colour, linewidth=0.0, zorder=0.2)
+        corners = [[(a, 0.0), (a, 1.0), (b, 1.0), (b, 0.0), (a, 0.0)] for a, b in plot.shaded]
+        shades = PathPatch(
+            Path.make_compound_path_from_polys(np.array(corners)),
+            transform=axes.get_xaxis_transform(), color=style.colour("band"), linewidth=0.0,
+            zorder=0.2,
+        )  # fmt: skip
+        axes.add_artist(shades)
     if plot.band is not None:
         axes.axhspan(*plot.band, color=style.colour("band"), linewidth=0.0, zorder=0.2)
     if plot.origin:
@@ -136,13 +141,18 @@ def draw_plot(axes: Axes, plot: Plot, chart: Chart, scale: float, bins: int | No
         values = trace.values
         size = trace.width * scale
         colour = style.colour(trace.colour)
+        # Not by `plot`, which takes as long again for limits that are set below.
         if trace.dots:
-            axes.plot(x, values, "o", color=colour, markersize=size, markeredgewidth=0.0)
-            continue
-        if bins is not None and trace.x is None:
-            x, values = thinned(x, values, bins)
-        line = "--" if trace.dashed else "-"
-        axes.plot(x, values, line, color=colour, linewidth=size)
+            line = Line2D(
+                x, values, linestyle="none", marker="o", color=colour, markersize=size,
+                markeredgewidth=0.0,
+            )  # fmt: skip
+        else:
+            if bins is not None and trace.x is None:
+                x, values = thinned(x, values, bins)
+            dashes: Literal["--", "-"] = "--" if trace.dashed else "-"
+            line = Line2D(x, values, linestyle=dashes, color=colour, linewidth=size)
+        axes.add_artist(line)
     if chart.log:
         if axes.get_yscale() != "log":
             axes.loglog()

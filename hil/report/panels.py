@@ -132,7 +132,7 @@ def _draw_grid(axes: Axes) -> None:
     x += [value for _ in rows for value in (*x_limits, np.nan)]
     y += [value for y in rows for value in (y, y, np.nan)]
     colour = style.colour("grid")
-    axes.add_line(Line2D(x, y, linewidth=_GRID_WIDTH, color=colour, zorder=_GRID_ORDER))
+    axes.add_artist(Line2D(x, y, linewidth=_GRID_WIDTH, color=colour, zorder=_GRID_ORDER))
 
 
 def box_panel(boxes: Boxes) -> Panel:

@@ -65,13 +65,17 @@ def page(**changes: Any) -> Iterator[None]:
 
     The settings of matplotlib are global.
     """
-    with _settings, warnings.catch_warnings(), mpl.rc_context():
+    settings: Any = mpl.rcParams
+    with _settings, warnings.catch_warnings():
         # A name may have glyphs that are missing in DejaVu.
         warnings.filterwarnings("ignore", message=r"Glyph \d+")
-        settings: Any = mpl.rcParams
-        dict.update(settings, _checked_settings())
-        settings.update(changes)
-        yield
+        before = _settings_now()
+        try:
+            dict.update(settings, _checked_settings())
+            settings.update(changes)
+            yield
+        finally:  # as `rc_context`, which copies one by one
+            dict.update(settings, before)
 
 
 @cache
@@ -79,7 +83,15 @@ def _checked_settings() -> dict[str, Any]:
     """Return the settings of all pictures, which matplotlib checks one by one: here, once."""
     settings: Any = mpl.rcParams
     with mpl.rc_context():
-        mpl.rcdefaults()
+        dict.update(settings, mpl.rcParamsDefault)
         settings.update({"svg.fonttype": "none", "svg.hashsalt": "hil", "text.parse_math": False})
         settings.update(_STYLE)
-        return dict(settings)
+        checked = _settings_now()
+    del checked["backend"]  # the user's, of which pictures have no need
+    return checked
+
+
+def _settings_now() -> dict[str, Any]:
+    """Return the settings of matplotlib; `rcParams["backend"]` would load pyplot."""
+    settings: Any = mpl.rcParams
+    return dict(dict.items(settings))
