@@ -20,10 +20,9 @@ from hil.pipeline.notes import Note, PoorlySeparated, UnrestrictedBodies
 from identification import IdentificationError
 from identification.estimators.consistent import SolverError
 from identification.estimators.covariance import solve_with_prior
-from identification.estimators.least_squares import no_narrower
 from identification.factor.estimate import Estimate
 from identification.factor.factor import MAX_GRAM_CONDITION, Factor, require_rows
-from identification.reduction.intervals import delayed, widened
+from identification.reduction.intervals import widened
 from identification.reduction.posterior import Posterior
 from identification.reduction.reduction import Reduction
 from identification.selection.settings import Settings
@@ -190,7 +189,7 @@ def estimate_campaign(
         CacheError: the cache cannot be written.
     """
     reduced = added(part for part in parts if isinstance(part, ReducedArchives))
-    estimator = Estimator(arm)
+    estimator = ArmEstimator(arm)
     group = EstimateGroup.of(reduced, settings, key)
     estimates: list[BatchEstimate] = []
     broken = [*reduced.broken, *(part for part in parts if isinstance(part, SkippedArchive))]
@@ -272,7 +271,7 @@ def estimate_arm(
     notes = list[Note]()
     if len(group.setups) > 1:
         notes.append(DifferentSetups(tuple(sorted(group.setups))))
-    estimator = Estimator(arm)
+    estimator = ArmEstimator(arm)
     try:
         found = estimator.cached(group, (), cache)
         return estimator.sum("pooled", group, found.estimates[-1], [*found.notes, *notes])
@@ -290,8 +289,8 @@ class GroupEstimates(NamedTuple):
     notes: tuple[UnrestrictedBodies, ...] = ()
 
 
-class Estimator:
-    """An estimator for one arm."""
+class ArmEstimator:
+    """Estimates of one arm: those of `hil.pipeline.estimating` from sums, cached."""
 
     def __init__(self, arm: ArmModel) -> None:
         settings = arm.settings
@@ -408,12 +407,17 @@ class Estimator:
         else:
             estimate = fit_of(self.model, self.name)((), total.factor)
         motions = {ref.motion for ref in group.refs}
-        if len(motions) == 1 and "" not in motions:
-            covariance = no_narrower(estimate.covariance, np.array(group.values))
-            estimate = replace(estimate, covariance=covariance)
-        estimate = delayed(estimate, total, self._delay_variance, precision)
-        exact = np.zeros(self.model.n_joints)  # in units of the torque of the arm
-        return widened(estimate, total, posterior, precision, exact, recordings).estimate
+        is_one_motion = len(motions) == 1 and "" not in motions
+        return widened(
+            estimate,
+            total,
+            posterior,
+            precision,
+            delay_variance=self._delay_variance,
+            repetitions=np.array(group.values) if is_one_motion else None,
+            torque_scale=np.zeros(self.model.n_joints),  # in units of the torque of the arm
+            recordings=recordings,
+        ).estimate
 
     def repetition(self, summary: Summary, estimate: Estimate, settings: str) -> BatchEstimate:
         """Return the estimate from one archive, with the digest of the settings."""

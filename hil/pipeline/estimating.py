@@ -28,7 +28,7 @@ from identification.estimators.robust import RobustEstimate, robust_estimate
 from identification.factor.columns import instrument_factor
 from identification.factor.estimate import Estimate
 from identification.factor.factor import MAX_GRAM_CONDITION, Factor, no_rows_message, total_factor
-from identification.reduction.intervals import delayed, widened
+from identification.reduction.intervals import widened
 from identification.reduction.posterior import Posterior
 from identification.reduction.reduction import Reduction
 from identification.selection.settings import Settings, Strength
@@ -167,9 +167,17 @@ def estimate_with(
             warnings: list[Note] = [] if unsolved is None else [UnrestrictedBodies(str(unsolved))]
         else:
             result, warnings = _without_prior(prepared, name)
-        if prepared.sources.same_motion:
-            result = result.with_scatter()
-        pooled = delayed(result.pooled, total, settings.delay_variance, precision)
+        scale = torque_scale_of(prepared.sources)
+        pooled, stated, form = widened(
+            result.pooled,
+            total,
+            posterior,
+            precision,
+            delay_variance=settings.delay_variance,
+            repetitions=result.values if prepared.sources.same_motion else None,
+            torque_scale=scale.std,
+            recordings=factors,
+        )
         result = replace(result, pooled=pooled)
         task.advance(1, "prior")
         of_prior = replace(beside, estimate=pooled)
@@ -178,8 +186,6 @@ def estimate_with(
         task.advance(1, "held-out motion")
         held_out = tuple(Factor.by_time(model, samples) for samples in prepared.held_out)
         task.advance(1)
-    scale = torque_scale_of(prepared.sources)
-    stated, form = widened(pooled, total, posterior, precision, scale.std, factors)
     return Estimation(
         estimator=name,
         result=result,

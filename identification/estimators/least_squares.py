@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Final, Literal
 
 import numpy as np
@@ -106,11 +106,6 @@ class RepeatedEstimate:
             factor: of all.
         """
         return cls(pooled, np.array(values), factor, estimate(model, factor).std)
-
-    def with_scatter(self) -> RepeatedEstimate:
-        """Widen the intervals to the scatter of repetitions, which can cancel in the covariance."""
-        covariance = no_narrower(self.pooled.covariance, self.values)
-        return replace(self, pooled=replace(self.pooled, covariance=covariance))
 
     @property
     def mean(self) -> Array:

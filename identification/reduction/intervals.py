@@ -18,6 +18,7 @@ from identification.estimators.friction_form import (
     with_drift,
     with_uncertain_form,
 )
+from identification.estimators.least_squares import no_narrower
 from identification.estimators.torque_scale import with_torque_scale
 from identification.factor.estimate import Estimate, inverse_variance
 from identification.factor.factor import Factor
@@ -30,11 +31,12 @@ from identification.reduction.reduction import Reduction
 class Widened(NamedTuple):
     """An estimate whose intervals allow for what its model lacks."""
 
-    estimate: Estimate
+    pooled: Estimate  #: with the scatter of repetitions and the error of the delay
+    estimate: Estimate  #: with everything
     form: FormUncertainty | None  #: of the friction law; None if it was not examined
 
 
-def delayed(
+def _delayed(
     estimate: Estimate, total: Reduction, variance: float, precision: Array | None
 ) -> Estimate:
     """Return the estimate with the error of the delay in its intervals.
@@ -55,10 +57,13 @@ def widened(
     total: Reduction,
     posterior: Posterior,
     precision: Array | None,
+    *,
+    delay_variance: float,
+    repetitions: Array | None,
     torque_scale: Array,
     recordings: Sequence[Factor],
 ) -> Widened:
-    """Return the estimate with elastic gears and an uncertain friction law in its intervals.
+    """Return the estimate with all errors that the scatter of its residuals does not show.
 
     Its change by the scale of the torques is added to it, not to the intervals.
 
@@ -67,9 +72,15 @@ def widened(
         total: sums of the fitted rows.
         posterior: of the arm.
         precision: information (p, p) of the prior, if the estimate has one.
+        delay_variance: mean square error of the delay [s²].
+        repetitions: parameters from each repetition of one motion (R, p); None: of several motions.
         torque_scale: relative standard deviation of each joint's torque (n,).
         recordings: factors of the recordings in order, whose friction may drift.
     """
+    if repetitions is not None:
+        covariance = no_narrower(estimate.covariance, repetitions)
+        estimate = replace(estimate, covariance=covariance)
+    estimate = _delayed(estimate, total, delay_variance, precision)
     model = posterior.model
     factor = total.factor
     # The scores of a stronger prior, or of possible bodies, are not zero.
@@ -92,7 +103,7 @@ def widened(
         own = estimate if believed is None else replace(estimate, values=believed)
         form = form_uncertainty(model, own, factor, total.unmodelled.forms, precision)
         result = with_uncertain_form(result, form)
-    return Widened(_with_drift(model, result, recordings), form)
+    return Widened(estimate, _with_drift(model, result, recordings), form)
 
 
 def _excess(estimate: Estimate, total: Reduction, values: Array) -> Array:

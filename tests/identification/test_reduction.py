@@ -7,7 +7,7 @@ import pytest
 
 from identification.estimators.prior import BODY_STD_SHARE
 from identification.factor.factor import Factor
-from identification.reduction.intervals import delayed, widened
+from identification.reduction.intervals import widened
 from identification.reduction.posterior import Posterior
 from identification.reduction.reduction import Reduction, reduce
 from identification.selection.averaging import AveragedBandwidth
@@ -35,12 +35,24 @@ def reduced(*versions, shares=(1.0,), unmodelled=True):
     )
 
 
-def estimated(total):
-    """Estimate with everything that widens its intervals."""
+def wider(total, delay_variance):
+    """Return everything that widens the intervals of one motion, and the estimate before."""
     posterior = Posterior.of(MODEL, total.factor, BODY_STD_SHARE, {}, Strength())
     pooled = posterior.fit(total.factor).estimate
-    late = delayed(pooled, total, 1e-7, posterior.precision)
-    return widened(late, total, posterior, posterior.precision, np.zeros(2), ()).estimate
+    return pooled, widened(
+        pooled,
+        total,
+        posterior,
+        posterior.precision,
+        delay_variance=delay_variance,
+        repetitions=None,
+        torque_scale=np.zeros(2),
+        recordings=(),
+    )
+
+
+def estimated(total):
+    return wider(total, 1e-7)[1].estimate
 
 
 @pytest.fixture(scope="module")
@@ -91,12 +103,10 @@ def drifting(count, drift):
 def test_drift_is_neither_another_law_nor_an_elastic_gear(drift):
     """The first repetitions alone do not balance at the parameters of all of them."""
     total = Reduction.total(MODEL, drifting(10, drift))
-    posterior = Posterior.of(MODEL, total.factor, BODY_STD_SHARE, {}, Strength())
-    pooled = posterior.fit(total.factor).estimate
-    wider = widened(pooled, total, posterior, posterior.precision, np.zeros(2), ())
-    assert wider.form is not None
-    assert np.all(wider.form.probability < 0.5)
-    assert np.max(wider.estimate.std / pooled.std) < 3.0
+    pooled, found = wider(total, 0.0)
+    assert found.form is not None
+    assert np.all(found.form.probability < 0.5)
+    assert np.max(found.estimate.std / pooled.std) < 3.0
 
 
 def test_campaigns_of_other_motions_add_by_their_rows(halves):

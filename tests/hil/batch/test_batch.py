@@ -305,7 +305,7 @@ class TestCache:
         cache = CacheLocation(str(tmp_path / "cache"))
         first = batch(folder, cache=cache, estimator=estimator)
         with monkeypatch.context() as patch:
-            patch.setattr(estimates.Estimator, "of_each", pytest.fail)
+            patch.setattr(estimates.ArmEstimator, "of_each", pytest.fail)
             second = batch(folder, cache=cache, estimator=estimator)
         for level in ("repetitions", "campaigns", "pooled"):
             for one, other in zip(getattr(first, level), getattr(second, level), strict=True):
