@@ -38,10 +38,10 @@ def cut_short(packet: bytes, transfer: int) -> list[bytes]:
 
 encode = CyclicPacket.encode
 IN_THE_CODEC = "AssertionError-tests.fuzz.targets.codec"
-IN_THE_JUDGE = "AssertionError-tests.drivers.judge"
+BY_THE_JUDGE = "AssertionError-tests.drivers.set_points"
 PLANTED: dict[str, tuple[str, Any, str, Callable[..., Any], str]] = {
     "a guard that lets everything pass":
-        ("session", Guard, "check_set_point", lambda *_: None, IN_THE_JUDGE),
+        ("session", Guard, "check_set_point", lambda *_: None, BY_THE_JUDGE),
     "an exception in the session":
         ("session", Session, "_cyclic", lambda *_: 1 // 0, "ZeroDivision"),
     "a codec that changes a byte":

@@ -150,7 +150,7 @@ def test_the_demo_writes_results_and_begins_with_the_verdict(tmp_path: Path) -> 
         (["identify", str(CELL_PATH)], "cell.toml"),
         (
             ["import", "rosbag2", "x.db3", "-o", "y.mcap"],
-            "--urdf arm.urdf, or --cell cell.toml, or --dh table.csv",
+            "--urdf arm.urdf, --cell cell.toml, or --dh table.csv",
         ),
         (["import", "rosbag2", "x.db3", "-o", "y.mcap", "--urdf", str(URDF_PATH)], "x.db3"),
         (

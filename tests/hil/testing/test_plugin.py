@@ -113,6 +113,7 @@ def test_a_project_without_it_pays_for_a_few_small_modules() -> None:
         "hil",
         "hil.base",
         "hil.base.errors",
+        "hil.base.exit_status",
         "hil.base.first_use",
         "hil.base.terminal_text",
         "hil.testing",
