@@ -33,6 +33,7 @@ _CURRENT_NOISE = 0.02  # A, standard deviation
 _COULOMB = np.array([30.0, 40.0, 20.0, 4.0, 4.0, 2.0])  # N·m
 _VISCOUS = np.array([20.0, 30.0, 12.0, 2.0, 2.0, 1.0])  # N·m·s
 _REVERSAL = 1000.0  # s/rad, so that friction reverses within a step of the encoder
+_LAG = 5  # cycles
 _BATCH = 100
 _FIRST = 3000  # cycle in which an excitation of a campaign begins, about
 
@@ -66,9 +67,7 @@ def records(repetition: int) -> NDArray[np.void]:
     position, velocity, acceleration = _motion()
     period = PERIOD
     revolutions = drive.motor_revolutions(position)
-    # The arm lags a few cycles behind its targets.
-    measured = np.roll(revolutions, 5, axis=0)
-    measured[:5] = revolutions[0]
+    measured = _behind_targets(revolutions)
     noise = random.normal(scale=0.5, size=measured.shape)
     measured = np.rint(measured * _COUNTS + noise) / _COUNTS
     steps = np.diff(measured, axis=0, prepend=measured[:1])
@@ -85,12 +84,19 @@ def records(repetition: int) -> NDArray[np.void]:
     rows["target_velocity"] = drive.joint_velocity(_wire(per_cycle), period)
     rows["position"] = drive.joint_position(_wire(measured))
     rows["velocity"] = drive.joint_velocity(_wire(steps), period)
-    current = drive.motor_current(_torque(position, velocity, acceleration))
+    current = _behind_targets(drive.motor_current(_torque(position, velocity, acceleration)))
     rows["model_current"] = _wire(current)
     demanded = current + random.normal(scale=_CURRENT_NOISE, size=current.shape)
     rows["target_current"] = _wire(np.rint(demanded / _CURRENT_STEP) * _CURRENT_STEP)
     rows["diagonal_inertia"] = _wire([40.0, 80.0, 18.0, 0.3, 0.35, 0.13] + 0.1 * np.cos(position))
     return rows
+
+
+def _behind_targets(values: Array) -> Array:
+    """Return values (m, n) of an arm that lags a few cycles behind its targets."""
+    late = np.roll(values, _LAG, axis=0)
+    late[:_LAG] = values[0]
+    return late
 
 
 def drive_train() -> DriveTrain:
