@@ -72,6 +72,7 @@ _SAME_NUISANCES_STEP: Final = 1e-3  # s, step of the delay that hardly moves wha
 _SAME_WEIGHTS_STEP: Final = 1e-4  # s, step that hardly changes the residuals
 _TIME_BLOCKS: Final = 80  # blocks of time
 _ROWS_AT_ONCE: Final = 8192
+_STEP_ROUNDING: Final = 1e-6  # relative deviation of a step of an even clock
 _FALSE_DELAY_PROBABILITY: Final = 0.005  # one-sided probability of a false delay
 CLOSED_LOOP_BIAS: Final = 1e-4
 """Standard deviation [s] of an estimate's error in addition to its interval: encoder noise in the
@@ -100,7 +101,11 @@ def predicted_rate(samples: Samples, torque: Array) -> Array:
     rate = np.zeros_like(torque)
     for segment in samples.segments:
         if segment.stop - segment.start > 1:
-            rate[segment] = np.gradient(torque[segment], samples.motion.time[segment], axis=0)
+            time = samples.motion.time[segment]
+            step = float(time[-1] - time[0]) / (len(time) - 1)
+            # Even steps but for rounding take a fifth of the time.
+            is_even = np.abs(np.diff(time) - step).max() < _STEP_ROUNDING * step
+            rate[segment] = np.gradient(torque[segment], step if is_even else time, axis=0)
     return rate
 
 
@@ -120,10 +125,11 @@ def rate_products(model: RobotModel, samples: Samples) -> Array:
         load = part.known_torque(model)
         inside = slice(start - first, stop - first)
         for joint, (block, columns) in enumerate(zip(*part.regressor(model), strict=True)):
-            rate = predicted_rate(part, np.column_stack([block, load[:, joint]]))[inside]
-            usable = part.usable[inside, joint]
+            # Rows of memory are columns here, as the regressor has them.
+            rate = predicted_rate(part, np.vstack([block.T, load[:, joint]]).T)[inside]
+            usable = np.where(part.usable[inside, joint], block[inside].T, 0.0)
             places = np.ix_(columns, np.append(columns, model.n_parameters))
-            products[joint][places] += block[inside][usable].T @ rate[usable]
+            products[joint][places] += usable @ rate
     return products
 
 
