@@ -15,7 +15,7 @@ a velocity reversal are left out: presliding friction is similar to a delay.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from enum import Enum
 from functools import cached_property
@@ -32,7 +32,7 @@ from identification.estimators.delay_nuisances import Nuisances, nuisances
 from identification.estimators.load_friction import fit_with_load
 from identification.factor.blocks import FOLDS, count_by_block, merged
 from identification.factor.estimate import Estimate, estimate, inverse_variance, residual_variance
-from identification.factor.factor import Factor, no_rows_message
+from identification.factor.factor import Factor, no_rows_message, time_blocks
 from identification.factor.normal_equations import NormalEquations, Solution, solve
 from identification.model.motion import Motion
 from identification.model.robot import RobotModel
@@ -114,7 +114,35 @@ def rate_products(model: RobotModel, samples: Samples) -> Array:
 
     Of all rows: over a stretch they do not cancel as they do over a whole motion.
     """
+    return factor_and_rates(model, samples, with_factor=False)[1]
+
+
+def factor_and_rates(
+    model: RobotModel, samples: Samples, *, with_factor: bool = True
+) -> tuple[Factor, Array]:
+    """Return the factor of samples by time, and their :func:`rate_products`, by one regressor."""
     products = np.zeros((model.n_joints, model.n_parameters, model.n_parameters + 1))
+    index, duration = time_blocks(samples)
+    factor = replace(Factor.zero(model, int(index.max(initial=-1)) + 1), block=duration)
+    factor.counts[:] = count_by_block(index, samples.usable)
+    for part, rows, inside in _with_neighbours(samples):
+        load = part.known_torque(model)
+        tables = []
+        for joint, (block, columns) in enumerate(zip(*part.regressor(model), strict=True)):
+            # Rows of memory are columns here, as the regressor has them.
+            rate = predicted_rate(part, np.vstack([block.T, load[:, joint]]).T)[inside]
+            table = np.vstack([block[inside].T, part.torque[inside, joint]])
+            table[:, ~part.usable[inside, joint]] = 0.0  # they may be NaN
+            places = np.ix_(columns, np.append(columns, model.n_parameters))
+            products[joint][places] += table[:-1] @ rate
+            tables.append(table)
+        if with_factor:
+            factor.add_rows(index[rows], tables)
+    return factor, products
+
+
+def _with_neighbours(samples: Samples) -> Iterator[tuple[Samples, slice, slice]]:
+    """Yield parts of samples with a row more on each side, their rows, and where these are."""
     m = len(samples.torque)
     # A low-pass needs all rows at once; otherwise the regressor of a long recording is never whole.
     length = m if samples.torque_bandwidth is not None else _ROWS_AT_ONCE
@@ -122,15 +150,7 @@ def rate_products(model: RobotModel, samples: Samples) -> Array:
         stop = min(start + length, m)
         first = max(start - 1, 0)  # a rate needs the neighbouring rows
         part = samples.between(first, min(stop + 1, m))
-        load = part.known_torque(model)
-        inside = slice(start - first, stop - first)
-        for joint, (block, columns) in enumerate(zip(*part.regressor(model), strict=True)):
-            # Rows of memory are columns here, as the regressor has them.
-            rate = predicted_rate(part, np.vstack([block.T, load[:, joint]]).T)[inside]
-            usable = np.where(part.usable[inside, joint], block[inside].T, 0.0)
-            places = np.ix_(columns, np.append(columns, model.n_parameters))
-            products[joint][places] += usable @ rate
-    return products
+        yield part, slice(start, stop), slice(start - first, stop - first)
 
 
 def delay_sensitivity(

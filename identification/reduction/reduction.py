@@ -14,7 +14,7 @@ from typing import Final
 import numpy as np
 
 from identification.arrays import Array
-from identification.estimators.delay import rate_products
+from identification.estimators.delay import factor_and_rates, rate_products
 from identification.estimators.elasticity import ElasticTorque
 from identification.estimators.friction_form import form_factor
 from identification.estimators.prior import body_prior, posterior_values
@@ -114,14 +114,19 @@ def reduce(
         unmodelled: whether the recording is one of those that show what the model lacks.
         elastic: whether positions are of motors, in front of elastic gears.
     """
-    reduce_rows = form_factor if unmodelled else Factor.by_time
-    rows = mean_factor([reduce_rows(model, samples) for samples in versions], shares)
+    if uncertain_delay and not unmodelled:
+        both = [factor_and_rates(model, samples) for samples in versions]
+        rows = mean_factor([factor for factor, _ in both], shares)
+        return Reduction(rows, np.tensordot(shares, [sums for _, sums in both], axes=1))
+    if not unmodelled:
+        return Reduction(mean_factor([Factor.by_time(model, each) for each in versions], shares))
+    rows = mean_factor([form_factor(model, samples) for samples in versions], shares)
     # The rows without further terms of friction are part of those with them.
-    factor = rows.restricted(np.arange(model.n_parameters)) if unmodelled else rows
+    factor = rows.restricted(np.arange(model.n_parameters))
     rates = None
     if uncertain_delay:
         rates = np.tensordot(shares, [rate_products(model, each) for each in versions], axes=1)
-    if not unmodelled or not factor.samples.any():
+    if not factor.samples.any():
         return Reduction(factor, rates)
     torque = None
     if elastic:
