@@ -34,6 +34,7 @@ from identification.selection.settings import Settings
 from identification.signals.samples import Samples
 from identification.validation.finding_messages import Naming, worded
 from identification.validation.findings.diagnosis import of_diagnosis
+from identification.validation.prediction import noise_floor
 
 from .archive_discovery import JOINT_TEMPERATURE, ArchiveRef, cell_in, errors_of_origin, open_ref
 from .cache import Arrays, CacheLocation, code_digest
@@ -165,8 +166,9 @@ def reduced_archive(wanted: ToReduce, settings: Settings) -> tuple[Summary, Redu
     merged = [MergedSamples(source.merged)] if source.merged else []
     stated = map(StatedText, archive.header.findings.warnings)
     warnings: list[Note] = [*known_warnings(cell, archive), *stated, *merged]
-    if wanted.examined:
-        warnings += _other_meanings(model, versions[0], source, ref.origin)
+    if wanted.examined and versions[0].usable.any():
+        noise = None if fit is None else noise_floor(model, fit.values, versions[:1])
+        warnings += _other_meanings(model, versions[0], source, ref.origin, noise)
     if archive.outcome is not None and archive.outcome.repaired:
         warnings.append(RepairedArchive())
     parts = factor.parts(wanted.parts)
@@ -175,16 +177,21 @@ def reduced_archive(wanted: ToReduce, settings: Settings) -> tuple[Summary, Redu
 
 
 def _other_meanings(
-    model: RobotModel, samples: Samples, source: Source, origin: str
+    model: RobotModel, samples: Samples, source: Source, origin: str, noise: Array | None
 ) -> tuple[OtherMeaning, ...]:
     """Return what a recording is other than stated, as a verdict and an import ask it.
+
+    Args:
+        model: of the arm.
+        samples: of the recording.
+        source: it.
+        origin: where it comes from.
+        noise: standard deviation of the torque noise (n,); None if it cannot be measured.
 
     Raises:
         ArchiveError: its torque as a whole is, so that no parameter follows from it.
     """
-    if not samples.usable.any():
-        return ()
-    found = diagnose(model, [samples])
+    found = diagnose(model, [samples], noise=noise)
     names = tuple(model.joint_names)
     if found.is_otherwise:
         finding = worded(of_diagnosis(found)[0], Naming(names))

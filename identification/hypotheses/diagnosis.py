@@ -220,6 +220,7 @@ def diagnose(
     unseen: Sequence[Samples] = (),
     *,
     known: TorqueDiagnosis | None = None,
+    noise: Array | None = None,
 ) -> TorqueDiagnosis:
     """Ask what prepared recordings of one arm are, and what explains the errors of their fit.
 
@@ -229,13 +230,15 @@ def diagnose(
         fitted: a fit of them; None asks only for what they are throughout.
         unseen: recordings that it predicts worse, in which something may begin.
         known: what they are throughout, where that was asked before.
+        noise: standard deviation of each joint's torque noise (n,), by default that of the fit.
     """
     found = known
     if found is None:
         rows = few_rows(recordings)
         score = score_of(model, rows)
         found = torque_of(model, recordings, rows, score)
-        noise = None if fitted is None else fitted.noise
+        if noise is None and fitted is not None:
+            noise = fitted.noise
         found = with_readings(found, model, rows, score, noise)
     if fitted is None or found.is_otherwise:
         return found
