@@ -117,7 +117,7 @@ FindingKey = Literal[
     "axis error of little torque",
     "axis error on unseen motion alone",
     "unexplained error",
-    "left open by the motion",
+    "undetermined by the motion",
     "nothing explained",
     "little explained",
     "explained",

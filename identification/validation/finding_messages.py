@@ -623,7 +623,7 @@ SENTENCES: Final[Mapping[FindingKey, Sentence]] = {
         " {floor:pc1}; none of the tested faults explains it (delay, torque constants, signs and"
         " order of joints, payload, changes between recordings)",
     ),
-    "left open by the motion": Sentence(
+    "undetermined by the motion": Sentence(
         LEFT_OPEN,
         "parameters that fit the recording equally well (to {fitted:pc1}) differ by {open:pc1} of"
         " the torque on {motion}, as the fitted motion does not determine them; the error of"

@@ -165,7 +165,7 @@ def left_open(evidence: Evidence, limits: Thresholds) -> Finding | None:
         "overall": overall,
     }
     step: RemedyKey = "cover the motion in both directions"
-    return Finding("left open by the motion", "doubtful", step, values=values)
+    return Finding("undetermined by the motion", "doubtful", step, values=values)
 
 
 def _unexplained_axes(evidence: Evidence, limits: Thresholds) -> tuple[Mask, Mask]:
