@@ -2,27 +2,106 @@
 
 A sans-I/O core (`Session`, guarded by a `Guard`) that any `Transport` feeds through `exchange`;
 knows nothing of plans, robot dynamics or files. Every refusal is a class of `drivers.errors`.
-
-The names of `drivers.api`, which are imported when the first of them is used: who needs one
-module does not wait for all.
 """
 
-from importlib import import_module
-from typing import TYPE_CHECKING, Any
+from __future__ import annotations
 
-if TYPE_CHECKING:
-    from drivers.api import *  # noqa: F403
+from drivers.c4g_packets import MODE_FIELDS, CyclicPacket, InitPacket, Mode
+from drivers.cycle_records import CycleRing, cycle_dtype
+from drivers.drive_train import DriveTrain
+from drivers.errors import (
+    DriverError,
+    DriveTrainError,
+    GuardError,
+    PacketError,
+    RefusalError,
+    RequestError,
+    SourceFailed,
+    TransportClosed,
+)
+from drivers.events import (
+    Counters,
+    Event,
+    GapSeen,
+    HoldChanged,
+    InitReceived,
+    LinkLost,
+    MotionEnded,
+    MotionStarted,
+    OverrideChanged,
+    PacketRejected,
+    Refused,
+    RepliesLost,
+    StateChanged,
+)
+from drivers.exchange.loop import exchange
+from drivers.guard import Guard, GuardLimits
+from drivers.motion_source import BoundsName, MotionSource
+from drivers.session import Session
+from drivers.states import Outcome, State
+from drivers.transports.base import Transport, TransportError, TransportSpec
+from drivers.transports.simulated import (
+    Corrupt,
+    Delay,
+    Duplicate,
+    Fault,
+    FaultyLink,
+    Lose,
+    Peer,
+    Reorder,
+    SimulatedTransport,
+)
+from drivers.transports.udp import UdpSpec, UdpTransport
 
-
-def __getattr__(name: str) -> Any:
-    """A name of `drivers.api`."""
-    if name == "__all__" or not name.startswith("_"):
-        api = import_module("drivers.api")
-        if name in ("__all__", *api.__all__):
-            return getattr(api, name)
-    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-
-
-def __dir__() -> list[str]:
-    """All names, loaded or not: the reference documents them."""
-    return [*globals(), *import_module("drivers.api").__all__]
+__all__ = [
+    "RepliesLost",
+    "BoundsName",
+    "Corrupt",
+    "Counters",
+    "CycleRing",
+    "CyclicPacket",
+    "Delay",
+    "DriveTrain",
+    "DriveTrainError",
+    "DriverError",
+    "Duplicate",
+    "Event",
+    "Fault",
+    "FaultyLink",
+    "GapSeen",
+    "HoldChanged",
+    "Guard",
+    "GuardError",
+    "GuardLimits",
+    "InitPacket",
+    "InitReceived",
+    "LinkLost",
+    "Lose",
+    "MODE_FIELDS",
+    "Mode",
+    "MotionEnded",
+    "MotionSource",
+    "MotionStarted",
+    "OverrideChanged",
+    "Outcome",
+    "PacketError",
+    "PacketRejected",
+    "Peer",
+    "RefusalError",
+    "Refused",
+    "Reorder",
+    "RequestError",
+    "Session",
+    "SimulatedTransport",
+    "SourceFailed",
+    "State",
+    "StateChanged",
+    "Transport",
+    "TransportClosed",
+    "TransportError",
+    "TransportSpec",
+    "UdpSpec",
+    "UdpTransport",
+    "cycle_dtype",
+    "exchange",
+]

@@ -5,8 +5,10 @@ The floors themselves are a contract of import-linter in `pyproject.toml`.
 
 from __future__ import annotations
 
+import pkgutil
 import subprocess
 import sys
+from importlib import import_module
 from pathlib import Path
 
 import pytest
@@ -50,3 +52,13 @@ def test_a_look_loads_no_interpolator_or_recorder() -> None:
     loaded = loaded_by("hil.cli.look")
     assert "planner.limits" in loaded
     assert not {"planner.api", "planner.interpolator", "hil.archive.recorder"} & loaded
+
+
+@pytest.mark.parametrize(
+    "package", ["planner", "identification", "identification.excitation", "sim_fixtures"]
+)
+def test_a_name_that_is_imported_on_first_use_is_no_module(package: str) -> None:
+    """Once the module is imported, the name would be the module."""
+    modules = {module.name for module in pkgutil.iter_modules(import_module(package).__path__)}
+    assert "api" in modules
+    assert not modules & set(import_module(f"{package}.api").__all__)

@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-import math
 from typing import Final
 
 import numpy as np
+from numpy.lib.recfunctions import structured_to_unstructured
 from numpy.typing import NDArray
 
 from drivers.arrays import Array
@@ -71,7 +71,7 @@ class CycleCounter:
             records[name] = np.nan
         states = np.empty(len(values), STATE_DTYPE)
         columns = state_columns(values.dtype, self._sign)
-        columns.write(_numbers(values), states)
+        columns.write(structured_to_unstructured(values, np.float64), states)
         records[ARM_STATE] = states
         return records
 
@@ -106,15 +106,3 @@ def _states(robot_mode: NDArray[np.int32]) -> NDArray[np.uint8]:
     """Return the state of the session for each mode of the robot: nothing is commanded in any."""
     off = np.where(np.isin(robot_mode, POWER_MODES), State.DRIVING_ON, State.DRIVE_OFF)
     return np.where(robot_mode == ROBOT_RUNNING, State.CLOSED, off).astype(np.uint8)
-
-
-def _numbers(values: NDArray[np.void]) -> Array:
-    """Return the numbers of all outputs (m, c), in the order of their layout.
-
-    `numpy.lib.recfunctions`, which has this, loads masked arrays.
-    """
-    names = values.dtype.names or ()
-    columns = [
-        values[name].reshape(len(values), math.prod(values.dtype[name].shape)) for name in names
-    ]
-    return np.concatenate(columns, axis=1, dtype=np.float64)
