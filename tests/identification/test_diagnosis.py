@@ -249,7 +249,7 @@ def within(start: float, end: float = 1.0) -> NDArray[np.bool_]:
 
 @pytest.mark.parametrize("part", [(0.3, 0.7), (0.4, 0.55), (0.85, 1.0)])
 @pytest.mark.parametrize(("joint", "scale"), [(0, 1.4), (1, 1.3), (2, 0.7)])
-def test_a_load_with_another_scale_has_its_mass(
+def test_a_load_has_its_mass_beside_another_scale_in_its_part(
     part: tuple[float, float], joint: int, scale: float
 ) -> None:
     """The last body weighs 1 kg more there; neither is found where there is none."""
@@ -267,7 +267,7 @@ def test_a_load_with_another_scale_has_its_mass(
 
 
 @pytest.mark.parametrize("start", [0.8, 0.85])
-def test_a_load_near_the_end_is_no_friction(start: float) -> None:
+def test_a_load_near_the_end_of_unseen_motion_is_no_friction(start: float) -> None:
     torque = np.where(within(start), motion((1.0, 1.0, 2.0))[1], motion()[1])
     (load,) = explanations(torque, unseen_from=0.7)
     assert load.change.meaning == "payload"
@@ -287,7 +287,7 @@ def test_more_friction_from_a_time_on_is_no_load(unseen_from: float | None) -> N
     assert found.size == pytest.approx(0.5, abs=0.05)
 
 
-def test_what_nothing_explains_in_a_part_is_not_certain() -> None:
+def test_what_nothing_explains_in_a_part_is_not_called_a_load_for_certain() -> None:
     """A spring that is there for a part of the time."""
     q, torque, _ = motion()
     spring = 4.0 * np.sin(3.0 * q) * np.array([0.0, 1.0, 0.0])
