@@ -6,7 +6,6 @@ from collections.abc import Sequence
 from typing import Final, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from identification.arrays import Array
 from identification.distributions import SIGNIFICANT_SIGMAS
@@ -15,6 +14,7 @@ from identification.factor.blocks import FOLDS
 from identification.factor.normal_equations import solve_with_ridge
 from identification.hypotheses.error_ratios import (
     ErrorRatios,
+    error_ratio,
     geometric_mean,
     mean_and_error,
 )
@@ -35,8 +35,8 @@ _SAME_PART_ERROR_RATIO: Final = 0.85  # the same, if separate parameters for the
 _NEAR_NOISE_FLOORS: Final = 2.0
 _MIN_POWER_SHARE: Final = 1e-20  # squared torque of an axis that counts, as a share of the largest
 _SEPARATE_ERROR_RATIO: Final = 1.1  # error ratio to separate parameters
-MIN_ROWS: Final = 10
-"""Usable rows of a block that is compared."""
+_MIN_ROWS: Final = 10
+MIN_BLOCKS: Final = 2
 # Ridge as a share of each column's information, for columns that the motion hardly determines.
 _RIDGE: Final = 1e-6
 
@@ -112,10 +112,6 @@ class ColumnScore(NamedTuple):
             np.sqrt(mine[positive] / least[positive])
         ) <= (_SEPARATE_ERROR_RATIO)
 
-    def mean_squares(self, blocks: NDArray[np.bool_]) -> Array:
-        """Return the mean squared errors in some blocks (n,)."""
-        return np.asarray(self.squares[blocks].sum(axis=0) / max(1, np.count_nonzero(blocks)))
-
     def ratio_to(self, other: ColumnScore) -> tuple[float, float]:
         """Return the error ratio, geometric mean over the joints, and its upper limit by blocks."""
         ratios = ErrorRatios.of(self.squares, other.squares)
@@ -127,23 +123,11 @@ class ColumnScore(NamedTuple):
         mean, error = mean_and_error(ratios.changes[some].sum(axis=1) / counts)
         return ratio, float(np.exp(mean + SIGNIFICANT_SIGMAS * error))
 
-    def ratio_inside(self, other: ColumnScore, blocks: NDArray[np.bool_]) -> tuple[float, float]:
-        """Return the error ratio in some blocks (B,), and its upper limit by leaving out each.
 
-        Of a part of few blocks some show little, so that the errors are summed before they are
-        compared.
-        """
-        mine, its = self.squares[blocks], other.squares[blocks]
-        some = (mine.sum(axis=0) > 0.0) & (its.sum(axis=0) > 0.0)
-        count = len(mine)
-        if count < 2 or not some.any():
-            return 1.0, np.inf
-        sums = [np.vstack([each.sum(axis=0), each.sum(axis=0) - each]) for each in (mine, its)]
-        least = np.finfo(np.float64).tiny
-        logs = 0.5 * np.log(np.maximum(sums[0], least) / np.maximum(sums[1], least))
-        means = logs[:, some].mean(axis=1)
-        error = np.sqrt((count - 1) * means[1:].var())
-        return float(np.exp(means[0])), float(np.exp(means[0] + SIGNIFICANT_SIGMAS * error))
+def fit_ratio(fitted: Array, other: Array) -> float:
+    """Return the ratio of the errors of two fits by their squares (n,), a mean over the joints."""
+    positive = (fitted > 0.0) & (other > 0.0)
+    return geometric_mean(error_ratio(fitted, other)[positive])
 
 
 def separate_errors(tables: ColumnSums, target: Array, part: Array) -> Array:
@@ -179,11 +163,7 @@ def separate_errors(tables: ColumnSums, target: Array, part: Array) -> Array:
 
 
 def column_score(
-    tables: ColumnSums,
-    added: Array,
-    target: Array,
-    prior: ScorePrior | None = None,
-    starts: NDArray[np.intp] | None = None,
+    tables: ColumnSums, added: Array, target: Array, prior: ScorePrior | None = None
 ) -> ColumnScore:
     """Predict every fifth block from the others.
 
@@ -194,7 +174,6 @@ def column_score(
         added: columns of further parameters (B, n, q, r).
         target: of each joint (n, q).
         prior: of the parameters; without one, bodies that no arm has are allowed.
-        starts: the first of the blocks that are predicted as one; by default each is one.
     """
 
     def solved(gram: Array) -> Array:
@@ -202,22 +181,17 @@ def column_score(
 
     blocks, n = tables.rows.shape
     p = tables.n_parameters
-    rows = tables.rows
     column = np.broadcast_to(target[:, :, None], (blocks, n, target.shape[1], 1))
     wide = np.concatenate([added, column], axis=3)
     moved = tables.gram @ wide
     sums = _Sums(tables.of_parameters, moved[..., :p, :], np.swapaxes(wide, 2, 3) @ moved)
-    if starts is not None:
-        sums = _Sums(*(np.add.reduceat(part, starts, axis=0) for part in sums))
-        rows = np.add.reduceat(rows, starts, axis=0)
-        blocks = len(starts)
-    folds = _Sums(*(folded(part) for part in sums))
+    folds = _Sums(tables.by_fold, folded(sums.mixed), folded(sums.beside))
     whole = _Sums(*(part.sum(axis=0) for part in folds))
     # Weighted by the inverse variances of an ordinary fit, limited by rounding.
     torque = whole.beside[:, -1, -1]
     floor = 1e-12 * torque + np.finfo(np.float64).tiny
     usual = np.maximum(whole.squares(_solved(whole.weighted(np.ones(n)))), floor)
-    weights = np.maximum(rows.sum(axis=0), 1) / usual
+    weights = np.maximum(tables.rows.sum(axis=0), 1) / usual
     total = whole.weighted(weights)
     of_folds = total - folds.weighted(weights)
     squares = np.zeros((blocks, n))
@@ -227,7 +201,7 @@ def column_score(
         values = solved(of_folds[k])
         coefficients.append(values)
         squares[fold_blocks] = _Sums(*(part[fold_blocks] for part in sums)).squares(values)
-    squares = np.where(rows >= MIN_ROWS, np.maximum(squares, floor / blocks), 0.0)
+    squares = np.where(tables.rows >= _MIN_ROWS, np.maximum(squares, floor / blocks), 0.0)
     fitted = np.maximum(whole.squares(solved(total)), floor)
     fold_values = np.array(coefficients)
     return ColumnScore(squares, fitted, torque, fold_values[:, :p], fold_values[:, p:])

@@ -133,21 +133,6 @@ class TorqueDiagnosis:
         return None if self.inertia is None else self.inertia.time
 
     @property
-    def begins_within(self) -> bool:
-        """Whether something begins or ends within a recording that was fitted."""
-        return any(
-            each.change.part is not None and each.change.part.is_within
-            for each in self.explanations or ()
-        )
-
-    @property
-    def begins_within_unseen(self) -> bool:
-        """Whether something begins or ends within an unseen recording."""
-        return any(
-            each.change.part is not None and each.change.part.is_within for each in self.begun
-        )
-
-    @property
     def is_otherwise(self) -> bool:
         """Whether the torque, or its times, are other than stated as a whole."""
         is_weightless = self.is_weightless or self.is_partly_weightless

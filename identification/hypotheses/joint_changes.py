@@ -59,7 +59,6 @@ class Part(NamedTuple):
 
     name: str  # such as "A.mcap", or "A.mcap from 3 s on"
     blocks: tuple[bool, ...]  # mask over the blocks (B,)
-    is_within: bool = False  # whether it begins or ends within a recording
 
 
 class Change(NamedTuple):

@@ -116,7 +116,7 @@ class _Problem:
         if scaling:
             friction_only = change.meaning == "friction"
             mask = tables.mask_of(change)
-            concerned[:, [*(change.joints or range(n))]] = mask[:, None, None] * (
+            concerned[:, [*change.joints]] = mask[:, None, None] * (
                 model.friction_columns if friction_only else np.ones(p)
             )
         std = np.zeros(n) if scale_std is None else scale_std.copy()

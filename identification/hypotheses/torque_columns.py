@@ -55,6 +55,11 @@ class ColumnSums:
         """Sums over the columns of the parameters (B, n, p, p)."""
         return np.ascontiguousarray(self.gram[..., : self.n_parameters, : self.n_parameters])
 
+    @cached_property
+    def by_fold(self) -> Array:
+        """The same of each fold (F, n, p, p)."""
+        return folded(self.of_parameters)
+
     def mask_of(self, change: Change) -> Array:
         """Return 1 for the blocks (B,) that a change concerns, 0 for the others.
 
@@ -85,80 +90,25 @@ class ColumnSums:
             blocks: of all recordings together.
             divided: parts of each block.
         """
-        rows = ColumnRows.of(model, recordings, values)
-        return rows.sums(rows.edges(-(-blocks // len(recordings)), divided))
-
-    def divided_torque(self, joint: int, mask: Array, factor: float) -> ColumnSums:
-        """Return the sums with the torque of a joint divided by a factor in some blocks (B,)."""
-        gram = self.gram.copy()
-        at = self.width - gram.shape[1] + joint
-        scale = np.where(mask > 0.0, 1.0 / factor, 1.0)[:, None]
-        gram[:, joint, at, :] *= scale
-        gram[:, joint, :, at] *= scale
-        return replace(self, gram=gram)
-
-
-@dataclass(frozen=True, eq=False)
-class ColumnRows:
-    """Some thousand rows of recordings, one after the other, with the columns of a `ColumnSums`."""
-
-    columns: Array  # (n, k, q), zero where not usable
-    usable: NDArray[np.bool_]  # (k, n)
-    time: Array  # since its recording began (k,) [s]
-    recording: NDArray[np.intp]  # index of the recording of each row (k,)
-    n_parameters: int  # p
-    step: int  # only every `step`-th row is there
-
-    @classmethod
-    def of(cls, model: RobotModel, recordings: Sequence[Samples], values: Array) -> ColumnRows:
-        """Evaluate the columns.
-
-        Args:
-            model: of the arm.
-            recordings: prepared.
-            values: parameters (p,) of the rate and the load of its torque.
-        """
+        count = divided * -(-blocks // len(recordings))
         step = row_step(recordings, _MAX_ROWS)
-        columns = []
-        usable = []
-        times = []
+        grams = []
+        rows = []
+        starts = []
         for samples in recordings:
             some = np.arange(step // 2, len(samples.torque), step)
-            used = samples.usable[some]
-            columns.append(_tables(model, samples, values, some) * used.T[:, :, None])
-            usable.append(used)
-            times.append(samples.motion.time[some] - samples.motion.time[0])
-        index = np.repeat(np.arange(len(recordings)), [len(time) for time in times])
-        every = np.concatenate(columns, axis=1), np.concatenate(usable), np.concatenate(times)
-        return cls(*every, index, model.n_parameters, step)
-
-    def edges(self, blocks: int, divided: int = 1, least_rows: int = 0) -> NDArray[np.intp]:
-        """Return the first rows of equal blocks of each recording, and the end.
-
-        Args:
-            blocks: of each recording.
-            divided: parts of each block.
-            least_rows: of a part; a recording of fewer has fewer blocks.
-        """
-        ends = np.searchsorted(self.recording, np.arange(int(self.recording[-1]) + 2))
-        parts = []
-        for a, b in pairwise(ends):
-            most = max(1, (b - a) // (divided * least_rows)) if least_rows else blocks
-            parts.append(np.linspace(a, b, divided * min(blocks, most) + 1)[:-1])
-        return np.append(np.concatenate(parts), ends[-1]).round().astype(np.intp)
-
-    def sums(self, edges: NDArray[np.intp]) -> ColumnSums:
-        """Return the sums of the blocks between these rows (B + 1,)."""
-        grams = []
-        for a, b in pairwise(edges.tolist()):
-            block = self.columns[:, a:b]
-            grams.append(np.swapaxes(block, 1, 2) @ block)
-        rows = np.array([np.count_nonzero(self.usable[a:b], axis=0) for a, b in pairwise(edges)])
-        first = np.minimum(edges[:-1], len(self.time) - 1)
-        recording = self.recording[first]
-        is_start = np.diff(recording, prepend=-1) != 0
-        start = np.where(is_start, 0.0, self.time[first])
-        return ColumnSums(np.array(grams), rows, recording, start, self.n_parameters, self.step)
+            tables = _tables(model, samples, values, some)
+            edges = np.linspace(0, len(some), count + 1).round().astype(int)
+            usable = samples.usable[some]
+            tables *= usable.T[:, :, None]
+            for a, b in pairwise(edges):
+                block_rows = tables[:, a:b]
+                grams.append(np.swapaxes(block_rows, 1, 2) @ block_rows)
+                rows.append(np.count_nonzero(usable[a:b], axis=0))
+                starts.append(samples.motion.time[some[a]] - samples.motion.time[0] if a else 0.0)
+        recording = np.repeat(np.arange(len(recordings)), count)
+        p = model.n_parameters
+        return cls(np.array(grams), np.array(rows), recording, np.array(starts), p, step)
 
 
 def row_step(recordings: Sequence[Samples], rows: int) -> int:
@@ -255,13 +205,7 @@ def folded(blocks: Array) -> Array:
     return np.array([blocks[k::FOLDS].sum(axis=0) for k in range(FOLDS)])
 
 
-def columns_of(
-    tables: ColumnSums,
-    model: RobotModel,
-    values: Array,
-    change: Change,
-    load: Array | None = None,
-) -> Array:
+def columns_of(tables: ColumnSums, model: RobotModel, values: Array, change: Change) -> Array:
     """Return the columns of a change as combinations of a table's columns (B, n, q, r).
 
     Args:
@@ -269,7 +213,6 @@ def columns_of(
         model: of the arm.
         values: parameters (p,).
         change: of what was recorded.
-        load: carried in each block (B, 10), whose torque has the scale of the joint as well.
     """
     _, n, width, _ = tables.gram.shape
     p = model.n_parameters
@@ -289,8 +232,4 @@ def columns_of(
     else:
         friction = change.meaning == "friction"
         columns[joints, :p, 0] = values * model.friction_columns if friction else values
-    masked = tables.mask_of(change)[:, None, None, None] * columns
-    if change.meaning == "scale" and load is not None and load.any():
-        with_load = (tables.mask_of(change)[:, None] * load)[:, None, :, None]
-        masked[:, joints, p : p + N_LINK] = with_load
-    return np.asarray(masked)
+    return np.asarray(tables.mask_of(change)[:, None, None, None] * columns)

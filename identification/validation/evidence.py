@@ -259,11 +259,12 @@ def gather(
     moved = _total_time_moved(training) >= Thresholds().moved
     fit = ExplainedFit(values, floor, names, prior, context.scale_std)
     changes = find_changes(model, pooled, training, others, unseen, moved) if others else ()
-    is_worse = error.overall > _MIN_ERROR_GROWTH * fitted.overall
+    is_worse = (
+        error.overall > _MIN_ERROR_GROWTH * fitted.overall
+        and load.explained < MIN_LOAD_EXPLAINED
+        and not changes
+    )
     diagnosis = diagnose(model, training, fit, others if is_worse else (), known=known)
-    is_throughout = bool(changes) or load.explained >= MIN_LOAD_EXPLAINED
-    if diagnosis.begun and not diagnosis.begins_within_unseen and is_throughout:
-        diagnosis = replace(diagnosis, begun=())
     return Evidence(
         estimate=pooled,
         held_out=error,

@@ -97,8 +97,6 @@ FindingKey = Literal[
     "torque of a part",
     "friction of a part",
     "arm of a part",
-    "undetermined change of a part",
-    "unexplained part",
     # what differs on unseen motion
     "load",
     "changed torque",
@@ -265,7 +263,6 @@ Value = (
     | ConsistencyCheck
     | FrictionLaw
     | tuple[str, ...]
-    | tuple[tuple[Change, ...], ...]
     | tuple[int, ...]
     | tuple[float, ...]
     | tuple[Change, ...]

@@ -212,11 +212,6 @@ class _Text(string.Formatter):
                 return law_option(value) if format_spec == "option" else law_text(value)
             case RepeatedSamples():
                 return f"{value.joint} {value.count} in {value.recording}"
-            case tuple() if format_spec == "each with":
-                return " or ".join(
-                    " with ".join(self.format_field(change, "") for change in changes)
-                    for changes in value
-                )
             case tuple() if format_spec == "names":
                 return self._naming.all_of(value)
             case tuple():
@@ -253,19 +248,9 @@ _QUANTITIES: Final[Mapping[Meaning, str]] = {
 }
 
 
-_OF_A_PART: Final[Mapping[Meaning, str]] = {
-    "payload": "another load",
-    "scale": "another scale of the torque of {joints}",
-    "friction": "another friction of {joints}",
-    "arm": "another arm or tool",
-}
-
-
 def _change(change: Change, naming: Naming) -> str:
-    """Return a sign, an order, a coupled angle or what is other in a part, in words."""
-    joints = naming.all_of(change.joints) if change.joints else "all axes"
-    if change.meaning in _OF_A_PART:
-        return _OF_A_PART[change.meaning].format(joints=joints)
+    """Return a sign, an order or a coupled angle in words."""
+    joints = naming.all_of(change.joints)
     if change.meaning in _QUANTITIES:
         done = "negated" if change.meaning in SIGNS else "interchanged"
         return f"{_QUANTITIES[change.meaning]} of {joints} {done}"
@@ -536,16 +521,6 @@ SENTENCES: Final[Mapping[FindingKey, Sentence]] = {
     "arm of a part": _fault(
         "sameness",
         "{part} was probably recorded with another arm, tool or setting than the other data",
-    ),
-    "undetermined change of a part": _fault(
-        "sameness",
-        "{part} differs from the other data, and explanations that fit alike do not tell how:"
-        " {alike:each with}",
-    ),
-    "unexplained part": _fault(
-        "sameness",
-        "{part} differs from the other data, and none of the tested explanations fits it; the"
-        " nearest is {nearest:each with}",
     ),
     "load": Sentence(
         "load",

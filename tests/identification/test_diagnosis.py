@@ -9,12 +9,7 @@ from numpy.typing import NDArray
 from identification import Recording
 from identification.estimators.prior import body_prior, posterior_values
 from identification.factor.factor import Factor
-from identification.hypotheses.column_search import (
-    ExplainedFit,
-    Explanation,
-    find_columns,
-    find_columns_of_unseen,
-)
+from identification.hypotheses.column_search import ExplainedFit, find_columns
 from identification.hypotheses.diagnosis import TorqueDiagnosis, diagnose
 from identification.hypotheses.joint_changes import Change
 from identification.hypotheses.readings import Adequacy
@@ -222,74 +217,3 @@ def test_a_load_in_a_part_is_no_scale_of_a_torque(
     assert load.size == pytest.approx(1.0, abs=0.01)
     found = {each.change.joints: each.size for each in others}
     assert found == {(j,): pytest.approx(s - 1.0, abs=0.01) for j, s in enumerate(scales) if s > 1}
-
-
-def explanations(torque: Floats, unseen_from: float | None = None) -> tuple[Explanation, ...]:
-    """Return what explains the errors of a fit of a torque, or of its rows before a share."""
-    q, _, _ = motion()
-    options = Preprocessing(14.0, exclude_rows="rests")
-    rows = len(TIME) if unseen_from is None else round(unseen_from * len(TIME))
-    seen, *unseen = (
-        prepare(Recording(TIME[part], q[part], NAMES, torque[part]), model(), options=options)
-        for part in (slice(0, rows), slice(rows, None))
-        if part.start < len(TIME)
-    )
-    factor = Factor.of(model(), seen)
-    values, _ = posterior_values(factor, body_prior(model(), factor).gaussian, ROWS_PER_FACT)
-    if unseen:
-        return find_columns_of_unseen(model(), [seen], unseen, ExplainedFit(values))
-    return find_columns(model(), [seen], ExplainedFit(values))
-
-
-def within(start: float, end: float = 1.0) -> NDArray[np.bool_]:
-    """Rows between two shares of the time."""
-    share = TIME / TIME[-1]
-    return np.asarray(((start <= share) & (share <= end))[:, None])
-
-
-@pytest.mark.parametrize("part", [(0.3, 0.7), (0.4, 0.55), (0.85, 1.0)])
-@pytest.mark.parametrize(("joint", "scale"), [(0, 1.4), (1, 1.3), (2, 0.7)])
-def test_a_load_has_its_mass_beside_another_scale_in_its_part(
-    part: tuple[float, float], joint: int, scale: float
-) -> None:
-    """The last body weighs 1 kg more there; neither is found where there is none."""
-    factors = np.where(np.arange(3) == joint, scale, 1.0)
-    bare, loaded = motion()[1], motion((1.0, 1.0, 2.0))[1]
-    load, gain = explanations(np.where(within(*part), loaded * factors, bare))
-    assert (load.change.meaning, gain.change[:2]) == ("payload", ("scale", (joint,)))
-    assert load.change.part == gain.change.part
-    assert load.is_certain and gain.is_certain
-    assert load.size == pytest.approx(1.0, abs=0.01)
-    assert gain.size == pytest.approx(scale - 1.0, abs=0.01)
-    (only,) = explanations(np.where(within(*part), bare * factors, bare))
-    assert only.change[:2] == ("scale", (joint,))
-    assert only.size == pytest.approx(scale - 1.0, abs=0.01)
-
-
-@pytest.mark.parametrize("start", [0.8, 0.85])
-def test_a_load_near_the_end_of_unseen_motion_is_no_friction(start: float) -> None:
-    torque = np.where(within(start), motion((1.0, 1.0, 2.0))[1], motion()[1])
-    (load,) = explanations(torque, unseen_from=0.7)
-    assert load.change.meaning == "payload"
-    assert load.change.part is not None and load.change.part.is_within
-    assert load.size == pytest.approx(1.0, abs=0.02)
-
-
-@pytest.mark.parametrize("unseen_from", [None, 0.7])
-def test_more_friction_from_a_time_on_is_no_load(unseen_from: float | None) -> None:
-    """Of all joints at once, by a factor."""
-    q, torque, _ = motion()
-    velocity = np.gradient(q, TIME, axis=0)
-    more = 0.5 * (0.4 * np.sign(velocity) + 0.2 * velocity)
-    start = 0.5 if unseen_from is None else 0.85
-    (found,) = explanations(np.where(within(start), torque + more, torque), unseen_from)
-    assert found.change[:2] == ("friction", ())
-    assert found.size == pytest.approx(0.5, abs=0.05)
-
-
-def test_what_nothing_explains_in_a_part_is_not_called_a_load_for_certain() -> None:
-    """A spring that is there for a part of the time."""
-    q, torque, _ = motion()
-    spring = 4.0 * np.sin(3.0 * q) * np.array([0.0, 1.0, 0.0])
-    for each in explanations(torque + np.where(within(0.4, 0.7), spring, 0.0)):
-        assert each.change.meaning == "arm" or not each.is_certain

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from typing import Final
 
 import numpy as np
@@ -15,7 +15,6 @@ from identification.validation.evidence import Evidence
 from identification.validation.finding import (
     Finding,
     FindingKey,
-    Level,
     Mask,
     RemedyKey,
     Thresholds,
@@ -126,44 +125,11 @@ def is_constant(change: Change) -> bool:
 def faults(evidence: Evidence, limits: Thresholds) -> tuple[Finding, ...]:
     """Return changes of the fitted recordings that make parts of them more predictable."""
     begun = () if evidence.diagnosis is None else evidence.diagnosis.begun
-    found = [
-        each
-        for each in (*(evidence.explanations or ()), *begun)
-        if not _is_left_out(each, evidence, limits)
-    ]
     return tuple(
         _fault(each, evidence, limits)
-        if each.is_certain
-        else _of_a_part(each, [other for other in found if _is_beside(each, other)], limits)
-        for k, each in enumerate(found)
-        if each.is_certain or not any(_is_beside(each, other) for other in found[:k])
+        for each in (*(evidence.explanations or ()), *begun)
+        if not _is_left_out(each, evidence, limits)
     )
-
-
-def _is_beside(each: Explanation, other: Explanation) -> bool:
-    """Whether two changes that are not certain are of one part."""
-    return each.change.part == other.change.part and not other.is_certain
-
-
-def _of_a_part(each: Explanation, found: Sequence[Explanation], limits: Thresholds) -> Finding:
-    """Return that something is other in a part, but not for certain what.
-
-    Args:
-        each: what was found first.
-        found: all that was found in the part.
-        limits: of the checks.
-    """
-    nearest = tuple(other.change for other in found)
-    values: dict[str, Value] = {
-        **fault_values(each),
-        "nearest": (nearest,),
-        "alike": (nearest, *each.rivals),
-    }
-    key: FindingKey = "undetermined change of a part" if each.rivals else "unexplained part"
-    _, remedy = fault_keys(each.change)
-    level: Level = "wrong" if each.ratio < limits.cause else "doubtful"
-    explains = 1.0 - each.ratio**2
-    return Finding(key, level, remedy, "cause", values, explains=explains, joints=())
 
 
 def _is_left_out(each: Explanation, evidence: Evidence, limits: Thresholds) -> bool:

@@ -22,7 +22,7 @@ from identification.validation.prediction import MAX_FRICTION_CHANGE
 def load(evidence: Evidence, limits: Thresholds) -> Finding | None:
     """Return a body on the last link on held-out motion only, if it explains the error."""
     found = evidence.load
-    if found is None or found.explained < limits.load or _begins_within(evidence):
+    if found is None or found.explained < limits.load:
         return None
     half_interval = found.half_interval
     is_known = bool(np.isfinite(half_interval))
@@ -39,12 +39,6 @@ def load(evidence: Evidence, limits: Thresholds) -> Finding | None:
     return Finding("load", "wrong", "record with one payload", "cause", values)
 
 
-def _begins_within(evidence: Evidence) -> bool:
-    """Whether something begins within a motion, which as a whole is neither with nor without."""
-    found = evidence.diagnosis
-    return found is not None and (found.begins_within or found.begins_within_unseen)
-
-
 def _changes(evidence: Evidence, limits: Thresholds) -> tuple[UnseenChange, ...] | None:
     """Return the changes of joints; None if another cause would look like one."""
     # Or it has spoilt the parameters.
@@ -54,7 +48,7 @@ def _changes(evidence: Evidence, limits: Thresholds) -> tuple[UnseenChange, ...]
     others = [each for each in evidence.explanations or () if not is_constant(each.change)]
     if any(each.change.is_discrete or each.ratio < limits.cause for each in others):
         return None
-    if evidence.diagnosis is not None and (evidence.diagnosis.begun or _begins_within(evidence)):
+    if evidence.diagnosis is not None and evidence.diagnosis.begun:
         return None
     return evidence.changes
 
