@@ -290,7 +290,7 @@ class GroupEstimates(NamedTuple):
 
 
 class ArmEstimator:
-    """Estimates of one arm: those of `hil.pipeline.estimating` from sums, cached."""
+    """Estimates of one arm from sums, as `hil.pipeline.estimating` makes them; cached."""
 
     def __init__(self, arm: ArmModel) -> None:
         settings = arm.settings
