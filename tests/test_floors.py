@@ -54,9 +54,7 @@ def test_a_look_loads_no_interpolator_or_recorder() -> None:
     assert not {"planner.api", "planner.interpolator", "hil.archive.recorder"} & loaded
 
 
-@pytest.mark.parametrize(
-    "package", ["planner", "identification", "identification.excitation", "sim_fixtures"]
-)
+@pytest.mark.parametrize("package", ["planner", "identification"])
 def test_a_name_that_is_imported_on_first_use_is_no_module(package: str) -> None:
     """Once the module is imported, the name would be the module."""
     modules = {module.name for module in pkgutil.iter_modules(import_module(package).__path__)}

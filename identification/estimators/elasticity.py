@@ -21,12 +21,13 @@ from dataclasses import dataclass, replace
 from typing import Final, Self
 
 import numpy as np
+import scipy
 
 from identification.arrays import Array
 from identification.estimators.delay import DELAY_BANDWIDTH
 from identification.factor.estimate import Estimate, inverse_variance
 from identification.factor.factor import Factor
-from identification.factor.normal_equations import solve, solve_non_negative
+from identification.factor.normal_equations import solve
 from identification.factor.rows import augmented_rows
 from identification.model.motion import Motion
 from identification.model.robot import RobotModel
@@ -268,8 +269,8 @@ def with_elastic_gears(
     lost = times * np.tensordot(weights, torque.lost, axes=1)
     errors = errors + moved.T @ (lost if excess is None else lost - excess)
     # Correlated compliances cannot be cut off at zero one by one.
-    information = np.asarray(np.linalg.inv(covariance))
-    mean = solve_non_negative(information, errors / design_effect)
+    root = np.linalg.cholesky(np.linalg.inv(covariance))
+    mean, _ = scipy.optimize.nnls(root.T, root.T @ (covariance @ errors) / design_effect)
     added = moved @ (np.outer(mean, mean) + covariance) @ moved.T
     return replace(
         estimate,

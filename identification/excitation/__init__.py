@@ -1,25 +1,64 @@
-"""Design of exciting motions: criteria, constraints, searches.
+"""Design of exciting motions: criteria, constraints, searches."""
 
-The names of `identification.excitation.api`, which are imported when the first of them is used: who
-needs one module does not wait for all.
-"""
+# ruff: noqa: F401
+import types
 
-from importlib import import_module
-from typing import TYPE_CHECKING, Any
+from identification.errors import WorkspaceError
+from identification.excitation.collision import CollisionChecker, Proximity
+from identification.excitation.constraints import (
+    SAMPLE_PERIOD,
+    Constraints,
+    CurrentModel,
+    check_motion,
+    midpoints,
+    sampled,
+)
+from identification.excitation.criteria import (
+    CRITERIA,
+    Criteria,
+    Given,
+    Objective,
+    condition_number,
+    correlation,
+    coupling_index,
+    coupling_index_max,
+    fitness_eq7,
+    friction_of_excitation,
+    information,
+    log10_det,
+)
+from identification.excitation.errors import (
+    CollisionModelError,
+    DesignError,
+    JournalError,
+    MissingMeshError,
+    NoFeasibleMotionError,
+)
+from identification.excitation.excitation import Excitation, ViaPointMotion
+from identification.excitation.genomes import Genome, SineGenome, ViaPointGenome
+from identification.excitation.motion_precision import LoadQuantities, Precision, Quantities
+from identification.excitation.searches.journal import Journal
+from identification.excitation.searches.methods import METHODS, Method, SearchMethod
+from identification.excitation.searches.population import (
+    Front,
+    Population,
+    Problem,
+    Scores,
+    SearchSettings,
+)
+from identification.excitation.searches.search import (
+    RESCORE_PERIOD,
+    Design,
+    SearchProgress,
+    most_evaluations,
+    search,
+)
+from identification.excitation.validation_motions import random_validation_motions
+from identification.excitation.violation import KINDS, Violation
+from identification.model.workspace import Box, Workspace
 
-if TYPE_CHECKING:
-    from identification.excitation.api import *  # noqa: F403
-
-
-def __getattr__(name: str) -> Any:
-    """A name of `identification.excitation.api`."""
-    if name == "__all__" or not name.startswith("_"):
-        api = import_module("identification.excitation.api")
-        if name in ("__all__", *api.__all__):
-            return getattr(api, name)
-    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-
-
-def __dir__() -> list[str]:
-    """All names, loaded or not: the reference documents them."""
-    return [*globals(), *import_module("identification.excitation.api").__all__]
+__all__ = [
+    name
+    for name, member in globals().items()
+    if not (name.startswith("_") or isinstance(member, types.ModuleType))
+]

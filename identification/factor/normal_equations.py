@@ -21,8 +21,6 @@ MAX_UNDETERMINED_SHARE: Final = 1e-3
 """Share in undetermined directions up to which a parameter is determined."""
 
 _MIN_COLUMN_RATIO: Final = 1e-10  # length of a column that is rounding, over that of the longest
-_MIN_ASCENT_SHARE: Final = 1e-12  # share of a right side that is rounding
-_MAX_CHANGES_PER_UNKNOWN: Final = 3  # of an active set, which rounding may repeat
 
 
 class NormalEquations(NamedTuple):
@@ -102,35 +100,6 @@ def solve_positive(matrix: Array, right: Array) -> Array:
     _, solution, failed = scipy.linalg.lapack.dposv(matrix.T, right)
     # A matrix that rounding made indefinite.
     return np.asarray(np.linalg.solve(matrix, right) if failed else solution)
-
-
-def solve_non_negative(matrix: Array, right: Array) -> Array:
-    """Minimise ``x'M x / 2 - r'x`` over x >= 0, with a positive definite matrix (k, k), (k,).
-
-    By the active-set method of Lawson and Hanson (1974, chapter 23) on normal equations (Bro and
-    De Jong 1997). `scipy.optimize.nnls` does the same, but `scipy.optimize` takes 0.3 s to import.
-    """
-    x = np.zeros(len(right))
-    free = np.zeros(len(right), dtype=np.bool_)
-    tolerance = _MIN_ASCENT_SHARE * np.abs(right).max(initial=0.0)
-    for _ in range(_MAX_CHANGES_PER_UNKNOWN * len(right)):
-        ascent = np.where(free, -np.inf, right - matrix @ x)
-        if ascent.max() <= tolerance:
-            break
-        free[np.argmax(ascent)] = True
-        while True:
-            target = np.zeros_like(x)
-            target[free] = np.linalg.solve(matrix[np.ix_(free, free)], right[free])
-            if np.all(target >= 0.0):
-                break
-            # As far towards the target as all stay positive.
-            falling = target < 0.0
-            steps = x[falling] / (x[falling] - target[falling])
-            x += steps.min() * (target - x)
-            free[np.flatnonzero(falling)[np.argmin(steps)]] = False
-            x[~free] = 0.0
-        x = target
-    return x
 
 
 def solve_rows(rows: Array, target: Array, worst: float = MAX_ROW_CONDITION) -> Solution:

@@ -17,7 +17,7 @@ from identification.estimators.robust import robust_estimate
 from identification.factor.estimate import estimate, joint_weights, residual_variance
 from identification.factor.estimation_method import LeastSquares
 from identification.factor.factor import MAX_GRAM_CONDITION, Factor, reduced, total_factor
-from identification.factor.normal_equations import solve, solve_non_negative, solve_rows
+from identification.factor.normal_equations import solve, solve_rows
 from identification.factor.rows import augmented_rows
 from identification.model.motion import Motion
 from identification.model.robot import RobotModel
@@ -83,29 +83,6 @@ def exact_solution(samples):
         remainder = gram[i][P] - sum(gram[i][j] * values[j] for j in range(i + 1, P))
         values[i] = remainder / gram[i][i]
     return np.array([float(v) for v in values])
-
-
-class TestNonNegativeSolutions:
-    @pytest.mark.parametrize("unknowns", [1, 2, 6, 14])
-    def test_no_smaller_value_is_near(self, unknowns):
-        """Gradient zero where positive, and none downhill where zero (Kuhn and Tucker)."""
-        rng = np.random.default_rng(unknowns)
-        zero, positive = 0, 0
-        for _ in range(50):
-            rows = rng.normal(size=(unknowns + 2, unknowns)) * 10.0 ** rng.uniform(-2, 2, unknowns)
-            matrix, right = rows.T @ rows, rows.T @ rng.normal(size=unknowns + 2)
-            x = solve_non_negative(matrix, right)
-            slope = (matrix @ x - right) / (np.sqrt(np.diag(matrix)))
-            assert np.all(x >= 0.0)
-            np.testing.assert_allclose(slope[x > 0.0], 0.0, atol=1e-9)
-            assert np.all(slope[x == 0.0] > -1e-9)
-            zero, positive = zero + np.sum(x == 0.0), positive + np.sum(x > 0.0)
-        assert zero and positive
-
-    def test_a_positive_solution_is_that_without_limits(self):
-        matrix = np.array([[2.0, 0.5], [0.5, 1.0]])
-        expected = np.array([0.25, 3.0])
-        np.testing.assert_allclose(solve_non_negative(matrix, matrix @ expected), expected)
 
 
 class TestFactor:
