@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from hil.base.arrays import Array
 from hil.base.files import json_digest
 from hil.cell import Cell
-from hil.pipeline.estimating import posterior_of
+from hil.pipeline.estimating import fit_with_prior, posterior_of, with_intervals
 from hil.pipeline.estimators import fit_of
 from hil.pipeline.notes import Note, PoorlySeparated, UnrestrictedBodies
 from identification import IdentificationError
@@ -22,7 +22,6 @@ from identification.estimators.consistent import SolverError
 from identification.estimators.covariance import solve_with_prior
 from identification.factor.estimate import Estimate
 from identification.factor.factor import MAX_GRAM_CONDITION, Factor, require_rows
-from identification.reduction.intervals import widened
 from identification.reduction.posterior import Posterior
 from identification.reduction.reduction import Reduction
 from identification.selection.settings import Settings
@@ -298,8 +297,7 @@ class ArmEstimator:
         self.name = arm.estimator
         self.cell = cell_from(arm.cell, arm.urdf, settings.friction)
         self.model = self.cell.model
-        self._delay_variance = settings.delay_variance
-        self._strength = settings.strength
+        self._settings = settings
 
     def cached(
         self, group: EstimateGroup, fitted: Sequence[Summary], cache: CacheLocation
@@ -334,42 +332,50 @@ class ArmEstimator:
     def of_each(self, group: EstimateGroup, fitted: Sequence[Summary]) -> GroupEstimates:
         """Estimate from each of `fitted` and from the group.
 
+        The intervals of the group are at least as wide as the scatter of repetitions of one motion,
+        and allow for everything that `hil identify` intervals do.
+
         Raises:
             IdentificationError: there is no estimate.
         """
-        assert group.total is not None
-        posterior, notes = self.posterior(group.total.factor)
-        share = 1.0 / len(group.refs)
-        singles = [self.of_archive(summary, posterior, share) for summary in fitted]
-        if singles:
-            group = replace(group, values=tuple(each.values for each in singles))
-        whole = self.of_group(group, posterior, [summary.total for summary in fitted])
-        return GroupEstimates((*singles, whole), tuple(notes))
-
-    def posterior(self, total: Factor) -> tuple[Posterior, list[UnrestrictedBodies]]:
-        """Return the posterior of a sum and its archives, and notes.
-
-        Raises:
-            IdentificationError: there is no usable row.
-        """
-        require_rows(self.model, total)
-        prior = posterior_of(self.cell, total, self.name, self._strength)
-        if self.name != "auto":
-            return prior, []
-        posterior, _, unsolved = prior.solved(total)
-        return posterior, [] if unsolved is None else [UnrestrictedBodies(str(unsolved))]
+        total, settings = group.total, self._settings
+        assert total is not None
+        require_rows(self.model, total.factor)
+        notes: tuple[UnrestrictedBodies, ...] = ()
+        if self.name == "auto":
+            posterior, fit, notes = fit_with_prior(
+                self.cell, total.factor, self.name, settings.strength
+            )
+            whole = fit.estimate
+            share = 1.0 / len(group.refs)
+            singles = [self.of_archive(summary, posterior, share) for summary in fitted]
+        else:
+            posterior = posterior_of(self.cell, total.factor, self.name, settings.strength)
+            whole = fit_of(self.model, self.name)((), total.factor)
+            # without the bodies' restriction, as the scatter of `hil identify`
+            singles = [summary.fit for summary in fitted if summary.fit is not None]
+        values = np.array([each.values for each in singles] or group.values)
+        motions = {ref.motion for ref in group.refs}
+        is_one_motion = len(motions) == 1 and "" not in motions
+        whole = with_intervals(
+            whole,
+            total,
+            posterior,
+            self.name,
+            settings,
+            repetitions=values if is_one_motion else None,
+            torque_scale=np.zeros(self.model.n_joints),  # in units of the torque of the arm
+            recordings=[summary.total for summary in fitted],
+        ).estimate
+        return GroupEstimates((*singles, whole), notes)
 
     def of_archive(self, summary: Summary, posterior: Posterior, share: float) -> Estimate:
         """Return the estimate from one archive, this share of the archives of the posterior.
 
-        That of the consistent estimator is unconstrained, as in `hil identify`. The scatter of the
-        scores is that of the archive by itself.
+        The scatter of the scores is that of the archive by itself.
         """
-        fit = summary.fit
         scatter = summary.scatter
-        assert fit is not None and scatter is not None, "it was fitted"
-        if self.name != "auto":
-            return fit
+        assert scatter is not None, "it was fitted"
         # A copy: the total itself does not cache what is computed here.
         total = summary.total.merged(max(1, len(summary.total)))
         try:
@@ -386,38 +392,6 @@ class ArmEstimator:
             interval_factor=scatter.interval_factor,
             method=replace(result.estimate.method, blocks=scatter.blocks),
         )
-
-    def of_group(
-        self, group: EstimateGroup, posterior: Posterior, recordings: Sequence[Factor]
-    ) -> Estimate:
-        """Return the estimate from a sum over archives, with the posterior of that sum.
-
-        Its intervals are at least as wide as the scatter of repetitions of one motion, and allow
-        for everything that `hil identify` intervals do. Friction may drift over `recordings`.
-
-        Raises:
-            IdentificationError: there is no consistent solution.
-        """
-        total = group.total
-        assert total is not None
-        precision = None
-        if self.name == "auto":
-            estimate = posterior.fit(total.factor).estimate
-            precision = posterior.precision
-        else:
-            estimate = fit_of(self.model, self.name)((), total.factor)
-        motions = {ref.motion for ref in group.refs}
-        is_one_motion = len(motions) == 1 and "" not in motions
-        return widened(
-            estimate,
-            total,
-            posterior,
-            precision,
-            delay_variance=self._delay_variance,
-            repetitions=np.array(group.values) if is_one_motion else None,
-            torque_scale=np.zeros(self.model.n_joints),  # in units of the torque of the arm
-            recordings=recordings,
-        ).estimate
 
     def repetition(self, summary: Summary, estimate: Estimate, settings: str) -> BatchEstimate:
         """Return the estimate from one archive, with the digest of the settings."""

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Final
+from typing import Final, NamedTuple
 
 import numpy as np
 
@@ -28,7 +28,7 @@ from identification.estimators.robust import RobustEstimate, robust_estimate
 from identification.factor.columns import instrument_factor
 from identification.factor.estimate import Estimate
 from identification.factor.factor import MAX_GRAM_CONDITION, Factor, no_rows_message, total_factor
-from identification.reduction.intervals import widened
+from identification.reduction.intervals import Widened, widened
 from identification.reduction.posterior import Posterior
 from identification.reduction.reduction import Reduction
 from identification.selection.settings import Settings, Strength
@@ -159,21 +159,21 @@ def estimate_with(
         reductions = reductions or prepared.reductions
         factors = [reduction.factor for reduction in reductions]
         total = Reduction.total(model, reductions)
-        posterior = posterior_of(cell, total.factor, name, settings.strength)
-        posterior, beside, unsolved = posterior.solved(total.factor)
-        precision = posterior.precision if name in OF_PRIOR else None
+        posterior, beside, unrestricted = fit_with_prior(
+            cell, total.factor, name, settings.strength
+        )
         if name in OF_PRIOR:
             result = _posterior(model, posterior, beside.estimate, factors)
-            warnings: list[Note] = [] if unsolved is None else [UnrestrictedBodies(str(unsolved))]
+            warnings: list[Note] = [*unrestricted]
         else:
             result, warnings = _without_prior(prepared, name)
         scale = torque_scale_of(prepared.sources)
-        pooled, stated, form = widened(
+        pooled, stated, form = with_intervals(
             result.pooled,
             total,
             posterior,
-            precision,
-            delay_variance=settings.delay_variance,
+            name,
+            settings,
             repetitions=result.values if prepared.sources.same_motion else None,
             torque_scale=scale.std,
             recordings=factors,
@@ -227,6 +227,49 @@ def posterior_of(cell: Cell, factor: Factor, name: str, strength: Strength) -> P
     if name != "auto":
         strength = Strength()
     return Posterior.of(cell.model, factor, share, known_parameters(cell), strength)
+
+
+class PriorFit(NamedTuple):
+    """Posterior of a sum of recordings, with its fit."""
+
+    posterior: Posterior
+    estimate: PosteriorEstimate
+    notes: tuple[UnrestrictedBodies, ...]  #: why the bodies are not restricted to possible ones
+
+
+def fit_with_prior(cell: Cell, total: Factor, name: str, strength: Strength) -> PriorFit:
+    """Fit a sum of recordings with the prior of an estimator, see :func:`posterior_of`."""
+    posterior, fit, unsolved = posterior_of(cell, total, name, strength).solved(total)
+    return PriorFit(
+        posterior, fit, () if unsolved is None else (UnrestrictedBodies(str(unsolved)),)
+    )
+
+
+def with_intervals(
+    estimate: Estimate,
+    total: Reduction,
+    posterior: Posterior,
+    name: str,
+    settings: Settings,
+    *,
+    repetitions: Array | None,
+    torque_scale: Array,
+    recordings: Sequence[Factor],
+) -> Widened:
+    """Return an estimate by an estimator with all that its intervals allow for.
+
+    See :func:`~identification.reduction.intervals.widened`.
+    """
+    return widened(
+        estimate,
+        total,
+        posterior,
+        posterior.precision if name in OF_PRIOR else None,
+        delay_variance=settings.delay_variance,
+        repetitions=repetitions,
+        torque_scale=torque_scale,
+        recordings=recordings,
+    )
 
 
 def _without_prior(prepared: Prepared, name: Estimator) -> tuple[RepeatedEstimate, list[Note]]:
