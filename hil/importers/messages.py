@@ -174,10 +174,10 @@ def _(fixed: FixedFingers) -> str:
 
 def places_of(fixed: FixedFingers) -> str:
     """Return where the joints of a gripper are fixed, and why."""
-    places = ", ".join(
-        f"{number(place)} {fixed.units[name]}" for name, place in fixed.positions.items()
-    )
-    return f"at {places}: a gripper that was not recorded"
+    places = [f"{number(place)} {fixed.units[name]}" for name, place in fixed.positions.items()]
+    if len(set(places)) == 1:
+        places = places[:1]  # of all
+    return f"at {', '.join(places)}: a gripper that was not recorded"
 
 
 @worded.register

@@ -11,6 +11,7 @@ import pytest
 from hil.archive import open_archive
 from hil.base.errors import InputError, SourceError
 from hil.cell.arms import Links, arms_of, recorded_arms
+from hil.importers.conclusions import FixedFingers
 from hil.importers.imported_robot import Robot
 from hil.importers.messages import sentence
 from hil.importers.recording_import import ImportOptions, import_recording
@@ -186,6 +187,16 @@ def test_a_gripper_that_a_bag_has_not_is_fixed_by_every_import(tmp_path: Path) -
         assert result.exit_code == 0, (result.output, result.exception)
         assert "finger_j1: fixed at 0 rad: a gripper that was not recorded" in result.output
         assert joints_of(output) == names
+
+
+@pytest.mark.parametrize(
+    ("places", "text"),
+    [((0.0, 0.0), "fixed at 0 m: a gripper"), ((0.0, 0.02), "fixed at 0 m, 0.02 m: a gripper")],
+)
+def test_a_place_that_all_fingers_have_is_said_once(places: tuple[float, float], text: str) -> None:
+    fingers = "left_finger", "right_finger"
+    fixed = FixedFingers(dict(zip(fingers, places, strict=True)), dict.fromkeys(fingers, "m"))
+    assert f"left_finger, right_finger: {text}" in sentence(fixed)
 
 
 @pytest.mark.parametrize("effort", ["motor_current", "ignore"])
