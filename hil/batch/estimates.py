@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from hil.base.arrays import Array
 from hil.base.files import json_digest
 from hil.cell import Cell
-from hil.pipeline.estimating import fit_with_prior, posterior_of, with_intervals
+from hil.pipeline.estimating import fit_with_prior, posterior_of
 from hil.pipeline.estimators import fit_of
 from hil.pipeline.notes import Note, PoorlySeparated, UnrestrictedBodies
 from identification import IdentificationError
@@ -22,6 +22,7 @@ from identification.estimators.consistent import SolverError
 from identification.estimators.covariance import solve_with_prior
 from identification.factor.estimate import Estimate
 from identification.factor.factor import MAX_GRAM_CONDITION, Factor, require_rows
+from identification.reduction.intervals import widened
 from identification.reduction.posterior import Posterior
 from identification.reduction.reduction import Reduction
 from identification.selection.settings import Settings
@@ -357,12 +358,12 @@ class ArmEstimator:
         values = np.array([each.values for each in singles] or group.values)
         motions = {ref.motion for ref in group.refs}
         is_one_motion = len(motions) == 1 and "" not in motions
-        whole = with_intervals(
+        whole = widened(
             whole,
             total,
             posterior,
-            self.name,
-            settings,
+            posterior.precision if self.name == "auto" else None,
+            delay_variance=settings.delay_variance,
             repetitions=values if is_one_motion else None,
             torque_scale=np.zeros(self.model.n_joints),  # in units of the torque of the arm
             recordings=[summary.total for summary in fitted],

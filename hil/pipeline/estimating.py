@@ -28,7 +28,7 @@ from identification.estimators.robust import RobustEstimate, robust_estimate
 from identification.factor.columns import instrument_factor
 from identification.factor.estimate import Estimate
 from identification.factor.factor import MAX_GRAM_CONDITION, Factor, no_rows_message, total_factor
-from identification.reduction.intervals import Widened, widened
+from identification.reduction.intervals import widened
 from identification.reduction.posterior import Posterior
 from identification.reduction.reduction import Reduction
 from identification.selection.settings import Settings, Strength
@@ -168,12 +168,12 @@ def estimate_with(
         else:
             result, warnings = _without_prior(prepared, name)
         scale = torque_scale_of(prepared.sources)
-        pooled, stated, form = with_intervals(
+        pooled, stated, form = widened(
             result.pooled,
             total,
             posterior,
-            name,
-            settings,
+            posterior.precision if name in OF_PRIOR else None,
+            delay_variance=settings.delay_variance,
             repetitions=result.values if prepared.sources.same_motion else None,
             torque_scale=scale.std,
             recordings=factors,
@@ -242,33 +242,6 @@ def fit_with_prior(cell: Cell, total: Factor, name: str, strength: Strength) -> 
     posterior, fit, unsolved = posterior_of(cell, total, name, strength).solved(total)
     return PriorFit(
         posterior, fit, () if unsolved is None else (UnrestrictedBodies(str(unsolved)),)
-    )
-
-
-def with_intervals(
-    estimate: Estimate,
-    total: Reduction,
-    posterior: Posterior,
-    name: str,
-    settings: Settings,
-    *,
-    repetitions: Array | None,
-    torque_scale: Array,
-    recordings: Sequence[Factor],
-) -> Widened:
-    """Return an estimate by an estimator with all that its intervals allow for.
-
-    See :func:`~identification.reduction.intervals.widened`.
-    """
-    return widened(
-        estimate,
-        total,
-        posterior,
-        posterior.precision if name in OF_PRIOR else None,
-        delay_variance=settings.delay_variance,
-        repetitions=repetitions,
-        torque_scale=torque_scale,
-        recordings=recordings,
     )
 
 
