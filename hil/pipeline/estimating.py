@@ -238,7 +238,14 @@ class PriorFit(NamedTuple):
 
 
 def fit_with_prior(cell: Cell, total: Factor, name: str, strength: Strength) -> PriorFit:
-    """Fit a sum of recordings with the prior of an estimator, see :func:`posterior_of`."""
+    """Fit a sum of recordings with the prior of an estimator.
+
+    Args:
+        cell: of the arm.
+        total: of the recordings.
+        name: of the estimator.
+        strength: of the prior, as for :func:`posterior_of`.
+    """
     posterior, fit, unsolved = posterior_of(cell, total, name, strength).solved(total)
     return PriorFit(
         posterior, fit, () if unsolved is None else (UnrestrictedBodies(str(unsolved)),)
