@@ -77,11 +77,11 @@ def _clock_time(sources: Sequence[Source]) -> Array | None:
 
 
 def _shown(samples: Samples) -> slice:
-    """Rows of a figure: the motion with a margin before and after it."""
+    """Rows of a figure: the motion with a margin before and after it; all if nothing moves."""
     moving = moving_rows(samples)
     time = samples.motion.time
     if moving.start == moving.stop:
-        return moving
+        moving = slice(0, len(time))
     first = int(np.searchsorted(time, time[moving.start] - _MARGIN_SECONDS))
     last = int(np.searchsorted(time, time[moving.stop - 1] + _MARGIN_SECONDS, side="right"))
     return slice(first, last, max(1, (last - first) // FIGURE_SAMPLES))

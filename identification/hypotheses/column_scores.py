@@ -34,7 +34,8 @@ _SAME_PART_ERROR_RATIO: Final = 0.85  # the same, if separate parameters for the
 # noise floors; a floor of coloured noise is estimated a third too low
 _NEAR_NOISE_FLOORS: Final = 2.0
 _MIN_POWER_SHARE: Final = 1e-20  # squared torque of an axis that counts, as a share of the largest
-_SEPARATE_ERROR_RATIO: Final = 1.1  # error ratio to separate parameters
+SEPARATE_ERROR_RATIO: Final = 1.1
+"""Error ratio to separate parameters up to which a change explains a part as well."""
 _MIN_ROWS: Final = 10
 MIN_BLOCKS: Final = 2
 # Ridge as a share of each column's information, for columns that the motion hardly determines.
@@ -110,7 +111,7 @@ class ColumnScore(NamedTuple):
         positive = (least > 0.0) & (mine > 0.0)
         return bool(positive.any()) and geometric_mean(
             np.sqrt(mine[positive] / least[positive])
-        ) <= (_SEPARATE_ERROR_RATIO)
+        ) <= (SEPARATE_ERROR_RATIO)
 
     def ratio_to(self, other: ColumnScore) -> tuple[float, float]:
         """Return the error ratio, geometric mean over the joints, and its upper limit by blocks."""

@@ -6,19 +6,26 @@ and with one change after the other. The change that reduces the error most is n
 reduction is significant and explains the error of the fit: what is left is near the noise, near the
 error of the other joints, or near that of separate parameters for the part. The search is repeated
 with it.
+
+What was found in a part is certain only if nothing else explains it as well (another change of the
+part, a load with one, friction that drifts), and if the part is then predicted as well as the rest.
 """
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Final, NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from identification.arrays import Array
+from identification.distributions import SIGNIFICANT_SIGMAS
 from identification.hypotheses.column_scores import (
     MIN_BLOCKS,
+    SEPARATE_ERROR_RATIO,
     ColumnScore,
     ScorePrior,
     column_score,
@@ -26,6 +33,7 @@ from identification.hypotheses.column_scores import (
     rough_size,
     separate_errors,
 )
+from identification.hypotheses.error_ratios import mean_and_error
 from identification.hypotheses.joint_changes import Change, Meaning, Part, changed_samples
 from identification.hypotheses.sizes import estimated_size
 from identification.hypotheses.torque_columns import BLOCKS, ColumnSums, columns_of
@@ -43,6 +51,7 @@ _MIN_PAYLOAD_SIGMAS: Final = 2.0  # standard deviations of a payload that is one
 _MAX_CHANGES: Final = 4  # changes
 _SCALE_ROUNDS: Final = 20  # fits, each with the scale of the one before undone
 _SCALE_TOLERANCE: Final = 1e-3  # relative change of a scale
+_MOST_RIVALS: Final = 3  # that are named
 _PARTS_PER_BLOCK: Final = 4  # parts of a block whose scatter gives the interval of a size
 _OF_ARM: Final[tuple[Meaning, ...]] = ("payload", "arm")  # that may be of a part
 _OF_JOINT: Final[tuple[Meaning, ...]] = ("scale", "friction")
@@ -58,6 +67,11 @@ class Explanation(NamedTuple):
             a size.
         std: standard deviation of it over the blocks.
         interval_factor: standard deviations in half a 95 % interval.
+        rivals: other changes that explain its part as well, or several at once that explain more,
+            the best first.
+        excess: error of its part with it over that of the other blocks, 1.0 if not significantly
+            above.
+        others: further changes of its part, where they are not certain.
     """
 
     change: Change
@@ -65,6 +79,18 @@ class Explanation(NamedTuple):
     size: float | None = None
     std: float = 0.0
     interval_factor: float = 2.0
+    rivals: tuple[tuple[Change, ...], ...] = ()
+    excess: float = 1.0
+    others: tuple[Change, ...] = ()
+
+    @property
+    def is_certain(self) -> bool:
+        """Whether it is clearly not zero, nothing else explains as much, and nothing is left."""
+        if self.size is None:
+            is_something = self.change.meaning != "payload"  # a load has a mass
+        else:
+            is_something = abs(self.size) > self.half_interval
+        return is_something and not self.rivals and self.excess <= SEPARATE_ERROR_RATIO
 
     @property
     def half_interval(self) -> float:
@@ -152,6 +178,39 @@ def _best(trials: Sequence[_Trial]) -> _Trial | None:
     return min(alike, key=lambda trial: (trial.coefficients, trial.explanation.ratio), default=None)
 
 
+def _contains(changes: Sequence[Change], other: Change) -> bool:
+    """Return whether another friction of a joint is part of one of some changes."""
+    return other.meaning == "friction" and any(
+        each.meaning.startswith("friction") and {*other.joints} <= {*(each.joints or other.joints)}
+        for each in changes
+    )
+
+
+def _excess(squares: Array, usual: Array, inside: NDArray[np.bool_]) -> float:
+    """Return the errors of a part's blocks over those of the others, 1.0 if not significant.
+
+    Args:
+        squares: squared errors (B, n).
+        usual: what they are in proportion to (B, n).
+        inside: the blocks of the part (B,).
+    """
+    tested = (squares > 0.0) & (usual > 0.0)
+    joints = tested[inside].any(axis=0) & tested[~inside].any(axis=0)
+    tested = tested[:, joints]
+    blocks = tested.any(axis=1)
+    levels = np.full(tested.shape, np.nan)
+    levels[tested] = 0.5 * np.log(squares[:, joints][tested] / usual[:, joints][tested])
+    if not joints.any():
+        return 1.0
+    levels -= np.nanmean(levels, axis=0)
+    means = np.nanmean(levels[blocks], axis=1)
+    (mean, error), (rest, rest_error) = (
+        mean_and_error(means[which]) for which in (inside[blocks], ~inside[blocks])
+    )
+    is_more = mean - rest > SIGNIFICANT_SIGMAS * math.hypot(error, rest_error)
+    return math.exp(mean - rest) if is_more else 1.0
+
+
 @dataclass(eq=False)
 class _Search:
     """Recordings as sums over columns, and the changes that were found in them."""
@@ -195,7 +254,91 @@ class _Search:
             if meaning in ("arm", "drift"):
                 break  # separate parameters leave nothing to compare, a drift what is not linear
             self.known.append(trial.explanation.change)
-        return tuple(found)
+        return tuple(self._examined(found))
+
+    def _examined(self, found: Sequence[Explanation]) -> Iterator[Explanation]:
+        """Yield what was found, each in a part with what contradicts it, given all others.
+
+        All that is in a part is as uncertain as one of it. What was found after it, and is
+        throughout or uncertain as well, rests on it and is left out.
+        """
+        changes = [each.change for each in found]
+        examined = []
+        for k, each in enumerate(found):
+            if each.change.part is None:
+                examined.append(each)
+                continue
+            self.known = changes[:k] + changes[k + 1 :]
+            score = self._score(self._before, each.change)
+            rivals = self._rivals(each.change, score)
+            each = each._replace(rivals=rivals, excess=self._excess(each.change.part, score))
+            several = len(found) > 1
+            examined.append(self._resized(each, score.values.mean(axis=0)) if several else each)
+        uncertain = next((each for each in examined if not each.is_certain), None)
+        if uncertain is None:
+            yield from examined
+            return
+        first = next(each for each in examined if each.change.part == uncertain.change.part)
+        for each in examined[: examined.index(first)]:
+            yield each
+        others = [change for change in changes if change.part == first.change.part]
+        others.remove(uncertain.change)
+        rivals = tuple(
+            (*rival, *(each for each in others if not _contains(rival, each)))
+            for rival in uncertain.rivals
+        )
+        yield uncertain._replace(others=tuple(others), rivals=rivals)
+        for each in examined[examined.index(first) + 1 :]:
+            part = each.change.part
+            if part is not None and part != first.change.part and each.is_certain:
+                yield each
+
+    def _rivals(self, change: Change, score: ColumnScore) -> tuple[tuple[Change, ...], ...]:
+        """Return changes that explain a part as well as one, and pairs that explain more.
+
+        Of all parameters, which explain the most, pairs are rivals that explain as much.
+
+        Args:
+            change: that was found in the part.
+            score: of it.
+        """
+        load = Change("payload", part=change.part)
+        of_joints = [
+            Change(meaning, joints, part=change.part)
+            for meaning in _OF_JOINT
+            for joints in [(), *((joint,) for joint in self.moved)]
+            if joints or meaning == "friction"
+        ]
+        drift = Change("friction drift", tuple(self.moved))
+        singles = [(each,) for each in (load, *of_joints, drift) if each != change]
+        pairs = [(load, each) for each in of_joints]
+        if change.meaning in _OF_JOINT:
+            pairs += [(change, each) for each in of_joints if each != change]
+        alike = SEPARATE_ERROR_RATIO if change.meaning == "arm" else _ALIKE_ERROR_RATIO
+        found: dict[tuple[Change, ...], float] = {}
+        for rivals in (singles, pairs):
+            for rival in rivals:
+                ratio, highest = self._score(self._before, *rival).ratio_to(score)
+                is_more = ratio * alike < 1.0 and highest < 1.0
+                is_pair = len(rival) > 1 and change.meaning != "arm"
+                if is_more if is_pair else ratio <= alike:
+                    found[rival] = ratio
+            if found:
+                break  # of pairs, one of which is enough
+        return tuple(sorted(found, key=found.__getitem__)[:_MOST_RIVALS])
+
+    def _excess(self, part: Part, score: ColumnScore) -> float:
+        """Return the error of a part over that of the other blocks, 1.0 if not significant.
+
+        It is compared as it is, and as a share of the torque, with which noise may grow.
+        """
+        tables = self.tables
+        inside = tables.mask_of(Change("arm", part=part)) > 0.0
+        torque = tables.torques[:, :, None]
+        power = (np.swapaxes(torque, 1, 2) @ tables.gram @ torque)[..., 0, 0]
+        return min(
+            _excess(score.squares, usual, inside) for usual in (tables.rows.astype(float), power)
+        )
 
     def _load_and_scale(self, found: Explanation) -> list[Explanation]:
         """Return a load in a part with the scale of a joint, if they explain more than was found.

@@ -29,7 +29,7 @@ class GravityDirection:
     declared: Array  # gravity of the model (3,) [m/s²]
     best: Array  # gravity that fits the training motion best, of the same size (3,) [m/s²]
     # squared error on unseen motion under `best` over `declared`, geometric mean over the joints
-    # that moved
+    # that moved in both
     ratio: float
 
     @property
@@ -93,10 +93,14 @@ def find_gravity(model: RobotModel, training: Factor, held_out: Factor) -> Gravi
     if _weight_agreement(training, best, fitted(best)[0], model.nominal) < 0.0:
         other = fitted(-best)[0]
         best = -best if _weight_agreement(training, -best, other, model.nominal) > 0.0 else best
-    counts = held_out.samples > 0
-    change = np.log(unseen(best)) - np.log(unseen(model.gravity))
-    ratio = float(np.exp(change[counts].mean())) if counts.any() else 1.0
-    return GravityDirection(model.gravity, best, ratio)
+    counts = (held_out.samples > 0) & (training.samples > 0)
+    errors = np.log(unseen(best))
+    torque = np.log(np.maximum(held_out.gram[:, -1, -1], 1e-300))
+    # An error above the torque itself tells nothing, however much less it is than another one.
+    if not counts.any() or np.mean((errors - torque)[counts]) >= 0.0:
+        return GravityDirection(model.gravity, best, 1.0)
+    change = errors - np.log(unseen(model.gravity))
+    return GravityDirection(model.gravity, best, float(np.exp(change[counts].mean())))
 
 
 def _weight_agreement(factor: Factor, gravity: Array, values: Array, nominal: Array) -> float:

@@ -37,6 +37,7 @@ Meaning = Literal[
     "load friction",
     "payload",
     "friction",
+    "friction drift",
     "arm",
 ]
 DEGREE: Final = np.pi / 180.0

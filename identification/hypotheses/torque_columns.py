@@ -208,15 +208,22 @@ def folded(blocks: Array) -> Array:
 def columns_of(tables: ColumnSums, model: RobotModel, values: Array, change: Change) -> Array:
     """Return the columns of a change as combinations of a table's columns (B, n, q, r).
 
+    Friction drifts by a parabola of time.
+
     Args:
         tables: of the blocks.
         model: of the arm.
         values: parameters (p,).
         change: of what was recorded.
     """
-    _, n, width, _ = tables.gram.shape
+    blocks, n, width, _ = tables.gram.shape
     p = model.n_parameters
     joints = list(change.joints or range(model.n_joints))
+    if change.meaning == "friction drift":
+        time = (np.arange(blocks) + 0.5) / blocks  # of all recordings, one after the other
+        parts = np.zeros((n, width, len(joints)))
+        parts[joints, :p, range(len(joints))] = values * model.friction_columns
+        return np.concatenate([np.multiply.outer(time**k, parts) for k in (1, 2)], axis=3)
     count = {"payload": N_LINK, "arm": p, "load friction": n}.get(change.meaning, 1)
     columns = np.zeros((n, width, count))
     if change.meaning == "delay":

@@ -166,6 +166,11 @@ class Evidence:
         return joint not in self.prismatic
 
     @property
+    def unfitted(self) -> NDArray[np.bool_]:
+        """Joints with rows of held-out motion only (n,)."""
+        return (self.training.rows == 0) & (self.held_out.rows > 0)
+
+    @property
     def explanations(self) -> tuple[Explanation, ...] | None:
         """Changes that explain the errors of the fit; None if not searched for."""
         return None if self.diagnosis is None else self.diagnosis.explanations

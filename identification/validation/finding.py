@@ -43,6 +43,7 @@ Role = Literal["condition", "cause", "symptom"]
 FindingKey = Literal[
     # the recordings
     "nothing held out",
+    "joints not fitted",
     "joints at rest",
     "no torque",
     "position jumps",
@@ -97,6 +98,8 @@ FindingKey = Literal[
     "torque of a part",
     "friction of a part",
     "arm of a part",
+    "undetermined change of a part",
+    "unexplained part",
     # what differs on unseen motion
     "load",
     "changed torque",
@@ -204,6 +207,7 @@ RemedyKey = Literal[
     "state the coupled difference",
     "separate the payloads",
     "check what changed in between",
+    "find what changed in between",
     "separate the arms",
     "record with one payload",
     "check what changed",
@@ -266,6 +270,7 @@ Value = (
     | tuple[int, ...]
     | tuple[float, ...]
     | tuple[Change, ...]
+    | tuple[tuple[Change, ...], ...]
     | tuple[PositionJump, ...]
     | tuple[RepeatedSamples, ...]
 )

@@ -212,6 +212,10 @@ class _Text(string.Formatter):
                 return law_option(value) if format_spec == "option" else law_text(value)
             case RepeatedSamples():
                 return f"{value.joint} {value.count} in {value.recording}"
+            case tuple() if format_spec == "with":
+                return " with ".join(self.format_field(change, "") for change in value)
+            case tuple() if format_spec == "sets":
+                return ", or ".join(self.format_field(changes, "with") for changes in value)
             case tuple() if format_spec == "names":
                 return self._naming.all_of(value)
             case tuple():
@@ -248,9 +252,20 @@ _QUANTITIES: Final[Mapping[Meaning, str]] = {
 }
 
 
+_OF_A_PART: Final[Mapping[Meaning, str]] = {
+    "payload": "another load",
+    "scale": "another scale of the torque of {}",
+    "friction": "another friction of {}",
+    "friction drift": "friction that drifts throughout",
+    "arm": "another arm, tool or setting",
+}
+
+
 def _change(change: Change, naming: Naming) -> str:
-    """Return a sign, an order or a coupled angle in words."""
-    joints = naming.all_of(change.joints)
+    """Return a sign, an order, a coupled angle, or what is other in a part, in words."""
+    joints = naming.all_of(change.joints) or "all axes"
+    if change.meaning in _OF_A_PART:
+        return _OF_A_PART[change.meaning].format(joints)
     if change.meaning in _QUANTITIES:
         done = "negated" if change.meaning in SIGNS else "interchanged"
         return f"{_QUANTITIES[change.meaning]} of {joints} {done}"
@@ -264,14 +279,26 @@ _CORRECTED: Final = Optional(
 )
 
 
-def _fault(check: str, words: str) -> Sentence:
-    """Return the sentence of a change, with the error that is left with it corrected if known."""
-    return Sentence(check, f"{words}{{corrected}}", optional={"corrected": _CORRECTED})
+def _fault(check: str, words: str, sized: Optional | None = None) -> Sentence:
+    """Return the sentence of a change, with the error that is left with it corrected if known.
+
+    Args:
+        check: it belongs to.
+        words: of the sentence, with `sized` where its size is.
+        sized: its size in words, or that the motion does not determine it.
+    """
+    optional = {"corrected": _CORRECTED}
+    if sized is not None:
+        optional["sized"] = sized
+    return Sentence(check, f"{words}{{corrected}}", optional=optional)
 
 
+_UNKNOWN: Final = "which the motion does not determine"
+_TIMES: Final = Optional(
+    "{size:.3g} ± {half_interval:.2g} times as large as", f"of another size, {_UNKNOWN}, than"
+)
 _CONSTANT: Final = (
-    "the torque of {axes} is {size:.3g} ± {half_interval:.2g} times the value consistent with the"
-    " other axes"
+    "is {size:.3g} ± {half_interval:.2g} times the value consistent with the other axes"
 )
 _EXCEEDS: Final = "the torque error on {motion} exceeds {limit:pc0}"
 _SLOW: Final = "the torque error on {motion} beyond noise exceeds {limit:pc1}: {each}"
@@ -296,6 +323,9 @@ _AT_SPEED: Final = (
 
 SENTENCES: Final[Mapping[FindingKey, Sentence]] = {
     "nothing held out": Sentence(UNTESTED, "no motion was held out: all errors are in-sample"),
+    "joints not fitted": Sentence(
+        UNTESTED, "the fitted motion does not move {joints}, and {motion} does"
+    ),
     "joints at rest": Sentence(UNTESTED, "{joints} moved for less than {least:g} s of {motion}"),
     "no torque": Sentence(UNTESTED, "the measured torque of {joints} is zero throughout {motion}"),
     "position jumps": Sentence(
@@ -469,23 +499,31 @@ SENTENCES: Final[Mapping[FindingKey, Sentence]] = {
     ),
     "delay of the torque": _fault(
         "delay",
-        "the torque of {axes} lags the position by {size:.3g} ± {half_interval:.2g} ms"
-        " {difference:more} than assumed",
+        "the torque of {axes} lags the position by {sized} than assumed",
+        Optional(
+            "{size:.3g} ± {half_interval:.2g} ms {difference:more}",
+            f"another time, {_UNKNOWN},",
+        ),
     ),
     "drift of a joint": _fault(
         "zeros",
-        "the zero of {axes} drifts by about {size:.2g}° over the fitted motion",
+        "the zero of {axes} drifts by {sized} over the fitted motion",
+        Optional("about {size:.2g}°", f"an angle, {_UNKNOWN},"),
     ),
-    "torque constant": _fault("torque constant", _CONSTANT),
+    "torque constant": _fault(
+        "torque constant",
+        "the torque of {axes} {sized}",
+        Optional(_CONSTANT, f"has another scale than the other axes, {_UNKNOWN}"),
+    ),
     "torque constant, as assumed": Sentence(
         "torque constant",
-        f"{_CONSTANT}, which the assumed uncertainty of the torques includes (standard deviation of"
-        " the ratio {scale_std:pc1})",
+        f"the torque of {{axes}} {_CONSTANT}, which the assumed uncertainty of the torques includes"
+        " (standard deviation of the ratio {scale_std:pc1})",
     ),
     "load friction": _fault(
         "friction over load",
-        "friction grows with the load, by {size:.3g} ± {half_interval:.2g} of the transmitted"
-        " torque (median axis)",
+        "friction grows with the load, by {sized} of the transmitted torque (median axis)",
+        Optional("{size:.3g} ± {half_interval:.2g}", f"a share, {_UNKNOWN},"),
     ),
     "torque sign": _fault(_SIGN, "the torque of {axes} probably has the wrong sign"),
     "position sign": _fault(_SIGN, "the position of {axes} probably has the wrong sign"),
@@ -505,22 +543,42 @@ SENTENCES: Final[Mapping[FindingKey, Sentence]] = {
     ),
     "payload of a part": _fault(
         "sameness",
-        "in {part} the arm carried {size:.3g} ± {half_interval:.2g} kg {difference:more} than in"
-        " the other data",
+        "in {part} the arm carried {sized} than in the other data",
+        Optional(
+            "{size:.3g} ± {half_interval:.2g} kg {difference:more}",
+            f"another mass, {_UNKNOWN},",
+        ),
     ),
     "torque of a part": _fault(
         "sameness",
-        "in {part} the torque of {axes} is {size:.3g} ± {half_interval:.2g} times as large as"
-        " in the other data",
+        "in {part} the torque of {axes} is {sized} in the other data",
+        _TIMES,
     ),
     "friction of a part": _fault(
         "sameness",
-        "in {part} the friction of {axes} is {size:.3g} ± {half_interval:.2g} times as large as"
-        " in the other data",
+        "in {part} the friction of {axes} is {sized} in the other data",
+        _TIMES,
     ),
     "arm of a part": _fault(
         "sameness",
         "{part} was probably recorded with another arm, tool or setting than the other data",
+    ),
+    "undetermined change of a part": Sentence(
+        "sameness",
+        "{part} differs from the other data, and several explanations fit it: {alike:sets}",
+    ),
+    "unexplained part": Sentence(
+        "sameness",
+        "{part} differs from the other data; the nearest explanation is {nearest:with}{kilograms}"
+        "{times}, {left}",
+        optional={
+            "kilograms": Optional(" ({mass:.3g} ± {half_interval:.2g} kg {difference:more})"),
+            "times": Optional(" ({factor:.3g} ± {half_interval:.2g} times)"),
+            "left": Optional(
+                "with which the error is still {excess:.2g} times as large as in the other data",
+                "which is not certain",
+            ),
+        },
     ),
     "load": Sentence(
         "load",
@@ -897,6 +955,10 @@ REMEDIES: Final[Mapping[RemedyKey, str]] = {
         " file ([robot.payload])"
     ),
     "check what changed in between": _SAMENESS,
+    "find what changed in between": (
+        "find out what changed there (payload, drive settings, temperature), and identify the"
+        " recordings of each state separately"
+    ),
     "separate the arms": "identify from recordings of one arm in one condition",
     "record with one payload": (
         "record both with the same tool and payload, or state the payload of each in its cell file"

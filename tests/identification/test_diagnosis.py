@@ -9,7 +9,12 @@ from numpy.typing import NDArray
 from identification import Recording
 from identification.estimators.prior import body_prior, posterior_values
 from identification.factor.factor import Factor
-from identification.hypotheses.column_search import ExplainedFit, find_columns
+from identification.hypotheses.column_search import (
+    ExplainedFit,
+    Explanation,
+    find_columns,
+    find_columns_of_unseen,
+)
 from identification.hypotheses.diagnosis import TorqueDiagnosis, diagnose
 from identification.hypotheses.joint_changes import Change
 from identification.hypotheses.readings import Adequacy
@@ -217,3 +222,75 @@ def test_a_load_in_a_part_is_no_scale_of_a_torque(
     assert load.size == pytest.approx(1.0, abs=0.01)
     found = {each.change.joints: each.size for each in others}
     assert found == {(j,): pytest.approx(s - 1.0, abs=0.01) for j, s in enumerate(scales) if s > 1}
+
+
+def explanations(torque: Floats, unseen_from: float | None = None) -> tuple[Explanation, ...]:
+    """Return what explains the errors of a fit of a torque, or of its rows before a share."""
+    q, _, _ = motion()
+    rows = len(TIME) if unseen_from is None else round(unseen_from * len(TIME))
+    seen, *unseen = (
+        prepare(
+            Recording(TIME[part], q[part], NAMES, torque[part]),
+            model(),
+            options=Preprocessing(14.0, exclude_rows="rests"),
+        )
+        for part in (slice(0, rows), slice(rows, None))
+        if part.start < len(TIME)
+    )
+    factor = Factor.of(model(), seen)
+    values, _ = posterior_values(factor, body_prior(model(), factor).gaussian, ROWS_PER_FACT)
+    if unseen:
+        return find_columns_of_unseen(model(), [seen], unseen, ExplainedFit(values))
+    return find_columns(model(), [seen], ExplainedFit(values))
+
+
+def within(start: float, end: float = 1.0) -> NDArray[np.bool_]:
+    """Rows between two shares of the time (m, 1)."""
+    share = TIME / TIME[-1]
+    return np.asarray(((start <= share) & (share <= end))[:, None])
+
+
+def dry_and_viscous() -> Floats:
+    """The friction of `motion`, without noise."""
+    velocity = np.gradient(motion()[0], TIME, axis=0)
+    return np.asarray(0.4 * np.sign(velocity) + 0.2 * velocity)
+
+
+@pytest.mark.parametrize("joint", [0, 1, 2])
+def test_a_load_with_another_scale_of_its_part_is_not_certain(joint: int) -> None:
+    """A load alone has a wrong mass; that it is not alone is named."""
+    factors = np.where(np.arange(3) == joint, 1.4, 1.0)
+    bare, loaded = motion()[1], motion((1.0, 1.0, 2.0))[1]
+    found, *more = explanations(np.where(within(0.3, 0.7), loaded * factors, bare))
+    assert not more
+    assert not found.is_certain
+    kinds = [{(each.meaning, each.joints) for each in rival} for rival in found.rivals]
+    assert {("payload", ()), ("scale", (joint,))} in kinds
+
+
+@pytest.mark.parametrize("start", [0.5, 0.3])
+def test_a_load_alone_is_certain(start: float) -> None:
+    (found,) = explanations(np.where(within(start), motion((1.0, 1.0, 2.0))[1], motion()[1]))
+    assert found.change.meaning == "payload"
+    assert found.is_certain
+
+
+def test_friction_of_a_joint_from_a_time_on_is_certain() -> None:
+    more = np.where(within(0.5), 0.5 * dry_and_viscous() * KNEE, 0.0)
+    (found,) = explanations(motion()[1] + more)
+    assert found.change[:2] == ("friction", (1,))
+    assert found.size == pytest.approx(0.5, abs=0.02)
+    assert found.is_certain
+
+
+@pytest.mark.parametrize("rise", [0.6, 1.2])
+def test_friction_that_drifts_is_no_certain_step(rise: float) -> None:
+    """Neither in what is fitted nor in unseen motion."""
+    passed = (TIME / TIME[-1])[:, None]
+    (found,) = explanations(motion()[1] + rise * passed * dry_and_viscous())
+    assert not found.is_certain
+    assert found.rivals[0] == (Change("friction drift", (0, 1, 2)),)
+    later = np.maximum(passed - 0.5, 0.0)
+    (begun,) = explanations(motion()[1] + 2.0 * rise * later * dry_and_viscous(), 0.5)
+    assert not begun.is_certain
+    assert "friction drift" in {each.meaning for rival in begun.rivals for each in rival}

@@ -117,6 +117,48 @@ def test_words_have_no_full_stop_and_no_capital(text: str) -> None:
             "",
         ),
         (
+            Finding("payload of a part", "wrong", values={"part": "A.mcap from 3 s on"}),
+            "in A.mcap from 3 s on the arm carried another mass, which the motion does not"
+            " determine, than in the other data",
+            "",
+        ),
+        (
+            Finding(
+                "undetermined change of a part",
+                "wrong",
+                values={
+                    "part": "A.mcap from 3 s on",
+                    "alike": (
+                        (Change("payload"),),
+                        (Change("payload"), Change("scale", (1,))),
+                        (Change("friction drift", (0, 1, 2)),),
+                    ),
+                },
+            ),
+            "A.mcap from 3 s on differs from the other data, and several explanations fit it:"
+            " another load, or another load with another scale of the torque of two, or friction"
+            " that drifts throughout",
+            "",
+        ),
+        (
+            Finding(
+                "unexplained part",
+                "wrong",
+                values={
+                    "part": "A.mcap from 3 s on",
+                    "nearest": (Change("payload"),),
+                    "mass": 0.95,
+                    "half_interval": 0.2,
+                    "difference": 0.95,
+                    "excess": 2.5,
+                },
+            ),
+            "A.mcap from 3 s on differs from the other data; the nearest explanation is another"
+            " load (0.95 ± 0.2 kg more), with which the error is still 2.5 times as large as in the"
+            " other data",
+            "",
+        ),
+        (
             Finding(
                 "angle difference", "wrong", "state the coupled difference", joints=(2, 1)
             ),

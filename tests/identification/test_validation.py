@@ -816,6 +816,20 @@ class TestChangesToUnseenMotion:
         assert [(change.kind, change.joint) for change in changes] == [("friction", 1)]
         assert changes[0].ratio == pytest.approx(factor, abs=0.05)
 
+    def test_gain_and_friction_are_alike_where_either_leaves_what_is_usual(self):
+        """Of a joint of little weight, with an error of the fit that hides which of them it is."""
+
+        def waved(factor):
+            def measured(motion, torque):
+                wave = 0.4 * torque.std(axis=0) * np.sin(7.0 * motion.time)[:, None]
+                return with_friction(np.array([1.0, factor]))(motion, torque) + wave * [0.0, 1.0]
+
+            return measured
+
+        (change,) = changes_between(waved(8.0), waved(10.4))
+        assert (change.kind, change.joint, change.alike) == ("friction", 1, True)
+        assert change.ratio == pytest.approx(1.3, abs=0.02)
+
     def test_a_torque_beside_an_error_of_the_fit(self):
         """The error on unseen motion is not twice that of the fitted one."""
 

@@ -289,6 +289,15 @@ class TestJudgement:
                 (0, 1),
                 {"growth": (4.0, 4.0), "relative": (0.2, 0.2)},
             ),
+            (
+                {
+                    "training": replace(an_error(0.05), rows=np.array([100, 0])),
+                    "held_out": an_error(np.array([0.01, 0.4])),
+                },
+                "joints not fitted",
+                (1,),
+                {},
+            ),
             ({"moved": np.array([9.0, 0.4])}, "joints at rest", (1,), {"least": 0.5}),
             ({"held_out": HEAVY}, "nothing explained", (0,), {}),
             (

@@ -9,6 +9,7 @@ import numpy as np
 
 from identification.arrays import Array
 from identification.distributions import SIGNIFICANT_SIGMAS
+from identification.hypotheses.column_scores import SEPARATE_ERROR_RATIO
 from identification.hypotheses.column_search import Explanation
 from identification.hypotheses.joint_changes import SIGNS, Change, Meaning
 from identification.validation.evidence import Evidence
@@ -127,8 +128,30 @@ def faults(evidence: Evidence, limits: Thresholds) -> tuple[Finding, ...]:
     begun = () if evidence.diagnosis is None else evidence.diagnosis.begun
     return tuple(
         _fault(each, evidence, limits)
+        if each.change.part is None or each.is_certain
+        else _of_a_part(each, limits)
         for each in (*(evidence.explanations or ()), *begun)
         if not _is_left_out(each, evidence, limits)
+    )
+
+
+def _of_a_part(each: Explanation, limits: Thresholds) -> Finding:
+    """Return that something in a part is other than in the rest, and what it may be."""
+    change = each.change
+    values: dict[str, Value] = {**fault_values(each), "nearest": (change, *each.others)}
+    if "size" in values and not each.others:
+        values["mass" if change.meaning == "payload" else "factor"] = values["size"]
+    if each.rivals:
+        values["alike"] = ((change, *each.others), *each.rivals)
+    if each.excess > SEPARATE_ERROR_RATIO:
+        values["excess"] = each.excess
+    return Finding(
+        "undetermined change of a part" if each.rivals else "unexplained part",
+        "wrong" if each.ratio < limits.cause else "doubtful",
+        "find what changed in between",
+        "cause",
+        values,
+        explains=1.0 - each.ratio**2,
     )
 
 
@@ -158,10 +181,10 @@ def _fault(each: Explanation, evidence: Evidence, limits: Thresholds) -> Finding
     matters = np.nan_to_num(evidence.held_out.relative) > limits.unexplained
     key, remedy = fault_keys(each.change)
     values = fault_values(each)
-    if is_constant(each.change):
+    if is_constant(each.change) and each.size is not None:
         # Of a torque's scale over those of the others, whose scales are in that of the change.
         std = float(np.hypot(scale_std[[*each.change.joints]].max(), each.std))
-        if abs(each.size or 0.0) <= SIGNIFICANT_SIGMAS * std:
+        if abs(each.size) <= SIGNIFICANT_SIGMAS * std:
             return Finding(
                 "torque constant, as assumed",
                 "information",
@@ -192,21 +215,20 @@ def fault_keys(change: Change) -> tuple[FindingKey, RemedyKey]:
 
 
 def fault_values(each: Explanation) -> dict[str, Value]:
-    """Return the figures of a change: its size as it is stated.
+    """Return the figures of a change: its size as it is stated, if it is determined.
 
     That is ms of a delay, degrees of a drift, the factor of a scale. `difference` has the sign of
     the size, `whole` is what the ratio is of.
     """
-    change_size = each.size or 0.0
     is_factor = each.change.meaning in ("scale", "friction")
     unit = {"delay": 1e3, "drift": np.degrees(1.0)}.get(each.change.meaning, 1.0)
-    values: dict[str, Value] = {
-        "size": abs(unit * change_size + (1.0 if is_factor else 0.0)),
-        "half_interval": unit * each.half_interval,
-        "difference": change_size,
-        "ratio": each.ratio,
-        "whole": "the fitted motion",
-    }
+    values: dict[str, Value] = {"ratio": each.ratio, "whole": "the fitted motion"}
+    if each.size is not None:
+        values |= {
+            "size": abs(unit * each.size + (1.0 if is_factor else 0.0)),
+            "half_interval": unit * each.half_interval,
+            "difference": each.size,
+        }
     if each.change.part is not None:
         values |= {"part": each.change.part.name, "whole": "the recordings"}
     return values

@@ -21,6 +21,8 @@ def correlation(evidence: Evidence, limits: Thresholds) -> Finding | None:
     if evidence.residuals is None:
         return None
     autocorrelation = evidence.residuals.autocorrelation
+    if np.isnan(autocorrelation.time).all():
+        return None  # no rows
     parameters = len(evidence.estimate.names)
     worth = float(np.nansum(autocorrelation.effective_rows))
     values: dict[str, Value] = {
@@ -39,7 +41,7 @@ def over_speed(evidence: Evidence, limits: Thresholds) -> Finding | None:
     checks = evidence.residuals
     if checks is None:
         return None
-    joints = _notable(checks, checks.speed, limits)
+    joints = _notable(checks, checks.speed, limits) & ~evidence.unfitted
     if not joints.any():
         return Finding("no residual over speed", "good")
     found = Finding("residual over speed", "doubtful", "try friction terms", "symptom")
@@ -51,7 +53,7 @@ def over_position(evidence: Evidence, limits: Thresholds) -> Finding | None:
     checks = evidence.residuals
     if checks is None:
         return None
-    joints = _notable(checks, checks.position, limits)
+    joints = _notable(checks, checks.position, limits) & ~evidence.unfitted
     if not joints.any():
         return Finding("no residual over position", "good")
     found = Finding("residual over position", "doubtful", "check the geometry", "symptom")
@@ -83,7 +85,7 @@ def ripple(evidence: Evidence, limits: Thresholds) -> Finding | None:
     if checks is None or checks.ripple is None:
         return None
     share = checks.share(checks.ripple.rms)
-    joints = _notable(checks, checks.ripple, limits)
+    joints = _notable(checks, checks.ripple, limits) & ~evidence.unfitted
     large = joints & (share > limits.ripple)
     harmonic = [checks.ripple.strongest(joint) for joint in range(len(share))]
     if not joints.any():

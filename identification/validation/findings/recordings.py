@@ -19,6 +19,15 @@ def nothing_held_out(evidence: Evidence, _: Thresholds) -> Finding | None:
     return Finding("nothing held out", "wrong", "hold out a motion")
 
 
+def joints_not_fitted(evidence: Evidence, limits: Thresholds) -> Finding | None:
+    """Return the joints of a large error that no fitted row moves, and held-out ones do."""
+    large = np.nan_to_num(evidence.held_out.relative) > limits.axis
+    joints = large & evidence.unfitted
+    if not joints.any():
+        return None
+    return Finding("joints not fitted", "wrong", "cover the motion", "cause").about(joints)
+
+
 def joints_at_rest(evidence: Evidence, limits: Thresholds) -> Finding | None:
     """Return the joints that hardly moved on held-out motion."""
     moved = evidence.moved

@@ -26,6 +26,7 @@ Check = Callable[[Evidence, Thresholds], "Finding | tuple[Finding, ...] | None"]
 
 CHECKS: Final[tuple[Check, ...]] = (
     recordings.nothing_held_out,
+    recordings.joints_not_fitted,
     recordings.joints_at_rest,
     recordings.no_torque,
     recordings.position_jumps,
