@@ -43,7 +43,7 @@ _MAX_REMAINING_ERROR: Final = (2.0, 0.1)
 # fitted one does not cover: below 0.6.
 _MIN_EXPLAINED_SHARE: Final = 2.0 / 3.0
 # Ratio of remaining errors up to which the two kinds are alike, as for a joint that has little more
-# than friction: friction varies, a gain is set once. So are two that leave no more than is usual.
+# than friction: friction varies, a gain is set once. More where neither leaves more than is usual.
 _ALIKE_ERROR_RATIO: Final = 1.1
 
 
@@ -168,7 +168,9 @@ def find_changes(
                 trials.append(UnseenChange(kind, joint, ratio, deviation, left))
         if trials:
             least = min(trial.relative for trial in trials)
-            most = max(_ALIKE_ERROR_RATIO * least, float(usual[joint]))  # nothing is left to tell
+            most = max(
+                _ALIKE_ERROR_RATIO * least, min(_MIN_ERROR_GROWTH * least, float(usual[joint]))
+            )
             alike = [trial for trial in trials if trial.relative <= most]
             changes.append(alike[-1]._replace(alike=len(alike) > 1))
     return tuple(changes)

@@ -193,7 +193,7 @@ def test_gravity_that_a_verdict_prints_makes_the_model_good(cases: Path, tmp_pat
     line = ("identify", log, "--urdf", cases / "arm.urdf", "--map", stated)
     code, shown = typed(*line, "-o", tmp_path / "wrong", "-v")
     assert code == 5
-    (option,) = set(re.findall(r"`(--gravity 0 0 0)` where a log", shown))
+    (option,) = set(re.findall(r"`(--gravity 0 0 0)` with a log", shown))
     code, shown = typed(*line, *shlex.split(option), "-o", tmp_path / "right")
     assert code == 0
     assert "Good for feed-forward" in shown
