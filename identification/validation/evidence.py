@@ -168,7 +168,7 @@ class Evidence:
     @property
     def unfitted(self) -> NDArray[np.bool_]:
         """Joints with rows of held-out motion only (n,)."""
-        return (self.training.rows == 0) & (self.held_out.rows > 0)
+        return np.asarray((self.training.rows == 0) & (self.held_out.rows > 0))
 
     @property
     def explanations(self) -> tuple[Explanation, ...] | None:
