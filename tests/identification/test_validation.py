@@ -816,7 +816,7 @@ class TestChangesToUnseenMotion:
         assert [(change.kind, change.joint) for change in changes] == [("friction", 1)]
         assert changes[0].ratio == pytest.approx(factor, abs=0.05)
 
-    def test_gain_and_friction_are_alike_where_either_leaves_what_is_usual(self):
+    def test_gain_and_friction_alike_within_the_usual_error(self):
         """Of a joint of little weight, with an error of the fit that hides which of them it is."""
 
         def waved(factor):
