@@ -179,10 +179,15 @@ def _best(trials: Sequence[_Trial]) -> _Trial | None:
 
 
 def _contains(changes: Sequence[Change], other: Change) -> bool:
-    """Return whether another friction of a joint is part of one of some changes."""
-    return other.meaning == "friction" and any(
-        each.meaning.startswith("friction") and {*other.joints} <= {*(each.joints or other.joints)}
-        for each in changes
+    """Return whether a friction is part of one of some changes, or a constant in place of it."""
+    if other.meaning == "friction":
+        return any(
+            each.meaning.startswith("friction")
+            and {*other.joints} <= {*(each.joints or other.joints)}
+            for each in changes
+        )
+    return other.part is None and any(
+        each.part is None and each.meaning == other.meaning for each in changes
     )
 
 
@@ -222,6 +227,7 @@ class _Search:
     moved: list[int]  # joints whose scale and friction the fitted rows show
     seen: int  # recordings without a change that begins in them
     blocks: int
+    recorded: Sequence[Samples]  # the recordings, with all scales
     known: list[Change] = field(default_factory=list)
 
     @classmethod
@@ -239,7 +245,7 @@ class _Search:
         usable = np.any([samples.usable.any(axis=0) for samples in fit], axis=0)
         moved = np.flatnonzero((travel > MIN_MOVEMENT) & usable).tolist()
         tables = ColumnSums.of(model, recordings, fitted.values, blocks=blocks)
-        return cls(model, recordings, fitted, tables, moved, seen, blocks)
+        return cls(model, recordings, fitted, tables, moved, seen, blocks, recordings)
 
     def explanations(self, most: int = _MAX_CHANGES) -> tuple[Explanation, ...]:
         """Return the changes found, one after the other."""
@@ -265,43 +271,50 @@ class _Search:
         changes = [each.change for each in found]
         examined = []
         for k, each in enumerate(found):
-            if each.change.part is None:
+            part = each.change.part
+            if part is None:
                 examined.append(each)
                 continue
-            self.known = changes[:k] + changes[k + 1 :]
+            others = changes[:k] + changes[k + 1 :]
+            self.known = others
             score = self._score(self._before, each.change)
-            rivals = self._rivals(each.change, score)
-            each = each._replace(rivals=rivals, excess=self._excess(each.change.part, score))
-            several = len(found) > 1
-            examined.append(self._resized(each, score.values.mean(axis=0)) if several else each)
-        uncertain = next((each for each in examined if not each.is_certain), None)
+            if len(found) > 1:
+                each = self._resized(each, score.values.mean(axis=0))
+            rivals = self._rivals(each, score) or self._other_constants(each)
+            self.known = others
+            examined.append(each._replace(rivals=rivals, excess=self._excess(part, score)))
+        of_parts = [each for each in examined if each.change.part is not None]
+        uncertain = next((each for each in of_parts if not each.is_certain), None)
         if uncertain is None:
             yield from examined
             return
-        first = next(each for each in examined if each.change.part == uncertain.change.part)
-        for each in examined[: examined.index(first)]:
-            yield each
-        others = [change for change in changes if change.part == first.change.part]
+        part = uncertain.change.part
+        first = next(k for k, change in enumerate(changes) if change.part == part)
+        yield from examined[:first]
+        others = [change for change in changes[first:] if change.part in (None, part)]
         others.remove(uncertain.change)
         rivals = tuple(
             (*rival, *(each for each in others if not _contains(rival, each)))
             for rival in uncertain.rivals
         )
         yield uncertain._replace(others=tuple(others), rivals=rivals)
-        for each in examined[examined.index(first) + 1 :]:
-            part = each.change.part
-            if part is not None and part != first.change.part and each.is_certain:
-                yield each
+        yield from (
+            each
+            for each in examined[first:]
+            if each.change.part not in (None, part) and each.is_certain
+        )
 
-    def _rivals(self, change: Change, score: ColumnScore) -> tuple[tuple[Change, ...], ...]:
+    def _rivals(self, found: Explanation, score: ColumnScore) -> tuple[tuple[Change, ...], ...]:
         """Return changes that explain a part as well as one, and pairs that explain more.
 
-        Of all parameters, which explain the most, pairs are rivals that explain as much.
+        Of pairs significantly more, or with another size of what was found. Of all parameters,
+        which explain the most, pairs are rivals that explain as much.
 
         Args:
-            change: that was found in the part.
+            found: change of the part.
             score: of it.
         """
+        change = found.change
         load = Change("payload", part=change.part)
         of_joints = [
             Change(meaning, joints, part=change.part)
@@ -311,21 +324,64 @@ class _Search:
         ]
         drift = Change("friction drift", tuple(self.moved))
         singles = [(each,) for each in (load, *of_joints, drift) if each != change]
-        pairs = [(load, each) for each in of_joints]
+        throughout = [Change("scale", (joint,)) for joint in self.moved]
+        pairs = [(load, each) for each in (*of_joints, *throughout)]
         if change.meaning in _OF_JOINT:
             pairs += [(change, each) for each in of_joints if each != change]
         alike = SEPARATE_ERROR_RATIO if change.meaning == "arm" else _ALIKE_ERROR_RATIO
-        found: dict[tuple[Change, ...], float] = {}
+        ratios: dict[tuple[Change, ...], float] = {}
         for rivals in (singles, pairs):
             for rival in rivals:
-                ratio, highest = self._score(self._before, *rival).ratio_to(score)
-                is_more = ratio * alike < 1.0 and highest < 1.0
-                is_pair = len(rival) > 1 and change.meaning != "arm"
-                if is_more if is_pair else ratio <= alike:
-                    found[rival] = ratio
-            if found:
+                both = self._score(self._before, *rival)
+                ratio, highest = both.ratio_to(score)
+                is_rival = ratio <= alike
+                if len(rival) > 1 and change.meaning != "arm":
+                    is_rival = ratio * alike < 1.0 and (
+                        highest < 1.0 or self._has_another_size(found, rival, both)
+                    )
+                if is_rival:
+                    ratios[rival] = ratio
+            if ratios:
                 break  # of pairs, one of which is enough
-        return tuple(sorted(found, key=found.__getitem__)[:_MOST_RIVALS])
+        return tuple(sorted(ratios, key=ratios.__getitem__)[:_MOST_RIVALS])
+
+    def _has_another_size(
+        self, found: Explanation, rival: Sequence[Change], score: ColumnScore
+    ) -> bool:
+        """Return whether a size, in a set of changes, is outside the intervals of each other."""
+        if found.size is None or found.change not in rival:
+            return False
+        search = replace(self, known=list(self.known))
+        for each in rival:
+            if each.meaning == "scale" and each.part is None and found.change.meaning == "payload":
+                search._undo(each, found.change)  # of the torque of the load as well
+            elif each != found.change:
+                search.known.append(each)
+        other = search._resized(found, score.values.mean(axis=0))
+        if other.size is None:
+            return True
+        reach = math.hypot(found.half_interval, other.half_interval)
+        return abs(other.size - found.size) > reach
+
+    def _other_constants(self, found: Explanation) -> tuple[tuple[Change, ...], ...]:
+        """Return scales of other joints throughout that fit alike, with another size of a part."""
+        rivals = []
+        for constant in self.known:
+            if constant.meaning != "scale" or constant.part is not None:
+                continue
+            search = replace(self, known=[each for each in self.known if each != constant])
+            search.recordings = self.recorded  # with its scale
+            search._refitted(self.fitted.values)
+            one = search._score(search._before, found.change, constant)
+            for joint in self.moved:
+                other = constant._replace(joints=(joint,))
+                if other in self.known:
+                    continue
+                both = search._score(search._before, found.change, other)
+                is_alike = both.ratio_to(one)[0] <= _ALIKE_ERROR_RATIO
+                if is_alike and search._has_another_size(found, (found.change, other), both):
+                    rivals.append((found.change, other))
+        return tuple(rivals[:_MOST_RIVALS])
 
     def _excess(self, part: Part, score: ColumnScore) -> float:
         """Return the error of a part over that of the other blocks, 1.0 if not significant.

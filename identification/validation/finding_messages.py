@@ -265,7 +265,9 @@ def _change(change: Change, naming: Naming) -> str:
     """Return a sign, an order, a coupled angle, or what is other in a part, in words."""
     joints = naming.all_of(change.joints) or "all axes"
     if change.meaning in _OF_A_PART:
-        return _OF_A_PART[change.meaning].format(joints)
+        words = _OF_A_PART[change.meaning].format(joints)
+        is_throughout = change.meaning == "scale" and change.part is None
+        return f"{words} throughout" if is_throughout else words
     if change.meaning in _QUANTITIES:
         done = "negated" if change.meaning in SIGNS else "interchanged"
         return f"{_QUANTITIES[change.meaning]} of {joints} {done}"

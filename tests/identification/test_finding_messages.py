@@ -136,8 +136,8 @@ def test_words_have_no_full_stop_and_no_capital(text: str) -> None:
                 },
             ),
             "A.mcap from 3 s on differs from the other data, and several explanations fit it:"
-            " another load, or another load with another scale of the torque of two, or friction"
-            " that drifts throughout",
+            " another load, or another load with another scale of the torque of two throughout, or"
+            " friction that drifts throughout",
             "",
         ),
         (
