@@ -15,7 +15,6 @@ from hil.pipeline.prepared import Prepared, prepare_sources, samples_of
 from hil.pipeline.sources import (
     Source,
     archives_in,
-    arm_differences,
     gather_sources,
     refuse_duplicates,
 )
@@ -23,7 +22,13 @@ from hil.pipeline.torque_scale import torque_scale
 from identification.estimators.payload_problem import KnownArm, Run
 
 from .payload_found import BareCheck, PayloadFound
-from .payload_run import doubtful_mounting, flange_of, weighed, weight_per_mass
+from .payload_run import (
+    doubtful_mounting,
+    flange_of,
+    require_one_arm,
+    weighed,
+    weight_per_mass,
+)
 
 
 def weigh_by_model(
@@ -58,10 +63,7 @@ def weigh_by_model(
     fitted = [path for path in of_arm if open_archive(path).header.purpose != "validation"]
     sources = gather_sources(fitted or of_arm, options.split, in_sample=True)
     others = gather_sources(paths, options.split, in_sample=True)
-    if differing := arm_differences(sources.cell, others.cell):
-        problem = f"belongs to another arm than {arm[0]}: {' and '.join(differing)} differ"
-        remedy = "give recordings of the arm of the model"
-        raise ArchiveError(paths[0], problem, remedy=remedy)
+    require_one_arm(sources.cell, others.cell, str(arm[0]), paths[0])
     _require_usable(sources.cell.file.robot.payload is not None, "carries a known payload", arm[0])
     # The loaded recordings have one bandwidth, and the arm must have the same.
     prepared = prepare_sources(sources, options, reporter).unhedged()

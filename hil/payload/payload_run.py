@@ -12,11 +12,13 @@ import numpy as np
 
 from hil.base.errors import ArchiveError, InputError
 from hil.base.progress import Reporter
+from hil.cell import Cell
 from hil.cell.cell import FLANGES
 from hil.pipeline.options import Options
 from hil.pipeline.other_meanings import require_weight
 from hil.pipeline.prepared import Prepared, prepare_sources, samples_of
 from hil.pipeline.sources import (
+    GRAVITY,
     Source,
     Sources,
     aligned,
@@ -155,16 +157,38 @@ def _sources_of(sides: Mapping[bool, Sequence[Path]]) -> dict[bool, Sources]:
     }
     bare = sources[False].cell
     loaded = sources[True].cell
-    if differing := arm_differences(bare, loaded):
-        problem = f"belongs to another arm than {bare.path}: {' and '.join(differing)} differ"
-        remedy = "give bare and loaded recordings of one arm"
-        raise ArchiveError(sides[True][0], problem, field="--loaded", remedy=remedy)
+    require_one_arm(bare, loaded, str(bare.path), sides[True][0], "--loaded")
     for source in (*sources[False].training, *sources[True].training):
         if source.recording.torque is None:
             problem = "contains no joint torques"
             remedy = "give drive.torque_constant in the column map"
             raise ArchiveError(source.path, problem, field="torque", remedy=remedy)
     return sources
+
+
+def require_one_arm(bare: Cell, loaded: Cell, name: str, path: Path, field: str = "") -> None:
+    """Raise ArchiveError if cells differ.
+
+    Args:
+        bare: of the recordings without the payload.
+        loaded: of those with it.
+        name: of the bare recordings, for the error.
+        path: of the first loaded one.
+        field: that names them, if any.
+    """
+    differing = arm_differences(bare, loaded)
+    if differing == [GRAVITY]:
+        sides = (f"{cell.file.robot.gravity}" for cell in (loaded, bare))
+        problem = f"is read with the gravity {' and not '.join(sides)} m/s², as {name} is"
+        remedy = (
+            "record the torques of both with the weight of the arm, or both without it, on an arm"
+            " mounted alike"
+        )
+        raise ArchiveError(path, problem, field=field, remedy=remedy)
+    if differing:
+        problem = f"belongs to another arm than {name}: {' and '.join(differing)} differ"
+        remedy = "give bare and loaded recordings of one arm"
+        raise ArchiveError(path, problem, field=field, remedy=remedy)
 
 
 def _runs(

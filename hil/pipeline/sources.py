@@ -7,7 +7,7 @@ from collections.abc import Iterator, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, Final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -110,8 +110,12 @@ def cell_of(archive: Archive) -> Cell:
     return Cell.from_texts(archive.text("cell.toml"), archive.text("robot.urdf"), archive.path)
 
 
+GRAVITY: Final = "gravity of [robot]"
+"""Difference of cells of one arm that is mounted otherwise, or whose torque has no weight."""
+
+
 def arm_differences(cell: Cell, other: Cell) -> list[str]:
-    """Return the parts in which two cells describe different arms.
+    """Return the parts in which two cells describe different arms; `GRAVITY` if it is that alone.
 
     Payloads and how well torques are known aside.
     """
@@ -126,7 +130,13 @@ def arm_differences(cell: Cell, other: Cell) -> list[str]:
         for cell in (cell, other)
     )
     first, second = parts
-    return [name for name in first if first[name] != second[name]]
+    differing = [name for name in first if first[name] != second[name]]
+    gravity = other.file.robot.gravity
+    if differing == ["[robot]"] and gravity != cell.file.robot.gravity:
+        robot = cell.file.robot.model_copy(update={"gravity": gravity})
+        turned = replace(cell, file=cell.file.model_copy(update={"robot": robot}))
+        return arm_differences(turned, other) or [GRAVITY]
+    return differing
 
 
 def gather_sources(

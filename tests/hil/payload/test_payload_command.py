@@ -18,9 +18,11 @@ from typer.testing import CliRunner
 
 from hil.base.errors import ArchiveError, InputError
 from hil.base.progress import Silent
+from hil.cell import Cell
 from hil.cli import app
 from hil.importers.column_map import Drive
-from hil.payload.payload_run import find_payload
+from hil.payload.payload_run import find_payload, require_one_arm
+from sim_fixtures.ns16 import CELL_PATH
 from tests import messages
 from tests.docs.typed import ROOT, commands
 from tests.hil.fast_cell import QUICK
@@ -181,6 +183,20 @@ def test_the_same_recording_and_another_arm_are_named(folder: Path, tmp_path: Pa
     other = archived(tmp_path / "ur10.mcap", simulate("ur10_robot.urdf", time, seed=1))
     with pytest.raises(ArchiveError, match=r"ur10\.mcap.*another arm .* robot\.urdf"):
         find_payload(empty, [other], Silent())
+
+
+def test_another_gravity_is_not_another_arm() -> None:
+    """Such as that of a torque from which a controller removed the weight of the arm."""
+    bare = Cell.load(CELL_PATH)
+    loaded = bare.with_values({"robot.gravity": [0.0, 0.0, 0.0]})
+    with pytest.raises(
+        ArchiveError, match=r"is read with the gravity .* as bare\.mcap is"
+    ) as raised:
+        require_one_arm(bare, loaded, "bare.mcap", Path("full.mcap"))
+    assert "both with the weight of the arm, or both without it" in str(raised.value)
+    other = loaded.with_values({"robot.rotor_inertia": False})
+    with pytest.raises(ArchiveError, match=r"another arm than bare\.mcap: \[robot\] differ"):
+        require_one_arm(bare, other, "bare.mcap", Path("full.mcap"))
 
 
 TYPE = np.array([12.0, 12.0, 10.0, 5.0, 5.0, 5.0])  # N·m/A, joint side
