@@ -8,13 +8,10 @@ from pathlib import Path
 from typing import Final, Literal, Self
 
 from hil.archive.campaign_archives import load_record
-from hil.precision.requirements import Requirement, requirements_from
+from hil.precision.requirements import MIN_CONSECUTIVE_MET, Requirement, requirements_from
 
 from .folder import save_record
 
-MIN_CONSECUTIVE_MET: Final = 2
-"""Repetitions after which a requirement must be met one after the other: one interval alone can be
-narrow by chance, the more often one looks (Simons 1968 adds observations after the first look)."""
 MIN_REPETITIONS: Final = 3
 """Repetitions before a campaign ends because more of them do not help."""
 OVERDUE_FACTOR: Final = 2

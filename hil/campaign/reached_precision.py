@@ -38,7 +38,12 @@ from hil.pipeline.sources import Source, gather_sources
 from hil.precision.forecast import REFERENCE_PERIOD
 from hil.precision.given_recordings import given_sources
 from hil.precision.required_quantities import ReferenceMotions, RequiredQuantities
-from hil.precision.requirements import Requirement, require_known, requirements_from
+from hil.precision.requirements import (
+    MIN_CONSECUTIVE_MET,
+    Requirement,
+    require_known,
+    requirements_from,
+)
 from identification.estimators.delay import CombinedDelay, delay_sensitivity
 from identification.estimators.torque_scale import absolute
 from identification.excitation import midpoints
@@ -47,7 +52,7 @@ from identification.factor.factor import Factor
 from identification.reduction.reduction import MAX_UNMODELLED_REPETITIONS, Reduction
 from identification.signals.samples import Samples
 
-from .precision_record import MIN_CONSECUTIVE_MET, PrecisionLook, PrecisionRecord, Reached
+from .precision_record import PrecisionLook, PrecisionRecord, Reached
 from .record_messages import precision_line
 from .state import CampaignState
 

@@ -28,6 +28,7 @@ from hil.pipeline.torque_scale import TorqueScale, torque_scale
 from hil.precision.given_recordings import given_sources
 from hil.precision.required_quantities import ReferenceMotions, RequiredQuantities
 from identification.distributions import NORMAL_95
+from identification.estimators.elasticity import KnownGears, fitted_gears
 from identification.estimators.payload_estimate import parameter_change
 from identification.estimators.payload_problem import FRICTION_DRIFT_STD
 from identification.excitation import Excitation, LoadQuantities, Objective, midpoints
@@ -37,12 +38,14 @@ from identification.factor.factor import Factor
 from identification.model.known_payload import Payload
 from identification.model.motion import Motion
 from identification.model.robot import RobotModel
+from identification.reduction.intervals import excess_scores
+from identification.reduction.reduction import Reduction
 from identification.selection.settings import Strength
 from planner import JointLimits, Trajectory
 from sim_fixtures.servo import loops_per_cycle
 
 from .predicted_variances import PredictedRows
-from .requirements import Requirement, require_known
+from .requirements import MIN_CONSECUTIVE_MET, Requirement, require_known
 
 MODEL_ERROR_SHARE: Final = 0.03
 """Torque error of a fitted model, as a share of each joint's torque, where nothing was recorded.
@@ -82,7 +85,8 @@ class Forecast:
         requirement: what was wanted.
         worst: the quantity that is worst.
         half: half of its 95 % interval after the planned repetitions, in units of the requirement.
-        repetitions: of this motion that meet the requirement; None if none do.
+        repetitions: of this motion that meet the requirement, at least `MIN_CONSECUTIVE_MET`, as a
+            campaign runs them; None if none do.
         motions: different motions of this kind that meet it, once each; None if none do.
         limit: half of the interval that the scale of the torque alone leaves; zero if the interval
             is in units of the torque of this arm.
@@ -148,6 +152,7 @@ class PrecisionDesign:
     scale: TorqueScale
     source: str  #: where the torque error is from
     rigid: bool  #: whether the arm is a simulated one with rigid gears
+    gears: KnownGears | None  #: by recordings; None: none
 
     @classmethod
     def of(
@@ -196,11 +201,12 @@ class PrecisionDesign:
         factor = Factor.from_samples(cell.model, Motion.joined(sampled), reference.torque(nominal))
         prior = posterior_of(cell, factor, "auto", Strength()).prior.gaussian.information
         values = nominal
+        gears = None
         scale = torque_scale(cell, (), simulated=simulated)
         if cell.file.drive_train is not None:
             scale = replace(scale, by_currents=True)
         if given:
-            values, prior, error = _posterior(cell, given)
+            values, prior, error, gears = _posterior(cell, given)
             source = "of the given recordings"
         information = prior + reference.information(error)
         subject = values
@@ -212,8 +218,9 @@ class PrecisionDesign:
             )
             required, subject = _load(cell.model, requirements[0], payload, values, information)
         made = cls(
-            cell, required, subject, values, prior, error, noise, reference, scale, source, exact
-        )
+            cell, required, subject, values, prior, error, noise, reference, scale, source, exact,
+            gears,
+        )  # fmt: skip
         made._require_possible()
         return made
 
@@ -257,8 +264,8 @@ class PrecisionDesign:
                     requirement=requirement,
                     worst=label,
                     half=ratio * requirement.value,
-                    repetitions=_least(repeated),
-                    motions=_least(various),
+                    repetitions=_least(repeated, MIN_CONSECUTIVE_MET),
+                    motions=_least(various, 1),
                     limit=float(limits[mine].max()) * requirement.value,
                 )
             )
@@ -270,7 +277,7 @@ class PrecisionDesign:
             step = float(motion.time[1] - motion.time[0])
             objective = Objective(self.cell.model, precision=self.precision(1.0))
             return _Shown(step * objective.precise_grams(motion), None)
-        rows = PredictedRows.of(self.cell, motion, self.values, rigid=self.rigid)
+        rows = PredictedRows.of(self.cell, motion, self.values, gears=self.gears, rigid=self.rigid)
         p = self.cell.model.n_parameters
         return _Shown(rows.grams[:, :p, :p], rows)
 
@@ -390,11 +397,11 @@ def short_search() -> DesignSettings:
     )
 
 
-def _least(meets: Callable[[int], bool]) -> int | None:
-    """Return the least count, up to `_MAX_REPETITIONS`, from which on a condition holds."""
+def _least(meets: Callable[[int], bool], lowest: int) -> int | None:
+    """Return the least count, to `_MAX_REPETITIONS`, from which on a condition holds."""
     if not meets(_MAX_REPETITIONS):
         return None
-    low = 0
+    low = lowest - 1
     high = _MAX_REPETITIONS
     while high - low > 1:
         middle = (low + high) // 2
@@ -402,26 +409,46 @@ def _least(meets: Callable[[int], bool]) -> int | None:
     return high
 
 
-def _posterior(cell: Cell, paths: Sequence[Path]) -> tuple[Array, Array, Array]:
-    """Return parameters (p,), information (p, p) and torque error (n,) by recordings of an arm."""
+def _posterior(cell: Cell, paths: Sequence[Path]) -> tuple[Array, Array, Array, KnownGears | None]:
+    """Return what recordings show of an arm.
+
+    These are parameters (p,), their information (p, p), the torque error (n,), and its gears.
+    """
     settings = stated_settings(cell, FIXED)
-    factors = list[Factor]()
+    reductions = list[Reduction]()
     errors = list[Array]()
     for source in given_sources(cell, paths):
         versions = versions_of(source, cell, settings)
-        factors.append(reduction_of(cell, settings, versions, unmodelled=False).factor)
-        if len(errors) < _MIN_MEASURED_RECORDINGS:
+        measured = len(errors) < _MIN_MEASURED_RECORDINGS
+        reductions.append(reduction_of(cell, settings, versions, unmodelled=measured))
+        if measured:
             step = float(np.median(np.diff(versions[0].motion.time)))
-            alone = posterior_of(cell, factors[-1], "auto", Strength())
-            noise = alone.free(factors[-1]).estimate.noise_std
+            factor = reductions[-1].factor
+            alone = posterior_of(cell, factor, "auto", Strength())
+            noise = alone.free(factor).estimate.noise_std
             errors.append(noise**2 * step * alone.design_effect)
-    total = sum(factors[1:], factors[0])
+    every = Reduction.total(cell.model, reductions)
+    total = every.factor
     posterior = posterior_of(cell, total, "auto", Strength())
     estimate = posterior.free(total).estimate
     weights = inverse_variance(estimate.noise_std**2)
     data = total.weighted(weights).A / posterior.design_effect
     information = data + posterior.prior.belief.gaussian.information
-    return estimate.values, information, np.median(errors, axis=0)
+    gears = None
+    if every.unmodelled is not None and every.unmodelled.elastic is not None:
+        elastic = every.unmodelled.elastic
+        fitted = fitted_gears(
+            estimate,
+            total,
+            elastic,
+            posterior.design_effect,
+            posterior.precision,
+            times=every.times,
+            excess=excess_scores(estimate, every, estimate.values),
+        )
+        size = elastic.compliance / elastic.recordings
+        gears = KnownGears(size, fitted.mean, fitted.covariance)
+    return estimate.values, information, np.median(errors, axis=0), gears
 
 
 def _assumed_error(cell: Cell, scatter: Array, *, exact: bool) -> tuple[Array, Array, str]:

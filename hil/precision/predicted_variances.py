@@ -20,6 +20,7 @@ from identification.distributions import student_limit
 from identification.estimators.covariance import MIN_FINE_BLOCKS
 from identification.estimators.delay import DelayEstimate, UndeterminedDelay, predicted_rate
 from identification.estimators.elasticity import (
+    KnownGears,
     elastic_torque,
     expected_compliance,
     expected_square,
@@ -52,16 +53,26 @@ class PredictedRows:
     cell: Cell
     grams: Array  #: integrals of the products of the columns of each joint (n, q, q), q = p + 1 + n
     duration: float  #: of the motion [s]
+    gears: KnownGears
     rigid: bool  #: whether the gears are known to be rigid, as on a simulated arm
 
     @classmethod
-    def of(cls, cell: Cell, motion: Motion, values: Array, *, rigid: bool) -> Self:
+    def of(
+        cls,
+        cell: Cell,
+        motion: Motion,
+        values: Array,
+        *,
+        gears: KnownGears | None = None,
+        rigid: bool,
+    ) -> Self:
         """Return the sums over a sampled motion.
 
         Args:
             cell: of the arm.
             motion: sampled.
             values: parameters (p,).
+            gears: what recordings have shown of them, if any.
             rigid: whether the gears are known to be rigid.
         """
         model = cell.model
@@ -77,9 +88,10 @@ class PredictedRows:
         ).with_friction_direction(model)
         rate = predicted_rate(samples, torque)
         elastic = np.zeros((*torque.shape, n))
+        if gears is None:
+            gears = KnownGears.unknown(expected_compliance(model, samples, values))
         if cell.file.drive_train is not None:
-            compliance = expected_compliance(model, samples, values)
-            elastic = elastic_torque(model, samples, values, compliance)
+            elastic = elastic_torque(model, samples, values, gears.size)
         p = model.n_parameters
         step = float(motion.time[1] - motion.time[0])
         grams = np.zeros((n, p + 1 + n, p + 1 + n))
@@ -90,7 +102,7 @@ class PredictedRows:
             table[:, p + 1 :] = elastic[:, joint]
             some = table[samples.usable[:, joint]]
             grams[joint] = step * some.T @ some
-        return cls(cell, grams, step * len(torque), rigid)
+        return cls(cell, grams, step * len(torque), gears, rigid)
 
     def variances(
         self, directions: Array, prior: Array, density: Array, motions: float = 1.0
@@ -112,11 +124,15 @@ class PredictedRows:
         moved = inverse @ total[:p, p]
         variance = float(total[p, p] - total[:p, p] @ moved)
         delay = self._delay_variance(1.0 / np.sqrt(variance) if variance > 0.0 else np.inf)
+        before = self.gears.covariance
         moved_by_gears, covariance = open_compliance(
-            inverse, total[:p, p + 1 :], total[p + 1 :, p + 1 :]
+            inverse, total[:p, p + 1 :], total[p + 1 :, p + 1 :], known=before
         )
         gears = directions @ moved_by_gears
-        square = expected_square(covariance, rigid=self.rigid)
+        # Estimates of rigid gears scatter by noise; others come nearer to what the gears have.
+        change = covariance - covariance @ covariance if self.rigid else before - covariance
+        scatter = np.sqrt(np.maximum(np.diag(change), 0.0))
+        square = expected_square(covariance, self.gears.mean, scatter)
         return Variances(
             rows,
             delay * (directions @ moved) ** 2,

@@ -17,6 +17,9 @@ from identification.model.robot import RobotModel
 
 Kind = Literal["parameters", "parameter", "friction", "torque", "mass"]
 
+MIN_CONSECUTIVE_MET: Final = 2
+"""Repetitions after which a requirement must be met one after the other: one interval alone can be
+narrow by chance, the more often one looks (Simons 1968 adds observations after the first look)."""
 FORMS: Final = (
     "parameters 5 %",
     "PARAMETER 5 %",

@@ -197,8 +197,35 @@ def elastic_torque(model: RobotModel, samples: Samples, values: Array, complianc
     return torque
 
 
+@dataclass(frozen=True, eq=False)
+class FittedGears:
+    """Compliances of gears beside the parameters, in units of the expected ones."""
+
+    moved: Array  #: change of the parameters by each (p, n)
+    mean: Array  #: (n,)
+    covariance: Array  #: (n, n)
+
+
+@dataclass(frozen=True, eq=False)
+class KnownGears:
+    """What is known of the compliances of gears, in units of `size`."""
+
+    size: Array  #: (n,) [rad/(N m) or m/N]
+    mean: Array  #: (n,)
+    covariance: Array  #: (n, n)
+
+    @classmethod
+    def unknown(cls, size: Array) -> Self:
+        """Return what is known before a recording, with the expected compliances (n,)."""
+        return cls(size, np.zeros(len(size)), np.eye(len(size)))
+
+
 def open_compliance(
-    inverse: Array, products: Array, squares: Array, design_effect: float = 1.0
+    inverse: Array,
+    products: Array,
+    squares: Array,
+    design_effect: float = 1.0,
+    known: Array | None = None,
 ) -> tuple[Array, Array]:
     """Return how compliances move the parameters (p, n), and their own covariance (n, n).
 
@@ -209,24 +236,30 @@ def open_compliance(
         products: of the parameters' columns with the compliances' (p, n).
         squares: of the compliances' columns (n, n).
         design_effect: rows that count as one.
+        known: covariance of the compliances before these rows (n, n); by default one each.
     """
     moved = inverse @ products
-    beside = (squares - products.T @ moved) / design_effect + np.eye(len(squares))
+    before = np.eye(len(squares)) if known is None else np.linalg.inv(known)
+    beside = (squares - products.T @ moved) / design_effect + before
     return moved, np.asarray(np.linalg.inv(beside))
 
 
-def expected_square(covariance: Array, *, rigid: bool) -> Array:
-    """Return the expected mean square (n, n) of the fitted compliances of an arm not recorded yet.
+def expected_square(covariance: Array, mean: Array, scatter: Array) -> Array:
+    """Return the expected mean square (n, n) of the fitted compliances of a motion not run yet.
 
-    `covariance` (n, n) is what its recordings will leave open. Their means scatter about zero: of
-    rigid gears by the noise, else with what the recordings show of the expected ones. None is
-    negative; different gears are taken for independent.
+    None is negative; different gears are taken for independent.
+
+    Args:
+        covariance: that its recordings will leave (n, n).
+        mean: of their estimates (n,).
+        scatter: standard deviations of these (n,).
     """
-    shown = np.eye(len(covariance)) - covariance
-    variance = np.diag(covariance @ shown if rigid else shown)
-    deviation = np.sqrt(np.maximum(variance, 0.0))
-    squares = np.outer(deviation, deviation) / (2.0 * np.pi)
-    np.fill_diagonal(squares, 0.5 * deviation**2)
+    ratio = mean / np.where(scatter > 0.0, scatter, 1.0)
+    above = np.where(scatter > 0.0, scipy.special.ndtr(ratio), mean > 0.0)
+    density = scatter * np.exp(-0.5 * ratio**2) / np.sqrt(2.0 * np.pi)
+    positive = mean * above + density
+    squares = np.outer(positive, positive)
+    np.fill_diagonal(squares, (mean**2 + scatter**2) * above + mean * density)
     return np.asarray(covariance + squares)
 
 
@@ -242,7 +275,30 @@ def with_elastic_gears(
 ) -> Estimate:
     """Return the estimate with the mean square of the compliances in its covariance.
 
-    No gear has a negative compliance.
+    Arguments are those of :func:`fitted_gears`.
+    """
+    fitted = fitted_gears(
+        estimate, factor, torque, design_effect, precision, believed, times, excess
+    )
+    square = np.outer(fitted.mean, fitted.mean) + fitted.covariance
+    return replace(
+        estimate,
+        covariance=estimate.covariance + fitted.moved @ square @ fitted.moved.T,
+        method=estimate.method.widened("elastic_gears"),
+    )
+
+
+def fitted_gears(
+    estimate: Estimate,
+    factor: Factor,
+    torque: ElasticTorque,
+    design_effect: float,
+    precision: Array | None = None,
+    believed: Array | None = None,
+    times: float = 1.0,
+    excess: Array | None = None,
+) -> FittedGears:
+    """Fit the compliances of gears beside the parameters; none is negative.
 
     Args:
         estimate: of p parameters and n joints, with rigid gears.
@@ -271,9 +327,4 @@ def with_elastic_gears(
     # Correlated compliances cannot be cut off at zero one by one.
     root = np.linalg.cholesky(np.linalg.inv(covariance))
     mean, _ = scipy.optimize.nnls(root.T, root.T @ (covariance @ errors) / design_effect)
-    added = moved @ (np.outer(mean, mean) + covariance) @ moved.T
-    return replace(
-        estimate,
-        covariance=estimate.covariance + added,
-        method=estimate.method.widened("elastic_gears"),
-    )
+    return FittedGears(moved, mean, covariance)

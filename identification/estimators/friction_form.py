@@ -15,9 +15,6 @@ coefficient and the scatter of that over blocks of time (Bayes factor of a Gauss
 Raftery 1995, section 3). The mean square of the shift, :math:`\sum P\,(\hat c^2 + \sigma_c^2)\,m
 m^T`, is added to the covariance: of the law itself if the law is right, and if it is wrong of the
 coefficients that the right one would have (model averaging, Hoeting et al. 1999).
-
-Friction that changes during the recordings has no single coefficient. Its spread about the mean is
-added (:func:`with_drift`), so that the intervals hold what friction was at any time.
 """
 
 from __future__ import annotations
@@ -221,25 +218,4 @@ def with_uncertain_form(estimate: Estimate, uncertainty: FormUncertainty) -> Est
         estimate,
         covariance=estimate.covariance + uncertainty.covariance,
         method=estimate.method.widened("friction_form"),
-    )
-
-
-def with_drift(model: RobotModel, estimate: Estimate, change: Array) -> Estimate:
-    """Return the estimate with the spread of friction that changes in its covariance.
-
-    Of relative changes (n,) of each joint's friction over the recordings, in a straight line about
-    the mean: a standard deviation of the change over the root of twelve.
-    """
-    friction = np.where(model.friction_columns, estimate.values, 0.0)
-    spread = np.zeros((model.n_parameters, model.n_joints))
-    for k, term in enumerate(model.friction.terms, model.base.rank):
-        if not term.motor:
-            spread[k, term.owner] = friction[k] * change[term.owner] / np.sqrt(12.0)
-    if not spread.any():
-        return estimate
-    spread[~np.isfinite(np.diag(estimate.covariance))] = 0.0
-    return replace(
-        estimate,
-        covariance=estimate.covariance + spread @ spread.T,
-        method=estimate.method.widened("friction_drift"),
     )

@@ -11,11 +11,10 @@ import numpy as np
 from identification.arrays import Array
 from identification.estimators.delay import with_uncertain_delay
 from identification.estimators.elasticity import with_elastic_gears
-from identification.estimators.friction_drift import drift_of_factors
+from identification.estimators.friction_drift import with_drift
 from identification.estimators.friction_form import (
     FormUncertainty,
     form_uncertainty,
-    with_drift,
     with_uncertain_form,
 )
 from identification.estimators.least_squares import no_narrower
@@ -23,7 +22,6 @@ from identification.estimators.torque_scale import with_torque_scale
 from identification.factor.estimate import Estimate, inverse_variance
 from identification.factor.factor import Factor
 from identification.factor.normal_equations import solve
-from identification.model.robot import RobotModel
 from identification.reduction.posterior import Posterior
 from identification.reduction.reduction import Reduction
 
@@ -85,7 +83,11 @@ def widened(
     factor = total.factor
     # The scores of a stronger prior, or of possible bodies, are not zero.
     believed = None if precision is None else posterior.believed(factor)
-    result = _with_scale(estimate, factor, precision, torque_scale)
+    inverse = _inverse(estimate, factor, precision)
+    result = estimate
+    if torque_scale.any():
+        weights = inverse_variance(estimate.noise_std**2)
+        result = with_torque_scale(estimate, factor, weights, inverse, torque_scale)
     form = None
     if total.unmodelled is not None:
         effect = posterior.design_effect
@@ -98,15 +100,15 @@ def widened(
                 precision,
                 believed,
                 total.times,
-                _excess(estimate, total, estimate.values if believed is None else believed),
+                excess_scores(estimate, total, estimate.values if believed is None else believed),
             )
         own = estimate if believed is None else replace(estimate, values=believed)
         form = form_uncertainty(model, own, factor, total.unmodelled.forms, precision)
         result = with_uncertain_form(result, form)
-    return Widened(estimate, _with_drift(model, result, recordings), form)
+    return Widened(estimate, with_drift(model, result, recordings, inverse), form)
 
 
-def _excess(estimate: Estimate, total: Reduction, values: Array) -> Array:
+def excess_scores(estimate: Estimate, total: Reduction, values: Array) -> Array:
     """Return the scores (p,) of rows with unmodelled effects beyond their share of all scores."""
     assert total.unmodelled is not None
     forms = total.unmodelled.forms
@@ -117,22 +119,9 @@ def _excess(estimate: Estimate, total: Reduction, values: Array) -> Array:
     return np.asarray(total.times * shown - total.factor.scores(weights, values).sum(axis=0))
 
 
-def _with_scale(
-    estimate: Estimate, factor: Factor, precision: Array | None, std: Array
-) -> Estimate:
-    if not std.any():
-        return estimate
-    weights = inverse_variance(estimate.noise_std**2)
-    equations = factor.weighted(weights)
+def _inverse(estimate: Estimate, factor: Factor, precision: Array | None) -> Array:
+    """Return the inverse of the information of rows and prior (p, p), zero where undetermined."""
+    equations = factor.weighted(inverse_variance(estimate.noise_std**2))
     if precision is not None:
         equations = equations._replace(A=equations.A + precision)
-    return with_torque_scale(estimate, factor, weights, solve(equations).inverse, std)
-
-
-def _with_drift(model: RobotModel, estimate: Estimate, recordings: Sequence[Factor]) -> Estimate:
-    """Return the estimate with the significant drift of friction in its intervals."""
-    drift = drift_of_factors(model, estimate.values, recordings)
-    if drift is None:
-        return estimate
-    change = np.where(drift.significant, np.nan_to_num(drift.change), 0.0)
-    return with_drift(model, estimate, change)
+    return solve(equations).inverse
