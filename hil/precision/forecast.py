@@ -206,7 +206,9 @@ class PrecisionDesign:
         if cell.file.drive_train is not None:
             scale = replace(scale, by_currents=True)
         if given:
-            values, prior, error, gears = _posterior(cell, given)
+            values, prior, measured, gears = _posterior(cell, given)
+            # One recording shows both; repetitions average the noise.
+            error = np.maximum(measured - noise, _error_density(SIMULATED_SHARE, scatter))
             source = "of the given recordings"
         information = prior + reference.information(error)
         subject = values
@@ -457,12 +459,17 @@ def _assumed_error(cell: Cell, scatter: Array, *, exact: bool) -> tuple[Array, A
     `scatter` is that of the torques (n,) [N m]; the model of an `exact` arm leaves out nothing.
     """
     share = SIMULATED_SHARE if exact else MODEL_ERROR_SHARE
-    error = (share * scatter) ** 2 * ERROR_CORRELATION_TIME
+    error = _error_density(share, scatter)
     if exact:
         source = f"of the simulated arm: its current noise, and {100 * share:g} % of the torque"
         return error, _current_noise(cell), source
     source = f"assumed, {100 * share:g} % of each joint's torque; recordings measure it (--given)"
     return error, (NOISE_SHARE * scatter) ** 2 * _cycle(cell), source
+
+
+def _error_density(share: float, scatter: Array) -> Array:
+    """Return the density (n,) of an error that is a share of the torques' scatter (n,)."""
+    return (share * scatter) ** 2 * ERROR_CORRELATION_TIME
 
 
 def _current_noise(cell: Cell) -> Array:

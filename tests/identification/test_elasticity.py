@@ -11,6 +11,7 @@ from identification.estimators.elasticity import (
     ElasticTorque,
     elastic_torque,
     expected_compliance,
+    expected_square,
     lost_torque,
     open_compliance,
     with_elastic_gears,
@@ -214,3 +215,14 @@ def test_an_undetermined_parameter_stays_so():
     wider = with_elastic_gears(unknown, Factor.by_time(MODEL, samples), torque, 1.0)
     assert np.isinf(wider.covariance[0, 0])
     np.testing.assert_array_equal(wider.covariance[0, 1:], 0.0)
+
+
+def test_what_a_motion_will_leave_of_gears_is_the_mean_over_what_it_may_show():
+    """Of estimates about what recordings have shown, none negative, with what stays open."""
+    mean = np.array([0.6, 0.0, 0.2])
+    scatter = np.array([0.05, 0.7, 0.0])
+    covariance = np.diag([0.01, 0.4, 0.09])
+    shown = mean + scatter * np.random.default_rng(1).standard_normal((400_000, 3))
+    shown = np.maximum(shown, 0.0)
+    expected = covariance + shown.T @ shown / len(shown)
+    np.testing.assert_allclose(expected_square(covariance, mean, scatter), expected, atol=3e-3)

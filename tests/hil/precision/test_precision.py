@@ -260,7 +260,7 @@ class TestCommand:
         (entry,) = json.loads(result.stdout)["precision"]
         assert entry["requirement"] == "friction 5 %"
         assert 0.0 < entry["half"] < 0.05
-        assert entry["repetitions"] == 1
+        assert entry["repetitions"] == 2  # as many are always run
 
     def test_a_motion_for_a_payload_lasts_ten_seconds_at_most(self, cell, tmp_path: Path) -> None:
         out = tmp_path / "out"
