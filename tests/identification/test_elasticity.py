@@ -217,7 +217,7 @@ def test_an_undetermined_parameter_stays_so():
     np.testing.assert_array_equal(wider.covariance[0, 1:], 0.0)
 
 
-def test_what_a_motion_will_leave_of_gears_is_the_mean_over_what_it_may_show():
+def test_expected_square_is_the_mean_over_estimates():
     """Of estimates about what recordings have shown, none negative, with what stays open."""
     mean = np.array([0.6, 0.0, 0.2])
     scatter = np.array([0.05, 0.7, 0.0])
