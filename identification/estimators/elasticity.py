@@ -263,27 +263,12 @@ def expected_square(covariance: Array, mean: Array, scatter: Array) -> Array:
     return np.asarray(covariance + squares)
 
 
-def with_elastic_gears(
-    estimate: Estimate,
-    factor: Factor,
-    torque: ElasticTorque,
-    design_effect: float,
-    precision: Array | None = None,
-    believed: Array | None = None,
-    times: float = 1.0,
-    excess: Array | None = None,
-) -> Estimate:
-    """Return the estimate with the mean square of the compliances in its covariance.
-
-    Arguments are those of :func:`fitted_gears`.
-    """
-    fitted = fitted_gears(
-        estimate, factor, torque, design_effect, precision, believed, times, excess
-    )
-    square = np.outer(fitted.mean, fitted.mean) + fitted.covariance
+def with_elastic_gears(estimate: Estimate, gears: FittedGears) -> Estimate:
+    """Return the estimate with the mean square of the compliances in its covariance."""
+    square = np.outer(gears.mean, gears.mean) + gears.covariance
     return replace(
         estimate,
-        covariance=estimate.covariance + fitted.moved @ square @ fitted.moved.T,
+        covariance=estimate.covariance + gears.moved @ square @ gears.moved.T,
         method=estimate.method.widened("elastic_gears"),
     )
 

@@ -10,7 +10,7 @@ import numpy as np
 
 from identification.arrays import Array
 from identification.estimators.delay import with_uncertain_delay
-from identification.estimators.elasticity import with_elastic_gears
+from identification.estimators.elasticity import fitted_gears, with_elastic_gears
 from identification.estimators.friction_drift import with_drift
 from identification.estimators.friction_form import (
     FormUncertainty,
@@ -92,7 +92,7 @@ def widened(
     if total.unmodelled is not None:
         effect = posterior.design_effect
         if total.unmodelled.elastic is not None:
-            result = with_elastic_gears(
+            gears = fitted_gears(
                 result,
                 factor,
                 total.unmodelled.elastic,
@@ -102,6 +102,7 @@ def widened(
                 total.times,
                 excess_scores(estimate, total, estimate.values if believed is None else believed),
             )
+            result = with_elastic_gears(result, gears)
         own = estimate if believed is None else replace(estimate, values=believed)
         form = form_uncertainty(model, own, factor, total.unmodelled.forms, precision)
         result = with_uncertain_form(result, form)

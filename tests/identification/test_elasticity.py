@@ -12,6 +12,7 @@ from identification.estimators.elasticity import (
     elastic_torque,
     expected_compliance,
     expected_square,
+    fitted_gears,
     lost_torque,
     open_compliance,
     with_elastic_gears,
@@ -67,7 +68,7 @@ def fitted(samples):
     estimate = fit_least_squares(MODEL, [samples])
     factor = Factor.by_time(MODEL, samples)
     torque = ElasticTorque.of(MODEL, samples, estimate.values)
-    return estimate, with_elastic_gears(estimate, factor, torque, 1.0)
+    return estimate, with_elastic_gears(estimate, fitted_gears(estimate, factor, torque, 1.0))
 
 
 def deviation(estimate):
@@ -148,7 +149,7 @@ def test_the_noise_of_rigid_gears_makes_none_elastic():
     inverse = solve(factor.weighted(weights)).inverse
     moved, covariance = open_compliance(inverse, products, squares)
     errors = measured - products.T @ estimate.values
-    wider = with_elastic_gears(estimate, factor, sums, 1.0)
+    wider = with_elastic_gears(estimate, fitted_gears(estimate, factor, sums, 1.0))
     added = wider.covariance - estimate.covariance - moved @ covariance @ moved.T
     # The most likely ones without negative shares, among all on a grid.
     shares = np.linspace(0.0, 1.0, 201)
@@ -212,7 +213,8 @@ def test_an_undetermined_parameter_stays_so():
     covariance[0, 0] = np.inf
     unknown = replace(estimate, covariance=covariance)
     torque = ElasticTorque.of(MODEL, samples, estimate.values)
-    wider = with_elastic_gears(unknown, Factor.by_time(MODEL, samples), torque, 1.0)
+    gears = fitted_gears(unknown, Factor.by_time(MODEL, samples), torque, 1.0)
+    wider = with_elastic_gears(unknown, gears)
     assert np.isinf(wider.covariance[0, 0])
     np.testing.assert_array_equal(wider.covariance[0, 1:], 0.0)
 
