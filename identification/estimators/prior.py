@@ -244,15 +244,16 @@ class BodyPrior:
     def with_weight(self, weight: float) -> BodyPrior:
         """Return the prior with so many times the information on bodies.
 
-        Of friction, rotors and offsets, whose mean of zero says nothing, it stays the same. The
-        estimate is closer to the described bodies; its intervals believe them no more.
+        Of friction, rotors and offsets, whose mean of zero says nothing, it stays the same. With a
+        larger weight the estimate is closer to the described bodies, and its intervals believe them
+        no more; with a smaller one the bodies are believed less.
         """
         if weight == 1.0:
             return self
         std = self.std.copy()
         std[self.bodies] /= np.sqrt(weight)
         origin = replace(self.origin, weight=weight * self.origin.weight)
-        return replace(self, std=std, origin=origin, believed=self.belief)
+        return replace(self, std=std, origin=origin, believed=self.belief if weight > 1.0 else None)
 
     def most_probable(self, values: Array) -> Array:
         """Return the most probable standard and other parameters (s + k,) of parameters (p,)."""
@@ -303,20 +304,28 @@ def posterior_values(
     prior: GaussianPrior,
     design_effect: float = 1.0,
     start: Array | None = None,
+    *,
+    ordinary_weights: bool = False,
 ) -> tuple[Array, Array]:
     """Return the posterior's parameters (p,) and the weights of the joints (n,).
 
-    The weights are the inverse variances of the joints' own residuals, by iteration.
+    The weights are the inverse variances of the joints' own residuals, by iteration. If no bodies
+    fit all joints, as with torques of wrong scales, the iteration may end with one joint fitted at
+    the expense of the others.
 
     Args:
         factor: of the data.
         prior: of the parameters.
         design_effect: rows of data that count as one.
         start: weights from which the iteration starts (n,).
+        ordinary_weights: whether the residuals are those of an ordinary fit, without iteration.
     """
     sums = TorqueSums.of(factor)
     precision = design_effect * prior.information
-    return sums.posterior(prior.mean, precision, factor.smallest_noise, start)
+    rounds = _NOISE_ROUNDS
+    if ordinary_weights:
+        start, rounds = joint_weights(factor), 1
+    return sums.posterior(prior.mean, precision, factor.smallest_noise, start, rounds=rounds)
 
 
 def with_prior(
@@ -361,7 +370,12 @@ def with_prior(
 
 
 def fit_posterior(
-    model: RobotModel, factor: Factor, prior: GaussianPrior, design_effect: float | None = None
+    model: RobotModel,
+    factor: Factor,
+    prior: GaussianPrior,
+    design_effect: float | None = None,
+    *,
+    ordinary_weights: bool = False,
 ) -> PosteriorEstimate:
     """Estimate from a factor by time and a prior, with coloured residuals.
 
@@ -375,6 +389,7 @@ def fit_posterior(
         factor: of the data, by blocks of time.
         prior: of the parameters.
         design_effect: rows that count as one, by default as :func:`design_effect_of` says.
+        ordinary_weights: of the joints, as for :func:`posterior_values`.
 
     Raises:
         IdentificationError: the factor has no rows.
@@ -382,9 +397,13 @@ def fit_posterior(
     require_rows(model, factor)
     if design_effect is None:
         design_effect = design_effect_of(factor, prior)
-    values, weights = posterior_values(factor, prior, design_effect)
+    values, weights = posterior_values(
+        factor, prior, design_effect, ordinary_weights=ordinary_weights
+    )
     if prior.believed is not None:
-        base = fit_posterior(model, factor, prior.believed, design_effect)
+        base = fit_posterior(
+            model, factor, prior.believed, design_effect, ordinary_weights=ordinary_weights
+        )
         shift = values - base.estimate.values
         bias = _beyond_chance(
             shift,
