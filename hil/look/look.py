@@ -32,6 +32,7 @@ from hil.look.corrected_map import with_entries
 from hil.look.other_arm import Contradictions
 from hil.look.readings import (
     Basis,
+    ErrorExplained,
     Evidence,
     Fact,
     NextStep,
@@ -40,7 +41,13 @@ from hil.look.readings import (
 )
 from hil.look.result import Aspect, Look, ParameterGroup, Row
 from hil.look.servo_load import may_be_load, servo_load, torques_without_sign, without_torque
-from hil.look.torque_sample import SETTINGS, TorqueSample, explained, prepared
+from hil.look.torque_sample import (
+    SETTINGS,
+    SUSPECT_ERROR,
+    TorqueSample,
+    explained,
+    prepared,
+)
 from hil.look.undescribed import undescribed_robot
 from hil.pipeline.sources import Source, cell_of, source_of
 from identification.errors import IdentificationError
@@ -49,7 +56,7 @@ from identification.hypotheses.diagnosis import UNEXPLAINED, few_rows, torque_of
 from identification.hypotheses.inertia_scale import retimed
 from identification.hypotheses.joint_changes import Axes
 from identification.hypotheses.readings import Readings
-from identification.hypotheses.scores import EXPLAINED_ERROR, score_of
+from identification.hypotheses.scores import EXPLAINED_ERROR, LARGE_REDUCTION, score_of
 from identification.hypotheses.search import find_readings
 from identification.hypotheses.torque_low_pass import TorqueLowPass, torque_low_pass
 from identification.model.robot import RobotModel
@@ -177,6 +184,10 @@ def _with_torque(
 ) -> Look:
     recording = recorded.recording
     finding = _finding(source, imported, cell, recording)
+    if finding.torque.error > SUSPECT_ERROR and (found := explained(imported.archive)):
+        least = (1.0 - LARGE_REDUCTION) * found.score.overall
+        if finding.readings.score.overall > least:
+            finding = finding.or_explained(ErrorExplained(found.score.overall, found.how))
     delay, low_pass = _channel(finding.axes.read(recording), finding.readings.model)
     channel = list(physics.channel_rows(delay, low_pass))
     if recorded.retimed:

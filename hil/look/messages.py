@@ -42,6 +42,7 @@ from hil.look.readings import (
     DoubtfulTime,
     Either,
     ErrorAsRead,
+    ErrorExplained,
     ErrorRatio,
     Evidence,
     ExplainedTorque,
@@ -624,6 +625,11 @@ def _(unseen: UnseenFriction) -> str:
 
 
 @_worded.register
+def _(explained: ErrorExplained) -> str:
+    return f"to {number(100.0 * explained.error, 2)} % {_how(explained.how)}"
+
+
+@_worded.register
 def _(error: StillUnexplained) -> str:
     return f"but {percentage(error.error)} of the torque stays unexplained"
 
@@ -792,11 +798,15 @@ def _about(motors: MotorTorque | MotorCurrents) -> str:
 
 @import_messages.worded.register
 def _(explained: ExplainedTorque) -> str:
+    return f"torque: follows the arm of the URDF, {_how(explained)}"
+
+
+def _how(explained: ExplainedTorque) -> str:
     parts = (
         f"low-passed at {number(explained.low_pass, 2)} Hz" if explained.low_pass else "",
         "with rotors heavier than the links" if explained.heavy_rotors else "",
     )
-    return f"torque: follows the arm of the URDF, {', '.join(filter(None, parts))}"
+    return ", ".join(filter(None, parts))
 
 
 @import_messages.worded.register

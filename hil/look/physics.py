@@ -28,6 +28,7 @@ from hil.look.readings import (
     DelayProblem,
     Either,
     ErrorAsRead,
+    ErrorExplained,
     ErrorRatio,
     Evidence,
     Fact,
@@ -248,6 +249,8 @@ class TorqueFindings:
         map_text: the column map of the import; None for a bag.
         files: the recording, parsed.
         is_side_open: whether nothing states that the torque is that of the joints.
+        explained: how a low-pass or heavy rotors explain the torque as read at least as well as the
+            changes that were found, none of which is then certain; None if they do not.
     """
 
     cell: Cell
@@ -259,6 +262,7 @@ class TorqueFindings:
     source: Path
     files: LogFiles
     is_side_open: bool = True
+    explained: ErrorExplained | None = None
 
     @cached_property
     def size(self) -> Size:
@@ -324,6 +328,8 @@ class TorqueFindings:
         evidence: tuple[Evidence, ...] = (Basis.FREE_PARAMETERS,)
         if self.no_better is not None:
             evidence = (*evidence, self.no_better)
+        if self.explained is not None:
+            evidence = (*evidence, self.explained)
         rows.append(Row("as read", as_read, Certainty.CERTAIN, evidence))
         return rows
 
@@ -347,9 +353,16 @@ class TorqueFindings:
 
     @property
     def fits_badly(self) -> bool:
-        """Whether no tested change explains the torque as well as a free fit does."""
+        """Whether nothing that was tested explains the torque as well as a free fit does."""
+        if self.explained is not None:
+            return False
         doubted = any(not step.sure for step in self.readings.steps)
         return doubted and not self.readings.adequacy.is_enough
+
+    def or_explained(self, explained: ErrorExplained) -> TorqueFindings:
+        """Return the findings where this explains the torque as well: no change is certain."""
+        steps = tuple(replace(step, is_adequate=False) for step in self.readings.steps)
+        return replace(self, readings=replace(self.readings, steps=steps), explained=explained)
 
     def steps(self, *meanings: Meaning) -> list[Step]:
         """Return the changes of some meanings."""

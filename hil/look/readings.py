@@ -406,6 +406,14 @@ class FreeFit:
 
 
 @dataclass(frozen=True)
+class ErrorExplained:
+    """Relative error of the torque as read, with what a low-pass or heavy rotors explain of it."""
+
+    error: float
+    how: ExplainedTorque
+
+
+@dataclass(frozen=True)
 class StillUnexplained:
     """Share of the torque that the arm does not explain, for which no row is certain."""
 
@@ -561,6 +569,7 @@ Evidence = (
     | MirrorImage
     | UnseenFriction
     | StillUnexplained
+    | ErrorExplained
     | NoBetter
     | OtherScales
     | FreeFit

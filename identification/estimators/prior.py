@@ -69,6 +69,7 @@ _INDEPENDENT_ROW_SHARE: Final = 0.01  # share of the rows for that deviation
 _MIN_EIGENVALUE_RATIO: Final = 1e-12  # over the largest one, of its normal equations
 _NOISE_ROUNDS: Final = 20  # of the noise of the joints
 _NOISE_TOLERANCE: Final = 1e-3  # relative change of the noise
+_SMALL_NOISE: Final = 3e-3  # share of the torque, smaller than most drives allow
 # Of the scatter of its torque, that a term of friction alone makes. Coulomb and viscous friction
 # together are the torque of a light wrist, and a fifth of that of a heavy arm.
 _FRICTION_SHARE: Final = 0.5
@@ -134,16 +135,31 @@ class TorqueSums(NamedTuple):
             start: weights from which the iteration starts (n,).
             rounds: at most, of the noise.
         """
+        if start is not None:
+            return self._settled(mean, precision, smallest_noise, start, rounds)
+        # Where the prior contradicts the rows, two noises may be consistent: as large as the
+        # contradiction, which leaves the prior as it is, and as small as the rows allow.
+        whole = self.gram[:, -1, -1] / np.maximum(self.samples, 1)
+        weights = np.divide(1.0, whole, where=whole > 0.0, out=np.zeros(len(whole)))
+        found = [
+            self._settled(mean, precision, smallest_noise, weights / share**2, rounds)
+            for share in (1.0, _SMALL_NOISE)
+        ]
+        return min(found, key=lambda each: self._surprise(each[0], each[1], mean, precision))
+
+    def _settled(
+        self, mean: Array, precision: Array, smallest_noise: float, start: Array, rounds: int
+    ) -> tuple[Array, Array]:
+        """Return parameters and weights that agree, by iteration of the noise from `start`."""
         gram, samples = self
         flat = gram.reshape(len(gram), -1)
         rows = np.maximum(samples, 1)
-        variance = gram[:, -1, -1] / rows
-        floor = smallest_noise**2 * variance + np.finfo(np.float64).tiny
+        whole = gram[:, -1, -1] / rows
+        floor = smallest_noise**2 * whole + np.finfo(np.float64).tiny
         least = np.maximum(precision.diagonal(), np.finfo(np.float64).tiny)
         values = mean
         weights = np.zeros(len(gram))
-        if start is not None:
-            variance = np.where(start > 0.0, 1.0 / np.where(start > 0.0, start, 1.0), variance)
+        variance = np.where(start > 0.0, 1.0 / np.where(start > 0.0, start, 1.0), whole)
         # A torque that is zero throughout was not measured.
         has_rows = (samples > 0) & (gram[:, -1, -1] > 0.0)
         for _ in range(rounds):
@@ -165,6 +181,14 @@ class TorqueSums(NamedTuple):
             if (np.abs(variance - previous) <= _NOISE_TOLERANCE * previous).all():
                 break
         return values, weights
+
+    def _surprise(self, values: Array, weights: Array, mean: Array, precision: Array) -> float:
+        """Return -2 times the logarithm of rows and prior at these parameters and weights."""
+        seen = weights > 0.0
+        change = values - mean
+        of_rows = weights[seen] @ self.squared_errors(values)[seen]
+        of_noise = np.asarray(self.samples)[seen] @ np.log(weights[seen])
+        return float(of_rows - of_noise + change @ precision @ change)
 
 
 @dataclass(frozen=True, eq=False)
@@ -309,9 +333,9 @@ def posterior_values(
 ) -> tuple[Array, Array]:
     """Return the posterior's parameters (p,) and the weights of the joints (n,).
 
-    The weights are the inverse variances of the joints' own residuals, by iteration. If no bodies
-    fit all joints, as with torques of wrong scales, the iteration may end with one joint fitted at
-    the expense of the others.
+    The weights are the inverse variances of the joints' own residuals, by iteration; of two that
+    are consistent, the more probable. If no bodies fit all joints, as with torques of wrong scales,
+    the iteration may end with one joint fitted at the expense of the others.
 
     Args:
         factor: of the data.

@@ -28,6 +28,7 @@ from identification.hypotheses.scores import (
     Comparison,
     Score,
     compare,
+    fits_alike,
     score_of,
 )
 from identification.model.nominal_masses import mass_fault
@@ -83,6 +84,8 @@ def find_inertia_scale(
 ) -> InertiaScale | None:
     """Return the factor that explains a torque much better; None if the described one does.
 
+    None also where heavy rotors explain it as well.
+
     Args:
         model: of the arm.
         samples: of a recording, as read.
@@ -92,28 +95,29 @@ def find_inertia_scale(
     """
     if not np.any(model.gravity):
         return None
-    errors: dict[float, tuple[float, Comparison]] = {
-        1.0: (score.overall, compare(score, score, model))
-    }
+    scores: dict[float, tuple[Score, Comparison]] = {1.0: (score, compare(score, score, model))}
 
     def ratio(factor: float) -> float:
-        if factor not in errors:
+        if factor not in scores:
             lighter = _lighter(model, factor)
             other = score_of(lighter, samples)
-            errors[factor] = other.overall, compare(other, score, lighter)
-        return errors[factor][1].ratio
+            scores[factor] = other, compare(other, score, lighter)
+        return scores[factor][1].ratio
 
     best = min(_TRIED, key=ratio)
     if ratio(best) >= 1.0:
         return None
     best = _narrowed(ratio, best)
-    error, against = errors[best]
+    scaled, against = scores[best]
+    error = scaled.overall
     agrees = 1.0 < best < torque_scale
     least = 1.0 if best > 1.0 else _LESS
     if error > EXPLAINED_ERROR or against.sigmas > -(SEPARATE_SIGMAS if agrees else SURE_SIGMAS):
         return None
     if against.ratio > least:
         return None
+    if fits_alike(score_of(model, samples, wide_rotors=True), scaled, model):
+        return None  # heavy rotors are inertia without weight as well
     return InertiaScale(best, error, score.overall, against, _weight(model, samples, best))
 
 

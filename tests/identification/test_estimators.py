@@ -707,6 +707,18 @@ class TestPosterior:
         assert np.abs((posterior.estimate.values - free.values) / free.std).max() < 0.05
         np.testing.assert_allclose(posterior.estimate.std, free.std, rtol=0.05)
 
+    def test_a_prior_that_the_rows_contradict_makes_no_noise(self):
+        """A noise as large as the contradiction is consistent with this prior, and less likely."""
+        samples = simulated(MODEL, truth(), one_sine_each(), 0.01 * NOISE)
+        factor = Factor.by_time(MODEL, samples)
+        prior = prior_of(KNOWN)
+        at = MODEL.parameter_names.index("f0_1")
+        mean = prior.mean.copy()
+        mean[at] += 30.0 * prior.std[at]
+        values, weights = posterior_values(factor, replace(prior, mean=mean), 10.0)
+        np.testing.assert_allclose(1.0 / np.sqrt(weights), 0.01 * NOISE, rtol=0.1)
+        np.testing.assert_allclose(values[at], truth()[at], rtol=1e-3)
+
     def test_a_wrong_prior_is_detected(self):
         wrong = KNOWN | {"f0_1": (20.0, 1.0)}
         result = fit_posterior(MODEL, Factor.by_time(MODEL, noisy()), prior_of(wrong))
