@@ -53,6 +53,7 @@ from hil.look.readings import (
     LastBody,
     LateVelocity,
     LowPassedTorque,
+    LowPassLag,
     MapEntries,
     MapKey,
     MirrorImage,
@@ -143,6 +144,7 @@ _FACTS: Final[Mapping[Fact, str]] = {
     Fact.TORQUE_UNEXAMINED: "side, gravity, signs, joint order not examined",
     Fact.DELAY_UNDETERMINED: "not determined",
     Fact.NO_DELAY: "none",
+    Fact.DELAY_OF_LOW_PASS: "none but that of the low-pass",
     Fact.NO_DELAY_SEEN: "none seen",
     Fact.NO_LOW_PASS: "none in the torque",
     Fact.NO_BODIES: "almost no rigid-body torque: a model was subtracted",
@@ -677,6 +679,11 @@ def _(interval: DelayInterval) -> str:
     if interval.delay is not None:
         return f"{1e3 * interval.delay:.1f} {text}"
     return f"{text}; predicts no better" if interval.unconfirmed else text
+
+
+@_worded.register
+def _(lag: LowPassLag) -> str:
+    return f"it lags by {1e3 * lag.lag:.0f} ms, the torque by {1e3 * lag.delay:.0f} ms"
 
 
 @_worded.register

@@ -37,6 +37,7 @@ from hil.look.readings import (
     GravityOption,
     LastBody,
     LowPassedTorque,
+    LowPassLag,
     MapEntries,
     MirrorImage,
     MotorCurrents,
@@ -114,6 +115,7 @@ _MAX_CHOICES: Final = 3
 # error ratio of readings of which the recording does not choose one
 _ALIKE_ERROR_RATIO: Final = 1.02
 _OTHER_UNIT_FACTOR: Final = 3.0  # factor beyond which the masses of a URDF do not explain a torque
+_SAME_LAG: Final = 0.2  # of the lag of a low-pass, by which a delay that is this lag differs
 _THOUSAND: Final = 1000.0
 _MAX_GEAR_RATIO: Final = 1000.0  # motor turns per joint turn; built are 1 to some 300
 _MAX_GEAR_RATIO_SPREAD: Final = 10.0  # factor between the ratios of a joint and of the arm
@@ -705,7 +707,7 @@ def without_torque(recording: Recording, load: NoJointTorque | None = None) -> R
 
 def channel_rows(delay: DelayEstimate | None, low_pass: TorqueLowPass | None) -> Iterator[Row]:
     """Yield delay and low-pass of the torque."""
-    yield _delay_row(delay)
+    yield _of_low_pass(delay, low_pass) or _delay_row(delay)
     bandwidth = None if low_pass is None else low_pass.settings.torque_bandwidth
     if low_pass is None or bandwidth is None:
         none = (Basis.NO_FILTER_BETTER,)
@@ -717,6 +719,23 @@ def channel_rows(delay: DelayEstimate | None, low_pass: TorqueLowPass | None) ->
     certainty = Certainty.LIKELY if confirmed else Certainty.UNDETERMINED
     evidence = (FilterShape(shape.order, shape.causal, confirmed=confirmed),)
     yield Row("low-pass", reading, certainty, evidence, Decide.ASK_FOR_FILTER)
+
+
+def _of_low_pass(delay: DelayEstimate | None, low_pass: TorqueLowPass | None) -> Row | None:
+    """Return the row of a delay that is the lag of a low-pass; None if there is no such low-pass.
+
+    The low-pass predicts other parts better than its lag alone does.
+    """
+    if delay is None or not delay.significant or low_pass is None or not low_pass.confirmed:
+        return None
+    bandwidth, shape = low_pass.settings.torque_bandwidth, low_pass.settings.torque_shape
+    if bandwidth is None or not shape.causal:
+        return None
+    lag = shape.lag(bandwidth)
+    if abs(delay.delay - lag) > _SAME_LAG * lag:
+        return None
+    evidence = (LowPassLag(lag, delay.delay),)
+    return Row("delay", Fact.DELAY_OF_LOW_PASS, Certainty.LIKELY, evidence)
 
 
 def by_estimated_times(row: Row) -> Row:

@@ -67,6 +67,7 @@ class Fact(Enum):
     TORQUE_UNEXAMINED = auto()
     DELAY_UNDETERMINED = auto()
     NO_DELAY = auto()
+    DELAY_OF_LOW_PASS = auto()
     NO_DELAY_SEEN = auto()
     NO_LOW_PASS = auto()
     OTHER_ARM = auto()
@@ -450,6 +451,14 @@ class DelayInterval:
 
 
 @dataclass(frozen=True)
+class LowPassLag:
+    """By how much a low-pass of the torque delays a slow motion, and how late that is [s]."""
+
+    lag: float
+    delay: float
+
+
+@dataclass(frozen=True)
 class DelayProblem:
     """Why no delay is seen: the estimate that does not determine it."""
 
@@ -577,6 +586,7 @@ Evidence = (
     | SizeRatio
     | LastBody
     | DelayInterval
+    | LowPassLag
     | DelayProblem
     | FilterShape
     | Contradiction

@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from scipy.signal import butter, sosfilt
 
 from benchmarks.board import cut, import_all
 from benchmarks.conditions import filtered, written
@@ -22,7 +23,7 @@ from hil.importers.recording_import import ImportOptions, read_recording
 from hil.importers.stamps import concluded_unit
 from hil.look import look_at
 from hil.look.before_identification import concluded
-from hil.look.readings import ReadAsGiven, RowsReading, ZeroTorques
+from hil.look.readings import ErrorExplained, ReadAsGiven, RowsReading, ZeroTorques
 from hil.look.result import Look
 from tests.hil.simulated_logs import (
     Simulated,
@@ -207,6 +208,21 @@ def test_a_slow_log_is_refused_by_its_rate(tmp_path: Path, simulated: Simulated)
     log = write_log(path, ["t", "q{}", "tau{}"], *signals)
     with pytest.raises(SourceError, match="has 5 samples per second"):
         look(log)
+
+
+@pytest.mark.long
+def test_a_low_pass_explains_a_torque_better_than_another_arm(
+    tmp_path: Path, simulated: Simulated
+) -> None:
+    """At 2 Hz: a third of the torque is gone, and no sign, zero or scale is certain."""
+    sections = butter(2, 2.0, fs=125.0, output="sos")
+    torque = sosfilt(sections, simulated.torque, axis=0)
+    found = look(log_of(tmp_path, simulated, torque=torque))
+    (row,) = [row for row in found.rows if row.aspect == "as read"]
+    (explained,) = [each for each in row.evidence if isinstance(each, ErrorExplained)]
+    assert explained.error < 0.05
+    assert explained.how.low_pass == pytest.approx(2.0, rel=0.1)
+    assert not [row for row in found.rows if row.is_changed and row.certainty is Certainty.CERTAIN]
 
 
 @pytest.mark.long

@@ -56,6 +56,7 @@ from identification.hypotheses.torque_low_pass import TorqueLowPass
 from identification.model.robot import RobotModel
 from identification.signals.recording import Recording
 from identification.signals.samples import prepare
+from identification.signals.smoothing import LowPassShape
 from tests.hil.importers.bags import STATE, bag, state, states
 from tests.hil.importers.moving_log import JOINTS, URDF
 from tests.hil.simulated_logs import write_log, write_moving_log
@@ -215,6 +216,20 @@ def test_a_low_pass_that_something_resembles_is_open() -> None:
     assert row_text(row).reading == "perhaps: torque low-passed at 24 Hz"
     _, likely = channel_rows(None, TorqueLowPass(filtered, confirmed=True))
     assert likely.certainty is Certainty.LIKELY
+
+
+@pytest.mark.parametrize(("delay", "is_lag"), [(0.046, True), (0.07, False)])
+def test_the_lag_of_a_low_pass_is_no_delay(delay: float, is_lag: bool) -> None:
+    found = DelayEstimate(
+        delay=delay, std=1e-4, assumed=0.0, cycle=0.002, interval_factor=2.0,
+        reason=None, significant=True,
+    )  # fmt: skip
+    shape = LowPassShape(order=2, causal=True)  # 5 Hz lag by 45 ms
+    filtered = replace(SETTINGS, torque_bandwidth=5.0, torque_shape=shape)
+    row, _ = channel_rows(found, TorqueLowPass(filtered, confirmed=True))
+    assert (row.reading is Fact.DELAY_OF_LOW_PASS) == is_lag
+    doubted, _ = channel_rows(found, TorqueLowPass(filtered, confirmed=False))
+    assert doubted.reading == TorqueDelay(delay, confirmed=True)
 
 
 def test_degrees_are_concluded(tmp_path: Path, urdf: Path, table: Mapping[str, Floats]) -> None:
