@@ -233,10 +233,12 @@ def _unreadable(path: Path, scan: Scan) -> ArchiveError:
             f"is of profile version {version}; this software reads version {FORMAT_VERSION}",
             remedy="install a newer hil",
         )
+    remedy = "import it (`hil import log FILE --urdf ARM.urdf`), or give a file that hil recorded"
     if not scan.damages:
         problem = f"is an MCAP file, but not an archive: it has no {METADATA!r} metadata record"
     elif 0 in scan.damages:
         problem = "is not an MCAP file"
     else:
         problem = f"is truncated before its first data: {scan.faults[0]}"
-    return NotAnArchiveError(path, problem, remedy="give a file that hil recorded or imported")
+        remedy = "give another copy of it, or leave it out"
+    return NotAnArchiveError(path, problem, remedy=remedy)
