@@ -31,8 +31,6 @@ CHOICES: Final[Mapping[str, tuple[str, ...]]] = {
     "reversal": (names.REVERSAL,),
     "friction": (names.FRICTION_AT_SPEED,),
     "load": (names.LOAD,),
-    "weights": (names.JOINT_WEIGHTS,),
-    "bodies": (names.BODY_PRIOR,),
     "strength": (names.STRENGTH,),
     "consistency": (names.CONSISTENT,),
     "springs": (names.SPRINGS,),

@@ -139,11 +139,13 @@ class TorqueSums(NamedTuple):
             return self._settled(mean, precision, smallest_noise, start, rounds)
         # Where the prior contradicts the rows, two noises may be consistent: as large as the
         # contradiction, which leaves the prior as it is, and as small as the rows allow.
+        # Rows that parameters may fit exactly show no noise: only the first is asked of these.
         whole = self.gram[:, -1, -1] / np.maximum(self.samples, 1)
         weights = np.divide(1.0, whole, where=whole > 0.0, out=np.zeros(len(whole)))
+        is_exact = bool(np.any((self.samples > 0) & (self.samples < 2 * len(mean))))
         found = [
             self._settled(mean, precision, smallest_noise, weights / share**2, rounds)
-            for share in (1.0, _SMALL_NOISE)
+            for share in ((1.0,) if is_exact else (1.0, _SMALL_NOISE))
         ]
         return min(found, key=lambda each: self._surprise(each[0], each[1], mean, precision))
 
@@ -268,16 +270,15 @@ class BodyPrior:
     def with_weight(self, weight: float) -> BodyPrior:
         """Return the prior with so many times the information on bodies.
 
-        Of friction, rotors and offsets, whose mean of zero says nothing, it stays the same. With a
-        larger weight the estimate is closer to the described bodies, and its intervals believe them
-        no more; with a smaller one the bodies are believed less.
+        Of friction, rotors and offsets, whose mean of zero says nothing, it stays the same. The
+        estimate is closer to the described bodies; its intervals believe them no more.
         """
         if weight == 1.0:
             return self
         std = self.std.copy()
         std[self.bodies] /= np.sqrt(weight)
         origin = replace(self.origin, weight=weight * self.origin.weight)
-        return replace(self, std=std, origin=origin, believed=self.belief if weight > 1.0 else None)
+        return replace(self, std=std, origin=origin, believed=self.belief)
 
     def most_probable(self, values: Array) -> Array:
         """Return the most probable standard and other parameters (s + k,) of parameters (p,)."""
@@ -328,28 +329,21 @@ def posterior_values(
     prior: GaussianPrior,
     design_effect: float = 1.0,
     start: Array | None = None,
-    *,
-    ordinary_weights: bool = False,
 ) -> tuple[Array, Array]:
     """Return the posterior's parameters (p,) and the weights of the joints (n,).
 
     The weights are the inverse variances of the joints' own residuals, by iteration; of two that
-    are consistent, the more probable. If no bodies fit all joints, as with torques of wrong scales,
-    the iteration may end with one joint fitted at the expense of the others.
+    are consistent, the more probable.
 
     Args:
         factor: of the data.
         prior: of the parameters.
         design_effect: rows of data that count as one.
         start: weights from which the iteration starts (n,).
-        ordinary_weights: whether the residuals are those of an ordinary fit, without iteration.
     """
     sums = TorqueSums.of(factor)
     precision = design_effect * prior.information
-    rounds = _NOISE_ROUNDS
-    if ordinary_weights:
-        start, rounds = joint_weights(factor), 1
-    return sums.posterior(prior.mean, precision, factor.smallest_noise, start, rounds=rounds)
+    return sums.posterior(prior.mean, precision, factor.smallest_noise, start)
 
 
 def with_prior(
@@ -394,12 +388,7 @@ def with_prior(
 
 
 def fit_posterior(
-    model: RobotModel,
-    factor: Factor,
-    prior: GaussianPrior,
-    design_effect: float | None = None,
-    *,
-    ordinary_weights: bool = False,
+    model: RobotModel, factor: Factor, prior: GaussianPrior, design_effect: float | None = None
 ) -> PosteriorEstimate:
     """Estimate from a factor by time and a prior, with coloured residuals.
 
@@ -413,7 +402,6 @@ def fit_posterior(
         factor: of the data, by blocks of time.
         prior: of the parameters.
         design_effect: rows that count as one, by default as :func:`design_effect_of` says.
-        ordinary_weights: of the joints, as for :func:`posterior_values`.
 
     Raises:
         IdentificationError: the factor has no rows.
@@ -421,13 +409,9 @@ def fit_posterior(
     require_rows(model, factor)
     if design_effect is None:
         design_effect = design_effect_of(factor, prior)
-    values, weights = posterior_values(
-        factor, prior, design_effect, ordinary_weights=ordinary_weights
-    )
+    values, weights = posterior_values(factor, prior, design_effect)
     if prior.believed is not None:
-        base = fit_posterior(
-            model, factor, prior.believed, design_effect, ordinary_weights=ordinary_weights
-        )
+        base = fit_posterior(model, factor, prior.believed, design_effect)
         shift = values - base.estimate.values
         bias = _beyond_chance(
             shift,

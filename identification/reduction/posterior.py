@@ -28,8 +28,6 @@ class Posterior:
     prior: BodyPrior
     design_effect: float  #: rows that count as one
     consistent: bool  #: whether parameters that no bodies have are excluded
-    #: whether each joint counts by its noise in an ordinary fit
-    ordinary_weights: bool = False
 
     @classmethod
     def of(
@@ -46,13 +44,7 @@ class Posterior:
         """
         prior = body_prior(model, factor, share, known, wide_rotors=strength.wide_rotors)
         effect = design_effect_of(factor, prior.gaussian)
-        return cls(
-            model,
-            prior.with_weight(strength.weight),
-            effect,
-            strength.consistent,
-            strength.ordinary_weights,
-        )
+        return cls(model, prior.with_weight(strength.weight), effect, strength.consistent)
 
     @property
     def precision(self) -> Array:
@@ -61,22 +53,16 @@ class Posterior:
 
     def believed(self, factor: Factor) -> Array:
         """Return the parameters (p,) by what is believed, without a stronger prior."""
-        return self._fitted(factor, self.prior.belief)[0]
+        return posterior_values(factor, self.prior.belief.gaussian, self.design_effect)[0]
 
     def free(self, factor: Factor, share: float = 1.0) -> PosteriorEstimate:
         """Fit a factor that is this share of the rows, whatever bodies the parameters need."""
         effect = share * self.design_effect
-        return fit_posterior(
-            self.model,
-            factor,
-            self.prior.gaussian,
-            effect,
-            ordinary_weights=self.ordinary_weights,
-        )
+        return fit_posterior(self.model, factor, self.prior.gaussian, effect)
 
     def weights(self, factor: Factor, share: float = 1.0) -> Array:
         """Return the weights of the joints (n,): inverse variances of their residuals."""
-        return self._fitted(factor, self.prior, share)[1]
+        return posterior_values(factor, self.prior.gaussian, share * self.design_effect)[1]
 
     def fit(self, factor: Factor, share: float = 1.0) -> PosteriorEstimate:
         """Fit a factor that is this share of the rows, with the prior counting as for all."""
@@ -89,18 +75,11 @@ class Posterior:
 
     def values(self, factor: Factor, share: float = 1.0) -> Array:
         """Return the parameters (p,) from a factor that is this share of the rows."""
-        values, weights = self._fitted(factor, self.prior, share)
+        effect = share * self.design_effect
+        values, weights = posterior_values(factor, self.prior.gaussian, effect)
         if not self.consistent:
             return values
-        effect = share * self.design_effect
         return consistent_values(self.model, factor, weights, values, self.prior, effect)
-
-    def _fitted(self, factor: Factor, prior: BodyPrior, share: float = 1.0) -> tuple[Array, Array]:
-        """Return parameters (p,) and weights of the joints (n,), whatever bodies they need."""
-        effect = share * self.design_effect
-        return posterior_values(
-            factor, prior.gaussian, effect, ordinary_weights=self.ordinary_weights
-        )
 
     def solved(self, factor: Factor) -> tuple[Posterior, PosteriorEstimate, SolverError | None]:
         """Fit a factor; if that fails, without restriction to possible bodies, with the error."""

@@ -35,7 +35,6 @@ def strength_words(strength: Strength) -> tuple[str, ...]:
         f"body prior weighted {strength.weight:g} times",
         "physically consistent" if strength.consistent else "physical consistency not required",
         "wide rotor prior" if strength.wide_rotors else "rotor prior as for links",
-        f"joints weighted by {'an ordinary fit' if strength.ordinary_weights else 'iteration'}",
     )
 
 

@@ -28,7 +28,7 @@ from identification.selection.scores import (
     SettingDecision,
     SettingsTrial,
 )
-from identification.selection.settings import Choice, Settings, Strength
+from identification.selection.settings import Choice, Settings
 from identification.signals.masks import ExcludedRows
 from identification.signals.samples import Preprocessing, VelocitySource
 
@@ -60,8 +60,6 @@ LOW_PASS: Final = "low-pass of the torque"
 REVERSAL: Final = "reversal of dry friction"
 DELAY: Final = "delay of the torque"
 LOAD: Final = "friction that grows with load"
-JOINT_WEIGHTS: Final = "weights of the joints"
-BODY_PRIOR: Final = "prior of the bodies"
 STRENGTH: Final = "strength of the prior"
 CONSISTENT: Final = "physical consistency"
 SPRINGS: Final = "torsion springs"
@@ -84,14 +82,11 @@ NEARBY_FACTORS: Final = (1.0, 0.9, 0.95, 1.05, 1.1)  # factors of the bandwidth 
 PRIOR_WEIGHTS: Final = (1.0, 4.0, 16.0, 64.0, 1e4)
 """Weights of the described bodies: deviations of 30, 15, 7.5, 4 and 0.3 % of their masses.
 
-None below one, except `REFUSED_WEIGHT`: folds of one motion would favour a weaker prior, which
-another motion pays for. The large ones are for recordings that determine little
-(``benchmarks.poor_recordings``): the board hardly depends on them (up to 4 instead of 1e4 changes
-its mean error by 0.1 %), but would lose with a first weight of 4 (``benchmarks.leave_one_out``).
+None below one: folds of one motion would favour a weaker prior, which another motion pays for. The
+large ones are for recordings that determine little (``benchmarks.poor_recordings``): those of the
+board hardly depend on them (up to 4 instead of 1e4 changes their mean error by 0.1 %), but would
+lose with a first weight of 4 (``benchmarks.leave_one_out``).
 """
-REFUSED_WEIGHT: Final = 1e-4
-"""Weight of described bodies that the data refuse: a deviation of 30 times their masses, which
-still decides what the motion does not determine."""
 # Terms in addition to Coulomb and viscous friction; they correlate, so at most one. The stated law
 # comes first.
 FRICTION_TERMS: Final[tuple[Mapping[str, Any], ...]] = (
@@ -103,7 +98,6 @@ FRICTION_TERMS: Final[tuple[Mapping[str, Any], ...]] = (
 MIN_REVERSAL_IMPROVEMENT: Final = 0.05
 MIN_ROTORS_IMPROVEMENT: Final = 0.05
 """Rotors far heavier than the links change the error to a fifth or to less than a tenth more."""
-MIN_REFUSAL_IMPROVEMENT: Final = 0.05
 MIN_TERM_IMPROVEMENT: Final = 0.02
 MIN_SPRING_IMPROVEMENT: Final = 0.3  # of the error of its own joint
 _MAX_SWEEPS: Final = 2
@@ -211,21 +205,16 @@ def _first_candidates(start: Settings, questions: Collection[Question]) -> Setti
 def _choose_prior(
     trial: SettingsTrial, now: Settings, requested: Collection[str]
 ) -> tuple[Settings, Settings, list[Choice]]:
-    """Choose whether to believe bodies, how strongly, and whether they must be possible.
+    """Choose the strength of the prior, then whether bodies must be possible.
 
     Returns the settings after each of the two, and the decisions.
     """
     choices: list[Choice] = []
-    if "strength" in requested:
-        for decide in (_ordinary_weights, _refused_bodies):
-            decision = decide(trial, now)
-            now = decision.settings
-            choices = [*choices, decision.choice]
-    if "strength" in requested and trial.knows_bodies(now) and now.strength.weight >= 1.0:
+    if "strength" in requested and trial.knows_bodies(now):
         weights = [replace(now.strength, weight=weight) for weight in PRIOR_WEIGHTS]
         decision = trial.decide_last(STRENGTH, [replace(now, strength=each) for each in weights])
         now = decision.settings
-        choices = [*choices, decision.choice]
+        choices = [decision.choice]
     compared = now
     if "consistency" in requested:
         possible = replace(now, strength=replace(now.strength, consistent=True))
@@ -241,33 +230,6 @@ def _choose_prior(
         else:
             now = possible
     return compared, now, choices
-
-
-def _ordinary_weights(trial: SettingsTrial, now: Settings) -> SettingDecision:
-    """Choose whether joints are weighted by an ordinary fit, or by the residuals of their own.
-
-    Where the torque of each joint has a scale of its own, no bodies make all of them; weights by
-    the residuals then favour the joint whose torque they can make, at the expense of the others.
-    """
-    ordinary = replace(now.strength, ordinary_weights=True)
-    return _unless_refused(trial, JOINT_WEIGHTS, now, ordinary)
-
-
-def _refused_bodies(trial: SettingsTrial, now: Settings) -> SettingDecision:
-    """Choose whether the data refuse the prior of the bodies."""
-    refused = replace(now.strength, ordinary_weights=True, weight=REFUSED_WEIGHT)
-    return _unless_refused(trial, BODY_PRIOR, now, refused)
-
-
-def _unless_refused(
-    trial: SettingsTrial, name: str, now: Settings, other: Strength
-) -> SettingDecision:
-    return trial.decide(
-        name,
-        [now, replace(now, strength=other)],
-        MIN_REFUSAL_IMPROVEMENT,
-        certainty=MIN_CERTAINTY,
-    )
 
 
 def _friction_terms(trial: SettingsTrial, now: Settings) -> SettingDecision:

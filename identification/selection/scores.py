@@ -322,13 +322,7 @@ class SettingsTrial:
         _, of_all = posterior_values(self._folds(settings).fitted, prior.gaussian, effect)
 
         def estimate(factor: Factor) -> Array:
-            values, weights = posterior_values(
-                factor,
-                prior.gaussian,
-                effect,
-                of_all,
-                ordinary_weights=settings.strength.ordinary_weights,
-            )
+            values, weights = posterior_values(factor, prior.gaussian, effect, of_all)
             if settings.strength.consistent:
                 values = consistent_values(model, factor, weights, values, prior, effect)
             return values

@@ -20,8 +20,6 @@ class Strength:
     consistent: bool = False  #: whether parameters that no bodies have are excluded
     #: whether rotors that act like a link's inertia may also make half of their joint's torque
     wide_rotors: bool = False
-    #: whether each joint counts by its noise in an ordinary fit, and not in the fit itself
-    ordinary_weights: bool = False
 
 
 @dataclass(frozen=True)

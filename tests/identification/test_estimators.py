@@ -750,27 +750,6 @@ class TestWeightOfBodies:
         np.testing.assert_allclose(ratio[links], 0.1)
         np.testing.assert_allclose(np.delete(ratio, links), 1.0)
 
-    def test_refused_bodies_are_believed_less(self):
-        """A smaller weight is another belief, and the intervals are of that."""
-        weaker = self.PRIOR.with_weight(0.01)
-        links = MODEL.layout.links.ravel()
-        np.testing.assert_allclose(weaker.std[links], 10.0 * self.PRIOR.std[links])
-        np.testing.assert_allclose(weaker.belief.std, weaker.std)
-
-    def test_weights_of_an_ordinary_fit_are_not_iterated(self):
-        factor = Factor.by_time(MODEL, noisy())
-        prior = self.PRIOR.gaussian
-        values, weights = posterior_values(factor, prior, 3.0, ordinary_weights=True)
-        np.testing.assert_allclose(weights, joint_weights(factor))
-        normal = factor.weighted(weights)
-        np.testing.assert_allclose(
-            (normal.A + 3.0 * prior.information) @ values,
-            normal.b + 3.0 * prior.information @ prior.mean,
-            rtol=1e-6,
-        )
-        estimate = fit_posterior(MODEL, factor, prior, 3.0, ordinary_weights=True).estimate
-        np.testing.assert_allclose(estimate.values, values)
-
     def test_intervals_hold_for_bodies_as_uncertain_as_is_believed(self):
         """Arms drawn from the prior, fitted as if their bodies were nearly the described ones."""
         rng = np.random.default_rng(4)

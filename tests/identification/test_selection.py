@@ -25,13 +25,10 @@ from identification.selection.essential import CutRule, choose_essential, elimin
 from identification.selection.folds import Errors, Folds
 from identification.selection.messages import cut_words
 from identification.selection.questions import (
-    BODY_PRIOR,
     CONSISTENT,
     DELAY,
-    JOINT_WEIGHTS,
     LOAD,
     LOW_PASS,
-    MIN_REFUSAL_IMPROVEMENT,
     MIN_TERM_IMPROVEMENT,
     PRIOR_WEIGHTS,
     STRENGTH,
@@ -409,9 +406,8 @@ class TestChosenSettings:
         settings, choices = chosen(a_recording(duration=LONG), {"estimator"})
         assert settings.strength.weight > 1.0
         # That bodies can exist is no question where they fit as well.
-        assert [choice.name for choice in choices] == [JOINT_WEIGHTS, BODY_PRIOR, STRENGTH]
+        assert [choice.name for choice in choices] == [STRENGTH]
         assert settings.strength.consistent
-        assert not settings.strength.ordinary_weights
 
     @pytest.mark.parametrize(("mass", "described"), [("9", False), ("6", True)])
     def test_only_the_described_bodies_are_kept_as_they_are(self, mass, described):
@@ -420,26 +416,6 @@ class TestChosenSettings:
         model = RobotModel.from_urdf(other, friction=FrictionLaw(third=None))
         settings, _ = chosen(a_recording(duration=LONG, noise=1.0), {"estimator"}, model=model)
         assert (settings.strength.weight == PRIOR_WEIGHTS[-1]) == described
-
-    @pytest.mark.parametrize("scale", [(1.0, 0.4), (2.5, 1.0)])
-    def test_torques_of_different_scales_have_ordinary_weights(self, scale):
-        """No bodies make both torques: residuals favour the joint that they can make."""
-        recording = a_recording(duration=LONG)
-        settings, choices = chosen(
-            replace(recording, torque=recording.torque * np.array(scale)), {"estimator"}
-        )
-        decision = next(choice for choice in choices if choice.name == JOINT_WEIGHTS)
-        assert decision.errors[1] < (1.0 - MIN_REFUSAL_IMPROVEMENT) * decision.errors[0]
-        assert settings.strength.ordinary_weights
-        assert settings.strength.weight >= 1.0  # an ordinary fit agrees with the bodies
-
-    @pytest.mark.parametrize(("factor", "refused"), [(1.0, False), (10.0, True)])
-    def test_a_short_recording_refuses_bodies_of_another_arm(self, factor, refused):
-        other = URDF.replace('<mass value="6"/>', f'<mass value="{6.0 * factor}"/>')
-        other = other.replace('<mass value="3"/>', f'<mass value="{3.0 / factor}"/>')
-        model = RobotModel.from_urdf(other, friction=FrictionLaw(third=None))
-        settings, _ = chosen(a_recording(duration=1.5, noise=3.0), {"estimator"}, model=model)
-        assert (settings.strength.weight < 1.0) == refused
 
     def test_a_negative_friction_is_not_made_possible(self):
         """Constraints that predict clearly worse are given up."""
