@@ -180,7 +180,7 @@ class _Ended:
     Attributes:
         outcome, repetitions: of its record.
         reached: halves of the intervals, one for each requirement.
-        promised: likewise, for so many repetitions, with what the validation runs show.
+        promised: likewise, for the repetitions that were run, given the validation runs.
         largest: largest errors, likewise in units of the requirement.
         inside: of each requirement, the share of quantities whose true value is in its interval.
         within: share of them whose error is at most what was required.

@@ -199,7 +199,7 @@ def elastic_torque(model: RobotModel, samples: Samples, values: Array, complianc
 
 @dataclass(frozen=True, eq=False)
 class FittedGears:
-    """Compliances of gears beside the parameters, in units of the expected ones."""
+    """Compliances of gears, fitted with the parameters, in units of the expected ones."""
 
     moved: Array  #: change of the parameters by each (p, n)
     mean: Array  #: (n,)
@@ -283,7 +283,7 @@ def fitted_gears(
     times: float = 1.0,
     excess: Array | None = None,
 ) -> FittedGears:
-    """Fit the compliances of gears beside the parameters; none is negative.
+    """Fit the compliances of gears together with the parameters; none is negative.
 
     Args:
         estimate: of p parameters and n joints, with rigid gears.

@@ -60,7 +60,7 @@ class _Trend(NamedTuple):
 
     @classmethod
     def of(cls, power: Array, recordings: int) -> Self:
-        """Return the times of parts of so many recordings, with their squared friction (P, n)."""
+        """Return the times of the parts, given their squared friction (P, n)."""
         pieces = len(power)
         usual = np.median(power, axis=0)
         moving = power > 0.1 * np.where(usual > 0.0, usual, np.inf)

@@ -139,7 +139,7 @@ class TorqueSums(NamedTuple):
             return self._settled(mean, precision, smallest_noise, start, rounds)
         # Where the prior contradicts the rows, two noises may be consistent: as large as the
         # contradiction, which leaves the prior as it is, and as small as the rows allow.
-        # Rows that parameters may fit exactly show no noise: only the first is asked of these.
+        # Rows that the parameters may fit exactly do not show the noise: one start for these.
         whole = self.gram[:, -1, -1] / np.maximum(self.samples, 1)
         weights = np.divide(1.0, whole, where=whole > 0.0, out=np.zeros(len(whole)))
         is_exact = bool(np.any((self.samples > 0) & (self.samples < 2 * len(mean))))

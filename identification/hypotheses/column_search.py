@@ -192,7 +192,7 @@ def _contains(changes: Sequence[Change], other: Change) -> bool:
 
 
 def _excess(squares: Array, usual: Array, inside: NDArray[np.bool_]) -> float:
-    """Return the errors of a part's blocks over those of the others, 1.0 if not significant.
+    """Return the error of a part's blocks over that of all others, 1.0 if not significant.
 
     Args:
         squares: squared errors (B, n).
