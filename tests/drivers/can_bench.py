@@ -8,6 +8,7 @@ import os
 import pty
 import select
 import threading
+import time
 import tty
 
 import numpy as np
@@ -32,7 +33,7 @@ from hil.control.simulated_cell import simulated_drive
 from sim_fixtures import ControllerSettings, SimulatedController, ns16
 from sim_fixtures.can_link import CanControllerLink
 from tests.drivers.rig import MOVE, limits, smooth_move
-from tests.drivers.transport_contract import TransportContract
+from tests.drivers.transport_contract import PATIENCE, TransportContract
 
 N = 6
 HOME = np.radians([0.0, 0.0, -90.0, 0.0, 90.0, 0.0])
@@ -234,9 +235,8 @@ class Run:
 class SlcanBus:
     """Two emulated serial adapters joined by a bus, served by a thread.
 
-    `ports` are the serial devices, `rates` the bit rate commands of each, `set_up` these and those
-    that open and close, `refused` the commands
-    that were answered with the bell.
+    `ports` are the serial devices, `rates` the bit rate commands of each, `set_up` these and what
+    opens and closes, `refused` the commands that were answered with the bell.
     """
 
     def __init__(self) -> None:
@@ -289,6 +289,17 @@ class SlcanBus:
             self.refused.append(line)
             answer = b"\a"
         self._waiting[side].extend(answer)
+
+    def await_open(self) -> None:
+        """Wait until both adapters are on the bus.
+
+        The kernel hands over the two terminals independently: a frame may overtake the other
+        side's command to open, and is then lost, as on a real bus.
+        """
+        end = time.monotonic() + PATIENCE
+        while not all(self._open):
+            assert time.monotonic() < end, f"an adapter did not open: {self.set_up}"
+            time.sleep(0.001)
 
     @staticmethod
     def _is_frame(line: str) -> bool:

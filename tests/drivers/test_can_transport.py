@@ -96,6 +96,7 @@ class TestSlcan(CanContract):
         near = slcan(adapters.ports[0]).open()
         far = open_controller_link(slcan(adapters.ports[1]))
         far.receive(0.0)
+        adapters.await_open()
         yield from closed_after(near, far)
         assert adapters.refused == []
 

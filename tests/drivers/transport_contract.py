@@ -42,7 +42,8 @@ class TransportContract:
         near, far = link
         for number in range(5):
             far.send(bytes([number]) * 48)
-        assert [near.receive(PATIENCE)[0] for _ in range(5)] == [0, 1, 2, 3, 4]
+        received = [near.receive(PATIENCE) for _ in range(5)]
+        assert received == [bytes([number]) * 48 for number in range(5)]
 
     def test_no_packet_is_none_after_the_timeout(self, link):
         near, far = link
