@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from typing import Final, NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from identification.arrays import Array
 from identification.distributions import SIGNIFICANT_SIGMAS
@@ -93,8 +94,7 @@ class ColumnScore(NamedTuple):
         affected = affected[np.isin(affected, every)]
         if not affected.size:
             return False
-        floor = usual.shares(noise)
-        if np.all(after[affected] <= _NEAR_NOISE_FLOORS**2 * floor[affected]):
+        if self.is_near_noise(noise, affected):
             return True
         ratio = geometric_mean(np.sqrt(after[affected] / before[affected]))
         if ratio <= _EXPLAINED_ERROR_RATIO:
@@ -112,6 +112,15 @@ class ColumnScore(NamedTuple):
         return bool(positive.any()) and geometric_mean(
             np.sqrt(mine[positive] / least[positive])
         ) <= (SEPARATE_ERROR_RATIO)
+
+    def is_near_noise(self, noise: Array, joints: NDArray[np.intp] | None = None) -> bool:
+        """Return whether the errors of a fit are little above its sums of squared noise (n,).
+
+        The errors of some `joints`, by default of all that have torque.
+        """
+        loaded = self.shares(self.fitted) > 0.0
+        near = (self.fitted <= _NEAR_NOISE_FLOORS**2 * noise) | ~loaded
+        return bool(np.all(near if joints is None else near[joints]))
 
     def ratio_to(self, other: ColumnScore) -> tuple[float, float]:
         """Return the error ratio, geometric mean over the joints, and its upper limit by blocks."""

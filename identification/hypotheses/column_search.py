@@ -328,14 +328,17 @@ class _Search:
         pairs = [(load, each) for each in (*of_joints, *throughout)]
         if change.meaning in _OF_JOINT:
             pairs += [(change, each) for each in of_joints if each != change]
-        alike = SEPARATE_ERROR_RATIO if change.meaning == "arm" else _ALIKE_ERROR_RATIO
+        is_arm = change.meaning == "arm"
+        if is_arm and self._may_be_unmodelled(score):
+            return ((Change("unmodelled"),),)
+        alike = SEPARATE_ERROR_RATIO if is_arm else _ALIKE_ERROR_RATIO
         ratios: dict[tuple[Change, ...], float] = {}
         for rivals in (singles, pairs):
             for rival in rivals:
                 both = self._score(self._before, *rival)
                 ratio, highest = both.ratio_to(score)
                 is_rival = ratio <= alike
-                if len(rival) > 1 and change.meaning != "arm":
+                if len(rival) > 1 and not is_arm:
                     is_rival = ratio * alike < 1.0 and (
                         highest < 1.0 or self._has_another_size(found, rival, both)
                     )
@@ -344,6 +347,16 @@ class _Search:
             if ratios:
                 break  # of pairs, one of which is enough
         return tuple(sorted(ratios, key=ratios.__getitem__)[:_MOST_RIVALS])
+
+    def _may_be_unmodelled(self, score: ColumnScore) -> bool:
+        """Return whether parameters of a part may fit what the model lacks.
+
+        Other motions show it with other parameters. The parameters of another arm explain most of
+        an error that is more than noise.
+        """
+        usual = self._score(self._before)
+        is_noise = usual.is_near_noise(self._noise)
+        return is_noise or not score.explains((), usual, self._noise, None)
 
     def _has_another_size(
         self, found: Explanation, rival: Sequence[Change], score: ColumnScore

@@ -39,6 +39,7 @@ Meaning = Literal[
     "friction",
     "friction drift",
     "arm",
+    "unmodelled",
 ]
 DEGREE: Final = np.pi / 180.0
 SIGNS: Final[tuple[Sign, ...]] = get_args(Sign)

@@ -258,6 +258,7 @@ _OF_A_PART: Final[Mapping[Meaning, str]] = {
     "friction": "another friction of {}",
     "friction drift": "friction that drifts throughout",
     "arm": "another arm, tool or setting",
+    "unmodelled": "another motion, which shows more of what the model lacks",
 }
 
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from functools import cache
+
 import numpy as np
 import pytest
 from numpy.typing import NDArray
@@ -19,6 +21,7 @@ from identification.hypotheses.diagnosis import TorqueDiagnosis, diagnose
 from identification.hypotheses.joint_changes import Change
 from identification.hypotheses.readings import Adequacy
 from identification.hypotheses.scores import ROWS_PER_FACT
+from identification.model.motion import Motion
 from identification.signals.samples import Preprocessing, prepare
 from identification.validation.findings.diagnosis import of_diagnosis
 from tests.identification.three_axes import HIP, KNEE, NAMES, TIME, model, motion
@@ -307,3 +310,60 @@ def test_friction_that_drifts_is_no_certain_step(rise: float) -> None:
     (begun,) = explanations(motion()[1] + 2.0 * rise * later * dry_and_viscous(), 0.5)
     assert not begun.is_certain
     assert "friction drift" in {each.meaning for rival in begun.rivals for each in rival}
+
+
+HALF = len(TIME) // 2
+
+
+@cache
+def two_motions(factors: tuple[float, ...] = (1.0, 1.0, 1.0)) -> tuple[Floats, Floats]:
+    """Positions and torques of a motion, and of a smaller and faster one in the second half.
+
+    The bodies of the second are those of the description times a factor each.
+    """
+    later = within(0.5)
+    phase = np.cumsum(np.where(later, 1.6, 1.0), axis=0) * TIME[1]
+    rate = np.array([[2.0, 5.1], [3.3, 6.2], [2.7, 7.4]])
+    shape = np.sin(rate * phase[..., None] + np.arange(6.0).reshape(3, 2)).sum(axis=2)
+    q = 0.4 * np.where(later, 0.6, 1.0) * shape
+    v = np.gradient(q, TIME, axis=0)
+    states = Motion.of_states(q, v, np.gradient(v, TIME, axis=0))
+    robot = model()
+    values = np.zeros((2, robot.n_parameters))
+    for row, factor in zip(values, ((1.0, 1.0, 1.0), factors), strict=True):
+        bodies = np.repeat(factor, robot.layout.width) * robot.nominal
+        row[: robot.base.rank] = robot.base.grouping @ bodies
+    before, after = (robot.torque(row, states) for row in values)
+    return q, np.where(later, after, before) + 0.4 * np.sign(v) + 0.2 * v
+
+
+def of_three_runs_each(position: Floats, torque: Floats) -> tuple[Explanation, ...]:
+    """Return what explains the errors of a fit of both halves, recorded three times each."""
+    options = Preprocessing(14.0, exclude_rows="rests")
+    rng = np.random.default_rng(1)
+    runs = []
+    for part in (*[slice(0, HALF)] * 3, *[slice(HALF, None)] * 3):
+        noisy = torque[part] + rng.normal(0.0, 0.02, (HALF, 3))
+        run = Recording(TIME[:HALF], position[part], NAMES, noisy)
+        runs.append(prepare(run, model(), options=options))
+    factor = Factor.of(model(), prepare(Recording(TIME, position, NAMES, torque), model()))
+    values, _ = posterior_values(factor, body_prior(model(), factor).gaussian, ROWS_PER_FACT)
+    return find_columns(model(), runs, ExplainedFit(values, noise=np.full(3, 0.03)))
+
+
+def test_what_the_model_lacks_is_no_certain_arm() -> None:
+    """Two motions show different parts of a ripple, which parameters of their own fit better."""
+    q, torque = two_motions()
+    (found,) = of_three_runs_each(q, torque + 0.05 * np.sin(5.0 * q))
+    assert found.change.meaning == "arm"
+    assert found.rivals == ((Change("unmodelled"),),)
+    assert not found.is_certain
+
+
+@pytest.mark.parametrize("factors", [(2.0, 2.0, 0.5), (1.0, 1.5, 1.0)])
+def test_another_arm_is_certain(factors: tuple[float, ...]) -> None:
+    """Even if both lack a ripple in the model."""
+    q, torque = two_motions(factors)
+    (found,) = of_three_runs_each(q, torque + 0.5 * np.sin(5.0 * q))
+    assert found.change.meaning == "arm"
+    assert found.is_certain
