@@ -70,6 +70,7 @@ _MIN_EIGENVALUE_RATIO: Final = 1e-12  # over the largest one, of its normal equa
 _NOISE_ROUNDS: Final = 20  # of the noise of the joints
 _NOISE_TOLERANCE: Final = 1e-3  # relative change of the noise
 _SMALL_NOISE: Final = 3e-3  # share of the torque, smaller than most drives allow
+_SAME_ERROR: Final = 0.1  # by which a joint's error may rise and is as good
 # Of the scatter of its torque, that a term of friction alone makes. Coulomb and viscous friction
 # together are the torque of a light wrist, and a fifth of that of a heavy arm.
 _FRICTION_SHARE: Final = 0.5
@@ -137,17 +138,29 @@ class TorqueSums(NamedTuple):
         """
         if start is not None:
             return self._settled(mean, precision, smallest_noise, start, rounds)
-        # Where the prior contradicts the rows, two noises may be consistent: as large as the
-        # contradiction, which leaves the prior as it is, and as small as the rows allow.
-        # Rows that the parameters may fit exactly do not show the noise: one start for these.
         whole = self.gram[:, -1, -1] / np.maximum(self.samples, 1)
         weights = np.divide(1.0, whole, where=whole > 0.0, out=np.zeros(len(whole)))
-        is_exact = bool(np.any((self.samples > 0) & (self.samples < 2 * len(mean))))
-        found = [
-            self._settled(mean, precision, smallest_noise, weights / share**2, rounds)
-            for share in ((1.0,) if is_exact else (1.0, _SMALL_NOISE))
-        ]
-        return min(found, key=lambda each: self._surprise(each[0], each[1], mean, precision))
+        found = self._settled(mean, precision, smallest_noise, weights, rounds)
+        if np.any((self.samples > 0) & (self.samples < 2 * len(mean))):
+            return found  # rows that the parameters may fit exactly do not show the noise
+        # Where the prior contradicts the rows, two noises may be consistent: as large as the
+        # contradiction, which leaves the prior as it is, and as small as the rows allow.
+        closer = self._settled(mean, precision, smallest_noise, weights / _SMALL_NOISE**2, rounds)
+        return closer if self._is_better(closer, found, mean, precision) else found
+
+    def _is_better(
+        self, closer: tuple[Array, Array], found: tuple[Array, Array], mean: Array, precision: Array
+    ) -> bool:
+        """Return whether parameters and weights are more probable, at no joint's expense.
+
+        If no bodies fit all joints, as with torques of wrong scales, the more probable parameters
+        fit one joint and no other.
+        """
+        theirs, ours = (self.squared_errors(values) for values, _ in (closer, found))
+        if np.any(theirs > (1.0 + _SAME_ERROR) ** 2 * ours):
+            return False
+        more, less = (self._surprise(*each, mean, precision) for each in (found, closer))
+        return less < more
 
     def _settled(
         self, mean: Array, precision: Array, smallest_noise: float, start: Array, rounds: int

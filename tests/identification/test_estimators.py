@@ -62,6 +62,7 @@ from identification.estimators.delay_messages import undetermined_words
 from identification.estimators.loss_functions import Loss
 from identification.estimators.prior import (
     OFFSET_STD_SHARE,
+    TorqueSums,
     body_lengths,
     body_prior,
     design_effect_of,
@@ -87,6 +88,7 @@ from identification.signals.recording import in_succession
 from identification.signals.smoothing import low_pass
 from sim_fixtures import ControllerSettings, SimulatedController
 from sim_fixtures.ns16 import CELL_PATH, urdf_text
+from tests.identification import three_axes
 from tests.identification.robots import robot_text
 from tests.identification.two_link import (
     MODEL,
@@ -718,6 +720,22 @@ class TestPosterior:
         values, weights = posterior_values(factor, replace(prior, mean=mean), 10.0)
         np.testing.assert_allclose(1.0 / np.sqrt(weights), 0.01 * NOISE, rtol=0.1)
         np.testing.assert_allclose(values[at], truth()[at], rtol=1e-3)
+
+    @pytest.mark.parametrize("seed", [11, 12, 19, 39])
+    def test_no_joint_is_fitted_at_the_expense_of_others(self, seed):
+        """Torques of a scale each fit no bodies; the most probable fit is that of one joint."""
+        model = three_axes.model()
+        q, torque, _ = three_axes.motion()
+        scale = np.exp(0.5 * np.random.default_rng(seed).standard_normal(3))
+        recording = Recording(three_axes.TIME, q, three_axes.NAMES, torque * scale)
+        samples = prepare(recording, model, options=Preprocessing(14.0, exclude_rows="rests"))
+        factor = Factor.by_time(model, samples)
+        prior = body_prior(model, factor).gaussian
+        sums = TorqueSums.of(factor)
+        start = sums.samples / sums.gram[:, -1, -1]
+        values, _ = posterior_values(factor, prior, 10.0)
+        usual, _ = posterior_values(factor, prior, 10.0, start)
+        assert (sums.squared_errors(values) <= 1.21 * sums.squared_errors(usual)).all()
 
     def test_a_wrong_prior_is_detected(self):
         wrong = KNOWN | {"f0_1": (20.0, 1.0)}
