@@ -10,98 +10,35 @@ it.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
-from itertools import combinations, product
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import replace
 from typing import Final
 
-import numpy as np
-
-from identification.arrays import Array
-from identification.hypotheses.few_row_fits import (
-    ORDER_STARTS,
-    FewRowFits,
-    best_orders,
-    to_compare,
-)
 from identification.hypotheses.gravity_share import has_part_of_gravity
+from identification.hypotheses.hypothesis import SAME_SIZE_TOLERANCE, Hypothesis, thinned
 from identification.hypotheses.joint_changes import (
-    AS_READ,
-    COUPLED,
-    DEGREE,
-    ORDERS,
     SIGNS,
     SIZED,
     UNITS,
     Axes,
     Change,
-    Meaning,
-    alternatives_to,
-    changed_samples,
-    coupled_pairs,
-    differs,
-    mounted_model,
-    order_change,
-    whole_order,
 )
 from identification.hypotheses.joint_fit import (
-    JointFit,
-    candidates,
-    find_joints,
-    fit_joints,
     position_scales,
-    starting_at,
 )
-from identification.hypotheses.mirror_images import SignRival, Signs, mirror_images
+from identification.hypotheses.mirror_images import SignRival
 from identification.hypotheses.readings import Adequacy, Readings, Step, is_disputed
 from identification.hypotheses.scores import (
-    ALIKE_REDUCTION,
     EXPLAINED_ERROR,
     LARGE_REDUCTION,
-    MIN_REDUCTION,
-    ROWS_PER_FACT,
-    SEPARATE_SIGMAS,
-    SURE_SIGMAS,
-    Comparison,
-    Score,
     compare,
     fits_alike,
-    inertial_torque,
     score_of,
-    sigmas_of,
 )
 from identification.model.robot import RobotModel
 from identification.signals.samples import Samples
 
-_MAX_JOINT_ERROR_RATIO: Final = 1.1  # error ratio of a joint beyond which a reading spoils it
-_HALVED_ERROR_RATIO: Final = 0.5  # error ratio over all joints from which it may
 _MAX_ROWS: Final = 700
-_FIRST_TRIAL_ROWS: Final = 250  # on which all readings are tried first
-# error ratio of one exchange from which a whole order is searched for
-_EXCHANGE_ERROR_RATIO: Final = 0.98
-_MAX_STEPS: Final = 6
-_SAME_SIZE_TOLERANCE: Final = 0.3  # rad, or of a scale: difference of two fits that are one
-# error ratio to a zero far away, of which no better fit is expected
-_FAR_ZERO_ERROR_RATIO: Final = 0.5
-_MIN_ZERO_SEPARATION: Final = 60.0 * DEGREE  # between two zeros that are not one
-_FAR_ZERO_STARTS: Final = 2  # zeros far from what is stated at which a fit starts
-_NEEDED_SIGMAS: Final = 2.0  # standard errors of one of several zeros and scales that its fit needs
-# signs of least error, compared together with zeros and scales
-_COMPARED_SIGNS: Final = 3
-_MAX_NEGATED_JOINTS: Final = 8  # that move, up to which every combination of their signs is tried
-# deg, near which a fit starts
-_START_ZEROS_DEGREES: Final = (-135.0, -90.0, -45.0, 45.0, 90.0, 135.0, 180.0)
-
-
-@dataclass(frozen=True, eq=False)
-class Trial:
-    """A change, tried."""
-
-    change: Change
-    model: RobotModel
-    samples: Samples
-    score: Score
-    against: Comparison  # with the reading before
 
 
 def find_readings(
@@ -122,87 +59,86 @@ def find_readings(
         with_nearest: whether to return also what comes nearest to the reading found, and which
             zeros the torque does not show; a quarter of the time where nothing is to be changed.
     """
-    few = _thinned(samples, _MAX_ROWS)
-
-    def started(changes: Sequence[Change] = ()) -> _Search:
-        search = _Search(model, few, mountings or {}, unit_is_open=unit_is_open)
-        search.change(changes)
-        return search
-
-    search, steps = _searched(started)
-    search, steps, no_better = _without_chance(started, search, steps)
+    few = thinned(samples, _MAX_ROWS)
+    hypothesis = Hypothesis(model, few, mountings or {}, unit_is_open=unit_is_open)
+    hypothesis, steps = _searched(hypothesis)
+    hypothesis, steps, no_better = _without_chance(hypothesis, steps)
     if not steps and not unit_is_open and not with_nearest:
-        return Readings((), search.model, search.samples, search.score, {}, no_better=no_better)
-    rivals = _fewest_signs(search, steps)
-    search, steps = _signs_together(started, search, steps)
+        return Readings(
+            (), hypothesis.model, hypothesis.samples, hypothesis.score, {}, no_better=no_better
+        )
+    rivals = _fewest_signs(hypothesis, steps)
+    hypothesis, steps = _signs_together(hypothesis, steps)
     steps = _without_adopted(steps)
     # What a change explains shows only together with the others.
-    steps = [step if step.alike else replace(step, error=search.score.overall) for step in steps]
+    steps = [
+        step if step.alike else replace(step, error=hypothesis.score.overall) for step in steps
+    ]
     found = Readings(
         steps=tuple(steps),
-        model=search.model,
-        samples=search.samples,
-        score=score_of(search.model, search.samples, search.score.columns),
-        nearest=search.nearest() if with_nearest else {},
-        unseen_zeros=search.unseen_zeros() if with_nearest else (),
-        adequacy=search.adequacy(),
+        model=hypothesis.model,
+        samples=hypothesis.samples,
+        score=score_of(hypothesis.model, hypothesis.samples, hypothesis.score.columns),
+        nearest=hypothesis.nearest() if with_nearest else {},
+        unseen_zeros=hypothesis.unseen_zeros() if with_nearest else (),
+        adequacy=hypothesis.adequacy(),
         rivals=rivals,
         no_better=no_better,
-        scales=position_scales(search.model, search.samples) if unit_is_open else None,
+        scales=position_scales(hypothesis.model, hypothesis.samples) if unit_is_open else None,
     )
-    return replace(found, steps=tuple(_judged(started, search, found)))
+    return replace(found, steps=tuple(_judged(hypothesis, found)))
 
 
-def _searched(started: Callable[..., _Search]) -> tuple[_Search, list[Step]]:
+def _searched(stated: Hypothesis) -> tuple[Hypothesis, list[Step]]:
     """Return the best hypothesis, and its steps: one change after the other, then signs at once.
 
     Signs are tried together with zeros and scales, and all of them together, where a change is
     doubted or the arm does not explain the torque.
     """
-    search, steps = _one_by_one(started)
-    if not steps and search.score.overall <= EXPLAINED_ERROR:
-        return search, steps
-    is_enough = search.adequacy().is_enough
+    hypothesis, steps = _one_by_one(stated)
+    if not steps and hypothesis.score.overall <= EXPLAINED_ERROR:
+        return hypothesis, steps
+    is_enough = hypothesis.adequacy().is_enough
     is_doubted = not is_enough or any(not step.sure or step.is_far for step in steps)
     if is_doubted:
-        search, steps = _with_a_sign(started, search, steps)
+        hypothesis, steps = _with_a_sign(hypothesis, steps)
     if is_doubted or (_has_signs(steps) and len(steps) > 1):
-        search, steps = _with_signs(started, search, steps)
-    return search, steps
+        hypothesis, steps = _with_signs(hypothesis, steps)
+    return hypothesis, steps
 
 
 def _has_signs(steps: Sequence[Step]) -> bool:
     return any(step.change.meaning in SIGNS for step in steps)
 
 
-def _fewest_signs(search: _Search, steps: Sequence[Step]) -> tuple[SignRival, ...]:
+def _fewest_signs(hypothesis: Hypothesis, steps: Sequence[Step]) -> tuple[SignRival, ...]:
     """Adopt the mirror image with the fewest changed signs; return the other images."""
-    rivals = search.sign_rivals()
+    rivals = hypothesis.sign_rivals()
     if _has_signs(steps) and rivals:
         fewest = rivals[0]
-        if len(fewest.signs.changes) < len(search.signs.changes):
-            search.change([Change("axis sign", fewest.flipped)])
-            return search.sign_rivals()
+        if len(fewest.signs.changes) < len(hypothesis.signs.changes):
+            hypothesis.change([Change("axis sign", fewest.flipped)])
+            return hypothesis.sign_rivals()
     return rivals
 
 
-def _judged(started: Callable[..., _Search], search: _Search, found: Readings) -> list[Step]:
+def _judged(hypothesis: Hypothesis, found: Readings) -> list[Step]:
     """Return the steps that were found, each adequate if nothing else explains the rows alike."""
     steps = list(found.steps)
     if not found.adequacy.is_enough:
-        steps = _doubted(steps, search, started())
+        steps = _doubted(steps, hypothesis)
     doubted = [step for step in steps if not step.sure]
     steps = [  # each was chosen together with the others
         step if doubted in ([], [step]) else replace(step, is_adequate=False) for step in steps
     ]
     if any(step.change.meaning == "no gravity" for step in steps) and has_part_of_gravity(
-        started().model, search.samples, found.score
+        hypothesis.restarted().model, hypothesis.samples, found.score
     ):
         steps = [replace(step, is_adequate=False) for step in steps]
     has_other_scales = found.scales is not None and bool(found.scales.other)
     return [
         replace(step, is_adequate=False)
-        if is_disputed(step, search.signs, found.rivals)
+        if is_disputed(step, hypothesis.signs, found.rivals)
         or (has_other_scales and step.change.meaning in SIZED)  # which may imitate them
         else step
         for step in steps
@@ -210,8 +146,8 @@ def _judged(started: Callable[..., _Search], search: _Search, found: Readings) -
 
 
 def _without_chance(
-    started: Callable[..., _Search], search: _Search, steps: list[Step]
-) -> tuple[_Search, list[Step], tuple[Change, ...]]:
+    hypothesis: Hypothesis, steps: list[Step]
+) -> tuple[Hypothesis, list[Step], tuple[Change, ...]]:
     """Return a hypothesis without changes that are not better than none, and these changes.
 
     Where several changes fit alike, a recording without any of them is one more that may: the best
@@ -219,31 +155,28 @@ def _without_chance(
     """
     open_steps = [step for step in steps if step.alike]
     if not open_steps:
-        return search, steps, ()
+        return hypothesis, steps, ()
     rest = [step for step in steps if not step.alike]
-    without = started([step.change for step in rest])
-    drives_more = without.score.driven.sum() > search.score.driven.sum()
-    if drives_more or compare(search.score, without.score, search.model).is_better:
-        return search, steps, ()
+    without = hypothesis.restarted([step.change for step in rest])
+    drives_more = without.score.driven.sum() > hypothesis.score.driven.sum()
+    if drives_more or compare(hypothesis.score, without.score, hypothesis.model).is_better:
+        return hypothesis, steps, ()
     alike = (pair[0] for step in open_steps for pair in step.alike)
     no_better = dict.fromkeys([*(step.change for step in open_steps), *alike])
     return without, rest, tuple(no_better)
 
 
-def _with_signs(
-    started: Callable[..., _Search], found: _Search, steps: list[Step]
-) -> tuple[_Search, list[Step]]:
+def _with_signs(found: Hypothesis, steps: list[Step]) -> tuple[Hypothesis, list[Step]]:
     """Return a hypothesis with signs of all joints chosen at once, or the found one if better.
 
     One after the other leads astray where several are wrong.
     """
-    first = started()
     tried = []
-    for signs in first.best_signs():
+    for signs in found.restarted().best_signs():
         if signs.changes == found.signs.changes:
             continue
-        search = started(signs.changes)
-        tried.append((search, search.by_joint_fit(())))
+        hypothesis = found.restarted(signs.changes)
+        tried.append((hypothesis, hypothesis.by_joint_fit(())))
     if not tried:
         return found, steps
     best, more = min(tried, key=lambda each: each[0].score.overall)
@@ -255,31 +188,27 @@ def _with_signs(
         return found, steps
     chosen = best.signs.changes
     others = best.more_steps()
-    return best, [*_sign_steps(started, best, chosen), *more, *others]
+    return best, [*_sign_steps(best, chosen), *more, *others]
 
 
-def _sign_steps(
-    started: Callable[..., _Search], search: _Search, signs: Sequence[Change]
-) -> list[Step]:
+def _sign_steps(hypothesis: Hypothesis, signs: Sequence[Change]) -> list[Step]:
     """Return the steps of signs, each compared with all but it."""
-    before = started().score.overall
+    before = hypothesis.restarted().score.overall
     steps = []
     for sign in signs:
-        without = started([change for change in search.changes if change != sign])
-        ratio, sigmas, _ = compare(search.score, without.score, search.model)
-        steps.append(Step(sign, search.score.overall, before, ratio, sigmas))
+        without = hypothesis.restarted([each for each in hypothesis.changes if each != sign])
+        ratio, sigmas, _ = compare(hypothesis.score, without.score, hypothesis.model)
+        steps.append(Step(sign, hypothesis.score.overall, before, ratio, sigmas))
     return steps
 
 
-def _signs_together(
-    started: Callable[..., _Search], search: _Search, steps: list[Step]
-) -> tuple[_Search, list[Step]]:
+def _signs_together(hypothesis: Hypothesis, steps: list[Step]) -> tuple[Hypothesis, list[Step]]:
     """Return a hypothesis with one change of the sign for each joint; several may cancel."""
-    signs = search.signs.changes
-    adopted = [change for change in search.changes if change.meaning in SIGNS]
+    signs = hypothesis.signs.changes
+    adopted = [change for change in hypothesis.changes if change.meaning in SIGNS]
     if len(signs) == len(adopted) and {*signs} == {*adopted}:
-        return search, steps
-    axes = Axes.of(search.changes, search.model.n_joints)
+        return hypothesis, steps
+    axes = Axes.of(hypothesis.changes, hypothesis.model.n_joints)
     others = [step for step in steps if step.change.meaning not in SIGNS]
     sized = []
     for step in others:
@@ -290,9 +219,11 @@ def _signs_together(
         sized.append(replace(step, change=change))
     first = [step for step in sized if step.change.meaning not in SIZED]
     last = [step for step in sized if step.change.meaning in SIZED]
-    again = started([step.change for step in first] + [*signs] + [step.change for step in last])
+    again = hypothesis.restarted(
+        [step.change for step in first] + [*signs] + [step.change for step in last]
+    )
     known = {step.change: step for step in steps}
-    new = [known.get(step.change, step) for step in _sign_steps(started, again, signs)]
+    new = [known.get(step.change, step) for step in _sign_steps(again, signs)]
     return again, [*first, *new, *last]
 
 
@@ -305,36 +236,33 @@ def _without_adopted(steps: Sequence[Step]) -> list[Step]:
     ]
 
 
-def _one_by_one(started: Callable[..., _Search]) -> tuple[_Search, list[Step]]:
+def _one_by_one(hypothesis: Hypothesis) -> tuple[Hypothesis, list[Step]]:
     """Adopt changes one after the other, then zeros and scales of all joints together."""
-    search = started()
-    as_recorded = search.tried()
-    steps = search.more_steps()
+    as_recorded = hypothesis.tried()
+    steps = hypothesis.more_steps()
     if len(steps) > 1:
-        again = started()
-        single = again.single_as_good_as(search.score, as_recorded)
+        again = hypothesis.restarted()
+        single = again.single_as_good_as(hypothesis.score, as_recorded)
         if single is not None:
-            search = again
+            hypothesis = again
             steps = [single]
     if sized := [step for step in steps if step.change.meaning in SIZED]:
         # Found one after the other: now all at once, on the others.
         others = [step for step in steps if step not in sized]
-        again = started([step.change for step in others])
+        again = hypothesis.restarted([step.change for step in others])
         if joint_steps := again.by_joint_fit(sized):
-            search = again
+            hypothesis = again
             steps = [*others, *joint_steps]
-    return search, steps
+    return hypothesis, steps
 
 
-def _with_a_sign(
-    started: Callable[..., _Search], found: _Search, steps: list[Step]
-) -> tuple[_Search, list[Step]]:
+def _with_a_sign(found: Hypothesis, steps: list[Step]) -> tuple[Hypothesis, list[Step]]:
     """Return a hypothesis with a sign and fitted zeros and scales, or the found one if better.
 
     One after the other, neither need lessen the error: a joint whose sign is wrong has no zero that
     fits, and one whose zero is wrong no sign. Where both fit alike, no step is adequate.
     """
-    tried = list(_signed(started))
+    tried = list(_signed(found))
     if not tried:
         return found, steps
     change, best, more = min(tried, key=lambda each: each[1].score.overall)
@@ -345,8 +273,8 @@ def _with_a_sign(
         if not is_other or any(step.change == change for step in steps):
             return found, steps
         return found, [replace(step, is_adequate=False) for step in steps]
-    before = started()
-    without = started([step.change for step in more])
+    before = found.restarted()
+    without = found.restarted([step.change for step in more])
     alone = compare(best.score, without.score, found.model)
     is_alone = not any(
         other != change and fits_alike(again.score, best.score, found.model)
@@ -368,30 +296,28 @@ def _contains(changes: Sequence[Change], steps: Sequence[Step]) -> bool:
     return all(
         any(
             change[:2] == step.change[:2]
-            and abs(change.size - step.change.size) < _SAME_SIZE_TOLERANCE
+            and abs(change.size - step.change.size) < SAME_SIZE_TOLERANCE
             for change in changes
         )
         for step in steps
     )
 
 
-def _signed(started: Callable[..., _Search]) -> Iterator[tuple[Change, _Search, list[Step]]]:
+def _signed(found: Hypothesis) -> Iterator[tuple[Change, Hypothesis, list[Step]]]:
     """Yield the signs that fit best with zeros and scales of all joints, and these steps."""
-    fewer = started()
-    fewer.samples = _thinned(fewer.samples, _FIRST_TRIAL_ROWS)
-    for change in fewer.signs_by_joint_fit()[:_COMPARED_SIGNS]:
-        again = started([change])
+    for change in found.restarted().signs_by_joint_fit():
+        again = found.restarted([change])
         yield change, again, again.by_joint_fit(())
 
 
-def _doubted(steps: Sequence[Step], found: _Search, as_recorded: _Search) -> list[Step]:
+def _doubted(steps: Sequence[Step], found: Hypothesis) -> list[Step]:
     """Return steps of a reading that a free fit explains much better, none of them adequate.
 
     A sign or an order still is if no free fit without it comes near.
     """
     if not steps:
         return []
-    without = as_recorded.free_fit()
+    without = found.restarted().free_fit()
     is_beyond = found.stated_fit().ratio_to(without) < 1.0 - LARGE_REDUCTION
     return [
         replace(
@@ -406,506 +332,9 @@ def _doubted(steps: Sequence[Step], found: _Search, as_recorded: _Search) -> lis
 
 def find_zeros_and_scales(model: RobotModel, samples: Samples) -> Readings:
     """Find zeros and scales of joints that are other than stated, with nothing else changed."""
-    few = _thinned(samples, _MAX_ROWS)
-    search = _Search(model, few, {}, unit_is_open=False)
-    steps = search.by_joint_fit(())
-    adequacy = search.adequacy() if steps else Adequacy(1.0, 1.0, agrees=True)
+    few = thinned(samples, _MAX_ROWS)
+    hypothesis = Hypothesis(model, few, {}, unit_is_open=False)
+    steps = hypothesis.by_joint_fit(())
+    adequacy = hypothesis.adequacy() if steps else Adequacy(1.0, 1.0, agrees=True)
     steps = [replace(step, is_adequate=step.is_adequate and adequacy.is_enough) for step in steps]
-    return Readings(tuple(steps), model, search.samples, search.score, {}, (), adequacy)
-
-
-@dataclass(frozen=True, eq=False)
-class _Joints:
-    """Zeros and scales of several joints, tried together."""
-
-    fit: JointFit
-    changes: tuple[Change, ...]
-    samples: Samples
-    score: Score
-    whole: Comparison  # with the reading before
-    against: tuple[Comparison, ...]  # of each change, with all but it
-
-
-class _Search:
-    """The best interpretation so far, and the changes tried on it."""
-
-    def __init__(
-        self,
-        model: RobotModel,
-        samples: Samples,
-        mountings: Mapping[str, RobotModel],
-        *,
-        unit_is_open: bool,
-    ) -> None:
-        self.model = model
-        self.samples = samples
-        self._mountings = mountings
-        self._unit_is_open = unit_is_open
-        self._changes: list[Change] = []
-        self.score = score_of(model, samples)
-        self._trials: list[Trial] | None = None
-        self._excluded: frozenset[Change] = frozenset()
-        self._tries: dict[Change, Trial] = {}
-        self._fitted: list[_Joints] = []
-
-    @property
-    def changes(self) -> tuple[Change, ...]:
-        """What was adopted."""
-        return tuple(self._changes)
-
-    @property
-    def signs(self) -> Signs:
-        """The signs of all joints that were adopted."""
-        return Signs.of(Axes.of(self._changes, self.model.n_joints))
-
-    def change(self, changes: Sequence[Change]) -> None:
-        """Adopt changes as they are."""
-        for change in changes:
-            trial = self._try(change)
-            self._become(trial.model, trial.samples, trial.score, [change])
-
-    def _become(
-        self, model: RobotModel, samples: Samples, score: Score, changes: Sequence[Change]
-    ) -> None:
-        self.model = model
-        self.samples = samples
-        self.score = score
-        self._changes += changes
-        self._trials = None
-        self._tries.clear()
-        self._fitted.clear()
-
-    def by_friction(self) -> list[Step]:
-        """Adopt the sign of joints that friction would drive; none if it drives none."""
-        joints = tuple(np.flatnonzero(self.score.driven).tolist())
-        if not joints:
-            return []
-        kinds: tuple[Meaning, ...] = ("torque sign", "position sign")
-        # All torques negated: with other bodies an arm predicts them alike, so that the error does
-        # not decide, but friction and inertia do: a lag of the torque turns none of all.
-        everywhere = self.score.is_all_driven
-        if everywhere and inertial_torque(self.model, self.samples).sum() > 0.0:
-            return []  # the rows run backwards: no sign is wrong
-        if everywhere:
-            kinds = ("torque sign",)
-            joints = tuple(range(self.model.n_joints))
-        trials = [self._try(Change(kind, joints)) for kind in kinds]
-        best = min(trials, key=lambda trial: trial.against.ratio)
-        if not everywhere and (
-            best.against.ratio > 1.0 + ALIKE_REDUCTION or best.against.sigmas > SURE_SIGMAS
-        ):
-            return []
-        return [self._adopt(best, trials)]
-
-    def by_prediction(self) -> list[Step]:
-        """Adopt the change that fits best, or zeros and scales; none if none is significant."""
-        trials = self.tried()
-        better = [trial for trial in trials if trial.score.overall < self.score.overall]
-        good = [
-            trial
-            for trial in better
-            if trial.change.meaning not in SIZED
-            and trial.against.is_better
-            and not self._is_spoilt(trial)
-        ]
-        joints = self._best_joints(better)
-        if joints is not None and all(
-            compare(joints.score, trial.score, self.model).ratio < 1.0 - ALIKE_REDUCTION
-            for trial in good
-        ):
-            others = [trial for trial in better if trial.change.meaning not in SIZED]
-            others += [*self._singles(joints), *self._other_sides(joints)]
-            return self._adopt_joints(joints, others)
-        if not good:
-            return []
-        best = min(good, key=lambda trial: trial.against.ratio)
-        close = [trial for trial in good if self._are_alike(trial, best)]
-        best = min(close, key=lambda trial: (int(trial.score.driven.sum()), trial.against.ratio))
-        others = [trial for trial in better if trial.change.meaning != "zero"]
-        return [self._adopt(best, [*others, *self._singles()])]
-
-    def more_steps(self) -> list[Step]:
-        """Adopt changes one after the other, as long as they are significant."""
-        steps: list[Step] = []
-        while len(steps) < _MAX_STEPS:
-            found = self.by_prediction() or self.by_friction()
-            if not found:
-                break
-            steps += found
-        return steps
-
-    def signs_by_joint_fit(self) -> list[Change]:
-        """Return the signs of single joints, best fit with zeros and scales first."""
-        free = candidates(self.model, self.samples)
-        moved = np.flatnonzero(np.ptp(self.samples.motion.position, axis=0) > 0.0).tolist()
-        costs = {}
-        for change in (Change(kind, (joint,)) for joint in moved for kind in SIGNS):
-            samples = changed_samples(self.model, self.samples, change)
-            costs[change] = fit_joints(self.model, samples, free).cost
-        return sorted(costs, key=lambda change: costs[change])
-
-    def best_signs(self) -> list[Signs]:
-        """Return the signs of all joints that fit few rows best."""
-        moved = np.flatnonzero(np.ptp(self.samples.motion.position, axis=0) > 0.0)
-        if len(moved) > _MAX_NEGATED_JOINTS:
-            return []
-        fits = self._few_row_fits()
-        positions = []
-        for negated in product((1.0, -1.0), repeat=len(moved)):
-            position = np.ones(self.model.n_joints)
-            position[moved] = negated
-            positions.append(position)
-        signs = fits.by_friction(positions)
-        errors = fits.of_signs(signs)
-        best = [signs[k] for k in np.argsort(errors, kind="stable")[:_COMPARED_SIGNS]]
-        return list({each.changes: each for each in map(fits.with_best_torques, best)}.values())
-
-    def _few_row_fits(self) -> FewRowFits:
-        few = _thinned(self.samples, _FIRST_TRIAL_ROWS)
-        return FewRowFits(self.model, few, self._mountings)
-
-    def sign_rivals(self) -> tuple[SignRival, ...]:
-        """Return the signs of mirror images of the arm that fit alike, fewest changes first."""
-        tried = list(mirror_images(self.model.chain, self.model.gravity))
-        if self.signs.changes:
-            tried += [(joint,) for joint in range(self.model.n_joints)]
-        alike: dict[tuple[int, ...], float] = {}
-        self._keep_alike(alike, tried)
-        several = list(alike)
-        for joints in several:  # images of images
-            both = [tuple(sorted({*joints} ^ {*others})) for others in alike]
-            self._keep_alike(alike, [each for each in both if each and each not in alike])
-        rivals = [
-            SignRival(self.signs.flipped(joints), joints, error) for joints, error in alike.items()
-        ]
-        probable = [rival for rival in rivals if rival.signs.is_probable]
-        return tuple(sorted(probable, key=lambda rival: len(rival.signs.changes)))
-
-    def _keep_alike(
-        self, alike: dict[tuple[int, ...], float], tried: Sequence[tuple[int, ...]]
-    ) -> None:
-        """Add the joints that may be negated as well, with the error then."""
-        for joints in tried:
-            trial = self._try(Change("axis sign", joints))
-            if fits_alike(trial.score, self.score, self.model):
-                alike[joints] = trial.score.overall
-
-    def _singles(self, but: _Joints | None = None) -> list[Trial]:
-        """Return single fitted zeros and scales, other than the best."""
-        known = [] if but is None else list(but.changes)
-        singles = []
-        for each in self._fitted:
-            (change, *more) = each.changes
-            near = [
-                other
-                for other in known
-                if other[:2] == change[:2] and abs(other.size - change.size) < _SAME_SIZE_TOLERANCE
-            ]
-            if not more and not near:
-                known.append(change)
-                singles.append(self._try(change))
-        return singles
-
-    def _other_sides(self, joints: _Joints) -> list[Trial]:
-        """Return the best zero far from a single one that was found, where the motion has two.
-
-        Such as a joint whose body hangs: turned to either side it loads the others alike.
-        """
-        (change, *more) = joints.changes
-        if more or change.meaning != "zero":
-            return []
-        angles = [angle * DEGREE for angle in _START_ZEROS_DEGREES]
-        far = [angle for angle in angles if _apart(angle, change.size) > _MIN_ZERO_SEPARATION]
-        trials = [self._try(change._replace(size=angle)) for angle in far]
-        best = min(trials, key=lambda trial: trial.score.overall)
-        zero = np.zeros(self.model.n_joints)
-        zero[list(change.joints)] = best.change.size
-        free = np.isin(np.arange(2 * len(zero)), change.joints)
-        start = starting_at(self.model, self.samples, zero, np.zeros_like(zero))
-        size = float(fit_joints(self.model, self.samples, free, start).zero[change.joints[0]])
-        if _apart(size, change.size) < _MIN_ZERO_SEPARATION:
-            return [best]
-        return [self._try(change._replace(size=size))]
-
-    def by_joint_fit(self, near: Sequence[Step]) -> list[Step]:
-        """Adopt zeros and scales of all joints together, near the ones found before, if any fit."""
-        n = self.model.n_joints
-        zero = np.zeros(n)
-        gain = np.ones(n)
-        for step in near:
-            places = list(step.change.joints)
-            if step.change.meaning == "zero":
-                zero[places] += step.change.size
-            else:
-                gain[places] *= 1.0 + step.change.size
-        start = starting_at(self.model, self.samples, zero, gain - 1.0)
-        every = candidates(self.model, self.samples)
-        joints = self._joints(find_joints(self.model, self.samples, every, start))
-        if joints is None:
-            return []
-        found = self._adopt_joints(joints, [])
-        alike = {step.change[:2]: step.alike for step in near}
-        return [replace(step, alike=alike.get(step.change[:2], ())) for step in found]
-
-    def stated_fit(self) -> JointFit:
-        """Fit the rows as read."""
-        none = np.zeros(2 * self.model.n_joints, dtype=np.bool_)
-        return fit_joints(self.model, self.samples, none)
-
-    def free_fit(self) -> JointFit:
-        """Fit the rows with any zeros and scales, and hardly believe the masses."""
-        free = candidates(self.model, self.samples)
-        return fit_joints(self.model, self.samples, free, free_bodies=True)
-
-    def adequacy(self) -> Adequacy:
-        """Compare the reading found with a free fit."""
-        free = self.free_fit()
-        moved = [joint for each in self._changes if each.meaning == "zero" for joint in each.joints]
-        stated = self.stated_fit()
-        largest = float(stated.ratios_to(free).max(initial=1.0))
-        return Adequacy(stated.ratio_to(free), largest, free.is_zero_at(moved))
-
-    def _best_joints(self, trials: Sequence[Trial]) -> _Joints | None:
-        """Return zeros and scales that predict better; None if none do."""
-        every = candidates(self.model, self.samples)
-        best = self._joints(find_joints(self.model, self.samples, every))
-        if best is not None:
-            self._fitted.append(best)
-        zeros = [trial for trial in trials if trial.change.meaning == "zero"]
-        zeros = [trial for trial in zeros if trial.against.ratio < 1.0 - LARGE_REDUCTION]
-        for far in sorted(zeros, key=lambda trial: trial.against.ratio)[:_FAR_ZERO_STARTS]:
-            if (
-                best is not None
-                and compare(best.score, far.score, self.model).ratio < _FAR_ZERO_ERROR_RATIO
-            ):
-                continue  # near what is stated is better
-            zero = np.zeros(self.model.n_joints)
-            joints = list(far.change.joints)
-            zero[joints] = far.change.size
-            start = starting_at(self.model, self.samples, zero, np.zeros_like(zero))
-            alone = np.isin(np.arange(len(every)), joints)
-            for free in (alone, every):
-                fit = find_joints(self.model, self.samples, free, start)
-                other = self._joints(fit)
-                if other is not None:
-                    self._fitted.append(other)
-                if other is not None and (
-                    best is None
-                    or compare(other.score, best.score, self.model).ratio < 1.0 - ALIKE_REDUCTION
-                ):
-                    best = other
-        return best
-
-    def _joints(self, fit: JointFit) -> _Joints | None:
-        """Return the zeros and scales of a joint fit that predict better; None if none do."""
-        n = self.model.n_joints
-        while changes := _changes_of(fit):
-            samples, score = self._scored(changes)
-            without = [
-                self._scored([each for each in changes if each != one])[1] for one in changes
-            ]
-            against = [compare(score, other, self.model) for other in without]
-            is_needed = [each.sigmas < -_NEEDED_SIGMAS for each in against]
-            if all(is_needed):
-                whole = compare(score, self.score, self.model)
-                if whole.ratio > 1.0 - MIN_REDUCTION or whole.sigmas > -SEPARATE_SIGMAS:
-                    return None
-                return _Joints(fit, changes, samples, score, whole, tuple(against))
-            free = np.zeros(2 * n, dtype=np.bool_)
-            for change, is_one in zip(changes, is_needed, strict=True):
-                places = np.array(change.joints) + (0 if change.meaning == "zero" else n)
-                free[places] = is_one
-            fit = fit_joints(self.model, self.samples, free, fit.fixed(free))
-        return None
-
-    def _scored(self, changes: Sequence[Change]) -> tuple[Samples, Score]:
-        """Return samples with more zeros and scales, and their score."""
-        samples = self.samples
-        for change in changes:
-            samples = changed_samples(self.model, samples, change)
-        score = score_of(self.model, samples, self.score.columns)
-        return samples, score.of_torque(self._torque_scale(changes))
-
-    def _torque_scale(self, changes: Sequence[Change]) -> Array:
-        return Axes.of([*self._changes, *changes], self.model.n_joints).torque_scale
-
-    def _adopt_joints(self, joints: _Joints, others: Sequence[Trial]) -> list[Step]:
-        """Adopt zeros and scales, with other changes that fit alike."""
-        before = self.score.overall
-        alike = tuple(
-            (trial.change, trial.score.overall)
-            for trial in others
-            if fits_alike(trial.score, joints.score, self.model)
-        )
-        steps = [
-            Step(
-                change,
-                joints.score.overall,
-                before,
-                each.ratio,
-                each.sigmas,
-                alike,
-                is_adequate=change.meaning == "zero" or joints.fit.is_scale_known,
-            )
-            for change, each in zip(joints.changes, joints.against, strict=True)
-        ]
-        self._become(self.model, joints.samples, joints.score, joints.changes)
-        return steps
-
-    def single_as_good_as(self, score: Score, tried: Sequence[Trial]) -> Step | None:
-        """Adopt the one change of `tried` that fits as well as several do; None if none does."""
-        trials = [
-            trial
-            for trial in tried
-            if fits_alike(trial.score, score, self.model)
-            and trial.score.driven.sum() <= score.driven.sum()
-        ]
-        if not trials:
-            return None
-        return self._adopt(min(trials, key=lambda trial: trial.score.overall), trials)
-
-    def nearest(self) -> dict[Meaning, tuple[Change, Comparison]]:
-        """Return by meaning the change that comes nearest to the reading found."""
-        nearest: dict[Meaning, tuple[Change, Comparison]] = {}
-        for trial in self.tried():
-            meaning = trial.change.meaning
-            if meaning not in nearest or trial.against.ratio < nearest[meaning][1].ratio:
-                nearest[meaning] = trial.change, trial.against
-        return nearest
-
-    def unseen_zeros(self) -> tuple[int, ...]:
-        """Return the joints whose zeros may also be others."""
-        self.tried()
-        joints = np.flatnonzero(self.model.chain.revolute).tolist()
-        angles = (-45.0 * DEGREE, 45.0 * DEGREE)
-        possible = (
-            zero
-            for zero in (Change("zero", (joint,), angle) for joint in joints for angle in angles)
-            if zero not in self._excluded
-        )
-        unseen = (zero for zero in possible if self._try(zero).against.sigmas < SEPARATE_SIGMAS)
-        return tuple(dict.fromkeys(joint for zero in unseen for joint in zero.joints))
-
-    def _are_alike(self, trial: Trial, best: Trial) -> bool:
-        """Whether two changes fit alike, so that the recording does not choose one."""
-        if compare(trial.score, best.score, self.model).sigmas > SEPARATE_SIGMAS:
-            return False
-        if trial.score.overall < (1.0 + ALIKE_REDUCTION) * best.score.overall:
-            return True
-        more = trial.score.squares.sum(axis=1) - best.score.squares.sum(axis=1)
-        return sigmas_of(more) < SEPARATE_SIGMAS
-
-    def _orders(self, trials: Sequence[Trial], fits: FewRowFits) -> Iterator[Trial]:
-        """Yield whole orders: from several starts, the best exchange while the error falls."""
-        is_poor = self.score.overall > EXPLAINED_ERROR
-        for kind in ORDERS:
-            trials_of_kind = [trial for trial in trials if trial.change.meaning == kind]
-            if not is_poor and not any(
-                trial.against.ratio < _EXCHANGE_ERROR_RATIO for trial in trials_of_kind
-            ):
-                continue
-            tried = {whole_order(trial.change, self.model.n_joints) for trial in trials_of_kind}
-            for order in best_orders(fits, kind, ORDER_STARTS if is_poor else 1):
-                change = order_change(kind, order)
-                if change.joints and order not in tried:
-                    yield self._try(change)
-
-    def _is_spoilt(self, trial: Trial, beside: Trial | None = None) -> bool:
-        """Whether a change that concerns few joints fits another one worse, or drives one.
-
-        Worse than before, and than with `beside`. With an angle that contains another the posture
-        of all that follows is another.
-        """
-        if trial.change.meaning in ORDERS:
-            return False
-        if int(trial.score.driven.sum()) > int(self.score.driven.sum()):
-            return True
-        most = (
-            _MAX_JOINT_ERROR_RATIO
-            if beside is None
-            else _MAX_JOINT_ERROR_RATIO * np.maximum(1.0, beside.against.joints)
-        )
-        # What a second fault leaves may fit a joint worse where the first one is corrected.
-        halves = trial.against.ratio < _HALVED_ERROR_RATIO and beside is None
-        spoils = bool(np.any(trial.against.joints > most)) and not halves
-        return spoils and trial.change.meaning not in COUPLED
-
-    def _adopt(self, best: Trial, others: Sequence[Trial]) -> Step:
-        """Adopt a change, with others that fit equally well."""
-        alternatives: list[Trial] = []
-        if len(best.change.joints) < self.model.n_joints:  # an arm and its mirror image move alike
-            alternatives = [self._try(change) for change in alternatives_to(best.change)]
-            alternatives += [other for other in others if differs(other.change, best.change)]
-        alike = {
-            other.change: other.score.overall
-            for other in alternatives
-            if not self._is_spoilt(other, best)
-            and self._are_alike(other, best)
-            and other.score.driven.sum() <= best.score.driven.sum()
-        }
-        before = self.score.overall
-        ratio, sigmas, _ = best.against
-        ranked = sorted(alike.items(), key=lambda pair: pair[1])
-        self._become(best.model, best.samples, best.score, [best.change])
-        return Step(best.change, best.score.overall, before, ratio, sigmas, tuple(ranked))
-
-    def tried(self) -> list[Trial]:
-        """Return the changes of least error, tried on all rows."""
-        if self._trials is None:
-            fits = self._few_row_fits()
-            errors = fits.errors([AS_READ, *self._to_try()])
-            excluded = errors.pop(AS_READ) + SURE_SIGMAS**2 * ROWS_PER_FACT / fits.rows
-            self._excluded = frozenset(
-                change for change, error in errors.items() if error >= excluded
-            )
-            trials = [self._try(change) for change in to_compare(errors, excluded)]
-            self._trials = [*trials, *self._orders(trials, fits)]
-        return self._trials
-
-    def _to_try(self) -> Iterator[Change]:
-        n = self.model.n_joints
-        moved = np.flatnonzero(np.ptp(self.samples.motion.position, axis=0) > 0.0).tolist()
-        if self._unit_is_open and all(self.model.chain.revolute):
-            yield from (Change("degrees"), Change("radians"))
-        yield from (Change("mounting", (), 0.0, name) for name in self._mountings if name)
-        if "" in self._mountings:
-            yield Change("no gravity")
-        yield Change("torque sign", tuple(range(n)))
-        for joint in range(n):
-            if joint in moved:
-                yield from (Change(kind, (joint,)) for kind in SIGNS)
-            if self.model.chain.revolute[joint]:
-                yield from (
-                    Change("zero", (joint,), angle * DEGREE) for angle in _START_ZEROS_DEGREES
-                )
-        for pair in coupled_pairs(self.model, moved):
-            yield from (Change(kind, pair) for kind in COUPLED)
-        for pair in combinations(moved, 2):
-            yield from (Change(kind, pair) for kind in ORDERS)
-
-    def _try(self, change: Change) -> Trial:
-        if change not in self._tries:
-            model = mounted_model(self.model, change, self._mountings)
-            samples = changed_samples(self.model, self.samples, change)
-            columns = self.score.columns
-            if change.meaning in ("torque order", "joint order"):
-                columns = columns[list(whole_order(change, self.model.n_joints))]
-            score = score_of(model, samples, columns)
-            score = score.of_torque(self._torque_scale([change]))
-            against = compare(score, self.score, self.model)
-            self._tries[change] = Trial(change, model, samples, score, against)
-        return self._tries[change]
-
-
-def _apart(angle: float, other: float) -> float:
-    """Return the size of the angle between two [rad], at most half a turn."""
-    return float(abs((angle - other + np.pi) % (2.0 * np.pi) - np.pi))
-
-
-def _changes_of(fit: JointFit) -> tuple[Change, ...]:
-    zeros = [Change("zero", (joint,), float(fit.zero[joint])) for joint in fit.moved]
-    return (*zeros, *(Change("scale", (j,), float(fit.gain[j])) for j in fit.scaled))
-
-
-def _thinned(samples: Samples, rows: int) -> Samples:
-    return samples.thinned(max(1, len(samples.torque) // rows))
+    return Readings(tuple(steps), model, hypothesis.samples, hypothesis.score, {}, (), adequacy)
