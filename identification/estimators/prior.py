@@ -69,6 +69,7 @@ _INDEPENDENT_ROW_SHARE: Final = 0.01  # share of the rows for that deviation
 _MIN_EIGENVALUE_RATIO: Final = 1e-12  # over the largest one, of its normal equations
 _NOISE_ROUNDS: Final = 20  # of the noise of the joints
 _NOISE_TOLERANCE: Final = 1e-3  # relative change of the noise
+_LEAST_VARIANCE: Final = 1e-280  # whose inverse times sums of squares is still a number
 _SMALL_NOISE: Final = 3e-3  # share of the torque, smaller than most drives allow
 _SAME_ERROR: Final = 0.1  # by which a joint's error may rise and is as good
 # Of the scatter of its torque, that a term of friction alone makes. Coulomb and viscous friction
@@ -170,7 +171,7 @@ class TorqueSums(NamedTuple):
         flat = gram.reshape(len(gram), -1)
         rows = np.maximum(samples, 1)
         whole = gram[:, -1, -1] / rows
-        floor = smallest_noise**2 * whole + np.finfo(np.float64).tiny
+        floor = smallest_noise**2 * whole + _LEAST_VARIANCE
         least = np.maximum(precision.diagonal(), np.finfo(np.float64).tiny)
         values = mean
         weights = np.zeros(len(gram))
