@@ -8,14 +8,13 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from typing import Final
 
-from hil.importers.channels import Channel, kind_of
+from hil.importers.channels import OBJECT, Channel, kind_of
 from hil.importers.conclusions import NameBasis
 from hil.importers.name_words import is_commanded_position, kind_by_words
 from hil.importers.stated_units import without_unit
 from hil.importers.units import Kind
 
-NUMBER: Final = re.compile(r"\d{1,2}(?=\D*$)")
-"""The number of a joint in a name."""
+_NUMBER: Final = re.compile(r"\d{1,2}(?=\D*$)")
 _REPEATED_MARK: Final = re.compile(r"([_.-])\1+")  # around the name of a joint
 
 
@@ -78,7 +77,7 @@ def grouped(channels: Iterable[Channel], joints: Sequence[str]) -> list[ChannelG
         pattern = bare
         index = 0
         by_joint = False
-        match = NUMBER.search(bare)
+        match = number_in(bare)
         if match is not None:
             pattern = f"{bare[: match.start()]}{{}}{bare[match.end() :]}"
             index = int(match[0])
@@ -103,6 +102,11 @@ def grouped(channels: Iterable[Channel], joints: Sequence[str]) -> list[ChannelG
         whole = names[0] if len(names) == 1 else pattern
         groups.append(ChannelGroup(whole, kind, names, size, unit, by_joint))
     return groups
+
+
+def number_in(name: str) -> re.Match[str] | None:
+    """Return where the joint's number is in a name, None if it has none."""
+    return _NUMBER.search(OBJECT.sub(lambda index: "_" * len(index[0]), name))
 
 
 def _joint_in(name: str, joints: Sequence[str]) -> str | None:

@@ -15,7 +15,7 @@ from hil.base.errors import SourceError, UnrecordedJointError
 from hil.base.safe_input import parse_toml
 from hil.base.toml_text import to_text
 from hil.importers.array_files import ArrayFile
-from hil.importers.channel_groups import NUMBER, ChannelGroup, grouped
+from hil.importers.channel_groups import ChannelGroup, grouped, number_in
 from hil.importers.channels import channels_of, kind_in_file, kinds_of_file
 from hil.importers.column_map import ColumnMap, Format
 from hil.importers.conclusions import ChannelMeaning, NameBasis, UnitBasis, UnusedChannels
@@ -309,7 +309,7 @@ def _meaning(kind: Kind, held: Sequence[_Held]) -> ChannelMeaning:
 
 
 def _number(held: _Held) -> tuple[int, str]:
-    match = NUMBER.search(Path(held.file).stem)
+    match = number_in(Path(held.file).stem)
     return (int(match[0]) if match else 0, held.file)
 
 

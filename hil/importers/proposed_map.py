@@ -17,7 +17,7 @@ from hil.base.errors import SourceError, UnrecordedJointError
 from hil.base.safe_input import parse_toml
 from hil.base.toml_text import to_text
 from hil.importers.array_files import ArrayFile
-from hil.importers.channel_groups import NUMBER, ChannelGroup, grouped
+from hil.importers.channel_groups import ChannelGroup, grouped, number_in
 from hil.importers.channels import CHANNEL_NAMES, Channel, channels_of, kind_of, kinds_of_file
 from hil.importers.column_map import ColumnMap, Format, ready_map, ready_maps
 from hil.importers.conclusions import (
@@ -464,7 +464,7 @@ class _Search:
 
     def _absent(self, group: ChannelGroup) -> tuple[Sequence[str], str]:
         """Return the joints without a channel by the numbers of the others, else the last ones."""
-        numbers = [NUMBER.search(name) for name in group.names]
+        numbers = [number_in(name) for name in group.names]
         places = {int(match[0]) for match in numbers if match is not None}
         first = 0 if 0 in places else 1
         expected = range(first, first + len(self._joints))

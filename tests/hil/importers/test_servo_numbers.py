@@ -95,7 +95,9 @@ class TestLoads:
 
 
 class TestObjectsOfDrives:
-    @pytest.mark.parametrize("name", ["torque_actual_value_{}", "tau{}_6077h"])
+    @pytest.mark.parametrize(
+        "name", ["torque_actual_value_{}", "tau{}_6077h", "6077h_{}", "0x6077_{}", "axis{}_6077h"]
+    )
     def test_per_mille_is_named_and_can_be_stated(
         self, tmp_path: Path, urdf: Path, name: str
     ) -> None:
