@@ -35,7 +35,7 @@ from hil.look.result import ChangedReading, Look, Row, TiedReading
 from hil.look.servo_load import may_be_load, servo_load, torques_without_sign, without_torque
 from hil.look.torque_sample import SUSPECT_ERROR, TorqueSample, explained
 from hil.pipeline.sources import cell_of
-from identification.hypotheses.diagnosis import UNEXPLAINED, TorqueDiagnosis
+from identification.hypotheses.diagnosis import UNEXPLAINED, TorqueDiagnosis, unexplained_share
 from identification.hypotheses.scores import SURE_SIGMAS, Score, compare, score_of
 from identification.signals.samples import Samples
 from identification.text import percentage
@@ -178,6 +178,8 @@ def _as_a_look_says(
     """Return a log read again where a look is certain that it is other than recorded."""
     look = look_at_joints(source, imported)
     error = asked.score.overall if look.error is None else look.error
+    if error > UNEXPLAINED:
+        error = min(error, unexplained_share(asked.cell.model, asked.rows, asked.score))
     if error > UNEXPLAINED:
         if is_open:
             servo = without_torque(imported, source, robot_of, use, NoJointTorque(error))

@@ -65,7 +65,12 @@ from hil.look.readings import (
 from hil.look.readings import NextStep as Decide
 from hil.look.result import Aspect, ParameterGroup, Row, TiedReading
 from identification.estimators.delay import DelayEstimate
-from identification.estimators.prior import DETERMINED_STD_RATIO, body_prior, fit_posterior
+from identification.estimators.prior import (
+    DETERMINED_STD_RATIO,
+    body_prior,
+    fit_posterior,
+    nominal_ratio,
+)
 from identification.factor.factor import Factor
 from identification.hypotheses.diagnosis import RigidTorque, TorqueDiagnosis, rigid_torque
 from identification.hypotheses.inertia_scale import shows_times
@@ -152,6 +157,9 @@ class Size:
         nominal_torque = nominal_scale(model, nominal.values, [samples])
         scale = nominal_torque.scale
         if not np.isfinite(scale).any():
+            of_all, std = nominal_ratio(model, Factor.of(model, samples))
+            if std < of_all / SEPARATE_SIGMAS:
+                return cls(of_all, by_masses=True)
             return cls(_by_reach(model, samples), by_masses=True)
         # A scale that may be zero has no order of magnitude.
         known = nominal_torque.nonzero

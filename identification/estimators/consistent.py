@@ -368,7 +368,7 @@ def consistent_estimate(
     prior = prior or body_prior(model, factor)
     equations = factor.weighted(weights)
     standard, others = consistent_parameters(model, equations, prior, design_effect)
-    values = np.concatenate([model.base.grouping @ standard, others])
+    values = prior.combinations @ np.concatenate([standard, others])
     rows, target = rows_of(equations)
     excess = float(np.square(rows @ values - target).sum())
     free = factor.relative_error(unconstrained.values)

@@ -329,6 +329,8 @@ class _BodyEstimate(NamedTuple):
         Of functions (k, 10) of the parameters, determined part. Student's factor is for variances
         that are estimated from blocks, that of the scale is stated.
         """
+        if not np.isfinite(self.fit.covariance).all():
+            return np.full((len(rows), len(rows)), np.inf)
         combinations = rows @ np.linalg.pinv(self.determined)
         scaled = combinations * self.fit.interval_factors(combinations)[:, None]
         by_scale = _NORMAL_95**2 * combinations @ self.by_scale @ combinations.T

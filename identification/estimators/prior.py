@@ -642,10 +642,15 @@ def _of_model(model: RobotModel) -> _OfModel:
     combinations = np.zeros((model.n_parameters, layout.size + others))
     combinations[:b, : layout.size] = model.base.grouping
     combinations[b:, layout.size :] = np.eye(others)
-    rotors = model.base.grouping[:, layout.rotors]
+    # A rotor that is in the mass that it lifts is in the constant torque as well.
+    for name, terms in model.base.lumped.items():
+        for factor, rotor in terms:
+            place = model.parameter_names.index(name), layout.names.index(rotor)
+            combinations[place] += factor
+    rotors = combinations[:, layout.rotors]
     nominal = np.zeros((model.n_parameters + 1, 2 + rotors.shape[1] + others))
     nominal[:b, 0] = model.base.grouping @ model.nominal
-    nominal[:b, 1 : 1 + rotors.shape[1]] = rotors
+    nominal[:-1, 1 : 1 + rotors.shape[1]] = rotors
     nominal[b:-1, 1 + rotors.shape[1] : -1] = np.eye(others)
     nominal[-1, -1] = 1.0
     columns = dict[int, dict[str, int]]()
@@ -803,7 +808,7 @@ def _rotor_torque(model: RobotModel, sums: TorqueSums, rotors: NDArray[np.intp])
     A slow motion does not allow more, as for friction.
     """
     joints = np.flatnonzero(np.isin(model.layout.rotors, rotors))
-    columns = model.base.grouping[:, rotors]
+    columns = _of_model(model).combinations[:, rotors]
     squares = np.zeros((*sums.samples.shape[:-1], len(rotors)))
     for k, joint in enumerate(joints):
         used = np.flatnonzero(columns[:, k])

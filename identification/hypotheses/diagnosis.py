@@ -51,6 +51,9 @@ ROWS: Final = 700
 """Rows of all recordings in which something other than stated is searched for."""
 # error ratio of a torque without gravity that chance does not make
 _WEIGHTLESS_ERROR_RATIO: Final = 0.7
+_FREE_SHARE: Final = (
+    30.0  # standard deviation of bodies, of their masses, that says hardly anything
+)
 _MIN_ROWS: Final = 100  # that say something of bodies
 # share of the nominal torque below which the bodies are not the arm's
 _MIN_NOMINAL_SCALE: Final = 1.0 / 3.0
@@ -261,7 +264,7 @@ def torque_of(
         weightless,
         rigid,
         is_backwards=backwards,
-        error=score.overall,
+        error=unexplained_share(model, rows, score),
         keeps_gravity=keeps_gravity,
     )
     if found.rigid.is_nothing:
@@ -298,7 +301,23 @@ def with_readings(
         readings = find_zeros_and_scales(model, rows)
     else:
         readings = find_readings(model, rows, unit_is_open=False, with_nearest=False)
-    return replace(found, readings=readings, error=readings.score.overall)
+    error = unexplained_share(readings.model, readings.samples, readings.score)
+    return replace(found, readings=readings, error=error)
+
+
+def unexplained_share(model: RobotModel, rows: Samples, score: Score) -> float:
+    """Return the error of a torque, as a share of it, that no masses and rotors explain.
+
+    Args:
+        model: of the arm.
+        rows: of the recording.
+        score: of these rows, by what is believed of the arm.
+    """
+    error = score.overall
+    if error <= UNEXPLAINED:
+        return error
+    free = score_of(model, rows, score.columns, wide_rotors=True, share=_FREE_SHARE)
+    return min(error, free.overall)
 
 
 def _is_predicted(score: Score, samples: Samples, noise: Array | None) -> bool:

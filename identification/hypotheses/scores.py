@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from identification.arrays import Array
-from identification.estimators.prior import body_prior, posterior_values
+from identification.estimators.prior import BODY_STD_SHARE, body_prior, posterior_values
 from identification.factor.blocks import FOLDS
 from identification.factor.factor import Factor
 from identification.hypotheses.error_ratios import (
@@ -127,6 +127,7 @@ def score_of(
     columns: NDArray[np.intp] | None = None,
     *,
     wide_rotors: bool = False,
+    share: float = BODY_STD_SHARE,
 ) -> Score:
     """Predict every fifth of `_BLOCKS` blocks of samples from the others.
 
@@ -135,10 +136,11 @@ def score_of(
         samples: of the recording.
         columns: of the recorded torque that the joints are read from, by default in order.
         wide_rotors: as for :func:`~identification.estimators.prior.body_prior`.
+        share: likewise, of the bodies.
     """
     columns = np.arange(model.n_joints) if columns is None else columns
     factor = _factor(model, samples)
-    prior = body_prior(model, factor, wide_rotors=wide_rotors).gaussian
+    prior = body_prior(model, factor, share, wide_rotors=wide_rotors).gaussian
     squares = np.zeros((len(factor), factor.n_joints))
     weights: Array | None = None
     estimates: list[Array] = []

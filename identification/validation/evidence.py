@@ -24,6 +24,7 @@ from identification.hypotheses.diagnosis import (
     TorqueDiagnosis,
     diagnose,
     few_rows,
+    unexplained_share,
 )
 from identification.hypotheses.gravity_direction import GravityDirection, find_gravity
 from identification.hypotheses.scores import score_of
@@ -305,7 +306,8 @@ def _with_unseen(
     """Return a diagnosis, with a separate one of unseen recordings if a fit is far off."""
     if not unseen or error < UNEXPLAINED:
         return found
-    return replace(found, unseen_error=score_of(model, few_rows(unseen)).overall)
+    rows = few_rows(unseen)
+    return replace(found, unseen_error=unexplained_share(model, rows, score_of(model, rows)))
 
 
 def _with_friction(

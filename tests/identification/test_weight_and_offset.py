@@ -5,7 +5,10 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from identification import FrictionLaw, RobotModel
+from identification import Factor, FrictionLaw, Preprocessing, Recording, RobotModel, prepare
+from identification.estimators.prior import body_prior, nominal_ratio, posterior_values
+from identification.hypotheses.diagnosis import UNEXPLAINED, unexplained_share
+from identification.hypotheses.scores import score_of
 from identification.model.motion import Motion
 
 LAW = FrictionLaw(offset=True, third=None)
@@ -68,3 +71,54 @@ def test_the_rotor_inertia_is_separate_without_an_offset() -> None:
         assert changed.with_friction(offset=False, asymmetric=False).parameter_names == (
             lift.parameter_names
         )
+
+
+def recorded(rotor: float) -> tuple[Recording, Motion]:
+    """The described arm with a rotor inertia [kg] on the axis that lifts it, and its motion."""
+    lift = model()
+    time = np.arange(0.0, 10.0, 0.01)
+    angle = np.outer(time, [1.3, 2.1]) + np.array([0.0, 1.0])
+    q = 0.3 * np.sin(angle) + 0.1 * np.sin(2.7 * angle)
+    velocity = np.gradient(q, time, axis=0, edge_order=2)
+    acceleration = np.gradient(velocity, time, axis=0, edge_order=2)
+    motion = Motion.of_states(q, velocity, acceleration)
+    values = np.zeros(lift.n_parameters)
+    values[: lift.base.rank] = lift.base.grouping @ lift.nominal
+    torque = lift.torque(values, motion) + 0.4 * np.sign(velocity)
+    torque[:, 0] += rotor * acceleration[:, 0] + 3.0
+    torque += 0.01 * np.random.default_rng(0).standard_normal(torque.shape)
+    return Recording(time, q, ("z", "turn"), torque), motion
+
+
+def lifted(rotor: float) -> Factor:
+    recording, motion = recorded(rotor)
+    assert recording.torque is not None
+    return Factor.from_samples(model(), motion, recording.torque)
+
+
+@pytest.mark.parametrize("rotor", [0.0, 30.0, 2000.0])
+def test_the_prior_allows_a_rotor_in_the_mass_it_lifts(rotor: float) -> None:
+    """Also one of hundreds of times that mass, as of a spindle; its weight is none."""
+    lift = model()
+    factor = lifted(rotor)
+    prior = body_prior(lift, factor, wide_rotors=True).gaussian
+    values, _ = posterior_values(factor, prior)
+    mass = values[lift.parameter_names.index("m1")]
+    offset = values[lift.parameter_names.index("fo_1")]
+    assert mass == pytest.approx(7.0 + rotor, rel=0.01)
+    assert offset == pytest.approx(3.0 - 9.81 * rotor, rel=0.01, abs=0.5)
+
+
+@pytest.mark.parametrize("rotor", [0.0, 30.0, 2000.0])
+def test_the_nominal_torque_is_compared_without_such_a_rotor(rotor: float) -> None:
+    lift = model()
+    scale, std = nominal_ratio(lift, lifted(rotor))
+    assert scale == pytest.approx(1.0, abs=max(0.02, 3.0 * std))
+
+
+def test_a_torque_that_a_heavy_rotor_explains_is_explained() -> None:
+    """What is believed of the arm does not predict it."""
+    samples = prepare(recorded(2000.0)[0], model(), options=Preprocessing(14.0))
+    score = score_of(model(), samples)
+    assert score.overall > UNEXPLAINED
+    assert unexplained_share(model(), samples, score) < 0.02
