@@ -272,10 +272,10 @@ class _Search:
         examined = []
         for k, each in enumerate(found):
             part = each.change.part
-            if part is None:
-                examined.append(each)
-                continue
             others = changes[:k] + changes[k + 1 :]
+            if part is None:
+                examined.append(self._given(each, others))
+                continue
             self.known = others
             score = self._score(self._before, each.change)
             if len(found) > 1:
@@ -303,6 +303,18 @@ class _Search:
             for each in examined[first:]
             if each.change.part not in (None, part) and each.is_certain
         )
+
+    def _given(self, found: Explanation, others: list[Change]) -> Explanation:
+        """Return what was found throughout, with its size given all others.
+
+        The size of the first is otherwise that without those found later.
+        """
+        is_undone = self.recordings is not self.recorded  # a scale, whose size was found with it
+        if not others or is_undone or found.size is None:
+            return found
+        self.known = others
+        score = self._score(self._before, found.change)
+        return self._resized(found, score.values.mean(axis=0))
 
     def _rivals(self, found: Explanation, score: ColumnScore) -> tuple[tuple[Change, ...], ...]:
         """Return changes that explain a part as well as one, and pairs that explain more.

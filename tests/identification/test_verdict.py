@@ -1099,6 +1099,17 @@ class TestErrorsWithoutCause:
         assert cause.change.meaning == "load friction"
         assert cause.size == pytest.approx(0.2, abs=0.03)
 
+    @pytest.mark.long
+    @pytest.mark.parametrize("factors", [{0: 0.8, 2: 1.3}, {0: 1.3, 1: 0.8}, {1: 1.25, 2: 0.8}])
+    def test_two_constants_have_their_sizes_given_each_other(self, factors):
+        samples = recorded(1)
+        scale = np.array([factors.get(joint, 1.0) for joint in range(6)])
+        found = causes([replace(samples, torque=samples.torque * scale)])
+        assert {each.change.joints[0] for each in found} == {*factors}
+        for each in found:
+            (joint,) = each.change.joints
+            assert abs(1.0 + each.size - factors[joint]) < each.half_interval
+
     def test_an_error_that_no_fault_explains_has_none(self):
         """A spring on one axis that the model lacks."""
         samples = recorded(1)
