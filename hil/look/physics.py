@@ -72,7 +72,12 @@ from identification.estimators.prior import (
     nominal_ratio,
 )
 from identification.factor.factor import Factor
-from identification.hypotheses.diagnosis import RigidTorque, TorqueDiagnosis, rigid_torque
+from identification.hypotheses.diagnosis import (
+    RigidTorque,
+    TorqueDiagnosis,
+    rigid_torque,
+    unexplained_share,
+)
 from identification.hypotheses.inertia_scale import shows_times
 from identification.hypotheses.joint_changes import (
     COUPLED,
@@ -334,7 +339,9 @@ class TorqueFindings:
             rows.append(Row("explanation", Fact.NONE_FITS, Certainty.UNDETERMINED, (beside,)))
         if error > EXPLAINED_ERROR:
             rows = [no_longer_certain(row, StillUnexplained(error)) for row in rows]
-        as_read = ErrorAsRead(error)
+        as_read = ErrorAsRead(
+            unexplained_share(self.readings.model, self.readings.samples, self.readings.score)
+        )
         evidence: tuple[Evidence, ...] = (Basis.FREE_PARAMETERS,)
         if self.no_better is not None:
             evidence = (*evidence, self.no_better)

@@ -51,9 +51,7 @@ ROWS: Final = 700
 """Rows of all recordings in which something other than stated is searched for."""
 # error ratio of a torque without gravity that chance does not make
 _WEIGHTLESS_ERROR_RATIO: Final = 0.7
-_FREE_SHARE: Final = (
-    30.0  # standard deviation of bodies, of their masses, that says hardly anything
-)
+_FREE_SHARE: Final = 30.0  # standard deviation over the masses, of bodies hardly believed
 _MIN_ROWS: Final = 100  # that say something of bodies
 # share of the nominal torque below which the bodies are not the arm's
 _MIN_NOMINAL_SCALE: Final = 1.0 / 3.0
@@ -264,7 +262,7 @@ def torque_of(
         weightless,
         rigid,
         is_backwards=backwards,
-        error=unexplained_share(model, rows, score),
+        error=score.overall,
         keeps_gravity=keeps_gravity,
     )
     if found.rigid.is_nothing:
