@@ -8,7 +8,7 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from typing import Final
 
-from hil.importers.channels import OBJECT, Channel, kind_of
+from hil.importers.channels import DRIVE_OBJECT, Channel, kind_of
 from hil.importers.conclusions import NameBasis
 from hil.importers.name_words import is_commanded_position, kind_by_words
 from hil.importers.stated_units import without_unit
@@ -106,7 +106,7 @@ def grouped(channels: Iterable[Channel], joints: Sequence[str]) -> list[ChannelG
 
 def number_in(name: str) -> re.Match[str] | None:
     """Return where the joint's number is in a name, None if it has none."""
-    return _NUMBER.search(OBJECT.sub(lambda index: "_" * len(index[0]), name))
+    return _NUMBER.search(DRIVE_OBJECT.sub(lambda index: "_" * len(index[0]), name))
 
 
 def _joint_in(name: str, joints: Sequence[str]) -> str | None:

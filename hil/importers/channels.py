@@ -66,9 +66,11 @@ CHANNEL_NAMES: Final[Mapping[Kind, tuple[str, ...]]] = {
     "commanded_position": ("action", "actions", "action.pos", "action.position"),
 }  # fmt: skip
 """Names of channels in the logs of the field, lower case, without number and unit."""
-OBJECT: Final = re.compile(r"(?<![0-9a-z])(?:0x)?(606[4c]|607[78])h?(?![0-9a-z])", re.IGNORECASE)
+DRIVE_OBJECT: Final = re.compile(
+    r"(?<![0-9a-z])(?:0x)?(606[4c]|607[78])h?(?![0-9a-z])", re.IGNORECASE
+)
 """Index of an object of drives (CiA 402) in a name; it is no joint's number."""
-_OF_OBJECT: Final[Mapping[str, Kind]] = {
+_OF_DRIVE_OBJECT: Final[Mapping[str, Kind]] = {
     "6064": "position", "606c": "velocity", "6077": "torque", "6078": "motor_current",
 }  # fmt: skip
 _BY_NAME: Final = {name: kind for kind, names in CHANNEL_NAMES.items() for name in names}
@@ -137,8 +139,8 @@ def kind_of(name: str, unit: str | None = None) -> tuple[Kind | None, int | None
     A name that says nothing is of the quantity of its unit, where only one has it.
     """
     bare = without_unit(name)[0].strip().lower().rsplit("/", 1)[-1]
-    if drive_object := OBJECT.search(bare):
-        bare = OBJECT.sub("", bare)
+    if found := DRIVE_OBJECT.search(bare):
+        bare = DRIVE_OBJECT.sub("", bare)
     match = re.fullmatch(rf"(?P<base>.*?){_NUMBER}(?P<end>\D*)", bare)
     base, number = (
         (bare, None) if match is None else (match["base"] + match["end"], int(match["number"]))
@@ -146,8 +148,8 @@ def kind_of(name: str, unit: str | None = None) -> tuple[Kind | None, int | None
     for candidate in (base, base.strip(" _.-"), base.replace(" ", "_").strip("_")):
         if candidate in _BY_NAME:
             return _BY_NAME[candidate], number
-    if drive_object:
-        return _OF_OBJECT[drive_object[1]], number
+    if found:
+        return _OF_DRIVE_OBJECT[found[1]], number
     kinds: list[Kind] = [
         kind
         for kind in CHANNEL_NAMES

@@ -1,7 +1,7 @@
 """A reading of a recording, and its changes: tried, compared, and adopted where significant.
 
-Changes are fitted to few rows first. Of those of least error the torque of every fifth block is
-predicted from the others, and compared with the reading before, block by block.
+A few rows decide which changes are worth a comparison: each of these predicts every fifth block
+from the other blocks, and its errors are compared with the previous reading's, block by block.
 """
 
 from __future__ import annotations
@@ -238,7 +238,7 @@ class Hypothesis:
 
     def signs_by_joint_fit(self) -> list[Change]:
         """Return the signs of single joints that fit few rows best, with zeros and scales."""
-        few = thinned(self.samples, _FIRST_TRIAL_ROWS)
+        few = self.samples.thinned_to(_FIRST_TRIAL_ROWS)
         free = candidates(self.model, few)
         moved = np.flatnonzero(np.ptp(few.motion.position, axis=0) > 0.0).tolist()
         costs = {}
@@ -264,7 +264,7 @@ class Hypothesis:
         return list({each.changes: each for each in map(fits.with_best_torques, best)}.values())
 
     def _few_row_fits(self) -> FewRowFits:
-        few = thinned(self.samples, _FIRST_TRIAL_ROWS)
+        few = self.samples.thinned_to(_FIRST_TRIAL_ROWS)
         return FewRowFits(self.model, few, self._mountings)
 
     def sign_rivals(self) -> tuple[SignRival, ...]:
@@ -608,8 +608,3 @@ def _apart(angle: float, other: float) -> float:
 def _changes_of(fit: JointFit) -> tuple[Change, ...]:
     zeros = [Change("zero", (joint,), float(fit.zero[joint])) for joint in fit.moved]
     return (*zeros, *(Change("scale", (j,), float(fit.gain[j])) for j in fit.scaled))
-
-
-def thinned(samples: Samples, rows: int) -> Samples:
-    """Return about so many of the rows, evenly."""
-    return samples.thinned(max(1, len(samples.torque) // rows))

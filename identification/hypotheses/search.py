@@ -1,11 +1,10 @@
 """Other readings of a recording: sign, order, unit and zero of its joints, gravity in its torque.
 
-All readings are fitted to few rows first. For those of least error the torque of every fifth block
-is predicted from the others, and the errors are compared block by block. Parameters have the prior
-of :mod:`identification.estimators.prior`, so that geometry alone is enough and masses help where
-they are known. Among readings that predict alike, those in which friction takes energy from every
-joint come first. The best reading is adopted if it is significant, and the search is repeated with
-it.
+Changes are tried and compared by :mod:`identification.hypotheses.hypothesis`. Parameters have the
+prior of :mod:`identification.estimators.prior`, so that geometry alone is enough and masses help
+where they are known. Among readings that predict alike, one in which friction takes energy from
+every joint comes first. The best reading is adopted if it is significant, and the search is
+repeated with it.
 """
 
 from __future__ import annotations
@@ -15,7 +14,7 @@ from dataclasses import replace
 from typing import Final
 
 from identification.hypotheses.gravity_share import has_part_of_gravity
-from identification.hypotheses.hypothesis import SAME_SIZE_TOLERANCE, Hypothesis, thinned
+from identification.hypotheses.hypothesis import SAME_SIZE_TOLERANCE, Hypothesis
 from identification.hypotheses.joint_changes import (
     SIGNS,
     SIZED,
@@ -59,7 +58,7 @@ def find_readings(
         with_nearest: whether to return also what comes nearest to the reading found, and which
             zeros the torque does not show; a quarter of the time where nothing is to be changed.
     """
-    few = thinned(samples, _MAX_ROWS)
+    few = samples.thinned_to(_MAX_ROWS)
     hypothesis = Hypothesis(model, few, mountings or {}, unit_is_open=unit_is_open)
     hypothesis, steps = _searched(hypothesis)
     hypothesis, steps, no_better = _without_chance(hypothesis, steps)
@@ -332,7 +331,7 @@ def _doubted(steps: Sequence[Step], found: Hypothesis) -> list[Step]:
 
 def find_zeros_and_scales(model: RobotModel, samples: Samples) -> Readings:
     """Find zeros and scales of joints that are other than stated, with nothing else changed."""
-    few = thinned(samples, _MAX_ROWS)
+    few = samples.thinned_to(_MAX_ROWS)
     hypothesis = Hypothesis(model, few, {}, unit_is_open=False)
     steps = hypothesis.by_joint_fit(())
     adequacy = hypothesis.adequacy() if steps else Adequacy(1.0, 1.0, agrees=True)

@@ -42,5 +42,5 @@ def _integrated_error(model: RobotModel, samples: Samples, rows: int) -> float:
     steps = np.diff(part.motion.time)[:, None] * (part.torque[1:] + part.torque[:-1]) / 2.0
     torque = np.cumsum(np.concatenate([np.zeros_like(part.torque[:1]), steps]), axis=0)
     integrated = replace(part, torque=np.asarray(torque - torque.mean(axis=0)), parent=None)
-    few = integrated.thinned(max(1, len(torque) // rows))
+    few = integrated.thinned_to(rows)
     return score_of(model.with_friction(offset=True), few).overall

@@ -127,6 +127,10 @@ class Samples:
             parent=None,
         )
 
+    def thinned_to(self, rows: int) -> Samples:
+        """Return at least this many rows where there are, evenly spaced."""
+        return self.thinned(max(1, len(self.torque) // rows))
+
     def moving(self) -> Samples:
         """Return samples with the rows in sliding motion only."""
         return self if self.mask is None else replace(self, usable=self.mask.moving)

@@ -319,7 +319,7 @@ HALF = len(TIME) // 2
 def two_motions(factors: tuple[float, ...] = (1.0, 1.0, 1.0)) -> tuple[Floats, Floats]:
     """Positions and torques of a motion, and of a smaller and faster one in the second half.
 
-    The bodies of the second are those of the description times a factor each.
+    Each `factor` multiplies all parameters of one body, in the second half only.
     """
     later = within(0.5)
     phase = np.cumsum(np.where(later, 1.6, 1.0), axis=0) * TIME[1]
