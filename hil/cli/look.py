@@ -98,11 +98,11 @@ def screen(result: Look) -> list[str]:
     parts: list[Part] = []
     if result.groups:
         parts += ["", *determined(result.groups)]
-    steps = [
-        Paragraph(row_text(row).decide, f"next  {row.aspect}: ", 2)
-        for row in sorted(result.rows, key=lambda row: not row.is_fault)
-        if row.has_step
-    ]
+    deciding = sorted(
+        (row for row in result.rows if row.has_step), key=lambda row: not row.is_fault
+    )
+    named = dict.fromkeys((row.aspect, row_text(row).decide) for row in deciding)
+    steps = [Paragraph(decide, f"next  {aspect}: ", 2) for aspect, decide in named]
     questions = [
         part
         for choices in result.questions

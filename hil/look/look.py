@@ -29,6 +29,7 @@ from hil.importers.required_signals import require_motion
 from hil.importers.units import Kind
 from hil.look import physics, signals
 from hil.look.corrected_map import with_entries
+from hil.look.explanations import explained_rows
 from hil.look.other_arm import Contradictions
 from hil.look.readings import (
     Basis,
@@ -50,6 +51,7 @@ from hil.look.torque_sample import (
 )
 from hil.look.undescribed import undescribed_robot
 from hil.pipeline.sources import Source, cell_of, source_of
+from hil.pipeline.torque_scale import torque_scale
 from identification.errors import IdentificationError
 from identification.estimators.delay import DelayEstimate, estimate_delay
 from identification.hypotheses.diagnosis import UNEXPLAINED, few_rows, torque_of
@@ -207,7 +209,8 @@ def _with_torque(
             physics.no_longer_certain(row, scales) if row.aspect == "angle unit" else row
             for row in of_torque
         ]
-    rows = [*rows, *of_torque, *channel]
+    scale = torque_scale(cell, [recording], simulated=imported.archive.header.only_simulated)
+    rows = [*rows, *of_torque, *explained_rows(finding, scale.std), *channel]
     contradictions = Contradictions.of(
         cell, finding.readings.model, finding.readings.samples, score, score.overall
     )

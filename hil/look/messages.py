@@ -35,6 +35,7 @@ from hil.look.readings import (
     ClockReading,
     ColumnOrder,
     Contradiction,
+    CorrectedError,
     Correlation,
     DelayInterval,
     DelayProblem,
@@ -48,6 +49,7 @@ from hil.look.readings import (
     ExplainedTorque,
     Fact,
     FilterShape,
+    FoundChange,
     FreeFit,
     GravityOption,
     LastBody,
@@ -70,9 +72,11 @@ from hil.look.readings import (
     OtherLengths,
     OtherScales,
     OtherTimes,
+    PartError,
     ReadAsGiven,
     Reading,
     RigidShare,
+    RivalChanges,
     RowsReading,
     Setting,
     SizeRatio,
@@ -95,7 +99,7 @@ from hil.look.readings import (
 )
 from hil.look.result import ChangedReading, Look, Row, TiedReading
 from identification.estimators.delay_messages import undetermined_words
-from identification.hypotheses.joint_changes import COUPLED, ORDERS, Meaning
+from identification.hypotheses.joint_changes import COUPLED, ORDERS, Change, Meaning, Part
 from identification.signals.messages import (
     clock_lines,
     faults_words,
@@ -223,12 +227,27 @@ _STEPS: Final[Mapping[NextStep, str]] = {
     NextStep.RECORD_PAYLOAD: "record with and without it (`hil payload`)",
     NextStep.IMPORT_COMMANDS: "`hil identify` finds their servo and friction",
     NextStep.CHECK_ENCODER: "check encoder and cable, or cut the recording before the jump",
+    NextStep.CHECK_ENCODER_MOUNTING: "check its encoder and the coupling of its gear",
+    NextStep.CUT_THE_RECORDING: (
+        "find out what changed (load, drive settings, temperature); identify each part by itself"
+    ),
     NextStep.RECORD_COMMANDS: (
         "record the commanded positions as well: `hil identify` finds servo and friction by them"
     ),
     NextStep.ASK_FOR_POSITIONS: "ask for the raw encoder positions",
     NextStep.ASK_FOR_UNIT: "ask for the unit of the channel",
     NextStep.ASK_FOR_FILTER: "ask for the filter of the channel",
+}
+_OF_A_PART: Final[Mapping[Meaning, str]] = {
+    "payload": "another load",
+    "scale": "another scale of the torque{}",
+    "friction": "another friction{}",
+    "friction drift": "drifting friction{}",
+    "delay": "another delay{}",
+    "drift": "a drifting zero{}",
+    "load friction": "friction that grows with the load",
+    "arm": "another tool or setting",
+    "unmodelled": "a motion that shows more of what the model lacks",
 }
 _MAX_JUMPS: Final = 3  # that a row names
 _CHANGES: Final[Mapping[Meaning, str]] = {
@@ -350,6 +369,19 @@ def described(change: ArmChange) -> str:
     joints = change.change.joints
     all_of_them = len(joints) == len(change.joints)
     return f"{text}: {'all joints' if all_of_them else ', '.join(_names(change))}"
+
+
+def _of_a_part(change: Change, joints: Sequence[str]) -> str:
+    """Return what may be other in a part, without its size."""
+    names = ", ".join(joints[joint] for joint in change.joints)
+    of_joints = f" of {names}" if names else ""
+    return _OF_A_PART[change.meaning].format(of_joints)
+
+
+def _when(part: Part) -> str:
+    if part.stop is None:
+        return f"from {part.start:.3g} s on" if part.start > 0.0 else "throughout"
+    return f"from {part.start:.3g} to {part.stop:.3g} s"
 
 
 def _exchanged(change: ArmChange) -> str:
@@ -477,6 +509,45 @@ def _(changes: Changes) -> str:
 @_worded.register
 def _(change: ArmChange) -> str:
     return described(change)
+
+
+@_worded.register
+def _(found: FoundChange) -> str:
+    explanation, change = found.explanation, found.explanation.change
+    names = ", ".join(found.joints[joint] for joint in change.joints)
+    size, half = explanation.size, number(explanation.half_interval, 2)
+    when = "" if change.part is None else f" {_when(change.part)}"
+    if size is None or explanation.rivals:
+        return f"{_of_a_part(change, found.joints)}{when}"
+    match change.meaning:
+        case "payload":
+            more = "more" if size > 0.0 else "less"
+            return f"load {number(abs(size))} ± {half} kg {more}{when}"
+        case "drift":
+            return f"zero of {names} drifts by {number(np.degrees(size), 2)} deg"
+        case "scale":
+            return f"torque of {names} {number(1.0 + size)} ± {half} times as large{when}"
+        case _:
+            return f"{change.meaning} of {names} {number(1.0 + size)} ± {half} times{when}"
+
+
+@_worded.register
+def _(error: CorrectedError) -> str:
+    return f"{error.ratio:.2f} × error with it corrected"
+
+
+@_worded.register
+def _(rivals: RivalChanges) -> str:
+    sets = (
+        " with ".join(_of_a_part(change, rivals.joints) for change in each)
+        for each in rivals.changes
+    )
+    return f"or {', or '.join(sets)}"
+
+
+@_worded.register
+def _(error: PartError) -> str:
+    return f"error there still {number(error.ratio, 2)} times that of the rest"
 
 
 @_worded.register

@@ -20,6 +20,7 @@ from hil.importers.conclusions import (
     StatedUnit,
 )
 from identification.estimators.delay import DelayEstimate
+from identification.hypotheses.column_search import Explanation
 from identification.hypotheses.joint_changes import Change
 from identification.signals.position_steps import PositionJump
 from identification.signals.row_faults import RowFault
@@ -160,6 +161,14 @@ class Changes:
 
 
 @dataclass(frozen=True)
+class FoundChange:
+    """What explains the error of the torque, of an arm with these joints."""
+
+    explanation: Explanation
+    joints: tuple[str, ...]
+
+
+@dataclass(frozen=True)
 class ColumnOrder:
     """Joints of the columns of torque and position, where they differ from the URDF."""
 
@@ -246,6 +255,7 @@ Reading = (
     | OutsideLimits
     | SmoothPositions
     | Changes
+    | FoundChange
     | ColumnOrder
     | AngleUnit
     | Mounting
@@ -415,6 +425,28 @@ class ErrorExplained:
 
 
 @dataclass(frozen=True)
+class CorrectedError:
+    """Error of predicted parts with a change corrected, over that without."""
+
+    ratio: float
+
+
+@dataclass(frozen=True)
+class RivalChanges:
+    """Sets of changes that explain a part as well, the best first."""
+
+    changes: tuple[tuple[Change, ...], ...]
+    joints: tuple[str, ...]
+
+
+@dataclass(frozen=True)
+class PartError:
+    """Error of a part over that of the rest, with what was found in it corrected."""
+
+    ratio: float
+
+
+@dataclass(frozen=True)
 class StillUnexplained:
     """Share of the torque that the arm does not explain, for which no row is certain."""
 
@@ -578,6 +610,9 @@ Evidence = (
     | MirrorImage
     | UnseenFriction
     | StillUnexplained
+    | CorrectedError
+    | RivalChanges
+    | PartError
     | ErrorExplained
     | NoBetter
     | OtherScales
@@ -627,6 +662,8 @@ class NextStep(Enum):
     RECORD_PAYLOAD = auto()
     IMPORT_COMMANDS = auto()
     CHECK_ENCODER = auto()
+    CHECK_ENCODER_MOUNTING = auto()
+    CUT_THE_RECORDING = auto()
     RECORD_COMMANDS = auto()
     ASK_FOR_POSITIONS = auto()
     ASK_FOR_UNIT = auto()

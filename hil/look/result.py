@@ -50,6 +50,7 @@ Aspect = Literal[
     "arm",
     "bodies",
     "explanation",
+    "changed part",
 ]
 """What a row is about, as a person and a program read it."""
 

@@ -626,7 +626,8 @@ class _Search:
                     break
                 start, stop = tables.start[first], tables.start[end]
                 name = f"{self.fitted.name_of(k)} from {start:.3g} s to {stop:.3g} s"
-                yield Part(name, tuple(((blocks >= first) & (blocks < end)).tolist()))
+                inside = (blocks >= first) & (blocks < end)
+                yield Part(name, tuple(inside.tolist()), start, stop)
 
     def _later_parts(self) -> Iterator[Part]:
         """Yield the blocks from each time on, in recordings that are not known to be without."""
@@ -641,4 +642,4 @@ class _Search:
             description = f"{name} from {start:.3g} s on" if start > 0.0 else name
             if k < len(self.recordings) - 1:
                 description += " and what follows it"
-            yield Part(description, tuple((np.arange(blocks) >= first).tolist()))
+            yield Part(description, tuple((np.arange(blocks) >= first).tolist()), start)

@@ -51,6 +51,9 @@ ROWS: Final = 700
 """Rows of all recordings in which something other than stated is searched for."""
 # error ratio of a torque without gravity that chance does not make
 _WEIGHTLESS_ERROR_RATIO: Final = 0.7
+MIN_ERROR_GROWTH: Final = 1.25
+"""Error of unseen over the error of fitted motion from which something begins in it."""
+_FITTED_SHARE: Final = 0.7  # of a recording, in whose rest something may begin
 _FREE_SHARE: Final = 30.0  # standard deviation over the masses, of bodies hardly believed
 _MIN_ROWS: Final = 100  # that say something of bodies
 # share of the nominal torque below which the bodies are not the arm's
@@ -348,6 +351,56 @@ def _explained(
     )
 
 
+def explain_errors(
+    model: RobotModel, samples: Samples, scale_std: Array
+) -> tuple[Explanation, ...]:
+    """Return what explains the errors of a fit of one recording, by itself.
+
+    If nothing certain does, what begins in its last part, where a fit of the rest predicts that
+    worse: the time is resolved more finely there.
+
+    Args:
+        model: of the arm.
+        samples: of the recording, prepared.
+        scale_std: relative standard deviation of each joint's torque scale (n,).
+    """
+    fitted, _ = _fit(model, samples, scale_std)
+    found = find_columns(model, [samples], fitted)
+    if found and all(each.is_certain for each in found):
+        return found
+    cut = round(_FITTED_SHARE * len(samples.torque))
+    seen, unseen = samples.between(0, cut), samples.between(cut, len(samples.torque))
+    fitted, error = _fit(model, seen, scale_std)
+    if not _relative_error(Factor.of(model, unseen), fitted.values) > MIN_ERROR_GROWTH * error:
+        return found
+    passed = float(unseen.motion.time[0] - samples.motion.time[0])
+    begun = find_columns_of_unseen(model, [seen], [unseen], fitted)
+    if found and not any(each.is_certain for each in begun):
+        return found
+    return tuple(_later(each, passed) for each in begun)
+
+
+def _fit(model: RobotModel, samples: Samples, scale_std: Array) -> tuple[ExplainedFit, float]:
+    """Return a fit of a recording, and its error as a share of the torque."""
+    factor = Factor.of(model, samples)
+    values, _ = posterior_values(factor, body_prior(model, factor).gaussian, ROWS_PER_FACT)
+    return ExplainedFit(values, scale_std=scale_std), _relative_error(factor, values)
+
+
+def _relative_error(factor: Factor, values: Array) -> float:
+    power = max(float(factor.gram[:, -1, -1].sum()), np.finfo(np.float64).tiny)
+    return float(np.sqrt(factor.squared_errors(values).sum() / power))
+
+
+def _later(found: Explanation, passed: float) -> Explanation:
+    """Return what was found in a part of a recording, of which some time had passed [s]."""
+    part = found.change.part
+    assert part is not None  # which begins in it
+    stop = None if part.stop is None else part.stop + passed
+    part = part._replace(start=part.start + passed, stop=stop)
+    return found._replace(change=found.change._replace(part=part))
+
+
 def rigid_torque(model: RobotModel, samples: Samples) -> RigidTorque:
     """Return the share of the torque that bodies cause."""
     factor = Factor.of(model, samples)
@@ -360,8 +413,7 @@ def rigid_torque(model: RobotModel, samples: Samples) -> RigidTorque:
     rigid, other = np.sqrt(powers)
     over = np.where(rigid > 0.0, rigid / np.where(other > 0.0, other, np.inf), 0.0)
     over = np.where((other == 0.0) & (rigid > 0.0), np.inf, over)
-    power = max(float(factor.gram[:, -1, -1].sum()), np.finfo(np.float64).tiny)
-    error = float(np.sqrt(factor.squared_errors(values).sum() / power))
+    error = _relative_error(factor, values)
     is_little = samples.usable.any(axis=1).sum() < _MIN_ROWS or not powers[1].any()
     if mass_fault(model) is not None or is_little:
         return RigidTorque(np.nan, np.inf, over, error)

@@ -61,6 +61,8 @@ class Part(NamedTuple):
 
     name: str  # such as "A.mcap", or "A.mcap from 3 s on"
     blocks: tuple[bool, ...]  # mask over the blocks (B,)
+    start: float = 0.0  # time since the recording began, in which it begins [s]
+    stop: float | None = None  # the same of its end; None: it lasts
 
 
 class Change(NamedTuple):

@@ -20,6 +20,7 @@ from identification.hypotheses.carried_load import MIN_LOAD_EXPLAINED, CarriedLo
 from identification.hypotheses.column_scores import ScorePrior
 from identification.hypotheses.column_search import ExplainedFit, Explanation
 from identification.hypotheses.diagnosis import (
+    MIN_ERROR_GROWTH,
     UNEXPLAINED,
     TorqueDiagnosis,
     diagnose,
@@ -54,8 +55,6 @@ from identification.validation.prediction import (
 )
 from identification.validation.residuals import ResidualChecks, check_residuals
 
-# error of unseen over that of fitted motion from which something begins in it
-_MIN_ERROR_GROWTH: Final = 1.25
 # Share of the rows in the rarer direction of motion below which friction and offset of a joint are
 # one column: with it their correlation is 0.98.
 _MIN_REVERSE_SHARE: Final = 0.01
@@ -266,7 +265,7 @@ def gather(
     fit = ExplainedFit(values, floor, names, prior, context.scale_std)
     changes = find_changes(model, pooled, training, others, unseen, moved) if others else ()
     is_worse = (
-        error.overall > _MIN_ERROR_GROWTH * fitted.overall
+        error.overall > MIN_ERROR_GROWTH * fitted.overall
         and load.explained < MIN_LOAD_EXPLAINED
         and not changes
     )

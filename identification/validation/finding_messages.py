@@ -257,6 +257,9 @@ _OF_A_PART: Final[Mapping[Meaning, str]] = {
     "scale": "another scale of the torque of {}",
     "friction": "another friction of {}",
     "friction drift": "friction that drifts throughout",
+    "delay": "another delay of {}",
+    "drift": "a drifting zero of {}",
+    "load friction": "friction that grows with the load",
     "arm": "another arm, tool or setting",
     "unmodelled": "another motion, which shows more of what the model lacks",
 }

@@ -17,6 +17,7 @@ from identification.hypotheses.carried_load import CarriedLoad
 from identification.hypotheses.column_scores import ScorePrior
 from identification.hypotheses.column_search import (
     ExplainedFit,
+    Explanation,
     find_columns_of_unseen,
 )
 from identification.hypotheses.diagnosis import diagnose
@@ -469,6 +470,16 @@ class TestJudgement:
         verdict = judged(diagnosis=caused(meaning, 0, 1, part=part))
         (cause,) = (finding for finding in verdict.findings if finding.role == "cause")
         assert not {"{", "}"} & {*cause.words, *cause.next_step} and cause.next_step
+
+    @pytest.mark.parametrize("meaning", ["delay", "drift", "load friction", "scale"])
+    def test_an_uncertain_part_is_named_with_what_is_throughout(self, meaning):
+        throughout = Change(meaning, () if meaning == "load friction" else (1,))
+        load = Change("payload", part=BEGUN)
+        uncertain = Explanation(load, 0.5, rivals=((load,),), others=(throughout,))
+        diagnosis = caused("payload", part=BEGUN)
+        verdict = judged(diagnosis=replace(diagnosis, explanations=(uncertain,)))
+        (cause,) = (finding for finding in verdict.findings if finding.role == "cause")
+        assert "another load with" in cause.words
 
     @pytest.mark.parametrize("error", [0.05, 0.5])
     def test_steps_of_wrong_findings_replace_doubtful_ones(self, error):
