@@ -571,7 +571,9 @@ class TorqueFindings:
             stated = StatedPayload(payload.mass)
             return Row("payload", stated, Certainty.CERTAIN, (Basis.CELL,))
         decider = Decide.RECORD_PAYLOAD
-        last = next((group for group in reversed(groups) if group.quantity == "body"), None)
+        carrier = self.cell.joint_names[self.cell.model.chain.last_joint]
+        bodies = [group for group in groups if group.quantity == "body"]
+        last = next((group for group in bodies if group.body == carrier), None)
         if last is None or not last.identifiable:
             none = (Basis.LAST_BODY_UNDETERMINED,)
             reading = Fact.PAYLOAD_UNDETERMINED

@@ -57,11 +57,13 @@ def weigh_by_model(
         IdentificationError: the recordings do not determine the mass.
     """
     options = options or Options()
-    of_arm = list(archives_in(arm))
+    recorded = list(archives_in(arm))
     paths = list(archives_in(loaded))
+    # What the folder of the arm only predicted may be what is weighed.
+    fitted = [path for path in recorded if open_archive(path).header.purpose != "validation"]
+    of_arm = fitted or recorded
     refuse_duplicates([*of_arm, *paths])
-    fitted = [path for path in of_arm if open_archive(path).header.purpose != "validation"]
-    sources = gather_sources(fitted or of_arm, options.split, in_sample=True)
+    sources = gather_sources(of_arm, options.split, in_sample=True)
     others = gather_sources(paths, options.split, in_sample=True)
     require_one_arm(sources.cell, others.cell, str(arm[0]), paths[0])
     _require_usable(sources.cell.file.robot.payload is not None, "carries a known payload", arm[0])

@@ -335,8 +335,7 @@ def _require_within_reach(estimate: PayloadEstimate, length: float, frame: str) 
 
 def flange_of(model: RobotModel) -> str:
     """Return the flange link: `tool0`, `flange`, or the link of the last joint."""
-    last = {
-        name: pose for name, pose in model.chain.frames.items() if pose.joint == model.n_joints - 1
-    }
+    chain = model.chain
+    last = {name: pose for name, pose in chain.frames.items() if pose.joint == chain.last_joint}
     named = next((name for name in FLANGES if name in last), None)
     return named or min(last, key=lambda name: float(np.abs(last[name].translation).sum()))

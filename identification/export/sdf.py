@@ -14,7 +14,13 @@ from identification.arrays import Array
 from identification.errors import IdentificationError
 from identification.export.exported_arm import ExportedArm
 from identification.export.friction_curve import load_remarks
-from identification.export.urdf import TENSOR, WriteBackError, as_text, comment_text
+from identification.export.urdf import (
+    TENSOR,
+    WriteBackError,
+    as_text,
+    comment_text,
+    gravity_remarks,
+)
 from identification.model.motion import Motion
 from identification.model.pseudo_inertia import body
 
@@ -33,7 +39,7 @@ def sdf(arm: ExportedArm, name: str, remarks: Sequence[str] = ()) -> str:
     model = arm.model
     ranges = arm.ranges
     root = Node("sdf", version="1.9")
-    lines = [*remarks, *load_remarks(model, arm.written_load)]
+    lines = [*remarks, *load_remarks(model, arm.written_load), *gravity_remarks(model)]
     if lines:
         text = "".join(f"  {comment_text(line)}\n" for line in lines)
         root.append(ElementTree.Comment(f"\n{text}"))

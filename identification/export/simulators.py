@@ -19,7 +19,14 @@ from identification.export.actuators import Actuators
 from identification.export.exported_arm import ExportedArm
 from identification.export.friction_curve import load_remarks
 from identification.export.sdf import MissingDrakeError, drake_torque, sdf
-from identification.export.urdf import WriteBackError, as_text, comment_text, rnea, write_urdf
+from identification.export.urdf import (
+    WriteBackError,
+    as_text,
+    comment_text,
+    other_gravity,
+    rnea,
+    write_urdf,
+)
 from identification.model.elements import PlacedElement, TorsionSpring
 from identification.model.friction import (
     COULOMB,
@@ -33,6 +40,7 @@ from identification.model.friction import (
 from identification.model.kinematics import pinocchio_model
 from identification.model.motion import Motion
 from identification.model.regressor import RegressorPlan
+from identification.model.robot import STANDARD_GRAVITY
 
 Node = ElementTree.Element
 
@@ -233,6 +241,7 @@ class ModelFormat(NamedTuple):
     # rotor inertias, inertia and friction of coupled motors, torsion springs, a stated payload
     drives: bool = False
     rotors: bool = False  # rotor inertias alone
+    gravity: bool = False
 
 
 class SimulatorComparison(NamedTuple):
@@ -405,6 +414,9 @@ def _left_out(form: ModelFormat, arm: ExportedArm, motion: Motion) -> dict[str, 
     for name, torque, supported in _parts(form, arm, motion):
         if not supported:
             omitted[name] = omitted.get(name, 0.0) + torque()
+    if not form.gravity and (gravity := other_gravity(arm.model)):
+        usual = RegressorPlan.of_bodies(arm.model.chain, np.array(STANDARD_GRAVITY))
+        omitted[gravity] = rigid_torque(arm, motion) - _link_torque(arm, usual, motion)
     some = motion.rows(slice(None, None, -(-motion.n_samples // _MAX_COMPARED_ROWS)))
     rounded, whole = _rounding(arm, some)
     if np.abs(rounded).max() > AGREEMENT_TOLERANCE * np.abs(whole).max():
@@ -441,8 +453,12 @@ def _supported(form: ModelFormat, arm: ExportedArm, motion: Motion) -> Array:
 def rigid_torque(arm: ExportedArm, motion: Motion) -> Array:
     """Return the torque (m, n) of the links, without the payload."""
     model = arm.model
-    plan = RegressorPlan.of_bodies(model.chain, model.gravity)
-    return plan.torque(arm.standard[model.layout.links].reshape(-1), motion.kinematics())
+    return _link_torque(arm, RegressorPlan.of_bodies(model.chain, model.gravity), motion)
+
+
+def _link_torque(arm: ExportedArm, plan: RegressorPlan, motion: Motion) -> Array:
+    links = arm.standard[arm.model.layout.links]
+    return plan.torque(links.reshape(-1), motion.kinematics())
 
 
 def _friction(
@@ -536,10 +552,13 @@ FORMATS: Final[Mapping[str, ModelFormat]] = {
         _mujoco_torque,
         friction=(COULOMB, TANH, VISCOUS, QUADRATIC, CUBIC),
         drives=True,
+        gravity=True,
     ),
     "urdf": ModelFormat(".urdf", urdf, _pinocchio_torque),
     "sdf": ModelFormat(".sdf", sdf, drake_torque),
-    "pinocchio": ModelFormat(".pinocchio", pinocchio_archive, _archive_torque, rotors=True),
+    "pinocchio": ModelFormat(
+        ".pinocchio", pinocchio_archive, _archive_torque, rotors=True, gravity=True
+    ),
 }
 """Formats by name."""
 

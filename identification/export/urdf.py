@@ -29,7 +29,7 @@ from identification.model.kinematics import (
 from identification.model.motion import Motion
 from identification.model.pseudo_inertia import Body, body, margin
 from identification.model.regressor import RegressorPlan
-from identification.model.robot import RobotModel
+from identification.model.robot import STANDARD_GRAVITY, RobotModel
 from identification.model.urdf_text import urdf_tree
 
 TENSOR: Final = {
@@ -94,6 +94,7 @@ def write_urdf(
         load = np.zeros(model.n_joints) if load is None else load
         terms = [*equivalent_coulomb(model, friction, load)][: model.n_joints]
         remarks = (*remarks, *load_remarks(model, load))
+    remarks = (*remarks, *gravity_remarks(model))
     dynamics = [
         {
             attribute: values[symbol]
@@ -136,6 +137,19 @@ def joined_text(urdf: str, root: Element, remarks: Sequence[str] = ()) -> str:
     return prolog[0] + comment + text + epilog
 
 
+def other_gravity(model: RobotModel) -> str:
+    """Return a description of a gravity that simulators do not assume, empty if they do."""
+    if np.array_equal(model.gravity, STANDARD_GRAVITY):
+        return ""
+    x, y, z = model.gravity
+    return f"gravity of {x:.4g}, {y:.4g}, {z:.4g} m/s² in base axes, which the simulator must have"
+
+
+def gravity_remarks(model: RobotModel) -> tuple[str, ...]:
+    """Return remarks for a file that has no gravity; none if it is the usual one."""
+    return (f"Identified with a {gravity}.",) if (gravity := other_gravity(model)) else ()
+
+
 def not_in_urdf(model: RobotModel) -> tuple[str, ...]:
     """Return descriptions of the model's parameters that a URDF cannot represent."""
     absent = {
@@ -145,6 +159,7 @@ def not_in_urdf(model: RobotModel) -> tuple[str, ...]:
         "friction of coupled motors": bool(model.friction.motors),
         "the payload": model.payload is not None,
         "springs and balancers": bool(model.elements.elements),
+        **({gravity: True} if (gravity := other_gravity(model)) else {}),
     }
     return tuple(description for description, present in absent.items() if present)
 

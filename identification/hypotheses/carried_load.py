@@ -59,7 +59,7 @@ def find_load(
     fits = fitted.samples >= _MIN_ROWS
     weights = np.where(fits, predicted.samples / np.maximum(usual, floor), 0.0)
     before = unseen.squared_errors(values)
-    last = model.layout.links[-1]
+    last = model.layout.links[model.chain.last_joint]
     # Columns [last link | residual].
     change = np.zeros((unseen.n_parameters + 1, len(last) + 1))
     change[last, range(len(last))] = 1.0

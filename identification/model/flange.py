@@ -19,9 +19,9 @@ class FlangeMotion(NamedTuple):
 
 def flange_name(chain: Chain) -> str:
     """Return the link's name, or without a link of its own the last joint's."""
-    last = chain.n_joints - 1
+    last = chain.last_joint
     names = [name for name, frame in chain.frames.items() if frame.joint == last]
-    return names[-1] if names else chain.joint_names[-1]
+    return names[-1] if names else chain.joint_names[last]
 
 
 def flange_motion(chain: Chain, position: Array) -> FlangeMotion:
@@ -31,7 +31,7 @@ def flange_motion(chain: Chain, position: Array) -> FlangeMotion:
     origin = np.zeros((count, 3))
     axes = np.zeros((n, count, 3))
     origins = np.zeros((n, count, 3))
-    moving = chain.ancestors(n - 1)
+    moving = chain.ancestors(chain.last_joint)
     for joint in moving:
         axis = chain.axis[joint]
         origin = origin + rotation @ chain.translation[joint]

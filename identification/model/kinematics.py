@@ -130,6 +130,15 @@ class Chain:
         """Number n of joints."""
         return len(self.joint_names)
 
+    @property
+    def last_joint(self) -> int:
+        """Index of the joint that carries flange and payload: the last one of the longest arm.
+
+        Wheels and heads of a mobile robot hang on fewer joints than its flange. Of arms of equal
+        length, it is the last joint of the last arm.
+        """
+        return max(range(self.n_joints), key=lambda joint: (len(self.ancestors(joint)), joint))
+
     def frame(self, name: str | None) -> LinkFrame:
         """Return the frame of a moving link, by default the last joint's.
 
@@ -137,7 +146,7 @@ class Chain:
             ModelError: the description has no such link, or it is fixed to the base.
         """
         if name is None:
-            return LinkFrame(self.n_joints - 1, np.eye(3), np.zeros(3))
+            return LinkFrame(self.last_joint, np.eye(3), np.zeros(3))
         if name not in self.frames:
             raise ModelError(
                 f"the payload's frame {name!r} is not a link of the robot description; its links"

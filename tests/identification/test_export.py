@@ -33,6 +33,7 @@ from identification.export.simulators import (
     compare,
     mjcf,
     random_states,
+    rigid_torque,
 )
 from identification.export.urdf import NotConsistentError, WriteBackError, not_in_urdf, write_urdf
 from identification.factor.estimate import estimate
@@ -675,9 +676,31 @@ class TestReadBack:
         assert left >= everywhere
         expected = {"mjcf": set(), "pinocchio": rotors - {"rotor inertias"}}
         assert left & rotors == expected.get(form, rotors)
+        gravity = "gravity of 0, 3, -9 m/s² in base axes, which the simulator must have"
+        assert (gravity in left) == (form in ("urdf", "sdf"))
         assert ("the payload" in left) == (form != "mjcf")
         assert ("TorsionSpring of joint_2" in left) == (form != "mjcf")
         assert ("a term f2 with the speed squared" in left) == (form != "mjcf")
+
+    def test_what_gravity_adds_is_that_of_the_simulator(self):
+        """By pinocchio, the written file lacks the torque that is listed; its header says so."""
+        arm = an_arm(urdf_text(), gravity=(0.0, -4.9, -8.5))
+        text = FORMATS["urdf"].write(arm, "arm", [])
+        assert "Identified with a gravity of 0, -4.9, -8.5 m/s²" in text
+        motion = random_states(arm, 20)
+        model = pin.buildModelFromXML(text)
+        model.armature[:] = 0.0
+        loaded = np.array([pin.rnea(model, model.createData(), *at) for at in motion.states()])
+        lacks = np.sqrt(np.mean((rigid_torque(arm, motion) - loaded) ** 2, axis=0))
+        left = compare(text, FORMATS["urdf"], arm, motion).left_out
+        (listed,) = [torque for name, torque in left.items() if name.startswith("gravity")]
+        assert lacks.max() > 1.0
+        np.testing.assert_allclose(listed, lacks, atol=1e-9)
+
+    def test_the_usual_gravity_is_not_mentioned(self):
+        arm = an_arm(urdf_text())
+        assert "gravity" not in FORMATS["urdf"].write(arm, "arm", [])
+        assert not any("gravity" in name for name in compared("urdf", arm).left_out)
 
     @FORMS
     def test_a_changed_text_is_refused(self, form):

@@ -7,12 +7,16 @@ import numpy as np
 import pinocchio as pin
 import pytest
 
+from hil.payload.payload_run import flange_of
 from identification.arrays import Array
+from identification.factor.columns import standard_factor
 from identification.factor.estimate import Estimate
 from identification.factor.estimation_method import EstimationMethod
+from identification.hypotheses.carried_load import find_load
 from identification.model.flange import flange_motion, flange_name
 from identification.model.friction import FrictionLaw
 from identification.model.kinematics import chain_from_urdf, pinocchio_model
+from identification.model.known_payload import Load, Payload
 from identification.model.motion import Motion
 from identification.model.robot import RobotModel
 from identification.purposes.contact import contact, seen_force, seen_mass
@@ -88,6 +92,50 @@ def test_the_flange_moves_as_pinocchio_says(seed: int) -> None:
         pin.framesForwardKinematics(model, data, at)
         np.testing.assert_allclose(position, data.oMf[frame].translation, atol=1e-12)
         np.testing.assert_allclose(jacobian, expected, atol=1e-12)
+
+
+WHEELS = "".join(
+    f"""<link name="{name}"><inertial><mass value="1"/>
+      <inertia ixx="0.01" ixy="0" ixz="0" iyy="0.01" iyz="0" izz="0.01"/></inertial></link>
+    <joint name="{name}_joint" type="continuous"><parent link="base"/><child link="{name}"/>
+      <axis xyz="0 1 0"/></joint>"""
+    for name in ("wheel_left", "wheel_right")
+)
+MOBILE = RobotModel.from_urdf(
+    URDF.replace("</robot>", f"{WHEELS}</robot>"), friction=FrictionLaw(third=None)
+)
+
+
+def test_a_wheel_is_no_flange() -> None:
+    """Of a mobile robot, flange and payload are at the end of its arm, in any order of names."""
+    chain = MOBILE.chain
+    assert chain.joint_names[-1].startswith("wheel")
+    assert flange_name(chain) == "lower"
+    assert flange_of(MOBILE) == "lower"
+    assert chain.joint_names[chain.frame(None).joint] == "elbow"
+    arm = flange_motion(MODEL.chain, POSTURES)
+    turned = np.pad(POSTURES, ((0, 0), (0, 2)), constant_values=0.7)
+    robot = flange_motion(chain, turned)
+    np.testing.assert_allclose(robot.position, arm.position)
+    np.testing.assert_allclose(robot.jacobian[..., :2], arm.jacobian)
+    assert not robot.jacobian[..., 2:].any()
+
+
+def test_the_load_on_unseen_motion_hangs_on_the_arm() -> None:
+    """A mobile robot's arm carries it, not one of its wheels."""
+    motions = [four_sines(np.arange(0.0, 10.0, 0.005), n=4, seed=seed) for seed in (1, 2)]
+    values = MOBILE.base.grouping @ MOBILE.nominal
+    values = np.concatenate([values, np.full(MOBILE.n_parameters - len(values), 1.0)])
+    carried = Load(MOBILE.chain, MOBILE.gravity, Payload(2.0, (0.1, 0.0, 0.3)))
+    free, loaded = (
+        simulated(MOBILE, values, motion, noise=np.full(4, 0.05), seed=seed)
+        for seed, motion in enumerate(motions)
+    )
+    loaded = replace(loaded, torque=loaded.torque + carried.torque(loaded.motion))
+    factors = [standard_factor(MOBILE, [samples]) for samples in (free, loaded)]
+    load = find_load(MOBILE, [free], [loaded], *factors)
+    assert load.explained > 0.99
+    assert load.mass == pytest.approx(2.0, rel=0.02)
 
 
 # Gravity
@@ -229,8 +277,6 @@ def test_a_mass_above_the_smallest_is_seen_and_one_below_is_not() -> None:
     quiet_parts = slow_residuals(MODEL, truth(), [quiet(60.0, 1)])
     mass = seen_mass(MODEL, quiet_parts)
     assert mass is not None
-    from identification.model.known_payload import Load, Payload
-
     load = Load(
         MODEL.chain, MODEL.gravity, Payload(1.0, (0.0, 0.0, 0.0), frame=flange_name(MODEL.chain))
     )

@@ -153,7 +153,7 @@ def control_tables(arm: ExportedArm) -> ControlTables:
         motor_turns=model.friction.motor_speeds(),
         elements=tuple(_elements(model, arm.values)),
         gravity=model.gravity,
-        payload_frame=frame_name or f"joint {model.joint_names[-1]}",
+        payload_frame=frame_name or f"joint {model.joint_names[chain.last_joint]}",
         payload_joint=frame.joint,
         payload_rotation=frame.rotation,
         payload_origin=frame.translation,
