@@ -16,6 +16,7 @@ from hil.archive import open_archive
 from hil.importers.column_map import ColumnMap
 from hil.importers.imported_robot import Robot
 from hil.importers.log import import_log
+from hil.importers.recording_content import Use
 from identification import FrictionLaw, RobotModel
 
 Array = NDArray[np.float64]
@@ -178,6 +179,7 @@ def archive_of(
     urdf: Path,
     entries: Mapping[str, object] | None = None,
     law: FrictionLaw | None = None,
+    use: Use = "excitation",
     **arrays: Array,
 ) -> Path:
     """Import arrays into an archive, by default time t, positions q and torques tau."""
@@ -185,7 +187,8 @@ def archive_of(
     np.savez(table, **arrays)  # type: ignore[arg-type]
     usual = {"time": {"column": "t"}, "position": {"columns": "q"}, "torque": {"columns": "tau"}}
     columns = ColumnMap.model_validate(entries or usual)
-    return import_log(table, path, robot=Robot.from_urdf(urdf, friction=law), columns=columns)
+    robot = Robot.from_urdf(urdf, friction=law)
+    return import_log(table, path, robot=robot, columns=columns, use=use)
 
 
 def imported(source: Path, robot: Robot, **entries: object) -> dict[str, Any]:

@@ -165,6 +165,20 @@ class TestByModel:
         ]
         assert widths[0] > 0.5 * widths[1]
 
+    def test_a_recording_that_the_arm_only_predicted_is_weighed(self, tmp_path: Path) -> None:
+        """`hil identify A --predict B` puts both into one folder."""
+        bare = simulate("ur5_robot.urdf", np.arange(0.0, 20.0, 8e-3), seed=11)
+        archived(tmp_path / "bare.mcap", bare)
+        load = pin.Inertia(MASS, CENTRE, TENSOR)
+        full = simulate("ur5_robot.urdf", np.arange(0.0, 12.0, 8e-3), seed=2, load=load)
+        arrays = {"t": full.time, "q": full.position, "tau": full.torque}
+        archive_of(tmp_path / "full.mcap", full.urdf, law=LAW, use="validation", **arrays)
+        status, text = run(tmp_path, "--model", str(tmp_path), "full.mcap", "--json")
+        assert status == 0
+        weighed = json.loads(text)
+        assert weighed["figures"]["mass"]["value"] == pytest.approx(MASS, rel=0.02)
+        assert weighed["loaded"] == ["full.mcap"]
+
     def test_another_arm_and_nothing_carried_are_refused(self, folder: Path, arm: Path) -> None:
         with pytest.raises(InputError, match=r"empty\.mcap: shows no payload|does not separate"):
             run(folder, "--model", str(arm), "empty.mcap")
