@@ -37,7 +37,7 @@ def torque_constants(
     loaded: list[Path] | None = None,
     mass: float | None = None,
     centre: str | None = None,
-    inertia: str = "0,0,0,0,0,0",
+    inertia: str | None = None,
     frame: str | None = None,
     delay: Annotated[str, typer.Option(metavar="SECONDS")] = "stated",
     quiet: QuietOption = False,
@@ -58,7 +58,7 @@ def torque_constants(
         centre: Its centre of mass in the frame, x,y,z in m. Default: the origin of the frame;
             if the centre is elsewhere, the constants are wrong.
         inertia: Its inertia tensor about the centre of mass, xx,xy,xz,yy,yz,zz in kg·m² in the axes
-            of the frame.
+            of the frame. Default: estimated too.
         frame: URDF link of that frame. Default: the link of the last joint.
         delay: Delay of the current relative to the position, s. Default: as in the cell.
     """
@@ -69,12 +69,14 @@ def torque_constants(
         raise InputError(twice.pop(), "is listed twice", remedy="give it with or without load")
     if mass is not None and not loaded:
         raise _refusal("--mass", "has no recording with this payload", "add --loaded")
-    payload = _payload(mass, centre or "0,0,0", inertia, frame) if loaded else None
+    tensor = inertia or "0,0,0,0,0,0"
+    payload = _payload(mass, centre or "0,0,0", tensor, frame) if loaded else None
     carried = {path: payload for path in full if payload is not None}
     lag = delay_from(delay)
     if lag == "auto":
         raise _refusal("--delay", "cannot be estimated from currents", "give seconds")
-    result = find_gains(bare, carried, make_reporter(quiet=quiet or json), delay=lag)
+    reporter = make_reporter(quiet=quiet or json)
+    result = find_gains(bare, carried, reporter, delay=lag, unknown_inertia=inertia is None)
     assumed = None if centre or not loaded else assumption(frame)
     if json:
         print_json(as_dict(result) | {"assumed": assumed})

@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Literal, NamedTuple
+from typing import Final, Literal, NamedTuple
 
 import numpy as np
 
@@ -31,6 +32,8 @@ from .other_meanings import other_meanings
 from .prepared import motor_from_joint, samples_of, stated_settings
 from .sources import Source, aligned, cell_of, source_of
 
+_MIN_REACH: Final = 0.1  # m, of a body whose centre is at the flange
+
 
 @dataclass(frozen=True, eq=False)
 class GainsFound:
@@ -49,6 +52,7 @@ def find_gains(
     reporter: Reporter,
     *,
     delay: float | Literal["stated"] | None = "stated",
+    unknown_inertia: bool = False,
 ) -> GainsFound:
     """Identify the torque constant of every motor.
 
@@ -57,6 +61,8 @@ def find_gains(
         loaded: archives with another payload than that of their cell.
         reporter: of progress.
         delay: of currents behind positions [s]; "stated" uses the cell's.
+        unknown_inertia: whether the moments of inertia of `loaded` are estimated too; not if a
+            cell states another payload.
 
     Raises:
         InputError: an archive cannot be used, or not with the others; no archive has a payload.
@@ -103,7 +109,11 @@ def find_gains(
             task.advance(1, path.name)
     _require_load(loads.values())
     prepared = _prepared([*zip(sources, cells, lags, carried, strict=True)], model)
-    gains = identify_gains(model, _reduced(prepared, model, turns, reporter))
+    unknown = [load for load in loaded.values() if load is not None]
+    if not unknown_inertia or any(cell.model.payload is not None for cell in cells):
+        unknown = []
+    factors = _reduced(prepared, model, turns, reporter, unknown_inertia=bool(unknown))
+    gains = identify_gains(model, factors, max(map(_inertia_std, unknown), default=np.inf))
     has_gears = not np.array_equal(turns, np.eye(len(turns)))
     otherwise = _otherwise(prepared, model, turns, gains, sources)
     return GainsFound(gains, loads, has_gears, tuple(model.joint_names), otherwise)
@@ -136,8 +146,22 @@ def _prepared(
     return prepared
 
 
+def _inertia_std(load: Payload) -> float:
+    """Return the prior standard deviation of each moment of inertia of a load [kg·m²].
+
+    A body seldom extends further about its centre than from there to the flange.
+    """
+    reach = max(math.hypot(*load.centre), _MIN_REACH)
+    return load.mass * reach**2
+
+
 def _reduced(
-    prepared: Sequence[_Prepared], model: RobotModel, turns: Array, reporter: Reporter
+    prepared: Sequence[_Prepared],
+    model: RobotModel,
+    turns: Array,
+    reporter: Reporter,
+    *,
+    unknown_inertia: bool,
 ) -> list[Factor]:
     """Return the factor of each recording, in equal blocks of time."""
     longest = max(float(np.ptp(each.samples.motion.time)) for each in prepared)
@@ -146,7 +170,15 @@ def _reduced(
     with reporter.task("reducing recordings", len(prepared)) as task:
         for samples, current, load, name in prepared:
             factors.append(
-                gain_factor(model, samples, current, payload=load, transmission=turns, block=block)
+                gain_factor(
+                    model,
+                    samples,
+                    current,
+                    payload=load,
+                    unknown_inertia=unknown_inertia,
+                    transmission=turns,
+                    block=block,
+                )
             )
             task.advance(1, name)
     return factors

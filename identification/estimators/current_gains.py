@@ -2,7 +2,7 @@ r"""Current-to-torque gains of all drives, from a payload of known torque.
 
 Weighted least squares of the measured currents on one
 :func:`identification.factor.columns.gain_factor` for each recording k (after Gautier and Briot
-2014),
+2014, Wπ with the payload's moments of inertia if these are unknown),
 
 .. math:: i_m = \kappa_m \bigl(W_m \pi + \varphi_{km} f_m + \delta_{km} + t_m\bigr) + e_m, \qquad
           \kappa_m = 1 / K_m, \quad f_m = W_{m,f} \pi_f
@@ -87,10 +87,15 @@ class Gains:
         return np.asarray(self.std / np.abs(self.values))
 
 
-def identify_gains(model: RobotModel, factors: Sequence[Factor]) -> Gains:
+def identify_gains(
+    model: RobotModel, factors: Sequence[Factor], inertia_std: float = np.inf
+) -> Gains:
     """Estimate gains of motors (n,), from recordings with a known payload and with another or none.
 
-    `factors` are their :func:`identification.factor.columns.gain_factor`, with equal blocks.
+    Args:
+        model: of the arm.
+        factors: their :func:`identification.factor.columns.gain_factor`, with equal blocks.
+        inertia_std: prior standard deviation of moments of inertia that are unknown [kg·m²].
 
     Raises:
         IdentificationError: no usable row, or no recording with a payload.
@@ -98,7 +103,7 @@ def identify_gains(model: RobotModel, factors: Sequence[Factor]) -> Gains:
     runs = [np.stack(factor.matrices, axis=1) for factor in factors]
     totals = np.stack([run.sum(axis=0) for run in runs])
     rows = np.sum([factor.samples for factor in factors], axis=0)
-    p = model.n_parameters
+    p = totals.shape[-1] - 3
     if not rows.any():
         raise IdentificationError("no usable sample to identify gains from")
     total = totals.sum(axis=0)
@@ -106,7 +111,9 @@ def identify_gains(model: RobotModel, factors: Sequence[Factor]) -> Gains:
         raise IdentificationError(
             "no recording has a known payload, so gains and parameters have no scale"
         )
-    layout = _Layout(p, model.n_joints, len(runs), model.friction_columns)
+    moments = p - model.n_parameters
+    friction = np.pad(model.friction_columns, (0, moments))
+    layout = _Layout(p, model.n_joints, len(runs), friction, moments, inertia_std)
     noise, inverses = _motor_by_motor(total, rows)
     unknowns, _ = _gauss_newton(layout, totals, noise, inverses)
     level = _offset_variance(layout, totals, unknowns, rows)
@@ -133,6 +140,8 @@ class _Layout(NamedTuple):
     n: int
     runs: int
     friction: NDArray[np.bool_]  # which parameters are friction (p,)
+    moments: int  # unknown moments of inertia of the payload, the last parameters
+    inertia_std: float  # their prior standard deviation [kg·m²]
 
     @property
     def size(self) -> int:
@@ -151,6 +160,7 @@ class _Layout(NamedTuple):
     def prior(self, offset_variance: Array) -> Array:
         """Return the information on each unknown, by the variance of offsets (n,)."""
         prior = np.zeros(self.size)
+        prior[self.p - self.moments : self.p] = 1.0 / self.inertia_std**2
         prior[self.drifts[0]] = np.divide(
             1.0, offset_variance, out=np.zeros(self.n), where=offset_variance > 0.0
         )

@@ -1,7 +1,7 @@
 """Factors of other columns than the regressor's W.
 
-Instrumental variables use [Z | W | y], gains [W | t | 1 | i], a search for the direction of gravity
-[W0 | Wx | Wy | Wz | y], uncertain friction laws [W | F | y].
+Instrumental variables use [Z | W | y], gains [W | L | t | 1 | i], a search for the direction of
+gravity [W0 | Wx | Wy | Wz | y], uncertain friction laws [W | F | y].
 """
 
 from __future__ import annotations
@@ -19,6 +19,7 @@ from identification.factor.factor import Factor, time_blocks
 from identification.factor.rows import augmented_rows
 from identification.model.friction import FrictionTerm
 from identification.model.known_payload import Load, Payload
+from identification.model.link_wrenches import LINK_SYMBOLS, N_INERTIA
 from identification.model.motion import Motion
 from identification.model.regressor import RegressorPlan
 from identification.model.robot import RobotModel
@@ -71,18 +72,21 @@ def gain_factor(
     motor_current: Array,
     *,
     payload: Payload | None = None,
+    unknown_inertia: bool = False,
     transmission: Array | None = None,
     block: float = FINE_BLOCK,
 ) -> Factor:
-    """Reduce a recording to blocks of [W | t | 1 | i], one Gram matrix for each motor.
+    """Reduce a recording to blocks of [W | L | t | 1 | i], one Gram matrix for each motor.
 
-    A motor's current counts if the rows of all its joints do; t is the payload torque.
+    A motor's current counts if the rows of all its joints do; t is the payload torque, L has no
+    columns, or six of additional moments of inertia of the payload.
 
     Args:
         model: of the arm.
         samples: of the recording.
         motor_current: (m, n) [A].
         payload: that the arm carries.
+        unknown_inertia: whether L has six columns, zero without payload.
         transmission: motor angles per joint angle (n, n); identity: gains include gear ratios.
         block: duration of blocks, which count from the origin of the motion [s].
     """
@@ -92,23 +96,30 @@ def gain_factor(
     turns = np.eye(n) if transmission is None else np.asarray(transmission, dtype=np.float64)
     blocks, columns = samples.regressor(model)
     load = model.elements.known_torque(samples.motion.position)
+    moments = [np.zeros((m, N_INERTIA if unknown_inertia else 0))] * n
     if payload is not None:
-        load = load + Load(model.chain, model.gravity, payload).torque(samples.motion)
+        carried = Load(model.chain, model.gravity, payload)
+        load = load + carried.torque(samples.motion)
+        if unknown_inertia:
+            moments = [*carried.moment_columns(samples.motion)]
+    width = p + moments[0].shape[1]
     since = samples.motion.time - samples.origin
     index = np.maximum(np.floor(since / block + 1e-9).astype(np.intp), 0)
     usable = np.zeros((m, n), dtype=np.bool_)
-    tables = np.zeros((n, p + 3, m))
+    tables = np.zeros((n, width + 3, m))
     for motor, share in enumerate(np.linalg.inv(turns).T):
         acting = np.flatnonzero(share).tolist()
         usable[:, motor] = samples.usable[:, acting].all(axis=1)
         for joint in acting:
             tables[motor, columns[joint]] += share[joint] * blocks[joint].T
-            tables[motor, p] += share[joint] * samples.as_measured(joint, load[:, [joint]])[:, 0]
-        tables[motor, p + 1] = 1.0
-        tables[motor, p + 2] = motor_current[:, motor]
+            known = np.column_stack([moments[joint], load[:, joint]])
+            tables[motor, p : width + 1] += share[joint] * samples.as_measured(joint, known).T
+        tables[motor, width + 1] = 1.0
+        tables[motor, width + 2] = motor_current[:, motor]
         tables[motor][:, ~usable[:, motor]] = 0.0
-    names = (*model.parameter_names, "torque of the payload", "offset")
-    every = (np.arange(p + 2),) * n
+    symbols = LINK_SYMBOLS[: width - p]
+    names = (*model.parameter_names, *symbols, "torque of the payload", "offset")
+    every = (np.arange(width + 2),) * n
     return Factor.of_rows([(index, tables)], count_by_block(index, usable), every, names)
 
 

@@ -9,6 +9,7 @@ import numpy as np
 from identification.arrays import Array
 from identification.errors import ModelError
 from identification.model.kinematics import Chain
+from identification.model.link_wrenches import N_INERTIA, N_LINK
 from identification.model.motion import Motion
 from identification.model.pseudo_inertia import Body, inertial_parameters, tensors
 from identification.model.regressor import RegressorPlan
@@ -93,3 +94,17 @@ class Load:
             ShapeError: a motion of another arm.
         """
         return self._plan.torque(self.parameters, motion.checked(self._plan.chain.n_joints))
+
+    def moment_columns(self, motion: Motion) -> tuple[Array, ...]:
+        """Return the torque of each joint (m, 6) per moment of inertia [N·m or N per kg·m²].
+
+        Moments in the axes of the joint that carries it, in the order of `LINK_SYMBOLS`.
+
+        Raises:
+            ShapeError: a motion of another arm.
+        """
+        blocks, columns = self._plan.evaluate(motion.checked(self._plan.chain.n_joints))
+        full = [np.zeros((motion.n_samples, N_LINK)) for _ in blocks]
+        for target, block, present in zip(full, blocks, columns, strict=True):
+            target[:, present] = block
+        return tuple(target[:, :N_INERTIA] for target in full)
