@@ -15,6 +15,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+import tomlkit
 from numpy.typing import NDArray
 from typer.testing import CliRunner
 
@@ -123,6 +124,13 @@ def to_the_ground(table: Mapping[str, Floats]) -> dict[str, Floats]:
     matrix = np.eye(3)
     matrix[1, 0] = 1.0
     return {"q": table["q"] @ matrix.T, "v": table["v"] @ matrix.T}
+
+
+def by_rods(table: Mapping[str, Floats]) -> dict[str, Floats]:
+    """Rods drive the second joint from the base: torques belong to the coupled angles."""
+    matrix = np.eye(3)
+    matrix[1, 0] = 1.0
+    return to_the_ground(table) | {"tau": table["tau"] @ np.linalg.inv(matrix)}
 
 
 def late(table: Mapping[str, Floats]) -> dict[str, Floats]:
@@ -332,6 +340,29 @@ class TestConclusions:
         assert order in " ".join(result.output.split())
         text = (tmp_path / "a" / "map.toml").read_text()
         assert 'columns = ["tau2", "tau1", "tau3"]' in text
+
+    def test_rods_that_drive_a_joint_can_be_stated(
+        self, tmp_path: Path, urdf: Path, table: Mapping[str, Floats]
+    ) -> None:
+        """The lines of docs/logs.md for a parallelogram give joint angles and joint torques."""
+        path = tmp_path / "a.csv"
+        write_log(path, ["t", "q{}", "v{}", "tau{}"], *{**table, **by_rods(table)}.values())
+        motor = {"side": "motor"}
+        columns = {
+            "time": {"column": "t"},
+            "position": {"columns": "q{}", **motor},
+            "velocity": {"columns": "v{}", **motor},
+            "torque": {"columns": "tau{}", **motor},
+            "drive": {"gear_ratio": [1.0, 1.0, 1.0], "coupling": [[2, 1, 1.0]]},
+        }
+        stated = tmp_path / "map.toml"
+        stated.write_text(tomlkit.dumps(columns))
+        archive = tmp_path / "a.mcap"
+        done = hil("import", "log", path, "--urdf", urdf, "--map", stated, "-o", archive)
+        assert done.exit_code == 0, done.exception
+        read = open_archive(archive).columns
+        assert read["position"] == near(table["q"], abs=1e-7)
+        assert read["torque"] == near(table["tau"], abs=1e-4)
 
     @pytest.mark.long
     def test_a_coupled_angle_is_its_own_in_the_archive(
