@@ -34,6 +34,7 @@ CHOICES: Final[Mapping[str, tuple[str, ...]]] = {
     "strength": (names.STRENGTH,),
     "consistency": (names.CONSISTENT,),
     "springs": (names.SPRINGS,),
+    "position torque": (names.POSITION_TORQUE,),
 }
 """Names of the decisions of each choice; none of a chosen bandwidth averaged with the usual one."""
 

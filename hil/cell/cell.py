@@ -29,6 +29,7 @@ from planner.limits import JointLimits
 from .errors import CellError, first_error, require_known
 from .robot_model import robot_model
 from .schema import (
+    COMMON_FRICTION_ENTRIES,
     LINKS,
     CampaignTable,
     CellFile,
@@ -141,7 +142,7 @@ class Cell:
         common = FrictionTable.model_validate(dict(laws[0]))
         joints = {
             name: JointFrictionTable.model_validate(
-                {k: v for k, v in law.items() if k not in ("ripple", "springs")}
+                {k: v for k, v in law.items() if k not in COMMON_FRICTION_ENTRIES}
             )
             for name, law in tables.items()
         }

@@ -21,6 +21,7 @@ from identification.model.elements import (
     ExtensionSpring,
     GasCylinder,
     JointElements,
+    PositionTorque,
     TorqueRipple,
     TorsionSpring,
 )
@@ -31,6 +32,7 @@ from identification.model.robot import RobotModel
 
 from .errors import CellError
 from .schema import (
+    COMMON_FRICTION_ENTRIES,
     CouplingTable,
     ElementTable,
     ExtensionSpringTable,
@@ -74,6 +76,8 @@ def robot_model(
         elements += ripples(chain.joint_names, drive_train(), friction.ripple)
     _require(path, "robot.friction.springs", friction.springs, chain.joint_names)
     elements += springs(friction.springs)
+    _require(path, "robot.friction.position_torque", friction.position_torque, chain.joint_names)
+    elements += map(PositionTorque, friction.position_torque)
     laws = {}
     for name, joint_table in friction.joints.items():
         table = friction.model_copy(update=joint_table.model_dump(exclude_unset=True))
@@ -101,7 +105,7 @@ def ripples(
 ) -> list[TorqueRipple]:
     """Return the torque ripple of geared joints; of others it resembles gravity."""
     return [
-        TorqueRipple(name, tuple(zip(joints, row, strict=True)), tuple(orders))
+        TorqueRipple(name, tuple(orders), tuple(zip(joints, row, strict=True)))
         for k, (name, row) in enumerate(zip(joints, motor_from_joint.tolist(), strict=True))
         if abs(row[k]) >= _MIN_GEAR_RATIO
     ]
@@ -114,7 +118,7 @@ def springs(joints: Sequence[str]) -> list[TorsionSpring]:
 
 def _law(path: Path, field: str, table: FrictionTable) -> FrictionLaw:
     with _cell_errors(path, field, None, "correct that table"):
-        return FrictionLaw.from_table(table.model_dump(exclude={"joints", "ripple", "springs"}))
+        return FrictionLaw.from_table(table.model_dump(exclude=COMMON_FRICTION_ENTRIES))
 
 
 def _coupling(

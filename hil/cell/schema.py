@@ -196,9 +196,19 @@ class FrictionTable(JointFrictionTable):
         "nothing for automatic choice",
         [],
     )
+    position_torque: list[str] = field(
+        "names of joints with an identified torque that repeats two, three and four times per turn "
+        "of the joint, such as by cables or the error of a torque sensor; nothing for automatic "
+        "choice",
+        [],
+    )
     joints: dict[str, JointFrictionTable] = field(
         "tables of fields that differ for a joint, by its name", {}
     )
+
+
+COMMON_FRICTION_ENTRIES: Final = FrictionTable.model_fields.keys() - JointFrictionTable.model_fields
+"""Entries of `[robot.friction]` that the table of one joint does not have."""
 
 
 class CouplingTable(Table):

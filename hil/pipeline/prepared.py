@@ -448,6 +448,7 @@ def _questions(
         "friction": options.friction == "auto" and sources.cell.file.drive_train is None,
         "ripple": options.friction == "auto" and bool(_ripples(sources.cell)),
         "springs": options.friction == "auto" and bool(_spring_joints(sources.cell)),
+        "position torque": options.friction == "auto" and bool(_turning_joints(sources.cell)),
         "low-pass": _asks_low_pass(sources, options),
         "estimator": options.estimator == "auto",
     }
@@ -543,6 +544,7 @@ def _chosen(
             suggested,
             _ripples(cell),
             _spring_joints(cell),
+            _turning_joints(cell),
             known_parameters(cell),
         )
         task.advance(1)
@@ -569,6 +571,14 @@ def _spring_joints(cell: Cell) -> tuple[str, ...]:
     laws = cell.model.friction.laws
     joints = zip(cell.joint_names, cell.model.chain.revolute, laws, strict=False)
     return tuple(name for name, turns, law in joints if turns and law.offset and name not in stated)
+
+
+def _turning_joints(cell: Cell) -> tuple[str, ...]:
+    """Candidates of joints with a torque of their position; none as of `_spring_joints`."""
+    if cell.file.drive_train is not None or cell.file.robot.friction.position_torque:
+        return ()
+    joints = zip(cell.joint_names, cell.model.chain.revolute, strict=True)
+    return tuple(name for name, turns in joints if turns)
 
 
 def _delays(

@@ -24,7 +24,7 @@ from identification.excitation.criteria import (
 )
 from identification.excitation.excitation import Excitation
 from identification.factor.messages import method_words, prior_words, status_words
-from identification.model.elements import TorqueRipple
+from identification.model.elements import PeriodicTorque
 from identification.selection.essential import Elimination
 from identification.selection.messages import candidate_words, cut_words
 from identification.selection.settings import Choice
@@ -178,7 +178,7 @@ def _essential(choice: Elimination | NotEssential) -> results.EssentialResult | 
 
 
 def true_values(cell: Cell, header: ArchiveHeader) -> Array | None:
-    """Return the parameters (p,) of the simulated arm, NaN of a torque ripple; None if unknown."""
+    """Return the parameters (p,) of the simulated arm, NaN of periodic torques; None if unknown."""
     model = cell.model
     planted = header.planted
     if planted is not None:
@@ -190,9 +190,9 @@ def true_values(cell: Cell, header: ArchiveHeader) -> Array | None:
     from hil.control.planted_arm import planted_values  # only for a simulated arm
 
     values = planted_values(cell)
-    for ripple in model.elements.identified:
-        if isinstance(ripple.element, TorqueRipple):
-            values[model.element_part][ripple.part] = np.nan
+    for placed in model.elements.identified:
+        if isinstance(placed.element, PeriodicTorque):
+            values[model.element_part][placed.part] = np.nan
     return values
 
 

@@ -18,7 +18,7 @@ from identification.export.controller.tables import (
     control_tables,
 )
 from identification.export.exported_arm import ExportedArm
-from identification.model.elements import TorqueRipple
+from identification.model.elements import PeriodicTorque
 
 
 class MomentumObserver:
@@ -101,7 +101,7 @@ class MomentumObserver:
         for placed in elements.placed:
             row = q[None, :]
             found = placed.columns(row) @ values[placed.part] + placed.known_torque(row)
-            kind = 0 if isinstance(placed.element, TorqueRipple) else 1
+            kind = 0 if isinstance(placed.element, PeriodicTorque) else 1
             torque[kind, placed.joint] += float(found[0])
         return torque[0], torque[1]
 

@@ -9,6 +9,7 @@ from typing import Final, NamedTuple
 from identification.errors import IdentificationError
 from identification.estimators.torque_scale import absolute
 from identification.factor.estimate import Estimate, Known
+from identification.model.elements import PeriodicTorque
 from identification.model.link_wrenches import LINK_SYMBOLS
 from identification.model.robot import RobotModel
 
@@ -24,6 +25,7 @@ _OF_ELEMENT: Final = {
     "balancer": "factor of the torque of the balancer",
     "gas_spring": "factor of the torque of the gas spring",
     "ripple": "torque ripple",
+    "position": "position-dependent torque",
 }
 
 
@@ -136,6 +138,7 @@ def _of_elements(model: RobotModel) -> Iterator[Meaning]:
     for placed in model.elements.placed:
         for symbol in placed.element.symbols:
             words = next(text for kind, text in _OF_ELEMENT.items() if symbol.startswith(kind))
-            order = symbol.removeprefix("ripple_") if symbol.startswith("ripple") else ""
+            is_periodic = isinstance(placed.element, PeriodicTorque)
+            order = symbol.rpartition("_")[2] if is_periodic else ""
             joint = model.joint_names[placed.joint]
             yield Meaning(f"{words} {order}".rstrip(), "", joint)

@@ -19,6 +19,7 @@ import pinocchio as pin
 from identification.arrays import Array
 from identification.errors import IdentificationError
 from identification.export.friction_curve import equivalent_coulomb, load_remarks
+from identification.model.elements import PeriodicTorque
 from identification.model.friction import TERMS
 from identification.model.kinematics import (
     PINOCCHIO_ORDER,
@@ -152,13 +153,15 @@ def gravity_remarks(model: RobotModel) -> tuple[str, ...]:
 
 def not_in_urdf(model: RobotModel) -> tuple[str, ...]:
     """Return descriptions of the model's parameters that a URDF cannot represent."""
+    are_periodic = [isinstance(each, PeriodicTorque) for each in model.elements.elements]
     absent = {
         "rotor inertias": model.layout.rotor_inertia,
         "coupling inertias": bool(model.layout.pairs),
         **{kind.description: not kind.urdf for kind in model.friction.kinds},
         "friction of coupled motors": bool(model.friction.motors),
         "the payload": model.payload is not None,
-        "springs and balancers": bool(model.elements.elements),
+        "springs and balancers": not all(are_periodic),
+        "periodic torques of motors and joints": any(are_periodic),
         **({gravity: True} if (gravity := other_gravity(model)) else {}),
     }
     return tuple(description for description, present in absent.items() if present)

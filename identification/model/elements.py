@@ -1,4 +1,4 @@
-"""Springs, balancers and torque ripple: torques that depend on the angle q of a joint or motor."""
+"""Springs, balancers and periodic torques: torques that depend on the angle of a joint or motor."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Final, NamedTuple
+from typing import ClassVar, Final, NamedTuple
 
 import numpy as np
 
@@ -206,26 +206,20 @@ class GasCylinder(Element):
 
 
 @dataclass(frozen=True)
-class TorqueRipple(Element):
-    """A torque periodic in the angle of the joint's motor: cogging, gear teeth, wave generators.
+class PeriodicTorque(Element):
+    """A torque periodic in an angle; cosine and sine of each order are identified.
 
-    Cosine and sine of each order are identified. The effect of a coupled motor on other joints is
-    neglected.
+    The gear does not transmit it.
     """
 
-    motor: tuple[tuple[str, float], ...]  #: turns of the motor per turn of each joint, by name
-    orders: tuple[int, ...]  #: periods per turn of the motor
-
-    @property
-    def turns(self) -> Mapping[str, float]:
-        """Derivative of the motor's angle with respect to each joint angle."""
-        return dict(self.motor)
+    orders: tuple[int, ...]  #: periods per turn
+    prefix: ClassVar[str]  #: of the parameters' names
 
     @property
     def coefficients(self) -> tuple[Coefficient, ...]:
-        """``ripple_cos2`` and ``ripple_sin2`` of the second order, and so on."""
+        """Such as ``ripple_cos2`` and ``ripple_sin2`` of the second order."""
         return tuple(
-            Coefficient(f"ripple_{wave}{order}", "N·m", None, True)
+            Coefficient(f"{self.prefix}_{wave}{order}", "N·m", None, True)
             for order in self.orders
             for wave in ("cos", "sin")
         )
@@ -234,6 +228,33 @@ class TorqueRipple(Element):
         """Return cosine and sine of each order (m, 2 orders)."""
         angles = q[:, None] * np.array(self.orders, dtype=np.float64)
         return np.stack([np.cos(angles), np.sin(angles)], axis=-1).reshape(len(q), -1)
+
+
+@dataclass(frozen=True)
+class TorqueRipple(PeriodicTorque):
+    """A torque periodic in the angle of the joint's motor: cogging, gear teeth, wave generators.
+
+    The effect of a coupled motor on other joints is neglected.
+    """
+
+    motor: tuple[tuple[str, float], ...]  #: turns of the motor per turn of each joint, by name
+    prefix = "ripple"
+
+    @property
+    def turns(self) -> Mapping[str, float]:
+        """Derivative of the motor's angle with respect to each joint angle."""
+        return dict(self.motor)
+
+
+@dataclass(frozen=True)
+class PositionTorque(PeriodicTorque):
+    """A torque periodic in the joint's own angle: cables, the error of a torque sensor.
+
+    A torque that repeats once per turn resembles a weight, and is left to the bodies.
+    """
+
+    orders: tuple[int, ...] = (2, 3, 4)
+    prefix = "position"
 
 
 class PlacedElement(NamedTuple):

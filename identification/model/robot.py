@@ -20,7 +20,7 @@ from identification.model.base_parameters import (
     share_left,
 )
 from identification.model.coupling import Coupling
-from identification.model.elements import Element, ElementError, JointElements, TorqueRipple
+from identification.model.elements import Element, ElementError, JointElements, PeriodicTorque
 from identification.model.friction import OFFSET, FrictionLaw, JointFriction
 from identification.model.kinematics import Chain, chain_from_urdf
 from identification.model.known_payload import Load, Payload
@@ -409,8 +409,8 @@ class RobotModel:
         transmitted = np.zeros(self.n_parameters, dtype=np.bool_)
         transmitted[: self.base.rank] = ~np.isin(self.base.pivots, drives)
         for placed in self.elements.identified:
-            is_ripple = isinstance(placed.element, TorqueRipple)
-            transmitted[self.element_part][placed.part] = not is_ripple
+            is_periodic = isinstance(placed.element, PeriodicTorque)
+            transmitted[self.element_part][placed.part] = not is_periodic
         return transmitted
 
     @property

@@ -15,7 +15,7 @@ import pinocchio as pin
 
 from identification.arrays import Array
 from identification.errors import ModelError
-from identification.model.elements import TorqueRipple
+from identification.model.elements import PeriodicTorque
 from identification.model.friction import FrictionLaw
 from identification.model.kinematics import PINOCCHIO_ORDER
 from identification.model.link_wrenches import LINK_SYMBOLS, MASS_INDEX
@@ -54,7 +54,7 @@ class SingleStateTorque:
             (
                 placed,
                 values[model.element_part][placed.part],
-                isinstance(placed.element, TorqueRipple),
+                isinstance(placed.element, PeriodicTorque),
             )
             for placed in model.elements.placed
         ]

@@ -47,6 +47,7 @@ def _described(candidate: Candidate) -> tuple[str, ...]:
     if candidate.low_pass is not None:
         low_pass = f"low-pass of {number(candidate.low_pass)} Hz, {candidate.shape}"
     springs = ", ".join(candidate.springs)
+    of_position = ", ".join(candidate.position_torques)
     return (
         f"{candidate.bandwidth:g} Hz",
         "measured velocity" if candidate.velocity == "measured" else "velocity from positions",
@@ -54,6 +55,7 @@ def _described(candidate: Candidate) -> tuple[str, ...]:
         reversal_text(candidate.tanh, candidate.presliding),
         ripple,
         f"torsion springs of {springs}" if springs else "no torsion spring",
+        f"torque of the position of {of_position}" if of_position else "no torque of the position",
         _ROWS[candidate.excluded_rows],
         f"delay of {number(1e3 * candidate.delay)} ms",
         low_pass,

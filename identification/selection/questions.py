@@ -43,6 +43,7 @@ Question = Literal[
     "friction",
     "ripple",
     "springs",
+    "position torque",
     "low-pass",
     "estimator",
 ]
@@ -63,6 +64,7 @@ LOAD: Final = "friction that grows with load"
 STRENGTH: Final = "strength of the prior"
 CONSISTENT: Final = "physical consistency"
 SPRINGS: Final = "torsion springs"
+POSITION_TORQUE: Final = "torque of the position"
 ROWS_IN_MOTION: Final = "rows that are left out, by the error in motion"
 """Names of decisions."""
 # A drive differentiates its encoder at a higher rate than the log has.
@@ -99,7 +101,7 @@ MIN_REVERSAL_IMPROVEMENT: Final = 0.05
 MIN_ROTORS_IMPROVEMENT: Final = 0.05
 """Rotors far heavier than the links change the error to a fifth or to less than a tenth more."""
 MIN_TERM_IMPROVEMENT: Final = 0.02
-MIN_SPRING_IMPROVEMENT: Final = 0.3  # of the error of its own joint
+MIN_ELEMENT_IMPROVEMENT: Final = 0.3  # of the error of its own joint
 _MAX_SWEEPS: Final = 2
 
 LowPasses = Callable[[RobotModel, Preprocessing], Sequence[Preprocessing]]
@@ -122,6 +124,7 @@ def choose_settings(
     delays: Sequence[SuggestedDelay] = (),
     ripples: Sequence[Sequence[TorqueRipple]] = (),
     springs: Sequence[str] = (),
+    position_torques: Sequence[str] = (),
     stated: Known | None = None,
 ) -> Settings:
     """Choose settings one after the other.
@@ -136,6 +139,7 @@ def choose_settings(
             they are not determined.
         ripples: candidates for torque ripple.
         springs: joints that may have a spring.
+        position_torques: joints that may have a torque of their position.
         stated: parameters that are known.
 
     Returns:
@@ -174,6 +178,10 @@ def choose_settings(
     if "springs" in requested:
         # Last: what is left of a spring that impossible bodies stand for is theirs as before.
         for decision in _torsion_springs(trial, now, springs):
+            now = decision.settings
+            choices = [*choices, decision.choice]
+    if "position torque" in requested:
+        for decision in _position_torques(trial, now, position_torques):
             now = decision.settings
             choices = [*choices, decision.choice]
     if "bandwidth" in requested:
@@ -288,7 +296,7 @@ def _torsion_springs(
         decision = trial.decide(
             SPRINGS,
             [possible, every],
-            MIN_SPRING_IMPROVEMENT,
+            MIN_ELEMENT_IMPROVEMENT,
             joint=joint,
             possible=lambda settings: trial.stiffness(joint, settings) > 0.0,
             certainty=MIN_CERTAINTY,
@@ -301,6 +309,38 @@ def _torsion_springs(
     candidates = [possible, possible.with_friction(springs=shown)]
     decision = trial.decide(SPRINGS, candidates, by_joint=True)
     return [decision._replace(settings=replace(decision.settings, strength=now.strength))]
+
+
+def _position_torques(
+    trial: SettingsTrial, now: Settings, joints: Sequence[str]
+) -> list[SettingDecision]:
+    """Choose the joints with a torque that repeats with their position.
+
+    Each must predict its own joint much better, as a spring, and be seen nearly whole: elsewhere it
+    would be a guess. Those that would leave more of the error of the fitted rows are not tried.
+    """
+    most = 1.0 - 0.5 * MIN_ELEMENT_IMPROVEMENT
+    joints = [joint for joint in joints if trial.left_by_position(joint, now) < most]
+    if not joints:
+        return []
+    every = now.with_friction(position_torque=tuple(joints))
+
+    def shows_torque(joint: str) -> bool:
+        decision = trial.decide(
+            POSITION_TORQUE,
+            [now, every],
+            MIN_ELEMENT_IMPROVEMENT,
+            joint=joint,
+            possible=lambda settings: trial.is_seen_whole(joint, settings),
+            certainty=MIN_CERTAINTY,
+        )
+        return bool(decision.choice.chosen)
+
+    shown = tuple(filter(shows_torque, joints))
+    if not shown:
+        return []
+    candidates = [now, now.with_friction(position_torque=shown)]
+    return [trial.decide(POSITION_TORQUE, candidates, by_joint=True)]
 
 
 def _compare_delays(

@@ -26,7 +26,7 @@ from identification.estimators.prior import (
     torque_scatter,
 )
 from identification.factor.factor import Factor, total_factor
-from identification.model.elements import Element, TorqueRipple, TorsionSpring
+from identification.model.elements import Element, PositionTorque, TorqueRipple, TorsionSpring
 from identification.model.friction import FrictionLaw
 from identification.model.robot import RobotModel
 from identification.selection.folds import FOLDS, Errors, Folds, PredictedRows, mean_error
@@ -68,11 +68,15 @@ _POSTURES: Final = 50  # of a recording in which the inertia of the joints is ju
 _FAR_BETTER_ERROR_RATIO: Final = 0.5  # share of an error, of what shows in spite of doubts
 # Variance inflation from which on two columns are one (James et al. 2013, section 3.3.3): 5 to 10.
 _MAX_VARIANCE_INFLATION: Final = 5.0
+# torque of a position over a whole turn, over what the fitted rows show of it
+_MAX_UNSEEN_RATIO: Final = 2.0
+_TURN_POINTS: Final = 90
 
 Ready = Callable[[RobotModel, Preprocessing], Sequence[Samples]]
 """Prepares the fitted data for a model, averaged to a common rate."""
-Columns = tuple[tuple[FrictionLaw, ...], tuple[int, ...], tuple[str, ...]]
-"""Friction of a model, periods of its torque ripple per motor turn, joints with a spring."""
+Columns = tuple[tuple[FrictionLaw, ...], tuple[int, ...], tuple[str, ...], tuple[str, ...]]
+"""Friction of a model, periods of its torque ripple per motor turn, joints with a spring, joints
+with a torque of their position."""
 Known = Mapping[str, tuple[float, float]]
 """Mean and standard deviation of parameters that are known beforehand."""
 
@@ -117,11 +121,12 @@ class SettingsTrial:
 
     def model(self, settings: Settings) -> RobotModel:
         """Return the model of the arm with the friction and the torque ripple of settings."""
-        laws, orders, springs = key = self._columns(settings)
+        laws, orders, springs, of_position = key = self._columns(settings)
         if key not in self._models:
             model = self._model.with_friction_laws(laws)
             elements: list[Element] = [*self.ripples.get(orders, ())]
             elements += [TorsionSpring(joint, rest=0.0, identified=True) for joint in springs]
+            elements += map(PositionTorque, of_position)
             self._models[key] = model.with_elements(elements)
         return self._models[key]
 
@@ -129,10 +134,11 @@ class SettingsTrial:
         entries = {**settings.friction}
         orders = tuple(entries.pop("ripple", ()))
         springs = tuple(entries.pop("springs", ()))
+        of_position = tuple(entries.pop("position_torque", ()))
         key = tuple(entries.items())
         if key not in self._laws:
             self._laws[key] = tuple(law.changed(entries) for law in self._model.friction.laws)
-        return self._laws[key], orders, springs
+        return self._laws[key], orders, springs, of_position
 
     def factor_key(self, settings: Settings) -> tuple[Columns, Preprocessing]:
         """Return the key of the settings that change factors."""
@@ -340,6 +346,54 @@ class SettingsTrial:
     def values(self, settings: Settings) -> Array:
         """Return the parameters (p,) that all fitted rows give."""
         return self._estimator(settings)(self._folds(settings).fitted)
+
+    def left_by_position(self, joint: str, settings: Settings) -> float:
+        """Return the error that a torque of a joint's position leaves of its own, as a share.
+
+        In the rows that were fitted, without another fit: an estimate that takes no time.
+        """
+        model = self.model(settings)
+        index = model.joint_names.index(joint)
+        shape = PositionTorque(joint)
+        values = self.values(settings)
+        errors, columns = [], []
+        for samples in self.samples(settings):
+            rows = samples.usable[:, index]
+            predicted = samples.predicted_torque(model, values)[rows, index]
+            errors.append(samples.torque[rows, index] - predicted)
+            columns.append(shape.columns(samples.motion.position[rows, index]))
+        error, table = np.concatenate(errors), np.concatenate(columns)
+        left = error - table @ np.linalg.lstsq(table, error)[0]
+        power = float(error @ error)
+        return math.sqrt(float(left @ left) / power) if power > 0.0 else 1.0
+
+    def is_seen_whole(self, joint: str, settings: Settings) -> bool:
+        """Return whether the fitted rows show most of the torque of a joint's position.
+
+        Over a whole turn it is then at most twice what varies in these rows (RMS). One that a short
+        travel shows may be anything beyond it.
+        """
+        model = self.model(settings)
+        index = model.joint_names.index(joint)
+        coefficients = self.values(settings)[model.element_part]
+        placed = next(
+            each
+            for each in model.elements.identified
+            if isinstance(each.element, PositionTorque) and each.joint == index
+        )
+        over_turn, fitted = (
+            placed.element.columns(angles) @ coefficients[placed.part]
+            for angles in (
+                np.linspace(0.0, 2.0 * np.pi, _TURN_POINTS, endpoint=False),
+                np.concatenate(
+                    [
+                        samples.motion.position[samples.usable[:, index], index]
+                        for samples in self.samples(settings)
+                    ]
+                ),
+            )
+        )
+        return bool(over_turn.std() <= _MAX_UNSEEN_RATIO * fitted.std())
 
     def fast_error(self, settings: Settings) -> float:
         """Return the error of fast motion predicted from slower one; zero if there is none.
@@ -564,6 +618,7 @@ def _candidate(model: RobotModel, settings: Settings) -> Candidate:
         tanh=law.tanh,
         ripple=next((part.orders for part in elements if isinstance(part, TorqueRipple)), ()),
         springs=tuple(part.joint for part in elements if isinstance(part, TorsionSpring)),
+        position_torques=tuple(part.joint for part in elements if isinstance(part, PositionTorque)),
         excluded_rows=how.exclude_rows,
         delay=how.torque_delay,
         low_pass=how.torque_bandwidth,

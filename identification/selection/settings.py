@@ -34,6 +34,7 @@ class Candidate:
     tanh: float | None  #: speed of a smooth reversal [rad/s]
     ripple: tuple[int, ...]  #: orders per motor turn
     springs: tuple[str, ...]  #: joints
+    position_torques: tuple[str, ...]  #: joints
     excluded_rows: ExcludedRows | None  #: None: by the friction law
     delay: float  #: of the torque [s]
     low_pass: float | None  #: of the torque [Hz]

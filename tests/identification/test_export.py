@@ -665,7 +665,7 @@ class TestReadBack:
                 TorsionSpring("joint_2", 0.3, 50.0),
                 TorsionSpring("joint_2", -0.1, identified=True),
                 GasCylinder("joint_3", Anchors(0.8, 0.2, 0.1), 0.6, 1e-3, 1e6, 1e-3),
-                TorqueRipple("joint_1", (("joint_1", 100.0),), (1,)),
+                TorqueRipple("joint_1", (1,), (("joint_1", 100.0),)),
             ],
         )
         left = set(compared(form, arm, samples=200).left_out)

@@ -77,7 +77,7 @@ class TestTorque:
 
     def test_the_gear_carries_payload_and_springs_but_no_ripple(self):
         spring = TorsionSpring(MODEL.joint_names[1], rest=0.2, stiffness=50.0)
-        ripple = TorqueRipple(MODEL.joint_names[0], ((MODEL.joint_names[0], 80.0),), (1,))
+        ripple = TorqueRipple(MODEL.joint_names[0], (1,), ((MODEL.joint_names[0], 80.0),))
         payload = Payload(5.0, (0.1, 0.0, 0.2))
         model = RobotModel.from_urdf(URDF, friction=LAW, payload=payload, elements=[spring, ripple])
         motion = a_motion()

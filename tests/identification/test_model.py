@@ -27,6 +27,7 @@ from identification.model.elements import (
     ExtensionSpring,
     GasCylinder,
     JointElements,
+    PositionTorque,
     TorqueRipple,
     TorsionSpring,
 )
@@ -862,7 +863,7 @@ class TestElementModel:
     def test_ripple_turns_with_the_motor(self):
         """Cosine and sine of each order of the angle of a coupled motor."""
         motor = tuple(zip(JOINTS, (20.0, -30.0), strict=True))
-        model = with_elements(TorqueRipple(JOINTS[1], motor, (1, 2)))
+        model = with_elements(TorqueRipple(JOINTS[1], (1, 2), motor))
         motion = two_link.a_motion()
         assert model.parameter_names[model.element_part] == tuple(
             f"ripple_{wave}{order}_2" for order in (1, 2) for wave in ("cos", "sin")
@@ -871,6 +872,18 @@ class TestElementModel:
         angle = 20.0 * motion.position[:, 0] - 30.0 * motion.position[:, 1]
         expected = two_link.MODEL.torque(two_link.truth(), motion)
         expected[:, 1] += 0.5 * np.sin(2.0 * angle + np.arctan2(0.3, 0.4))
+        np.testing.assert_allclose(model.torque(values, motion), expected, atol=1e-9)
+
+    def test_a_position_torque_repeats_with_the_turn_of_its_joint(self):
+        model = with_elements(PositionTorque(JOINTS[0]))
+        motion = two_link.a_motion()
+        q = motion.position[:, 0]
+        assert model.parameter_names[model.element_part] == tuple(
+            f"position_{wave}{order}_1" for order in (2, 3, 4) for wave in ("cos", "sin")
+        )
+        values = np.concatenate([two_link.truth(), [0.3, 0.0, 0.0, 0.2, 0.1, 0.0]])
+        expected = two_link.MODEL.torque(two_link.truth(), motion)
+        expected[:, 0] += 0.3 * np.cos(2.0 * q) + 0.2 * np.sin(3.0 * q) + 0.1 * np.cos(4.0 * q)
         np.testing.assert_allclose(model.torque(values, motion), expected, atol=1e-9)
 
     def test_known_elements_are_load(self):

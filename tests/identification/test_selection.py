@@ -16,7 +16,7 @@ from identification.estimators.torque_channel import possible_low_passes
 from identification.factor.estimate import estimate
 from identification.factor.estimation_method import LeastSquares
 from identification.factor.factor import Factor
-from identification.model.elements import TorqueRipple, TorsionSpring
+from identification.model.elements import PositionTorque, TorqueRipple, TorsionSpring
 from identification.model.friction import FrictionLaw
 from identification.model.motion import Motion
 from identification.model.regressor import RegressorPlan
@@ -244,7 +244,7 @@ def cut(recording):
 
 
 def chosen(
-    recording, questions, *, model=MODEL, leaks=False, ripple=(), springs=(), low_passes=None
+    recording, questions, *, model=MODEL, leaks=False, ripple=(), low_passes=None, **candidates
 ):
     """Choose settings on the fitted rows, or on all of them with a leak."""
     fitted = recording if leaks else recording.between(0, cut(recording))
@@ -257,7 +257,7 @@ def chosen(
 
     start = Settings(Preprocessing())
     settings = choose_settings(
-        model, ready, start, questions, possible, ripples=[ripple], springs=springs
+        model, ready, start, questions, possible, ripples=[ripple], **candidates
     )
     return settings, settings.choices
 
@@ -339,7 +339,7 @@ class TestChosenSettings:
         assert settings.friction["third"] == "none"
 
     def test_torque_ripple_is_estimated_only_if_present(self):
-        ripple = [TorqueRipple(name, ((name, 40.0),), (2,)) for name in MODEL.joint_names]
+        ripple = [TorqueRipple(name, (2,), ((name, 40.0),)) for name in MODEL.joint_names]
         rippled = MODEL.with_elements(ripple)
         strong = a_recording(rippled, np.append(truth(), [0.0, 0.4, 0.3, 0.0]))
         settings, _ = chosen(strong, {"ripple"}, ripple=ripple)
@@ -360,6 +360,30 @@ class TestChosenSettings:
         assert not settings.strength.consistent  # nobody asked for it
         named = [choice.candidates[choice.chosen].springs for choice in choices]
         assert named == ([(joint,)] if stiffness else [])
+
+    @pytest.mark.parametrize("amplitude", [0.0, 1.0])
+    def test_a_position_torque_is_estimated_only_where_one_is(self, amplitude):
+        joint = MODEL.joint_names[1]
+        pulled = MODEL.with_elements([PositionTorque(joint)])
+        torques = amplitude * np.array([1.0, 0.0, 0.0, -0.5, 0.3, 0.0])
+        recording = a_recording(pulled, np.append(truth(), torques))
+        settings, choices = chosen(
+            recording, {"position torque"}, position_torques=MODEL.joint_names
+        )
+        assert settings.friction.get("position_torque") == ((joint,) if amplitude else None)
+        named = [choice.candidates[choice.chosen].position_torques for choice in choices]
+        assert named == ([(joint,)] if amplitude else [])
+
+    def test_a_short_travel_shows_no_torque_of_the_position(self):
+        """Beyond it, anything would fit."""
+        joint = MODEL.joint_names[1]
+        pulled = MODEL.with_elements([PositionTorque(joint)])
+        pace = np.array([[0.7, 1.1], [1.9, 2.3], [3.1, 4.7]])
+        motion = sine_motion(np.arange(0.0, LONG, 0.005), 0.1, pace, pace)
+        torques = np.array([1.0, 0.0, 0.0, -0.5, 0.3, 0.0])
+        recording = a_recording(pulled, np.append(truth(), torques), motion=motion)
+        settings, _ = chosen(recording, {"position torque"}, position_torques=MODEL.joint_names)
+        assert "position_torque" not in settings.friction
 
     @pytest.mark.parametrize(("shape", "name"), [(None, DELAY), (CAUSAL, LOW_PASS)])
     def test_a_delay_is_not_called_a_low_pass(self, shape, name):

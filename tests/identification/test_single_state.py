@@ -48,7 +48,7 @@ ARMS = {
             "elements": [
                 TorsionSpring("joint_2", 0.3, identified=True),
                 TorsionSpring("joint_3", -0.2, stiffness=300.0),
-                TorqueRipple("joint_3", (("joint_3", 100.0),), (1, 2)),
+                TorqueRipple("joint_3", (1, 2), (("joint_3", 100.0),)),
             ],
         },
     ),

@@ -16,8 +16,8 @@ from identification.model.elements import (
     Coefficient,
     ExtensionSpring,
     GasCylinder,
+    PeriodicTorque,
     PlacedElement,
-    TorqueRipple,
     TorsionSpring,
 )
 from identification.model.kinematics import skew
@@ -209,7 +209,7 @@ def _stated(coefficient: Coefficient) -> float:
 
 
 def _numbers(placed: PlacedElement, coefficients: list[float]) -> Iterator[tuple[str, list[float]]]:
-    """Yield kind and numbers of an element; of a torque ripple for each order."""
+    """Yield kind and numbers of an element; of a periodic torque for each order."""
 
     def between(anchors: Anchors) -> list[float]:
         return [anchors.base, anchors.link, anchors.angle]
@@ -225,7 +225,7 @@ def _numbers(placed: PlacedElement, coefficients: list[float]) -> Iterator[tuple
             force = gas.area * gas.pressure * gas.volume
             numbers = [gas.length, force, gas.volume, sense * gas.area, sense * coefficients[0]]
             yield "GAS_CYLINDER", [*between(gas.anchors), *numbers]
-        case TorqueRipple(orders=orders):
+        case PeriodicTorque(orders=orders):
             pairs = zip(coefficients[::2], coefficients[1::2], strict=True)
             for order, (cosine, sine) in zip(orders, pairs, strict=True):
                 yield "TORQUE_RIPPLE", [cosine, sine, float(order)]

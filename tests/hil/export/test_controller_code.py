@@ -33,6 +33,7 @@ from identification.model.elements import (
     Anchors,
     ExtensionSpring,
     GasCylinder,
+    PositionTorque,
     TorqueRipple,
     TorsionSpring,
 )
@@ -72,7 +73,8 @@ def a_whole_arm() -> ExportedArm:
                 "joint_2", Anchors(0.8, 0.2, 0.1), 0.7, 1e-3, 1e6, 1e-3,
                 pulls=False, identified=True,
             ),
-            TorqueRipple("joint_1", (("joint_1", 100.0),), (1, 3)),
+            TorqueRipple("joint_1", (1, 3), (("joint_1", 100.0),)),
+            PositionTorque("joint_2"),
         ],
     )  # fmt: skip
 
