@@ -753,8 +753,13 @@ def _body_deviations(mass: Array, length: Array) -> Array:
 
 
 def body_lengths(model: RobotModel) -> Array:
-    """Return a length of each body (n,) [m]: to its centre, its next joint, or its gyration."""
-    inertial = model.nominal[model.layout.links]
+    """Return a length of each body (n,) [m]: to its centre, its next joint, or its gyration.
+
+    Bodies with masses that are not the arm's have neither centre nor gyration: an inertia of
+    1 kg·m² about each axis is a placeholder as well.
+    """
+    has_bodies = mass_fault(model) is None
+    inertial = model.nominal[model.layout.links] * has_bodies
     mass = inertial[:, _MASS_INDEX]
     divisor = np.where(mass > 0.0, mass, np.inf)
     centre = np.linalg.norm(inertial[:, _MOMENT_SLICE], axis=1) / divisor

@@ -886,6 +886,14 @@ class TestBodyPrior:
         alone = 0.5 * np.sqrt(np.mean(torque**2) / np.mean(turning**2))
         assert prior.std[rotors[1]] == pytest.approx(max(prior.std[rotors[1]], alone))
 
+    def test_bodies_of_equal_masses_have_the_lengths_of_the_arm(self):
+        """An inertia of 1 kg·m² about each axis says as little as the masses."""
+        text = re.sub(r'(mass value|ixx|iyy|izz)="[^"]*"', r'\1="1"', URDF)
+        equal = RobotModel.from_urdf(text)
+        assert equal.nominal[equal.layout.links].any()
+        bare = RobotModel.from_urdf(re.sub(r"<inertial>.*?</inertial>", "", URDF, flags=re.DOTALL))
+        np.testing.assert_array_equal(body_lengths(equal), body_lengths(bare))
+
     def test_wide_rotors_alone_make_half_of_the_torque(self):
         """That of the first joint, too, whose column is that of the inertia of its link."""
         samples = noisy()
