@@ -21,6 +21,7 @@ from identification.arrays import Array
 from identification.distributions import SIGNIFICANT_SIGMAS
 from identification.factor.estimate import Estimate
 from identification.factor.factor import Factor
+from identification.hypotheses.column_search import Explanation
 from identification.model.robot import RobotModel
 from identification.signals.block_mean import BlockMean, block_index, block_mean
 from identification.signals.samples import Samples
@@ -45,6 +46,9 @@ _MIN_EXPLAINED_SHARE: Final = 2.0 / 3.0
 # Ratio of remaining errors up to which the two kinds are alike, as for a joint that has little more
 # than friction: friction varies, a gain is set once. More where neither leaves more than is usual.
 _ALIKE_ERROR_RATIO: Final = 1.1
+# Share of a torque constant's logarithm that a ratio exceeds where the constant changed: nearer to
+# all of it than to none.
+_MIN_CONSTANT_SHARE: Final = 0.5
 
 
 class UnseenChange(NamedTuple):
@@ -56,6 +60,36 @@ class UnseenChange(NamedTuple):
     std: float  # standard deviation over blocks of time, and by the uncertainty of the parameters
     relative: float  # remaining relative error of the joint on unseen motion
     alike: bool = False  # whether the other kind explains it as well
+
+
+def beyond_constants(
+    changes: Sequence[UnseenChange], explanations: Sequence[Explanation]
+) -> tuple[UnseenChange, ...]:
+    """Return the changes without gains that a torque constant of the fitted motion explains.
+
+    Where a constant is wrong in all motions, the parameters are between its value and that of the
+    other joints, and another motion has an error of a part of it. Where it is wrong in the fitted
+    motion only, the ratio is all of it.
+
+    Args:
+        changes: of unseen motion.
+        explanations: of the errors of the fit.
+    """
+    constants = {
+        joint: abs(np.log1p(found.size))
+        for found in explanations
+        if found.change.meaning == "scale"
+        and found.change.part is None
+        and found.size is not None
+        and found.size > -1.0
+        for joint in found.change.joints
+    }
+    return tuple(
+        change
+        for change in changes
+        if change.kind != "gain"
+        or abs(np.log(change.ratio)) > _MIN_CONSTANT_SHARE * constants.get(change.joint, 0.0)
+    )
 
 
 class _Part(NamedTuple):

@@ -29,7 +29,11 @@ from identification.hypotheses.diagnosis import (
 )
 from identification.hypotheses.gravity_direction import GravityDirection, find_gravity
 from identification.hypotheses.scores import score_of
-from identification.hypotheses.unseen_changes import UnseenChange, find_changes
+from identification.hypotheses.unseen_changes import (
+    UnseenChange,
+    beyond_constants,
+    find_changes,
+)
 from identification.model.robot import RobotModel
 from identification.signals.position_steps import PositionJump
 from identification.signals.samples import Samples
@@ -280,7 +284,7 @@ def gather(
         noise_floor=floor,
         open_share=None if in_sample else _open_share(pooled, unseen),
         disagreement=None if noise is None else _disagreement(result),
-        changes=changes,
+        changes=beyond_constants(changes, diagnosis.explanations or ()),
         one_way=_one_way(training),
         diagnosis=_with_unseen(diagnosis, model, others, error.overall),
         gravity=gravity,

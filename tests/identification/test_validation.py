@@ -19,7 +19,9 @@ from identification.factor.estimate import Estimate, estimate, joint_weights
 from identification.factor.estimation_method import EstimationMethod
 from identification.factor.factor import Factor, total_factor
 from identification.factor.normal_equations import solve
-from identification.hypotheses.unseen_changes import find_changes
+from identification.hypotheses.column_search import Explanation
+from identification.hypotheses.joint_changes import Change
+from identification.hypotheses.unseen_changes import UnseenChange, beyond_constants, find_changes
 from identification.model.coupling import Coupling
 from identification.model.friction import FrictionLaw
 from identification.model.mass_matrix import mass_matrices
@@ -805,6 +807,20 @@ class TestChangesToUnseenMotion:
         )
         assert (change.kind, change.joint) == ("gain", 1)
         assert change.ratio == pytest.approx(ratio, abs=0.02)
+
+    @pytest.mark.parametrize(
+        ("ratio", "size", "is_left"),
+        [(1.03, 0.25, False), (0.97, 0.25, False), (0.8, 0.25, True), (1.3, 0.25, True)],
+    )
+    def test_a_constant_of_all_motions_is_no_change(self, ratio, size, is_left):
+        """It leaves other motion an error of a part of it; one of the fitted motion, all of it."""
+        change = UnseenChange("gain", 1, ratio, 0.001, 0.01)
+        constant = Explanation(Change("scale", (1,)), 0.4, size)
+        assert beyond_constants((change,), (constant,)) == ((change,) if is_left else ())
+        of_other_joint = constant._replace(change=Change("scale", (0,)))
+        assert beyond_constants((change,), (of_other_joint,)) == (change,)
+        friction = change._replace(kind="friction")
+        assert beyond_constants((friction,), (constant,)) == (friction,)
 
     def test_a_joint_that_stood_has_none(self):
         more = with_friction(np.array([1.0, 2.0]))
