@@ -388,7 +388,13 @@ SENTENCES: Final[Mapping[FindingKey, Sentence]] = {
         "in {saturated:pc1} of its samples",
     ),
     "no saturation": Sentence("saturation", "no torque or current was at its limit"),
-    "undetermined": Sentence("excitation", "the motion does not determine {parameters}"),
+    "undetermined": Sentence(
+        "excitation",
+        "the motion does not determine {count} of {total} parameters ({parameters:3}){friction}",
+        optional={
+            "friction": Optional(", among them the friction of {friction_joints:names}"),
+        },
+    ),
     "undetermined in one direction": Sentence(
         "excitation",
         "{joints} moved in one direction only, so the motion determines just the sum of Coulomb"

@@ -668,8 +668,15 @@ class TestJudgement:
         assert direction.joints == (1,)
         assert_figures(direction, {"coulomb": ("f0_2",), "offset": ("fo_2",)})
         assert direction.remedy == "move in both directions"
-        assert_figures(others, {"parameters": ("m1",)})
+        assert_figures(others, {"parameters": ("m1",), "count": 1})
         assert "one direction" not in findings
+
+    def test_joints_without_friction_are_named(self):
+        estimate = an_estimate(undetermined=("m1", "f1_2"))
+        finding = found(estimate=estimate)["undetermined"]
+        assert_figures(finding, {"friction_joints": (1,), "count": 2})
+        estimate = an_estimate(undetermined=("m1",))
+        assert "friction_joints" not in found(estimate=estimate)["undetermined"].values
 
     def test_all_negated_torques_are_one_cause(self):
         """By the nominal model, or by friction that would drive every axis."""

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 
 from identification.validation.evidence import Evidence
@@ -11,6 +13,15 @@ from identification.validation.finding import Finding, Mask, Thresholds, Value
 def _friction_pair(joint: int) -> tuple[str, str]:
     """Return the labels of Coulomb friction and offset of a joint."""
     return f"f0_{joint + 1}", f"fo_{joint + 1}"
+
+
+def _without_friction(labels: Sequence[str], n_joints: int) -> tuple[int, ...]:
+    """Return the joints of which Coulomb or viscous friction is among labels."""
+    return tuple(
+        joint
+        for joint in range(n_joints)
+        if not {f"{symbol}_{joint + 1}" for symbol in ("f0", "f1")}.isdisjoint(labels)
+    )
 
 
 def _one_way(evidence: Evidence) -> Mask:
@@ -37,7 +48,13 @@ def undetermined(evidence: Evidence, _: Thresholds) -> Finding | None:
     labels = [label for label in evidence.estimate.undetermined if label not in explained]
     if not labels:
         return None
-    values: dict[str, Value] = {"parameters": tuple(labels)}
+    values: dict[str, Value] = {
+        "parameters": tuple(labels),
+        "count": len(labels),
+        "total": len(evidence.estimate.values),
+    }
+    if friction := _without_friction(labels, len(evidence.held_out.rows)):
+        values["friction_joints"] = friction
     return Finding("undetermined", "wrong", "design a motion", values=values)
 
 
