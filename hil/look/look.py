@@ -58,7 +58,7 @@ from identification.hypotheses.diagnosis import UNEXPLAINED, few_rows, torque_of
 from identification.hypotheses.inertia_scale import retimed
 from identification.hypotheses.joint_changes import Axes
 from identification.hypotheses.readings import Readings
-from identification.hypotheses.scores import EXPLAINED_ERROR, LARGE_REDUCTION, score_of
+from identification.hypotheses.scores import EXPLAINED_ERROR, LARGE_REDUCTION, Score, score_of
 from identification.hypotheses.search import find_readings
 from identification.hypotheses.torque_low_pass import TorqueLowPass, torque_low_pass
 from identification.model.robot import RobotModel
@@ -189,6 +189,9 @@ def _with_torque(
     if finding.torque.error > SUSPECT_ERROR and (found := explained(imported.archive)):
         least = (1.0 - LARGE_REDUCTION) * found.score.overall
         if finding.readings.score.overall > least:
+            if _is_beyond(found.score, finding):
+                stated = few_rows([prepared(recording, cell.model)])
+                finding = finding.as_stated(stated, found.score)
             finding = finding.or_explained(ErrorExplained(found.score.overall, found.how))
     delay, low_pass = _channel(finding.axes.read(recording), finding.readings.model)
     channel = list(physics.channel_rows(delay, low_pass))
@@ -217,6 +220,12 @@ def _with_torque(
     if contradictions.is_doubtful:
         rows.append(contradictions.row)
     return _look_of(finding, rows, groups)
+
+
+def _is_beyond(score: Score, finding: physics.TorqueFindings) -> bool:
+    """Return whether a score of rows as read is much better than one with all that was found."""
+    least = (1.0 - LARGE_REDUCTION) * finding.readings.score.overall
+    return finding.torque.time is None and score.overall < least
 
 
 def look_at_joints(source: Path, imported: ImportedRecording) -> Look:

@@ -90,7 +90,12 @@ from identification.hypotheses.joint_changes import (
 )
 from identification.hypotheses.mirror_images import SignRival, Signs
 from identification.hypotheses.readings import Readings, Step
-from identification.hypotheses.scores import EXPLAINED_ERROR, SEPARATE_SIGMAS, is_backwards
+from identification.hypotheses.scores import (
+    EXPLAINED_ERROR,
+    SEPARATE_SIGMAS,
+    Score,
+    is_backwards,
+)
 from identification.hypotheses.torque_low_pass import TorqueLowPass
 from identification.model.link_wrenches import LINK_SYMBOLS
 from identification.model.motion import Motion
@@ -380,6 +385,19 @@ class TorqueFindings:
         """Return the findings where this explains the torque as well: no change is certain."""
         steps = tuple(replace(step, is_adequate=False) for step in self.readings.steps)
         return replace(self, readings=replace(self.readings, steps=steps), explained=explained)
+
+    def as_stated(self, rows: Samples, score: Score) -> TorqueFindings:
+        """Return the findings without any change, where none explains the torque as well.
+
+        Changes that fit an arm without the low-pass or heavy rotors imitate these, and so do those
+        that come nearest.
+
+        Args:
+            rows: some of the recording, as read.
+            score: of a torque with what explains it.
+        """
+        readings = Readings((), self.cell.model, rows, score, {})
+        return replace(self, readings=readings, axes=Axes.of((), self.cell.model.n_joints))
 
     def steps(self, *meanings: Meaning) -> list[Step]:
         """Return the changes of some meanings."""

@@ -226,6 +226,21 @@ def test_a_low_pass_explains_a_torque_better_than_another_arm(
 
 
 @pytest.mark.long
+def test_a_heavy_rotor_is_no_scale_of_the_torque(tmp_path: Path, simulated: Simulated) -> None:
+    """Of 100 kg·m² on a joint that moves some 10: its torque is as stated, and so are its zeros."""
+    velocity = np.gradient(simulated.position, TIME, axis=0)
+    torque = simulated.torque.copy()
+    torque[:, 1] += 100.0 * np.gradient(velocity[:, 1], TIME)
+    found = look(log_of(tmp_path, simulated, torque=torque))
+    assert not [row for row in found.rows if row.is_changed]
+    (row,) = [row for row in found.rows if row.aspect == "as read"]
+    (explained,) = [each for each in row.evidence if isinstance(each, ErrorExplained)]
+    assert explained.how.heavy_rotors
+    assert found.error == pytest.approx(explained.error)
+    assert found.error < 0.05
+
+
+@pytest.mark.long
 def test_a_log_that_nothing_explains_better_is_read_as_given(tmp_path: Path) -> None:
     """A low-pass leaves 15 % of the torque; a zero, a sign and an order explain 1 % of that."""
     if not (RECORDED / "kr300").is_dir():
