@@ -195,9 +195,7 @@ def summary(rows: Sequence[Row], most: int = SCREEN_LINES) -> list[str]:
 
     Long cells take a second line as far as there is room, of uncertain rows first.
     """
-    usual = [
-        row for row in rows if isinstance(row.reading, Fact) and row.reading in _EXPECTED_FACTS
-    ]
+    usual = [row for row in rows if _is_usual(row)]
     shown = [row for row in rows if row not in usual]
     width = max(len("channel"), *(len(row.aspect) for row in shown), 0)
     head = _table_line(width, "channel", "meaning", "certainty", "evidence")
@@ -229,6 +227,12 @@ def summary(rows: Sequence[Row], most: int = SCREEN_LINES) -> list[str]:
             for line in zip_longest([row.aspect], meanings, [row.certainty], reasons, fillvalue="")
         ]
     return [*lines, *last]
+
+
+def _is_usual(row: Row) -> bool:
+    """Return whether a row agrees with the URDF, or has nothing that speaks against it."""
+    is_expected = isinstance(row.reading, Fact) and row.reading in _EXPECTED_FACTS
+    return is_expected or row.is_unsupported
 
 
 def _cell(text: str, columns: int) -> list[str]:

@@ -12,12 +12,15 @@ from hil.look.readings import (
     Decider,
     Evidence,
     MapEntries,
+    NearestZero,
+    NextBest,
     NextStep,
     NoBetter,
     Reading,
     Setting,
     Vector,
 )
+from identification.hypotheses.scores import MIN_REDUCTION
 
 Aspect = Literal[
     "time",
@@ -80,11 +83,25 @@ class Row:
     @property
     def has_step(self) -> bool:
         """Whether a person has something to do: to decide it, or to mend what is wrong."""
+        if self.is_unsupported:
+            return False
         if self.decider in (NextStep.IMPORT_COMMANDS, NextStep.RECORD_COMMANDS):
             return True
         return self.decider is not None and (
             self.is_fault or self.certainty is Certainty.UNDETERMINED
         )
+
+    @property
+    def is_unsupported(self) -> bool:
+        """Whether it leaves a zero or coupling open that nothing in the recording speaks for.
+
+        Columns may have any sign or order. A zero or a coupling other than the URDF's is a fault of
+        the arm or of its URDF, which needs evidence.
+        """
+        if self.aspect not in ("zero", "coupling") or self.certainty is not Certainty.UNDETERMINED:
+            return False
+        ratios = [each.ratio for each in self.evidence if isinstance(each, NearestZero | NextBest)]
+        return bool(ratios) and min(ratios) > 1.0 - MIN_REDUCTION
 
 
 @dataclass(frozen=True)

@@ -40,12 +40,17 @@ from hil.look.readings import (
     Basis,
     BeyondRange,
     DoubtfulArm,
+    Either,
     Fact,
     GravityOption,
     MapEntries,
+    NearestZero,
+    NextBest,
+    NextStep,
     OtherLengths,
     StillJoints,
     TorqueDelay,
+    UnseenZeros,
 )
 from hil.look.result import Aspect, Row, TiedReading
 from hil.look.torque_sample import SETTINGS, prepared
@@ -698,6 +703,29 @@ def test_long_cells_of_the_table_take_further_lines() -> None:
     lines = summary(rows_of(2))
     assert len(lines) == 1 + 2 * 3
     assert "..." not in " ".join(lines)
+
+
+def test_a_zero_without_evidence_takes_no_line() -> None:
+    """Nor is there anything to do for it; one that lessens the error has both, as has a sign."""
+
+    def shown(row: Row) -> bool:
+        lines = summary([*rows_of(1), row])
+        assert row.has_step == any(line.startswith(row.aspect) for line in lines)
+        return row.has_step
+
+    change = ArmChange(Change("zero", (0,), 0.8), ("j1",))
+    zeros, certainty, step = (
+        UnseenZeros(("j1",)),
+        Certainty.UNDETERMINED,
+        NextStep.COMPARE_A_POSTURE,
+    )
+    step = NextStep.COMPARE_A_POSTURE
+    for ratio, is_shown in ((1.0, False), (1.1, False), (0.9, True)):
+        evidence = (NearestZero(change, ratio),)
+        assert shown(Row("zero", zeros, certainty, evidence, step)) == is_shown
+    negated = ArmChange(Change("torque sign", (0,)), ("j1",))
+    signs = Either(Fact.SIGNS_OF_URDF, negated)
+    assert shown(Row("signs", signs, certainty, (NextBest(negated, 1.0),), NextStep.PUSH_A_JOINT))
 
 
 def test_uncertain_rows_get_further_lines_first() -> None:
