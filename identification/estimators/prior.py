@@ -755,11 +755,10 @@ def _body_deviations(mass: Array, length: Array) -> Array:
 def body_lengths(model: RobotModel) -> Array:
     """Return a length of each body (n,) [m]: to its centre, its next joint, or its gyration.
 
-    Bodies with masses that are not the arm's have neither centre nor gyration: an inertia of
-    1 kg·m² about each axis is a placeholder as well.
+    Where the masses are not an arm's, the inertias may be placeholders as well: they are if a
+    gyration exceeds the largest distance of joints, and then say no length.
     """
-    has_bodies = mass_fault(model) is None
-    inertial = model.nominal[model.layout.links] * has_bodies
+    inertial = model.nominal[model.layout.links]
     mass = inertial[:, _MASS_INDEX]
     divisor = np.where(mass > 0.0, mass, np.inf)
     centre = np.linalg.norm(inertial[:, _MOMENT_SLICE], axis=1) / divisor
@@ -768,6 +767,9 @@ def body_lengths(model: RobotModel) -> Array:
     distance = np.linalg.norm(model.chain.translation[1:], axis=1)
     usual = float(distance.mean()) if len(distance) else 0.0
     smallest = _MIN_BODY_LENGTH_SHARE * usual or _MIN_BODY_LENGTH_SHARE
+    longest = max(float(distance.max(initial=0.0)), smallest)
+    if mass_fault(model) is not None and gyration.max() > longest:
+        gyration = np.zeros_like(gyration)
     lengths = [centre, gyration, np.append(distance, 0.0), np.full(model.n_joints, smallest)]
     return np.asarray(np.max(lengths, axis=0))
 

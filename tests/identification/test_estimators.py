@@ -886,13 +886,17 @@ class TestBodyPrior:
         alone = 0.5 * np.sqrt(np.mean(torque**2) / np.mean(turning**2))
         assert prior.std[rotors[1]] == pytest.approx(max(prior.std[rotors[1]], alone))
 
-    def test_bodies_of_equal_masses_have_the_lengths_of_the_arm(self):
-        """An inertia of 1 kg·m² about each axis says as little as the masses."""
-        text = re.sub(r'(mass value|ixx|iyy|izz)="[^"]*"', r'\1="1"', URDF)
+    @pytest.mark.parametrize(("inertia", "is_length"), [("0.01", True), ("100", False)])
+    def test_a_placeholder_inertia_is_no_length(self, inertia, is_length):
+        """With equal masses of 1 kg: 0.12 m fits into the arm, 12 m is longer than it."""
+        text = re.sub(r'mass value="[^"]*"', 'mass value="1"', URDF)
+        text = re.sub(r'(ixx|iyy|izz)="[^"]*"', rf'\1="{inertia}"', text)
+        text = re.sub(r'<origin xyz="[^"]*"( rpy="[^"]*")?/>\s*<mass', "<mass", text)
         equal = RobotModel.from_urdf(text)
-        assert equal.nominal[equal.layout.links].any()
         bare = RobotModel.from_urdf(re.sub(r"<inertial>.*?</inertial>", "", URDF, flags=re.DOTALL))
-        np.testing.assert_array_equal(body_lengths(equal), body_lengths(bare))
+        gyration = np.sqrt(1.5 * float(inertia))
+        longer = np.maximum(body_lengths(bare), gyration if is_length else 0.0)
+        np.testing.assert_allclose(body_lengths(equal), longer)
 
     def test_wide_rotors_alone_make_half_of_the_torque(self):
         """That of the first joint, too, whose column is that of the inertia of its link."""
