@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from hil.base.arrays import Array
 from hil.base.safe_input import parse_toml
 from hil.base.toml_text import to_text
 from identification.hypotheses.joint_changes import Axes
@@ -52,20 +53,29 @@ def entries_of(
         "motor_current": (axes.torque_order, scale),
     }
     place = np.argsort(axes.position_order)
+    columns = place if same else count
+    drives = _terms(axes.drives, columns)
+    angles = axes.coupling @ np.linalg.inv(axes.drives)  # that no drive contains
+    if drives:
+        ratios = table.get("drive", {}).get("gear_ratio") or [1.0] * len(joints)
+        entries["drive.gear_ratio"] = ratios
+        entries["drive.coupling"] = [[j, k, each * ratios[j - 1]] for j, k, each in drives]
     if same and not np.array_equal(axes.position_order, count):
         entries["joints"] = [joints[int(joint)] for joint in place]
     for name, (order, sign) in quantities.items():
         if name not in table:
             continue
         if not same and not np.array_equal(order, count):
-            columns = _names(table[name].get("columns"), channels, joints)
-            if columns is not None:
-                entries[f"{name}.columns"] = [columns[int(column)] for column in order]
+            names = _names(table[name].get("columns"), channels, joints)
+            if names is not None:
+                entries[f"{name}.columns"] = [names[int(column)] for column in order]
         by_column = sign[place] if same else sign
         if np.any(sign != 1.0):
             entries[f"{name}.scale"] = by_column.tolist()
-        if name in ("position", "velocity") and (terms := _terms(axes, place if same else count)):
+        if name in ("position", "velocity") and (terms := _terms(angles, columns)):
             entries[f"{name}.coupled"] = terms
+        if drives:
+            entries[f"{name}.side"] = "motor"
     if axes.factor < 1.0:
         entries["position.unit"] = "deg"
     if axes.factor > 1.0:
@@ -77,14 +87,16 @@ def entries_of(
     return entries
 
 
-def _terms(axes: Axes, columns: NDArray[np.intp]) -> list[list[float]]:
+def _terms(coupling: Array, columns: NDArray[np.intp]) -> list[tuple[int, int, float]]:
     """Return the angles that contain others: column and joint, from 1, and the factor.
 
-    `columns` are the joints of the log's columns.
+    Args:
+        coupling: recorded angles per joint angle (n, n).
+        columns: joints of the log's columns.
     """
-    coupling = axes.coupling[np.ix_(columns, columns)]
-    others = np.argwhere(coupling - np.diag(np.diag(coupling)))
-    return [[int(j) + 1, int(k) + 1, float(coupling[j, k])] for j, k in others]
+    matrix = coupling[np.ix_(columns, columns)]
+    others = np.argwhere(matrix - np.diag(np.diag(matrix)))
+    return [(int(j) + 1, int(k) + 1, float(matrix[j, k])) for j, k in others]
 
 
 def _names(columns: Any, channels: Collection[str], joints: Sequence[str]) -> list[Any] | None:

@@ -99,7 +99,14 @@ from hil.look.readings import (
 )
 from hil.look.result import ChangedReading, Look, Row, TiedReading
 from identification.estimators.delay_messages import undetermined_words
-from identification.hypotheses.joint_changes import COUPLED, ORDERS, Change, Meaning, Part
+from identification.hypotheses.joint_changes import (
+    COUPLED,
+    COUPLED_DRIVES,
+    ORDERS,
+    Change,
+    Meaning,
+    Part,
+)
 from identification.signals.messages import (
     clock_lines,
     faults_words,
@@ -262,6 +269,8 @@ _CHANGES: Final[Mapping[Meaning, str]] = {
     "no gravity": "without gravity",
     "angle sum": "plus",
     "angle difference": "minus",
+    "drive sum": "plus",
+    "drive difference": "minus",
 }
 
 
@@ -361,7 +370,8 @@ def described(change: ArmChange) -> str:
         text = _CHANGES[meaning]
     if meaning in COUPLED:
         joint, other = _names(change)
-        return f"recorded {joint} is {joint} {text} {other}"
+        angle = f"recorded {joint} is {joint} {text} {other}"
+        return f"{angle}, driven by rods or a belt" if meaning in COUPLED_DRIVES else angle
     if meaning in ORDERS:
         return f"{text} {_exchanged(change)}"
     if not change.change.joints:

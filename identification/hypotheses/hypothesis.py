@@ -23,6 +23,7 @@ from identification.hypotheses.few_row_fits import (
 from identification.hypotheses.joint_changes import (
     AS_READ,
     COUPLED,
+    COUPLED_ANGLES,
     DEGREE,
     ORDERS,
     SIGNS,
@@ -34,6 +35,7 @@ from identification.hypotheses.joint_changes import (
     changed_samples,
     coupled_pairs,
     differs,
+    drive_of,
     mounted_model,
     order_change,
     whole_order,
@@ -562,7 +564,9 @@ class Hypothesis:
                 change for change, error in errors.items() if error >= excluded
             )
             trials = [self._try(change) for change in to_compare(errors, excluded)]
-            self._trials = [*trials, *self._orders(trials, fits)]
+            angles = [trial for trial in trials if trial.change.meaning in COUPLED_ANGLES]
+            drives = [self._try(drive_of(each.change)) for each in angles if each.against.ratio < 1]
+            self._trials = [*trials, *drives, *self._orders(trials, fits)]
         return self._trials
 
     def _to_try(self) -> Iterator[Change]:
@@ -582,7 +586,7 @@ class Hypothesis:
                     Change("zero", (joint,), angle * DEGREE) for angle in _START_ZEROS_DEGREES
                 )
         for pair in coupled_pairs(self.model, moved):
-            yield from (Change(kind, pair) for kind in COUPLED)
+            yield from (Change(kind, pair) for kind in COUPLED_ANGLES)
         for pair in combinations(moved, 2):
             yield from (Change(kind, pair) for kind in ORDERS)
 

@@ -21,7 +21,9 @@ from identification.signals.samples import Samples
 
 Sign = Literal["torque sign", "position sign", "axis sign"]
 Order = Literal["torque order", "position order", "joint order"]
-Coupled = Literal["angle sum", "angle difference"]
+CoupledAngle = Literal["angle sum", "angle difference"]
+CoupledDrive = Literal["drive sum", "drive difference"]
+Coupled = Literal[CoupledAngle, CoupledDrive]
 Meaning = Literal[
     Sign,
     Order,
@@ -47,8 +49,12 @@ ORDERS: Final[tuple[Order, ...]] = get_args(Order)
 SIZED: Final[tuple[Meaning, ...]] = ("zero", "scale")
 UNITS: Final[tuple[Meaning, ...]] = ("degrees", "radians")
 GRAVITIES: Final[tuple[Meaning, ...]] = ("mounting", "no gravity")
-COUPLED: Final[tuple[Coupled, ...]] = get_args(Coupled)
+COUPLED_ANGLES: Final[tuple[CoupledAngle, ...]] = get_args(CoupledAngle)
 """The recorded angle of the first joint contains the second's, added or subtracted."""
+COUPLED_DRIVES: Final[tuple[CoupledDrive, ...]] = get_args(CoupledDrive)
+"""So does the angle of its motor, as with rods that drive a joint from the base of the second: the
+recorded torque of the second does not carry the first's."""
+COUPLED: Final[tuple[Coupled, ...]] = (*COUPLED_ANGLES, *COUPLED_DRIVES)
 DISCRETE_MEANINGS: Final[tuple[Meaning, ...]] = (*SIGNS, *ORDERS, *COUPLED)
 """Changes without a size."""
 # An angle contains that of one of these joints before it: parallel axes are neighbours, or have one
@@ -104,7 +110,14 @@ def change_of_motion(change: Change) -> Change:
         return change._replace(meaning="position sign")
     if change.meaning.endswith("order"):
         return Change("position order", change.joints, order=change.places)
+    if change.meaning in COUPLED_DRIVES:
+        return change._replace(meaning=COUPLED_ANGLES[COUPLED_DRIVES.index(change.meaning)])
     return change
+
+
+def drive_of(change: Change) -> Change:
+    """Return the coupled drive with the angle of a coupled angle."""
+    return change._replace(meaning=COUPLED_DRIVES[COUPLED_ANGLES.index(change.meaning)])
 
 
 def mounted_model(
@@ -131,8 +144,7 @@ def changed_samples(model: RobotModel, samples: Samples, change: Change) -> Samp
     if change.meaning in GRAVITIES:
         return samples
     axes = Axes.of([change], model.n_joints)
-    torque = samples.torque[:, axes.torque_order] * (axes.torque_sign / axes.torque_scale)
-    result = replace(samples, torque=torque)
+    result = replace(samples, torque=axes.read_torque(samples.torque))
     if samples.parent is not None:
         parent, part = samples.parent
         result = replace(result, parent=(changed_samples(model, parent, change), part))
@@ -190,7 +202,8 @@ class Axes(NamedTuple):
 
     A quantity as read is ``sign * recorded[:, order]``; positions are multiplied by `factor`, and
     `zero` [rad] is added: angles that may each contain that of other joints, ``coupling @ angles``.
-    Torques are divided by `torque_scale`.
+    Torques are divided by `torque_scale`, and then added up by `drives` if motors turn with several
+    joints: ``torque @ drives``.
     """
 
     position_order: NDArray[np.intp]
@@ -201,13 +214,14 @@ class Axes(NamedTuple):
     zero: Array
     coupling: Array  # (n, n)
     torque_scale: Array
+    drives: Array  # (n, n)
 
     @classmethod
     def of(cls, changes: Iterable[Change], joints: int) -> Axes:
         """Return the axes after changes, one after the other."""
         axes = cls(
             np.arange(joints), np.ones(joints), np.arange(joints), np.ones(joints), 1.0,
-            np.zeros(joints), np.eye(joints), np.ones(joints),
+            np.zeros(joints), np.eye(joints), np.ones(joints), np.eye(joints),
         )  # fmt: skip
         for change in changes:
             axes = axes._after(change)
@@ -235,6 +249,7 @@ class Axes(NamedTuple):
                 torque_order=axes.torque_order[order],
                 torque_sign=axes.torque_sign[order] * sign,
                 torque_scale=axes.torque_scale[order],
+                drives=axes.drives[np.ix_(order, order)] * np.outer(sign, sign),
             )
         if meaning in ("degrees", "radians"):
             factor = DEGREE if meaning == "degrees" else 1.0 / DEGREE
@@ -249,9 +264,16 @@ class Axes(NamedTuple):
             axes = axes._replace(torque_scale=axes.torque_scale * scale)
         if meaning in COUPLED:
             with_other = np.eye(len(self.zero))
-            with_other[change.joints] = 1.0 if meaning == "angle sum" else -1.0
+            with_other[change.joints] = 1.0 if meaning.endswith("sum") else -1.0
             axes = axes._replace(coupling=axes.coupling @ with_other)
+            if meaning in COUPLED_DRIVES:
+                axes = axes._replace(drives=axes.drives @ with_other)
         return axes
+
+    def read_torque(self, torque: Array) -> Array:
+        """Return recorded torques (m, n) as read."""
+        own = torque[:, self.torque_order] * (self.torque_sign / self.torque_scale)
+        return np.asarray(own @ self.drives)
 
     def read(self, recording: Recording) -> Recording:
         """Return a recording as read."""
@@ -259,12 +281,11 @@ class Axes(NamedTuple):
         uncoupled = np.linalg.inv(self.coupling).T
         velocity = recording.velocity
         torque = recording.torque
-        factor = self.torque_sign / self.torque_scale
         return replace(
             recording,
             position=(recording.position[:, self.position_order] * scale + self.zero) @ uncoupled,
             velocity=None
             if velocity is None
             else velocity[:, self.position_order] * scale @ uncoupled,
-            torque=None if torque is None else torque[:, self.torque_order] * factor,
+            torque=None if torque is None else self.read_torque(torque),
         )

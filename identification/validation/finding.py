@@ -205,6 +205,8 @@ RemedyKey = Literal[
     "check the order",
     "state the coupled angle",
     "state the coupled difference",
+    "state the coupled drive",
+    "state the opposite coupled drive",
     "separate the payloads",
     "check what changed in between",
     "find what changed in between",

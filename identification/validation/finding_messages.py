@@ -14,7 +14,14 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Final, NamedTuple
 
-from identification.hypotheses.joint_changes import COUPLED, ORDERS, SIGNS, Change, Meaning
+from identification.hypotheses.joint_changes import (
+    COUPLED,
+    COUPLED_DRIVES,
+    ORDERS,
+    SIGNS,
+    Change,
+    Meaning,
+)
 from identification.model.friction import FrictionLaw
 from identification.model.messages import law_option, law_text
 from identification.signals.messages import faults_words, time_lines
@@ -276,8 +283,9 @@ def _change(change: Change, naming: Naming) -> str:
         done = "negated" if change.meaning in SIGNS else "interchanged"
         return f"{_QUANTITIES[change.meaning]} of {joints} {done}"
     joint, other = (naming.joints[index] for index in change.joints)
-    sign = "plus" if change.meaning == "angle sum" else "minus"
-    return f"the angle of {joint} {sign} the angle of {other}"
+    sign = "plus" if change.meaning.endswith("sum") else "minus"
+    angle = f"the angle of {joint} {sign} the angle of {other}"
+    return f"{angle}, driven by rods or a belt" if change.meaning in COUPLED_DRIVES else angle
 
 
 _CORRECTED: Final = Optional(
@@ -305,6 +313,10 @@ _TIMES: Final = Optional(
 )
 _CONSTANT: Final = (
     "is {size:.3g} ± {half_interval:.2g} times the value consistent with the other axes"
+)
+_DRIVEN: Final = (
+    "rods or belts probably drive {joint}: its recorded angle is its own FACTOR the angle of"
+    " {other}, whose motor does not carry its torque"
 )
 _EXCEEDS: Final = "the torque error on {motion} exceeds {limit:pc0}"
 _SLOW: Final = "the torque error on {motion} beyond noise exceeds {limit:pc1}: {each}"
@@ -553,6 +565,8 @@ SENTENCES: Final[Mapping[FindingKey, Sentence]] = {
         _COUPLED_ANGLES,
         "the recorded angle of {joint} is probably its own minus the angle of {other}",
     ),
+    "drive sum": _fault(_COUPLED_ANGLES, _DRIVEN.replace("FACTOR", "plus")),
+    "drive difference": _fault(_COUPLED_ANGLES, _DRIVEN.replace("FACTOR", "minus")),
     "payload of a part": _fault(
         "sameness",
         "in {part} the arm carried {sized} than in the other data",
@@ -838,6 +852,11 @@ _COUPLED: Final = (
     " the log: coupled = [[{numbers}, FACTOR]] in [position] and [velocity] (columns counted from"
     " 1)"
 )
+_COUPLED_DRIVE: Final = (
+    "see whether rods or belts drive {joint}; if they do, state in the column map of the log: side"
+    ' = "motor" in [position], [velocity] and [torque]; in [drive] gear_ratio = [1.0, ...] with an'
+    " entry for each joint, and coupling = [[{numbers}, FACTOR]] (columns counted from 1)"
+)
 
 MOUNTING_STEP: Final = (
     "state how the arm is mounted: `--gravity X Y Z` where a log is read with its URDF, or gravity"
@@ -962,6 +981,8 @@ REMEDIES: Final[Mapping[RemedyKey, str]] = {
     ),
     "state the coupled angle": _COUPLED.replace("FACTOR", "1"),
     "state the coupled difference": _COUPLED.replace("FACTOR", "-1"),
+    "state the coupled drive": _COUPLED_DRIVE.replace("FACTOR", "1.0"),
+    "state the opposite coupled drive": _COUPLED_DRIVE.replace("FACTOR", "-1.0"),
     "separate the payloads": (
         "identify the recordings of each payload separately, or state a known payload in their cell"
         " file ([robot.payload])"

@@ -52,6 +52,8 @@ CASES: dict[str, tuple[Change, ...]] = {
     "gravity removed": (Change("no gravity"),),
     "knee to the ground": (Change("angle sum", (1, 0)),),
     "ankle less the knee": (Change("angle difference", (2, 1)),),
+    "rods to the knee": (Change("drive sum", (1, 0)),),
+    "opposite rods to the ankle": (Change("drive difference", (2, 1)),),
 }
 
 
@@ -73,6 +75,14 @@ def planted(case: str) -> tuple[Floats, Floats]:
         "gravity removed": (q, torque - weight),
         "knee to the ground": (q + np.roll(q, 1, axis=1) * KNEE, torque),
         "ankle less the knee": (q - np.roll(q, 1, axis=1) * [0.0, 0.0, 1.0], torque),
+        "rods to the knee": (
+            q + np.roll(q, 1, axis=1) * KNEE,
+            torque - np.roll(torque, -1, axis=1) * HIP,
+        ),
+        "opposite rods to the ankle": (
+            q - np.roll(q, 1, axis=1) * [0.0, 0.0, 1.0],
+            torque + np.roll(torque, -1, axis=1) * KNEE,
+        ),
     }[case]
 
 

@@ -942,6 +942,12 @@ def with_axis_2(values):
     return values + np.array([0.0, 0.0, 1.0, 0.0, 0.0, 0.0]) * values[:, [1]]
 
 
+def relieved(samples):
+    """Rods drive axis 3 from the base: motor 2 does not carry its torque."""
+    torque = samples.torque - np.array([0.0, 1.0, 0.0, 0.0, 0.0, 0.0]) * samples.torque[:, [2]]
+    return replace(samples, torque=torque)
+
+
 GAIN = np.array([1.0, 1.15, 1.0, 1.0, 1.0, 1.0])
 FAULTS = {
     "delay": ((), late),
@@ -952,6 +958,7 @@ FAULTS = {
     "position order": ((1, 2), lambda samples: moved(samples, swapped, torque=False)),
     "joint order": ((1, 2), lambda samples: moved(samples, swapped)),
     "angle sum": ((2, 1), lambda samples: moved(samples, with_axis_2, torque=False)),
+    "drive sum": ((2, 1), lambda samples: relieved(moved(samples, with_axis_2, torque=False))),
 }
 SIZES = {"delay": DELAY, "scale": 0.15}
 

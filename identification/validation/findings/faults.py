@@ -36,6 +36,8 @@ _THROUGHOUT: Final[Mapping[Meaning, tuple[FindingKey, RemedyKey]]] = {
     "joint order": ("joint order", "check the order"),
     "angle sum": ("angle sum", "state the coupled angle"),
     "angle difference": ("angle difference", "state the coupled difference"),
+    "drive sum": ("drive sum", "state the coupled drive"),
+    "drive difference": ("drive difference", "state the opposite coupled drive"),
 }
 _OF_PART: Final[Mapping[Meaning, tuple[FindingKey, RemedyKey]]] = {
     "payload": ("payload of a part", "separate the payloads"),

@@ -162,6 +162,12 @@ def late(table: Mapping[str, Floats]) -> dict[str, Floats]:
             f"recorded {JOINTS[1]} is {JOINTS[1]} plus {JOINTS[0]}",
             marks=pytest.mark.long,
         ),
+        pytest.param(
+            by_rods,
+            "coupling",
+            f"recorded {JOINTS[1]} is {JOINTS[1]} plus {JOINTS[0]}, driven by rods or a belt",
+            marks=pytest.mark.long,
+        ),
     ],
 )
 def test_a_planted_meaning_is_named(
@@ -367,6 +373,21 @@ class TestConclusions:
         assert done.exit_code == 0, done.exception
         read = open_archive(archive).columns
         assert read["position"] == near(table["q"], abs=1e-7)
+        assert read["torque"] == near(table["tau"], abs=1e-4)
+
+    @pytest.mark.long
+    def test_the_map_of_a_look_states_rods(
+        self, tmp_path: Path, urdf: Path, table: Mapping[str, Floats]
+    ) -> None:
+        path = tmp_path / "a.csv"
+        write_log(path, ["t", "q{}", "v{}", "tau{}"], *{**table, **by_rods(table)}.values())
+        target, archive = tmp_path / "map.toml", tmp_path / "a.mcap"
+        assert hil("look", path, "--urdf", urdf, "-o", target).exit_code == 0
+        done = hil("import", "log", path, "--urdf", urdf, "--map", target, "-o", archive)
+        assert done.exit_code == 0, done.exception
+        read = open_archive(archive).columns
+        assert read["position"] == near(table["q"], abs=1e-7)
+        assert read["velocity"] == near(table["v"], abs=1e-7)
         assert read["torque"] == near(table["tau"], abs=1e-4)
 
     @pytest.mark.long
