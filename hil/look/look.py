@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Final
@@ -39,6 +39,7 @@ from hil.look.readings import (
     NextStep,
     NoJointTorque,
     StillUnexplained,
+    Vector,
 )
 from hil.look.result import Aspect, Look, ParameterGroup, Row
 from hil.look.servo_load import may_be_load, servo_load, torques_without_sign, without_torque
@@ -55,6 +56,7 @@ from hil.pipeline.torque_scale import torque_scale
 from identification.errors import IdentificationError
 from identification.estimators.delay import DelayEstimate, estimate_delay
 from identification.hypotheses.diagnosis import UNEXPLAINED, few_rows, torque_of
+from identification.hypotheses.gravity_direction import tilted_gravity
 from identification.hypotheses.inertia_scale import retimed
 from identification.hypotheses.joint_changes import Axes
 from identification.hypotheses.readings import Readings
@@ -65,6 +67,9 @@ from identification.model.robot import RobotModel
 from identification.signals.recording import RIGID_RATE, Recording, RecordingError
 from identification.signals.samples import Samples
 
+# of the torque, predicted from other parts, above which the direction of gravity is asked
+_TILT_ERROR: Final = 0.05
+_GRAVITY_DECIMALS: Final = 3  # of m/s², as finely as an arm is levelled
 _DELAY_SAMPLES: Final = 20_000
 # Both motion and torque are limited to a twelfth of it before a delay is estimated.
 _DELAY_RATE: Final = 125.0  # Hz
@@ -249,7 +254,13 @@ def _finding(
     torque = torque_of(cell.model, [samples], rows, score_of(cell.model, rows))
     if torque.time is not None:
         samples = retimed(cell.model, samples, torque.time)
-    readings = _readings(cell, samples, imported)
+    gravities: Mapping[str, Vector] = physics.MOUNTINGS
+    readings = _readings(cell, samples, imported, gravities)
+    is_open = readings.score.overall > _TILT_ERROR and not torque.is_otherwise
+    if is_open and (tilted := tilted_gravity(cell.model, samples)) is not None:
+        gravity = tuple((np.round(tilted.best, _GRAVITY_DECIMALS) + 0.0).tolist())
+        gravities = {**gravities, physics.tilt_name(tilted.angle): gravity}
+        readings = _readings(cell, samples, imported, gravities)
     axes = Axes.of((step.change for step in readings.steps), cell.model.n_joints)
     return physics.TorqueFindings(
         cell,
@@ -260,6 +271,7 @@ def _finding(
         imported.map_text,
         source,
         imported.files,
+        gravities,
         is_side_open=_is_side_open(imported),
     )
 
@@ -293,11 +305,13 @@ def _look_of(
     )
 
 
-def _readings(cell: Cell, samples: Samples, imported: ImportedRecording) -> Readings:
+def _readings(
+    cell: Cell, samples: Samples, imported: ImportedRecording, gravities: Mapping[str, Vector]
+) -> Readings:
     return find_readings(
         cell.model,
         samples,
-        mountings=mountings(cell),
+        mountings=mountings(cell, gravities),
         unit_is_open=_is_unit_open(imported),
     )
 
@@ -311,11 +325,13 @@ def _is_unit_open(imported: ImportedRecording) -> bool:
     )
 
 
-def mountings(cell: Cell) -> dict[str, RobotModel]:
-    """Return models of a cell with another gravity, by the mounting."""
+def mountings(
+    cell: Cell, gravities: Mapping[str, Vector] = physics.MOUNTINGS
+) -> dict[str, RobotModel]:
+    """Return models of a cell with another gravity [m/s²], by the mounting."""
     return {
         name: cell.model.under_gravity(gravity)
-        for name, gravity in physics.MOUNTINGS.items()
+        for name, gravity in gravities.items()
         if not np.allclose(gravity, cell.model.gravity)
     }
 

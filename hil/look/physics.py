@@ -104,7 +104,7 @@ from identification.signals.recording import Recording
 from identification.signals.samples import Samples
 from identification.validation.nominal_scale import nominal_scale
 
-MOUNTINGS: Final = {
+MOUNTINGS: Final[Mapping[str, Vector]] = {
     "": (0.0, 0.0, 0.0),
     "upside down": (0.0, 0.0, 9.81),
     "on a wall, +x down": (9.81, 0.0, 0.0),
@@ -139,6 +139,11 @@ _WEAK_STD_RATIO: Final = 0.9
 # Masses of arms over the cube of their reach, kg/m³: 11 (Gen3) to 216 (TX40).
 _ARM_DENSITY: Final = 45.0
 _DENSITY_SPREAD: Final = 3.0  # factor of one standard deviation
+
+
+def tilt_name(angle: float) -> str:
+    """Return the name of a mounting whose gravity is at an angle [rad] to the declared one."""
+    return f"tilted by {np.degrees(angle):.0f}°"
 
 
 @dataclass(frozen=True)
@@ -268,6 +273,7 @@ class TorqueFindings:
         torque: what it is as recorded, as a whole.
         map_text: the column map of the import; None for a bag.
         files: the recording, parsed.
+        gravities: that were tried, by mounting, "" for none [m/s²].
         is_side_open: whether nothing states that the torque is that of the joints.
         explained: how a low-pass or heavy rotors explain the torque as read at least as well as the
             changes that were found, none of which is then certain; None if they do not.
@@ -281,6 +287,7 @@ class TorqueFindings:
     map_text: str | None
     source: Path
     files: LogFiles
+    gravities: Mapping[str, Vector]
     is_side_open: bool = True
     explained: ErrorExplained | None = None
 
@@ -635,8 +642,7 @@ class TorqueFindings:
         axes = Axes.of(others, self.cell.model.n_joints)
         setting: Setting | None = self._line_of(axes)
         if setting is None and change.meaning in ("no gravity", "mounting"):
-            gravity = (0.0, 0.0, 0.0) if change.meaning == "no gravity" else MOUNTINGS[change.name]
-            setting = GravityOption(gravity)
+            setting = GravityOption(self.gravities[change.name])
         return TiedReading(_ASPECTS[change.meaning], self._of_arm(change), error, setting)
 
     def _line_of(self, axes: Axes) -> MapEntries | None:

@@ -10,6 +10,7 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
+from identification.hypotheses import gravity_direction
 from identification.hypotheses.carried_load import MIN_LOAD_EXPLAINED
 from identification.hypotheses.joint_changes import Change, Coupled, Order, Sign
 from identification.hypotheses.little_torque import LITTLE_TORQUE_SHARE
@@ -340,8 +341,9 @@ class Thresholds:
     #: seconds of unseen motion in which an axis must have moved: four blocks of the covariance, of
     #: which an error has a standard deviation of a third of it
     moved: float = 0.5
-    gravity: float = 0.5  #: squared error on unseen motion with the best gravity over declared
-    gravity_angle: float = 1.0  #: degrees between the two. Other faults on the NS 16: up to 0.06
+    #: squared error on unseen motion with the best gravity over declared
+    gravity: float = gravity_direction.MAX_ERROR_RATIO
+    gravity_angle: float = gravity_direction.MIN_ANGLE  #: degrees between the two
     load: float = (
         MIN_LOAD_EXPLAINED  #: share of the additional error that a body on the last link explains
     )

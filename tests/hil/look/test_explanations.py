@@ -1,4 +1,4 @@
-"""What a look says of a torque constant that is a little wrong, and of what changes in a log."""
+"""What a look says of a slightly wrong torque constant, of changes in a log, of a tilted arm."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from hil.importers.conclusions import Certainty
 from hil.importers.imported_robot import Robot
 from hil.importers.recording_import import ImportOptions
 from hil.look import look_at
-from hil.look.messages import as_json
+from hil.look.messages import as_json, row_text
 from hil.look.readings import FoundChange
 from hil.look.result import Look, Row
 from tests.hil.simulated_logs import Simulated, simulate, urdf_path, write_log
@@ -47,6 +47,16 @@ def look(folder: Path, simulated: Simulated) -> Look:
 
 def found_in(looked: Look) -> list[Row]:
     return [row for row in looked.rows if isinstance(row.reading, FoundChange)]
+
+
+def test_an_arm_on_a_slope_is_found_with_its_gravity(tmp_path: Path) -> None:
+    gravity = (0.0, -4.905, -8.496)  # 30 degrees
+    looked = look(tmp_path, simulate(URDF, TIME, seed=2, pace=1.5, gravity=gravity))
+    (row,) = [row for row in looked.rows if row.aspect == "mounting"]
+    assert row_text(row).reading == "tilted by 30°"
+    assert row.certainty is Certainty.CERTAIN
+    assert looked.gravity == pytest.approx(gravity, abs=0.1)
+    assert not any(row.is_changed for row in looked.rows if row.aspect != "mounting")
 
 
 def test_nothing_is_said_of_a_log_without_a_fault(tmp_path: Path, plain: Simulated) -> None:
