@@ -186,7 +186,17 @@ class RolloutResult(Frozen):
         )
 
     @property
+    def _is_mostly_unstable(self) -> bool:
+        return 2 * self.identified.unstable > self.windows
+
+    @property
     def _against_nominal(self) -> str:
+        if self._is_mostly_unstable:
+            return (
+                "The identified arm does not follow the recorded motion:"
+                f" {self.identified.unstable} of {self.windows} windows become unstable, so that its"
+                " errors say nothing more."
+            )
         if self.ratio is None:
             return f"There is no nominal arm to compare with: {self.no_nominal}."
         worse = [h for h, ratio in zip(self.horizons, self.ratio, strict=True) if ratio >= 1.0]

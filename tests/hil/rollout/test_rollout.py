@@ -73,6 +73,10 @@ def test_a_rollout_is_better_than_the_nominal_arm(folder: Path) -> None:
     assert "is better than the nominal one up to 1 s" in result.message
     assert all(np.isfinite(at).all() for at in result.identified.joints)
     assert "nan" not in (folder / ROLLOUT).read_text().lower()
+    unstable = result.identified.model_copy(update={"unstable": result.windows - 1})
+    message = result.model_copy(update={"identified": unstable}).message
+    assert message.startswith("The identified arm does not follow the recorded motion")
+    assert "better than the nominal" not in message
 
 
 def test_it_reads_what_was_identified(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
