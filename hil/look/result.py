@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any, Literal
+from typing import Any, Final, Literal
 
 from hil.importers.conclusions import Certainty, Conclusion
 from hil.look.readings import (
@@ -57,6 +57,13 @@ Aspect = Literal[
 ]
 """What a row is about, as a person and a program read it."""
 
+_NEEDED: Final = (
+    NextStep.IMPORT_COMMANDS,
+    NextStep.RECORD_COMMANDS,
+    NextStep.STATE_TORQUE_CONSTANT,
+)
+"""What a person has to do before an identification, however certain the row is."""
+
 
 @dataclass(frozen=True)
 class Row:
@@ -85,7 +92,7 @@ class Row:
         """Whether a person has something to do: to decide it, or to mend what is wrong."""
         if self.is_unsupported:
             return False
-        if self.decider in (NextStep.IMPORT_COMMANDS, NextStep.RECORD_COMMANDS):
+        if self.decider in _NEEDED:
             return True
         return self.decider is not None and (
             self.is_fault or self.certainty is Certainty.UNDETERMINED

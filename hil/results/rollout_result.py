@@ -194,8 +194,8 @@ class RolloutResult(Frozen):
         if self._is_mostly_unstable:
             return (
                 "The identified arm does not follow the recorded motion:"
-                f" {self.identified.unstable} of {self.windows} windows become unstable, so that its"
-                " errors say nothing more."
+                f" {self.identified.unstable} of {self.windows} windows become unstable, and its"
+                " errors say no more."
             )
         if self.ratio is None:
             return f"There is no nominal arm to compare with: {self.no_nominal}."
