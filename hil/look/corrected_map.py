@@ -57,7 +57,9 @@ def entries_of(
     drives = _terms(axes.drives, columns)
     angles = axes.coupling @ np.linalg.inv(axes.drives)  # that no drive contains
     if drives:
-        ratios = table.get("drive", {}).get("gear_ratio") or [1.0] * len(joints)
+        stated = table.get("drive", {}).get("gear_ratio")
+        of_motors = all(table[name].get("side") == "motor" for name in quantities if name in table)
+        ratios = stated if stated and of_motors else [1.0] * len(joints)
         entries["drive.gear_ratio"] = ratios
         entries["drive.coupling"] = [[j, k, each * ratios[j - 1]] for j, k, each in drives]
     if same and not np.array_equal(axes.position_order, count):

@@ -257,7 +257,7 @@ def _finding(
     gravities: Mapping[str, Vector] = physics.MOUNTINGS
     readings = _readings(cell, samples, imported, gravities)
     is_open = readings.score.overall > _TILT_ERROR and not torque.is_otherwise
-    if is_open and (tilted := tilted_gravity(cell.model, samples)) is not None:
+    if is_open and (tilted := tilted_gravity(cell.model, [samples])) is not None:
         gravity = tuple((np.round(tilted.best, _GRAVITY_DECIMALS) + 0.0).tolist())
         gravities = {**gravities, physics.tilt_name(tilted.angle): gravity}
         readings = _readings(cell, samples, imported, gravities)

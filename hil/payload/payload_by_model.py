@@ -20,10 +20,10 @@ from hil.pipeline.sources import (
 )
 from hil.pipeline.torque_scale import torque_scale
 from identification.estimators.payload_problem import KnownArm, Run
+from identification.hypotheses.gravity_direction import tilted_gravity
 
 from .payload_found import BareCheck, PayloadFound
 from .payload_run import (
-    doubtful_mounting,
     flange_of,
     require_one_arm,
     weighed,
@@ -80,7 +80,7 @@ def weigh_by_model(
     sides = {False: of_arm, True: paths}
     of_both = (*prepared.sources.training, *others.training)
     meanings = require_weight(cell.model, prepared.fitted, of_both, of_arm[0])
-    mounting = doubtful_mounting(cell.model, prepared.fitted)
+    mounting = tilted_gravity(cell.model, prepared.fitted)
     check = BareCheck(tuple(cell.model.joint_names), mounting, meanings)
     estimate, body = weighed(
         cell.model, runs, scale, frame, sides, others.training, check, known_arm

@@ -35,19 +35,14 @@ from identification.estimators.payload_estimate import (
     reach,
 )
 from identification.estimators.payload_problem import KnownArm, Run
-from identification.factor.columns import standard_factor
-from identification.hypotheses.gravity_direction import GravityDirection, find_gravity
+from identification.hypotheses.gravity_direction import tilted_gravity
 from identification.model.pseudo_inertia import Body
 from identification.model.robot import STANDARD_GRAVITY, RobotModel
-from identification.signals.samples import Samples
-from identification.validation.finding import Thresholds
 
 from .payload_found import BareCheck, PayloadFound
 from .payload_messages import certain_lines, mounting_words
 
 _MIN_CENTRE_LIMIT: Final = 0.5  # m, of a hand tool on an arm that is shorter itself
-_FITTED_SHARE: Final = 0.7  # of each bare recording, when the direction of gravity is tried
-_MAX_BARE_RECORDINGS: Final = 3  # enough to determine gravity
 
 
 def weight_per_mass(model: RobotModel) -> float:
@@ -97,7 +92,7 @@ def find_payload(
     recordings = [source.recording for source in training]
     scale = torque_scale(cell, recordings, simulated=simulated)
     with reporter.task("weighing", 2) as task:
-        mounting = doubtful_mounting(cell.model, prepared.fitted)
+        mounting = tilted_gravity(cell.model, prepared.fitted)
         task.advance(1)
         check = BareCheck(tuple(cell.model.joint_names), mounting, meanings)
         estimate, body = weighed(cell.model, runs, scale, frame, sides, training, check)
@@ -244,26 +239,6 @@ def weighed(
     travel = np.max(positions, axis=0)
     _require_within_reach(estimate, reach(model, frame, travel), frame)
     return estimate, estimate.body
-
-
-def doubtful_mounting(model: RobotModel, bare: Sequence[Samples]) -> GravityDirection | None:
-    """Return another direction of gravity that is likely, by the bare recordings; else None.
-
-    The check of :mod:`identification.validation`: fitted to the beginning of each recording, the
-    best direction predicts the rest much better than the stated one.
-    """
-    first = []
-    last = []
-    for samples in bare[:_MAX_BARE_RECORDINGS]:
-        count = len(samples.torque)
-        cut = round(_FITTED_SHARE * count)
-        first.append(samples.between(0, cut))
-        last.append(samples.between(cut, count))
-    gravity = find_gravity(model, standard_factor(model, first), standard_factor(model, last))
-    limits = Thresholds()
-    angle = float(np.degrees(gravity.angle))
-    likelier = gravity.ratio < limits.gravity and angle > limits.gravity_angle
-    return gravity if likelier else None
 
 
 def _require_agreement(

@@ -53,7 +53,6 @@ ROWS: Final = 700
 _WEIGHTLESS_ERROR_RATIO: Final = 0.7
 MIN_ERROR_GROWTH: Final = 1.25
 """Error of unseen over the error of fitted motion from which something begins in it."""
-_FITTED_SHARE: Final = 0.7  # of a recording, in whose rest something may begin
 _FREE_SHARE: Final = 30.0  # standard deviation over the masses, of bodies hardly believed
 _MIN_ROWS: Final = 100  # that say something of bodies
 # share of the nominal torque below which the bodies are not the arm's
@@ -368,8 +367,7 @@ def explain_errors(
     found = find_columns(model, [samples], fitted)
     if found and all(each.is_certain for each in found):
         return found
-    cut = round(_FITTED_SHARE * len(samples.torque))
-    seen, unseen = samples.between(0, cut), samples.between(cut, len(samples.torque))
+    seen, unseen = samples.to_fit_and_predict()
     fitted, error = _fit(model, seen, scale_std)
     if not _relative_error(Factor.of(model, unseen), fitted.values) > MIN_ERROR_GROWTH * error:
         return found

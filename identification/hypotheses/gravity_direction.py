@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Final
 
@@ -18,7 +19,7 @@ MAX_ERROR_RATIO: Final = 0.5
 """Squared error on unseen motion with the best gravity over the declared one, where it is wrong."""
 MIN_ANGLE: Final = 1.0
 """Degrees between the two. Other faults on the NS 16: up to 0.06."""
-_FITTED_SHARE: Final = 0.7  # of a recording
+_MAX_RECORDINGS: Final = 3  # enough to determine gravity
 _FRICTION_PASSES: Final = 2
 _MAX_TURNS: Final = 20
 _STEP_SHARES: Final = (1.0, 0.5, 0.1)  # of a Gauss-Newton step that are tried
@@ -53,14 +54,15 @@ def standard_parameters(factor: Factor, weights: Array) -> Array:
     return solve_with_ridge(equations.A, equations.b, _RIDGE)
 
 
-def tilted_gravity(model: RobotModel, samples: Samples) -> GravityDirection | None:
-    """Return the gravity that a recording shows instead of the declared one; None if it does not.
+def tilted_gravity(model: RobotModel, recordings: Sequence[Samples]) -> GravityDirection | None:
+    """Return the gravity that recordings show instead of the declared one; None if they do not.
 
-    It is fitted to the first part of the recording, and must predict the rest much better.
+    It is fitted to the first part of each, and must predict the rest much better.
     """
-    cut = round(_FITTED_SHARE * len(samples.torque))
-    parts = samples.between(0, cut), samples.between(cut, len(samples.torque))
-    found = find_gravity(model, *(standard_factor(model, [part]) for part in parts))
+    parts = [samples.to_fit_and_predict() for samples in recordings[:_MAX_RECORDINGS]]
+    found = find_gravity(
+        model, *(standard_factor(model, part) for part in zip(*parts, strict=True))
+    )
     is_tilted = found.ratio < MAX_ERROR_RATIO and np.degrees(found.angle) > MIN_ANGLE
     return found if is_tilted else None
 

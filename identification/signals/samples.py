@@ -26,6 +26,7 @@ from identification.signals.smoothing import (
 # Default (see :mod:`identification.selection.questions`). Planned motion is below 10 Hz, the
 # first resonance of large arms at 10 to 30 Hz; on the simulated NS 16 20 to 60 Hz are equal.
 RIGID_BANDWIDTH: Final = 40.0  # Hz
+_FITTED_SHARE: Final = 0.7  # of the rows of one recording
 _MAX_PREDICTIONS: Final = 2  # in memory: predictions of the result and of the nominal model
 _MIN_SEGMENT_SAMPLES: Final = 12  # samples, twice the minimum of a quintic spline
 
@@ -112,6 +113,11 @@ class Samples:
             mask=None if self.mask is None else self.mask.rows(part),
             parent=None if self.torque_bandwidth is None else (self, part),
         )
+
+    def to_fit_and_predict(self) -> tuple[Samples, Samples]:
+        """Return the first 70 %, to be fitted, and the rest, to be predicted."""
+        cut = round(_FITTED_SHARE * len(self.torque))
+        return self.between(0, cut), self.between(cut, len(self.torque))
 
     def thinned(self, step: int) -> Samples:
         """Return every `step`-th row, as of a torque without a low-pass."""
