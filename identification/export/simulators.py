@@ -27,7 +27,15 @@ from identification.export.urdf import (
     rnea,
     write_urdf,
 )
-from identification.model.elements import PlacedElement, TorsionSpring
+from identification.model.elements import (
+    Element,
+    ExtensionSpring,
+    GasCylinder,
+    PlacedElement,
+    PositionTorque,
+    TorqueRipple,
+    TorsionSpring,
+)
 from identification.model.friction import (
     COULOMB,
     CUBIC,
@@ -230,6 +238,15 @@ def pinocchio_archive(arm: ExportedArm, name: str, remarks: Sequence[str] = ()) 
     return str(pinocchio_arm(arm, name).saveToString())
 
 
+_ELEMENT_NAMES: Final[Mapping[type[Element], str]] = {
+    TorsionSpring: "torsion spring",
+    ExtensionSpring: "extension spring",
+    GasCylinder: "gas spring or balancer",
+    TorqueRipple: "torque ripple",
+    PositionTorque: "position-dependent torque",
+}
+
+
 class ModelFormat(NamedTuple):
     """A file format and the parts of the model that it supports."""
 
@@ -373,7 +390,7 @@ def _parts(form: ModelFormat, arm: ExportedArm, motion: Motion) -> Iterator[Part
     )
     for placed in model.elements.placed:
         supported = form.drives and isinstance(placed.element, TorsionSpring)
-        description = f"{type(placed.element).__name__} of {placed.element.joint}"
+        description = f"the {_ELEMENT_NAMES[type(placed.element)]} of {placed.element.joint}"
         yield description, partial(_element_torque, arm, motion, placed), supported
 
 

@@ -671,7 +671,8 @@ class TestReadBack:
         left = set(compared(form, arm, samples=200).left_out)
         everywhere = {"half the difference fd of viscous friction forwards and backwards",
                       "additional friction fs at low speed (Stribeck)", "a constant offset fo",
-                      "TorqueRipple of joint_1", "GasCylinder of joint_3"}  # fmt: skip
+                      "the torque ripple of joint_1",
+                      "the gas spring or balancer of joint_3"}  # fmt: skip
         rotors = {"rotor inertias", "inertia of coupled motors", "friction of coupled motors"}
         assert left >= everywhere
         expected = {"mjcf": set(), "pinocchio": rotors - {"rotor inertias"}}
@@ -679,7 +680,7 @@ class TestReadBack:
         gravity = "gravity of 0, 3, -9 m/s² in base axes, which the simulator must have"
         assert (gravity in left) == (form in ("urdf", "sdf"))
         assert ("the payload" in left) == (form != "mjcf")
-        assert ("TorsionSpring of joint_2" in left) == (form != "mjcf")
+        assert ("the torsion spring of joint_2" in left) == (form != "mjcf")
         assert ("a term f2 with the speed squared" in left) == (form != "mjcf")
 
     def test_what_gravity_adds_is_that_of_the_simulator(self):
