@@ -58,6 +58,7 @@ CANDIDATE = Candidate(
     tanh=None,
     ripple=(1, 2),
     springs=("elbow",),
+    position_torques=("wrist",),
     excluded_rows=None,
     delay=1.0 / 3.0,
     low_pass=None,
