@@ -170,6 +170,11 @@ def choose_settings(
         decision = trial.decide("torque ripple", [now, *rippled])
         now = decision.settings
         choices = [*choices, decision.choice]
+    if "position torque" in requested:
+        # Before the prior: bodies that cannot exist predict a torque of the position as well.
+        for decision in _position_torques(trial, now, position_torques):
+            now = decision.settings
+            choices = [*choices, decision.choice]
     trial.weigh(now)
     compared, now, decided = _choose_prior(trial, now, requested)
     if not trial.errors(compared).overall < MEANINGLESS_ERROR:
@@ -178,10 +183,6 @@ def choose_settings(
     if "springs" in requested:
         # Last: what is left of a spring that impossible bodies stand for is theirs as before.
         for decision in _torsion_springs(trial, now, springs):
-            now = decision.settings
-            choices = [*choices, decision.choice]
-    if "position torque" in requested:
-        for decision in _position_torques(trial, now, position_torques):
             now = decision.settings
             choices = [*choices, decision.choice]
     if "bandwidth" in requested:
