@@ -564,10 +564,20 @@ class Hypothesis:
                 change for change, error in errors.items() if error >= excluded
             )
             trials = [self._try(change) for change in to_compare(errors, excluded)]
-            angles = [trial for trial in trials if trial.change.meaning in COUPLED_ANGLES]
-            drives = [self._try(drive_of(each.change)) for each in angles if each.against.ratio < 1]
-            self._trials = [*trials, *drives, *self._orders(trials, fits)]
+            self._trials = [*trials, *self._drives(trials), *self._orders(trials, fits)]
         return self._trials
+
+    def _drives(self, trials: Sequence[Trial]) -> Iterator[Trial]:
+        """Yield the drives of coupled angles that lessen the error, where they halve it.
+
+        Where there are rods, the torque of two joints is wrong without them. What lessens it a
+        little imitates something else, such as a low-pass.
+        """
+        for trial in trials:
+            if trial.change.meaning in COUPLED_ANGLES and trial.against.ratio < 1.0:
+                drive = self._try(drive_of(trial.change))
+                if drive.against.ratio < _HALVED_ERROR_RATIO:
+                    yield drive
 
     def _to_try(self) -> Iterator[Change]:
         n = self.model.n_joints
