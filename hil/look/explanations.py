@@ -4,8 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 
-import numpy as np
-
 from hil.base.arrays import Array
 from hil.importers.conclusions import Certainty
 from hil.look.physics import TorqueFindings
@@ -18,7 +16,6 @@ from hil.look.readings import (
     RivalChanges,
 )
 from hil.look.result import Aspect, Row
-from identification.distributions import SIGNIFICANT_SIGMAS
 from identification.hypotheses.column_scores import SEPARATE_ERROR_RATIO
 from identification.hypotheses.column_search import Explanation
 from identification.hypotheses.diagnosis import explain_errors
@@ -44,18 +41,9 @@ def explained_rows(finding: TorqueFindings, scale_std: Array) -> Iterator[Row]:
         return
     for found in explain_errors(readings.model, readings.samples, scale_std):
         change = found.change
-        if change.meaning not in _NO_FAULTS and _is_beyond(found, scale_std):
+        if change.meaning not in _NO_FAULTS and not found.is_assumed(scale_std):
             is_likely = found.is_certain and not finding.fits_badly
             yield _row(found, finding.cell.joint_names, is_likely)
-
-
-def _is_beyond(found: Explanation, scale_std: Array) -> bool:
-    """Return whether a torque constant is wrong by more than is assumed of it."""
-    change = found.change
-    if change.meaning != "scale" or change.part is not None or found.size is None:
-        return True
-    std = np.hypot(scale_std[[*change.joints]].max(), found.std)
-    return bool(abs(found.size) > SIGNIFICANT_SIGMAS * std)
 
 
 def _row(found: Explanation, joints: tuple[str, ...], is_likely: bool) -> Row:

@@ -99,11 +99,11 @@ from hil.look.readings import (
 )
 from hil.look.result import ChangedReading, Look, Row, TiedReading
 from identification.estimators.delay_messages import undetermined_words
+from identification.hypotheses.change_messages import part_words
 from identification.hypotheses.joint_changes import (
     COUPLED,
     COUPLED_DRIVES,
     ORDERS,
-    Change,
     Meaning,
     Part,
 )
@@ -245,17 +245,6 @@ _STEPS: Final[Mapping[NextStep, str]] = {
     NextStep.ASK_FOR_UNIT: "ask for the unit of the channel",
     NextStep.ASK_FOR_FILTER: "ask for the filter of the channel",
 }
-_OF_A_PART: Final[Mapping[Meaning, str]] = {
-    "payload": "another load",
-    "scale": "another scale of the torque{}",
-    "friction": "another friction{}",
-    "friction drift": "drifting friction{}",
-    "delay": "another delay{}",
-    "drift": "a drifting zero{}",
-    "load friction": "friction that grows with the load",
-    "arm": "another tool or setting",
-    "unmodelled": "a motion that shows more of what the model lacks",
-}
 _MAX_JUMPS: Final = 3  # that a row names
 _CHANGES: Final[Mapping[Meaning, str]] = {
     "torque sign": "torque negated",
@@ -379,13 +368,6 @@ def described(change: ArmChange) -> str:
     joints = change.change.joints
     all_of_them = len(joints) == len(change.joints)
     return f"{text}: {'all joints' if all_of_them else ', '.join(_names(change))}"
-
-
-def _of_a_part(change: Change, joints: Sequence[str]) -> str:
-    """Return what may be other in a part, without its size."""
-    names = ", ".join(joints[joint] for joint in change.joints)
-    of_joints = f" of {names}" if names else ""
-    return _OF_A_PART[change.meaning].format(of_joints)
 
 
 def _when(part: Part) -> str:
@@ -528,7 +510,7 @@ def _(found: FoundChange) -> str:
     size, half = explanation.size, number(explanation.half_interval, 2)
     when = "" if change.part is None else f" {_when(change.part)}"
     if size is None or explanation.rivals:
-        return f"{_of_a_part(change, found.joints)}{when}"
+        return f"{part_words(change, found.joints)}{when}"
     match change.meaning:
         case "payload":
             more = "more" if size > 0.0 else "less"
@@ -549,7 +531,7 @@ def _(error: CorrectedError) -> str:
 @_worded.register
 def _(rivals: RivalChanges) -> str:
     sets = (
-        " with ".join(_of_a_part(change, rivals.joints) for change in each)
+        " with ".join(part_words(change, rivals.joints) for change in each)
         for each in rivals.changes
     )
     return f"or {', or '.join(sets)}"

@@ -92,6 +92,20 @@ class Explanation(NamedTuple):
             is_something = abs(self.size) > self.half_interval
         return is_something and not self.rivals and self.excess <= SEPARATE_ERROR_RATIO
 
+    def is_assumed(self, scale_std: Array) -> bool:
+        """Return whether it is a torque constant within what is assumed of the torques' scales.
+
+        Args:
+            scale_std: relative standard deviation of each joint's torque scale (n,).
+        """
+        if not self.change.is_constant or self.size is None:
+            return False
+        return abs(self.size) <= SIGNIFICANT_SIGMAS * self.relative_std(scale_std)
+
+    def relative_std(self, scale_std: Array) -> float:
+        """Return the deviation of a torque constant relative to the others, of these deviations."""
+        return math.hypot(scale_std[[*self.change.joints]].max(), self.std)
+
     @property
     def half_interval(self) -> float:
         """Half a 95 % interval of the size."""

@@ -93,6 +93,11 @@ class Change(NamedTuple):
         return self.meaning in DISCRETE_MEANINGS
 
     @property
+    def is_constant(self) -> bool:
+        """Whether it is a torque constant: a scale throughout."""
+        return self.meaning == "scale" and self.part is None
+
+    @property
     def places(self) -> tuple[int, ...]:
         """For an order: the joints whose columns the `joints` are read from."""
         return self.order or self.joints[::-1]

@@ -78,10 +78,7 @@ def beyond_constants(
     constants = {
         joint: abs(np.log1p(found.size))
         for found in explanations
-        if found.change.meaning == "scale"
-        and found.change.part is None
-        and found.size is not None
-        and found.size > -1.0
+        if found.change.is_constant and found.size is not None and found.size > -1.0
         for joint in found.change.joints
     }
     return tuple(

@@ -10,6 +10,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import replace
+from functools import partial
 from typing import Any, Final, Literal, NamedTuple
 
 import numpy as np
@@ -293,23 +294,46 @@ def _torsion_springs(
         return []
     every = possible.with_friction(springs=tuple(joints))
 
-    def shows_spring(joint: str) -> bool:
-        decision = trial.decide(
-            SPRINGS,
-            [possible, every],
-            MIN_ELEMENT_IMPROVEMENT,
-            joint=joint,
-            possible=lambda settings: trial.stiffness(joint, settings) > 0.0,
-            certainty=MIN_CERTAINTY,
-        )
-        return bool(decision.choice.chosen)
+    def pulls_back(joint: str, settings: Settings) -> bool:
+        return trial.stiffness(joint, settings) > 0.0
 
-    shown = tuple(filter(shows_spring, joints))
+    shown = _joints_better(trial, SPRINGS, (possible, every), joints, pulls_back)
     if not shown:
         return []
     candidates = [possible, possible.with_friction(springs=shown)]
     decision = trial.decide(SPRINGS, candidates, by_joint=True)
     return [decision._replace(settings=replace(decision.settings, strength=now.strength))]
+
+
+def _joints_better(
+    trial: SettingsTrial,
+    name: str,
+    candidates: tuple[Settings, Settings],
+    joints: Sequence[str],
+    possible: Callable[[str, Settings], bool],
+) -> tuple[str, ...]:
+    """Return the joints whose own error an element lessens much, where it is possible.
+
+    Args:
+        trial: of the settings.
+        name: of the decision.
+        candidates: without the element, and with one in every joint.
+        joints: that may have one.
+        possible: whether that of a joint may be chosen.
+    """
+
+    def is_better(joint: str) -> bool:
+        decision = trial.decide(
+            name,
+            candidates,
+            MIN_ELEMENT_IMPROVEMENT,
+            joint=joint,
+            possible=partial(possible, joint),
+            certainty=MIN_CERTAINTY,
+        )
+        return bool(decision.choice.chosen)
+
+    return tuple(filter(is_better, joints))
 
 
 def _position_torques(
@@ -326,18 +350,7 @@ def _position_torques(
         return []
     every = now.with_friction(position_torque=tuple(joints))
 
-    def shows_torque(joint: str) -> bool:
-        decision = trial.decide(
-            POSITION_TORQUE,
-            [now, every],
-            MIN_ELEMENT_IMPROVEMENT,
-            joint=joint,
-            possible=lambda settings: trial.is_seen_whole(joint, settings),
-            certainty=MIN_CERTAINTY,
-        )
-        return bool(decision.choice.chosen)
-
-    shown = tuple(filter(shows_torque, joints))
+    shown = _joints_better(trial, POSITION_TORQUE, (now, every), joints, trial.is_seen_whole)
     if not shown:
         return []
     candidates = [now, now.with_friction(position_torque=shown)]

@@ -350,7 +350,7 @@ class SettingsTrial:
     def left_by_position(self, joint: str, settings: Settings) -> float:
         """Return the error that a torque of a joint's position leaves of its own, as a share.
 
-        In the rows that were fitted, without another fit: an estimate that takes no time.
+        In the rows that were fitted, without another fit: which takes little time.
         """
         model = self.model(settings)
         index = model.joint_names.index(joint)

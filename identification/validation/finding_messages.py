@@ -14,6 +14,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Final, NamedTuple
 
+from identification.hypotheses.change_messages import CHANGES_OF_A_PART, part_words
 from identification.hypotheses.joint_changes import (
     COUPLED,
     COUPLED_DRIVES,
@@ -259,26 +260,11 @@ _QUANTITIES: Final[Mapping[Meaning, str]] = {
 }
 
 
-_OF_A_PART: Final[Mapping[Meaning, str]] = {
-    "payload": "another load",
-    "scale": "another scale of the torque of {}",
-    "friction": "another friction of {}",
-    "friction drift": "friction that drifts throughout",
-    "delay": "another delay of {}",
-    "drift": "a drifting zero of {}",
-    "load friction": "friction that grows with the load",
-    "arm": "another arm, tool or setting",
-    "unmodelled": "another motion, which shows more of what the model lacks",
-}
-
-
 def _change(change: Change, naming: Naming) -> str:
     """Return a sign, an order, a coupled angle, or what is other in a part, in words."""
+    if change.meaning in CHANGES_OF_A_PART:
+        return part_words(change, naming.joints)
     joints = naming.all_of(change.joints) or "all axes"
-    if change.meaning in _OF_A_PART:
-        words = _OF_A_PART[change.meaning].format(joints)
-        is_throughout = change.meaning == "scale" and change.part is None
-        return f"{words} throughout" if is_throughout else words
     if change.meaning in _QUANTITIES:
         done = "negated" if change.meaning in SIGNS else "interchanged"
         return f"{_QUANTITIES[change.meaning]} of {joints} {done}"

@@ -8,7 +8,6 @@ from typing import Final
 import numpy as np
 
 from identification.arrays import Array
-from identification.distributions import SIGNIFICANT_SIGMAS
 from identification.hypotheses.column_scores import SEPARATE_ERROR_RATIO
 from identification.hypotheses.column_search import Explanation
 from identification.hypotheses.joint_changes import SIGNS, Change, Meaning
@@ -120,11 +119,6 @@ def _vector(values: Array) -> str:
     return ", ".join(f"{value + 0.0:.2f}" for value in np.round(values, 2))
 
 
-def is_constant(change: Change) -> bool:
-    """Whether a change is a torque constant: a scale throughout."""
-    return change.meaning == "scale" and change.part is None
-
-
 def faults(evidence: Evidence, limits: Thresholds) -> tuple[Finding, ...]:
     """Return changes of the fitted recordings that make parts of them more predictable."""
     begun = () if evidence.diagnosis is None else evidence.diagnosis.begun
@@ -168,12 +162,12 @@ def _is_left_out(each: Explanation, evidence: Evidence, limits: Thresholds) -> b
     error = gravity_error(evidence, limits)
     if error is not None and each.ratio > error:
         return True
-    if (change.meaning in SIGNS or is_constant(change)) and all_opposite(evidence):
+    if (change.meaning in SIGNS or change.is_constant) and all_opposite(evidence):
         return True
     # A constant is relative to those of the other axes, of which one is wrong in one motion.
     changed = {change.joint for change in evidence.changes if change.kind == "gain"}
     is_strong = each.ratio < limits.cause or changed <= {*change.joints}
-    return is_constant(change) and not is_strong
+    return change.is_constant and not is_strong
 
 
 def _fault(each: Explanation, evidence: Evidence, limits: Thresholds) -> Finding:
@@ -183,19 +177,16 @@ def _fault(each: Explanation, evidence: Evidence, limits: Thresholds) -> Finding
     matters = np.nan_to_num(evidence.held_out.relative) > limits.unexplained
     key, remedy = fault_keys(each.change)
     values = fault_values(each)
-    if is_constant(each.change) and each.size is not None:
-        # Of a torque's scale over those of the others, whose scales are in that of the change.
-        std = float(np.hypot(scale_std[[*each.change.joints]].max(), each.std))
-        if abs(each.size) <= SIGNIFICANT_SIGMAS * std:
-            return Finding(
-                "torque constant, as assumed",
-                "information",
-                values={**values, "scale_std": std},
-                joints=each.change.joints,
-            )
+    if each.is_assumed(scale_std):
+        return Finding(
+            "torque constant, as assumed",
+            "information",
+            values={**values, "scale_std": each.relative_std(scale_std)},
+            joints=each.change.joints,
+        )
     # The ratio is a geometric mean over all joints, of which a scale of one hardly changes the
     # others: of a constant that matters it is that of its joint alone.
-    alone = is_constant(each.change) and bool(matters[[*each.change.joints]].any())
+    alone = each.change.is_constant and bool(matters[[*each.change.joints]].any())
     ratio = each.ratio ** (len(matters) if alone else 1)
     certain = each.change.is_discrete or ratio < limits.cause
     return Finding(

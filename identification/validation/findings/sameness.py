@@ -15,7 +15,7 @@ from identification.validation.finding import (
     Thresholds,
     Value,
 )
-from identification.validation.findings.faults import gravity_error, is_constant
+from identification.validation.findings.faults import gravity_error
 from identification.validation.prediction import MAX_FRICTION_CHANGE
 
 
@@ -45,7 +45,7 @@ def _changes(evidence: Evidence, limits: Thresholds) -> tuple[UnseenChange, ...]
     if load(evidence, limits) is not None or gravity_error(evidence, limits) is not None:
         return None
     # A gain of the fitted motion has not: of that motion only, it is what changed.
-    others = [each for each in evidence.explanations or () if not is_constant(each.change)]
+    others = [each for each in evidence.explanations or () if not each.change.is_constant]
     if any(each.change.is_discrete or each.ratio < limits.cause for each in others):
         return None
     if evidence.diagnosis is not None and evidence.diagnosis.begun:

@@ -339,6 +339,11 @@ class TestCommand:
         assert "commanded position  control.csv" in result.output
 
 
+def import_by(column_map: Path, log: Path, urdf: Path, archive: Path) -> None:
+    done = hil("import", "log", log, "--urdf", urdf, "--map", column_map, "-o", archive)
+    assert done.exit_code == 0, done.exception
+
+
 class TestConclusions:
     def test_an_identification_uses_what_is_sure(
         self, tmp_path: Path, urdf: Path, table: Mapping[str, Floats]
@@ -369,8 +374,7 @@ class TestConclusions:
         stated = tmp_path / "map.toml"
         stated.write_text(tomlkit.dumps(columns))
         archive = tmp_path / "a.mcap"
-        done = hil("import", "log", path, "--urdf", urdf, "--map", stated, "-o", archive)
-        assert done.exit_code == 0, done.exception
+        import_by(stated, path, urdf, archive)
         read = open_archive(archive).columns
         assert read["position"] == near(table["q"], abs=1e-7)
         assert read["torque"] == near(table["tau"], abs=1e-4)
@@ -383,8 +387,7 @@ class TestConclusions:
         write_log(path, ["t", "q{}", "v{}", "tau{}"], *{**table, **by_rods(table)}.values())
         target, archive = tmp_path / "map.toml", tmp_path / "a.mcap"
         assert hil("look", path, "--urdf", urdf, "-o", target).exit_code == 0
-        done = hil("import", "log", path, "--urdf", urdf, "--map", target, "-o", archive)
-        assert done.exit_code == 0, done.exception
+        import_by(target, path, urdf, archive)
         read = open_archive(archive).columns
         assert read["position"] == near(table["q"], abs=1e-7)
         assert read["velocity"] == near(table["v"], abs=1e-7)
@@ -405,8 +408,7 @@ class TestConclusions:
         assert sentence in " ".join(result.output.split())
         assert hil("look", path, "--urdf", urdf, "-o", target).exit_code == 0
         archive = tmp_path / "a.mcap"
-        done = hil("import", "log", path, "--urdf", urdf, "--map", target, "-o", archive)
-        assert done.exit_code == 0, done.exception
+        import_by(target, path, urdf, archive)
         columns = open_archive(archive).columns
         assert columns["position"] == near(table["q"], abs=1e-7)
         assert columns["velocity"] == near(table["v"], abs=1e-7)
@@ -428,8 +430,7 @@ class TestConclusions:
         lines = target.read_text().replace("[torque]\n", f"[torque]\n{side[1]}\n")
         target.write_text(f"{lines}\n[drive]\n{side[2]}\n")
         archive = tmp_path / "a.mcap"
-        done = hil("import", "log", path, "--urdf", urdf, "--map", target, "-o", archive)
-        assert done.exit_code == 0, done.exception
+        import_by(target, path, urdf, archive)
         torque = open_archive(archive).columns["torque"]
         assert torque == near(table["tau"], rel=0.2, abs=0.2)
 
