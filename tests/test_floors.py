@@ -48,10 +48,11 @@ def test_identification_knows_nothing_of_hil() -> None:
     assert not {name for name in loaded_by("identification.api") if name.startswith("hil")}
 
 
-def test_a_look_loads_no_interpolator_or_recorder() -> None:
+def test_a_look_loads_no_interpolator_recorder_or_export() -> None:
     loaded = loaded_by("hil.cli.look")
     assert "planner.limits" in loaded
-    assert not {"planner.api", "planner.interpolator", "hil.archive.recorder"} & loaded
+    apart = {"planner.interpolator", "hil.archive.recorder", "identification.export.urdf"}
+    assert not {"planner.api", "identification.api", *apart} & loaded
 
 
 @pytest.mark.parametrize("package", ["planner", "identification"])

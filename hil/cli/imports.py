@@ -44,7 +44,7 @@ from hil.importers.recording_import import (
 from hil.importers.rosbag2 import CommandStamps, Effort
 from hil.look.before_identification import Asking
 from hil.pipeline.options import friction_from
-from identification import FrictionLaw
+from identification.model.friction import FrictionLaw
 from identification.model.kinematics import MAX_MOVING_JOINTS
 from identification.model.robot import STANDARD_GRAVITY
 

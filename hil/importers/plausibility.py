@@ -222,8 +222,8 @@ def _outside(
     position: Array, names: Sequence[str], limits: UrdfLimits, turning: NDArray[np.bool_]
 ) -> OutsideLimits | None:
     """Return how positions leave the limits of the URDF, and how they would not."""
-    radians = in_turns(np.where(turning, np.radians(position), position), limits, turning)
-    position = in_turns(position, limits, turning)
+    recorded = position
+    position = in_turns(recorded, limits, turning)
     fits = _fits(position, limits)
     joints = range(len(names))
     beyond = [joint for joint in joints if not fits[joint, joint]]
@@ -239,8 +239,10 @@ def _outside(
     farthest = 3.0 * np.maximum(-limits.lower, limits.upper)
     far = (np.maximum(-low, high) > farthest)[beyond].any()
     columns = scipy.optimize.linear_sum_assignment(~fits + 1e-6 * (1.0 - np.eye(len(names))))[1]
-    if far and np.diag(_fits(radians, limits)).all():
-        return OutsideLimits(fraction, ranges, Within.DEGREES)
+    if far:
+        radians = in_turns(np.where(turning, np.radians(recorded), recorded), limits, turning)
+        if np.diag(_fits(radians, limits)).all():
+            return OutsideLimits(fraction, ranges, Within.DEGREES)
     if fits[joints, columns].all():
         order = tuple(names[int(j)] for j in np.argsort(columns))
         return OutsideLimits(fraction, ranges, Within.ORDER, order)

@@ -358,7 +358,7 @@ class TextTable:
     def _texts(self, index: int) -> list[str]:
         """Return the cells of a column as text; empty where a line is too short."""
         if self._is_simple:
-            rows = (line.split(self.dialect.delimiter) for line in self.lines)
+            rows = (line.split(self.dialect.delimiter, index + 1) for line in self.lines)
             return [cells[index].strip() if index < len(cells) else "" for cells in rows]
         try:
             cells = self._frame([index], dtype=str, na_filter=False)[index].tolist()

@@ -13,8 +13,9 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.patches import Patch, PathPatch
 from matplotlib.path import Path
-from matplotlib.ticker import NullFormatter, NullLocator, StrMethodFormatter
+from matplotlib.ticker import LogLocator, NullFormatter, NullLocator, StrMethodFormatter
 
+from hil.base.arrays import Array
 from hil.report import picture_style as style
 from hil.report.chart import Chart, Legend, Plot, thinned
 
@@ -142,7 +143,10 @@ def draw_plot(axes: Axes, plot: Plot, chart: Chart, scale: float, bins: int | No
         size = trace.width * scale
         colour = style.colour(trace.colour)
         # Not by `plot`, which takes as long again for limits that are set below.
-        if trace.dots:
+        line: Artist
+        if trace.dots and bins is not None:
+            line = _dots_of_page(x, values, colour, size)
+        elif trace.dots:
             line = Line2D(
                 x, values, linestyle="none", marker="o", color=colour, markersize=size,
                 markeredgewidth=0.0,
@@ -161,6 +165,9 @@ def draw_plot(axes: Axes, plot: Plot, chart: Chart, scale: float, bins: int | No
         axes.xaxis.set_minor_formatter(NullFormatter())
         few = plot.y_limits[1] < 20.0 * plot.y_limits[0]
         axes.yaxis.set_minor_formatter(StrMethodFormatter("{x:g}") if few else NullFormatter())
+        if bins is not None:  # a page shows no ticks but their numbers
+            axes.xaxis.set_minor_locator(NullLocator())
+            axes.yaxis.set_minor_locator(LogLocator(subs="auto") if few else NullLocator())
     axes.set_xlim(*chart.x_limits)
     axes.set_ylim(*plot.y_limits)
     if chart.ticks:
@@ -169,3 +176,17 @@ def draw_plot(axes: Axes, plot: Plot, chart: Chart, scale: float, bins: int | No
         axes.xaxis.set_minor_locator(NullLocator())
     if plot.names:
         axes.set_yticks([at for at, _ in plot.names], [text for _, text in plot.names])
+
+
+def _dots_of_page(x: Array, values: Array, colour: str, size: float) -> PathPatch:
+    """Return dots as one path of lines without length, with round ends.
+
+    As markers each is an element of its own: they take several times as long, and as much space.
+    """
+    places = np.column_stack([x, values])
+    places = places[np.isfinite(places).all(axis=1)]
+    path = Path(np.repeat(places, 2, axis=0), [Path.MOVETO, Path.LINETO] * len(places))
+    path.should_simplify = False  # which leaves out lines without length
+    return PathPatch(
+        path, fill=False, edgecolor=colour, linewidth=size, capstyle="round", zorder=2.0
+    )

@@ -55,7 +55,7 @@ _GRID_WIDTH: Final = 0.8
 _NAME_GAP: Final = 4.0  # between a matrix and its names
 _GRID_ORDER: Final = 0.5  # over shades, under curves
 _GOLDEN_RATIO: Final = 0.6180339887498949
-_DECIMALS: Final = re.compile(r"(\.\d)\d+")
+_FURTHER_DIGITS: Final = re.compile(r"(?<=\.\d)\d+")  # after the first decimal
 _SVG: Final = "{http://www.w3.org/2000/svg}"
 _LINK: Final = "{http://www.w3.org/1999/xlink}href"
 _COORDINATES: Final = frozenset({"x", "y", "width", "height", "transform", "points"})
@@ -323,7 +323,7 @@ def _cleaned(
         elif name == "d":
             value = _path(value)
         elif name in _COORDINATES:
-            value = _DECIMALS.sub(r"\1", value)
+            value = _FURTHER_DIGITS.sub("", value)
         cleaned.set("href" if name == _LINK else name, value)
     dots = [child for child in children if child.tag == "use"]
     styles = {dot.get("style", "") for dot in dots}
@@ -341,7 +341,7 @@ def _cleaned(
 
 def _path(data: str) -> str:
     """Return a path with one digit behind the point; lines after its start need no letter."""
-    short = " ".join(_DECIMALS.sub(r"\1", data).split()).replace(".0 ", " ")
+    short = " ".join(_FURTHER_DIGITS.sub("", data).split()).replace(".0 ", " ")
     has_curves = "C" in short or "Q" in short
     return short if has_curves else short.replace(" L ", " ")
 

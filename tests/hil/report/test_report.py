@@ -761,6 +761,14 @@ class TestPictures:
         (line,) = re.findall(r'd="([^"]*)"[^>]*stroke:var\(--ink\)', panel.svg)
         assert [len(part.split()) for part in line.split("M")] == [0, 4, 4]
 
+    def test_have_all_dots_of_a_trace_in_one_path(self):
+        chart = one_chart([0.0, 1.0, np.nan, 0.5] * 100)
+        dots = replace(chart.plots[0].traces[0], dots=True, width=2.2)
+        panel = chart_panel(replace(chart, plots=[replace(chart.plots[0], traces=[dots])]))
+        (path,) = re.findall(r'd="([^"]*)"[^>]*stroke:var\(--ink\)[^>]*linecap:round', panel.svg)
+        ends = [part.split() for part in path.split("M")[1:]]
+        assert len(ends) == 300 and all(dot[:2] == dot[2:] for dot in ends)
+
     def test_have_the_colours_of_the_page_and_no_id_twice(self, html):
         panel = chart_panel(one_chart([0.0, 1.0]))
         assert not re.search(r":#[0-9a-f]{6}|font-family|<style", panel.svg)
