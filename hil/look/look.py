@@ -55,7 +55,7 @@ from hil.pipeline.sources import Source, cell_of, source_of
 from hil.pipeline.torque_scale import torque_scale
 from identification.errors import IdentificationError
 from identification.estimators.delay import DelayEstimate, estimate_delay
-from identification.hypotheses.diagnosis import UNEXPLAINED, few_rows, torque_of
+from identification.hypotheses.diagnosis import UNEXPLAINED, TorqueDiagnosis, few_rows, torque_of
 from identification.hypotheses.gravity_direction import tilted_gravity
 from identification.hypotheses.inertia_scale import retimed
 from identification.hypotheses.joint_changes import Axes
@@ -190,8 +190,12 @@ def _with_torque(
     source: Path, recorded: Source, imported: ImportedRecording, cell: Cell, rows: list[Row]
 ) -> Look:
     recording = recorded.recording
-    finding = _finding(source, imported, cell, recording)
-    if finding.torque.error > SUSPECT_ERROR and (found := explained(imported.archive)):
+    samples, torque = _diagnosed(cell, recording)
+    found = explained(imported.archive) if torque.error > SUSPECT_ERROR else None
+    finding = _finding(
+        source, imported, cell, recording, samples, torque, is_explained=found is not None
+    )
+    if found is not None:
         least = (1.0 - LARGE_REDUCTION) * found.score.overall
         if finding.readings.score.overall > least:
             if _is_beyond(found.score, finding):
@@ -242,25 +246,49 @@ def look_at_joints(source: Path, imported: ImportedRecording) -> Look:
         SourceError: the recording cannot be used.
     """
     cell = cell_of(imported.archive)
-    finding = _finding(source, imported, cell, source_of(imported.archive, cell).recording)
+    recording = source_of(imported.archive, cell).recording
+    finding = _finding(source, imported, cell, recording, *_diagnosed(cell, recording))
     return _look_of(finding, finding.rows(), ())
 
 
-def _finding(
-    source: Path, imported: ImportedRecording, cell: Cell, recording: Recording
-) -> physics.TorqueFindings:
+def _diagnosed(cell: Cell, recording: Recording) -> tuple[Samples, TorqueDiagnosis]:
+    """Return samples of a recording, at the times that the torque shows, and what the torque is."""
     samples = prepared(recording, cell.model)
     rows = few_rows([samples])
     torque = torque_of(cell.model, [samples], rows, score_of(cell.model, rows))
     if torque.time is not None:
         samples = retimed(cell.model, samples, torque.time)
+    return samples, torque
+
+
+def _finding(
+    source: Path,
+    imported: ImportedRecording,
+    cell: Cell,
+    recording: Recording,
+    samples: Samples,
+    torque: TorqueDiagnosis,
+    *,
+    is_explained: bool = False,
+) -> physics.TorqueFindings:
+    """Return how the torque is to be read; see `find_readings` for `is_explained`."""
     gravities: Mapping[str, Vector] = physics.MOUNTINGS
-    readings = _readings(cell, samples, imported, gravities)
+
+    def read() -> Readings:
+        return find_readings(
+            cell.model,
+            samples,
+            mountings=mountings(cell, gravities),
+            unit_is_open=_is_unit_open(imported),
+            is_explained=is_explained,
+        )
+
+    readings = read()
     is_open = readings.score.overall > _TILT_ERROR and not torque.is_otherwise
     if is_open and (tilted := tilted_gravity(cell.model, [samples])) is not None:
         gravity = tuple((np.round(tilted.best, _GRAVITY_DECIMALS) + 0.0).tolist())
         gravities = {**gravities, physics.tilt_name(tilted.angle): gravity}
-        readings = _readings(cell, samples, imported, gravities)
+        readings = read()
     axes = Axes.of((step.change for step in readings.steps), cell.model.n_joints)
     return physics.TorqueFindings(
         cell,
@@ -302,17 +330,6 @@ def _look_of(
         finding.gravity(),
         finding.readings.score.overall,
         no_better=finding.no_better,
-    )
-
-
-def _readings(
-    cell: Cell, samples: Samples, imported: ImportedRecording, gravities: Mapping[str, Vector]
-) -> Readings:
-    return find_readings(
-        cell.model,
-        samples,
-        mountings=mountings(cell, gravities),
-        unit_is_open=_is_unit_open(imported),
     )
 
 

@@ -44,6 +44,7 @@ _VERTEX_SPACINGS: Final = (0.07, 0.02)
 _BANDWIDTH_OCTAVES: Final = ((1.0, 2.0), (2.0, 4.0))
 # share of a low-pass from which on the torque is nearer to it than to none
 _MIN_LOW_PASS_SHARE: Final = 0.5
+_LOW_PASS_SIGMAS: Final = 2.0  # standard deviations by which the share is larger
 
 # Half a period of the lowest bandwidth: shorter stretches do not show it, and shorter rests between
 # stretches stay in, because leaving them out would cost more neighbouring rows.
@@ -132,7 +133,7 @@ def possible_low_passes(
         kinds = [_Filter(delay, shape) for delay, shape in product(kind_delays, shapes)]
         misfit, best = spectra.best(kinds)
         share, std = spectra.attenuation(best)
-        if misfit < enough and share - std > _MIN_LOW_PASS_SHARE:
+        if misfit < enough and share - _LOW_PASS_SIGMAS * std > _MIN_LOW_PASS_SHARE:
             assert best.shape is not None
             possible.append(
                 replace(
@@ -177,6 +178,19 @@ class _Joint(NamedTuple):
         bands = len(self.powers)
         power = np.maximum(self.gram.reshape(bands, size, size) @ own @ own, 0.0)
         return power, self.cross[:bands] @ own + 1j * (self.cross[bands : 2 * bands] @ own)
+
+    def filtered(self, values: Array, gain: Complex) -> _Joint:
+        """Return the joint with the torque of parameters (p,) through a gain (B,)."""
+        own = np.append(values[self.columns], 1.0)
+        bands = len(self.powers)
+        products = self.gram.reshape(bands, len(own), len(own)) @ own
+        cross = gain[:, None] * products
+        return self._replace(
+            cross=np.concatenate([cross.real, cross.imag, np.zeros((2 * bands, len(own)))]),
+            powers=np.abs(gain) ** 2 * np.maximum(products @ own, 0.0),
+            slope_cross=np.zeros_like(self.slope_cross),
+            slope_power=np.zeros_like(self.slope_power),
+        )
 
     @classmethod
     def of(cls, columns: NDArray[np.intp], gram: Array, rows: float, step: float) -> _Joint:
@@ -280,34 +294,59 @@ class _Spectra:
         """Return how much of a low-pass is in the torque, and the standard deviation of that.
 
         0: none of it, 1: all of it. In the two octaves above the bandwidth, where the two differ
-        most, the gain g of the recorded torque over that of a model fitted without the low-pass is
-        ``log g / log |H|``. Joints count by how well the two torques agree there: one whose torque
-        the model does not describe says nothing. Without torque there the standard deviation is
+        most, the gain of the torque over that of a model fitted without the low-pass is compared
+        with the gain that the same fit has of the torque that the model with the low-pass predicts:
+        parameters that the low-pass changes, such as the inertia, take up a part of its fall.
+        Joints and octaves count by how well the torque agrees there with the fit, and the standard
+        deviation contains how much their gains contradict each other. Without torque there it is
         infinite.
 
-        A causal low-pass is late as well, which spoils a fit without a delay, while one with a
-        delay by its lag may describe all of a weak one: the larger share is returned.
+        A causal low-pass is late as well: of fits without a delay, and with one by its lag, the
+        more precise counts.
         """
         assert channel.shape is not None
         delays = [channel.delay]
         if channel.shape.causal:
             delays.append(channel.delay + channel.shape.lag(channel.bandwidth))
-        return max(self._attenuation(channel, _Filter(delay)) for delay in delays)
+        filtered = self._predicted(channel)
+        shares = [self._attenuation(filtered, channel, _Filter(delay)) for delay in delays]
+        return min(shares, key=lambda pair: pair[1])
 
-    def _attenuation(self, channel: _Filter, without: _Filter) -> tuple[float, float]:
+    def _predicted(self, channel: _Filter) -> _Spectra:
+        """Return spectra whose torque is what a fit with a filter predicts."""
+        values = self._fitted([channel])[2][0]
+        gain = self.response(channel)[0]
+        return replace(self, joints=tuple(joint.filtered(values, gain) for joint in self.joints))
+
+    def _attenuation(
+        self, filtered: _Spectra, channel: _Filter, without: _Filter
+    ) -> tuple[float, float]:
+        gains, information = self._gains(channel, without)
+        expected, _ = filtered._gains(channel, without)
+        precision = float(np.sum(information * expected**2))
+        if not precision > 0.0:
+            return 0.0, math.inf
+        share = float(np.sum(information * expected * gains)) / precision
+        contradiction = float(np.sum(information * (gains - share * expected) ** 2))
+        scatter = contradiction / max(1, int(np.count_nonzero(information)) - 1)
+        return share, math.sqrt(max(1.0, scatter) / precision)
+
+    def _gains(self, channel: _Filter, without: _Filter) -> tuple[Array, Array]:
+        """Return logarithms of the gain of the torque, and the information on them (octaves, j).
+
+        Over the torque of a model that is fitted without the low-pass of a channel.
+        """
         values = self._fitted([without])[2][0]
         response = self.response(channel)[0]
         size = np.maximum(np.abs(response), np.finfo(np.float64).tiny)
         # The phase is not judged: that of a delay fitted by mistake would hide the torque.
         phases = (np.ones_like(response), response / size, self.response(without)[0])
         modelled = [joint.modelled(values) for joint in self.joints]
-        shares = []
-        for octave in _BANDWIDTH_OCTAVES:
+        shape = len(_BANDWIDTH_OCTAVES), len(self.joints)
+        gains, information = np.zeros(shape), np.zeros(shape)
+        for place, octave in enumerate(_BANDWIDTH_OCTAVES):
             low, high = (factor * channel.bandwidth for factor in octave)
             inside = (self.frequency >= low) & (self.frequency < high)
-            certain = np.zeros(len(self.joints))  # information on the logarithm of the gain
-            gains = np.zeros(len(self.joints))  # its logarithm
-            expected = np.zeros(len(self.joints))
             for k, (joint, (model, cross)) in enumerate(zip(self.joints, modelled, strict=True)):
                 power = float(model[inside].sum())
                 torque = float(joint.powers[inside].sum())
@@ -318,17 +357,9 @@ class _Spectra:
                 # At most one, up to the rounding of sums of squares.
                 coherence = min(product**2 / (power * torque), 1.0 - MIN_NOISE)
                 count = max(1.0, joint.duration * (high - low))
-                certain[k] = 2.0 * count * coherence / (1.0 - coherence)
-                gains[k] = math.log(product / power)
-                expected[k] = math.log(float((size * model)[inside].sum()) / power)
-            if certain.any():
-                fall = float(certain @ expected) / certain.sum()
-                gain = float(certain @ gains) / certain.sum()
-                shares.append((gain / fall, 1.0 / (abs(fall) * math.sqrt(certain.sum()))))
-        if not shares:
-            return 0.0, math.inf
-        share, std = np.array(shares).T
-        return float(share.mean()), float(np.linalg.norm(std)) / len(std)
+                information[place, k] = 2.0 * count * coherence / (1.0 - coherence)
+                gains[place, k] = math.log(product / power)
+        return gains, information
 
     def _solved(self, sums: Sequence[_Products], weights: Array) -> Array:
         """Return the parameters (k, p) of joint weights (k, j)."""

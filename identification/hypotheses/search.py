@@ -47,6 +47,7 @@ def find_readings(
     mountings: Mapping[str, RobotModel] | None = None,
     unit_is_open: bool = True,
     with_nearest: bool = True,
+    is_explained: bool = False,
 ) -> Readings:
     """Find how samples of one recording are to be read.
 
@@ -57,10 +58,13 @@ def find_readings(
         unit_is_open: whether nothing states the unit of the positions.
         with_nearest: whether to return also what comes nearest to the reading found, and which
             zeros the torque does not show; a quarter of the time where nothing is to be changed.
+        is_explained: whether something else, such as a low-pass, explains most of the error: then
+            changes are tried one by one only. To search signs together with zeros and scales takes
+            longest, and they would fit by chance.
     """
     few = samples.thinned_to(_MAX_ROWS)
     hypothesis = Hypothesis(model, few, mountings or {}, unit_is_open=unit_is_open)
-    hypothesis, steps = _searched(hypothesis)
+    hypothesis, steps = _searched(hypothesis, is_explained=is_explained)
     hypothesis, steps, no_better = _without_chance(hypothesis, steps)
     if not steps and not unit_is_open and not with_nearest:
         return Readings(
@@ -88,14 +92,14 @@ def find_readings(
     return replace(found, steps=tuple(_judged(hypothesis, found)))
 
 
-def _searched(stated: Hypothesis) -> tuple[Hypothesis, list[Step]]:
+def _searched(stated: Hypothesis, *, is_explained: bool) -> tuple[Hypothesis, list[Step]]:
     """Return the best hypothesis, and its steps: one change after the other, then signs at once.
 
     Signs are tried together with zeros and scales, and all of them together, where a change is
     doubted or the arm does not explain the torque.
     """
     hypothesis, steps = _one_by_one(stated)
-    if not steps and hypothesis.score.overall <= EXPLAINED_ERROR:
+    if is_explained or (not steps and hypothesis.score.overall <= EXPLAINED_ERROR):
         return hypothesis, steps
     is_enough = hypothesis.adequacy().is_enough
     is_doubted = not is_enough or any(not step.sure or step.is_far for step in steps)
