@@ -102,7 +102,6 @@ _RATE: Final = 250.0  # Hz
 _MEMORY: Final = 0.02  # s, of the noise
 _NOISE: Final = 0.02  # of the torque's scatter
 _REPEATED: Final = 0.003  # likewise, of the error that every repetition has
-_TAILS: Final = (0.05, 0.5, 0.95)
 _MOST: Final = 12  # repetitions of a simulated rule
 
 

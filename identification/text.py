@@ -31,6 +31,11 @@ def joined(names: Sequence[str], most: int = 6) -> str:
     return ", ".join(names[:most]) + (f" and {omitted} more" if omitted > 0 else "")
 
 
+def enumerated(parts: Sequence[str]) -> str:
+    """Return one or more parts as in a sentence: a, b and c."""
+    return " and ".join([", ".join(parts[:-1]), parts[-1]] if len(parts) > 1 else parts)
+
+
 def number(value: float, digits: int = 3) -> str:
     """Format with `digits` significant digits, without an exponent from 1e-4 to 1e6: 1324."""
     is_whole = 10.0**digits <= abs(float(f"{value:.{digits}g}")) < LARGEST_DECIMAL

@@ -269,11 +269,14 @@ class ControllerText:
     level: int
 
 
-def text_frame(message: str, source: str, level: int = 3) -> bytes:
+_INFO: Final = 3  # level of a text
+
+
+def text_frame(message: str) -> bytes:
     """Return a frame with a line of text, cut to the length that a frame can have."""
-    words = (message.encode()[:MAX_TEXT_BYTES], source.encode()[:MAX_TEXT_BYTES])
+    words = (message.encode()[:MAX_TEXT_BYTES], b"controller")
     packed = b"".join(bytes([len(word)]) + word for word in words)
-    return frame(FrameType.TEXT, packed + bytes([level]))
+    return frame(FrameType.TEXT, packed + bytes([_INFO]))
 
 
 def controller_text(payload: bytes) -> ControllerText:

@@ -257,7 +257,7 @@ class UrTransport:
             self._note(text)
 
     def _note(self, text: str) -> None:
-        self._ready.append((rtde.text_frame(text, "controller"), None))
+        self._ready.append((rtde.text_frame(text), None))
 
     def wait(self, timeout: float) -> bool:
         """Whether a frame is there within `timeout` s; to the precision of timers."""

@@ -53,7 +53,6 @@ REJECTED = "rejected"  # Outcome of a motion that completed and failed its quali
 MAX_RECORDED_JOINTS: Final = 256
 SEQUENCE_MODULUS: Final = 1 << 32  # of the numbers of messages
 
-_CHECKSUM_DIGITS = 8  # of a checksum
 _PATTERN = re.compile(
     r"(?P<kind>[a-z]+)_(?P<index>[0-9]{3,18})_a(?P<attempt>[1-9][0-9]{0,17})\.mcap"
 )

@@ -22,6 +22,7 @@ from hil.archive import open_archive
 from hil.archive.campaign_archives import load_record
 from hil.base.arrays import Array
 from hil.cell import Cell
+from identification.arrays import root_mean_square
 from identification.model.motion import Motion
 from planner import FourierSeries, PiecewiseCubic
 
@@ -180,6 +181,6 @@ class FrictionMeter:
         work = (torque * np.gradient(columns["position"][rows], axis=0)).sum(axis=0)
         with np.errstate(divide="ignore", invalid="ignore"):
             friction = (work - self._rigid_work) / self._way
-        rms = np.sqrt(np.mean(torque**2, axis=0))
+        rms = root_mean_square(torque)
         measurable = (self._way > _MIN_TRAVEL) & (np.abs(friction) > _MIN_FRICTION_SHARE * rms)
         return np.where(measurable, friction, np.nan)

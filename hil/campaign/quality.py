@@ -25,6 +25,7 @@ from hil.base.errors import ArchiveError
 from hil.cell import Cell
 from hil.control.motions import CampaignMotion
 from hil.control.slips import slip_of
+from identification.arrays import root_mean_square, runs_of
 from identification.distributions import MAD_TO_STD
 from identification.signals.noise import STANDSTILL_WINDOW_SECONDS
 from identification.signals.recording import stuck
@@ -125,8 +126,7 @@ def problem_of(executed: Executed, trajectory: Motion, cell: Cell) -> QualityPro
             start, travel = standstill
             return StuckJoint(name, start * cell.period, travel)
     for name, column in zip(cell.joint_names, high.T, strict=True):
-        edges = np.flatnonzero(np.diff(column.astype(np.int8), prepend=0, append=0))
-        longest = int((edges[1::2] - edges[::2]).max(initial=0))
+        longest = max((stop - start for start, stop in runs_of(column)), default=0)
         if longest >= MIN_SATURATED_CYCLES:
             return SaturatedCurrent(name, longest * cell.period)
     return None
@@ -226,13 +226,9 @@ class RepetitionCheck:
         )
         usual = np.median([repetition.position[:rows] for repetition in self._earlier], axis=0)
         currents = np.median([repetition.current[:rows] for repetition in self._earlier], axis=0)
-        scale = np.maximum(_rms(currents), 1e-3 * self._cell.drive_train.current_limit)
-        apart = _rms(executed.position[:rows] - usual) / following_threshold(self._cell)
-        return np.array([apart, _rms(executed.current[:rows] - currents) / scale])
-
-
-def _rms(values: Array) -> Array:
-    return np.asarray(np.sqrt(np.mean(values**2, axis=0)))
+        scale = np.maximum(root_mean_square(currents), 1e-3 * self._cell.drive_train.current_limit)
+        apart = root_mean_square(executed.position[:rows] - usual) / following_threshold(self._cell)
+        return np.array([apart, root_mean_square(executed.current[:rows] - currents) / scale])
 
 
 def following_threshold(cell: Cell) -> Array:

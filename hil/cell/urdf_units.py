@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from typing import Final, NamedTuple
 
 from identification.errors import ModelError
 from identification.model.description_units import Quantity, WrongUnit, wrong_units
+from identification.text import enumerated
 
 _PLURAL: Final[Mapping[Quantity, str]] = {
     "mass": "masses",
@@ -44,9 +45,9 @@ def unit_problem(urdf: str) -> UnitProblem | None:
         return None  # the model says what is wrong
     if not wrong:
         return None
-    found = _joined([f"{_PLURAL[each.quantity]} in {each.unit}" for each in wrong])
+    found = enumerated([f"{_PLURAL[each.quantity]} in {each.unit}" for each in wrong])
     places = "; ".join(f"{_place(each)} is {each.value:.6g} {_SI[each.quantity]}" for each in wrong)
-    steps = _joined(
+    steps = enumerated(
         [
             f"{_PLURAL[each.quantity]} in {_SI[each.quantity]} (multiply by {each.factor:g})"
             for each in wrong
@@ -59,7 +60,3 @@ def unit_problem(urdf: str) -> UnitProblem | None:
 def _place(wrong: WrongUnit) -> str:
     kind, name = wrong.element
     return f"{kind} {name}: {_FIELDS[wrong.quantity]}"
-
-
-def _joined(parts: Sequence[str]) -> str:
-    return " and ".join([", ".join(parts[:-1]), parts[-1]] if len(parts) > 1 else parts)

@@ -27,6 +27,7 @@ from hil.importers.mcap_messages import Topic
 from hil.importers.messages import sentence
 from hil.importers.resampling import at_stamps
 from hil.importers.ros_messages import CONTROLLER_STATE, JOINT_STATE
+from identification.arrays import root_mean_square
 
 Stamps = NDArray[np.int64]
 
@@ -203,7 +204,7 @@ def _commands_of(bag: Bag, topic: str, measured: Measured) -> Commands:
         raise _NotCommandsError("it has no command at the time of the measured positions")
     values = np.where(known[:, None], values, np.nan)
     position = measured.position[known]
-    wrong = np.sqrt(np.mean((values[known] - position) ** 2, axis=0))
+    wrong = root_mean_square(values[known] - position)
     deviation = position.std(axis=0)
     if (wrong > np.maximum(deviation, _MAX_COMMAND_DIFFERENCE)).any():
         joint = int(np.argmax(wrong / np.maximum(deviation, _MAX_COMMAND_DIFFERENCE)))

@@ -17,6 +17,7 @@ from hil.report.rendering import environment, page_bytes, template_text
 from hil.results.provenance import RESULTS
 from hil.results.servo_result import ServoResults
 from hil.results.servo_series import ServoSeries, load_servo_series
+from identification.arrays import root_mean_square
 from identification.text import interval_text
 
 MEASURED: Final = Legend("measured", "measured", "--first", 1.6)
@@ -51,7 +52,7 @@ def motion_charts(
     results: ServoResults, series: ServoSeries, most: int = _PICTURE_JOINTS
 ) -> list[Chart]:
     """Return charts of the joints with the largest errors of the command, in their order."""
-    errors = np.sqrt(np.mean((series.commanded - series.measured) ** 2, axis=0))
+    errors = root_mean_square(series.commanded - series.measured)
     chosen = np.sort(np.argsort(-errors)[:most])
     return [_chart(results, series, int(joint)) for joint in chosen]
 

@@ -15,6 +15,7 @@ from hil.results.servo_result import (
     ServoValue,
     ServoVerdict,
 )
+from identification.arrays import root_mean_square
 from identification.text import interval_text
 
 _MAX_GOOD_ERROR_SHARE: Final = 0.5
@@ -290,7 +291,7 @@ def _joint_errors(results: ServoResults) -> dict[str, str]:
     errors = np.array([each.joint_errors_mrad for each in results.validation])
     if not len(errors):
         return {}
-    overall = np.sqrt(np.mean(errors**2, axis=0))
+    overall = root_mean_square(errors)
     return {name: f"{error:.2g}" for name, error in zip(results.joint_names, overall, strict=True)}
 
 

@@ -91,7 +91,6 @@ LOAD_FRICTION_STD: Final = 0.1
 """Deviation of the share of the transmitted torque that becomes friction: strain-wave gears lose
 some 2 to 15 % (Bittencourt and Gunnarsson 2012)."""
 _MIN_ROWS_PER_PARAMETER: Final = 2  # per parameter, to estimate the noise
-_INERTIA_SLICE = slice(0, 6)
 _MOMENT_SLICE = slice(6, 9)
 _MASS_INDEX = 9
 
@@ -707,10 +706,11 @@ def _standard_deviations(model: RobotModel, share: float, masses: Array, length:
     return std
 
 
-def nominal_deviations(model: RobotModel, share: float = BODY_STD_SHARE) -> Array:
+def nominal_deviations(model: RobotModel) -> Array:
     """Return deviations of the nominal bodies as inertial parameters (rank, 10 n), one each."""
     links = model.layout.links
-    std = _body_deviations(share * model.nominal[links][:, _MASS_INDEX], body_lengths(model))
+    masses = model.nominal[links][:, _MASS_INDEX]
+    std = _body_deviations(BODY_STD_SHARE * masses, body_lengths(model))
     return np.asarray(model.base.grouping[:, links.ravel()] * std.ravel())
 
 

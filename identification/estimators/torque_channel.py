@@ -16,7 +16,7 @@ from typing import Final, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from identification.arrays import Array
+from identification.arrays import Array, runs_of
 from identification.factor.blocks import EqualRuns, add_grams, equal_runs
 from identification.factor.factor import MIN_NOISE
 from identification.model.robot import RobotModel
@@ -531,9 +531,8 @@ def _window(length: int) -> Array:
 
 def _stretches(time: Array, usable: NDArray[np.bool_]) -> Iterator[tuple[int, int]]:
     """Yield start and stop of the stretches of usable rows (m,) that show a low-pass."""
-    edges = np.flatnonzero(np.diff(usable.astype(np.int8), prepend=0, append=0))
     runs: list[tuple[int, int]] = []
-    for start, stop in edges.reshape(-1, 2).tolist():
+    for start, stop in runs_of(usable):
         if runs and time[start] - time[runs[-1][1] - 1] < _MIN_STRETCH_SECONDS:
             start = runs.pop()[0]
         runs.append((start, stop))

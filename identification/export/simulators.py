@@ -13,7 +13,7 @@ import numpy as np
 import pinocchio as pin
 from numpy.typing import NDArray
 
-from identification.arrays import Array
+from identification.arrays import Array, root_mean_square
 from identification.errors import IdentificationError
 from identification.export.actuators import Actuators
 from identification.export.exported_arm import ExportedArm
@@ -286,14 +286,16 @@ def compare(text: str, form: ModelFormat, arm: ExportedArm, motion: Motion) -> S
         MissingDrakeError: likewise Drake.
     """
     difference = read_back(text, form, arm)
-    omitted = {name: _rms(torque) for name, torque in _left_out(form, arm, motion).items()}
-    omitted[_REVERSALS] = _rms(_dry(arm, motion) - _dry(arm, motion, jumps=True))
+    omitted = {
+        name: root_mean_square(torque) for name, torque in _left_out(form, arm, motion).items()
+    }
+    omitted[_REVERSALS] = root_mean_square(_dry(arm, motion) - _dry(arm, motion, jumps=True))
     if form.read is _mujoco_torque:
         dry = _mujoco_torque(text, arm, motion, friction=True) - _supported(form, arm, motion)
-        omitted[_REVERSALS] = _rms(dry - _dry(arm, motion))
+        omitted[_REVERSALS] = root_mean_square(dry - _dry(arm, motion))
     whole = arm.model.torque(arm.values, motion.without_load()) + arm.model.load_torque(motion)
     return SimulatorComparison(
-        difference, _rms(whole), {k: v for k, v in omitted.items() if v.any()}
+        difference, root_mean_square(whole), {k: v for k, v in omitted.items() if v.any()}
     )
 
 
@@ -452,12 +454,12 @@ def _rounding(arm: ExportedArm, motion: Motion) -> tuple[Array, Array]:
     return whole - rigid_torque(arm, motion) - motion.acceleration @ arm.rotors, whole
 
 
-def unsupported_torque(arm: ExportedArm, motion: Motion, form: str = "mjcf") -> Array:
-    """Return the torque (m, n) of all parts that a format does not support, along a motion.
+def unsupported_torque(arm: ExportedArm, motion: Motion) -> Array:
+    """Return the torque (m, n) of all parts that MuJoCo does not simulate, along a motion.
 
     Without dry friction at reversals, which every simulator has in its own way.
     """
-    parts = _left_out(FORMATS[form], arm, motion).values()
+    parts = _left_out(FORMATS["mjcf"], arm, motion).values()
     return np.asarray(np.sum([np.zeros(motion.position.shape), *parts], axis=0))
 
 
@@ -626,10 +628,6 @@ def _comment(node: Node, remarks: Sequence[str]) -> None:
 def _add(parent: Node, tag: str, /, **attributes: str | None) -> Node:
     stated = {key: value for key, value in attributes.items() if value is not None}
     return ElementTree.SubElement(parent, tag, stated)
-
-
-def _rms(torque: Array) -> Array:
-    return np.asarray(np.sqrt(np.mean(torque**2, axis=0)))
 
 
 def _text(root: Node) -> str:

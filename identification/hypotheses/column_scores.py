@@ -49,18 +49,6 @@ class ScorePrior(NamedTuple):
     gaussian: GaussianPrior
     design_effect: float  # rows that count as one
 
-    def added_to(self, gram: Array, step: int) -> Array:
-        """Return sums of `[W | added | y]` (k + 1, k + 1) of each `step`-th row with the prior.
-
-        Of fewer rows fewer are correlated.
-        """
-        precision = max(1.0, self.design_effect / step) * self.gaussian.information
-        p = len(precision)
-        total = gram.copy()
-        total[:p, :p] += precision
-        total[:p, -1] += precision @ self.gaussian.mean
-        return total
-
 
 class ColumnScore(NamedTuple):
     """Squared errors of predicted blocks, and parameters and added coefficients by fold."""
@@ -172,9 +160,7 @@ def separate_errors(tables: ColumnSums, target: Array, part: Array) -> Array:
     return errors(np.maximum(tables.rows.sum(axis=0), 1) / usual)
 
 
-def column_score(
-    tables: ColumnSums, added: Array, target: Array, prior: ScorePrior | None = None
-) -> ColumnScore:
+def column_score(tables: ColumnSums, added: Array, target: Array) -> ColumnScore:
     """Predict every fifth block from the others.
 
     Columns and target are combinations of the columns of the tables.
@@ -183,12 +169,7 @@ def column_score(
         tables: of the blocks.
         added: columns of further parameters (B, n, q, r).
         target: of each joint (n, q).
-        prior: of the parameters; without one, bodies that no arm has are allowed.
     """
-
-    def solved(gram: Array) -> Array:
-        return _solved(gram if prior is None else prior.added_to(gram, tables.step))
-
     blocks, n = tables.rows.shape
     p = tables.n_parameters
     column = np.broadcast_to(target[:, :, None], (blocks, n, target.shape[1], 1))
@@ -208,11 +189,11 @@ def column_score(
     coefficients = []
     for k in range(FOLDS):
         fold_blocks = slice(k, None, FOLDS)
-        values = solved(of_folds[k])
+        values = _solved(of_folds[k])
         coefficients.append(values)
         squares[fold_blocks] = _Sums(*(part[fold_blocks] for part in sums)).squares(values)
     squares = np.where(tables.rows >= _MIN_ROWS, np.maximum(squares, floor / blocks), 0.0)
-    fitted = np.maximum(whole.squares(solved(total)), floor)
+    fitted = np.maximum(whole.squares(_solved(total)), floor)
     fold_values = np.array(coefficients)
     return ColumnScore(squares, fitted, torque, fold_values[:, :p], fold_values[:, p:])
 

@@ -17,7 +17,7 @@ from typing import Final, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from identification.arrays import Array
+from identification.arrays import Array, root_mean_square
 from identification.export.exported_arm import ExportedArm
 from identification.export.simulators import load_mujoco
 from identification.rollout.mujoco_simulation import MAX_POSITION_ERROR, Feedback
@@ -88,7 +88,7 @@ def polished(start: Driven) -> Driven:
     from mujoco import minimize  # optional dependency
 
     quantities = _quantities(start)
-    size = np.sqrt(np.mean(start.residuals() ** 2, axis=0))
+    size = root_mean_square(start.residuals())
     scale = np.where(size > 0.0, size, 1.0) * np.sqrt(len(start.motion.windows))
 
     def residuals(columns: Array) -> Array:

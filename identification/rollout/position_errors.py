@@ -10,7 +10,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from identification.arrays import Array
+from identification.arrays import Array, root_mean_square
 from identification.distributions import student_limit
 from identification.export.exported_arm import ExportedArm
 from identification.export.simulators import unsupported_torque
@@ -198,7 +198,7 @@ def errors_of(positions: Array, measured: Array, chain: Chain) -> RolloutErrors:
             ends = [flange_motion(chain, at[rows, k]).position for at in (positions, measured)]
             away = ends[0] - ends[1]
             distances[k] = np.sqrt(np.mean(np.sum(away**2, axis=1)))
-    rms = np.sqrt(np.mean(difference**2, axis=0))
+    rms = root_mean_square(difference)
     first = np.count_nonzero(np.isinf(positions[:, -1]), axis=0)
     return RolloutErrors(rms, distances, int(np.count_nonzero(~whole[:, -1])), first)
 

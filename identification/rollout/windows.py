@@ -11,10 +11,9 @@ import numpy as np
 import scipy
 from numpy.typing import NDArray
 
-from identification.arrays import Array
+from identification.arrays import Array, runs_of
 from identification.errors import IdentificationError
 from identification.model.motion import Motion
-from identification.signals.masks import runs_of
 from identification.signals.samples import Samples
 
 STEP_SECONDS: Final = 5e-3

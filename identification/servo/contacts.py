@@ -20,13 +20,12 @@ import numpy as np
 import scipy
 from numpy.typing import NDArray
 
-from identification.arrays import Array
+from identification.arrays import Array, root_mean_square, runs_of
 from identification.servo.fit import ROBUST
 from identification.servo.intervals import reach_of, widened_covariance
 from identification.servo.parameters import PLACE, POSITIVE, natural, without_absent
 from identification.servo.recorded_motion import ServoMotion
 from identification.servo.servo_fit import ServoFit
-from identification.signals.masks import runs_of
 
 _OVER: Final = 1.0  # s that a joint stands, longer than any answer to a command takes
 _PERIOD: Final = 0.05  # s between rows that are judged
@@ -69,7 +68,7 @@ def contacts_of(motion: ServoMotion, fit: ServoFit, resolution: Array) -> list[C
     if len(position) <= over:
         return []
     still = _at_rest(position, _RESTING * np.sqrt(12.0) * resolution, over)
-    scatter = np.sqrt(np.mean(fit.estimate.scatter**2, axis=0))
+    scatter = root_mean_square(fit.estimate.scatter)
     least = ROBUST * np.maximum(scatter, resolution)
     compliance = fit.estimate.values[:, PLACE["kp"]]
     beyond, deviation, friction = _beyond(motion, every, fit)

@@ -14,7 +14,6 @@ positions show these, and only gravity and the inertia of the bodies show the to
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from typing import Final, NamedTuple
 
 import numpy as np
@@ -71,18 +70,6 @@ POSITIVE: Final = np.array([term.positive for term in TERMS])
 BUS_DELAY_SPREAD: Final = 0.03  # s, about zero: half of a normal distribution
 ABSENT: Final = {"limit": np.inf, "speed": 1.0, "acceleration": np.inf}
 """Values of terms that are not in a model, where that is not zero."""
-
-
-@dataclass(frozen=True, eq=False)
-class ServoParameters:
-    """Values of `TERMS` of n joints in SI units."""
-
-    values: Array  #: (n, len(TERMS))
-    present: NDArray[np.bool_]  #: whether a term is in the model (n, len(TERMS))
-
-    def of(self, name: str) -> Array:
-        """Return the values of a parameter (n,)."""
-        return self.values[:, PLACE[name]]
 
 
 def natural(coordinates: Array) -> Array:

@@ -9,7 +9,7 @@ import numpy as np
 import scipy
 from numpy.typing import NDArray
 
-from identification.arrays import Array
+from identification.arrays import Array, root_mean_square
 from identification.servo.fit import Prior
 from identification.servo.parameters import NAMES, PLACE, TERMS
 from identification.servo.recorded_motion import SMOOTHING_SECONDS, ServoMotion
@@ -42,7 +42,7 @@ def prior_of(motions: Sequence[ServoMotion], resolution: Array) -> Prior:
     """
     errors = np.concatenate([motion.command - motion.position for motion in motions])
     moving = moving_joints(motions)
-    size = np.maximum(_of_moving(_rms(errors), moving), resolution)
+    size = np.maximum(_of_moving(root_mean_square(errors), moving), resolution)
     mean = np.zeros((len(size), len(TERMS)))
     spread = np.tile([term.spread for term in TERMS], (len(size), 1))
     mean[:, PLACE["kp"]] = np.log(_compliance(motions, errors))
@@ -109,12 +109,8 @@ def _compliance(motions: Sequence[ServoMotion], errors: Array) -> Array:
     The servos of an arm are of a few types: that of the joint whose errors are smallest for the
     torque that it needs. A softer servo would not have followed.
     """
-    torque = _rms(np.concatenate([motion.bodies.bias for motion in motions]))
-    softest = _rms(errors) / np.maximum(torque, 1e-9)
+    torque = root_mean_square(np.concatenate([motion.bodies.bias for motion in motions]))
+    softest = root_mean_square(errors) / np.maximum(torque, 1e-9)
     turning = motions[0].turning
     common = [softest[turning == turns].min() for turns in turning]
     return np.asarray(np.maximum(common, _MIN_COMPLIANCE))
-
-
-def _rms(values: Array) -> Array:
-    return np.asarray(np.sqrt((values**2).mean(axis=0)))

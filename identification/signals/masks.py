@@ -10,7 +10,7 @@ from typing import Final, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from identification.arrays import Array
+from identification.arrays import Array, runs_of
 from identification.distributions import MAD_TO_STD
 from identification.model.motion import Motion
 from identification.model.robot import RobotModel
@@ -286,12 +286,6 @@ def edge_rows(recording: Recording, end: float, delay: float = 0.0) -> NDArray[n
             at = inside - delay
             edge[segment] = (at < inside[0] + end) | (at > inside[-1] - end)
     return edge
-
-
-def runs_of(flags: NDArray[np.bool_]) -> list[tuple[int, int]]:
-    """Return start and stop of every run of True."""
-    edges = np.flatnonzero(np.diff(flags.astype(np.int8), prepend=0, append=0))
-    return list(zip(edges[::2].tolist(), edges[1::2].tolist(), strict=True))
 
 
 def _leaves_peak(channel: Array, start: int, stop: int, resolution: float) -> bool:

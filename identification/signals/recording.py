@@ -11,7 +11,7 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from identification.arrays import Array
+from identification.arrays import Array, root_mean_square
 from identification.errors import IdentificationError, ShapeError
 
 # Command range beyond which a constant position is an error.
@@ -359,7 +359,7 @@ def _difference(time: Array, a: Array, other_time: Array, b: Array) -> float:
     if np.count_nonzero(inside) < _MIN_OVERLAP_SHARE * max(len(a), len(b)):
         return np.inf
     at = np.column_stack([np.interp(time[inside], other_time, column) for column in b.T])
-    return float(np.sqrt(np.mean((a[inside] - at) ** 2, axis=0)).max())
+    return float(root_mean_square(a[inside] - at).max())
 
 
 def _resampled(recording: Recording) -> tuple[Array, Array]:

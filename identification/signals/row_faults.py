@@ -13,7 +13,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from identification.arrays import Array
+from identification.arrays import Array, runs_of
 from identification.signals.noise import smallest_steps
 from identification.signals.position_steps import MAX_ACCELERATION, Excursion, excursions
 from identification.signals.recording import GAP_STEPS, Recording
@@ -186,8 +186,7 @@ def _frozen(recording: Recording) -> Iterator[tuple[int, int]]:
     for values in (position, recording.torque, recording.velocity):
         if values is not None:
             equal &= (values[1:] == values[:-1]).all(axis=1)
-    edges = np.flatnonzero(np.diff(equal.astype(np.int8), prepend=0, append=0))
-    runs = list(zip(edges[::2].tolist(), edges[1::2].tolist(), strict=True))
+    runs = runs_of(equal)
     lengths = np.array([stop - start for start, stop in runs])
     if not len(runs):
         return

@@ -9,7 +9,7 @@ from typing import Final, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from identification.arrays import Array
+from identification.arrays import Array, root_mean_square
 from identification.distributions import SIGNIFICANT_SIGMAS
 from identification.estimators.consistent import ConsistentEstimate, consistent_estimate
 from identification.estimators.prior import BodyPrior
@@ -198,4 +198,4 @@ def _gravity_loaded(model: RobotModel, motion: Factor, values: Array) -> NDArray
     rigid = np.where(model.friction_columns, 0.0, values)
     weight = model.torque(rigid, Motion.at_rest(position))
     measured = np.sqrt(motion.gram[:, -1, -1] / np.maximum(motion.samples, 1))
-    return np.asarray(np.sqrt(np.mean(weight**2, axis=0)) > _MIN_GRAVITY_SHARE * measured)
+    return np.asarray(root_mean_square(weight) > _MIN_GRAVITY_SHARE * measured)

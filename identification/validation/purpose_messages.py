@@ -6,7 +6,7 @@ import math
 from collections.abc import Sequence
 from typing import Final
 
-from identification.text import number, percentage
+from identification.text import enumerated, number, percentage
 from identification.validation.purpose import NoFigure, Purpose, PurposeName, good_for
 
 TITLES: Final[dict[PurposeName, str]] = {
@@ -60,18 +60,14 @@ def purposes_in_a_sentence(
     ]
     unknown = [_with_figure(p, joints) for p in purposes if p.name in asked and p.good is None]
     sentences = [
-        f"Good {'only ' if only else ''}for {_enumerated(good)}." if good else "",
-        f"Not for {_enumerated(bad)}." if bad else "",
-        f"Not judged: {_enumerated(unknown)}." if unknown else "",
-        f"It notices {_enumerated(seen)}." if seen else "",
+        f"Good {'only ' if only else ''}for {enumerated(good)}." if good else "",
+        f"Not for {enumerated(bad)}." if bad else "",
+        f"Not judged: {enumerated(unknown)}." if unknown else "",
+        f"It notices {enumerated(seen)}." if seen else "",
     ]
     if not good_for(purposes, asked):
         sentences[:3] = [*sentences[1:3], sentences[0]]
     return " ".join(filter(None, sentences))
-
-
-def _enumerated(parts: Sequence[str]) -> str:
-    return " and ".join(filter(None, [", ".join(parts[:-1]), parts[-1]]))
 
 
 def _with_figure(purpose: Purpose, joints: Sequence[str]) -> str:

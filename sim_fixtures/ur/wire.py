@@ -145,10 +145,13 @@ class DataPackages:
         return package("U", self._struct.pack(*flat))
 
 
-def text_package(text: str, source: str = "controller", level: int = 3) -> bytes:
+_INFO: Final = 3  # level of a text
+
+
+def text_package(text: str) -> bytes:
     """Return a package with a line of text."""
-    words = (text.encode()[:255], source.encode()[:255])
-    return package("M", b"".join(bytes([len(word)]) + word for word in words) + bytes([level]))
+    words = (text.encode()[:255], b"controller")
+    return package("M", b"".join(bytes([len(word)]) + word for word in words) + bytes([_INFO]))
 
 
 def state_package(

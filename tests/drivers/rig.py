@@ -179,12 +179,6 @@ def still(rows: int, position=START) -> Table:
     return Table(np.tile(position, (rows, 1)))
 
 
-def bump(height, cycles: int) -> np.ndarray:
-    """From zero to `height` (n,) and back, with zero jerk at both ends, (cycles, n)."""
-    s = np.linspace(0.0, 1.0, cycles)[:, None]
-    return (4.0 * s * (1.0 - s)) ** 4 * np.asarray(height)
-
-
 def smooth_move(distance, cycles: int, start=START) -> Table:
     """From start by `distance` (n,) along a polynomial with zero jerk at both ends."""
     s = np.linspace(0.0, 1.0, cycles + 1)[:, None]

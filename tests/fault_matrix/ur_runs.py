@@ -71,7 +71,6 @@ _IN_SHORT: Final[Mapping[str, str]] = {
 }
 """Word for each reason by which a motion is lost, by a part of it."""
 _FAST: Final = 0.6  # rad/s of joint 1: three quarters of its speed in this motion
-_HELD: Final = 120  # cycles after the motion began to move at which it is held, if it is
 
 
 @cache

@@ -21,15 +21,12 @@ from hil.control.motions import player_of
 from hil.control.move import plan_move
 from hil.control.ur_simulation import UrPeer, simulated_ur
 from planner import TrajectoryPlayer
-from sim_fixtures.ur import CELL_PATH, SimulatedUr, UrArmTruth
+from sim_fixtures.ur import CELL_PATH, SimulatedUr
 from sim_fixtures.ur.controller import parse_ur_fault
 
 PERIOD = 0.002
-STARTED = 114
-"""Cycle of the first set-point of a motion that was requested at the beginning, or later."""
 MIDST = 260
-"""A cycle within that motion, at speed."""
-QUIET = UrArmTruth(current_noise=0.0, velocity_noise=0.0)
+"""A cycle within a motion that was requested at the beginning, at speed."""
 
 
 @cache
