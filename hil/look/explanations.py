@@ -17,8 +17,8 @@ from hil.look.readings import (
 )
 from hil.look.result import Aspect, Row
 from identification.hypotheses.column_scores import SEPARATE_ERROR_RATIO
-from identification.hypotheses.column_search import Explanation
 from identification.hypotheses.diagnosis import explain_errors
+from identification.hypotheses.explanation import Explanation
 from identification.hypotheses.joint_changes import Change
 from identification.hypotheses.scores import EXPLAINED_ERROR
 

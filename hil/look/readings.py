@@ -20,7 +20,7 @@ from hil.importers.conclusions import (
     StatedUnit,
 )
 from identification.estimators.delay import DelayEstimate
-from identification.hypotheses.column_search import Explanation
+from identification.hypotheses.explanation import Explanation
 from identification.hypotheses.joint_changes import Change
 from identification.signals.position_steps import PositionJump
 from identification.signals.row_faults import RowFault

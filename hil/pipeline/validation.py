@@ -10,8 +10,8 @@ from pathlib import Path
 from hil.base.progress import Reporter
 from hil.cell.nominal import Nominal, nominal_of
 from identification import Factor, IdentificationError
-from identification.hypotheses.column_scores import ScorePrior
 from identification.hypotheses.diagnosis import TorqueDiagnosis
+from identification.hypotheses.sizes import ScorePrior
 from identification.purposes.purposes import Application, purposes_of
 from identification.purposes.thresholds import ContactThreshold
 from identification.selection.essential import Elimination, choose_essential

@@ -10,7 +10,6 @@ from numpy.typing import NDArray
 
 from identification.arrays import Array
 from identification.distributions import SIGNIFICANT_SIGMAS
-from identification.estimators.prior import GaussianPrior
 from identification.factor.blocks import FOLDS
 from identification.factor.normal_equations import solve_with_ridge
 from identification.hypotheses.error_ratios import (
@@ -41,13 +40,8 @@ _MIN_ROWS: Final = 10
 MIN_BLOCKS: Final = 2
 # Ridge as a share of each column's information, for columns that the motion hardly determines.
 _RIDGE: Final = 1e-6
-
-
-class ScorePrior(NamedTuple):
-    """What is believed of an arm in addition to fitted rows."""
-
-    gaussian: GaussianPrior
-    design_effect: float  # rows that count as one
+ALIKE_ERROR_RATIO: Final = 1.05
+"""Ratio of errors up to which two changes explain as much."""
 
 
 class ColumnScore(NamedTuple):

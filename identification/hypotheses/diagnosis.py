@@ -17,12 +17,8 @@ import numpy as np
 from identification.arrays import Array
 from identification.estimators.prior import body_prior, nominal_ratio, posterior_values
 from identification.factor.factor import Factor
-from identification.hypotheses.column_search import (
-    ExplainedFit,
-    Explanation,
-    find_columns,
-    find_columns_of_unseen,
-)
+from identification.hypotheses.column_search import find_columns, find_columns_of_unseen
+from identification.hypotheses.explanation import ExplainedFit, Explanation
 from identification.hypotheses.gravity_share import has_part_of_gravity
 from identification.hypotheses.inertia_scale import InertiaScale, find_inertia_scale
 from identification.hypotheses.joint_changes import Change, changed_samples

@@ -23,10 +23,8 @@ from numpy.typing import NDArray
 
 from identification.arrays import Array
 from identification.estimators.covariance import cluster_covariance, solve_with_prior
+from identification.estimators.prior import GaussianPrior
 from identification.factor.normal_equations import NormalEquations
-from identification.hypotheses.column_scores import (
-    ScorePrior,
-)
 from identification.hypotheses.joint_changes import Change
 from identification.hypotheses.torque_columns import ColumnSums, columns_of
 from identification.model.link_wrenches import MASS_INDEX
@@ -38,6 +36,13 @@ _MAX_ITERATIONS: Final = 30
 _STEP_TOLERANCE: Final = 1e-3  # of an unknown and its deviation
 _MIN_STEP_FACTOR: Final = 0.1  # factor of a factor, in one step
 _MIN_NOISE_SHARE: Final = 1e-6  # of the torque
+
+
+class ScorePrior(NamedTuple):
+    """What is believed of an arm in addition to fitted rows."""
+
+    gaussian: GaussianPrior
+    design_effect: float  # rows that count as one
 
 
 class ChangeSize(NamedTuple):

@@ -21,7 +21,7 @@ from identification.arrays import Array
 from identification.distributions import SIGNIFICANT_SIGMAS
 from identification.factor.estimate import Estimate
 from identification.factor.factor import Factor
-from identification.hypotheses.column_search import Explanation
+from identification.hypotheses.explanation import Explanation
 from identification.model.robot import RobotModel
 from identification.signals.block_mean import BlockMean, block_index, block_mean
 from identification.signals.samples import Samples

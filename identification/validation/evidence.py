@@ -17,8 +17,6 @@ from identification.factor.columns import standard_factor
 from identification.factor.estimate import Estimate
 from identification.factor.factor import Factor, total_factor
 from identification.hypotheses.carried_load import MIN_LOAD_EXPLAINED, CarriedLoad, find_load
-from identification.hypotheses.column_scores import ScorePrior
-from identification.hypotheses.column_search import ExplainedFit, Explanation
 from identification.hypotheses.diagnosis import (
     MIN_ERROR_GROWTH,
     UNEXPLAINED,
@@ -27,8 +25,10 @@ from identification.hypotheses.diagnosis import (
     few_rows,
     unexplained_share,
 )
+from identification.hypotheses.explanation import ExplainedFit, Explanation
 from identification.hypotheses.gravity_direction import GravityDirection, find_gravity
 from identification.hypotheses.scores import score_of
+from identification.hypotheses.sizes import ScorePrior
 from identification.hypotheses.unseen_changes import (
     UnseenChange,
     beyond_constants,

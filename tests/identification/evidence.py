@@ -7,8 +7,8 @@ import numpy as np
 from identification.estimators.delay import DelayEstimate
 from identification.factor.estimate import Estimate
 from identification.factor.estimation_method import EstimationMethod
-from identification.hypotheses.column_search import Explanation
 from identification.hypotheses.diagnosis import RigidTorque, TorqueDiagnosis
+from identification.hypotheses.explanation import Explanation
 from identification.hypotheses.joint_changes import Change
 from identification.validation.evidence import CellContext, Evidence
 from identification.validation.finding import Thresholds

@@ -11,13 +11,9 @@ from numpy.typing import NDArray
 from identification import Recording
 from identification.estimators.prior import body_prior, posterior_values
 from identification.factor.factor import Factor
-from identification.hypotheses.column_search import (
-    ExplainedFit,
-    Explanation,
-    find_columns,
-    find_columns_of_unseen,
-)
+from identification.hypotheses.column_search import find_columns, find_columns_of_unseen
 from identification.hypotheses.diagnosis import TorqueDiagnosis, diagnose
+from identification.hypotheses.explanation import ExplainedFit, Explanation
 from identification.hypotheses.joint_changes import Change
 from identification.hypotheses.readings import Adequacy
 from identification.hypotheses.scores import ROWS_PER_FACT

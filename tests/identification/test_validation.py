@@ -19,7 +19,7 @@ from identification.factor.estimate import Estimate, estimate, joint_weights
 from identification.factor.estimation_method import EstimationMethod
 from identification.factor.factor import Factor, total_factor
 from identification.factor.normal_equations import solve
-from identification.hypotheses.column_search import Explanation
+from identification.hypotheses.explanation import Explanation
 from identification.hypotheses.joint_changes import Change
 from identification.hypotheses.unseen_changes import UnseenChange, beyond_constants, find_changes
 from identification.model.coupling import Coupling

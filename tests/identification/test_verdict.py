@@ -14,15 +14,11 @@ from identification.factor.estimate import estimate
 from identification.factor.factor import Factor
 from identification.hypotheses import column_search
 from identification.hypotheses.carried_load import CarriedLoad
-from identification.hypotheses.column_scores import ScorePrior
-from identification.hypotheses.column_search import (
-    ExplainedFit,
-    Explanation,
-    find_columns_of_unseen,
-)
+from identification.hypotheses.column_search import find_columns_of_unseen
 from identification.hypotheses.diagnosis import diagnose
+from identification.hypotheses.explanation import ExplainedFit, Explanation
 from identification.hypotheses.joint_changes import DISCRETE_MEANINGS, Change, Part
-from identification.hypotheses.sizes import estimated_size
+from identification.hypotheses.sizes import ScorePrior, estimated_size
 from identification.hypotheses.torque_columns import ColumnSums
 from identification.hypotheses.unseen_changes import UnseenChange
 from identification.model.known_payload import Payload

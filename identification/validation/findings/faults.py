@@ -9,7 +9,7 @@ import numpy as np
 
 from identification.arrays import Array
 from identification.hypotheses.column_scores import SEPARATE_ERROR_RATIO
-from identification.hypotheses.column_search import Explanation
+from identification.hypotheses.explanation import Explanation
 from identification.hypotheses.joint_changes import SIGNS, Change, Meaning
 from identification.validation.evidence import Evidence
 from identification.validation.finding import (
