@@ -1,7 +1,7 @@
 """What a session knows of a controller's protocol: cycles in, replies out, whatever the bytes.
 
 A `Wire` makes a `MeasuredCycle` of the packet of each cycle, and bytes of the reply that the
-session decides on. `drivers.c4g_wire` is that of C4G Open, `drivers.ur.wire` that of Universal
+session decides on. `drivers.c4g_wire` is for C4G Open, `drivers.ur.wire` for Universal
 Robots.
 """
 

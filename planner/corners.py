@@ -277,7 +277,7 @@ _TIME_RESOLUTION = 1e-15  # of the time, as a share of the duration
 def passing(motion: PiecewiseCubic, point: Array) -> Passing:
     """Return where `motion` is nearest to `point` (n,) [rad].
 
-    The distance is that of a point of the path, hence an upper bound of the true one.
+    The distance of one point of the path, hence an upper bound of the true one.
     """
     times = np.linspace(0.0, motion.duration, _SEARCH_SAMPLES)
     apart = motion.sample(times)[0] - point

@@ -155,7 +155,7 @@ class Legs(NamedTuple):
 
         `fly` (c,) is the share of the deceleration that the next acceleration overlaps.
 
-        Limits within a corner are the larger ones of the two moves; those of acceleration are the
+        Limits within a corner are the larger ones of the two moves; limits of acceleration are the
         deceleration before and the acceleration after it.
         """
         first = self.bounds.take(before)

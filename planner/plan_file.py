@@ -117,7 +117,7 @@ class PlanFile:
 
         Raises:
             InvalidPlanFile: no limits are given or stored, or the stored motion breaks its limits
-                or is not that of its moves.
+                or does not match its moves.
             PlannerError: the moves cannot be planned.
         """
         use_stored = limits is None

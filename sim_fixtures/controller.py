@@ -460,8 +460,8 @@ class MoveInterpolator(Protocol):
 class OwnMotion:
     """Moves of the controller's own program through postures (n,) [rad].
 
-    The set-point of the present cycle is `position` [rad] and `velocity` [rad/s], (n,), that of the
-    step to it.
+    The set-point of the present cycle is `position` [rad] and `velocity` [rad/s], (n,) of
+    the step to it.
 
     Args:
         postures: joint angles (n,) [rad] each.

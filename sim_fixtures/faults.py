@@ -76,7 +76,7 @@ class FaultyController(Protocol):
 class InjectedFault:
     """One fault of the controller or its robot; see `GRAMMAR` for the kinds.
 
-    `cycle` is that of its beginning, `axis` counts from 1, `count` is its duration in cycles,
+    `cycle` is the first one, `axis` counts from 1, `count` is its duration in cycles,
     `word` the option of the kind, "" without one.
     """
 

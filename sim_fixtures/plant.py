@@ -149,7 +149,7 @@ def build_model(
         inertia_scale: by which inertias of the links are multiplied.
 
     Raises:
-        SettingError: the number of armatures is not that of the joints, or a joint is not revolute.
+        SettingError: there is not one armature per joint, or a joint is not revolute.
     """
     model = pin.buildModelFromXML(_as_revolute(urdf))
     inertias = np.asarray(armature, dtype=np.float64)

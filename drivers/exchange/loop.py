@@ -269,7 +269,7 @@ class _LatenessMonitor:
         self._max_late = max_late
         self._late_reply_at = -math.inf
         self._consecutive = 0
-        self._arrived = math.nan  # that of the last packet
+        self._arrived = math.nan  # arrival of the last packet
         self._cycle = 0
 
     def before_reply(self, arrived: float) -> None:

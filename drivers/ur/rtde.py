@@ -122,7 +122,7 @@ class FrameSplitter:
         """Return the frames that these bytes complete.
 
         Raises:
-            RtdeError: a length below that of a header: the stream is not RTDE.
+            RtdeError: a length shorter than a header: the stream is not RTDE.
         """
         data = self._rest + data
         frames = []

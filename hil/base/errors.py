@@ -47,7 +47,7 @@ DISK_ERRNOS: Final = frozenset({errno.ENOSPC, errno.EDQUOT, errno.EIO, errno.ERO
 class HilError(Exception):
     """Base class of the errors of `hil`; the message is for the operator.
 
-    `exit_code` is that of the command line; `figures` are JSON data about the work done before.
+    `exit_code` is the exit status; `figures` are JSON data about the work done before.
     """
 
     exit_code: ClassVar[int] = ExitStatus.FAILED
@@ -137,7 +137,7 @@ class SourceError(InputError):
 class RefusedRecordingError(SourceError):
     """A recording that was read, and from which nothing follows.
 
-    The exit status is that of the verdict on its archive: the result is negative.
+    The exit status states the verdict on its archive: the result is negative.
     """
 
     exit_code: ClassVar[int] = ExitStatus.NEGATIVE_RESULT

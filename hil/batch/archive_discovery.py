@@ -357,7 +357,7 @@ def arm_digest(cell: Cell, drive_train: bytes | None, *, simulated: bool = False
     """Return the digest that identifies a robot: links, joints, friction law, drives.
 
     Payload and delay are not part of it (see :class:`Setup`). The drive
-    train of the archive has precedence over that of the cell.
+    train of the archive takes precedence over the cell's.
     """
     drives = cell.file.drive_train
     parts = {

@@ -21,7 +21,7 @@ class Setup:
     mass: float = 0.0  #: of the payload [kg]
     centre: tuple[float, ...] = ()  #: of its mass in the frame (3,) [m]; empty without a payload
     inertia: tuple[float, ...] = ()  #: about the centre (6,) [kg·m²]; empty if zero
-    frame: str = ""  #: link of the description; "": that of the last joint
+    frame: str = ""  #: link of the description; "": the link of the last joint
 
     def __bool__(self) -> bool:
         return bool(self.delay or self.centre)

@@ -93,7 +93,7 @@ def run_motions(
 
     Args:
         campaign: state of its folder.
-        link: to the controller; by default that of the cell.
+        link: to the controller; default: the cell's.
         watch: of the run.
         reporter: of progress.
         options: of the run.

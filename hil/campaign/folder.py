@@ -45,7 +45,7 @@ LOCK_TIMEOUT: Final = 0.5  # s to wait for a lock
 MESH: Final = "mesh "  # Prefix of the entry of a mesh, by its name in the URDF
 MISSING: Final = "missing"
 PAYLOADS: Final = "payload"
-"""Folder, in that of a campaign, with a folder for each payload that it weighs."""
+"""Folder within a campaign's folder, with one folder per payload that it weighs."""
 PAYLOAD_RESULT: Final = "payload.json"
 """File of a payload that was weighed, in its folder."""
 SIDES: Final = ("bare", "loaded")

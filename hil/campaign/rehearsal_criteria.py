@@ -92,7 +92,7 @@ class ParameterErrors:
 
 @dataclass(frozen=True)
 class UnseenError:
-    """Largest torque error of any joint on unseen motion, over that of the true parameters."""
+    """Torque error on unseen motion over the true parameters' error, of the worst joint."""
 
     ratio: float
     joint: int

@@ -76,8 +76,8 @@ def new(
     arm with known Denavit-Hartenberg parameters and no URDF use --dh.
 
     With --controller ur --host HOST, a Universal Robots arm gives its type, serial number,
-    calibration, limits, payload and torque constants; nothing moves, nothing is claimed. Without
-    --urdf its own kinematics are used, without masses.
+    calibration, limits, payload and torque constants; nothing moves, and hil takes no control.
+    Without --urdf its own kinematics are used, without masses.
 
     **Examples:** `hil new --urdf robot.urdf --from-controller 10.2.12.150 -o cell.toml`, `hil new
     --dh table.csv --convention modified -o cell.toml`, `hil new --design-only --urdf robot.urdf -o

@@ -1,7 +1,7 @@
 """The link to a controller: runs motions on it, or records motions of its own program.
 
-A `MotionLink` steers over a `ControllerPort`: that of `hil.control.virtual_link` in virtual time,
-that of `hil.control.live_link` in real time.
+A `MotionLink` steers over a `ControllerPort`: `hil.control.virtual_link` has one in virtual time,
+`hil.control.live_link` one in real time.
 """
 
 from __future__ import annotations

@@ -64,7 +64,7 @@ class FixedDistance:
 
 @dataclass(frozen=True)
 class NarrowerLimit:
-    """A motor whose current limit in the controller is not that of the cell file [A]."""
+    """A motor whose current limit differs between controller and cell file [A]."""
 
     controller: float
     cell: float

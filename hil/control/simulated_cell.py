@@ -55,7 +55,7 @@ def simulated_link(
     Args:
         cell: with the true parameters in `[simulation]`.
         effects: whether to simulate unmodelled effects, with the sizes of the cell.
-        drive: true drive train, by default that of the cell.
+        drive: true drive train; default: the cell's.
         truth: true parameters, by default of the cell.
         instead_of_hardware: also simulate a cell with a real link.
         only_axis: number, from 1, of the only axis that is opened; None for all.
@@ -135,7 +135,7 @@ def simulated_controller(
         drive: likewise.
         truth: likewise.
         settings: by default `controller_settings(cell)`.
-        seed: by default that of the cell.
+        seed: of the noise; default: the cell's.
         session: as for `simulated_link`.
         faults: likewise.
         own_speed: share of the velocity limits at which the moves of an own program run.

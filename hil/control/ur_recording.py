@@ -88,7 +88,7 @@ def listening(
 
     Raises:
         CellError: the cell is not one of such an arm.
-        ControllerError: there is no controller, or it is that of another arm.
+        ControllerError: there is no controller, or it belongs to another arm.
         OperatorStopError: stopped before it was connected.
     """
     spec = _spec_of(cell)
@@ -121,7 +121,7 @@ def record_arm(
 
     Args:
         arm: whose outputs are read.
-        cell: that of the arm.
+        cell: of the arm.
         path: of the archive.
         kind: one of `hil.control.record.KINDS`.
         stop: ends the recording.

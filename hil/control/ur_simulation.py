@@ -120,7 +120,7 @@ def simulated_ur(
         faults: of the controller.
         seed: of the noise, that of the cell by default.
         session: number of earlier sessions; each has noise of its own.
-        truth: what the arm is; by default that of the cell.
+        truth: true parameters of the arm; default: the cell's.
         effects: whether to simulate unmodelled effects, with the sizes of the cell.
     """
     return SimulatedUr(

@@ -257,7 +257,7 @@ def run_search(
         reporter: of progress.
         workers: processes of the planner.
         stop: request of the operator.
-        problem: by default that of cell and settings.
+        problem: of the search; default: from cell and settings.
         journal: of the scores.
 
     Raises:

@@ -98,7 +98,7 @@ class RobotNaming:
     def place(self, ref: ArchiveRef) -> ArchiveRef:
         """Return a recording with robot and date; robots of one type are arms of their own.
 
-        A date of the pattern counts first, then that of the clock, of the name and of the file.
+        The first of these that is known: the date in the pattern, the clock, the name, the file.
 
         Raises:
             InputError: the robot is not named where it should be.

@@ -492,7 +492,7 @@ def write_arm(
 
     Args:
         arm: that is written.
-        folder: by default that of the identification.
+        folder: default: the folder of the identification.
         annotate: write copies of the archives with the predicted torque.
         reporter: of progress.
     """

@@ -30,7 +30,7 @@ class NameBasis(Enum):
     """From what a channel has its quantity."""
 
     NAME = auto()
-    JOINT = auto()  #: a name that contains that of a joint of the URDF
+    JOINT = auto()  #: a name that contains the name of a URDF joint
     UNIT = auto()  #: the unit alone: the name says nothing
     WORD = auto()  #: a word in the name
     WORDS = auto()  #: a word in each of several names, one for each joint
@@ -47,7 +47,7 @@ class UnitBasis(Enum):
     LOG = auto()  #: the log states it
     MAP = auto()  #: a ready map states it
     MESSAGE = auto()  #: the type of the message has it
-    CUSTOM = auto()  #: nothing states it: that of most logs
+    CUSTOM = auto()  #: nothing states it; most logs have it
     NUMBERS = auto()  #: nothing states it: concluded from the numbers
     OPTION = auto()  #: the user named the channel
 

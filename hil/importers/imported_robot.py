@@ -102,7 +102,7 @@ class Robot:
 
         Args:
             path: of the file.
-            gravity: (3,) [m/s²] in base axes; by default that of the cell.
+            gravity: (3,) [m/s²] in base axes; default: the cell's.
             locked: positions by name [rad or m] of joints to be fixed in addition to the joints of
                 the cell.
             recorded: names of the joints that were recorded; see `from_urdf`.

@@ -305,7 +305,7 @@ def _finding(
 
 
 def _is_side_open(imported: ImportedRecording) -> bool:
-    """Return whether nothing states that a torque is that of the joints.
+    """Return whether nothing states that a torque acts on the joints, not on the motors.
 
     A map of the user states it, so does the message of a bag, and an archive unless its log was
     imported without.

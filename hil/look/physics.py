@@ -274,7 +274,7 @@ class TorqueFindings:
         map_text: the column map of the import; None for a bag.
         files: the recording, parsed.
         gravities: that were tried, by mounting, "" for none [m/s²].
-        is_side_open: whether nothing states that the torque is that of the joints.
+        is_side_open: whether nothing states that the torque acts on the joints, not the motors.
         explained: how a low-pass or heavy rotors explain the torque as read at least as well as the
             changes that were found, none of which is then certain; None if they do not.
     """

@@ -39,7 +39,7 @@ class Fact(Enum):
     TIMES_UNSEEN = auto()
     BACKWARDS = auto()  #: the rows run backwards in time
     MEASURED = auto()
-    SLOPE = auto()  #: the velocity is that of the position
+    SLOPE = auto()  #: the velocity is the slope of the position
     SCALED_SLOPE = auto()
     SLOPE_IN_DEGREES = auto()
     SLOPE_OF_DEGREES = auto()

@@ -116,7 +116,7 @@ class TiedReading:
     """One of the readings that fit alike.
 
     Attributes:
-        aspect: that of a row.
+        aspect: of the row.
         reading: what it would be: a change, the signs of all joints, or, where the side is open,
             what its setting says.
         error: of the torque, predicted from other parts of the recording, as a share of it; None

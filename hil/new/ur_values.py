@@ -157,7 +157,7 @@ def cell_of_arm(arm: UrArmStatements, described: NewCell | None) -> NewCell:
 def from_arm(arm: UrArmStatements, urdf: str) -> CellValues:
     """Return the values that an arm states, and what is assumed of the rest.
 
-    `urdf` is its URDF, whose angles are those of the controller.
+    `urdf` is its URDF, with the controller's angles.
     """
     parts = {
         ASSUMED: _assumed(arm),

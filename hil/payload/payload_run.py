@@ -66,7 +66,7 @@ def find_payload(
         bare: archives, folders of them, or campaign folders.
         loaded: likewise.
         reporter: of progress.
-        frame: link of the payload, by default that of `flange_of`.
+        frame: link of the payload; default: `flange_of`.
         options: of the identification.
 
     Raises:

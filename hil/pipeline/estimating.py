@@ -218,7 +218,7 @@ def posterior_of(cell: Cell, factor: Factor, name: str, strength: Strength) -> P
         cell: of the arm.
         factor: of the data.
         name: of the estimator.
-        strength: of the prior for "auto"; all others have that of the residuals.
+        strength: of the prior for "auto"; others take the strength that the residuals give.
     """
     table = cell.file.nominal
     share = NOMINAL_STD_SHARE if name == "prior" else BODY_STD_SHARE

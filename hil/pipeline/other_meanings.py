@@ -35,7 +35,7 @@ def require_weight(
 ) -> tuple[Finding, ...]:
     """Return what bare recordings are other than described; gravity must be in their torque.
 
-    A controller that removes the weight of its arm may remove that of the load it knows as well,
+    A controller that removes the weight of its arm may also remove the weight of a load it knows,
     so that the torque does not say how heavy one is.
 
     Args:

@@ -58,7 +58,7 @@ def find_gains(
 
     Args:
         archives: with and without a known payload.
-        loaded: archives with another payload than that of their cell.
+        loaded: archives whose payload differs from their cell's.
         reporter: of progress.
         delay: of currents behind positions [s]; "stated" uses the cell's.
         unknown_inertia: whether the moments of inertia of `loaded` are estimated too; not if a

@@ -38,7 +38,7 @@ class TorqueScale:
 def torque_scale(cell: Cell, recordings: Sequence[Recording], *, simulated: bool) -> TorqueScale:
     """Return the uncertainty of the torques of recordings, of the worst where they differ.
 
-    That of the column map comes first, then that of the cell. The torques of a simulated arm
+    The column map takes precedence over the cell. The torques of a simulated arm
     (`simulated`: only one can have moved) are exact: its currents are made with the torque
     constants of the cell. A controller's own currents and imported ones have torque constants of a
     data sheet unless something else is stated, and joint torque sensors are no better

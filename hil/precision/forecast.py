@@ -167,7 +167,7 @@ class PrecisionDesign:
     ) -> PrecisionDesign:
         """Return the requirements about a cell, on its validation motions.
 
-        Without recordings the torque error of a real arm is assumed; that of a simulated one is the
+        Without recordings the torque error of a real arm is assumed; for a simulated one it is the
         noise of its currents.
 
         Args:

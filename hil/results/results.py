@@ -1,7 +1,7 @@
 """Schema of `results.json`.
 
 Numbers are in SI units; infinite and unknown numbers are the strings "Infinity" and "NaN". Lists
-per joint are in the order of `joint_names`, lists per parameter in that of `parameters`.
+per joint are in the order of `joint_names`, lists per parameter in the order of `parameters`.
 """
 
 from __future__ import annotations

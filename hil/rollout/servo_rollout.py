@@ -103,7 +103,7 @@ def roll_out_servo(
 ) -> tuple[Rollout, bool]:
     """Simulate held-out positions on a servo; also return whether its model is good.
 
-    The bodies are the URDF's. The servo is that of a folder's results with the terms that MuJoCo
+    The bodies are the URDF's. The servo comes from a folder's results, with the terms that MuJoCo
     has, or is identified from the fitted positions.
 
     Args:

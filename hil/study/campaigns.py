@@ -109,7 +109,7 @@ def fly_bys(cell: Cell, settings: StudySettings) -> tuple[PlannedMotion, ...]:
 def sines(cell: Cell, settings: StudySettings) -> tuple[PlannedMotion, ...]:
     """Return random sums of three sines for each joint, about home and the middle in turn.
 
-    Their frequencies are up to the appendix's bound, their amplitudes up to that of eq. 8.
+    Frequencies are bounded as in the appendix, amplitudes by eq. 8.
 
     Raises:
         NoExcitationError: none satisfies all constraints.

@@ -101,7 +101,7 @@ class PayloadMounting:
     def require(self, loaded: bool, option: str = "") -> None:
         """Return when the payload is mounted (`loaded`) or removed.
 
-        `option` is that of the command with which the run goes on.
+        `option` of the command continues the run.
 
         Raises:
             NotRehearsedError: a side has not passed its rehearsal.
@@ -145,7 +145,7 @@ class PayloadCampaign:
     """Two campaigns of one motion in the folder of a payload, without and with it.
 
     Attributes:
-        root: the folder, `payload/NAME` in that of the campaign with the motion.
+        root: the folder, `payload/NAME` of the campaign with the motion.
         name: of the payload.
         bare, loaded: its sides.
     """
@@ -159,7 +159,7 @@ class PayloadCampaign:
     def of(cls, campaign: Campaign, name: str, assumed: Payload | None) -> Self:
         """Return the payload campaign of a campaign's motion, begun or to be continued.
 
-        `assumed` is the payload as checks and simulation have it; None for that of the folder.
+        `assumed` is the payload for checks and simulation; None: the payload of the folder.
 
         Raises:
             InputError: the name is no name of a folder, or nothing was assumed yet.

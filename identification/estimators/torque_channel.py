@@ -105,7 +105,7 @@ def possible_low_passes(
         model: of the arm.
         noise_variance: of the positions (n,), as for :func:`identification.signals.samples.smooth`.
         options: of the preparation.
-        undelayed: delay without a low-pass [s], by default that of the options.
+        undelayed: delay without a low-pass [s]; default: the options'.
     """
     still = options.torque_delay if undelayed is None else undelayed
     mean = recording.averaged(RIGID_RATE)

@@ -60,7 +60,7 @@ def limit_violations(
 ) -> list[Violation]:
     """Return the largest violation of each quantity and joint.
 
-    Its time is that of one of the samples of the motion, which include both ends.
+    Its time is the time of a sample of the motion; samples include both ends.
     """
     return _beyond_limits(trajectory.extrema(), limits, motion)
 

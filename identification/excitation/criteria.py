@@ -436,7 +436,7 @@ class Objective:
 
         Args:
             motion: of m samples.
-            matrix: M (e, e); with weights that of all parameters (p, p).
+            matrix: M (e, e); with weights (p, p), of all parameters.
             weights: of the rows of the joints (n,).
             means: subtracted from each joint's columns.
         """

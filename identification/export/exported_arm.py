@@ -47,7 +47,7 @@ class ExportedArm:
     def friction(self) -> tuple[dict[str, float], ...]:
         """Coefficients by symbol of each joint, then of each coupled motor.
 
-        Coulomb friction contains that of the `load`.
+        Coulomb friction includes friction caused by the `load`.
         """
         coefficients = self.values[self.model.friction_part]
         return equivalent_coulomb(self.model, coefficients, self.written_load)

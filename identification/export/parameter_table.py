@@ -35,7 +35,7 @@ class ParameterRow:
 
     Attributes:
         name: such as `I3zz`.
-        meaning: in words; of a base parameter that of its first summand.
+        meaning: in words; for a base parameter the meaning of its first summand.
         body: link of the description, empty of what is no property of a body.
         joint: that moves the body, or has the friction.
         estimate: in units of the torque of this arm, as `low`, `high` and `std`.

@@ -268,7 +268,7 @@ class SimulatorComparison(NamedTuple):
     # the largest torque of the joint
     difference: float
     torque: Array  # root mean square of the whole torque over the motion (n,) [N·m or N]
-    left_out: Mapping[str, Array]  # that of each unsupported part (n,), by description
+    left_out: Mapping[str, Array]  # torque of each unsupported part (n,), by description
 
 
 def compare(text: str, form: ModelFormat, arm: ExportedArm, motion: Motion) -> SimulatorComparison:

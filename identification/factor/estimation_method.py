@@ -31,7 +31,9 @@ class PriorOrigin:
     share: float  #: standard deviation of the described bodies, as a share of them
     #: why bodies of the size of the torque take the place of the described ones; None: they do not
     fault: MassFault | None = None
-    scale: float = 1.0  #: measured torque over that of the described bodies, if they are unrelated
+    scale: float = (
+        1.0  #: ratio of measured torque to the described bodies' torque, if they are unrelated
+    )
     stated: int = 0  #: parameters whose values are stated
     weight: float = 1.0  #: by which the information on bodies is multiplied
 

@@ -67,7 +67,7 @@ class RigidTorque:
     Attributes:
         scale: over that of the description's bodies; NaN where it has no masses, or of few rows.
         std: standard deviation of it.
-        over_friction: torque of fitted bodies over that of fitted friction, RMS (n,).
+        over_friction: ratio of the torque of fitted bodies to fitted friction, RMS (n,).
         error: of that fit, as a share of the torque over all joints.
     """
 

@@ -26,8 +26,8 @@ class Explanation(NamedTuple):
         interval_factor: standard deviations in half a 95 % interval.
         rivals: other changes that explain its part as well, or several at once that explain more,
             the best first.
-        excess: error of its part with it over that of the other blocks, 1.0 if not significantly
-            above.
+        excess: ratio of the error of its part, with it, to the error of the other blocks; 1.0 if
+            not significantly higher.
         others: further changes of its part, where they are not certain.
     """
 

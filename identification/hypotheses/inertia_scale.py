@@ -57,7 +57,7 @@ class InertiaScale(NamedTuple):
         error: of the torque with it, as a share.
         stated: without it.
         against: comparison of both.
-        weight: over that of the described masses; NaN where there are none.
+        weight: ratio to the weight of the described masses; NaN where there are none.
     """
 
     factor: float
@@ -90,7 +90,7 @@ def find_inertia_scale(
         model: of the arm.
         samples: of a recording, as read.
         score: of these.
-        torque_scale: of the torque to that of the described masses; NaN where it is not known.
+        torque_scale: ratio of the torque to the described masses' torque; NaN if unknown.
             Longer links have more weight: that the torque is larger as well is evidence of them.
     """
     if not np.any(model.gravity):

@@ -129,7 +129,7 @@ def _has_another_size(fit: ColumnFit, found: Explanation, rival: Rival, score: C
 
 
 def excess_of(fit: ColumnFit, part: Part, score: ColumnScore) -> float:
-    """Return the error of a part over that of the other blocks, 1.0 if not significant.
+    """Return the ratio of a part's error to the other blocks' error, 1.0 if not significant.
 
     It is compared as it is, and as a share of the torque, with which noise may grow.
     """
@@ -143,7 +143,7 @@ def excess_of(fit: ColumnFit, part: Part, score: ColumnScore) -> float:
 
 
 def _excess(squares: Array, usual: Array, inside: NDArray[np.bool_]) -> float:
-    """Return the error of a part's blocks over that of all others, 1.0 if not significant.
+    """Return the ratio of errors inside a part and outside it, 1.0 if not significant.
 
     Args:
         squares: squared errors (B, n).

@@ -341,7 +341,7 @@ class RobotModel:
     def torque(self, values: Array, motion: Motion) -> Array:
         """Return the joint torques [N·m, N] of parameter values (p,), shape (m, n).
 
-        Without :meth:`load_torque`; an unknown load of the motion is that of the values.
+        Without :meth:`load_torque`; an unknown load of the motion is computed from the values.
 
         Raises:
             ShapeError: an array has another shape.
@@ -375,7 +375,7 @@ class RobotModel:
         """Return the torque [N·m, N] that the gears transmit, of parameters (p,), shape (m, n).
 
         That of the bodies, the payload, springs and balancers; without friction, offsets, torque
-        ripple and the inertia of rotors, as far as this is separate from that of the bodies.
+        ripple and the inertia of rotors, as far as it can be separated from the bodies.
 
         Raises:
             ShapeError: an array has another shape.
@@ -387,7 +387,7 @@ class RobotModel:
     def with_gear_load(self, motion: Motion) -> Motion:
         """Return the motion with the transmitted torque that load-dependent friction needs.
 
-        A known load, else that of the URDF's bodies and of nominal springs and balancers.
+        A known load, else the load of the URDF's bodies and nominal springs and balancers.
         """
         if not self.friction.has_load or motion.load is not None:
             return motion

@@ -46,7 +46,7 @@ def flange_error(model: RobotModel, values: Array, recordings: Sequence[Samples]
     After `HORIZON_SECONDS`, of an arm with parameters (p,); None of too little unseen motion.
 
     Raises:
-        IdentificationError: the inertia of the arm is not that of bodies.
+        IdentificationError: no bodies have the inertia of the arm.
     """
     stretches = []
     errors = []
@@ -77,7 +77,7 @@ def departures(model: RobotModel, values: Array, windows: Windows, error: Array)
         error: of the torque (w, K, n) [N·m or N].
 
     Raises:
-        IdentificationError: the inertia of the arm is not that of bodies.
+        IdentificationError: no bodies have the inertia of the arm.
     """
     count, steps, n = error.shape
     # The inertia of an arm hardly changes in so many steps; of many joints it takes long.

@@ -221,7 +221,7 @@ def leading_joint(positions: Array, measured: Array, chain: Chain) -> int:
 def coverage(ensemble: Array, measured: Array) -> Array:
     """Return the share of measured positions in the 95 % band of an ensemble (N, w, h, n): (h, n).
 
-    The band is that of one more arm, from mean and scatter of the stable ones.
+    The band is for one more arm, from mean and scatter of the stable ones.
     """
     count = np.count_nonzero(np.isfinite(ensemble), axis=0)
     in_band = count >= _MIN_ARMS

@@ -115,7 +115,7 @@ def stretches_of(
 
     Args:
         samples: of the recording.
-        load: torque that was subtracted from that of the samples (m, n), and is added.
+        load: torque (m, n) that was subtracted from the samples' torque, and is added again.
         step: of the simulation [s].
         commanded: positions (m, n); samples without (NaN) are gaps if others have one.
     """

@@ -15,7 +15,7 @@ class AveragedBandwidth:
     """Usual bandwidth of the motion, in case another motion prefers it to the chosen one."""
 
     bandwidth: float  #: [Hz]
-    weight: float  #: of its rows, relative to those of the chosen bandwidth; at most 1
+    weight: float  #: of its rows, relative to rows of the chosen bandwidth; at most 1
 
     @property
     def shares(self) -> tuple[float, float]:

@@ -523,7 +523,7 @@ class SettingsTrial:
     def samples(self, settings: Settings) -> list[Samples]:
         """Return the samples of settings, with direction of friction and transmitted torque.
 
-        The load is that of the estimate without friction that depends on it.
+        The load comes from the estimate without load-dependent friction.
         """
         model = self.model(settings)
         how = settings.preprocessing

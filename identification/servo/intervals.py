@@ -36,7 +36,7 @@ class ServoIntervals:
 
     Attributes:
         determined: whether the motion determines a parameter, not the prior: its interval ends
-            within a factor of two, is a good deal narrower than that of the prior, and if the term
+            within a factor of two, is clearly narrower than the prior's, and if the term
             is in some models only, unseen windows show it. Nor does a term that they do not show
             change it by more than that factor.
     """

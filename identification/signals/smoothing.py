@@ -224,7 +224,7 @@ class _Problem:
         """Return the mean squared residual of a channel, and the slope of its logarithm.
 
         The slope is that over the logarithm of the penalty; `closest` (m,) is the closest residual,
-        `roughness` (k,) that of its coefficients.
+        `roughness` (k,) the roughness of its coefficients.
         """
         factor, correction = self._corrected(penalty, roughness)
         residual = closest - self.design.rows @ correction

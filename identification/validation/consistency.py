@@ -62,7 +62,7 @@ class ConsistencyCheck:
 
     consistent: ConsistentEstimate
     held_out: float  # relative torque error on held-out motion
-    unconstrained_held_out: float  # that of the unconstrained estimate
+    unconstrained_held_out: float  # error of the unconstrained estimate
     held_out_rise: Array  # rise per joint (n,), NaN without rows or with little torque
     # smallest second moment of each link over the nominal body's in the same direction (n,), zero
     # at the bound

@@ -110,7 +110,7 @@ class CellContext:
     controller: PredictionError | None = None  # error of its dynamic model on the unseen motion
     delays: DelayEstimate | None = None  # of the recorded torque relative to the position
     assumed_delay: float = 0.0  # in the fit [s]
-    nominal_scale: NominalScale | None = None  # measured torque over that of nominal inertias
+    nominal_scale: NominalScale | None = None  # ratio of measured to nominal inertial torque
     jumps: tuple[PositionJump, ...] = ()  # impossible steps of measured positions
     controller_inertia: InertiaRatio | None = None  # its diagonal inertia over the identified one
     corrections: tuple[Finding, ...] = ()  # faults of recordings that were corrected

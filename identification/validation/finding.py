@@ -313,7 +313,7 @@ class Thresholds:
 
     #: relative torque error over all axes that no noise excuses; published fits: 4 to 9 %
     overall: float = 0.1
-    noise: float = 2.0  #: noise floors up to which an error is that of the recording
+    noise: float = 2.0  #: noise floors up to which an error is the recording's own
     axis: float = 0.35  #: relative torque error of one axis; wrists of real arms reach 20 %
     explained: float = 0.0  #: R² of an axis up to which the model is wrong
     little_explained: float = 0.5  #: R² below which an axis is doubtful
@@ -333,11 +333,11 @@ class Thresholds:
     #: error on unseen over error on fitted motion, as shares of the torque; wrong if also above
     #: half of `axis`, above `unexplained` if the torque error itself has grown by a half
     generalisation: float = 2.5
-    #: torque of an axis as a share of that of all axes below which it alone does not decide
+    #: share of an axis in the torque of all axes below which it alone does not decide
     minor: float = LITTLE_TORQUE_SHARE
     #: the same as a share of its own limit; sensors resolve some thousandths of their range
     minor_of_limit: float = 0.005
-    nominal: float = 0.005  #: overall error above that of the nominal or controller's model
+    nominal: float = 0.005  #: overall error above the nominal or controller model's
     #: seconds of unseen motion in which an axis must have moved: four blocks of the covariance, of
     #: which an error has a standard deviation of a third of it
     moved: float = 0.5

@@ -328,7 +328,7 @@ _AT_SPEED: Final = (
 SENTENCES: Final[Mapping[FindingKey, Sentence]] = {
     "nothing held out": Sentence(UNTESTED, "no motion was held out: all errors are in-sample"),
     "joints not fitted": Sentence(
-        UNTESTED, "the fitted motion does not move {joints}, and {motion} does"
+        UNTESTED, "the fitted motion does not move {joints}, but {motion} does"
     ),
     "joints at rest": Sentence(UNTESTED, "{joints} moved for less than {least:g} s of {motion}"),
     "no torque": Sentence(UNTESTED, "the measured torque of {joints} is zero throughout {motion}"),
@@ -395,9 +395,9 @@ SENTENCES: Final[Mapping[FindingKey, Sentence]] = {
     ),
     "undetermined in one direction": Sentence(
         "excitation",
-        "{joints} moved in one direction only, so the motion determines just the sum of Coulomb"
-        " friction and torque offset: {each}",
-        "{coulomb} and {offset}",
+        "{joints} moved in one direction only, so of Coulomb friction and torque offset the motion"
+        " determines only the sum: {each}",
+        "{coulomb} + {offset}",
     ),
     "poor excitation": Sentence(
         "excitation",
@@ -527,7 +527,7 @@ SENTENCES: Final[Mapping[FindingKey, Sentence]] = {
     ),
     "torque constant, as assumed": Sentence(
         "torque constant",
-        f"the torque of {{axes}} {_CONSTANT}, which the assumed uncertainty of the torques includes"
+        f"the torque of {{axes}} {_CONSTANT}, within the assumed uncertainty of the torques"
         " (standard deviation of the ratio {scale_std:pc1})",
     ),
     "load friction": _fault(

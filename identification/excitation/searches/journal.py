@@ -51,7 +51,7 @@ class Journal:
         error: why the last record was not written, None if it was.
 
     Raises:
-        JournalError: the file is not a journal, or is that of another search or software.
+        JournalError: the file is not a journal, or belongs to another search or software.
         OSError: it cannot be read or started.
     """
 

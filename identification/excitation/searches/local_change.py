@@ -112,7 +112,7 @@ class LocalChange(NamedTuple):
     def states(self, time: Array) -> Array:
         """Return position, velocity and acceleration (3, k, n) for times in the part (k,) [s].
 
-        Each is that of the changed motion when as large a share of the part is over.
+        Each belongs to the changed motion at the same fraction of the part.
         """
         stretched = self.enter + (time - self.enter) * (1.0 + self.later / self.length)
         return np.array(self.motion.sample(stretched - self.begin))

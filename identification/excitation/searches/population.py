@@ -228,7 +228,7 @@ class Problem:
     def sensitivity(self, genes: Array, weights: Array | None) -> Sensitivity:
         """Return the slopes of `weights` (d,) times the criteria along the motion of genes.
 
-        Without weights they are those of minus the logarithm of the precision's criterion.
+        Without weights, of minus the logarithm of the precision's criterion.
 
         Raises:
             PlannerError: the motion cannot be planned.

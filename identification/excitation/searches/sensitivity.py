@@ -103,8 +103,8 @@ class Sensitivity:
     def slopes(self, change: LocalChange, step: float) -> Array:
         """Return the slopes (2 + c,) of criterion, duration's and other margins for one gene.
 
-        `change` is that of the motion with the gene changed by `step`. States keep their places in
-        the part that changes.
+        `change` of the motion, for a change of the gene by `step`. States keep their places in the
+        part that changes.
         """
         part = slice(*np.searchsorted(self.time, (change.enter, change.left)).tolist())
         margins = self.margins
@@ -135,7 +135,7 @@ class Linearisation(NamedTuple):
 def sensitivity_of(problem: SensitivityProblem, genes: Array, weights: Array | None) -> Sensitivity:
     """Return the slopes of `weights` (d,) times the criteria, and of the margins, by the states.
 
-    Without weights the criterion is minus the logarithm of that of the wanted precision.
+    Without weights, of minus the logarithm of the criterion of the required precision.
 
     Raises:
         PlannerError: the motion cannot be planned.
