@@ -61,7 +61,15 @@ class ColumnFit:
         seen: int = 0,
         blocks: int = BLOCKS,
     ) -> Self:
-        """Reduce recordings, of which nothing is known."""
+        """Reduce recordings, without any known change.
+
+        Args:
+            model: of the arm.
+            recordings: of one arm.
+            fitted: fit whose errors are to be explained.
+            seen: recordings, from the first, in which no change begins.
+            blocks: in all recordings together.
+        """
         fit = recordings[:seen] or recordings
         travel = np.max([np.ptp(samples.motion.position, axis=0) for samples in fit], axis=0)
         usable = np.any([samples.usable.any(axis=0) for samples in fit], axis=0)
