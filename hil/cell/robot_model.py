@@ -11,7 +11,7 @@ from typing import Final
 import numpy as np
 
 from hil.base.arrays import Array
-from hil.cell.urdf_units import unit_problem
+from hil.cell.urdf_unit_problem import unit_problem
 from identification.errors import ModelError
 from identification.model.coupling import Coupling
 from identification.model.elements import (

@@ -20,7 +20,7 @@ from hil.cell.arms import Links, joints_outside
 from hil.cell.gripper_names import gripper_joints
 from hil.cell.nominal import nominal_of
 from hil.cell.toml_edits import urdf_limits, with_values
-from hil.cell.urdf_units import unit_problem
+from hil.cell.urdf_unit_problem import unit_problem
 from hil.importers.dh import Convention, urdf_of_dh
 from hil.importers.plausibility import (
     NominalTorque,

@@ -1,4 +1,4 @@
-"""Robot descriptions in units other than SI, refused before anything is concluded."""
+"""What a URDF in units other than SI is refused with, before anything is concluded from it."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from typing import Final, NamedTuple
 
 from identification.errors import ModelError
-from identification.model.description_units import Quantity, WrongUnit, wrong_units
+from identification.model.urdf_unit_check import Quantity, WrongUnit, wrong_units
 from identification.text import enumerated
 
 _PLURAL: Final[Mapping[Quantity, str]] = {

@@ -9,7 +9,7 @@ from xml.etree import ElementTree
 
 import pytest
 
-from identification.model.description_units import WrongUnit, wrong_units
+from identification.model.urdf_unit_check import WrongUnit, wrong_units
 from tests.hil.simulated_logs import urdf_path
 from tests.tiers import quick_ones
 

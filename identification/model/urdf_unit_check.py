@@ -1,8 +1,8 @@
-"""Units of a robot description, by the description alone: grams, millimetres, g·mm².
+"""Whether a URDF is in SI units, by the URDF alone: grams, millimetres and g·mm² are found.
 
 An arm's masses, lengths, centres of mass and inertias bound each other: no body is much larger than
 the arm, none is lighter than air or many times denser than lead. A description that no arm can have
-is examined in other units; it is only concluded upon where these make it an arm as they are built.
+is examined in other units, which are named only where they make it an arm as arms are built.
 """
 
 from __future__ import annotations
