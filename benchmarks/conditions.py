@@ -18,13 +18,13 @@ from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
-import scipy.signal
 
 from benchmarks import parser_of, show
 from benchmarks.board import ABOVE_PLAIN, DATA, Parts, cut, fit_errors, import_all, row_name
 from benchmarks.degradations import delayed_torque
 from benchmarks.fetch import FETCHED
 from benchmarks.joint_log import JointLog
+from benchmarks.plain_fit import causally_low_passed
 from benchmarks.published import Published, known
 from hil.base.errors import HilError
 from hil.identified.identified_arm import arm_from
@@ -92,9 +92,7 @@ def negated(log: JointLog) -> JointLog:
 def filtered(log: JointLog) -> JointLog:
     """A controller's causal low-pass of the torque, at the rate of its interface."""
     rate = 1.0 / float(np.median(np.diff(log.time)))
-    poles = scipy.signal.butter(2, min(FILTER, 0.4 * rate), fs=rate, output="sos")
-    start = scipy.signal.sosfilt_zi(poles)[:, :, None] * log.torque[0]
-    torque, _ = scipy.signal.sosfilt(poles, log.torque, axis=0, zi=start)
+    torque = causally_low_passed(log.time, log.torque, min(FILTER, 0.4 * rate))
     return slower(FILTERED_RATE)(replace(log, torque=torque))
 
 

@@ -22,6 +22,7 @@ from numpy.typing import NDArray
 
 from benchmarks import parser_of, show
 from benchmarks.arms import urdf as arm_urdf
+from benchmarks.plain_fit import causally_low_passed
 from hil.archive import open_archive
 from hil.base.errors import HilError
 from hil.importers.conclusions import Certainty
@@ -157,9 +158,9 @@ def plants(arm: Arm) -> Iterator[Planted]:
     )  # fmt: skip
     degrees = None if v is None else np.degrees(v)
     yield of("degrees", "position, angle unit", "deg", position=np.degrees(q), velocity=degrees)
-    yield of("low-passed", "low-pass", "low-passed at", torque=_low_passed(t, tau))
+    yield of("low-passed", "low-pass", "low-passed at", torque=causally_low_passed(t, tau, _CUT))
     yield of("delayed", "delay", "lags", torque=_shifted(t, tau, -_LATE))
-    smooth = _shifted(t, _low_passed(t, q, both=True), _AHEAD)
+    smooth = _shifted(t, _without_lag(t, q), _AHEAD)
     yield of("commanded", "positions", "commanded", position=smooth)
     yield of("wrapped", "wraps", "wrapped", position=_wrapped(q))
     third = 2 if n == 6 else 3  # the next parallel axis
@@ -198,13 +199,11 @@ def _signs(
         )  # fmt: skip
 
 
-def _low_passed(t: Array, values: Array, *, both: bool = False) -> Array:
-    step = float(np.median(np.diff(t)))
-    sections = scipy.signal.butter(2, _CUT if not both else 2.0 * _CUT, fs=1.0 / step, output="sos")
-    if both:
-        return np.asarray(scipy.signal.sosfiltfilt(sections, values, axis=0))
-    start = scipy.signal.sosfilt_zi(sections)[:, :, None] * values[0]
-    return np.asarray(scipy.signal.sosfilt(sections, values, axis=0, zi=start)[0])
+def _without_lag(t: Array, values: Array) -> Array:
+    """Return values through a low-pass forth and back."""
+    rate = 1.0 / float(np.median(np.diff(t)))
+    sections = scipy.signal.butter(2, 2.0 * _CUT, fs=rate, output="sos")
+    return np.asarray(scipy.signal.sosfiltfilt(sections, values, axis=0))
 
 
 def _shifted(t: Array, values: Array, ahead: float) -> Array:

@@ -301,6 +301,14 @@ def low_passed(time: Array, values: Array, cutoff: float) -> Array:
     return np.asarray(scipy.signal.sosfiltfilt(sections, values, axis=0, padlen=padding))
 
 
+def causally_low_passed(time: Array, values: Array, cutoff: float) -> Array:
+    """Values (m, n) through a Butterworth filter of order 2, initially at rest, as in a drive."""
+    rate = 1.0 / float(np.median(np.diff(time)))
+    sections = scipy.signal.butter(2, cutoff, fs=rate, output="sos")
+    start = scipy.signal.sosfilt_zi(sections)[:, :, None] * values[0]
+    return np.asarray(scipy.signal.sosfilt(sections, values, axis=0, zi=start)[0])
+
+
 def solve(table: Array, torque: Array) -> Array:
     """Weighted least squares (14 n,) of minimum norm; a joint's weight is that of its residual."""
     factors = _joint_factors(table, torque)
