@@ -130,7 +130,7 @@ def identify(
             recording is held out.
         reading: what the channels are, where that cannot be concluded from names and units.
         options: of the estimation.
-        reporter: receives messages and progress; None for none. `hil.reporter()` prints them.
+        reporter: receives messages and progress, or None. `hil.reporter()` prints them.
 
     Raises:
         InputError: a recording or the URDF cannot be read, a quantity is left open, or nothing can

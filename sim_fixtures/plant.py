@@ -293,7 +293,7 @@ class Plant:
         return np.ones(n) if self._scale is None else self._scale.copy()
 
     def jam(self, torque: Array | None) -> None:
-        """Set additional dry friction, (n,) [N m]; None for none."""
+        """Set additional dry friction, (n,) [N m], or None."""
         self._jam = torque
         self._set_coulomb()
 

@@ -93,7 +93,7 @@ def main(arguments: Sequence[str]) -> int:
 
 
 def _loopback(transport: Transport) -> Transport | None:
-    """Return a link like this one that receives what it sends; None where there is none."""
+    """Return a link like this one that receives what it sends, or None."""
     if isinstance(transport, PollingTransport):
         with suppress(TransportError):  # the loopback device is off: the link may work all the same
             return transport.loopback()

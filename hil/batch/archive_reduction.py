@@ -330,7 +330,7 @@ FIT: Final = ("values", "covariance", "noise_std", "samples")
 def cached_reduction(
     archives: Sequence[ToReduce], settings: Settings, cache: CacheLocation
 ) -> ReducedArchives | None:
-    """Return the cached reduction of exactly these archives; None if there is none."""
+    """Return the cached reduction of exactly these archives, or None."""
     refs = [one.ref for one in archives]
     entry = cache.read(refs[0].origin, reduction_key(archives, settings))
     if entry is None:

@@ -111,7 +111,7 @@ def _stays_below(place: str) -> bool:
 
 
 def text_at(url: str) -> str | None:
-    """Return the text of a small file at a URL; None if there is none.
+    """Return the text of a small file at a URL, or None.
 
     Raises:
         ArchiveError: it cannot be read.

@@ -1,4 +1,4 @@
-"""What was found of the steps of a campaign, as values; `status_messages` words them."""
+"""State of the steps of a campaign, as values; `status_messages` words them."""
 
 from __future__ import annotations
 

@@ -16,7 +16,7 @@ from .state import CampaignState
 
 
 class DryRunStage:
-    """Runs every motion that is to be sent at full speed once slowly, and has it accepted.
+    """Runs every motion once slowly before it is sent at full speed, and has it accepted.
 
     `state` is "accepted", "to be accepted", or "left out" where the caller did without.
 
@@ -67,7 +67,7 @@ class DryRunStage:
         return [motion for motion in motions if self._complete(motion) is None]
 
     def run(self, runner: Runner) -> None:
-        """Run what is missing slowly, and have it accepted; see `accept`."""
+        """Run the missing motions slowly, and have them accepted; see `accept`."""
         missing = self.missing()
         for slow in missing:
             name = runner.run_motion(slow, slow.index + 1, len(self.motions), MAX_DRY_RUN_OVERRIDE)

@@ -1,4 +1,4 @@
-"""The operator of a running campaign: what is shown to him of the run, and what he accepts."""
+"""The operator of a running campaign: what the run shows, and what it asks to accept."""
 
 from __future__ import annotations
 

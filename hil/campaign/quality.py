@@ -113,7 +113,7 @@ class Executed:
 
 
 def problem_of(executed: Executed, trajectory: Motion, cell: Cell) -> QualityProblem | None:
-    """Return the problem of a single motion, None for none."""
+    """Return the problem of a single motion, or None."""
     if (problem := incomplete_or_slowed(executed, trajectory, cell)) is not None:
         return problem
     cycles = int(np.ceil(trajectory.duration / cell.period - 1e-6))
@@ -135,7 +135,7 @@ def problem_of(executed: Executed, trajectory: Motion, cell: Cell) -> QualityPro
 def incomplete_or_slowed(
     executed: Executed, trajectory: Motion, cell: Cell
 ) -> QualityProblem | None:
-    """Return the problem of a motion that is incomplete, or was held or slowed; None for none."""
+    """Return the problem of a motion that is incomplete, or was held or slowed, or None."""
     cycles = int(np.ceil(trajectory.duration / cell.period - 1e-6))
     rows = len(executed.commanded)
     if rows < cycles - 1:
@@ -149,7 +149,7 @@ def incomplete_or_slowed(
 
 
 def moving_arm(executed: Executed, _trajectory: Motion, cell: Cell) -> QualityProblem | None:
-    """Return the problem of a recording of the arm at rest, in which it moved; None for none."""
+    """Return the problem of a recording of the arm at rest, in which it moved, or None."""
     rows = min(round(STANDSTILL_WINDOW_SECONDS / cell.period), len(executed.position) - 1)
     moved = np.abs(executed.position[rows:] - executed.position[:-rows]).max(axis=0)
     speed = moved / (rows * cell.period)
@@ -192,7 +192,7 @@ class RepetitionCheck:
         self._earlier.append(executed)
 
     def problem(self, executed: Executed) -> QualityProblem | None:
-        """Return the problem of a repetition, None for none."""
+        """Return the problem of a repetition, or None."""
         problem = problem_of(executed, self._trajectory, self._cell)
         if problem is not None or not self._earlier:
             return problem
@@ -258,7 +258,7 @@ class ArchiveReview:
     Attributes:
         rejected: archives that failed their check.
         adopted: archives of an earlier run that was killed before it entered them.
-        replaced: accepted repetitions that this run rejected, None for none.
+        replaced: accepted repetitions that this run rejected, or None.
     """
 
     def __init__(self, folder: CampaignFolder, cell: Cell, motion: Motion) -> None:
@@ -316,7 +316,7 @@ class ArchiveReview:
                 self.enter(motion, name, None if slip is None else Slipped(slip))
 
     def _judged(self, executed: Executed) -> QualityProblem | None:
-        """Return the problem of a repetition, None for none.
+        """Return the problem of a repetition, or None.
 
         Where enough later attempts agree with each other and not with the only accepted one, that
         one is rejected instead: once in a run, since a second time shows that they scatter. So are

@@ -118,7 +118,7 @@ class PrecisionMeter:
         return PrecisionLook(len(paths), tuple(reached))
 
     def estimate(self, paths: Sequence[Path]) -> MeasuredMotion:
-        """Return what some repetitions together say of the required quantities."""
+        """Estimate the required quantities from some repetitions together."""
         if self._first != paths[0]:
             self._choose(paths[0])
         for path in paths:

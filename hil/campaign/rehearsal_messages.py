@@ -1,4 +1,4 @@
-"""What a rehearsal found, assumed and cannot detect, in words."""
+"""Results, assumptions and blind spots of a rehearsal, in words."""
 
 from __future__ import annotations
 
@@ -57,7 +57,7 @@ def criterion_record(judged: Judged, cell: Cell) -> RehearsalCriterion:
 
 
 def assumption_words(assumption: Assumption) -> str:
-    """Return what is assumed of a simulated arm."""
+    """Return an assumption about the simulated arm."""
     match assumption:
         case CurrentNoise(noise, resolution):
             return (

@@ -148,7 +148,7 @@ def _of_run(
 
 
 def run_with_effects(folder: Path, twin: Twin) -> tuple[str, int]:
-    """Run a plan on the arm with what the model leaves out; return the failure, and the cycles.
+    """Run a plan on the arm with effects that the model lacks; return the failure and the cycles.
 
     In a separate process, parallel to the run as modelled. Each has its own link, seed and
     folder, so that neither affects the other.

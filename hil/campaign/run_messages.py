@@ -1,4 +1,4 @@
-"""What the reader of a run's results must know, in words."""
+"""Notes for the reader of a run's results, in words."""
 
 from __future__ import annotations
 

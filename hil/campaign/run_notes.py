@@ -1,4 +1,4 @@
-"""What the reader of a run's results must know, as values; `run_messages` words them."""
+"""Notes for the reader of a run's results, as values; `run_messages` words them."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Steps of a campaign in words: what was found of each, and details for the report."""
+"""Steps of a campaign in words: the state of each, and details for the report."""
 
 from __future__ import annotations
 

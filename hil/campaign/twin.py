@@ -55,7 +55,7 @@ class CurrentNoise:
 
 @dataclass(frozen=True)
 class DefaultEffects:
-    """What the model leaves out, of default sizes."""
+    """Effects that the model lacks, with default sizes."""
 
     torque_ripple: float  #: share of the Coulomb torque
     friction_drift: float  #: share by which friction falls

@@ -30,7 +30,7 @@ class MotionFailedError(ExecutionError):
         motion: its name.
         outcome: "stopped", "refused" by this PC, or "lost".
         reason: why, as a clause.
-        archive: name of its archive; None if there is none.
+        archive: name of its archive, or None.
         refused: the refusal, if this PC refused it.
 
     Attributes:

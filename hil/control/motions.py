@@ -242,5 +242,5 @@ def moves_to_dict(moves: PlanFile | None) -> dict[str, Any]:
 
 
 def moves_from_dict(data: Mapping[str, Any]) -> PlanFile | None:
-    """Return the entry `moves` of data, None if there is none."""
+    """Return the entry `moves` of data, or None."""
     return PlanFile.from_dict(data["moves"]) if "moves" in data else None

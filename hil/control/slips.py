@@ -33,7 +33,7 @@ _FIELDS: Final = ("cycle", "gap", "position", "velocity")
 
 
 def slip_of(path: Path) -> PositionJump | None:
-    """Return the largest slip of a measured position in an archive; None for none.
+    """Return the largest slip of a measured position in an archive, or None.
 
     Raises:
         ArchiveError: it cannot be read.

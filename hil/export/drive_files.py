@@ -55,7 +55,7 @@ class WhatToExport:
     Attributes:
         output: file; None for one named `identified` in the folder of the results.
         ranges: whether a file of ranges is written next to it.
-        count: of draws from the posterior, None for none.
+        count: of draws from the posterior, or None.
         seed: of the draws.
         into: MJCF or URDF that is changed, in place unless there is an output; None for a new file.
     """

@@ -1,4 +1,4 @@
-"""What is known of the conditions of recordings in addition to the logs, such as a room's heat."""
+"""Known conditions of recordings that the logs lack, such as the room temperature."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What a log contains in addition to its motion: temperatures, and the name of its robot."""
+"""Channels of a log besides its motion: temperatures, and the name of its robot."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ _NO_FACTS: Final = (*_JOINTS, "header", "layout", "variance")
 
 
 class ExtraChannels(NamedTuple):
-    """What is read from each log in addition to its motion; some columns are found by name.
+    """Channels read from each log besides its motion; some columns are found by name.
 
     These are temperatures and the time since the start.
 

@@ -1,4 +1,4 @@
-"""What a trend of a fleet says in words: a sentence for each robot."""
+"""Trends of a fleet in words: a sentence for each robot."""
 
 from __future__ import annotations
 

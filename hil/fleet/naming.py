@@ -175,7 +175,7 @@ class RobotNaming:
 
 
 def date_in(text: str) -> str | None:
-    """Return the date in a name, ISO 8601 in UTC; None if there is none."""
+    """Return the date in a name, ISO 8601 in UTC, or None."""
     if (match := _YEAR_FIRST.search(text)) is not None:
         year, _, month, day, *clock = match.groups()
         hour, minute, second = (int(part or 0) for part in clock)

@@ -1,4 +1,4 @@
-"""What a trend follows of each joint, as functions of the estimate of a recording."""
+"""Quantities of each joint that a trend follows, as functions of a recording's estimate."""
 
 from __future__ import annotations
 

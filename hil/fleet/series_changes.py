@@ -174,7 +174,7 @@ def courses(family: Sequence[Series]) -> list[Course | None]:
 
 
 class CommonCourse(NamedTuple):
-    """What robots of one type have in common over time, and its model with a season of a year."""
+    """The common course of robots of one type, and its model with a yearly season."""
 
     series: Series
     course: Course
@@ -234,7 +234,7 @@ def _without_effects(family: Sequence[Series]) -> tuple[list[Series], list[_Prio
 
 
 def mean_of_known(columns: Array) -> Array:
-    """Return the means of columns (m, c) over what is known of them (c,), 0 where nothing is."""
+    """Return the means (c,) of the known values of columns (m, c), 0 without any."""
     counts = np.isfinite(columns).sum(axis=0)
     return np.asarray(np.nansum(columns, axis=0) / np.maximum(counts, 1))
 

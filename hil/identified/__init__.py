@@ -1,1 +1,1 @@
-"""From recordings of any kind to an identified arm in memory, and from there to its files."""
+"""Identifies an arm from recordings of any kind, in memory, and writes its files."""

@@ -1,4 +1,4 @@
-"""Recordings that are pandas DataFrames, as logs."""
+"""pandas DataFrames as logs."""
 
 from __future__ import annotations
 

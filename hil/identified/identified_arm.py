@@ -1,4 +1,4 @@
-"""From recordings to an identified arm: what `hil identify` and `hil.identify(...)` both run."""
+"""Identifies an arm from recordings, for both `hil identify` and `hil.identify(...)`."""
 
 from __future__ import annotations
 
@@ -102,7 +102,7 @@ class IdentifiedArm:
 
     @property
     def results(self) -> Results:
-        """Content of `results.json`, without what only the written files have."""
+        """Content of `results.json`, except fields that describe written files."""
         return self.identification.results
 
     @cached_property
@@ -325,7 +325,7 @@ def identify_servo(
         predict: recordings to predict from their commands alone, and not to fit.
         compare: MJCF whose servo parameters are compared.
         reading: what the channels are, where that cannot be concluded from names and units.
-        reporter: receives messages and progress; None for none.
+        reporter: receives messages and progress, or None.
 
     Raises:
         InputError: a recording or the URDF cannot be read, or nothing can be identified from it.
@@ -385,7 +385,7 @@ def identify_recordings(
     output: Path | None = None,
     compare: Path | None = None,
 ) -> IdentifiedArm | IdentifiedServo:
-    """Import what is no archive, and identify; without a robot all must be archives.
+    """Import recordings that are not archives, and identify; only these need a robot.
 
     Recordings with commanded positions and without torque are identified as servos.
 

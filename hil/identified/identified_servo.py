@@ -32,7 +32,7 @@ PICTURE = "motion.png"
 
 @dataclass(frozen=True, eq=False)
 class IdentifiedServo:
-    """Servo and friction of an arm without torque, not written anywhere yet.
+    """Servo and friction of an arm without torque, in memory.
 
     Attributes:
         recordings: files that were fitted.
@@ -94,7 +94,7 @@ def identified_servo(
         recordings: files that are fitted.
         predicted: files that are predicted.
         options: of any identification; options about torques are ignored.
-        compare: file whose parameters are compared, None for none.
+        compare: file whose parameters are compared, or None.
         channels: a line for each group of channels.
         reporter: of progress.
     """

@@ -1,4 +1,4 @@
-"""What was read of each recording, in a line that says only what is unusual about it."""
+"""One line per recording that was read, with remarks only on what is unusual."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ _MAX_RECORDING_LINES: Final = 3
 
 
 def read_lines(arm: IdentifiedArm) -> list[tuple[str, str]]:
-    """Return use and content of each recording; of many the first ones, and their number."""
+    """Return use and content of each recording; of many, the first ones and their number."""
     decisive = [*_decisive(arm)]
     lines = [*_imported(arm)]
     sources = arm.identification.prepared.sources

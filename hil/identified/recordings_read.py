@@ -1,4 +1,4 @@
-"""What was read of logs and bags: their content, and what is not as the file has it."""
+"""What was read from logs and bags: their content, and how it differs from the file."""
 
 from __future__ import annotations
 
@@ -58,7 +58,7 @@ _NOT_OF_SERVOS: Final = (
 
 
 def recording_results(staging: Staging, predicted: Sequence[Path]) -> list[RecordingResult]:
-    """Return what was read of each imported recording, for `results.json` and the report."""
+    """Return what was read from each imported recording, for `results.json` and the report."""
     return [
         RecordingResult(
             file=staging.sources[place].name,

@@ -39,7 +39,7 @@ _UNWRITTEN: Final = Path("<not written>")  # folder of the archives, as no file 
 
 @dataclass
 class Staging:
-    """Recordings to identify from: files that are archives, and others in memory.
+    """Recordings to identify from: archive files, and other recordings in memory.
 
     Attributes:
         fitted: archives to fit.
@@ -104,7 +104,7 @@ def staged(
     options: ImportOptions,
     reporter: Reporter,
 ) -> Iterator[Staging]:
-    """Read the recordings that are not archives, and report what was concluded.
+    """Read the recordings that are not archives, and report the conclusions.
 
     Errors about an archive in memory name the recording it was read from.
 

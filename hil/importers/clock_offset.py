@@ -25,7 +25,7 @@ _MIN_AGREEMENT: Final = (
 
 
 def clock_offset(position: Timed, command: Timed) -> int | None:
-    """Return what is added to the stamps of commands [ns]; None if both have one clock.
+    """Return the offset to add to the stamps of commands [ns]; None if both share a clock.
 
     Both have one clock if they were recorded at the same time by their stamps, and positions follow
     commands as a servo does. Otherwise the speeds of all joints agree best at the offset; how late

@@ -19,7 +19,7 @@ _OPTION = "--commands"
 
 @dataclass(frozen=True)
 class CommandFile:
-    """Where a file has its commands.
+    """Location of the commands in a file.
 
     Attributes:
         columns: of the joints, in their order.

@@ -1,4 +1,4 @@
-"""What an import concludes of a recording, as values; :mod:`hil.importers.messages` words them.
+"""Conclusions of an import, as values; :mod:`hil.importers.messages` words them.
 
 Nothing reads the words back: what follows from a conclusion follows from its fields.
 """
@@ -19,7 +19,7 @@ Sample = Literal["row", "message"]
 
 
 class Certainty(StrEnum):
-    """How certain a conclusion is; the value is what a person and a program read."""
+    """How certain a conclusion is; persons and programs read the value."""
 
     CERTAIN = "certain"  #: nothing else fits
     LIKELY = "likely"  #: by names or custom
@@ -27,7 +27,7 @@ class Certainty(StrEnum):
 
 
 class NameBasis(Enum):
-    """From what a channel has its quantity."""
+    """Source of a channel's quantity."""
 
     NAME = auto()
     JOINT = auto()  #: a name that contains the name of a URDF joint
@@ -42,7 +42,7 @@ class NameBasis(Enum):
 
 
 class UnitBasis(Enum):
-    """From what a channel has its unit."""
+    """Source of a channel's unit."""
 
     LOG = auto()  #: the log states it
     MAP = auto()  #: a ready map states it
@@ -103,7 +103,7 @@ class FixedFingers(Conclusion):
 
 
 class UnitsFrom(Enum):
-    """From what the units of a data set of LeRobot are known."""
+    """Source of the units of a LeRobot data set."""
 
     OPTION = auto()
     ENCODER = auto()  #: the numbers are in steps of an encoder
@@ -149,7 +149,7 @@ class MappedUnit(Conclusion):
 
 @dataclass(frozen=True)
 class StatedUnit(Conclusion):
-    """The unit that the file states, where the map has none."""
+    """The unit that the file states and the map does not."""
 
     kind: Kind
     unit: str
@@ -235,7 +235,7 @@ class Excerpt(Conclusion):
 
 @dataclass(frozen=True)
 class MissingNumbers(Conclusion):
-    """Rows that were left out, as a number is missing in them."""
+    """Rows left out because a number is missing."""
 
     count: int
     total: int

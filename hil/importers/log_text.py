@@ -1,4 +1,4 @@
-"""Text of a log, in any usual encoding, or what a file is instead."""
+"""Text of a log in any usual encoding; or what else a file is."""
 
 from __future__ import annotations
 

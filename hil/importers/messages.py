@@ -1,4 +1,4 @@
-"""Sentences about what an import concludes: the only place that makes them."""
+"""Sentences about the conclusions of an import; only this module makes them."""
 
 from __future__ import annotations
 
@@ -94,7 +94,7 @@ def sentence(conclusion: Conclusion) -> str:
 
 
 def as_findings(examined: Examined) -> Findings:
-    """Return what was found in words, as an archive has it."""
+    """Return findings in words, as an archive stores them."""
     found = tuple(map(sentence, examined.found))
     return Findings(lines=found, warnings=tuple(map(sentence, examined.warnings)))
 
@@ -125,7 +125,7 @@ def reason_of(meaning: ChannelMeaning) -> str:
 
 
 def basis_of(meaning: ChannelMeaning) -> str:
-    """Return from what channels have their quantity."""
+    """Return the source of the channels' quantity."""
     return _BASIS[meaning.basis]
 
 
@@ -207,7 +207,7 @@ def _(unit: ConcludedUnit) -> str:
 
 
 def source_of(unit: StatedUnit | ConcludedUnit) -> str:
-    """Return from what a quantity has its unit."""
+    """Return the source of a quantity's unit."""
     if isinstance(unit, StatedUnit):
         return f"in {unit.unit}, as the file states"
     none = "no unit is stated; read as"

@@ -1,4 +1,4 @@
-"""What the words in a channel's name say, where the whole name is in no table.
+"""The meaning of words in a channel's name, if no table has the whole name.
 
 Loggers put the name of a robot, of a message or of a side before the quantity, and ``measured`` or
 the joint behind it: ``fr3_q1``, ``actuators[0].position``, ``MeasuredJointPosition_2``.

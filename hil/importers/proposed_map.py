@@ -205,7 +205,7 @@ class _Search:
         self._used: set[str] = set()
 
     def proposal(self, form: Format | None) -> Proposal:
-        """Return the map, or raise SourceError with what is missing; `form` is stated in it."""
+        """Return the map, or raise SourceError with what is missing; it states `form`."""
         columns: dict[str, _Columns] = {}
         kinds: list[Kind] = [*(("time",) if self._rate is None else ()), *JOINT_KINDS]
         for kind in kinds:

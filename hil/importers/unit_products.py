@@ -71,7 +71,7 @@ class UnitProduct(NamedTuple):
 
 @lru_cache(maxsize=512)
 def product_of(text: str) -> UnitProduct | None:
-    """Return what a product or quotient of units is; None of other text.
+    """Return the quantity of a product or quotient of units; None for other text.
 
     Kilograms, grams, pounds and ounces are their weights, and only with a length.
     """

@@ -1,4 +1,4 @@
-"""What columns without names, and several columns of times, may be: by their numbers alone."""
+"""Guesses about columns without names and several time columns, from their numbers alone."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What an identification or an import concludes of a log, by the same search as a look."""
+"""What an identification or an import concludes from a log, by the same search as a look."""
 
 from __future__ import annotations
 
@@ -55,7 +55,7 @@ _REMEDY: Final = (
 
 
 class Concluded(NamedTuple):
-    """A recording as it is to be read, and what it is then; None where that was not asked."""
+    """A recording, read as concluded, with its diagnosis; None where none was made."""
 
     recording: ImportedRecording
     diagnosis: TorqueDiagnosis | None = None
@@ -64,7 +64,7 @@ class Concluded(NamedTuple):
 
 @dataclass(frozen=True)
 class LayoutReading:
-    """How recordings with the columns of one that was examined are read.
+    """How to read recordings with the same columns as an examined one.
 
     Attributes:
         proposed: column map by names and units of these columns.
@@ -80,7 +80,7 @@ class LayoutReading:
     def of(
         cls, imported: ImportedRecording, source: Path, found: Concluded
     ) -> LayoutReading | None:
-        """Return how others are read; None where this recording has no torque or no columns."""
+        """Return how to read others; None if this recording has no torque or no columns."""
         if imported.map_text is None or imported.is_stated:
             return None
         if "torque" not in found.recording.archive.columns:
@@ -90,7 +90,7 @@ class LayoutReading:
     def read(
         self, imported: ImportedRecording, source: Path, robot_of: RobotOf, use: Use
     ) -> ImportedRecording:
-        """Return a recording of the same columns as the examined one is read.
+        """Read a recording with the same columns in the same way.
 
         An arm and its logger have one layout: a recording of a poorer motion, or one that is held
         out, does not decide anew what its columns mean.
@@ -117,7 +117,7 @@ def concluded(
     options: ImportOptions,
     use: Use,
 ) -> Concluded:
-    """Return a log read again as its motion and torque say it is, if that is certain.
+    """Return a log, read again by what motion and torque show with certainty.
 
     A log that a map describes, or whose torque follows its arm, is returned as it is, and so is a
     bag. It has a warning if the URDF may describe another arm.
@@ -211,7 +211,7 @@ def _as_a_look_says(
 
 @dataclass
 class Asking:
-    """What motion and torque say of a recording, asked before its archive is written.
+    """What motion and torque show about a recording, before its archive is written.
 
     Attributes:
         source: the recording.

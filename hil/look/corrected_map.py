@@ -1,4 +1,4 @@
-"""A column map changed by what was found in the recording."""
+"""A column map, corrected by what was found in the recording."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ def with_entries(text: str, entries: Mapping[str, Any]) -> str:
 def entries_of(
     axes: Axes, text: str, channels: Collection[str], joints: Sequence[str]
 ) -> dict[str, Any]:
-    """Return the entries of a map that make an import read what `axes` say.
+    """Return the entries of a map with which an import reads the recording as `axes` describe it.
 
     Angles of `zero` are in the unit of the map, before its scale and coupling.
 

@@ -1,4 +1,4 @@
-"""Rows of what explains the error of a torque: a constant, a drift, or a change in a part."""
+"""Rows about what explains the torque error: a constant, a drift, or a change in a part."""
 
 from __future__ import annotations
 

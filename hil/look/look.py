@@ -238,7 +238,7 @@ def _is_beyond(score: Score, finding: physics.TorqueFindings) -> bool:
 
 
 def look_at_joints(source: Path, imported: ImportedRecording) -> Look:
-    """Return what the torque of an imported recording says of its joints, and no more.
+    """Return only what the torque of an imported recording shows about its joints.
 
     Whether the arm is another one is left to the caller.
 

@@ -1,4 +1,4 @@
-"""Sentences about a look: the only place that makes them."""
+"""Sentences about a look; only this module makes them."""
 
 from __future__ import annotations
 
@@ -290,7 +290,7 @@ def _reason(evidence: Evidence, reading: Reading) -> str:
 
 
 def choice_text(choice: TiedReading) -> str:
-    """Return one of the readings that fit alike in words."""
+    """Return one of several equally good readings in words."""
     if choice.reading is not None:
         return worded(choice.reading)
     return "motor current" if isinstance(choice.setting, MotorCurrents) else "torque of the motors"
@@ -307,7 +307,7 @@ def gravity_option(gravity: Vector) -> str:
 
 
 def fit_alike(choices: Sequence[TiedReading]) -> str:
-    """Return how many readings fit alike, in words."""
+    """Return how many readings fit equally well, in words."""
     return f"{'two' if len(choices) == 2 else 'three'} explanations fit equally well"
 
 
@@ -410,7 +410,7 @@ def _worded(value: object) -> str:
 
 
 def worded(value: object) -> str:
-    """Return a reading, the evidence of one, or what decides it, in words."""
+    """Return a reading, its evidence, or the step that decides it, in words."""
     return _worded(value)
 
 

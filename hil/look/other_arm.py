@@ -1,4 +1,4 @@
-"""What contradicts the arm of a URDF in a recording: range and speed, size, lengths, torque."""
+"""Contradictions between a recording and its URDF: range, speed, size, lengths, torque."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ _UNEXPLAINED_ERROR: Final = 0.15
 
 @dataclass(frozen=True)
 class Contradictions:
-    """What contradicts the arm, one thing of each kind; None for nothing.
+    """Contradictions to the arm, at most one of each kind, or None.
 
     The kinds are independent: another zero of a joint changes its motion alone, another unit of
     the torque the size alone. One cause of this sort does not explain two of them. A torque that
@@ -123,13 +123,13 @@ class Contradictions:
 
     @property
     def row(self) -> Row:
-        """What a look says of a doubtful arm."""
+        """The row of a look about a doubtful arm."""
         step = NextStep.GIVE_URDF_OF_THIS_ARM
         return Row("arm", Fact.OTHER_ARM, Certainty.UNDETERMINED, self.found, step)
 
     @property
     def is_doubtful(self) -> bool:
-        """Whether the arm may be another one, by a finding that is enough or by two."""
+        """Whether it may be another arm, by one sufficient finding or by two."""
         return self.is_far or self.lengths is not None or len(self.found) > 1
 
 

@@ -199,7 +199,7 @@ class Size:
 
     @property
     def may_be_geared(self) -> bool:
-        """Whether gears between motors and joints may be what makes it too small."""
+        """Whether it may be too small because it acts on motors, behind gears."""
         return self.is_off and 1.0 / _MAX_GEAR_RATIO < (self.factor or 1.0) < 1.0
 
     @property
@@ -213,7 +213,7 @@ class Size:
 def sides_alike(
     size: Size, joints: Sequence[str], gears: Sequence[Change] = ()
 ) -> tuple[TiedReading, ...]:
-    """Return what a torque may be that is too small for the joint side; empty if it is not.
+    """Return what a torque too small for the joint side may be; empty if it is not too small.
 
     Args:
         size: of the torque.
@@ -267,7 +267,7 @@ def _by_reach(model: RobotModel, samples: Samples) -> float | None:
 
 @dataclass(frozen=True, eq=False)
 class TorqueFindings:
-    """What the torque says of a recording.
+    """What the torque shows about a recording.
 
     Attributes:
         torque: what it is as recorded, as a whole.
@@ -364,7 +364,7 @@ class TorqueFindings:
 
     @property
     def other_scales(self) -> OtherScales | None:
-        """Return what leaves the unit of positions open; None if it is stated, or is shown."""
+        """Return why the unit of positions is undetermined; None if it is stated or shown."""
         scales = self.readings.scales
         if scales is None or scales.agrees:
             return None
@@ -373,7 +373,7 @@ class TorqueFindings:
 
     @property
     def no_better(self) -> NoBetter | None:
-        """The changes that fit best, by no more than chance; None if there are none."""
+        """The changes that fit best, but not better than by chance; None without any."""
         changes = self.readings.no_better
         if not changes:
             return None
@@ -382,19 +382,19 @@ class TorqueFindings:
 
     @property
     def fits_badly(self) -> bool:
-        """Whether nothing that was tested explains the torque as well as a free fit does."""
+        """Whether no tested change explains the torque as well as a free fit."""
         if self.explained is not None:
             return False
         doubted = any(not step.sure for step in self.readings.steps)
         return doubted and not self.readings.adequacy.is_enough
 
     def or_explained(self, explained: ErrorExplained) -> TorqueFindings:
-        """Return the findings where this explains the torque as well: no change is certain."""
+        """Return the findings if this explains the torque as well: then no change is certain."""
         steps = tuple(replace(step, is_adequate=False) for step in self.readings.steps)
         return replace(self, readings=replace(self.readings, steps=steps), explained=explained)
 
     def as_stated(self, rows: Samples, score: Score) -> TorqueFindings:
-        """Return the findings without any change, where none explains the torque as well.
+        """Return the findings without any change, if none explains the torque as well.
 
         Changes that fit an arm without the low-pass or heavy rotors imitate these, and so do those
         that come nearest.
@@ -609,7 +609,7 @@ class TorqueFindings:
         return Row("payload", reading, Certainty.LIKELY, evidence, decider)
 
     def questions(self) -> tuple[tuple[TiedReading, ...], ...]:
-        """Return the readings that fit alike, the best of each meaning."""
+        """Return the readings that fit equally well, the best of each meaning."""
         choices: list[tuple[TiedReading, ...]] = []
         if self.readings.score.overall > EXPLAINED_ERROR:
             return ()  # none of them is right
@@ -646,7 +646,7 @@ class TorqueFindings:
         return TiedReading(_ASPECTS[change.meaning], self._of_arm(change), error, setting)
 
     def _line_of(self, axes: Axes) -> MapEntries | None:
-        """Return the entries of a map that state axes; None if there are none."""
+        """Return the entries of a map that state axes, or None."""
         if self.map_text is None:
             return None
         entries = self._entries_of(axes, self.map_text)
@@ -720,7 +720,7 @@ def _says_nothing(row: Row, basis: Basis) -> Row:
 
 
 def no_longer_certain(row: Row, evidence: Evidence) -> Row:
-    """Return a row that rests on a torque of which the evidence leaves it less than certain."""
+    """Return a row, downgraded because the torque that it rests on is not explained well enough."""
     if row.certainty is not Certainty.CERTAIN or row.aspect == "payload":
         return row
     return replace(row, certainty=Certainty.LIKELY, evidence=(*row.evidence, evidence))
@@ -780,7 +780,7 @@ def _of_low_pass(delay: DelayEstimate | None, low_pass: TorqueLowPass | None) ->
 
 
 def by_estimated_times(row: Row) -> Row:
-    """Return a row that is not certain, as the times of the samples were estimated."""
+    """Return a row, no longer certain because the sample times were estimated."""
     if row.certainty is not Certainty.CERTAIN:
         return row
     evidence = (*row.evidence, Basis.ESTIMATED_TIMES)

@@ -1,4 +1,4 @@
-"""What the rows of a look conclude, from what, and what decides it; `messages` words them."""
+"""Conclusions of a look, their evidence, and how to decide them; `messages` words them."""
 
 from __future__ import annotations
 
@@ -95,7 +95,7 @@ class ClockReading:
 
 @dataclass(frozen=True)
 class RowsReading:
-    """Rows that are not of the motion, times that are not stamps, and steps no arm makes."""
+    """Rows outside the motion, times other than stamps, and steps that no arm makes."""
 
     faults: tuple[RowFault, ...]
     times: SampleTimes | None
@@ -344,14 +344,14 @@ class SlopeFactors:
 
 @dataclass(frozen=True)
 class LateVelocity:
-    """By how much the velocity comes after the slope of the positions [s]."""
+    """Lag of the velocity behind the slope of the positions [s]."""
 
     lag: float
 
 
 @dataclass(frozen=True)
 class ErrorRatio:
-    """Error of the torque over that as recorded, and their difference in standard errors."""
+    """Ratio of the torque error to the error as recorded; difference in standard errors."""
 
     ratio: float
     sigmas: float
@@ -375,14 +375,14 @@ class NearestZero:
 
 @dataclass(frozen=True)
 class MirrorImage:
-    """An image of the arm, with positions and torques negated, that explains the torque alike."""
+    """A mirror image of the arm (positions and torques negated) that explains the torque too."""
 
     change: ArmChange
 
 
 @dataclass(frozen=True)
 class UnseenFriction:
-    """Joints in which friction is not seen."""
+    """Joints whose friction is not visible."""
 
     joints: tuple[str, ...]
 
@@ -397,14 +397,14 @@ class RigidShare:
 
 @dataclass(frozen=True)
 class OtherScales:
-    """Factors of positions that the torque fits better; none where it shows no scale of most."""
+    """Factors of positions with which the torque fits better; empty where it shows no scale."""
 
     factors: tuple[tuple[str, float], ...]
 
 
 @dataclass(frozen=True)
 class NoBetter:
-    """Changes that fit best, by no more than chance."""
+    """Changes that fit best, but not better than by chance."""
 
     changes: tuple[ArmChange, ...]
 
@@ -426,14 +426,14 @@ class ErrorExplained:
 
 @dataclass(frozen=True)
 class CorrectedError:
-    """Error of predicted parts with a change corrected, over that without."""
+    """Ratio of the error of predicted parts with a change corrected to the error without."""
 
     ratio: float
 
 
 @dataclass(frozen=True)
 class RivalChanges:
-    """Sets of changes that explain a part as well, the best first."""
+    """Sets of changes that explain a part equally well, the best first."""
 
     changes: tuple[tuple[Change, ...], ...]
     joints: tuple[str, ...]
@@ -441,7 +441,7 @@ class RivalChanges:
 
 @dataclass(frozen=True)
 class PartError:
-    """Error of a part over that of the rest, with what was found in it corrected."""
+    """Ratio of the error of a part, corrected, to the error of the rest."""
 
     ratio: float
 
@@ -472,7 +472,7 @@ class LastBody:
 
 @dataclass(frozen=True)
 class DelayInterval:
-    """Half of a 95 % interval [s], with the delay where that is within it.
+    """Half a 95 % interval [s], with the delay if the interval contains it.
 
     `unconfirmed` says that other parts of the recording are not predicted better with the delay.
     """
@@ -484,7 +484,7 @@ class DelayInterval:
 
 @dataclass(frozen=True)
 class LowPassLag:
-    """By how much a low-pass of the torque delays a slow motion, and how late that is [s]."""
+    """Delay of a slow motion by a low-pass of the torque, and the total lag [s]."""
 
     lag: float
     delay: float
@@ -492,7 +492,7 @@ class LowPassLag:
 
 @dataclass(frozen=True)
 class DelayProblem:
-    """Why no delay is seen: the estimate that does not determine it."""
+    """Why no delay is known: the estimate that does not determine it."""
 
     estimate: DelayEstimate
 
@@ -576,7 +576,7 @@ Contradiction = (
 
 @dataclass(frozen=True)
 class NoJointTorque(Conclusion):
-    """A channel named as a torque that is none, such as the load or the duty of a servo.
+    """A channel named as a torque that is not one, such as the load or duty cycle of a servo.
 
     Attributes:
         unexplained: share of it that no masses of the arm explain; None where that is not why.
@@ -633,7 +633,7 @@ Evidence = (
 
 
 class NextStep(Enum):
-    """What a person does to decide a row: states an option or a key, measures, or asks."""
+    """How a person decides a row: state an option or a key, measure, or find out."""
 
     STATE_UNIT_OR_GEARS = auto()
     STATE_GRAVITY = auto()
@@ -739,7 +739,7 @@ class ExplainedTorque(Conclusion):
 
 @dataclass(frozen=True)
 class ReadAsGiven(Conclusion):
-    """A torque read as given: this share of it stays unexplained, and nothing explains more."""
+    """A torque read as recorded: this share stays unexplained, and no change explains more."""
 
     error: float
     no_better: NoBetter
@@ -754,6 +754,6 @@ class DoubtfulArm(Conclusion):
 
 @dataclass(frozen=True)
 class DoubtfulTime(Conclusion):
-    """Recorded times that are not of the motion, by this factor."""
+    """Recorded times that differ from the motion's by this factor."""
 
     factor: float

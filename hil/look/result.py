@@ -160,7 +160,7 @@ class Look:
         error: of the torque as read, predicted from other parts of the recording, as a share of
             it; None without a torque or an arm.
         bag_text: how the joint states of a bag were read, as a map; None for other recordings.
-        no_better: changes that fit best, by no more than chance; None if there are none.
+        no_better: changes that fit best, by no more than chance, or None.
     """
 
     source: str

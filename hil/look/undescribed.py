@@ -1,4 +1,4 @@
-"""The robot of a recording without a description of its arm: joints without lengths and masses."""
+"""A robot for recordings without a URDF: joints without lengths and masses."""
 
 from __future__ import annotations
 

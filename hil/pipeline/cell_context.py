@@ -1,4 +1,4 @@
-"""What an estimate and its verdict need of cell and recordings in addition to the model."""
+"""Facts about cell and recordings that an estimate and its verdict need besides the model."""
 
 from __future__ import annotations
 

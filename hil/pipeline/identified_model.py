@@ -1,4 +1,4 @@
-"""An identified arm and what it was identified from."""
+"""An identified arm with its samples."""
 
 from __future__ import annotations
 
@@ -91,7 +91,7 @@ class IdentifiedModel:
         return posterior_of(self.cell, self.factor, self.estimator, strength)
 
     def predicted_residuals(self, shortest: float) -> list[Array]:
-        """Return what moves joints otherwise than predicted (m, n), for each fitted recording.
+        """Return the torque that the model does not predict (m, n), for each fitted recording.
 
         That is measured minus predicted torque (`driving_residual`). Each tenth of the rows is
         predicted from the others: what was fitted leaves too little. Of a short recording the parts
@@ -120,7 +120,7 @@ class IdentifiedModel:
 
 
 def predicted_parts(duration: float, shortest: float) -> int:
-    """Return in how many parts, two or more, a motion [s] is predicted from its rest."""
+    """Return into how many parts, two or more, a motion [s] is split for cross-validation."""
     return int(np.clip(duration / shortest, 2, FOLDS))
 
 

@@ -1,4 +1,4 @@
-"""What the results say about recordings, settings and estimate, in words."""
+"""Notes of the results about recordings, settings and estimate, in words."""
 
 from __future__ import annotations
 
@@ -69,7 +69,7 @@ def note_lines(notes: Iterable[Note]) -> list[str]:
 
 
 def finding_lines(findings: Iterable[Finding], joints: Sequence[str]) -> list[str]:
-    """Return what recordings of these joints are other than described, with what to do."""
+    """Return how recordings of these joints differ from their description, with a remedy."""
     naming = Naming(tuple(joints), TestedOn.RECORDINGS)
     return [
         f"{each.words}: {each.next_step}" for each in (worded(found, naming) for found in findings)
@@ -270,5 +270,5 @@ def scale_words(scale: TorqueScale) -> str:
 
 
 def scaled_words(scale: TorqueScale) -> str:
-    """Return what has an uncertain scale."""
+    """Return which torques have an uncertain scale."""
     return "torque constants" if scale.by_currents else "the scale of the recorded torques"

@@ -1,4 +1,4 @@
-"""What the results say about recordings, settings and estimate; `note_messages` words it.
+"""Notes of the results about recordings, settings and estimate; `note_messages` words them.
 
 Nothing reads the words back: what follows from a note follows from its fields.
 """
@@ -19,7 +19,7 @@ from identification.validation.finding import Finding
 
 @dataclass(frozen=True)
 class Note:
-    """One thing that results say."""
+    """A note."""
 
 
 # Recordings
@@ -27,7 +27,7 @@ class Note:
 
 @dataclass(frozen=True)
 class StatedText(Note):
-    """A sentence that an archive, an import before this one, or a folder has."""
+    """A sentence stored in an archive or a folder, or by an earlier import."""
 
     text: str
     recording: str = ""
@@ -51,7 +51,7 @@ class EndedEarly(Note):
 
 @dataclass(frozen=True)
 class NotJudged(Note):
-    """An archive that the manifest of its campaign does not have."""
+    """An archive that is missing from its campaign's manifest."""
 
     recording: str
 
@@ -63,7 +63,7 @@ class RepairedArchive(Note):
 
 @dataclass(frozen=True)
 class OtherMeaning(Note):
-    """What a recording is other than described, by a finding of its own."""
+    """How a recording differs from its description, as a finding."""
 
     finding: Finding
     joints: tuple[str, ...]  #: names of the arm's joints, which the finding numbers
@@ -124,7 +124,7 @@ class UnevenClock(Note):
 
 @dataclass(frozen=True)
 class PositionNoise(Note):
-    """From what the noise of the positions was estimated."""
+    """Source of the estimated noise of the positions."""
 
     at_standstill: bool
 
@@ -149,7 +149,7 @@ class EstimatedDelay(Note):
 
 @dataclass(frozen=True)
 class NoOtherDelay(Note):
-    """No other delay was applied than the assumed one."""
+    """Only the assumed delay was applied."""
 
     assumed: float  #: [s]
     beside_low_pass: bool = False  #: of the torque, whose lag the estimate may be
@@ -192,7 +192,7 @@ class LoadNotConverged(Note):
 
 @dataclass(frozen=True)
 class IntervalUnits(Note):
-    """In which units of torque the intervals are, and what absolute ones assume."""
+    """Torque units of the intervals, and what absolute ones assume."""
 
     scale: TorqueScale
 
@@ -212,14 +212,14 @@ class PoorlySeparated(Note):
 
 @dataclass(frozen=True)
 class UnrestrictedBodies(Note):
-    """Bodies that cannot exist were allowed, as no others were found."""
+    """Physically inconsistent bodies were allowed because no others were found."""
 
     reason: str  #: of the solver
 
 
 @dataclass(frozen=True)
 class ManyOutliers(Note):
-    """More rows of a joint stand out than outliers would."""
+    """Too many rows of a joint stand out to be outliers."""
 
     joint: str
     share: float  #: of its rows
@@ -258,14 +258,14 @@ class NoEssentialParameters(Enum):
 
 @dataclass(frozen=True)
 class NotConsistent(Note):
-    """No parameters of possible bodies were found."""
+    """No physically consistent parameters were found."""
 
     reason: str  #: of the solver
 
 
 @dataclass(frozen=True)
 class CostlyBodies(Note):
-    """Possible bodies predict worse."""
+    """Physically consistent bodies predict worse."""
 
     check: ConsistencyCheck
 

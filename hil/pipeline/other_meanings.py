@@ -1,4 +1,4 @@
-"""What recordings are other than their description, for commands that judge no model."""
+"""How recordings differ from their description, for commands that do not judge a model."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from identification.validation.findings.faults import fault_keys
 
 
 def other_meanings(found: TorqueDiagnosis, sources: Sequence[Source]) -> tuple[Finding, ...]:
-    """Return what recordings are other than described, and what to do about each."""
+    """Return how recordings differ from their description, each with a remedy."""
     certain = [_certain(step.change) for step in found.discrete if step.sure]
     return (*row_findings(sources), *certain, *of_diagnosis(found))
 
@@ -33,7 +33,7 @@ def _certain(change: Change) -> Finding:
 def require_weight(
     model: RobotModel, recordings: Sequence[Samples], sources: Sequence[Source], path: Path | None
 ) -> tuple[Finding, ...]:
-    """Return what bare recordings are other than described; gravity must be in their torque.
+    """Return how bare recordings differ from their description; their torque must include gravity.
 
     A controller that removes the weight of its arm may also remove the weight of a load it knows,
     so that the torque does not say how heavy one is.

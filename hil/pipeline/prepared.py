@@ -279,7 +279,7 @@ def renewed_delay(sources: Sources, settings: Settings, options: Options) -> Com
 
 
 def with_stated_delay(estimate: DelayEstimate, stated: float) -> CombinedDelay:
-    """Return the delay by an estimate and by what is stated of a controller [s]."""
+    """Return the delay from an estimate and the controller's stated delay [s]."""
     return estimate.combined(stated, Thresholds().delay * estimate.cycle, CLOSED_LOOP_BIAS)
 
 
@@ -785,7 +785,7 @@ def _excluded(
 
 
 def motor_from_joint(recording: Recording) -> Array:
-    """Motor angles per joint angle (n, n) as imported, by default the identity."""
+    """Motor angles per joint angle (n, n) as imported; default: the identity."""
     stored = recording.provenance.get("motor_from_joint")
     return np.eye(recording.n_joints) if stored is None else numbers(json.loads(stored), 2)
 

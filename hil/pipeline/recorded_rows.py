@@ -1,4 +1,4 @@
-"""Findings about the rows and the clock of recordings, by these alone."""
+"""Findings about rows and clock of recordings, without a model."""
 
 from __future__ import annotations
 
@@ -57,7 +57,7 @@ def faulty_rows(sources: Sequence[Source]) -> Iterator[Finding]:
 
 
 def row_counters(sources: Sequence[Source]) -> Iterator[Finding]:
-    """Yield a finding about times that count rows, and are read in a unit that a map states."""
+    """Yield a finding about times that count rows, and that a map reads in a unit."""
     for source in {source.path: source for source in sources}.values():
         unit = source.recording.provenance.get(ROW_COUNTER)
         if unit is not None:

@@ -75,12 +75,12 @@ class Source:
 
     @property
     def whole(self) -> Recording:
-        """The recording that is prepared: with its context, if it is a part."""
+        """The recording to prepare: the whole one, if this is a part."""
         return self.recording if self.context is None else self.context[0]
 
     @property
     def motion_key(self) -> int:
-        """A number that parts of one recording have in common."""
+        """A number common to all parts of one recording."""
         return id(self.whole.position)
 
 
@@ -115,7 +115,7 @@ GRAVITY: Final = "gravity of [robot]"
 
 
 def arm_differences(cell: Cell, other: Cell) -> list[str]:
-    """Return the parts in which two cells describe different arms; `GRAVITY` if it is that alone.
+    """Return the parts in which two cells describe different arms; `GRAVITY` if only that.
 
     Payloads and how well torques are known aside.
     """

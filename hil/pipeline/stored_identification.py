@@ -76,7 +76,7 @@ class NotReusableError(Exception):
 
 @dataclass(frozen=True, eq=False)
 class StoredIdentification:
-    """What the files of a folder have of an identification, with the samples of its archives."""
+    """An identification from the files of a folder, with the samples of its archives."""
 
     folder: Path
     results: Results

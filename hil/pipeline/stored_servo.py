@@ -35,7 +35,7 @@ _MIN_INTERVAL_DRAWS: Final = 2000  # for the interval of a sum
 
 
 def servo_folder(paths: Sequence[Path]) -> Path | None:
-    """Return the folder of results of an arm without torque, None if this is none."""
+    """Return the folder of results of an arm without torque, None if it has no such results."""
     if len(paths) == 1 and paths[0].is_dir() and is_servo_result(paths[0] / RESULTS):
         return paths[0]
     return None

@@ -1,4 +1,4 @@
-"""Results of an identification: everything that was found, as `results.json` has it."""
+"""Results of an identification, as in `results.json`."""
 
 from __future__ import annotations
 

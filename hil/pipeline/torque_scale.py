@@ -1,4 +1,4 @@
-"""How well the scale of recorded torques is known, and from where."""
+"""How well the scale of recorded torques is known, with the source."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from planner.arrays import numbers
 
 
 class ScaleSource(Enum):
-    """From where the uncertainty of a scale is."""
+    """Source of the uncertainty of a scale."""
 
     COLUMN_MAP = auto()
     ROBOT_TABLE = auto()  #: of the cell file

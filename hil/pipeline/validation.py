@@ -43,7 +43,7 @@ class Validation:
 
     @property
     def warnings(self) -> tuple[Note, ...]:
-        """What makes no model bad."""
+        """Remarks that do not affect the verdict."""
         found: list[Note] = []
         if isinstance(self.consistency, NotConsistent):
             found.append(self.consistency)

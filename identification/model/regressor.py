@@ -65,9 +65,9 @@ class RegressorPlan:
         gravity: acceleration in base axes (3,) [m/s²].
         links: used :data:`LINK_SYMBOLS` (0..9) of each link, rising.
         rotors: whether the rotor inertia of each joint has a column.
-        friction: of the joints; None for none.
+        friction: of the joints, or None.
         couplings: pairs of joints with a column for their coupling inertia.
-        elements: springs and balancers; None for none.
+        elements: springs and balancers, or None.
     """
 
     def __init__(

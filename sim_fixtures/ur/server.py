@@ -70,7 +70,7 @@ class UrServer:
     Args:
         controller: the controller, which is stepped here.
         host: address to listen at.
-        rtde, primary, dashboard, realtime: ports; 0 for a free one, None for none. The last
+        rtde, primary, dashboard, realtime: ports; 0 for a free one, or None. The last
             one takes programs alone.
         cycle_extension: longest time by which a cycle is extended to wait for the set-point of a
             client, while a program takes set-points [s]: the computers of tests are busy.

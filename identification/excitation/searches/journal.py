@@ -84,7 +84,7 @@ class Journal:
         self.damaged = len(stored) - self._next
 
     def recall(self, genes: Array) -> Scores | None:
-        """Return the recorded scores of genes (m, n_genes), None if there are none."""
+        """Return the recorded scores of genes (m, n_genes), or None."""
         rows = self._rows.get(_key(genes))
         if rows is None:
             return None
