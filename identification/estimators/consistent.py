@@ -205,7 +205,7 @@ def consistent_parameters(
 
 
 def without_rounding(model: RobotModel, parameters: Array) -> Array:
-    """Return parameters of drives and friction (s + k,) without what rounding left below zero."""
+    """Return parameters (s + k,) with zero where rounding made drives or friction negative."""
     x = parameters.copy()
     s = model.layout.size
     layout = model.layout
@@ -242,7 +242,7 @@ def consistent_values(
     prior: BodyPrior,
     design_effect: float = 1.0,
 ) -> Array:
-    """Return a posterior's parameters (p,), or the most probable possible ones instead of them.
+    """Return a posterior's parameters (p,), or the most probable consistent ones.
 
     Args:
         model: of the arm.

@@ -90,7 +90,7 @@ class Gains:
 def identify_gains(
     model: RobotModel, factors: Sequence[Factor], inertia_std: float = np.inf
 ) -> Gains:
-    """Estimate gains of motors (n,), from recordings with a known payload and with another or none.
+    """Estimate motor gains (n,) from recordings with a known payload, and with another or none.
 
     Args:
         model: of the arm.

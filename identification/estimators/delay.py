@@ -207,7 +207,7 @@ def with_uncertain_delay(
 
 @dataclass(frozen=True)
 class CombinedDelay:
-    """Delay of the torque of all axes by an estimate and a stated value."""
+    """Delay of the torque of all axes, combined from an estimate and a stated value."""
 
     mean: float  # [s]
     variance: float  # [s²]
@@ -271,7 +271,7 @@ class DelayEstimate:
         return abs(self.delay - delay) > self.half_interval
 
     def combined(self, stated: float, bound: float, bias: float = 0.0) -> CombinedDelay:
-        """Return the delay by this estimate and by a stated value together [s].
+        """Combine the estimated delay with a stated one [s].
 
         Errors of the stated value are Gaussian, with the variance of uniform ones of up to `bound`
         either way; the estimate, significant or not, has its own and a `bias` (standard deviation).

@@ -1,4 +1,4 @@
-r"""What resembles a delay of the torque: columns that are estimated together with it.
+r"""Columns that resemble a delay of the torque, and are estimated together with it.
 
 A delay adds :math:`-d\,\dot\tau` to the torque. So do, in part, the error of a torque's scale, that
 of an encoder's zero, friction that changes in time, and friction that the model's law does not
@@ -51,7 +51,7 @@ class Nuisances:
 
 
 def nuisances(model: RobotModel, samples: Samples, values: Array) -> Nuisances:
-    """Return what resembles a delay in the torques of an arm with parameters near these (p,)."""
+    """Return columns that resemble a delay, for an arm with parameters near these (p,)."""
     n = model.n_joints
     # Of torques before a low-pass, which all columns pass at the end.
     samples_before = replace(samples, torque_bandwidth=None, parent=None)

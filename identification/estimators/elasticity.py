@@ -1,4 +1,4 @@
-r"""Uncertainty of an estimate by elastic gears between the measured motors and the links.
+r"""Uncertainty of an estimate caused by elastic gears between measured motors and links.
 
 A gear of compliance c turns its link back by c times the torque :math:`\tau_l` that it transmits.
 The motors then feel the torque of links at :math:`q - C \tau_l`, whose difference to that of rigid
@@ -94,7 +94,7 @@ class ElasticTorque:
         )
 
     def scaled(self, share: float) -> ElasticTorque:
-        """Return the sums of rows that count so much."""
+        """Return the sums with another weight of the rows."""
         return ElasticTorque(
             share * self.products,
             share * self.squares,
@@ -118,7 +118,7 @@ class ElasticTorque:
 
 
 def lost_torque(model: RobotModel, samples: Samples, values: Array) -> Array:
-    """Return the torque of bodies and drives (m, n) that smoothing has taken from the motion.
+    """Return the torque of bodies and drives (m, n) lost by smoothing the motion.
 
     With the smoother S, the smoothed torque lacks ``1/S - 1`` of itself, which is the sum of the
     powers of 1 - S.
@@ -157,7 +157,7 @@ def expected_compliance(model: RobotModel, samples: Samples, values: Array) -> A
 
 
 def elastic_torque(model: RobotModel, samples: Samples, values: Array, compliance: Array) -> Array:
-    """Return what compliances, one by one, add to the torques: (m, n, n), the last index theirs.
+    """Return the torque (m, n, n) that each compliance (last index) adds.
 
     Args:
         model: of the arm.
@@ -208,7 +208,7 @@ class FittedGears:
 
 @dataclass(frozen=True, eq=False)
 class KnownGears:
-    """What is known of the compliances of gears, in units of `size`."""
+    """Knowledge of gear compliances, in units of `size`."""
 
     size: Array  #: (n,) [rad/(N m) or m/N]
     mean: Array  #: (n,)
@@ -216,7 +216,7 @@ class KnownGears:
 
     @classmethod
     def unknown(cls, size: Array) -> Self:
-        """Return what is known before a recording, with the expected compliances (n,)."""
+        """Return the prior knowledge, with the expected compliances (n,)."""
         return cls(size, np.zeros(len(size)), np.eye(len(size)))
 
 

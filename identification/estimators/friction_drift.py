@@ -1,4 +1,4 @@
-r"""Drift of friction over recordings, as an arm gets warm, and what it makes of an estimate.
+r"""Drift of friction over recordings, as an arm warms up, and its effect on an estimate.
 
 Friction that drifts has no single coefficient: at a time x, from -1/2 to 1/2 over the recordings,
 the parameters are :math:`\pi + x \sum_j c_j f_j`, with the own friction :math:`f_j` of joint j and
@@ -81,7 +81,7 @@ class _Trend(NamedTuple):
 def drift_of_factors(
     model: RobotModel, values: Array, factors: Sequence[Factor]
 ) -> FrictionDrift | None:
-    """Return the drift by the factors by time of recordings in order; None with too few blocks."""
+    """Return the drift from time-ordered factors of recordings; None with too few blocks."""
     pulls = _friction_pulls(model, values, factors)
     return None if pulls is None else friction_trend(_sums(model, values, pulls))
 
@@ -89,7 +89,7 @@ def drift_of_factors(
 def with_drift(
     model: RobotModel, estimate: Estimate, recordings: Sequence[Factor], inverse: Array
 ) -> Estimate:
-    """Return the estimate with the mean square of its errors by significant drift of friction.
+    """Return the estimate, its covariance widened by errors from significant friction drift.
 
     Args:
         model: of the arm, p parameters.

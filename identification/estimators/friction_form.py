@@ -1,4 +1,4 @@
-r"""Uncertainty of the form of friction, and what it makes of the covariance of an estimate.
+r"""Uncertainty of the friction law, and its effect on the covariance of an estimate.
 
 A law that lacks a term is fitted wrongly, alike in every block of time, so that the scatter of
 blocks does not show the error of its coefficients. Each joint may have one more term than its law
@@ -101,7 +101,7 @@ def form_uncertainty(
     forms: Factor,
     precision: Array | None = None,
 ) -> FormUncertainty:
-    """Ask whether a friction law lacks a term.
+    """Test whether a friction law lacks a term.
 
     Args:
         model: of the estimate, p parameters and n joints.
@@ -213,7 +213,7 @@ def _friction_rms(model: RobotModel, estimate: Estimate, factor: Factor) -> Arra
 
 
 def with_uncertain_form(estimate: Estimate, uncertainty: FormUncertainty) -> Estimate:
-    """Return the estimate with the mean square of these shifts in its covariance."""
+    """Return the estimate, its covariance widened by the mean square of these shifts."""
     return replace(
         estimate,
         covariance=estimate.covariance + uncertainty.covariance,

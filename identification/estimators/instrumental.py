@@ -1,4 +1,4 @@
-r"""Instrumental variables: estimates without bias by noise in the measured positions.
+r"""Instrumental variables: estimates without bias from noise in the measured positions.
 
 With instruments Z that correlate with the motion and not with its noise, here the regressor of the
 planned motion, and one weight per joint in Omega,

@@ -38,7 +38,7 @@ Result = TypeVar("Result", bound=Fitted)
 
 @dataclass(frozen=True, eq=False)
 class LoadFit(Generic[Result]):
-    """A fit with the load of the fit before it."""
+    """A fit with the load of the previous fit."""
 
     result: Result  #: of the last fit
     samples: tuple[Samples, ...]  #: with the load of the result, for all that follows
@@ -60,7 +60,7 @@ def fit_with_load(
     *,
     most: int = MAX_PASSES,
 ) -> LoadFit[Result]:
-    """Return the fixed point of fits of samples with the load of the fit before.
+    """Return the fixed point of fits, each with the load of the previous one.
 
     The first fit has the load that the samples carry (:meth:`Samples.with_load` of an estimate
     without such friction saves a pass). Where they carry none, it is zero: the columns of the

@@ -25,7 +25,7 @@ Mask = NDArray[np.bool_]
 
 
 class TestedOn(StrEnum):
-    """What the motion is that was predicted; the value is what a person and a program read."""
+    """Kind of the predicted motion; persons and programs read the value."""
 
     __test__ = False  # no test, whatever its name
 
@@ -254,7 +254,7 @@ Figure = float | str
 
 @dataclass(frozen=True)
 class RepeatedSamples:
-    """Samples of a joint that a log repeats, has late or lacks."""
+    """Samples of a joint that a log repeats, delays or lacks."""
 
     joint: str
     count: int

@@ -1,4 +1,4 @@
-"""The nominal model with the friction of the arm: what a good description alone would predict."""
+"""The nominal model with fitted friction: what a good description alone would predict."""
 
 from __future__ import annotations
 

@@ -142,7 +142,7 @@ def _usable_part(samples: Samples, torque: Array, bandwidth: float | None) -> Ar
 
 
 def driving_residual(model: RobotModel, samples: Samples, values: Array) -> Array:
-    """Return the measured less the predicted torque (m, n), as far as it would move a joint.
+    """Return measured minus predicted torque (m, n), as far as it would move a joint.
 
     The dry friction of a joint at rest holds any torque between those of sliding either way, and
     what a fit leaves of it there is no error of joints that move.

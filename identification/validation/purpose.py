@@ -1,4 +1,4 @@
-"""What a model is good for: figures of purposes, each with the limit that it is held against."""
+"""Purposes of a model, each with its figure and limit."""
 
 from __future__ import annotations
 

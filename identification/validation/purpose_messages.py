@@ -39,7 +39,7 @@ def purposes_in_a_sentence(
     *,
     only: bool = False,
 ) -> str:
-    """Return what a model is good for, what not, and what it would notice.
+    """Return what a model is good for, what it is not good for, and what it would notice.
 
     What it is not good for comes first if that was requested; requested purposes that could not
     be judged are named with the reason.

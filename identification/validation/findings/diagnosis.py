@@ -1,4 +1,4 @@
-"""Findings about what recordings are: torque without bodies or gravity, zeros, another arm."""
+"""Findings about the recorded torque: without bodies or gravity, other zeros, another arm."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ _MAX_SCALE_RATIO: Final = 3.0  # of the torque to that of the masses; descriptio
 
 
 def is_other(evidence: Evidence) -> bool:
-    """Whether a torque is other than stated: as a whole, backwards, of other zeros."""
+    """Whether a torque differs from its description: as a whole, reversed in time, or in zeros."""
     found = evidence.diagnosis
     if found is None:
         return False
@@ -25,12 +25,12 @@ def is_other(evidence: Evidence) -> bool:
 
 
 def other_meanings(evidence: Evidence, _: Thresholds) -> tuple[Finding, ...]:
-    """Return what the torque is other than stated."""
+    """Return how the torque differs from its description."""
     return () if evidence.diagnosis is None else of_diagnosis(evidence.diagnosis)
 
 
 def of_diagnosis(found: TorqueDiagnosis) -> tuple[Finding, ...]:
-    """Return what a torque is other than stated: as a whole, backwards, of zeros, open signs."""
+    """Return how a torque differs from its description: whole, time, zeros, undetermined signs."""
     findings = [_zeros(found), *(_open(step) for step in found.discrete if not step.sure)]
     if found.rigid.is_nothing:
         findings.insert(0, without_bodies(found.rigid))
@@ -49,7 +49,7 @@ def of_diagnosis(found: TorqueDiagnosis) -> tuple[Finding, ...]:
 
 
 def without_bodies(rigid: RigidTorque) -> Finding:
-    """Return that there is next to nothing of bodies in a torque."""
+    """Return that a torque has almost no rigid-body part."""
     values = {"over_friction": float(rigid.over_friction.max()), "scale": rigid.scale}
     return Finding("no bodies", "wrong", "record all torque", "cause", values)
 
