@@ -64,7 +64,7 @@ def read_or_identify(
     """
     if reuse and len(paths) == 1 and paths[0].is_dir():
         try:
-            return stored_model(paths[0], reporter, predict)
+            return stored_identification(paths[0], reporter, predict).model()
         except NotReusableError as error:
             reporter.say(f"{paths[0]}: identified again: {error}")
     return model_of(identify_paths(paths, reporter, options, predict=predict))
@@ -154,16 +154,6 @@ class StoredIdentification:
         """Name of the estimator."""
         assert self.results.settings is not None
         return self.results.settings.estimator
-
-
-def stored_model(folder: Path, reporter: Reporter, predict: Sequence[Path] = ()) -> IdentifiedModel:
-    """Return the arm in the files of a folder, see :func:`stored_identification`.
-
-    Raises:
-        NotReusableError: they are missing, of other archives, or without consistent parameters.
-        InputError: the archives cannot be read.
-    """
-    return stored_identification(folder, reporter, predict).model()
 
 
 def stored_identification(
