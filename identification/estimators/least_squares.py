@@ -143,6 +143,7 @@ def estimate_repetitions(
     fit: Fit | None = None,
     *,
     each: Callable[[Sequence[Samples], Factor], Array] | None = None,
+    factors: Sequence[Factor] = (),
 ) -> RepeatedEstimate:
     """Estimate from each repetition and from all, by default by weighted least squares (eq. 4).
 
@@ -151,6 +152,7 @@ def estimate_repetitions(
         recordings: of the repetitions; a single one has the estimate from all.
         fit: estimator.
         each: gives the parameters (p,) from a single repetition; by default the same estimator.
+        factors: of the recordings by time, if known.
 
     Raises:
         IdentificationError: a repetition without a usable row.
@@ -160,7 +162,7 @@ def estimate_repetitions(
         return fit_least_squares(model, some, factor=factor)
 
     fit = fit or weighted
-    factors = [Factor.by_time(model, samples) for samples in recordings]
+    factors = factors or [Factor.by_time(model, samples) for samples in recordings]
     total = sum(factors, Factor.zero(model))
     pooled = fit(recordings, total)
     values = [pooled.values]

@@ -242,20 +242,21 @@ def check_motion(
     *,
     checker: CollisionChecker | None = None,
     currents: CurrentModel | None = None,
+    period: float = SAMPLE_PERIOD,
 ) -> tuple[Violation, ...]:
     """Return the violations of a motion of any duration, none if it may be sent.
 
-    Limits, rest at both ends and contacts are checked over all time, torques and currents each
-    `SAMPLE_PERIOD`.
+    Limits, rest at both ends and contacts are checked over all time.
 
     Args:
         trajectory: the motion.
         limits: of the joints.
         checker: of collisions; none are checked without it.
         currents: of the motors; likewise.
+        period: at which torques and currents are checked [s].
     """
     constraints = Constraints(limits, max_duration=np.inf, checker=checker, currents=currents)
-    return constraints.violations(trajectory, sampled(trajectory))
+    return constraints.violations(trajectory, sampled(trajectory, period))
 
 
 def clearance(checker: CollisionChecker, q: Array) -> Violation | None:
