@@ -15,6 +15,8 @@ from hil.importers.stated_units import without_unit
 from hil.importers.units import Kind
 
 _NUMBER: Final = re.compile(r"\d{1,2}(?=\D*$)")
+_WORD_JOINT: Final = re.compile(r"^joint_(?=\D)|(?<=\D)_joint$")
+_MIN_SHORT_NAME: Final = 3  # of a joint that is not written as in the URDF
 _REPEATED_MARK: Final = re.compile(r"([_.-])\1+")  # around the name of a joint
 
 
@@ -51,7 +53,8 @@ class ChannelGroup:
         """Return the joints of the URDF to which the names belong."""
         if not self.by_joint:
             return ()
-        return tuple(joint for joint in joints if self.pattern.replace("{}", joint) in self.names)
+        named = {_joint_in(name, joints) for name in self.names}
+        return tuple(joint for joint in joints if any(each and each[0] == joint for each in named))
 
     def columns(self, joints: Sequence[str]) -> str | list[str]:
         """Return `columns` of the map: the pattern where it gives these names, else the list."""
@@ -81,15 +84,16 @@ def grouped(channels: Iterable[Channel], joints: Sequence[str]) -> list[ChannelG
         if match is not None:
             pattern = f"{bare[: match.start()]}{{}}{bare[match.end() :]}"
             index = int(match[0])
-        joint = _joint_in(bare, joints)
-        if joint is not None:
-            quantity = _REPEATED_MARK.sub(r"\1", bare.replace(joint, "")).strip(" _.-/")
+        found = _joint_in(bare, joints)
+        if found is not None:
+            joint, written = found
+            quantity = _REPEATED_MARK.sub(r"\1", bare.replace(written, "")).strip(" _.-/")
             of_joint = kind_of(quantity, channel.unit)[0] or kind_by_words(quantity)
             is_of_kind = of_joint is not None and (kind in (None, of_joint) or "/" in bare)
             if is_of_kind or (kind is None and is_commanded_position(quantity)):
                 kind = of_joint
                 by_joint = True
-                pattern = bare.replace(joint, "{}")
+                pattern = bare.replace(written, "{}")
                 index = list(joints).index(joint)
         entry = (index, bare + end, channel)
         members.setdefault((pattern + end, kind, by_joint), []).append(entry)
@@ -109,6 +113,26 @@ def number_in(name: str) -> re.Match[str] | None:
     return _NUMBER.search(DRIVE_OBJECT.sub(lambda index: "_" * len(index[0]), name))
 
 
-def _joint_in(name: str, joints: Sequence[str]) -> str | None:
-    """Return the joint with the longest name contained in a channel's name, or None."""
-    return max((joint for joint in joints if joint in name), key=len, default=None)
+def _joint_in(name: str, joints: Sequence[str]) -> tuple[str, str] | None:
+    """Return the joint with the longest name in a channel's name, and how it is written; or None.
+
+    Without its exact name, whole words are one in other letters or marks, or without the word
+    joint: ``Hip angle`` is of ``hip``, ``shoulder_pan_pos`` of ``shoulder_pan_joint``.
+    """
+    exact = max((joint for joint in joints if joint in name), key=len, default=None)
+    if exact is not None:
+        return exact, exact
+    words = _folded(name)
+    best = None
+    for joint in joints:
+        for short in dict.fromkeys((_folded(joint), _WORD_JOINT.sub("", _folded(joint)))):
+            match = re.search(rf"(?<![a-z0-9]){re.escape(short)}(?![a-z0-9])", words)
+            is_longer = best is None or len(short) > len(best[1])
+            if match is not None and len(short) >= _MIN_SHORT_NAME and is_longer:
+                best = joint, name[match.start() : match.end()]
+    return best
+
+
+def _folded(name: str) -> str:
+    """Return a name in lower case with underscores for marks, of the same length."""
+    return re.sub(r"[\s.-]", "_", name.lower())

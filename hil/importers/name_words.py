@@ -49,6 +49,11 @@ motor motors rotor gravity friction coriolis inertia ddq qdd acc acceleration dt
 limit limits max min offset std var"""
 _OTHER: Final = _COMMANDED.union(f"{_WANTED} {_OUTSIDE} {_PART}".split())
 """Words of channels that are not the measured quantity of a joint."""
+_ALLOWED: Final[Mapping[Kind, frozenset[str]]] = {
+    "motor_current": frozenset({"motor", "motors"}),
+    "torque": frozenset({"estimated", "est"}),
+}
+"""Those of them that a quantity may have."""
 
 
 _PLACES: Final = """
@@ -74,10 +79,10 @@ def words_of(name: str) -> list[str]:
 def is_other(name: str, kind: Kind) -> bool:
     """Return whether a word says that a channel is not the measured quantity of a joint.
 
-    A current may be called that of a motor: no other is measured.
+    A current may be called that of a motor: no other is measured. A torque may be called an
+    estimate: drives without a torque sensor name so what they conclude from the current.
     """
-    allowed = {"motor", "motors"} if kind == "motor_current" else set()
-    return not (_OTHER - allowed).isdisjoint(words_of(name))
+    return not (_OTHER - _ALLOWED.get(kind, frozenset())).isdisjoint(words_of(name))
 
 
 def is_qualifier(text: str) -> bool:

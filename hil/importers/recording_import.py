@@ -589,7 +589,7 @@ def _imported(request: _Request, robot_of: RobotOf, *, options: ImportOptions) -
         robot = _arm_of_map(robot, columns.arm, path)
         imported = _of_map(request, robot, columns, map_text(path))
         return replace(imported, is_stated=True)
-    robot = robot_of(partial(_no_joints, source))
+    robot = robot_of(_no_joints)
     if some is not None:
         robot = _arm_of_map(robot, some.stated.arm, path)
     proposal = _proposed(request, robot, options, some)
@@ -778,7 +778,5 @@ def _joints_of(columns: ColumnMap, path: Path) -> tuple[str, ...]:
     return columns.joints
 
 
-def _no_joints(source: Path) -> tuple[str, ...]:
-    problem = "does not name the recorded joints"
-    remedy = "lock the joints that were not recorded (--locked NAME), or give a map with joints"
-    raise SourceError(source, problem, field="--lock-others", remedy=remedy)
+def _no_joints() -> None:
+    """Return no names of joints: names and number of the channels show which were recorded."""

@@ -53,7 +53,7 @@ TIMES: Final[Mapping[str, int]] = {"s": 0, "ms": 3, "us": 6, "ns": 9}
 
 SUFFIXES: Final = (
     *("deg", "rad", "mrad", "gon", "mdeg", "rpm", "ms", "us", "ns", "sec", "mA", "permille"),
-    *("Nm", "mNm", "Ncm", "Nmm", "kgcm", "kgfcm", "ozin", "ozfin", "lbft", "lbfft", "lbin"),
+    *("Nm", "mNm", "kNm", "Ncm", "Nmm", "kgcm", "kgfcm", "ozin", "ozfin", "lbft", "lbfft", "lbin"),
     *("ticks", "counts", "increments"),
 )
 """Units that end the name of a column, behind an underscore."""

@@ -227,7 +227,8 @@ class PeriodicTorque(Element):
     def shapes(self, q: Array) -> Array:
         """Return cosine and sine of each order (m, 2 orders)."""
         angles = q[:, None] * np.array(self.orders, dtype=np.float64)
-        return np.stack([np.cos(angles), np.sin(angles)], axis=-1).reshape(len(q), -1)
+        waves = np.stack([np.cos(angles), np.sin(angles)], axis=-1)
+        return waves.reshape(len(q), 2 * len(self.orders))
 
 
 @dataclass(frozen=True)

@@ -60,6 +60,8 @@ _MIN_FAST_SHARE: Final = 0.1
 _SPEED_FACTOR: Final = 2.0
 # Smallest friction within the range of speeds, as a share of Coulomb or static friction.
 _MIN_FRICTION_SHARE: Final = 0.5
+# Likewise beside a power of the speed that is positive: what scatter may do.
+_MIN_CONVEX_FRICTION_SHARE: Final = 0.9
 # Share of load that becomes friction in a worm gear; a larger one is another effect.
 _MAX_LOAD_FRICTION_SHARE: Final = 0.5
 _MIN_SCATTER_SHARE: Final = 0.1  # share of the torque's scatter from which on friction is judged
@@ -423,7 +425,9 @@ class SettingsTrial:
     def has_friction(self, settings: Settings) -> bool:
         """Return whether the fitted friction of every joint stays near that at rest at all speeds.
 
-        Up to twice those recorded and at least to a usual one, which another motion may have.
+        Up to twice those recorded and at least to a usual one, which another motion may have. Where
+        a power of the speed is positive, friction may hardly fall: such a sum with negative viscous
+        friction imitates dry friction that falls with speed, and rises without bound beyond it.
         """
         model = self.model(settings)
         values = self.values(settings)
@@ -446,11 +450,10 @@ class SettingsTrial:
             total = np.sum(forces, axis=0)
             # Stribeck friction at the lowest speed is at most twice that at higher ones.
             dry = max(coefficients.get("f0", 0.0), float(total[0]))
+            is_convex = coefficients.get("f2", 0.0) > 0.0
+            least = _MIN_CONVEX_FRICTION_SHARE if is_convex else _MIN_FRICTION_SHARE
             # Friction that hardly shows in the torque is not worth a judgement.
-            if (
-                dry > _MIN_SCATTER_SHARE * scatter
-                and float(total.min()) < _MIN_FRICTION_SHARE * dry
-            ):
+            if dry > _MIN_SCATTER_SHARE * scatter and float(total.min()) < least * dry:
                 return False
         return True
 

@@ -885,6 +885,8 @@ class TestElementModel:
         expected = two_link.MODEL.torque(two_link.truth(), motion)
         expected[:, 0] += 0.3 * np.cos(2.0 * q) + 0.2 * np.sin(3.0 * q) + 0.1 * np.cos(4.0 * q)
         np.testing.assert_allclose(model.torque(values, motion), expected, atol=1e-9)
+        element = PositionTorque(JOINTS[0])
+        assert element.columns(q[:0]).shape == (0, 6)  # of a joint that never moved
 
     def test_known_elements_are_load(self):
         sprung_model = with_elements(replace(SPRING, identified=False))

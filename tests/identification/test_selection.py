@@ -324,6 +324,17 @@ class TestChosenSettings:
         assert decision.chosen == 0
         assert settings.friction["third"] == "none"
 
+    def test_a_power_of_the_speed_does_not_stand_for_dry_friction_that_falls(self):
+        """Such a sum is right up to the recorded 1.3 rad/s, and at twice far from the true law."""
+        falling = MODEL.with_friction(stribeck=0.3)
+        pace = np.array([[0.6, 1.0], [1.4, 0.8], [2.2, 1.8]])
+        motion = sine_motion(np.arange(0.0, 30.0, 0.005), 0.3, pace, pace)
+        recording = a_recording(falling, np.append(truth(), [3.0, 2.5]), motion=motion)
+        settings, choices = chosen(recording, {"friction"})
+        decision = next(choice for choice in choices if choice.name == "friction at speed")
+        assert min(decision.errors) < (1.0 - MIN_TERM_IMPROVEMENT) * decision.errors[0]
+        assert settings.friction["third"] == "none"
+
     def test_stribeck_friction_needs_motion_faster_than_it_reaches(self):
         """Slower than twice its speed it cannot be distinguished from viscous friction."""
         stribeck = MODEL.with_friction(stribeck=0.1)

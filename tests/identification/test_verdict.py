@@ -687,6 +687,13 @@ class TestJudgement:
             (wrong,) = (each for each in findings.values() if each.level == "wrong")
             assert (wrong.key, wrong.remedy) == (key, "negate all torques")
 
+    @pytest.mark.parametrize(("known", "named"), [(-0.25, True), (np.nan, False)])
+    def test_a_balanced_arm_has_no_scale_of_its_masses(self, known, named):
+        """Centres of mass that are uncertain by more than what the bodies lift say none."""
+        diagnosis = replace(NOTHING, rigid=replace(NOTHING.rigid, scale=-0.25, std=0.1))
+        scale = NominalScale(np.full(2, known), np.full(2, 0.1), np.full(2, 0.1))
+        assert ("another arm" in found(diagnosis=diagnosis, nominal_scale=scale)) == named
+
     def test_one_negated_torque_is_named_by_the_nominal_model(self):
         scale = NominalScale(np.array([1.0, -1.0]), np.full(2, 0.1), np.zeros(2))
         findings = found(nominal_scale=scale)

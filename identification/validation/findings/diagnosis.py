@@ -122,12 +122,14 @@ def _open(step: Step) -> Finding:
 def another_arm(evidence: Evidence, _: Thresholds) -> Finding | None:
     """Find masses that differ from the description, however well the model predicts.
 
-    None where another finding says more.
+    None where another finding says more, and where no joint shows a torque that its bodies must
+    have: centres of mass that are uncertain by more than what a balanced arm lifts say no scale.
     """
     if evidence.diagnosis is None or is_other(evidence):
         return None
     rigid = evidence.diagnosis.rigid
-    if not np.isfinite(rigid.scale) or evidence.context.nominal_scale is None:
+    nominal = evidence.context.nominal_scale
+    if not np.isfinite(rigid.scale) or nominal is None or not np.isfinite(nominal.scale).any():
         return None
     far = SIGNIFICANT_SIGMAS * rigid.std
     if rigid.scale - far < _MAX_SCALE_RATIO and rigid.scale + far > 1.0 / _MAX_SCALE_RATIO:

@@ -117,7 +117,10 @@ def lists(bracket: Callable[[Floats], str]) -> Callable[[Path], Path]:
 
 
 def of(time: str, *names: str) -> Callable[[Path], Path]:
-    """Names of position, velocity and torque, then of others; {} is a joint from 0."""
+    """Names of position, velocity and torque, then of others; {} is a joint from 0.
+
+    JOINT is its name, `Joint` with a capital letter.
+    """
 
     def write(path: Path) -> Path:
         factor = 180.0 / np.pi if any("deg" in name or "°" in name for name in names) else 1.0
@@ -126,7 +129,9 @@ def of(time: str, *names: str) -> Callable[[Path], Path]:
         values = [TIME]
         for name, part in zip(names, columns, strict=False):
             numbered = [name.replace("{}", str(joint)) for joint in range(3)]
-            header += [name.replace("JOINT", JOINTS[k]) for k, name in enumerate(numbered)]
+            for column, joint in zip(numbered, JOINTS, strict=True):
+                written = column.replace("JOINT", joint)
+                header.append(written.replace("Joint ", f"{joint} ".title()))
             values += [*part.T]
         return table(path, header, *values, mark=";")
 
@@ -149,6 +154,8 @@ NAMES = {
     "pybullet": of(
         "t", "JOINT_jointPosition", "JOINT_jointVelocity", "JOINT_appliedJointMotorTorque"
     ),
+    "unitree_sdk": of("t", "q{}", "dq{}", "tauEst{}", "tau_ff{}"),
+    "gait": of("Time (s)", "Joint angle [deg]", "Joint velocity [deg/s]", "Joint torque [Nm]"),
     "fanuc": of("Tick", "J{} Angle(deg)", "J{} Speed(deg/s)", "J{} Torque(Nm)", "J{} Current(A)"),
     "kuka": of(
         "Zeit [s]", "A{} Istposition [°]", "A{} Istgeschw. [°/s]", "A{} Drehmoment [Nm]"

@@ -80,6 +80,16 @@ class TestConcluded:
             " joints; all others are fixed"
         ) in map(sentence, imported.concluded)
 
+    def test_by_their_names_where_all_others_are_to_be_locked(
+        self, tmp_path: Path, urdf: Path
+    ) -> None:
+        """A log names its joints in its columns, not beside them as a bag does."""
+        path = by_joint(tmp_path / "a.csv", RIGHT)
+        output = tmp_path / "a.mcap"
+        result = hil("import", "log", path, "--urdf", urdf, "--lock-others", "-o", output)
+        assert result.exit_code == 0, (result.output, result.exception)
+        assert joints_of(output) == RIGHT
+
     def test_by_their_number(self, tmp_path: Path) -> None:
         urdf = robot_of_arms(tmp_path, ("arm", 3), ("head", 1))
         path = generic(tmp_path / "a.csv")
