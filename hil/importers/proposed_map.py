@@ -262,6 +262,8 @@ class _Search:
         if kind == "torque":
             groups = [g for g in groups if not self._is_load(g.pattern)] or groups
         if len(groups) > 1:
+            groups = self._of_all_joints(kind, groups)
+        if len(groups) > 1:
             self._refuse_several(kind, groups)
         (group,) = groups
         if kind == "torque" and self._is_load(group.pattern) and not self._has_commands:
@@ -279,6 +281,20 @@ class _Search:
         self._used.update([group.pattern, *group.names])
         self._concluded.append(self._meaning(kind, group))
         return group.columns(self._columns_of)
+
+    def _of_all_joints(self, kind: Kind, groups: Sequence[ChannelGroup]) -> list[ChannelGroup]:
+        """Return groups of different joints as one, such as torques of some and a force of one."""
+        named = [
+            (joint, name)
+            for group in groups
+            for joint, name in zip(group.joints(self._columns_of), group.names, strict=False)
+        ]
+        names = dict(named)
+        if len(names) < len(named) or set(names) != set(self._columns_of):
+            return [*groups]
+        ordered = tuple(names[joint] for joint in self._columns_of)
+        unit = next(group.unit for group in groups if ordered[0] in group.names)
+        return [ChannelGroup(",".join(ordered), kind, ordered, len(ordered), unit, by_joint=True)]
 
     @staticmethod
     def _is_load(columns: _Columns) -> bool:

@@ -37,6 +37,7 @@ from hil.look.torque_sample import SUSPECT_ERROR, TorqueSample, explained
 from hil.pipeline.sources import cell_of
 from identification.hypotheses.diagnosis import UNEXPLAINED, TorqueDiagnosis, unexplained_share
 from identification.hypotheses.scores import SURE_SIGMAS, Score, compare, score_of
+from identification.signals.recording import MIN_MOVEMENT
 from identification.signals.samples import Samples
 from identification.text import percentage
 from identification.validation.finding import Finding
@@ -102,7 +103,7 @@ class LayoutReading:
             use: what the recording is for.
 
         Raises:
-            RefusedRecordingError: a joint moves under a constant torque.
+            RefusedRecordingError: every joint that moves does so under a constant torque.
         """
         _require_measured(imported.archive, source)
         if self.look is None:
@@ -252,10 +253,14 @@ def _require_known_side(source: Path, imported: ImportedRecording, asked: Torque
 
 
 def _require_measured(archive: Archive, source: Path) -> None:
-    """Raise RefusedRecordingError if a joint moves under one and the same torque."""
+    """Raise RefusedRecordingError if every joint that moves does so under a constant torque.
+
+    A single one is not fitted, like one whose torque is zero.
+    """
     position, torque = (np.asarray(archive.columns[name]) for name in ("position", "torque"))
     constant = constant_torques(position, torque, cell_of(archive).joint_names)
-    if constant:
+    moved = np.count_nonzero(np.ptp(position, axis=0) > MIN_MOVEMENT)
+    if constant and len(constant) == moved:
         remedy = "give the channel that was measured (--columns 'torque=NAME{}'), or record it"
         problem = sentence(constant[0])
         raise RefusedRecordingError(source, problem, field="torque", remedy=remedy)

@@ -196,7 +196,7 @@ def _spikes(prepared: Prepared) -> Iterator[Finding]:
 
 
 def _unmeasured(prepared: Prepared) -> Iterator[Finding]:
-    """Yield a finding about joints that move, and whose torque is zero throughout."""
+    """Yield a finding about joints that move, and whose torque is zero or constant throughout."""
     counts = prepared.masked.get(RowReason.UNMEASURED)
     if counts is None or not counts.any():
         return

@@ -14,7 +14,7 @@ from identification.arrays import Array, runs_of
 from identification.distributions import MAD_TO_STD
 from identification.model.motion import Motion
 from identification.model.robot import RobotModel
-from identification.signals.recording import Recording
+from identification.signals.recording import MIN_MOVEMENT, Recording
 
 Rows = NDArray[np.bool_]
 
@@ -60,7 +60,7 @@ class RowReason(Enum):
     """Why a row is not used; `identification.signals.messages` words it."""
 
     EDGE = auto()  #: next to a gap or an end of the recording
-    UNMEASURED = auto()  #: torque of the joint zero throughout
+    UNMEASURED = auto()  #: torque of the joint zero throughout, or constant although it moves
     SATURATED = auto()  #: torque or current
     REST = auto()
     STANDSTILL = auto()  #: slower than it
@@ -173,11 +173,17 @@ def mask_rows(
 
 
 def _unmeasured(recording: Recording) -> NDArray[np.bool_]:
-    """Return the joints whose torque is zero throughout while others have one (n,)."""
+    """Return the joints whose torque is not measured while that of others is (n,).
+
+    It is zero throughout, or constant although the joint moves, as of a channel that is stuck.
+    """
     if recording.torque is None:
         return np.zeros(recording.position.shape[1], dtype=np.bool_)
-    zero = ~recording.torque.any(axis=0)
-    return np.asarray(zero & ~zero.all())
+    stuck = (np.ptp(recording.torque, axis=0) == 0.0) & (
+        np.ptp(recording.position, axis=0) > MIN_MOVEMENT
+    )
+    silent = stuck | ~recording.torque.any(axis=0)
+    return np.asarray(silent & ~silent.all())
 
 
 def long_rests(time: Array, still: Rows) -> Rows:

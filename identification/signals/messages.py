@@ -15,7 +15,7 @@ from identification.text import duration_text, number, percentage
 
 ROW_REASONS: Final[Mapping[RowReason, str]] = {
     RowReason.EDGE: "next to a gap or an end of the recording",
-    RowReason.UNMEASURED: "joint torque zero throughout",
+    RowReason.UNMEASURED: "joint torque zero or constant throughout",
     RowReason.SATURATED: "torque or current saturated",
     RowReason.REST: "at rest",
     RowReason.STANDSTILL: "below the standstill speed",

@@ -12,7 +12,14 @@ from identification.arrays import Array
 from identification.model.motion import Motion
 from identification.model.regressor import Regressor
 from identification.model.robot import RobotModel
-from identification.signals.masks import MIN_STRETCH_SAMPLES, ExcludedRows, RowMask, mask_rows
+from identification.signals.masks import (
+    END_PERIODS,
+    MAX_END_SECONDS,
+    MIN_STRETCH_SAMPLES,
+    ExcludedRows,
+    RowMask,
+    mask_rows,
+)
 from identification.signals.noise import difference_variance
 from identification.signals.recording import Recording, RecordingError
 from identification.signals.smoothing import (
@@ -28,6 +35,8 @@ from identification.signals.smoothing import (
 RIGID_BANDWIDTH: Final = 40.0  # Hz
 _FITTED_SHARE: Final = 0.7  # of the rows of one recording
 _MAX_PREDICTIONS: Final = 2  # in memory: predictions of the result and of the nominal model
+# Of a velocity or acceleration near an end over the largest elsewhere: a motion may begin abruptly.
+_MAX_AT_ENDS: Final = 2.0
 _MIN_SEGMENT_SAMPLES: Final = 12  # samples, twice the minimum of a quintic spline
 
 VelocitySource = Literal["position", "measured"]
@@ -248,7 +257,8 @@ def smooth(
 
     `noise_variance` of the measured positions (n,) [rad² or m²] is from standstill and at least
     resolution²/12; None: estimated from differences of positions. Rows of segments too short to
-    smooth keep their position, at rest.
+    smooth keep their position, at rest. Near the ends of a segment, where a smoother is inaccurate
+    and drives begin to filter, velocity and acceleration are at most twice those elsewhere in it.
     """
     position = recording.position.copy()
     velocity = np.zeros_like(position)
@@ -275,10 +285,27 @@ def smooth(
             slope = spline_of(time, speed[segment], None)
             velocity[segment] = slope(at)
             acceleration[segment] = slope(at, 1)
+        for derivative in (velocity, acceleration):
+            derivative[segment] = _bounded_at_ends(at, derivative[segment], spline.bandwidth)
         if len(time) > longest:
             longest = len(time)
             bandwidth = spline.bandwidth
     return Motion(recording.time, position, velocity, acceleration), bandwidth
+
+
+def _bounded_at_ends(time: Array, values: Array, bandwidth: Array) -> Array:
+    """Return values (m, n) that near the ends of a segment are no outliers of its other rows.
+
+    Args:
+        time: of the rows (m,) [s].
+        values: of derivatives of the position (m, n).
+        bandwidth: of the smoother (n,) [Hz].
+    """
+    end = np.minimum(MAX_END_SECONDS, END_PERIODS / bandwidth)
+    inside = (time[:, None] >= time[0] + end) & (time[:, None] <= time[-1] - end)
+    largest = _MAX_AT_ENDS * np.where(inside, np.abs(values), 0.0).max(axis=0)
+    largest[inside.sum(axis=0) < MIN_STRETCH_SAMPLES] = np.inf
+    return np.clip(values, -largest, largest)
 
 
 def prepare(

@@ -331,7 +331,9 @@ SENTENCES: Final[Mapping[FindingKey, Sentence]] = {
         UNTESTED, "the fitted motion does not move {joints}, but {motion} does"
     ),
     "joints at rest": Sentence(UNTESTED, "{joints} moved for less than {least:g} s of {motion}"),
-    "no torque": Sentence(UNTESTED, "the measured torque of {joints} is zero throughout {motion}"),
+    "no torque": Sentence(
+        UNTESTED, "the measured torque of {joints} is zero or constant throughout {motion}"
+    ),
     "position jumps": Sentence(
         "position jumps",
         "the measured position jumped faster than an arm can move: {jumps:3}",

@@ -74,7 +74,7 @@ def test_words_have_no_full_stop_and_no_capital(text: str) -> None:
     [
         (
             Finding("no torque", "wrong", "resolve the torque", joints=(0, 2)),
-            "the measured torque of one, three is zero throughout unseen motion",
+            "the measured torque of one, three is zero or constant throughout unseen motion",
             "record the torque of one, three with sufficient resolution",
         ),
         (

@@ -622,6 +622,27 @@ class TestSamples:
         np.testing.assert_allclose(smoothed.velocity[inner], exact.velocity[inner] + 0.1, atol=0.01)
         assert not smoothed.velocity[3000:3002].any()
 
+    def test_a_joint_that_moves_under_a_constant_torque_was_not_measured(self):
+        recording = smooth_recording()
+        torque = recording.torque.copy()
+        torque[:, 1] = 0.37
+        samples = prepare(replace(recording, torque=torque), MODEL)
+        assert not samples.usable[:, 1].any()
+        assert samples.usable[:, 0].any()
+
+    def test_where_a_drive_begins_to_filter_no_acceleration_is_an_outlier(self):
+        """Its first velocities are far from the slope of the positions."""
+        recording = smooth_recording()
+        exact = one_sine(recording.time)
+        velocity = exact.velocity.copy()
+        velocity[:4] += np.array([[5.0], [2.0], [1.0], [0.5]])
+        recording = replace(recording, velocity=velocity)
+        options = Preprocessing(velocity="measured")
+        smoothed = prepare(recording, MODEL, noise_variance=QUANTISATION, options=options).motion
+        for name in ("velocity", "acceleration"):
+            largest = np.abs(getattr(exact, name)).max(axis=0)
+            assert (np.abs(getattr(smoothed, name)) < 2.2 * largest).all()
+
     def test_invalid_recordings_and_bandwidths_raise(self):
         valid = smooth_recording()
         with pytest.raises(RecordingError, match="no joint torque"):

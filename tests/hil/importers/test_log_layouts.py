@@ -181,6 +181,14 @@ def message_rows(joints: Sequence[int]) -> list[str]:
     return rows
 
 
+def forces_beside_torques(path: Path) -> Path:
+    """A sliding joint has a force where the others have a torque."""
+    names = [f"{joint} pos" for joint in JOINTS]
+    kinds = ("torque [Nm]", "force [N]", "torque [Nm]")
+    efforts = [f"{joint} {kind}" for joint, kind in zip(JOINTS, kinds, strict=True)]
+    return table(path, ["t", *names, *efforts], TIME, *POSITION.T, *TORQUE.T)
+
+
 def echo_without_header(path: Path) -> Path:
     """`ros2 topic echo --csv /joint_states`."""
     path.write_text("\n".join(message_rows(ORDER)) + "\n")
@@ -212,6 +220,7 @@ LAYOUTS: Mapping[str, Callable[[Path], Path]] = {
     "desired beside measured": desired_beside,
     "plotjuggler": plot_juggler,
     "an index of dates": dates_without_name,
+    "a force beside torques": forces_beside_torques,
     "ros2 topic echo": echo_without_header,
     "ros2 topic echo in the order of the URDF": echo_in_order,
     "rostopic echo": echo_with_header,
