@@ -122,11 +122,11 @@ def _joint_in(name: str, joints: Sequence[str]) -> tuple[str, str] | None:
     exact = max((joint for joint in joints if joint in name), key=len, default=None)
     if exact is not None:
         return exact, exact
-    words = _folded(name)
+    folded = _folded(name)
     best = None
     for joint in joints:
         for short in dict.fromkeys((_folded(joint), _WORD_JOINT.sub("", _folded(joint)))):
-            match = re.search(rf"(?<![a-z0-9]){re.escape(short)}(?![a-z0-9])", words)
+            match = re.search(rf"(?<![a-z0-9]){re.escape(short)}(?![a-z0-9])", folded)
             is_longer = best is None or len(short) > len(best[1])
             if match is not None and len(short) >= _MIN_SHORT_NAME and is_longer:
                 best = joint, name[match.start() : match.end()]

@@ -324,7 +324,7 @@ class TestChosenSettings:
         assert decision.chosen == 0
         assert settings.friction["third"] == "none"
 
-    def test_a_power_of_the_speed_does_not_stand_for_dry_friction_that_falls(self):
+    def test_a_power_of_the_speed_is_not_falling_dry_friction(self):
         """Such a sum is right up to the recorded 1.3 rad/s, and at twice far from the true law."""
         falling = MODEL.with_friction(stribeck=0.3)
         pace = np.array([[0.6, 1.0], [1.4, 0.8], [2.2, 1.8]])

@@ -622,7 +622,7 @@ class TestSamples:
         np.testing.assert_allclose(smoothed.velocity[inner], exact.velocity[inner] + 0.1, atol=0.01)
         assert not smoothed.velocity[3000:3002].any()
 
-    def test_a_joint_that_moves_under_a_constant_torque_was_not_measured(self):
+    def test_a_constant_torque_of_a_joint_that_moves_is_not_measured(self):
         recording = smooth_recording()
         torque = recording.torque.copy()
         torque[:, 1] = 0.37
@@ -630,7 +630,7 @@ class TestSamples:
         assert not samples.usable[:, 1].any()
         assert samples.usable[:, 0].any()
 
-    def test_where_a_drive_begins_to_filter_no_acceleration_is_an_outlier(self):
+    def test_no_acceleration_near_an_end_is_an_outlier(self):
         """Its first velocities are far from the slope of the positions."""
         recording = smooth_recording()
         exact = one_sine(recording.time)

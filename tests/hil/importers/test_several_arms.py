@@ -80,9 +80,7 @@ class TestConcluded:
             " joints; all others are fixed"
         ) in map(sentence, imported.concluded)
 
-    def test_by_their_names_where_all_others_are_to_be_locked(
-        self, tmp_path: Path, urdf: Path
-    ) -> None:
+    def test_by_their_names_with_all_others_locked(self, tmp_path: Path, urdf: Path) -> None:
         """A log names its joints in its columns, not beside them as a bag does."""
         path = by_joint(tmp_path / "a.csv", RIGHT)
         output = tmp_path / "a.mcap"
