@@ -19,6 +19,7 @@ from identification.model.friction import COULOMB, TERMS
 from identification.selection.questions import FRICTION_AT_SPEED, LOAD, LOW_PASS, REVERSAL
 from identification.signals.angle_wraps import UNWRAPPED
 from identification.signals.masks import RowReason
+from identification.signals.play import ToAndFro, steps_to_and_fro
 from identification.signals.position_steps import PositionJump, position_steps
 from identification.signals.recording import MIN_MOVEMENT
 from identification.signals.samples import Samples
@@ -106,6 +107,7 @@ _MAX_ROUNDING_SHARE: Final = 0.02  # of accelerations, as a share
 _EXACT_ERROR: Final = 1e-4  # relative error below the resolution of any sensor
 _NOISE_RECORDINGS: Final = 3  # recordings that show the noise of the torque
 _MAX_NOISE_SHARE: Final = 0.5  # of the squared residual
+_PLAY_TOLERANCE: Final = 0.5  # relative, of a step by a play
 # a low-pass above this multiple of the motion's bandwidth has no effect
 _MAX_BANDWIDTH_RATIO: Final = 2.0
 
@@ -119,6 +121,7 @@ def cell_context_of(prepared: Prepared, estimate: Estimate) -> CellContext:
     saturated = prepared.masked.get(RowReason.SATURATED)
     nominal = nominal_of(cell)
     steps = [position_steps(source.recording, source.name) for source in recorded]
+    play = _play(prepared, estimate)
     return CellContext(
         torque_limit=torque_limits(cell),
         saturated=None if saturated is None else saturated / max(prepared.rows, 1),
@@ -133,7 +136,13 @@ def cell_context_of(prepared: Prepared, estimate: Estimate) -> CellContext:
             rotors_known=nominal.rotors_known,
             share=nominal.share,
         ),
-        jumps=tuple(jump for source_steps in steps for jump in source_steps.jumps),
+        jumps=tuple(
+            jump
+            for source_steps in steps
+            for jump in source_steps.jumps
+            if not _is_of_play(jump, play, cell.joint_names)
+        ),
+        play=play,
         controller_inertia=controller_inertia(
             cell, estimate, (*sources.training, *sources.held_out)
         ),
@@ -156,6 +165,31 @@ def cell_context_of(prepared: Prepared, estimate: Estimate) -> CellContext:
         commanded_positions=any(has_commands_as_positions(each.recording) for each in recorded),
         added_friction=_added_friction(prepared),
         scale_std=torque_scale_of(sources).std,
+    )
+
+
+def _play(prepared: Prepared, estimate: Estimate) -> tuple[ToAndFro, ...]:
+    """Return the joints whose positions step to and fro where the load of their gear reverses."""
+    sources, runs = prepared.sources.training, prepared.training
+    if not prepared.sources.in_sample:
+        sources, runs = (*sources, *prepared.sources.held_out), (*runs, *prepared.held_out)
+    found = tuple(steps_to_and_fro([source.recording for source in sources]))
+    if not found:
+        return ()
+    model = prepared.sources.cell.model
+    loads = [model.gear_torque(estimate.values, run.motion) for run in runs]
+    times = [run.motion.time for run in runs]
+    return tuple(
+        each for each in found if each.follows(times, [load[:, each.joint] for load in loads])
+    )
+
+
+def _is_of_play(jump: PositionJump, play: Sequence[ToAndFro], joint_names: Sequence[str]) -> bool:
+    """Return whether a step of a position is one of those by a play."""
+    return any(
+        joint_names[each.joint] == jump.joint
+        and abs(abs(jump.size) - each.size) < _PLAY_TOLERANCE * each.size
+        for each in play
     )
 
 

@@ -61,6 +61,7 @@ BY_CHECK: Final[Mapping[str, Picture]] = {
     "rows": "motion",
     "positions": "motion",
     "position jumps": "motion",
+    "play": "motion",
     "wrapped angles": "motion",
     "time": "motion",
     "times": "nominal",

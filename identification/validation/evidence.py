@@ -35,6 +35,7 @@ from identification.hypotheses.unseen_changes import (
     find_changes,
 )
 from identification.model.robot import RobotModel
+from identification.signals.play import ToAndFro
 from identification.signals.position_steps import PositionJump
 from identification.signals.samples import Samples
 from identification.validation.consistency import ConsistencyCheck
@@ -112,6 +113,7 @@ class CellContext:
     assumed_delay: float = 0.0  # in the fit [s]
     nominal_scale: NominalScale | None = None  # ratio of measured to nominal inertial torque
     jumps: tuple[PositionJump, ...] = ()  # impossible steps of measured positions
+    play: tuple[ToAndFro, ...] = ()  # steps of positions to and fro where the load reverses
     controller_inertia: InertiaRatio | None = None  # its diagonal inertia over the identified one
     corrections: tuple[Finding, ...] = ()  # faults of recordings that were corrected
     #: whether the positions are commands, which the arm follows late

@@ -48,6 +48,7 @@ FindingKey = Literal[
     "joints at rest",
     "no torque",
     "position jumps",
+    "play",
     "faulty rows",
     "spikes",
     "commanded positions",
@@ -152,6 +153,7 @@ FindingKey = Literal[
     "large ripple",
     "usual ripple",
     "no ripple",
+    "ripple over the angle",
     "large friction drift",
     "small friction drift",
     "no friction drift",
@@ -246,6 +248,7 @@ RemedyKey = Literal[
     "try friction terms",
     "check the geometry",
     "average the ripple",
+    "measure the play",
 ]
 """What to do about a finding, in the same form."""
 

@@ -334,6 +334,12 @@ SENTENCES: Final[Mapping[FindingKey, Sentence]] = {
     "no torque": Sentence(
         UNTESTED, "the measured torque of {joints} is zero or constant throughout {motion}"
     ),
+    "play": Sentence(
+        "play",
+        "positions step to and fro where the load of the joint reverses, as with play between"
+        " encoder and link: {each}",
+        "({size:.2g} ± {half_interval:.1g} {unit}, {count} times)",
+    ),
     "position jumps": Sentence(
         "position jumps",
         "the measured position jumped faster than an arm can move: {jumps:3}",
@@ -808,6 +814,11 @@ SENTENCES: Final[Mapping[FindingKey, Sentence]] = {
     "usual ripple": Sentence(
         "torque ripple", "torque ripple with the motor angle, of usual size: {each}", _RIPPLE
     ),
+    "ripple over the angle": Sentence(
+        "torque ripple",
+        "a torque repeats with the angle, as the ripple of a motor or gear does: {each}",
+        "({periods:.4g} times per turn of the joint, {relative:pc1} of its torque)",
+    ),
     "no ripple": Sentence("torque ripple", "no torque ripple is significant"),
     "large friction drift": Sentence(
         "friction over time",
@@ -1063,6 +1074,10 @@ REMEDIES: Final[Mapping[RemedyKey, str]] = {
     "check the geometry": (
         "check the URDF's geometry and gravity direction, and for a hose, spring or payload that"
         " the model lacks"
+    ),
+    "measure the play": (
+        "turn the link of {joints} to and fro by hand with the motor at rest: play in gear or"
+        " coupling shows as a free angle of this size; errors where the load reverses come from it"
     ),
     "average the ripple": (
         "record a long motion, which averages it, or compensate it separately: the model does not"

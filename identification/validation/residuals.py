@@ -20,6 +20,7 @@ from identification.model.robot import RobotModel
 from identification.signals.block_mean import BlockMean, block_index, block_mean
 from identification.signals.samples import Samples
 from identification.signals.spectrum import power_density
+from identification.validation.angle_ripple import AngleRipple, find_angle_ripple
 from identification.validation.prediction import PredictionError
 
 Rows = NDArray[np.bool_]
@@ -277,6 +278,7 @@ class ResidualChecks:
     drift: FrictionDrift | None  # None with too few recordings
     friction_share: Array  # friction over measured torque of the fitted recordings (n,)
     outliers: Outliers  # of the unseen motion, or of the fitted one without it
+    angle_ripple: AngleRipple | None = None  # over the joint's angle; None with gear ratios
 
     def share(self, size: Array) -> Array:
         """Return a residual (n,) as a share of the torque; zero for a joint without rows."""
@@ -345,6 +347,7 @@ def check_residuals(
         speed=_profile(runs, residuals, [run.motion.velocity for run in runs], repeated),
         position=_profile(runs, residuals, [run.motion.position for run in runs], repeated),
         ripple=ripple,
+        angle_ripple=find_angle_ripple(model, runs, residuals) if ripple is None else None,
         drift=friction_trend(drift),
         friction_share=np.sqrt(friction_power / np.where(seen > 0.0, seen, 1.0)),
         outliers=outliers,

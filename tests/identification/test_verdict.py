@@ -24,6 +24,7 @@ from identification.hypotheses.unseen_changes import UnseenChange
 from identification.model.known_payload import Payload
 from identification.model.robot import RobotModel
 from identification.text import percentage
+from identification.validation.angle_ripple import AngleRipple
 from identification.validation.evidence import gather
 from identification.validation.finding import Thresholds
 from identification.validation.finding_messages import LEFT_OPEN
@@ -842,6 +843,15 @@ class TestPatternsOfTheResidual:
         if share:
             assert finding.joints == (1,)
             assert_figures(finding, {"harmonic": (4,), "relative": (size,)})
+
+    @pytest.mark.parametrize(("share", "level"), [(0.9, "information"), (1.1, "doubtful")])
+    def test_ripple_over_the_angle_is_named_without_gears(self, clean, share, level):
+        size = share * Thresholds().ripple
+        of_angle = AngleRipple(np.array([np.nan, 200.0]), np.array([0.0, size]) * clean.torque_rms)
+        finding = found(residuals=replace(clean, angle_ripple=of_angle))["ripple over the angle"]
+        assert finding.level == level
+        assert finding.joints == (1,)
+        assert_figures(finding, {"periods": (200.0,), "relative": (size,)})
 
     @pytest.mark.parametrize(
         ("change", "share", "key", "joints"),

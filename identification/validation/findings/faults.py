@@ -156,6 +156,9 @@ def _is_left_out(each: Explanation, evidence: Evidence, limits: Thresholds) -> b
     change = each.change
     if _outliers_decide(evidence, limits):
         return True
+    # Play, which the positions alone show, resembles both.
+    if evidence.context.play and change.meaning in ("delay", "drift"):
+        return True
     # The lag of commanded positions is that of the servo.
     if evidence.context.commanded_positions and change.meaning == "delay":
         return True

@@ -100,6 +100,26 @@ def ripple(evidence: Evidence, limits: Thresholds) -> Finding | None:
     )
 
 
+def angle_ripple(evidence: Evidence, limits: Thresholds) -> Finding | None:
+    """Return the joints whose residual repeats many times in a turn, where no gears are stated."""
+    checks = evidence.residuals
+    if checks is None or checks.angle_ripple is None:
+        return None
+    found = checks.angle_ripple
+    share = checks.share(found.rms)
+    is_large = (share > limits.pattern) & (found.rms > limits.pattern_of_residual * checks.rms)
+    joints = found.significant & is_large & ~evidence.unfitted
+    if not joints.any():
+        return None
+    is_doubtful = bool((share[joints] > limits.ripple).any())
+    return Finding(
+        "ripple over the angle",
+        "doubtful" if is_doubtful else "information",
+        "average the ripple" if is_doubtful else None,
+        "cause",
+    ).about(joints, relative=share, periods=found.periods)
+
+
 def friction_drift(evidence: Evidence, limits: Thresholds) -> Finding | None:
     """Return the joints whose friction changed during the recordings, or that there are none."""
     checks = evidence.residuals

@@ -64,6 +64,25 @@ def of_jumps(found: Sequence[PositionJump]) -> Finding | None:
     return Finding("position jumps", "wrong", "check the encoder", "cause", values)
 
 
+def play(evidence: Evidence, _: Thresholds) -> Finding | None:
+    """Return the joints whose positions step to and fro where their load reverses."""
+    found = evidence.context.play
+    if not found:
+        return None
+    n = len(evidence.held_out.rows)
+    joints = np.zeros(n, dtype=np.bool_)
+    size, half, count = np.zeros((3, n))
+    for each in found:
+        joints[each.joint] = True
+        unit = float(np.degrees(1.0)) if evidence.revolute(each.joint) else 1e3
+        size[each.joint], half[each.joint] = unit * each.size, unit * each.half_interval
+        count[each.joint] = each.number
+    units = ["°" if evidence.revolute(joint) else "mm" for joint in range(n)]
+    return Finding("play", "doubtful", "measure the play", "cause").about(
+        joints, size=size, half_interval=half, count=count.astype(int), unit=units
+    )
+
+
 def corrections(evidence: Evidence, _: Thresholds) -> tuple[Finding, ...]:
     """Return the faults of the recordings that were corrected before the fit."""
     return evidence.context.corrections

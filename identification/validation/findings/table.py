@@ -30,6 +30,7 @@ CHECKS: Final[tuple[Check, ...]] = (
     recordings.joints_at_rest,
     recordings.no_torque,
     recordings.position_jumps,
+    recordings.play,
     excitation.undetermined,
     excitation.undetermined_in_one_direction,
     excitation.poor_excitation,
@@ -80,6 +81,7 @@ CHECKS: Final[tuple[Check, ...]] = (
     patterns.over_speed,
     patterns.over_position,
     patterns.ripple,
+    patterns.angle_ripple,
     patterns.friction_drift,
 )
 """Every check, in the order of the verdict's reasons: its line has the first one."""
