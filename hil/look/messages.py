@@ -33,6 +33,7 @@ from hil.look.readings import (
     Changes,
     Channels,
     ClockReading,
+    CoarsePositions,
     ColumnOrder,
     Contradiction,
     CorrectedError,
@@ -183,6 +184,7 @@ _BASES: Final[Mapping[Basis, str]] = {
     Basis.CHANNELS: "by the channels",
     Basis.ENCODER_NOISE: "broadband encoder noise",
     Basis.SMALL_NOISE: "small broadband noise",
+    Basis.HIDDEN_BY_ROUNDING: "the steps hide noise, a filter or commands",
     Basis.NO_NOISE: "no noise above that frequency",
     Basis.NO_MOTION: "no joint moves",
     Basis.DRIVING_FRICTION: "otherwise friction would add energy",
@@ -486,6 +488,11 @@ def _(joints: StillJoints) -> str:
 @_worded.register
 def _(wrapped: Wrapped) -> str:
     return f"wrapped at a full turn, unwrapped: {wrapped.joints}"
+
+
+@_worded.register
+def _(positions: CoarsePositions) -> str:
+    return f"in steps of {number(1e3 * positions.step, 2)} mrad"
 
 
 @_worded.register

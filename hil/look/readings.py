@@ -139,6 +139,13 @@ class Wrapped:
 
 
 @dataclass(frozen=True)
+class CoarsePositions:
+    """Positions rounded to a step [rad], which hides whether a sensor's noise is in them."""
+
+    step: float
+
+
+@dataclass(frozen=True)
 class SmoothPositions:
     """Positions without noise above a frequency [Hz]."""
 
@@ -253,6 +260,7 @@ Reading = (
     | StillJoints
     | Wrapped
     | OutsideLimits
+    | CoarsePositions
     | SmoothPositions
     | Changes
     | FoundChange
@@ -294,6 +302,7 @@ class Basis(Enum):
     ENCODER_NOISE = auto()
     SMALL_NOISE = auto()
     NO_NOISE = auto()
+    HIDDEN_BY_ROUNDING = auto()
     NO_MOTION = auto()
     DRIVING_FRICTION = auto()  #: of the reading as recorded
     DISSIPATION = auto()  #: in every joint

@@ -37,6 +37,7 @@ from hil.look.readings import (
     Basis,
     Channels,
     ClockReading,
+    CoarsePositions,
     Correlation,
     Fact,
     LateVelocity,
@@ -57,7 +58,7 @@ from hil.pipeline.sources import Source, has_commands_as_positions
 from identification.signals.angle_wraps import (
     UNWRAPPED,
 )
-from identification.signals.noise import has_small_noise, noiseless_above
+from identification.signals.noise import has_small_noise, hidden_by_rounding, noiseless_above
 from identification.signals.position_steps import position_steps
 from identification.signals.recording import (
     MIN_MOVEMENT,
@@ -281,8 +282,13 @@ def _measured(
     joints = recording.position[:, np.ptp(recording.position, axis=0) > MIN_MOVEMENT]
     if has_small_noise(recording.time, joints, recording.segments(), quiet):
         return Row("positions", Fact.MEASURED, Certainty.LIKELY, (Basis.SMALL_NOISE,))
-    reading = SmoothPositions(quiet)
     open_ = Certainty.UNDETERMINED
+    step = hidden_by_rounding(recording.time, joints, recording.segments())
+    if step is not None:
+        coarse = CoarsePositions(step)
+        hidden = (Basis.HIDDEN_BY_ROUNDING,)
+        return Row("positions", coarse, open_, hidden, NextStep.ASK_FOR_POSITIONS)
+    reading = SmoothPositions(quiet)
     return Row("positions", reading, open_, (Basis.NO_NOISE,), NextStep.ASK_FOR_POSITIONS)
 
 

@@ -351,7 +351,11 @@ def refuse_duplicates(archives: Sequence[Path | Archive]) -> None:
         except OSError:
             continue  # reported when it is opened
         if digest in seen:
-            raise InputError(path, f"is a copy of {seen[digest]}", remedy="give only one of them")
+            is_same = path == seen[digest]
+            fault = "was given twice" if is_same else f"is a copy of {seen[digest]}"
+            raise InputError(
+                path, fault, remedy="give it once" if is_same else "give only one of them"
+            )
         seen[digest] = path
 
 

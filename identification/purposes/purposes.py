@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -177,9 +177,25 @@ def simulation(arm: Application, limits: PurposeLimits) -> Purpose:
     if error is None:
         return Purpose.unknown("simulation", "too short", "m")
     good = error <= limits.distance
-    return Purpose(
-        "simulation", good, error, limits.distance, "m", references={"horizon": HORIZON_SECONDS}
-    )
+    references = {"horizon": HORIZON_SECONDS, **_largest(arm)}
+    return Purpose("simulation", good, error, limits.distance, "m", references=references)
+
+
+def _largest(arm: Application) -> dict[str, float]:
+    """Return the largest speed and acceleration of a joint that turns, in the held-out motion."""
+    turns = np.array(arm.model.chain.revolute)
+    use = [run.usable & turns for run in arm.held_out]
+    if not any(each.any() for each in use):
+        return {}
+
+    def largest(of_runs: Iterable[Array]) -> float:
+        pairs = zip(of_runs, use, strict=True)
+        return max(float(np.abs(values).max(where=each, initial=0.0)) for values, each in pairs)
+
+    return {
+        "speed": largest(run.motion.velocity for run in arm.held_out),
+        "acceleration": largest(run.motion.acceleration for run in arm.held_out),
+    }
 
 
 def single_parameters(estimate: Estimate) -> Purpose:

@@ -106,6 +106,7 @@ _MIN_WHITE_SHARE: Final = 0.5  # of the power that white noise of the upper freq
 _UPPER_SHARE: Final = 0.25  # of half the sampling rate, from which only noise is left of a motion
 # Single precision rounds angles to a third of it, and no joint's encoder resolves it.
 _MIN_SENSOR_NOISE: Final = 5e-7  # rad
+_GRID_TOLERANCE: Final = 0.05  # of a step, from a whole number of steps
 _DECIMAL_TOLERANCE: Final = 1e-3  # of a step, as a power of ten
 
 
@@ -148,6 +149,30 @@ def has_small_noise(time: Array, signals: Array, segments: Sequence[slice], abov
     of_band = power[frequency >= lowest][:, moving].mean(axis=0) * frequency[-1]
     white = variance >= np.maximum(_MIN_WHITE_SHARE * of_band, _MIN_SENSOR_NOISE**2)
     return bool(np.mean((beyond | of_encoder) & white) > 0.5)
+
+
+def hidden_by_rounding(time: Array, signals: Array, segments: Sequence[slice]) -> float | None:
+    """Return the step [rad] that angles (m, c) are rounded to, where it hides a sensor's noise.
+
+    None where they are not rounded so coarsely, or have another noise than that of rounding.
+
+    Args:
+        time: of the samples (m,) [s].
+        signals: that move.
+        segments: without gaps.
+    """
+    longest = max(segments, key=lambda segment: int(segment.stop - segment.start))
+    time, signals = time[longest], signals[longest]
+    if len(time) < _MIN_SAMPLES or not signals.size:
+        return None
+    step = smallest_steps(signals)
+    steps = np.diff(signals, axis=0) / np.where(step > 0.0, step, np.inf)
+    on_grid = np.abs(steps - np.rint(steps)).max(axis=0) < _GRID_TOLERANCE
+    rounding = step**2 / 12.0
+    is_coarse = on_grid & (rounding > _MIN_SENSOR_NOISE**2)
+    is_of_rounding = difference_variance(time, signals) < _MIN_ROUNDING_STD_RATIO**2 * rounding
+    hidden = is_coarse & is_of_rounding
+    return float(np.median(step[hidden])) if np.mean(hidden) > 0.5 else None
 
 
 def smallest_steps(signals: Array) -> Array:

@@ -140,9 +140,17 @@ def requirement(purpose: Purpose) -> str:
         case "gravity":
             return "off by less than dry friction"
         case "simulation":
-            return f"at most {number(1e3 * purpose.limit)} mm"
+            return f"at most {number(1e3 * purpose.limit)} mm{_tested_up_to(purpose)}"
         case _:
             return f"at most {number(purpose.limit)} {purpose.unit}"
+
+
+def _tested_up_to(purpose: Purpose) -> str:
+    """Return how fast the joints were, beyond which the figure says nothing."""
+    if "speed" not in purpose.references:
+        return ""
+    speed, acceleration = (purpose.references[name] for name in ("speed", "acceleration"))
+    return f"; tested up to {rounded(speed)} rad/s and {rounded(acceleration)} rad/s²"
 
 
 def _decimals(share: float) -> int:

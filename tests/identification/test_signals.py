@@ -29,6 +29,7 @@ from identification.signals.messages import clock_lines
 from identification.signals.noise import (
     difference_variance,
     has_small_noise,
+    hidden_by_rounding,
     noiseless_above,
     standstill_variance,
 )
@@ -537,6 +538,19 @@ class TestNoise:
         above = noiseless_above(time, angle, [slice(0, len(time))])
         assert above is not None
         assert has_small_noise(time, angle, [slice(0, len(time))], above) == measured
+
+    @pytest.mark.parametrize(
+        ("step", "hidden"), [(1e-3, 1e-3), (1e-4, 1e-4), (1e-6, None), (None, None)]
+    )
+    def test_coarse_steps_hide_noise(self, step, hidden):
+        """Steps below the noise of the encoder do not, and finer ones than any encoder's."""
+        time = np.arange(0.0, 20.0, 0.004)
+        angle = np.column_stack([np.sin(1.1 * time), np.cos(1.7 * time)])
+        angle += 2e-5 * np.random.default_rng(7).standard_normal(angle.shape)
+        if step is not None:
+            angle = step * np.round(angle / step)
+        found = hidden_by_rounding(time, angle, [slice(0, len(time))])
+        assert found == (None if hidden is None else pytest.approx(hidden))
 
 
 class TestSamples:

@@ -108,6 +108,13 @@ def test_a_log_as_it_is(tmp_path: Path, urdf: Path, table: Mapping[str, Floats])
     assert {group.body for group in looked.groups} == set(JOINTS)
 
 
+def test_coarse_positions_are_not_called_filtered(
+    tmp_path: Path, urdf: Path, table: Mapping[str, Floats]
+) -> None:
+    looked = look(urdf, tmp_path / "a.csv", table, q=np.round(table["q"], 3))
+    assert reading(looked, "positions") == ("in steps of 1 mrad", "undetermined")
+
+
 def negated(table: Mapping[str, Floats]) -> dict[str, Floats]:
     return {"tau": -table["tau"]}
 

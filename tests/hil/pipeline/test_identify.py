@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 import shutil
 from contextlib import nullcontext
 from dataclasses import replace
@@ -48,6 +49,7 @@ from identification.model.friction import FrictionLaw
 from identification.selection.questions import SuggestedDelay
 from identification.selection.settings import Settings, Strength
 from identification.signals.samples import Preprocessing
+from identification.validation.purpose_messages import requirement
 from sim_fixtures.ns16 import URDF_PATH
 from tests.hil.simulated_logs import archive_of, simulate
 
@@ -396,6 +398,16 @@ class TestSources:
         identification = identified(*campaign.folder.completed("excitation"))
         line = "Judged on a repetition of the fitted motion"
         assert line in identification.verdict.line
+
+    def test_show_how_fast_a_simulation_was_tested(self, campaign):
+        identification = identified(*campaign.folder.completed("excitation"))
+        purpose = next(
+            each for each in identification.verdict.purposes if each.name == "simulation"
+        )
+        (held_out,) = identification.prepared.held_out
+        fastest = np.abs(held_out.motion.velocity).max()
+        assert 0.9 * fastest < purpose.references["speed"] <= fastest
+        assert re.search(r"tested up to [\d.]+ rad/s and [\d.]+ rad/s²", requirement(purpose))
 
     @pytest.mark.parametrize("noise", [0.0, 0.01])
     def test_with_a_noiseless_torque_are_not_called_filtered(self, tmp_path, noise):
