@@ -12,6 +12,7 @@ from hil.base.arrays import Array
 from hil.base.errors import SourceError
 from hil.importers.plausibility import command_size
 from hil.importers.stamps import MIN_SECONDS
+from identification.signals.poses import poses_without_motion
 from identification.text import duration_text
 
 _COPIED: Final = 0.999  # of the rows
@@ -24,7 +25,8 @@ def require_motion(archive: Archive, recording: Path) -> None:
     """Check that a recording has a motion, and torques that vary if it has any.
 
     Raises:
-        SourceError: it is shorter than a second, no joint moves, or all torques are constant.
+        SourceError: it is shorter than a second, no joint moves, it has poses at rest alone, or all
+            torques are constant.
     """
     columns = archive.columns
     stamp = columns["stamp"]
@@ -34,7 +36,19 @@ def require_motion(archive: Archive, recording: Path) -> None:
         problem = f"has {samples} in {duration_text(duration)}, too few to identify from"
         remedy = "record a motion of all joints, of 10 s or more"
         raise SourceError(recording, problem, remedy=remedy)
-    if not np.ptp(np.asarray(columns["position"]), axis=0).any():
+    position = np.asarray(columns["position"])
+    if "torque" in columns and (poses := poses_without_motion(position)) is not None:
+        problem = (
+            f"has {poses} poses at rest and not the motion between them: at rest friction may have"
+            " any value within its Coulomb torque, which gravity is not told from, and nothing"
+            " shows inertia"
+        )
+        remedy = (
+            "record through the moves as well, without stopping the recording or cutting them out;"
+            " the rests may stay"
+        )
+        raise SourceError(recording, problem, remedy=remedy)
+    if not np.ptp(position, axis=0).any():
         problem = "no joint moves: every position is constant"
         remedy = "check which channels hold the measured positions (--columns 'position=NAME{}')"
         raise SourceError(recording, problem, field="position", remedy=remedy)
