@@ -38,7 +38,7 @@ def follows(found: ToAndFro, load: Floats) -> bool:
     return found.follows([TIME[:middle], TIME[middle:]], [load[:middle], load[middle:]])
 
 
-def test_play_is_that_of_the_joint_whose_load_reverses_at_its_steps() -> None:
+def test_play_is_of_the_joint_whose_load_reverses() -> None:
     position, load = motion()
     position[:, KNEE] += 0.5 * PLAY * np.sign(load[:, KNEE])
     (found,) = found_in(position)
