@@ -128,6 +128,8 @@ def _fewest_signs(hypothesis: Hypothesis, steps: Sequence[Step]) -> tuple[SignRi
 def _judged(hypothesis: Hypothesis, found: Readings) -> list[Step]:
     """Return the steps that were found, each adequate if nothing else explains the rows alike."""
     steps = list(found.steps)
+    if steps and _is_better_without(hypothesis):
+        steps = [replace(step, is_adequate=False) for step in steps]
     if not found.adequacy.is_enough:
         steps = _doubted(steps, hypothesis)
     doubted = [step for step in steps if not step.sure]
@@ -311,6 +313,15 @@ def _signed(found: Hypothesis) -> Iterator[tuple[Change, Hypothesis, list[Step]]
     for change in found.restarted().signs_by_joint_fit():
         again = found.restarted([change])
         yield change, again, again.by_joint_fit(())
+
+
+def _is_better_without(found: Hypothesis) -> bool:
+    """Return whether a free fit explains the rows much better without any change than with them.
+
+    Such as a heavy load on the flange, which the masses of the description contradict, and which
+    exchanged joints of a wrist imitate in a part.
+    """
+    return found.restarted().free_fit().ratio_to(found.free_fit()) < 1.0 - LARGE_REDUCTION
 
 
 def _doubted(steps: Sequence[Step], found: Hypothesis) -> list[Step]:
