@@ -39,14 +39,11 @@ def require_motion(archive: Archive, recording: Path) -> None:
     position = np.asarray(columns["position"])
     if "torque" in columns and (poses := poses_without_motion(position)) is not None:
         problem = (
-            f"has {poses} poses at rest and not the motion between them: at rest friction may have"
-            " any value within its Coulomb torque, which gravity is not told from, and nothing"
-            " shows inertia"
+            f"has {poses} poses at rest but not the motion between them: friction at rest may have"
+            " any value within its Coulomb torque, so that gravity cannot be separated from it, and"
+            " nothing shows inertia"
         )
-        remedy = (
-            "record through the moves as well, without stopping the recording or cutting them out;"
-            " the rests may stay"
-        )
+        remedy = "record the moves between the poses as well; the rests may stay in the recording"
         raise SourceError(recording, problem, remedy=remedy)
     if not np.ptp(position, axis=0).any():
         problem = "no joint moves: every position is constant"

@@ -72,7 +72,7 @@ def test_other_steps_are_no_play(change) -> None:
 
 
 def test_play_is_found_whatever_the_rate() -> None:
-    """At 500 Hz; at 40 Hz a step is not told from the motion."""
+    """At 500 Hz; at 40 Hz a step cannot be distinguished from the motion."""
     position, load = motion()
     position[:, KNEE] += 0.5 * PLAY * np.sign(load[:, KNEE])
     recording = Recording(time=TIME / 2.0, position=position, torque=position, joint_names=NAMES)

@@ -56,7 +56,7 @@ def test_poses_alone_are_refused_with_what_to_record(tmp_path: Path) -> None:
     robot = Robot.from_urdf(URDF)
     with pytest.raises(SourceError, match="has 25 poses at rest") as refused:
         look_at(log, lambda _: robot, ImportOptions())
-    assert "record through the moves as well" in (refused.value.remedy or "")
+    assert "record the moves between the poses" in (refused.value.remedy or "")
     with pytest.raises(SourceError, match="has 25 poses at rest"):
         hil.identify(log, urdf=URDF)
 
