@@ -13,7 +13,7 @@ from identification.arrays import Array
 from identification.hypotheses.column_scores import ColumnScore, column_score
 from identification.hypotheses.explanation import ExplainedFit, Explanation
 from identification.hypotheses.joint_changes import Change, changed_samples
-from identification.hypotheses.sizes import estimated_size
+from identification.hypotheses.sizes import ChangeSize, estimated_size
 from identification.hypotheses.torque_columns import BLOCKS, ColumnSums, columns_of
 from identification.model.link_wrenches import N_LINK
 from identification.model.robot import RobotModel
@@ -22,6 +22,8 @@ from identification.signals.samples import Samples
 
 _SCALE_ROUNDS: Final = 20  # fits, each with the scale of the one before undone
 _SCALE_TOLERANCE: Final = 1e-3  # relative change of a scale
+_LOAD: Final = Change("payload")  # that nobody stated
+_OTHER_SIGMAS: Final = 3.0  # standard deviations by which a size with a load is another one
 _PARTS_PER_BLOCK: Final = 4  # parts of a block whose scatter gives the interval of a size
 
 
@@ -127,17 +129,23 @@ class ColumnFit:
         tables = ColumnSums.of(
             self.model, self.recordings, values, blocks=self.blocks, divided=_PARTS_PER_BLOCK
         )
-        found = estimated_size(
-            explanation.change,
-            tables,
-            self.model,
-            values,
-            known=self.known,
-            prior=self.fitted.prior,
-            scale_std=self.fitted.scale_std,
-        )
+
+        def given(known: Sequence[Change]) -> ChangeSize | None:
+            return estimated_size(
+                explanation.change,
+                tables,
+                self.model,
+                values,
+                known=known,
+                prior=self.fitted.prior,
+                scale_std=self.fitted.scale_std,
+            )
+
+        found = given(self.known)
         if found is None:
             return explanation._replace(size=None, std=0.0)
+        if explanation.change.is_constant and _LOAD not in self.known:
+            found = _between(found, given([*self.known, _LOAD]))
         return explanation._replace(
             size=found.size, std=found.std, interval_factor=found.interval_factor
         )
@@ -160,3 +168,17 @@ class ColumnFit:
             if abs(more.mean()) < _SCALE_TOLERANCE:
                 break
         return fit, size, std
+
+
+def _between(size: ChangeSize, loaded: ChangeSize | None) -> ChangeSize:
+    """Return the size of a torque constant, between those without and with an unknown load.
+
+    Such a load changes the torques that the constant is compared with. Where the two sizes
+    contradict each other, neither is to be believed alone.
+    """
+    if loaded is None or abs(loaded.size - size.size) < _OTHER_SIGMAS * loaded.std:
+        return size
+    half = 0.5 * abs(loaded.size - size.size)
+    return loaded._replace(
+        size=0.5 * (loaded.size + size.size), std=float(np.hypot(loaded.std, half))
+    )
