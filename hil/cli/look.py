@@ -44,7 +44,7 @@ def look(
     verbose: VerboseOption = False,
     json: JsonOption = False,
 ) -> None:
-    """Show what each channel of a recording means, how certain that is, and what they determine.
+    """Show what each channel of a recording means, how certain that is, and what can be identified.
 
     Names, units and the slope of the positions decide some of it; with --urdf the torque decides
     the rest: side, sign, order and zero of the joints, gravity, mounting, delay and low-pass.

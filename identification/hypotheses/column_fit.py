@@ -23,7 +23,6 @@ from identification.signals.samples import Samples
 _SCALE_ROUNDS: Final = 20  # fits, each with the scale of the one before undone
 _SCALE_TOLERANCE: Final = 1e-3  # relative change of a scale
 _LOAD: Final = Change("payload")  # that nobody stated
-_OTHER_SIGMAS: Final = 3.0  # standard deviations by which a size with a load is another one
 _PARTS_PER_BLOCK: Final = 4  # parts of a block whose scatter gives the interval of a size
 
 
@@ -122,7 +121,10 @@ class ColumnFit:
         return np.asarray(noise**2 * self.tables.rows.sum(axis=0))
 
     def sized(self, explanation: Explanation, values: Array | None = None) -> Explanation:
-        """Return an explanation with the size that is most probable, by a fit with it (p,)."""
+        """Return an explanation with the size that is most probable, by a fit with it (p,).
+
+        A torque constant has none where its size with an unknown load is another one.
+        """
         values = self.fitted.values if values is None else values
         if explanation.change.meaning == "arm":
             return explanation
@@ -142,10 +144,13 @@ class ColumnFit:
             )
 
         found = given(self.known)
+        if found is not None and explanation.change.is_constant and _LOAD not in self.known:
+            # It changes the torques that a constant is compared with.
+            loaded = given([*self.known, _LOAD])
+            if loaded is not None and loaded.differs_from(found):
+                found = None
         if found is None:
             return explanation._replace(size=None, std=0.0)
-        if explanation.change.is_constant and _LOAD not in self.known:
-            found = _between(found, given([*self.known, _LOAD]))
         return explanation._replace(
             size=found.size, std=found.std, interval_factor=found.interval_factor
         )
@@ -168,17 +173,3 @@ class ColumnFit:
             if abs(more.mean()) < _SCALE_TOLERANCE:
                 break
         return fit, size, std
-
-
-def _between(size: ChangeSize, loaded: ChangeSize | None) -> ChangeSize:
-    """Return the size of a torque constant, between those without and with an unknown load.
-
-    Such a load changes the torques that the constant is compared with. Where the two sizes
-    contradict each other, neither is to be believed alone.
-    """
-    if loaded is None or abs(loaded.size - size.size) < _OTHER_SIGMAS * loaded.std:
-        return size
-    half = 0.5 * abs(loaded.size - size.size)
-    return loaded._replace(
-        size=0.5 * (loaded.size + size.size), std=float(np.hypot(loaded.std, half))
-    )

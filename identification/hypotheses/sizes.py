@@ -22,6 +22,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from identification.arrays import Array
+from identification.distributions import SIGNIFICANT_SIGMAS
 from identification.estimators.covariance import cluster_covariance, solve_with_prior
 from identification.estimators.prior import GaussianPrior
 from identification.factor.normal_equations import NormalEquations
@@ -51,6 +52,10 @@ class ChangeSize(NamedTuple):
     size: float
     std: float  # cluster-robust, with that of the prior
     interval_factor: float  # standard deviations in half a 95 % interval
+
+    def differs_from(self, other: ChangeSize) -> bool:
+        """Whether it differs significantly from another size, by its own deviation."""
+        return abs(self.size - other.size) > SIGNIFICANT_SIGMAS * self.std
 
 
 def estimated_size(

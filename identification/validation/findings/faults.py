@@ -156,8 +156,11 @@ def _is_left_out(each: Explanation, evidence: Evidence, limits: Thresholds) -> b
     change = each.change
     if _outliers_decide(evidence, limits):
         return True
-    # Play, which the positions alone show, resembles both.
-    if evidence.context.play and change.meaning in ("delay", "drift"):
+    # Play, which the positions alone show, resembles a delay, and a drift of its joint.
+    of_play = {each.joint for each in evidence.context.play}
+    if of_play and (
+        change.meaning == "delay" or (change.meaning == "drift" and of_play & {*change.joints})
+    ):
         return True
     # The lag of commanded positions is that of the servo.
     if evidence.context.commanded_positions and change.meaning == "delay":
