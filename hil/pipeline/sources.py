@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from collections import defaultdict
 from collections.abc import Iterator, Sequence
 from contextlib import suppress
@@ -339,24 +340,26 @@ def refuse_duplicates(archives: Sequence[Path | Archive]) -> None:
 
     Files with the same bytes, or imports of these and of the same episode in them.
     """
-    seen: dict[str, Path] = {}
+    seen: dict[str, str] = {}
     for archive in archives:
         path = place_of(archive)
+        name = str(path)
         try:
-            digest = (
-                archive.header.entries["source_sha256"] + archive.header.entries.get(EPISODE, "")
-                if isinstance(archive, Archive)
-                else file_digest(archive)
-            )
+            if isinstance(archive, Archive):
+                entries = archive.header.entries
+                digest = entries["source_sha256"] + entries.get(EPISODE, "")
+                name = ", ".join(json.loads(entries["source"]))
+            else:
+                digest = file_digest(archive)
         except OSError:
             continue  # reported when it is opened
         if digest in seen:
-            is_same = path == seen[digest]
+            is_same = name == seen[digest]
             fault = "was given twice" if is_same else f"is a copy of {seen[digest]}"
             raise InputError(
                 path, fault, remedy="give it once" if is_same else "give only one of them"
             )
-        seen[digest] = path
+        seen[digest] = name
 
 
 def _incomplete(archive: Archive) -> Note | None:

@@ -174,6 +174,15 @@ class TestWhatWasRead:
         assert any(line.startswith("tau1 .. tau3: torque") for line in read.channels)
         assert read.changes[0] in (place / "report.html").read_text()
 
+    def test_a_log_that_is_given_twice_is_named(self, folder: Path, tmp_path: Path) -> None:
+        """Not the archive in memory that was made of it."""
+        log = folder / "a.csv"
+        with pytest.raises(InputError, match=r"a\.csv: was given twice"):
+            hil.identify([log, log], urdf=folder / "three.urdf")
+        copy = shutil.copy(log, tmp_path / "copy.csv")
+        with pytest.raises(InputError, match=r"copy\.csv: is a copy of a\.csv"):
+            hil.identify([log, copy], urdf=folder / "three.urdf")
+
     def test_a_log_that_is_right_has_no_changes(self, result: Any) -> None:
         assert [read.use for read in result.results.recordings] == ["fitted", "predicted"]
         assert [read.changes for read in result.results.recordings] == [[], []]
