@@ -78,14 +78,6 @@ class _Trend(NamedTuple):
         return np.asarray((table - mean).reshape(values.shape))
 
 
-def drift_of_factors(
-    model: RobotModel, values: Array, factors: Sequence[Factor]
-) -> FrictionDrift | None:
-    """Return the drift from time-ordered factors of recordings; None with too few blocks."""
-    pulls = _friction_pulls(model, values, factors)
-    return None if pulls is None else friction_trend(_sums(model, values, pulls))
-
-
 def with_drift(
     model: RobotModel, estimate: Estimate, recordings: Sequence[Factor], inverse: Array
 ) -> Estimate:

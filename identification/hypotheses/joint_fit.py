@@ -70,7 +70,6 @@ class JointFit:
         zero: to add to the recorded positions (n,) [rad].
         gain: factor of each measured torque over that of the arm, less one (n,).
         zero_std: standard deviations (n,) [rad].
-        gain_std: likewise (n,).
         values: parameters (p,) of the model.
         error: of each joint as a share of its torque (n,), of the fitted rows.
         cost: twice the negative log posterior, to compare fits of the same rows.
@@ -81,7 +80,6 @@ class JointFit:
     zero: Array
     gain: Array
     zero_std: Array
-    gain_std: Array
     values: Array
     error: Array
     cost: float
@@ -454,10 +452,10 @@ def _fitted(problem: _Problem, free: Mask, point: _Point) -> JointFit:
         sums = problem.linearised(point, free)
         if before - point.cost < _COST_TOLERANCE:
             break
-    std = np.sqrt(ROWS_PER_FACT * _inverse(sums.matrix).diagonal()[p:])
+    zero_std = np.sqrt(ROWS_PER_FACT * _inverse(sums.matrix).diagonal()[p : p + n])
     power = np.where(problem.power > 0.0, problem.power, np.inf)
     error = np.sqrt(point.squares / power)
-    return JointFit(point.zero, point.gain, std[:n], std[n:], point.values, error, point.cost, free)
+    return JointFit(point.zero, point.gain, zero_std, point.values, error, point.cost, free)
 
 
 def _tied(problem: _Problem, fit: JointFit) -> tuple[int, ...]:

@@ -20,17 +20,14 @@ from identification.model.robot import RobotModel
 from identification.signals.block_mean import BlockMean, block_index, block_mean
 from identification.signals.samples import Samples
 from identification.signals.spectrum import power_density
-from identification.validation.angle_ripple import AngleRipple, find_angle_ripple
 from identification.validation.prediction import PredictionError
+from identification.validation.ripple import Ripple, joint_ripple, motor_ripple
 
 Rows = NDArray[np.bool_]
 
 RESIDUAL_BINS: Final = 12
 # probability of a false finding per joint, over all its bins
 FALSE_FINDING_PROBABILITY: Final = 0.001
-# Per motor turn: eccentricity 1; strain wave gears 2; pole pairs and slots of servo motors above.
-HARMONICS: Final = (1, 2, 3, 4, 6)
-_HARMONIC_SIGMAS: Final = 4.1  # largest of five harmonics: probability of about 0.001
 # robust standard deviations; one normal sample in 500 million is beyond six
 _OUTLIER_SIGMAS: Final = 6.0
 _MOST_JUMPS: Final = 1000  # outliers that are looked at
@@ -110,50 +107,6 @@ def _profile(
                 table[:, joint] = some.reshape(-1, RESIDUAL_BINS)
         sums.append(binned_sums)
     return Profile(edges, block_mean(sums, repeated))
-
-
-class Ripple(NamedTuple):
-    """Residual of n joints that follows the angle of their motors."""
-
-    parts: BlockMean  # cosine and sine part of each of `HARMONICS` (n, H, 2) [N·m or N]
-
-    @property
-    def amplitude(self) -> Array:
-        """Amplitude per joint and harmonic (n, H) [N·m or N], NaN where unknown."""
-        return np.asarray(np.hypot(self.parts.mean[..., 0], self.parts.mean[..., 1]))
-
-    @property
-    def rms(self) -> Array:
-        """RMS of all harmonics (n,) [N·m or N], with noise subtracted."""
-        squares = 0.5 * (self.parts.mean**2 - self.parts.std**2).sum(axis=-1)
-        return np.asarray(np.sqrt(np.maximum(np.nan_to_num(squares).sum(axis=-1), 0.0)))
-
-    @property
-    def significant(self) -> Rows:
-        """Whether some harmonic of a joint is significant (n,)."""
-        std = np.sqrt(np.mean(self.parts.std**2, axis=-1))
-        return np.asarray(
-            (np.nan_to_num(self.amplitude) > _HARMONIC_SIGMAS * np.nan_to_num(std)).any(-1)
-        )
-
-    def strongest(self, joint: int) -> int:
-        """Return the periods per motor turn of a joint's largest harmonic."""
-        return HARMONICS[int(np.nan_to_num(self.amplitude[joint]).argmax())]
-
-
-def _ripple_sums(samples: Samples, residual: Array, motor_from_joint: Array) -> Array:
-    """Sum a residual (m, n) times cosine and sine, and their squares (2, B, n, H, 2)."""
-    block = block_index(samples)
-    motor = samples.motion.position @ motor_from_joint.T
-    count = int(block[-1]) + 1
-    sums = np.zeros((2, count, residual.shape[1], len(HARMONICS), 2))
-    for joint, rows in enumerate(samples.usable.T):
-        for h, harmonic in enumerate(HARMONICS):
-            angle = harmonic * motor[rows, joint]
-            for part, wave in enumerate((np.cos(angle), np.sin(angle))):
-                for table, factor in zip(sums, (residual[rows, joint], wave), strict=True):
-                    table[:, joint, h, part] = np.bincount(block[rows], factor * wave, count)
-    return sums
 
 
 def _drift_sums(
@@ -274,11 +227,10 @@ class ResidualChecks:
     autocorrelation: Autocorrelation  # of the fitted recordings
     speed: Profile  # over the joint's own speed
     position: Profile  # over the joint's own position
-    ripple: Ripple | None  # over the motor angle; None without gear ratios
+    ripple: Ripple  # over the motor angle, without gear ratios over the joint angle
     drift: FrictionDrift | None  # None with too few recordings
     friction_share: Array  # friction over measured torque of the fitted recordings (n,)
     outliers: Outliers  # of the unseen motion, or of the fitted one without it
-    angle_ripple: AngleRipple | None = None  # over the joint's angle; None with gear ratios
 
     def share(self, size: Array) -> Array:
         """Return a residual (n,) as a share of the torque; zero for a joint without rows."""
@@ -303,7 +255,7 @@ def check_residuals(
         training: recordings that were fitted, in the order in which drift is tested.
         held_out: recordings of unseen motion.
         same_motion: whether the training repeats one motion.
-        motor_from_joint: motor angles per joint angle (n, n), which ripple needs.
+        motor_from_joint: motor angles per joint angle (n, n); None without gear ratios.
     """
     runs = [*training, *held_out]
     fitted = len(training)
@@ -319,13 +271,10 @@ def check_residuals(
     drift = [
         _drift_sums(model, values, *pair, pieces) for pair in zip(training, residuals, strict=False)
     ]
-    ripple = None
-    if motor_from_joint is not None:
-        waves = [
-            _ripple_sums(*run_residual, motor_from_joint)
-            for run_residual in zip(runs, residuals, strict=True)
-        ]
-        ripple = Ripple(block_mean(waves, repeated))
+    if motor_from_joint is None:
+        ripple = joint_ripple(model, runs, residuals)
+    else:
+        ripple = motor_ripple(runs, residuals, motor_from_joint, repeated)
     friction_power = sum(run_sums[1].sum(axis=0) for run_sums in drift)
     seen = torque[:fitted].sum(axis=0)
     judged = slice(fitted if held_out else 0, None)
@@ -347,7 +296,6 @@ def check_residuals(
         speed=_profile(runs, residuals, [run.motion.velocity for run in runs], repeated),
         position=_profile(runs, residuals, [run.motion.position for run in runs], repeated),
         ripple=ripple,
-        angle_ripple=find_angle_ripple(model, runs, residuals) if ripple is None else None,
         drift=friction_trend(drift),
         friction_share=np.sqrt(friction_power / np.where(seen > 0.0, seen, 1.0)),
         outliers=outliers,

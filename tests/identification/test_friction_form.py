@@ -6,7 +6,7 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
-from identification.estimators.friction_drift import drift_of_factors, with_drift
+from identification.estimators.friction_drift import with_drift
 from identification.estimators.friction_form import (
     FORMS,
     FormUncertainty,
@@ -159,19 +159,25 @@ def drifting(noise=0.0):
     return recorded(level * MODEL.torque(friction, MOTION), noise=noise)
 
 
-def widened(samples):
-    """Return the least-squares estimate of samples, and the same with drift in its intervals."""
+def widened(samples, parts=1):
+    """Return the least-squares estimate of samples, and the same with drift in its intervals.
+
+    The drift is measured in successive parts, as in several recordings.
+    """
+    edges = np.linspace(0, len(samples.motion.time), parts + 1).astype(int)
+    recordings = [Factor.by_time(MODEL, samples.between(a, b)) for a, b in pairwise(edges)]
     factor = Factor.by_time(MODEL, samples)
     weights = joint_weights(factor)
     estimate = fit_least_squares(MODEL, [samples], factor=factor)
     estimate = replace(estimate, noise_std=weights**-0.5)  # by which it was fitted
     inverse = factor.solve(weights).inverse
-    return estimate, with_drift(MODEL, estimate, [factor], inverse)
+    return estimate, with_drift(MODEL, estimate, recordings, inverse)
 
 
 class TestDrift:
-    def test_the_interval_holds_friction_at_any_time(self):
-        estimate, wider = widened(drifting(0.1 * NOISE))
+    @pytest.mark.parametrize("parts", [1, 3])
+    def test_the_interval_holds_friction_at_any_time(self, parts):
+        estimate, wider = widened(drifting(0.1 * NOISE), parts)
         half = wider.interval_factor * wider.std
         for k in (COULOMB[ELBOW], VISCOUS[ELBOW]):
             for level in (0.95, 1.0, 1.05):
@@ -197,19 +203,9 @@ class TestDrift:
         estimate, wider = widened(recorded())
         assert wider is estimate
 
-    @pytest.mark.parametrize("parts", [1, 3])
-    def test_it_is_measured_by_factors_of_recordings(self, parts):
-        samples = drifting(0.1 * NOISE)
-        edges = np.linspace(0, len(MOTION.time), parts + 1).astype(int)
-        factors = [Factor.by_time(MODEL, samples.between(a, b)) for a, b in pairwise(edges)]
-        drift = drift_of_factors(MODEL, truth(), factors)
-        assert drift is not None
-        assert drift.change[ELBOW] == pytest.approx(-0.1, abs=0.004)
-        assert list(drift.significant) == [False, True]
-
     def test_it_needs_some_time(self):
-        factor = Factor.by_time(MODEL, recorded().between(0, 100))
-        assert drift_of_factors(MODEL, truth(), [factor]) is None
+        estimate, wider = widened(drifting().between(0, 100))
+        assert wider is estimate
 
 
 class TestVerdict:

@@ -24,7 +24,6 @@ from identification.hypotheses.unseen_changes import UnseenChange
 from identification.model.known_payload import Payload
 from identification.model.robot import RobotModel
 from identification.text import percentage
-from identification.validation.angle_ripple import AngleRipple
 from identification.validation.evidence import gather
 from identification.validation.finding import Thresholds
 from identification.validation.finding_messages import LEFT_OPEN
@@ -32,14 +31,8 @@ from identification.validation.nominal_scale import NominalScale
 from identification.validation.physical_signs import Implausible, TopSpeedFriction
 from identification.validation.prediction import noise_floor
 from identification.validation.purpose import Purpose
-from identification.validation.residuals import (
-    HARMONICS,
-    BlockMean,
-    FrictionDrift,
-    Outliers,
-    Ripple,
-    check_residuals,
-)
+from identification.validation.residuals import FrictionDrift, Outliers, check_residuals
+from identification.validation.ripple import Ripple
 from identification.validation.verdict import judge
 from sim_fixtures.ns16 import load_truth, urdf_text
 from tests import messages
@@ -770,10 +763,8 @@ class TestJudgement:
 
 def ripple(size):
     """Return a ripple of the second joint, four per motor turn, of this rms."""
-    mean = np.zeros((2, len(HARMONICS), 2))
-    mean[1, HARMONICS.index(4), 0] = np.sqrt(2.0) * size
-    std = np.full_like(mean, 1e-6)
-    return Ripple(BlockMean(mean, std, np.full(2, 1000.0), np.full(2, 50)))
+    has_ripple = np.array([False, size > 0.0])
+    return Ripple("motor", np.array([1.0, 4.0]), np.array([0.0, size]), has_ripple)
 
 
 def drift(*change):
@@ -793,7 +784,7 @@ def clean():
         for seed in range(6)
     ]
     checks = check_residuals(model, values, runs[:5], runs[5:])
-    return replace(checks, ripple=None, drift=None, rms=np.full(2, 0.01))
+    return replace(checks, drift=None, rms=np.full(2, 0.01))
 
 
 def few_outliers(error, of_positions=(False, False)):
@@ -847,8 +838,9 @@ class TestPatternsOfTheResidual:
     @pytest.mark.parametrize(("share", "level"), [(0.9, "information"), (1.1, "doubtful")])
     def test_ripple_over_the_angle_is_named_without_gears(self, clean, share, level):
         size = share * Thresholds().ripple
-        of_angle = AngleRipple(np.array([np.nan, 200.0]), np.array([0.0, size]) * clean.torque_rms)
-        finding = found(residuals=replace(clean, angle_ripple=of_angle))["ripple over the angle"]
+        rms = np.array([0.0, size]) * clean.torque_rms
+        of_angle = Ripple("joint", np.array([np.nan, 200.0]), rms, rms > 0.0)
+        finding = found(residuals=replace(clean, ripple=of_angle))["ripple over the angle"]
         assert finding.level == level
         assert finding.joints == (1,)
         assert_figures(finding, {"periods": (200.0,), "relative": (size,)})

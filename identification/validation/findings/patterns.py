@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 
 from identification.arrays import Array
 from identification.validation.evidence import Evidence
 from identification.validation.finding import Finding, Mask, Thresholds, Value
-from identification.validation.residuals import Profile, ResidualChecks, Ripple
+from identification.validation.residuals import Profile, ResidualChecks
+from identification.validation.ripple import Ripple
 
 
 def _notable(checks: ResidualChecks, pattern: Profile | Ripple, limits: Thresholds) -> Mask:
@@ -80,14 +83,22 @@ def _with_worst(
 
 
 def ripple(evidence: Evidence, limits: Thresholds) -> Finding | None:
-    """Return the joints whose residual follows the motor angle, or that there are none."""
+    """Return the joints whose residual repeats with the motor angle, else with their own."""
     checks = evidence.residuals
-    if checks is None or checks.ripple is None:
+    if checks is None:
         return None
-    share = checks.share(checks.ripple.rms)
-    joints = _notable(checks, checks.ripple, limits) & ~evidence.unfitted
+    found = checks.ripple
+    share = checks.share(found.rms)
+    joints = _notable(checks, found, limits) & ~evidence.unfitted
     large = joints & (share > limits.ripple)
-    harmonic = [checks.ripple.strongest(joint) for joint in range(len(share))]
+    if found.turn == "joint":
+        if not joints.any():
+            return None
+        finding = Finding("ripple over the angle", "information", role="cause")
+        if large.any():
+            finding = replace(finding, level="doubtful", remedy="average the ripple")
+        return finding.about(joints, relative=share, periods=found.periods)
+    harmonic = [round(periods) for periods in found.periods.tolist()]
     if not joints.any():
         return Finding("no ripple", "good")
     if not large.any():
@@ -98,26 +109,6 @@ def ripple(evidence: Evidence, limits: Thresholds) -> Finding | None:
     return Finding("large ripple", "doubtful", "average the ripple", values=limit).about(
         large, relative=share, harmonic=harmonic
     )
-
-
-def angle_ripple(evidence: Evidence, limits: Thresholds) -> Finding | None:
-    """Return the joints whose residual repeats many times in a turn, where no gears are stated."""
-    checks = evidence.residuals
-    if checks is None or checks.angle_ripple is None:
-        return None
-    found = checks.angle_ripple
-    share = checks.share(found.rms)
-    is_large = (share > limits.pattern) & (found.rms > limits.pattern_of_residual * checks.rms)
-    joints = found.significant & is_large & ~evidence.unfitted
-    if not joints.any():
-        return None
-    is_doubtful = bool((share[joints] > limits.ripple).any())
-    return Finding(
-        "ripple over the angle",
-        "doubtful" if is_doubtful else "information",
-        "average the ripple" if is_doubtful else None,
-        "cause",
-    ).about(joints, relative=share, periods=found.periods)
 
 
 def friction_drift(evidence: Evidence, limits: Thresholds) -> Finding | None:

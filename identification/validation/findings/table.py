@@ -81,7 +81,6 @@ CHECKS: Final[tuple[Check, ...]] = (
     patterns.over_speed,
     patterns.over_position,
     patterns.ripple,
-    patterns.angle_ripple,
     patterns.friction_drift,
 )
 """Every check, in the order of the verdict's reasons: its line has the first one."""

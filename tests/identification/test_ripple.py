@@ -7,7 +7,7 @@ import pytest
 
 from identification.signals.recording import Recording
 from identification.signals.samples import Preprocessing, prepare
-from identification.validation.angle_ripple import AngleRipple, find_angle_ripple
+from identification.validation.ripple import Ripple, joint_ripple
 from tests.identification import three_axes
 
 TIME = np.arange(0.0, 20.0, 0.005)
@@ -15,7 +15,7 @@ KNEE = 1
 NOISE = 0.1  # N·m
 
 
-def found(periods: float, amplitude: float = NOISE) -> AngleRipple:
+def found(periods: float, amplitude: float = NOISE) -> Ripple:
     """Ripple of the knee in the residual of a motion at 200 Hz, with noise."""
     rng = np.random.default_rng(1)
     rate = np.array([1.1, 1.7, 2.3])
@@ -28,7 +28,7 @@ def found(periods: float, amplitude: float = NOISE) -> AngleRipple:
     slow = np.sin(3.0 * position) + 0.3 * np.cos(5.0 * TIME[:, None])  # what the model lacks
     residual = rng.normal(0.0, NOISE, position.shape) + NOISE * slow
     residual[:, KNEE] += amplitude * np.sin(periods * position[:, KNEE] + 0.4)
-    return find_angle_ripple(model, [samples], [np.where(samples.usable, residual, 0.0)])
+    return joint_ripple(model, [samples], [np.where(samples.usable, residual, 0.0)])
 
 
 @pytest.mark.parametrize("periods", [60.0, 101.0, 200.0])

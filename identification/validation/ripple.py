@@ -1,9 +1,9 @@
-"""Torque that repeats many times in a turn of a joint, without knowing its gears."""
+"""Torque ripple: a residual that repeats with the angle of the motors, else of the joints."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Final, NamedTuple
+from typing import Final, Literal, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,6 +14,9 @@ from identification.model.robot import RobotModel
 from identification.signals.block_mean import BlockMean, block_index, block_mean
 from identification.signals.samples import Samples
 
+# Per motor turn: eccentricity 1; strain wave gears 2; pole pairs and slots of servo motors above.
+HARMONICS: Final = (1, 2, 3, 4, 6)
+_HARMONIC_SIGMAS: Final = 4.1  # largest of five harmonics: probability of about 0.001
 # Per turn of the joint. Below, bodies, springs and cables repeat; above, hardly any motor has one.
 _LEAST_PERIODS: Final = 12.0
 _MOST_PERIODS: Final = 1000.0
@@ -25,16 +28,69 @@ _BAND: Final = 1.5  # ratio of the frequencies whose median power a peak is comp
 _FALSE_FINDING_PROBABILITY: Final = 0.001
 
 
-class AngleRipple(NamedTuple):
-    """Residual of n joints that repeats with their own angle, at its strongest period."""
+class Ripple(NamedTuple):
+    """Residual of n joints that repeats with an angle.
 
-    periods: Array  #: per turn (n,); NaN: none is significant
-    rms: Array  #: (n,) [N·m]
+    Attributes:
+        turn: whose turns the periods count.
+        periods: of the strongest wave, per turn (n,).
+        rms: (n,) [N·m or N], with noise subtracted.
+        significant: whether a joint has a ripple (n,).
+    """
 
-    @property
-    def significant(self) -> NDArray[np.bool_]:
-        """Whether a joint has one (n,)."""
-        return np.isfinite(self.periods)
+    turn: Literal["motor", "joint"]
+    periods: Array
+    rms: Array
+    significant: NDArray[np.bool_]
+
+
+def motor_ripple(
+    runs: Sequence[Samples], residuals: Sequence[Array], motor_from_joint: Array, repeated: int
+) -> Ripple:
+    """Find what repeats with the angle of each motor, at its `HARMONICS`.
+
+    Args:
+        runs: recordings.
+        residuals: of their torque (m, n), zero in rows that do not count.
+        motor_from_joint: motor angles per joint angle (n, n).
+        repeated: number of the first recordings that repeat one motion.
+    """
+    waves = [
+        _harmonic_sums(run, residual, motor_from_joint)
+        for run, residual in zip(runs, residuals, strict=True)
+    ]
+    mean, std, *_ = block_mean(waves, repeated)
+    amplitude = np.nan_to_num(np.hypot(mean[..., 0], mean[..., 1]))
+    noise = np.nan_to_num(np.sqrt(np.mean(std**2, axis=-1)))
+    squares = np.nan_to_num(0.5 * (mean**2 - std**2).sum(axis=-1))
+    return Ripple(
+        "motor",
+        np.array(HARMONICS, dtype=np.float64)[amplitude.argmax(axis=-1)],
+        np.sqrt(np.maximum(squares.sum(axis=-1), 0.0)),
+        (amplitude > _HARMONIC_SIGMAS * noise).any(axis=-1),
+    )
+
+
+def _harmonic_sums(samples: Samples, residual: Array, motor_from_joint: Array) -> Array:
+    """Sum a residual (m, n) times each wave, and its squares (2, B, n, H, 2)."""
+    block = block_index(samples)
+    motor = samples.motion.position @ motor_from_joint.T
+    count = int(block[-1]) + 1
+    sums = np.zeros((2, count, residual.shape[1], len(HARMONICS), 2))
+    for joint, rows in enumerate(samples.usable.T):
+        for h, harmonic in enumerate(HARMONICS):
+            phase = harmonic * motor[rows, joint]
+            sums[:, :, joint, h] = _wave_sums(block[rows], residual[rows, joint], phase, count)
+    return sums
+
+
+def _wave_sums(block: Indices, residual: Array, phase: Array, count: int) -> Array:
+    """Sum a residual times cosine and sine of a phase, and their squares, by block (2, B, 2)."""
+    sums = np.zeros((2, count, 2))
+    for part, wave in enumerate((np.cos(phase), np.sin(phase))):
+        for table, factor in zip(sums, (residual, wave), strict=True):
+            table[:, part] = np.bincount(block, factor * wave, count)
+    return sums
 
 
 class _Rows(NamedTuple):
@@ -51,23 +107,16 @@ class _Rows(NamedTuple):
 
     def wave(self, periods: float) -> BlockMean:
         """Return cosine and sine part of a number of periods per turn (2,)."""
-        phase = periods * self.angle
         count = int(self.block[-1]) + 1
-        sums = np.zeros((2, count, 2))
-        for part, wave in enumerate((np.cos(phase), np.sin(phase))):
-            for table, factor in zip(sums, (self.residual, wave), strict=True):
-                table[:, part] = np.bincount(self.block, factor * wave, count)
-        return block_mean([sums])
+        return block_mean([_wave_sums(self.block, self.residual, periods * self.angle, count)])
 
 
-def find_angle_ripple(
-    model: RobotModel, runs: Sequence[Samples], residuals: Sequence[Array]
-) -> AngleRipple:
-    """Find what repeats with the angle of each joint.
+def joint_ripple(model: RobotModel, runs: Sequence[Samples], residuals: Sequence[Array]) -> Ripple:
+    """Find what repeats many times in a turn of each joint, without knowing its gears.
 
-    The period is found in every second block of time and tested in the others, and the other way
-    round: both halves have to show the same one. Joints whose torque is that of one motor behind a
-    gear show eccentricity, poles and gear teeth so, at the orders times the gear ratio.
+    Eccentricity, poles and gear teeth repeat at their order times the gear ratio. The period is
+    searched in every second block of time and tested in the other blocks, and vice versa: both
+    halves must show the same one.
 
     Args:
         model: of the arm.
@@ -81,7 +130,7 @@ def find_angle_ripple(
             found = _ripple_of(rows)
             if found is not None:
                 periods[joint], rms[joint] = found
-    return AngleRipple(periods, rms)
+    return Ripple("joint", periods, rms, np.isfinite(periods))
 
 
 def _rows_of(joint: int, runs: Sequence[Samples], residuals: Sequence[Array]) -> _Rows | None:
