@@ -38,7 +38,6 @@ from hil.importers.recording_content import Use
 from hil.importers.recording_import import (
     ImportedRecording,
     ImportOptions,
-    import_bag,
     import_recording,
 )
 from hil.importers.rosbag2 import CommandStamps, Effort
@@ -367,13 +366,15 @@ def rosbag2(
     """
     names = _names(rename or [])
     options = ImportOptions(outside_limits=outside_limits)
-    asking = Asking(source, arm.robot, options, kind)
-    recording = import_bag(
+    asking = Asking(source, arm.robot, options)
+    recording = import_recording(
         source,
         output,
         arm.robot,
-        BagMap(topic=topic, effort=effort, clock=clock, command_topic=command_topic, rename=names),
         options,
+        bag=BagMap(
+            topic=topic, effort=effort, clock=clock, command_topic=command_topic, rename=names
+        ),
         held_joints=held or (),
         use=kind,
         force=force,
@@ -416,7 +417,7 @@ def log(
             what they contribute.
     """
     options = reading.options
-    asking = Asking(source, arm.robot, options, kind)
+    asking = Asking(source, arm.robot, options)
     recording = import_recording(
         source,
         output or source.with_suffix(".mcap"),

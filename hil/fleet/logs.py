@@ -38,6 +38,7 @@ from hil.importers.messages import sentence
 from hil.importers.recording_import import (
     ImportedRecording,
     ImportOptions,
+    ImportRequest,
     RobotOf,
     is_archive,
     read_by_map,
@@ -225,7 +226,7 @@ def conclude_map(log: str, reading: LogReading, cache: CacheLocation) -> ReadLog
     source = Path(log)
     as_stated = read_recording(source, reading.robot_of, reading.options)
     _require_usable(as_stated, source)
-    found = concluded(as_stated, source, reading.robot_of, reading.options, "excitation")
+    found = concluded(as_stated, source, reading.robot_of, reading.options)
     recording = found.recording
     _require_usable(recording, source)
     text = recording.text
@@ -240,7 +241,7 @@ def conclude_map(log: str, reading: LogReading, cache: CacheLocation) -> ReadLog
     )
     place = _place_of(source, reading, log_map, cache)
     _write(recording, place)
-    return _read(log, place, log_map, reading, cache, recording.files)
+    return _read(log, place, log_map, reading, cache, recording.request.files)
 
 
 def _read(
@@ -268,9 +269,8 @@ def _by_map(
         return robot if log_map.gravity is None else robot.with_gravity(log_map.gravity)
 
     outside = reading.options.outside_limits
-    return read_by_map(
-        source, robot_of, log_map.text, place=place, outside_limits=outside, files=files
-    )
+    request = ImportRequest(source, place, outside_limits=outside, files=files)
+    return read_by_map(request, robot_of, log_map.text)
 
 
 def _require_usable(recording: ImportedRecording, source: Path) -> None:

@@ -131,7 +131,7 @@ def staged(
                     continue
                 for source, place, recording in _read(path, robot_of, options, use, staging):
                     found = _concluded(
-                        recording, source, robot_of, options, use, reporter, staging.layouts
+                        recording, source, robot_of, options, reporter, staging.layouts
                     )
                     archives.append(found.recording.archive)
                     staging.recordings[place] = found.recording
@@ -176,7 +176,6 @@ def _concluded(
     source: Path,
     robot_of: RobotOf,
     options: ImportOptions,
-    use: Use,
     reporter: Reporter,
     layouts: dict[str, LayoutReading],
 ) -> Concluded:
@@ -188,13 +187,14 @@ def _concluded(
     require_torque(recording.archive, source)
     layout = layouts.get(recording.map_text or "")
     if layout is not None:
-        found = Concluded(layout.read(recording, source, robot_of, use))
+        found = Concluded(layout.read(recording, source, robot_of))
     else:
-        found = concluded(recording, source, robot_of, options, use)
+        found = concluded(recording, source, robot_of, options)
         if (layout := LayoutReading.of(recording, source, found)) is not None:
             layouts[layout.proposed] = layout
     _report(found.recording, source, reporter)
-    return found._replace(recording=replace(found.recording, files=LogFiles()))
+    request = replace(found.recording.request, files=LogFiles())
+    return found._replace(recording=replace(found.recording, request=request))
 
 
 def require_torques(staging: Staging) -> None:

@@ -84,21 +84,68 @@ class ImportOptions:
 
 
 @dataclass(frozen=True)
+class ImportRequest:
+    """A recording to read, whatever describes its channels.
+
+    Attributes:
+        source: its file or folder.
+        place: path of the archive.
+        use: what identification uses it for.
+        held_joints, coupled, outside_limits: as of :func:`hil.import_log`.
+        files: of a log, parsed once.
+    """
+
+    source: Path
+    place: Path
+    use: Use = "excitation"
+    held_joints: tuple[str, ...] = ()
+    coupled: bool = True
+    outside_limits: bool = False
+    files: LogFiles = field(default_factory=LogFiles, compare=False, repr=False)
+
+    def imported(
+        self,
+        content: RecordingContent,
+        text: str | None,
+        concluded: tuple[Conclusion, ...],
+        bag: BagMap | None = None,
+    ) -> ImportedRecording:
+        """Return what was read.
+
+        Args:
+            content: of the recording.
+            text: of its column map, TOML; None for joint states of a bag.
+            concluded: about its channels.
+            bag: map of the bag.
+        """
+        if self.files.longest is not None:
+            content = content.excerpt(self.files.longest)
+        archive, examined = content.archive(
+            self.place,
+            held_joints=self.held_joints,
+            use=self.use,
+            outside_limits=self.outside_limits,
+        )
+        return ImportedRecording(self, archive, content.source, text, concluded, examined, bag)
+
+
+@dataclass(frozen=True)
 class ImportedRecording:
     """An imported recording, in memory.
 
     Attributes:
+        request: by which it is read again with another map.
         archive: its content.
         sources: the files that it was read from.
         map_text: the column map, TOML; None for joint states of a bag, which need none.
-        bag: how those were read; None for a log.
-        is_stated: whether a whole column map was given.
-        held_joints, coupled, outside_limits: as of :func:`hil.import_log`.
         concluded: the meaning of each group of channels, what was fixed for it, and what the motion
             and the torque say, in this order.
         examined: what was found in its samples, and warnings.
+        bag: how joint states were read; None for a log.
+        is_stated: whether a whole column map was given.
     """
 
+    request: ImportRequest
     archive: Archive
     sources: tuple[Path, ...]
     map_text: str | None
@@ -106,11 +153,6 @@ class ImportedRecording:
     examined: Examined
     bag: BagMap | None = None
     is_stated: bool = False
-    #: of a log, parsed
-    files: LogFiles = field(default_factory=LogFiles, compare=False, repr=False)
-    held_joints: tuple[str, ...] = ()
-    coupled: bool = True
-    outside_limits: bool = False
 
     @property
     def text(self) -> str | None:
@@ -160,55 +202,6 @@ def has_joint_states(path: Path) -> bool:
     return bool(topics) or path.suffix.lower() != ".mcap"
 
 
-@dataclass(frozen=True)
-class _Request:
-    """What is read, and what the archive is for.
-
-    Attributes:
-        source: the recording.
-        place: path of the archive.
-        files: of a log, parsed before.
-        held_joints, use, coupled, outside_limits: as of :func:`hil.import_log`.
-    """
-
-    source: Path
-    place: Path
-    held_joints: tuple[str, ...]
-    use: Use
-    coupled: bool
-    outside_limits: bool
-    files: LogFiles = field(default_factory=LogFiles)
-
-    def imported(
-        self,
-        content: RecordingContent,
-        text: str | None,
-        concluded: tuple[Conclusion, ...],
-        bag: BagMap | None = None,
-    ) -> ImportedRecording:
-        """Return what was read, with the text of its column map or the map of its bag."""
-        if self.files.longest is not None:
-            content = content.excerpt(self.files.longest)
-        archive, examined = content.archive(
-            self.place,
-            held_joints=self.held_joints,
-            use=self.use,
-            outside_limits=self.outside_limits,
-        )
-        return ImportedRecording(
-            archive,
-            content.source,
-            text,
-            concluded,
-            examined,
-            bag,
-            files=self.files,
-            held_joints=self.held_joints,
-            coupled=self.coupled,
-            outside_limits=self.outside_limits,
-        )
-
-
 def read_recording(
     source: Path,
     robot_of: RobotOf,
@@ -239,14 +232,9 @@ def read_recording(
         SourceError: it cannot be read, or its channels leave a quantity open.
     """
     place = place or source.with_suffix(".mcap")
-    request = _Request(
-        source,
-        place,
-        tuple(held_joints),
-        use,
-        coupled,
-        options.outside_limits,
-        files or LogFiles(),
+    outside = options.outside_limits
+    request = ImportRequest(
+        source, place, use, tuple(held_joints), coupled, outside, files or LogFiles()
     )
     return _of_recorded_joints(partial(_imported, request, options=options), robot_of, source)
 
@@ -261,6 +249,7 @@ def import_recording(
     robot_of: RobotOf,
     options: ImportOptions = ImportOptions(),
     *,
+    bag: BagMap | None = None,
     held_joints: Sequence[str] = (),
     use: Use = "excitation",
     coupled: bool = True,
@@ -274,6 +263,7 @@ def import_recording(
         output: path of the archive.
         robot_of: reads the robot's cell or URDF.
         options: of the import.
+        bag: topics of a bag; None to find them, or for a log.
         held_joints: joints that were clamped.
         use: what the recording is for.
         coupled: whether coupled angles are searched for.
@@ -285,84 +275,31 @@ def import_recording(
         ArchiveWriteError: the archive exists or cannot be written.
     """
     require_writable(output, [source], force=force)
-    imported = read_recording(
-        source,
-        robot_of,
-        options,
-        place=output,
-        held_joints=held_joints,
-        use=use,
-        coupled=coupled,
+    request = ImportRequest(
+        source, output, use, tuple(held_joints), coupled, options.outside_limits
     )
-    imported = asked(imported)
+    read = (
+        partial(_imported, request, options=options)
+        if bag is None
+        else partial(_read_bag, request, stated=bag, path=options.columns)
+    )
+    imported = asked(_of_recorded_joints(read, robot_of, source))
     imported.write(output, force=force)
     return imported
 
 
-def read_again(
-    imported: ImportedRecording, source: Path, robot_of: RobotOf, text: str, use: Use
-) -> ImportedRecording:
-    """Read a log by another column map; its files are not parsed again.
-
-    Args:
-        imported: the log as it was read before.
-        source: its file or folder.
-        robot_of: reads the robot's cell or URDF.
-        text: of the map, TOML.
-        use: what the recording is for.
-
-    Raises:
-        SourceError: the map leaves a quantity open.
-    """
-    place = imported.archive.path
-    return read_by_map(
-        source,
-        robot_of,
-        text,
-        place=place,
-        use=use,
-        files=imported.files,
-        held_joints=imported.held_joints,
-        coupled=imported.coupled,
-        outside_limits=imported.outside_limits,
-    )
-
-
-def read_by_map(
-    source: Path,
-    robot_of: RobotOf,
-    text: str,
-    *,
-    place: Path,
-    use: Use = "excitation",
-    outside_limits: bool = False,
-    files: LogFiles | None = None,
-    held_joints: Sequence[str] = (),
-    coupled: bool = True,
-) -> ImportedRecording:
-    """Read a log or a bag by its map; see :func:`read_recording`.
-
-    Args:
-        source: file or folder of the recording.
-        robot_of: reads the robot's cell or URDF.
-        text: of the map, TOML.
-        place: path that its archive will have.
-        use: what the recording is for.
-        outside_limits: whether positions may leave the limits of the URDF.
-        files: parsed before.
-        held_joints: joints that were clamped.
-        coupled: whether coupled angles are searched for.
+def read_by_map(request: ImportRequest, robot_of: RobotOf, text: str) -> ImportedRecording:
+    """Read a log or a bag by its map, TOML; see :func:`read_recording`.
 
     Raises:
         SourceError: it cannot be read, or the map leaves a quantity open.
     """
+    source = request.source
     tables = parse_toml(text)
-    request = _Request(
-        source, place, tuple(held_joints), use, coupled, outside_limits, files or LogFiles()
-    )
-    if (bag := BagMap.of(tables)) is not None:
+    bag = BagMap.of(tables)
+    if bag is not None:
         return _of_recorded_joints(
-            lambda robots: _read_bag(request, robots, bag, None), robot_of, source
+            partial(_read_bag, request, stated=bag, path=None), robot_of, source
         )
     columns = ColumnMap.model_validate(tables)
 
@@ -371,49 +308,6 @@ def read_by_map(
         return _of_map(request, _arm_of_map(robot, columns.arm, source), columns, text)
 
     return _of_recorded_joints(read, robot_of, source)
-
-
-def import_bag(
-    source: Path,
-    output: Path,
-    robot_of: RobotOf,
-    bag: BagMap,
-    options: ImportOptions = ImportOptions(),
-    *,
-    held_joints: Sequence[str] = (),
-    use: Use = "excitation",
-    force: bool = False,
-    asked: Callable[[ImportedRecording], ImportedRecording] = _as_it_is,
-) -> ImportedRecording:
-    """Import joint states of a bag.
-
-    Args:
-        source: file or folder of the bag.
-        output: path of the archive.
-        robot_of: reads the robot's cell or URDF.
-        bag: map of its topics.
-        options: of the import.
-        held_joints: joints that were clamped.
-        use: what the recording is for.
-        force: whether an existing archive is replaced.
-        asked: returns the recording as its motion and torque say that it is.
-
-    Raises:
-        SourceError: it cannot be read, or its channels leave a quantity open.
-        ArchiveWriteError: the archive exists or cannot be written.
-    """
-    require_writable(output, [source], force=force)
-    request = _Request(
-        source, output, tuple(held_joints), use, coupled=True,
-        outside_limits=options.outside_limits,
-    )  # fmt: skip
-
-    def read(robots: RobotOf) -> ImportedRecording:
-        return _read_bag(request, robots, bag, options.columns)
-
-    imported = asked(_of_recorded_joints(read, robot_of, source))
-    imported.write(output, force=force)
-    return imported
 
 
 def _of_recorded_joints(
@@ -544,16 +438,19 @@ def read_episodes(
     """
     data = DataSet.read(source)
     for episode in data.episodes:
-        request = _Request(
-            episode.path, place_of(episode.path), (), use, coupled=True,
-            outside_limits=options.outside_limits,
-        )  # fmt: skip
+        place = place_of(episode.path)
+        request = ImportRequest(episode.path, place, use, outside_limits=options.outside_limits)
         read = partial(_of_episode, request, data=data, episode=episode, options=options)
         yield episode.path, _of_recorded_joints(read, robot_of, source)
 
 
 def _of_episode(
-    request: _Request, robot_of: RobotOf, *, data: DataSet, episode: Episode, options: ImportOptions
+    request: ImportRequest,
+    robot_of: RobotOf,
+    *,
+    data: DataSet,
+    episode: Episode,
+    options: ImportOptions,
 ) -> ImportedRecording:
     """Read an episode of a data set."""
     robot = robot_of(lambda: data.joints)
@@ -570,7 +467,9 @@ def _of_episode(
     return _by_map(request, robot, columns, text, content, concluded)
 
 
-def _imported(request: _Request, robot_of: RobotOf, *, options: ImportOptions) -> ImportedRecording:
+def _imported(
+    request: ImportRequest, robot_of: RobotOf, *, options: ImportOptions
+) -> ImportedRecording:
     """Read with the robot as it is described; see :func:`read_recording`."""
     source = request.source
     if is_data_set(source):
@@ -597,7 +496,7 @@ def _imported(request: _Request, robot_of: RobotOf, *, options: ImportOptions) -
 
 
 def _proposed(
-    request: _Request, robot: Robot, options: ImportOptions, some: PartialMap | None
+    request: ImportRequest, robot: Robot, options: ImportOptions, some: PartialMap | None
 ) -> Proposal:
     """Return the map that a log or a folder suggests, with the entries that some map states."""
     form = Format(missing="drop") if options.drop_missing else None
@@ -648,7 +547,7 @@ def _scaled(chosen: Mapping[str, str]) -> tuple[dict[str, str], dict[str, float]
     return names, scales
 
 
-def _with_own_rows(request: _Request, robot: Robot, proposal: Proposal) -> Proposal:
+def _with_own_rows(request: ImportRequest, robot: Robot, proposal: Proposal) -> Proposal:
     """Return a proposal that interpolates, where quantities are in rows of their own."""
     columns = proposal.columns
     source = request.source
@@ -667,7 +566,7 @@ def _with_own_rows(request: _Request, robot: Robot, proposal: Proposal) -> Propo
 
 
 def _of_map(
-    request: _Request,
+    request: ImportRequest,
     robot: Robot,
     columns: ColumnMap,
     text: str,
@@ -678,7 +577,7 @@ def _of_map(
     return _by_map(request, robot, columns, text, content, concluded)
 
 
-def _read_log(request: _Request, robot: Robot, columns: ColumnMap) -> RecordingContent:
+def _read_log(request: ImportRequest, robot: Robot, columns: ColumnMap) -> RecordingContent:
     return read_log(
         request.source,
         robot=robot,
@@ -689,7 +588,7 @@ def _read_log(request: _Request, robot: Robot, columns: ColumnMap) -> RecordingC
 
 
 def _by_map(
-    request: _Request,
+    request: ImportRequest,
     robot: Robot,
     columns: ColumnMap,
     text: str,
@@ -719,7 +618,7 @@ def _read_as_log(source: Path, options: ImportOptions) -> bool:
 
 
 def _read_bag(
-    request: _Request, robot_of: RobotOf, stated: BagMap, path: Path | None
+    request: ImportRequest, robot_of: RobotOf, stated: BagMap, path: Path | None
 ) -> ImportedRecording:
     """Read joint states by a map of a bag, from a path if it has one."""
     source = request.source

@@ -18,8 +18,7 @@ from hil.importers.conclusions import Certainty, TorqueSize
 from hil.importers.imported_robot import Robot
 from hil.importers.messages import sentence
 from hil.importers.plausibility import constant_torques
-from hil.importers.recording_content import Use
-from hil.importers.recording_import import ImportedRecording, ImportOptions, RobotOf, read_again
+from hil.importers.recording_import import ImportedRecording, ImportOptions, RobotOf, read_by_map
 from hil.look.look import look_at_joints, mountings
 from hil.look.messages import choice_text, fit_alike, sentences, setting_text
 from hil.look.other_arm import Contradictions
@@ -89,7 +88,7 @@ class LayoutReading:
         return cls(imported.map_text, source.name, found.look)
 
     def read(
-        self, imported: ImportedRecording, source: Path, robot_of: RobotOf, use: Use
+        self, imported: ImportedRecording, source: Path, robot_of: RobotOf
     ) -> ImportedRecording:
         """Read a recording with the same columns in the same way.
 
@@ -100,7 +99,6 @@ class LayoutReading:
             imported: the recording as its names and units say it is.
             source: its file or folder.
             robot_of: reads the robot's cell or URDF.
-            use: what the recording is for.
 
         Raises:
             RefusedRecordingError: every joint that moves does so under a constant torque.
@@ -108,7 +106,7 @@ class LayoutReading:
         _require_measured(imported.archive, source)
         if self.look is None:
             return imported
-        return _again(imported, source, robot_of, self.look, use, self.source)
+        return _again(imported, robot_of, self.look, self.source)
 
 
 def concluded(
@@ -116,7 +114,6 @@ def concluded(
     source: Path,
     robot_of: RobotOf,
     options: ImportOptions,
-    use: Use,
 ) -> Concluded:
     """Return a log, read again by what motion and torque show with certainty.
 
@@ -128,7 +125,6 @@ def concluded(
         source: its file or folder.
         robot_of: reads the robot's cell or URDF.
         options: of the import.
-        use: what the recording is for.
 
     Raises:
         SourceError: two readings fit alike.
@@ -140,7 +136,7 @@ def concluded(
     asked = TorqueSample.of(imported.archive)
     if is_open:
         if reason := servo_load(imported, lambda: asked):
-            return Concluded(without_torque(imported, source, robot_of, use, reason))
+            return Concluded(without_torque(imported, robot_of, reason))
     else:
         _require_measured(imported.archive, source)
         if unsigned := torques_without_sign(imported.archive, lambda: asked):
@@ -165,14 +161,13 @@ def concluded(
         _require_known_side(source, imported, asked)
         imported = replace(imported, concluded=(*imported.concluded, how.how))
         return Concluded(_of_this_arm(imported, source, asked.contradictions(how.score)))
-    return _as_a_look_says(imported, source, robot_of, use, asked, is_open)
+    return _as_a_look_says(imported, source, robot_of, asked, is_open)
 
 
 def _as_a_look_says(
     imported: ImportedRecording,
     source: Path,
     robot_of: RobotOf,
-    use: Use,
     asked: TorqueSample,
     is_open: bool,
 ) -> Concluded:
@@ -183,7 +178,7 @@ def _as_a_look_says(
         error = min(error, unexplained_share(asked.cell.model, asked.rows, asked.score))
     if error > UNEXPLAINED:
         if is_open:
-            servo = without_torque(imported, source, robot_of, use, NoJointTorque(error))
+            servo = without_torque(imported, robot_of, NoJointTorque(error))
             return Concluded(servo)
         raise _other_arm(source, error)
     changed = _changed(look)
@@ -198,7 +193,7 @@ def _as_a_look_says(
     assert imported.map_text is not None
     is_other_map = parse_toml(look.map_text) != parse_toml(imported.map_text)
     if is_other_map or look.gravity is not None:
-        again = _again(imported, source, robot_of, look, use)
+        again = _again(imported, robot_of, look)
         if (read := TorqueSample.of(again.archive)) is not None:
             axes = [row.aspect for row in changed if row.aspect in _OF_AXES]
             contradictions = read.contradictions(error=error, changed=axes)
@@ -218,22 +213,20 @@ class Asking:
         source: the recording.
         robot_of: its robot.
         options: how it is read.
-        use: what identification uses it for.
         refusal: why an identification would not take it; None if it would.
     """
 
     source: Path
     robot_of: RobotOf
     options: ImportOptions
-    use: Use
     refusal: SourceError | None = None
 
     def __call__(self, imported: ImportedRecording) -> ImportedRecording:
         """Return a recording as :func:`concluded`, or as it is where that refuses it."""
-        if self.use == "standstill":
+        if imported.request.use == "standstill":
             return imported
         try:
-            return concluded(imported, self.source, self.robot_of, self.options, self.use).recording
+            return concluded(imported, self.source, self.robot_of, self.options).recording
         except SourceError as error:
             self.refusal = error
             if isinstance(error, UndecidedError) and error.aspect == "side":
@@ -308,12 +301,7 @@ def _changed(look: Look) -> list[Row]:
 
 
 def _again(
-    imported: ImportedRecording,
-    source: Path,
-    robot_of: RobotOf,
-    look: Look,
-    use: Use,
-    looked_at: str = "",
+    imported: ImportedRecording, robot_of: RobotOf, look: Look, looked_at: str = ""
 ) -> ImportedRecording:
     """Read a log again with a map and the gravity that were found, perhaps of another log."""
     assert look.map_text is not None
@@ -323,7 +311,7 @@ def _again(
         described = robot_of(recorded)  # type: ignore[arg-type]
         return described if gravity is None else described.with_gravity(gravity)
 
-    again = read_again(imported, source, robot, look.map_text, use)
+    again = read_by_map(imported.request, robot, look.map_text)
     changes = [ChangedReading(row, looked_at) for row in _changed(look)]
     return replace(again, concluded=(*imported.concluded, *changes))
 

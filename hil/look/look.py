@@ -24,7 +24,13 @@ from hil.importers.conclusions import (
 )
 from hil.importers.excerpt import MAX_EXCERPT_ROWS
 from hil.importers.log_files import LogFiles
-from hil.importers.recording_import import ImportedRecording, ImportOptions, RobotOf, read_recording
+from hil.importers.recording_import import (
+    ImportedRecording,
+    ImportOptions,
+    ImportRequest,
+    RobotOf,
+    read_recording,
+)
 from hil.importers.required_signals import require_motion
 from hil.importers.units import Kind
 from hil.look import physics, signals
@@ -105,7 +111,7 @@ def look_at(source: Path, robot_of: RobotOf | None, options: ImportOptions) -> L
         if not is_open or (look.error or 0.0) <= UNEXPLAINED or explained(imported.archive):
             return look
         reason = NoJointTorque(look.error)
-    without = without_torque(imported, source, robot, "excitation", reason)
+    without = without_torque(imported, robot, reason)
     return _look(source, without, described=described)
 
 
@@ -174,7 +180,8 @@ def _archived(source: Path) -> ImportedRecording | None:
         for column, kind, unit in _COLUMNS
         if np.isfinite(archive.columns.get(column, np.nan)).any()
     )
-    return ImportedRecording(archive, (source,), None, concluded, Examined((), ()))
+    request = ImportRequest(source, source)
+    return ImportedRecording(request, archive, (source,), None, concluded, Examined((), ()))
 
 
 def _without_robot(recording: Recording, load: NoJointTorque | None) -> Row:
@@ -298,7 +305,7 @@ def _finding(
         axes,
         imported.map_text,
         source,
-        imported.files,
+        imported.request.files,
         gravities,
         is_side_open=_is_side_open(imported),
     )

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import replace
-from pathlib import Path
 from typing import Final
 
 import numpy as np
@@ -13,8 +12,7 @@ import tomlkit
 from hil.archive import Archive
 from hil.importers.conclusions import ChannelMeaning
 from hil.importers.name_words import words_of
-from hil.importers.recording_content import Use
-from hil.importers.recording_import import ImportedRecording, ImportOptions, RobotOf, read_again
+from hil.importers.recording_import import ImportedRecording, ImportOptions, RobotOf, read_by_map
 from hil.look.physics import Size
 from hil.look.readings import NoJointTorque
 from hil.look.torque_sample import SUSPECT_ERROR, TorqueSample
@@ -86,21 +84,9 @@ def _is_named_load(imported: ImportedRecording) -> bool:
 
 
 def without_torque(
-    imported: ImportedRecording,
-    source: Path,
-    robot_of: RobotOf,
-    use: Use,
-    reason: NoJointTorque,
+    imported: ImportedRecording, robot_of: RobotOf, reason: NoJointTorque
 ) -> ImportedRecording:
-    """Return a recording without its torque, and why.
-
-    Args:
-        imported: a recording.
-        source: its file or folder.
-        robot_of: reads the robot's cell or URDF.
-        use: what the recording is for.
-        reason: why its torque is none.
-    """
+    """Return a recording without its torque, and why."""
     if imported.map_text is None:
         columns = {
             name: column for name, column in imported.archive.columns.items() if name != "torque"
@@ -109,7 +95,7 @@ def without_torque(
     else:
         entries = tomlkit.parse(imported.map_text)
         del entries["torque"]
-        without = read_again(imported, source, robot_of, tomlkit.dumps(entries), use)
+        without = read_by_map(imported.request, robot_of, tomlkit.dumps(entries))
     others = [
         each
         for each in imported.concluded

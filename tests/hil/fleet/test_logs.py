@@ -244,7 +244,9 @@ class TestCached:
         read = []
         by_map = fleet_logs.read_by_map
         monkeypatch.setattr(
-            fleet_logs, "read_by_map", lambda *a, **k: read.append(a[0].name) or by_map(*a, **k)
+            fleet_logs,
+            "read_by_map",
+            lambda *a, **k: read.append(a[0].source.name) or by_map(*a, **k),
         )
         monkeypatch.setattr(fleet_logs, "read_recording", None)  # no map is concluded again
         result, importing = batch(folder, cache=cache)

@@ -47,7 +47,7 @@ from hil.importers.imported_robot import Robot, _cell_text
 from hil.importers.log import import_log
 from hil.importers.messages import sentence as worded
 from hil.importers.plausibility import examine
-from hil.importers.recording_import import import_bag
+from hil.importers.recording_import import import_recording
 from hil.importers.stamps import check_clock
 from hil.importers.text_table import TextTable
 from hil.pipeline.sources import cell_of
@@ -1274,11 +1274,11 @@ class TestRobotOptions:
         names = ["fer_joint1", "fer_joint2"]
         messages = [state(10**7 * k, [0.1 * k, 0.2 * k], names=names) for k in range(9)]
         bag(place / "bag.db3", {"/js": (STATE, messages)})
-        imported = import_bag(
+        imported = import_recording(
             place / "bag.db3",
             place / "o.mcap",
             lambda _: Robot.from_urdf(place / "arm.urdf"),
-            BagMap(rename=_names(["fer_joint{}=arm_joint{}"])),
+            bag=BagMap(rename=_names(["fer_joint{}=arm_joint{}"])),
         )
         assert imported.archive.joint_names == ("arm_joint1", "arm_joint2")
         assert imported.bag.rename == {"fer_joint1": "arm_joint1", "fer_joint2": "arm_joint2"}

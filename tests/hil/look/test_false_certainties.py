@@ -263,7 +263,7 @@ def test_a_log_that_nothing_explains_better_is_read_as_given(tmp_path: Path) -> 
     fitted = cut(split, {name: filtered(log) for name, log in logs.items()}).fitted
     source = written(fitted, tmp_path / "fitted.npz")
     imported = read_recording(source, lambda _: fitted.robot, ImportOptions())
-    found = concluded(imported, source, lambda _: fitted.robot, ImportOptions(), "excitation")
+    found = concluded(imported, source, lambda _: fitted.robot, ImportOptions())
     assert found.recording.map_text == imported.map_text
     (given,) = [each for each in found.recording.concluded if isinstance(each, ReadAsGiven)]
     assert given.error > 0.15

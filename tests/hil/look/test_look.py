@@ -579,9 +579,7 @@ class TestOtherArm:
             robot = Robot.from_urdf(self.described(tmp_path / "x.urdf", text))
             archive = tmp_path / f"{length}.mcap"
             imported = import_recording(source, archive, lambda _, arm=robot: arm, options)
-            again = concluded(
-                imported, source, lambda _, arm=robot: arm, options, "excitation"
-            ).recording
+            again = concluded(imported, source, lambda _, arm=robot: arm, options).recording
             doubts = [each for each in again.concluded if isinstance(each, DoubtfulArm)]
             assert [type(doubt.found[0]) for doubt in doubts] == [OtherLengths] * warned
 

@@ -45,7 +45,7 @@ def asked(folder: Path, time: Floats, position: Floats, torque: Floats) -> Concl
     robot = Robot.from_urdf(description)
     options = ImportOptions()
     recording = read_recording(path, lambda _: robot, options)
-    return concluded(recording, path, lambda _: robot, options, "excitation")
+    return concluded(recording, path, lambda _: robot, options)
 
 
 def test_torques_that_the_weight_keeps_positive_are_read(tmp_path: Path) -> None:
