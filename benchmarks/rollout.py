@@ -43,7 +43,8 @@ from hil.pipeline.identify_folder import identify_paths
 from hil.results.rollout_result import JUDGED_HORIZON, RolloutResult
 from hil.rollout.torque_rollout import RolloutOptions, nominal_arm, roll_out
 from identification import Samples
-from identification.export.exported_arm import ExportedArm, Ranges
+from identification.export.exported_arm import ExportedArm
+from identification.model.joint_ranges import JointRanges
 from identification.model.motion import Motion
 from identification.rollout.polish import Driven, polished
 from identification.rollout.position_errors import (
@@ -98,7 +99,7 @@ def time_of_windows() -> None:
     infinite = np.full(len(cell.joint_names), np.inf)
     standard = model.nominal
     standard[model.layout.rotors] = cell.nominal.rotor_inertia
-    ranges = Ranges(-infinite, infinite, infinite, infinite)
+    ranges = JointRanges(-infinite, infinite, infinite, infinite)
     arm = ExportedArm(cell.urdf, model, standard, cell.nominal_values(), ranges)
     motion = recorded(arm)
     feedback = light_feedback(arm, STEP_SECONDS, 1.0)

@@ -22,6 +22,7 @@ from drivers.ur.wire import UrProtocol
 from hil.base.arrays import Array
 from hil.base.safe_input import parse_toml, read_text, remedy_for_missing
 from hil.base.terminal_text import typed
+from identification.model.joint_ranges import urdf_limits
 from identification.model.robot import RobotModel
 from identification.model.workspace import Box, Workspace
 from planner.limits import JointLimits
@@ -41,7 +42,7 @@ from .schema import (
     SimulationTable,
     Table,
 )
-from .toml_edits import urdf_limits, with_values
+from .toml_edits import with_values
 
 T = TypeVar("T")
 

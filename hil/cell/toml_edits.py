@@ -1,22 +1,18 @@
-"""Changes of entries in the text of a TOML file, and limits in a URDF."""
+"""Changes of entries in the text of a TOML file."""
 
 from __future__ import annotations
 
-import math
-from collections.abc import Iterator, Mapping, Sequence
-from typing import Any, Final, NamedTuple
+from collections.abc import Iterator, Mapping
+from typing import Any
 
-import numpy as np
 import tomlkit
 from tomlkit.exceptions import TOMLKitError
 from tomlkit.items import Array as List
 from tomlkit.items import Item, Table
 
-from hil.base.arrays import Array
 from hil.base.errors import InputError
 from hil.base.safe_input import parse_toml
 from hil.base.toml_text import inline
-from identification.model.urdf_text import urdf_tree
 
 
 def with_values(text: str, values: Mapping[str, Any]) -> str:
@@ -97,42 +93,3 @@ def _entries(table: Mapping[str, Any], path: str) -> Iterator[tuple[str, str]]:
             yield from _entries(value, f"{path}{name}.")
         else:
             yield f"{path}{name}", repr(value)
-
-
-_MIN_ABSENT_LIMIT: Final = 1e4  # some URDFs have larger figures for "none"
-
-
-class UrdfLimits(NamedTuple):
-    """Limits per joint (n,): rad or m, per second, and N·m or N; infinite if not stated."""
-
-    lower: Array
-    upper: Array
-    velocity: Array
-    effort: Array
-
-
-def urdf_limits(urdf: str, joint_names: Sequence[str]) -> UrdfLimits:
-    """Read the limits of joints.
-
-    A range is not stated where it is absent or empty: lower and upper both 0, or exchanged. A speed
-    or effort is not stated where it is absent, 0, negative, or above 1e4.
-    """
-    joints = {joint.get("name"): joint for joint in urdf_tree(urdf).findall("joint")}
-    rows = []
-    for name in joint_names:
-        limit = joints[name].find("limit")
-        stated = {} if limit is None else limit.attrib
-        turns = joints[name].get("type") == "continuous"
-        lower, upper, velocity, effort = (
-            float(stated.get(key, 0.0)) for key in ("lower", "upper", "velocity", "effort")
-        )
-        if turns or not lower < upper:
-            lower = -math.inf
-            upper = math.inf
-        rows.append((lower, upper, _stated(velocity), _stated(effort)))
-    return UrdfLimits(*np.array(rows, dtype=np.float64).reshape(-1, 4).T)
-
-
-def _stated(figure: float) -> float:
-    """Return a limit of speed or effort, infinite if the figure is none."""
-    return figure if 0.0 < figure < _MIN_ABSENT_LIMIT else math.inf

@@ -19,7 +19,7 @@ from hil.cell import Cell
 from hil.cell.arms import Links, joints_outside
 from hil.cell.gripper_names import gripper_joints
 from hil.cell.nominal import nominal_of
-from hil.cell.toml_edits import urdf_limits, with_values
+from hil.cell.toml_edits import with_values
 from hil.cell.urdf_unit_problem import unit_problem
 from hil.importers.dh import Convention, urdf_of_dh
 from hil.importers.plausibility import (
@@ -27,6 +27,7 @@ from hil.importers.plausibility import (
 )
 from identification.errors import ModelError
 from identification.model.friction import FrictionLaw
+from identification.model.joint_ranges import urdf_limits
 from identification.model.kinematics import pinocchio_model
 from identification.model.robot import STANDARD_GRAVITY
 

@@ -21,11 +21,11 @@ from hil.base.arrays import Array
 from hil.base.errors import SourceError
 from hil.base.safe_input import parse_json, read_text
 from hil.base.toml_text import to_text
-from hil.cell.toml_edits import urdf_limits
 from hil.importers.array_files import ArrayFile
 from hil.importers.conclusions import EpisodeUnits, UnitsFrom
 from hil.importers.imported_robot import Robot
 from hil.importers.log_files import LogFiles
+from identification.model.joint_ranges import urdf_limits
 
 EpisodeUnit = Literal["deg", "rad", "range"]
 """Of the joints of a data set: degrees, radians, or -100 to 100 of the calibrated range."""

@@ -17,7 +17,6 @@ from numpy.typing import NDArray
 from hil.archive import ImportedSamples
 from hil.base.arrays import Array
 from hil.base.errors import SourceError
-from hil.cell.toml_edits import UrdfLimits, urdf_limits
 from hil.importers.conclusions import (
     Conclusion,
     ConstantPositions,
@@ -45,6 +44,7 @@ from hil.importers.conclusions import (
 from hil.importers.messages import problem_of, remedy_of
 from hil.importers.publishers import MIN_SAMPLE_DISTANCE, alternating_samples
 from hil.importers.stamps import MAX_SAMPLING_RATE, MIN_SAMPLING_RATE
+from identification.model.joint_ranges import JointRanges, urdf_limits
 from identification.model.motion import Motion
 from identification.model.urdf_text import position_units
 from identification.signals.angle_wraps import (
@@ -163,19 +163,19 @@ def _range(name: str, position: Array, turns: bool, lower: float, upper: float) 
     return JointRange(name, low, high, turns=bool(turns), limits=limits)
 
 
-def _fits(position: Array, limits: UrdfLimits) -> NDArray[np.bool_]:
+def _fits(position: Array, limits: JointRanges) -> NDArray[np.bool_]:
     """Return whether each column of positions fits the limits of each joint (joints, columns)."""
     above = limits.lower[:, None] - _LIMIT_TOLERANCE <= position.min(axis=0)
     return np.asarray(above & (position.max(axis=0) <= limits.upper[:, None] + _LIMIT_TOLERANCE))
 
 
-def limit_excess(low: Array, high: Array, limits: UrdfLimits) -> Array:
+def limit_excess(low: Array, high: Array, limits: JointRanges) -> Array:
     """Return how far ranges of positions leave the limits of each joint, negative within them."""
     return np.maximum(limits.lower - low, high - limits.upper)
 
 
 def whole_turns(
-    low: Array, high: Array, limits: UrdfLimits, turning: NDArray[np.bool_], most: int
+    low: Array, high: Array, limits: JointRanges, turning: NDArray[np.bool_], most: int
 ) -> Array:
     """Return the whole turns [rad] that bring ranges nearest to the limits (n,).
 
@@ -193,7 +193,7 @@ def whole_turns(
     return np.asarray(turns[nearest, np.arange(len(low))])
 
 
-def in_turns(position: Array, limits: UrdfLimits, turning: NDArray[np.bool_]) -> Array:
+def in_turns(position: Array, limits: JointRanges, turning: NDArray[np.bool_]) -> Array:
     """Return positions (m, n) without wraps, a joint within its limits but for a turn within them.
 
     Angles of 0 to 360 degrees and of +-180 are two conventions of one posture; others keep their
@@ -209,7 +209,7 @@ def in_turns(position: Array, limits: UrdfLimits, turning: NDArray[np.bool_]) ->
 
 
 def _continued(
-    position: Array, limits: UrdfLimits, turning: NDArray[np.bool_]
+    position: Array, limits: JointRanges, turning: NDArray[np.bool_]
 ) -> tuple[Array, Array]:
     """Return positions (m, n) without wraps, and the turn (n,) that brings each to its limits."""
     continued = position.copy()
@@ -219,7 +219,7 @@ def _continued(
 
 
 def _outside(
-    position: Array, names: Sequence[str], limits: UrdfLimits, turning: NDArray[np.bool_]
+    position: Array, names: Sequence[str], limits: JointRanges, turning: NDArray[np.bool_]
 ) -> OutsideLimits | None:
     """Return how positions leave the limits of the URDF, and how they would not."""
     recorded = position
@@ -330,7 +330,7 @@ def _positions(
     time: Array,
     position: Array,
     names: Sequence[str],
-    limits: UrdfLimits,
+    limits: JointRanges,
     turning: NDArray[np.bool_],
     *,
     has_speed: bool,

@@ -10,7 +10,6 @@ import numpy as np
 
 from hil.base.arrays import Array
 from hil.cell import Cell
-from hil.cell.toml_edits import urdf_limits
 from hil.importers.conclusions import Certainty
 from hil.importers.plausibility import MAX_LIMIT_RATIO, limit_excess, whole_turns
 from hil.look.physics import Size
@@ -29,6 +28,7 @@ from hil.look.readings import (
 from hil.look.result import Row
 from identification.hypotheses.inertia_scale import find_inertia_scale
 from identification.hypotheses.scores import Score
+from identification.model.joint_ranges import urdf_limits
 from identification.model.robot import RobotModel
 from identification.signals.samples import Samples
 

@@ -28,9 +28,9 @@ from hil.cell.arms import Links, joints_outside
 from hil.cell.errors import UNKNOWN, WHERE, models_of
 from hil.cell.gripper_names import gripper_joints, links_of
 from hil.cell.schema import CellFile
-from hil.cell.toml_edits import urdf_limits
 from hil.importers.dh import Convention, urdf_of_dh, urdf_of_parameters
 from identification.errors import ModelError
+from identification.model.joint_ranges import urdf_limits
 from identification.model.kinematics import (
     MAX_MOVING_JOINTS,
     Chain,

@@ -24,12 +24,12 @@ from hil.base.arrays import Array
 from hil.base.errors import ArchiveError, ControllerError, OperatorStopError
 from hil.base.safe_input import parse_toml
 from hil.cell.errors import UNKNOWN
-from hil.cell.toml_edits import urdf_limits
 from hil.control.connection import Connection
 from hil.control.link import SESSION_END_TIMEOUT
 from hil.control.live_link import ExchangeMonitor
 from hil.control.motion_watch import Stop
 from identification.excitation import CollisionModelError, Workspace
+from identification.model.joint_ranges import urdf_limits
 from planner import JointLimits
 
 from .found_shapes import check_by_found_shapes

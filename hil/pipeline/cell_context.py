@@ -12,10 +12,10 @@ from hil.archive import open_archive
 from hil.base.arrays import Array
 from hil.cell import Cell
 from hil.cell.nominal import nominal_of
-from hil.cell.toml_edits import urdf_limits
 from identification.estimators.torque_channel import torque_noiseless_above
 from identification.factor.estimate import Estimate
 from identification.model.friction import COULOMB, TERMS
+from identification.model.joint_ranges import urdf_limits
 from identification.selection.questions import FRICTION_AT_SPEED, LOAD, LOW_PASS, REVERSAL
 from identification.signals.angle_wraps import UNWRAPPED
 from identification.signals.masks import RowReason

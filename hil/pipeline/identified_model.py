@@ -13,7 +13,6 @@ import numpy as np
 from hil.base.arrays import Array
 from hil.base.errors import InputError
 from hil.cell import Cell
-from hil.cell.toml_edits import urdf_limits
 from hil.pipeline.cell_context import torque_limits
 from hil.pipeline.estimating import posterior_of
 from hil.pipeline.estimators import OF_PRIOR
@@ -26,9 +25,10 @@ from hil.results.provenance import (
 from identification import Estimate, Factor, Samples
 from identification.estimators.consistent import ConsistentEstimate
 from identification.estimators.ensemble import Ensemble, draw_ensemble
-from identification.export.exported_arm import ExportedArm, Ranges
+from identification.export.exported_arm import ExportedArm
 from identification.export.friction_curve import median_load
 from identification.factor.blocks import FINE_BLOCK, fine_blocks
+from identification.model.joint_ranges import JointRanges, urdf_limits
 from identification.model.pseudo_inertia import margin
 from identification.model.robot import RobotModel
 from identification.purposes.thresholds import ContactThreshold
@@ -174,7 +174,7 @@ def arm_with(cell: Cell, standard: Array, values: Array, fitted: Sequence[Sample
             described.effort if known_limits is None else np.nan_to_num(known_limits, nan=np.inf)
         )
     limits = described if cell.file.limits is None else cell.joint_limits
-    ranges = Ranges(limits.lower, limits.upper, limits.velocity, efforts)
+    ranges = JointRanges(limits.lower, limits.upper, limits.velocity, efforts)
     return ExportedArm(
         cell.urdf, cell.model, standard, values, ranges, median_load(cell.model, values, fitted)
     )

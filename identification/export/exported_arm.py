@@ -3,24 +3,15 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from typing import NamedTuple
 
 import numpy as np
 
 from identification.arrays import Array
 from identification.export.friction_curve import equivalent_coulomb
 from identification.model.elements import TorsionSpring
+from identification.model.joint_ranges import JointRanges
 from identification.model.pseudo_inertia import Body, body
 from identification.model.robot import RobotModel
-
-
-class Ranges(NamedTuple):
-    """Limits of the joints (n,), rad or m, rad/s or m/s, N·m or N; infinite if unknown."""
-
-    lower: Array
-    upper: Array
-    velocity: Array
-    effort: Array
 
 
 @dataclass(frozen=True, eq=False)
@@ -31,7 +22,7 @@ class ExportedArm:
     model: RobotModel
     standard: Array  # consistent standard parameters (s,)
     values: Array  # the corresponding parameters (p,) of the model
-    ranges: Ranges  # limits of its joints
+    ranges: JointRanges  # limits of its joints
     # torque of each gear (n,) [N·m, N] at which friction that grows with it is written, see
     # :func:`identification.export.friction_curve.median_load`; None: zero
     load: Array | None = field(default=None)

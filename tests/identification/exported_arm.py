@@ -2,7 +2,8 @@
 
 import numpy as np
 
-from identification.export.exported_arm import ExportedArm, Ranges
+from identification.export.exported_arm import ExportedArm
+from identification.model.joint_ranges import JointRanges
 from identification.model.robot import RobotModel
 from tests.identification.robots import some_bodies
 
@@ -24,5 +25,5 @@ def an_arm(urdf, **options):
     values = np.concatenate([model.base.grouping @ standard, others])
     infinite = np.full(n, np.inf)
     return ExportedArm(
-        urdf, model, standard, values, Ranges(-infinite, infinite, infinite, infinite)
+        urdf, model, standard, values, JointRanges(-infinite, infinite, infinite, infinite)
     )

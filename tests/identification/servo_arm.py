@@ -4,14 +4,15 @@ import numpy as np
 import pytest
 import scipy
 
-from identification.export.exported_arm import ExportedArm, Ranges
+from identification.export.exported_arm import ExportedArm
 from identification.export.simulators import mjcf
+from identification.model.joint_ranges import JointRanges
 from identification.rollout.servo_by_torque import PositionServo
 from tests.identification.two_link import MODEL, URDF, four_sines
 
 mujoco = pytest.importorskip("mujoco", reason="the extra mujoco is not installed")
 N = MODEL.n_joints
-NO_LIMITS = Ranges(*(np.full(N, limit) for limit in (-np.inf, np.inf, np.inf, np.inf)))
+NO_LIMITS = JointRanges(*(np.full(N, limit) for limit in (-np.inf, np.inf, np.inf, np.inf)))
 KP = np.array([2000.0, 500.0])
 KD = np.array([60.0, 10.0])
 DELAY = 0.012

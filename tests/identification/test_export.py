@@ -18,7 +18,6 @@ from identification.errors import ModelError, ShapeError
 from identification.estimators.consistent import consistent_estimate
 from identification.excitation.collision import CollisionChecker
 from identification.excitation.errors import CollisionModelError
-from identification.export.exported_arm import Ranges
 from identification.export.friction_curve import friction_curve, median_load
 from identification.export.parameter_files import (
     covariance_csv,
@@ -42,6 +41,7 @@ from identification.factor.factor import Factor
 from identification.model.coupling import Coupling
 from identification.model.elements import Anchors, GasCylinder, TorqueRipple, TorsionSpring
 from identification.model.friction import FrictionLaw
+from identification.model.joint_ranges import JointRanges
 from identification.model.kinematics import MAX_MOVING_JOINTS, chain_from_urdf
 from identification.model.known_payload import Payload
 from identification.model.motion import Motion
@@ -719,7 +719,7 @@ class TestTexts:
     def test_limits_springs_and_names(self):
         arm = an_arm(urdf_text(), elements=[TorsionSpring("joint_2", 0.3, 50.0)])
         n = arm.model.n_joints
-        ranges = Ranges(-np.ones(n), np.full(n, 2.0), np.full(n, 3.0), np.full(n, 40.0))
+        ranges = JointRanges(-np.ones(n), np.full(n, 2.0), np.full(n, 3.0), np.full(n, 40.0))
         arm = replace(arm, ranges=ranges)
         model = ElementTree.fromstring(mjcf(arm, "arm"))
         joint = model.find(".//joint[@name='joint_2']")

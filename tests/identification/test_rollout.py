@@ -6,9 +6,10 @@ from functools import partial
 import numpy as np
 import pytest
 
-from identification.export.exported_arm import ExportedArm, Ranges
+from identification.export.exported_arm import ExportedArm
 from identification.export.simulators import FORMATS, compare, mjcf
 from identification.model.friction import FrictionLaw
+from identification.model.joint_ranges import JointRanges
 from identification.model.motion import Motion
 from identification.model.robot import RobotModel
 from identification.rollout.mujoco_simulation import MAX_POSITION_ERROR, Feedback, RolloutArm
@@ -44,7 +45,7 @@ from tests.identification.two_link import MODEL, URDF, as_samples, four_sines, s
 mujoco = pytest.importorskip("mujoco", reason="the extra mujoco is not installed")
 
 N = MODEL.n_joints
-NO_LIMITS = Ranges(*(np.full(N, limit) for limit in (-np.inf, np.inf, np.inf, np.inf)))
+NO_LIMITS = JointRanges(*(np.full(N, limit) for limit in (-np.inf, np.inf, np.inf, np.inf)))
 NOTHING = Feedback(np.zeros(N), np.zeros(N))
 
 

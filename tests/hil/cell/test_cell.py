@@ -19,8 +19,8 @@ from hil.campaign.folder import MESH, MISSING, checksums
 from hil.cell import AngleFrame, Cell, CellError
 from hil.cell.errors import models_of
 from hil.cell.schema import CanTable, CellFile
-from hil.cell.toml_edits import urdf_limits
 from hil.design import preset, problem_of
+from identification.model.joint_ranges import urdf_limits
 from identification.model.motion import Motion
 from sim_fixtures.ns16 import CELL_PATH, URDF_PATH
 from sim_fixtures.plant import build_model

@@ -12,8 +12,8 @@ from typer.testing import CliRunner
 
 from hil.archive import open_archive
 from hil.cell import Cell
-from hil.cell.toml_edits import urdf_limits
 from hil.cli import app
+from identification.model.joint_ranges import urdf_limits
 from tests.hil.fast_cell import CELL
 from tests.hil.fast_cell import URDF as FAST
 from tests.hil.importers.moving_log import JOINTS, POSITION, URDF, imported, rows, text

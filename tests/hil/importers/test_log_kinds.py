@@ -13,11 +13,11 @@ import pytest
 
 from hil.archive import open_archive
 from hil.base.errors import SourceError
-from hil.cell.toml_edits import UrdfLimits
 from hil.importers.column_map import ColumnMap
 from hil.importers.imported_robot import Robot
 from hil.importers.log import import_log
 from hil.importers.plausibility import whole_turns
+from identification.model.joint_ranges import JointRanges
 from tests.hil.importers.moving_log import (
     COUNT,
     JOINTS,
@@ -454,7 +454,7 @@ def test_cases_have_the_samples_of_plain(
     [(-0.5, 0), (0.04 - 3.0, 0), (5.5, -1), (-6.9, 1), (11.8, -2), (-19.4, 3)],
 )
 def test_whole_turns_bring_a_joint_nearest_to_its_limits(low: float, turns: int) -> None:
-    limits = UrdfLimits(*(np.array([value]) for value in (-3.0, 3.0, 1.0, 1.0)))
+    limits = JointRanges(*(np.array([value]) for value in (-3.0, 3.0, 1.0, 1.0)))
     joint = np.array([low])
     angle = whole_turns(joint, joint + 0.5, limits, np.array([True]), 3)
     assert angle == near(2.0 * np.pi * turns)

@@ -27,7 +27,6 @@ from hil.campaign import Campaign, CampaignPlan, Stop, design
 from hil.cell import Cell
 from hil.cell.arms import Links
 from hil.cell.errors import UnknownFieldsError
-from hil.cell.toml_edits import urdf_limits
 from hil.cli import app
 from hil.control.motion_checks import collision_checker
 from hil.control.simulated_cell import simulated_link
@@ -39,6 +38,7 @@ from hil.new.cell_values import _nothing_moves
 from hil.new.notes import FixedOutside, GripperJoints, SeveralBranches
 from hil.testing import shortened
 from identification.excitation.collision_messages import unchecked_text
+from identification.model.joint_ranges import urdf_limits
 from sim_fixtures.ns16 import CELL_PATH, URDF_PATH
 from tests.hil.new_cells import TWO_JOINTS, described_robot, filled_in
 from tests.hil.simulated_logs import urdf_path
