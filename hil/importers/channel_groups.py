@@ -8,10 +8,13 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from typing import Final
 
+from hil.base.arrays import Array
+from hil.importers.array_files import ArrayFile
 from hil.importers.channels import DRIVE_OBJECT, Channel, kind_of
 from hil.importers.conclusions import NameBasis
 from hil.importers.name_words import is_commanded_position, kind_by_words
 from hil.importers.stated_units import without_unit
+from hil.importers.text_table import TextTable
 from hil.importers.units import Kind
 
 _NUMBER: Final = re.compile(r"\d{1,2}(?=\D*$)")
@@ -55,6 +58,16 @@ class ChannelGroup:
             return ()
         named = {_joint_in(name, joints) for name in self.names}
         return tuple(joint for joint in joints if any(each and each[0] == joint for each in named))
+
+    def numbers(self, file: TextTable | ArrayFile) -> Array:
+        """Return the numbers of the channels (m, n), not converted.
+
+        Raises:
+            SourceError: a cell is not a number.
+        """
+        if isinstance(file, ArrayFile) and len(self.names) == 1:
+            return file.matrix(self.names[0], "position")
+        return file.numbers(self.names, "position", None)
 
     def columns(self, joints: Sequence[str]) -> str | list[str]:
         """Return `columns` of the map: the pattern where it gives these names, else the list."""

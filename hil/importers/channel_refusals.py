@@ -6,15 +6,12 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Final
 
-from hil.base.arrays import Array
 from hil.base.errors import SourceError, UnrecordedJointError
-from hil.importers.array_files import ArrayFile
 from hil.importers.channel_candidates import LogChannels
 from hil.importers.channel_groups import ChannelGroup, number_in
 from hil.importers.channels import CHANNEL_NAMES, Channel, kinds_of_file
 from hil.importers.name_words import kinds_said, words_of
 from hil.importers.stated_units import other_unit
-from hil.importers.text_table import TextTable
 from hil.importers.units import JOINT_KINDS, Kind, kind_named, unit_of
 from hil.importers.unnamed_columns import ColumnBlocks, blocks_of, roughness
 
@@ -71,7 +68,7 @@ def _smoothest(channels: LogChannels, names: Sequence[str]) -> str | None:
         return None
     try:
         file = channels.file()
-        position = _positions(file, positions[0])
+        position = positions[0].numbers(file)
         found = {
             name: roughness(file.numbers([name], "time", None)[:, 0], position) for name in names
         }
@@ -81,12 +78,6 @@ def _smoothest(channels: LogChannels, names: Sequence[str]) -> str | None:
     if not known or (len(known) > 1 and known[1][0] < _MIN_ROUGHNESS_RATIO * known[0][0]):
         return None
     return known[0][1]
-
-
-def _positions(file: TextTable | ArrayFile, group: ChannelGroup) -> Array:
-    if isinstance(file, ArrayFile) and len(group.names) == 1:
-        return file.matrix(group.names[0], "position")
-    return file.numbers(group.names, "position", None)
 
 
 def unit_of_other_quantity(

@@ -45,8 +45,11 @@ def copied_commands(
     ]
     commands = [group for group in others if COMMANDED.search(group.pattern)]
     for group in commands:
-        values = _numbers(file, group)
-        if values is None or values.shape != position.shape:
+        try:
+            values = group.numbers(file)
+        except SourceError:  # of a cell that is no number
+            continue
+        if values.shape != position.shape:
             continue
         if np.mean((values == position).all(axis=1)) >= _MIN_EQUAL_ROWS_SHARE:
             measured = [
@@ -56,15 +59,3 @@ def copied_commands(
             ]
             return CopiedCommands(group.label, tuple(measured))
     return None
-
-
-def _numbers(file: TextTable | ArrayFile, group: ChannelGroup) -> Array | None:
-    """Return the numbers of a group of channels (m, n); None where they are none."""
-    try:
-        if isinstance(file, TextTable):
-            return file.numbers(group.names, "position")
-        if len(group.names) == 1:
-            return file.matrix(group.names[0], "position")
-        return file.numbers(group.names, "position", None)
-    except SourceError:
-        return None
