@@ -82,12 +82,12 @@ def trend(
     else:
         reporter = make_reporter(quiet=quiet or json, messages=verbose)
         with fleet.opened(arm, reading, reporter, covariate or (), (conditions, table)) as work:
-            estimated = estimated_fleet(
+            types, sources = estimated_fleet(
                 places, how.options(estimator="wls"), work.cluster, reporter,
                 cache=work.cache, naming=work.naming, importing=work.logs, conditions=stated,
             )  # fmt: skip
         maps = work.maps
-        result = estimated.judged(judge(estimated.types))
+        result = judge(types, sources)
     written = _written(result, output, table)
     if json:
         print_json({**as_dict(result), "written": [str(path) for path in written]})
@@ -107,13 +107,13 @@ def _print(
 ) -> None:
     """Print the verdict, the robots and what was written; the rest goes to standard error."""
     lines = [] if quiet else [*map_lines(maps, verbose=verbose), *_lines(result)]
-    broken = [f"{each.path} could not be used: {each.message}" for each in result.broken]
+    broken = [f"{each.path} could not be used: {each.message}" for each in result.sources.broken]
     for line in last(broken, _MAX_BROKEN_LINES, "--json"):
         typer.echo(printable(line), err=True)
     if written and not quiet:
         lines += [f"{path}: {use}" for path, use in written.items()]
-    if result.skipped and not quiet:
-        lines.append(skipped_line(result.skipped))
+    if result.sources.skipped and not quiet:
+        lines.append(skipped_line(result.sources.skipped))
     lines = [f"{verdict(result)}.", *lines, _counts(result)]
     for line in lines if verbose else brief(lines, last=TAIL_LINES):
         typer.echo(printable(line))
@@ -128,7 +128,8 @@ def _lines(result: FleetTrend) -> Iterator[str]:
 def _counts(result: FleetTrend) -> str:
     recordings = plural(result.recordings, "recording")
     robots = plural(len(result.robots), "robot")
-    return f"{recordings} of {robots}; {len(result.skipped)} skipped, {len(result.broken)} failed"
+    skipped, failed = len(result.sources.skipped), len(result.sources.broken)
+    return f"{recordings} of {robots}; {skipped} skipped, {failed} failed"
 
 
 def _written(result: FleetTrend, output: Path | None, table: Path | None) -> dict[Path, str]:

@@ -13,12 +13,12 @@ def as_dict(fleet: FleetTrend) -> dict[str, Any]:
     """Return the content of ``--json``; None for what is unknown."""
     return {
         "changed": bool(fleet.changed),
-        "simulated": fleet.simulated,
+        "simulated": fleet.sources.simulated,
         "covariates": list(fleet.covariates),
         "unknown": list(fleet.unknown),
         "seasonal": fleet.seasonal,
-        "dated_by_file": fleet.dated_by_file,
-        "in_several_places": {name: list(places) for name, places in fleet.twice.items()},
+        "dated_by_file": fleet.sources.dated_by_file,
+        "in_several_places": {name: list(places) for name, places in fleet.sources.twice.items()},
         "recordings": fleet.recordings,
         "robots": [
             {
@@ -33,9 +33,9 @@ def as_dict(fleet: FleetTrend) -> dict[str, Any]:
             for robot in fleet.robots
         ],
         "all_robots": [_together(robot) for robot in fleet.together],
-        "broken": [each.as_json() for each in fleet.broken],
-        "skipped": [each.as_json() for each in fleet.skipped],
-        "warnings": batch_lines(fleet.warnings),
+        "broken": [each.as_json() for each in fleet.sources.broken],
+        "skipped": [each.as_json() for each in fleet.sources.skipped],
+        "warnings": batch_lines(fleet.sources.warnings),
     }
 
 

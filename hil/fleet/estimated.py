@@ -26,38 +26,13 @@ from hil.fleet.series import (
     first_of,
     moment_of,
 )
-from hil.fleet.trend import FleetTrend
+from hil.fleet.trend import FleetSources
 from hil.pipeline.notes import Note
 from hil.pipeline.options import Options
 from identification import RobotModel
 from identification.selection.settings import Settings
 
 _RECORDINGS_PER_TASK: Final = 16  # recordings of one task
-
-
-@dataclass(frozen=True, eq=False)
-class EstimatedFleet:
-    """Series of the robots of a fleet by type, and what could not be used."""
-
-    types: tuple[TypeSeries, ...]
-    dated_by_file: int  #: recordings that have only the date of their file
-    twice: Mapping[str, Sequence[str]]  #: places of robots that are in several at the same time
-    simulated: bool
-    broken: tuple[SkippedArchive, ...]
-    skipped: tuple[SkippedArchive, ...]
-    warnings: tuple[Note, ...] = ()  #: about recordings that were used
-
-    def judged(self, trend: FleetTrend) -> FleetTrend:
-        """Return the trend of these series with what is known of their recordings."""
-        return replace(
-            trend,
-            dated_by_file=self.dated_by_file,
-            twice=self.twice,
-            simulated=self.simulated,
-            broken=self.broken,
-            skipped=self.skipped,
-            warnings=self.warnings,
-        )
 
 
 @one_thread()
@@ -71,8 +46,8 @@ def estimated_fleet(
     naming: RobotNaming,
     importing: LogImport | None = None,
     conditions: Conditions = Conditions(),  # noqa: B008 - frozen
-) -> EstimatedFleet:
-    """Estimate every recording.
+) -> tuple[tuple[TypeSeries, ...], FleetSources]:
+    """Estimate every recording; return the series of each type, and facts about the recordings.
 
     Args:
         roots: folders, files, patterns or URLs.
@@ -104,8 +79,7 @@ def estimated_fleet(
         raise InputError(None, "; ".join(["no recording can be used", *first]))
     types = _types(refs, options, cluster, reporter, cache, broken)
     used = [ref for each in types for ref in each.refs]
-    return EstimatedFleet(
-        types=tuple(each.series(conditions) for each in types),
+    sources = FleetSources(
         dated_by_file=sum(ref.dated_by == "file" for ref in used),
         twice=naming.in_several_places(used),
         simulated=all(ref.simulated for ref in used),
@@ -113,6 +87,7 @@ def estimated_fleet(
         skipped=found.skipped,
         warnings=frequent_notes([each for fits in types for each in fits.warned]),
     )
+    return tuple(each.series(conditions) for each in types), sources
 
 
 def _without_dates(refs: Sequence[ArchiveRef], undated: Sequence[SkippedArchive]) -> InputError:

@@ -131,14 +131,14 @@ def notes(fleet: FleetTrend) -> Iterator[str]:
             "no recording has a temperature, so warm-up and season count as day-to-day noise"
             + (", except for changes that all robots share" if fleet.seasonal else "")
         )
-    for robot, places in fleet.twice.items():
+    for robot, places in fleet.sources.twice.items():
         yield (
             f"{robot} is recorded in {' and '.join(places)} at the same time; if these are several"
             " robots, name them by several parts of the path: --robot '{robot}/{robot}/...'"
         )
     for name in fleet.unknown:
         yield f"no recording has a column {name!r} of numbers"
-    if fleet.dated_by_file:
-        recordings = plural(fleet.dated_by_file, "recording")
+    if fleet.sources.dated_by_file:
+        recordings = plural(fleet.sources.dated_by_file, "recording")
         yield f"{recordings} dated only by the file's time, which copying changes; see --robot"
-    yield from batch_lines(fleet.warnings)
+    yield from batch_lines(fleet.sources.warnings)

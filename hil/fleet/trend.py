@@ -153,15 +153,10 @@ class RobotTrend:
 
 
 @dataclass(frozen=True, eq=False)
-class FleetTrend:
-    """The robots of a fleet, the greatest concern first, and what could not be used.
+class FleetSources:
+    """What is known about the recordings of a fleet, apart from their numbers.
 
     Attributes:
-        robots: each by itself.
-        together: all robots of a type, of each type that has enough of them for a year.
-        covariates: names of temperatures and other columns that were used.
-        seasonal: whether the robots are enough to show what moves all of them at once.
-        unknown: requested covariates that no recording has.
         dated_by_file: recordings that have only the date of their file.
         twice: places of names that are in several at the same time, maybe of several robots.
         simulated: whether no robot moved.
@@ -169,17 +164,33 @@ class FleetTrend:
         warnings: about recordings that were used.
     """
 
-    robots: tuple[RobotTrend, ...]
-    together: tuple[RobotTrend, ...]
-    covariates: tuple[str, ...]
-    seasonal: bool
-    unknown: tuple[str, ...] = ()
     dated_by_file: int = 0
     twice: Mapping[str, Sequence[str]] = field(default_factory=dict)
     simulated: bool = False
     broken: tuple[SkippedArchive, ...] = ()
     skipped: tuple[SkippedArchive, ...] = ()
     warnings: tuple[Note, ...] = ()
+
+
+@dataclass(frozen=True, eq=False)
+class FleetTrend:
+    """The robots of a fleet, the greatest concern first.
+
+    Attributes:
+        robots: each by itself.
+        together: all robots of a type, of each type that has enough of them for a year.
+        covariates: names of temperatures and other columns that were used.
+        seasonal: whether the robots are enough to show what moves all of them at once.
+        unknown: requested covariates that no recording has.
+        sources: the recordings.
+    """
+
+    robots: tuple[RobotTrend, ...]
+    together: tuple[RobotTrend, ...]
+    covariates: tuple[str, ...]
+    seasonal: bool
+    unknown: tuple[str, ...]
+    sources: FleetSources
 
     @property
     def recordings(self) -> int:
@@ -194,6 +205,7 @@ class FleetTrend:
 
 def fleet_trend(
     types: Sequence[TypeSeries],
+    sources: FleetSources = FleetSources(),
     *,
     limits: Sequence[TrendLimit] = (),
     covariates: Sequence[str] = (),
@@ -202,6 +214,7 @@ def fleet_trend(
 
     Args:
         types: their series.
+        sources: of the series.
         limits: of which the dates are foreseen.
         covariates: names of numbers that may explain a change, in addition to those that most
             recordings have.
@@ -233,6 +246,7 @@ def fleet_trend(
         covariates=tuple(sorted(names)),
         seasonal=any(len(series.recordings) > MIN_SIBLINGS for series in types),
         unknown=tuple(name for name in covariates if name not in known),
+        sources=sources,
     )
 
 
