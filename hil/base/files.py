@@ -122,6 +122,18 @@ def write_files(folder: Path, contents: Mapping[str, str | bytes | None]) -> Non
     _sync(folder)
 
 
+def write_into(folder: Path, contents: Mapping[str, str | bytes]) -> tuple[Path, ...]:
+    """Write files into a folder, which is created if missing; return their paths.
+
+    Raises:
+        InputError: the folder cannot be created.
+        OutputError: the files cannot be written.
+    """
+    make_folder(folder)
+    write_files(folder, contents)
+    return tuple(folder / name for name in contents)
+
+
 def _write_through(path: Path, content: str | bytes) -> None:
     """Write a new file and wait until it is on the disk.
 

@@ -8,7 +8,7 @@ from typing import Annotated
 import typer
 
 from hil.base.exit_status import ExitStatus
-from hil.base.files import make_folder, write_files
+from hil.base.files import write_into
 from hil.base.one_screen import brief
 from hil.base.progress import reporter as make_reporter
 from hil.base.terminal_text import printable
@@ -45,8 +45,7 @@ def compare(
     if output is not None:
         from hil.compare.changes_page import comparison_page  # figures are slow to import
 
-        make_folder(output.parent)
-        write_files(output.parent, {output.name: comparison_page(comparison)})
+        write_into(output.parent, {output.name: comparison_page(comparison)})
     if json:
         print_json(comparison_document(comparison))
     else:

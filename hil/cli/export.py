@@ -24,13 +24,11 @@ from hil.cli.identify_options import FEW, EstimatorOption, Identifying
 from hil.export.controller_code import (
     CodeName,
     ExportedCode,
-    default_code_output,
     export_code,
 )
 from hil.export.drive_files import (
     ExportedDrives,
     WhatToExport,
-    default_drive_output,
     export_drives,
     patch_drives,
     write_ranges,
@@ -39,7 +37,6 @@ from hil.export.model_files import (
     Exported,
     ExportedEnsemble,
     FormatName,
-    default_output,
     export_ensemble,
     export_model,
 )
@@ -53,6 +50,7 @@ from hil.pipeline.options import Options
 from hil.pipeline.stored_identification import read_or_identify
 from hil.pipeline.stored_servo import servo_folder
 from identification.export.controller.c_source import Precision
+from identification.export.simulators import FORMATS
 
 ExportName = Literal[FormatName, CodeName, ServoFormatName]
 
@@ -126,18 +124,17 @@ def _exported(
     precision: Precision,
 ) -> Exported | ExportedEnsemble | ExportedCode | ExportedDrives:
     """Write an arm with torque."""
+    folder = archives[0] if archives[0].is_dir() else Path()
+    target = what.output or folder / _default_name(to, ensemble=what.count is not None)
     if to == "c" or to == "st":
         if what.count is not None or what.ranges:
             field = "--ranges" if what.ranges else "--ensemble"
             raise InputError(None, "is for files of simulators", field=field, remedy="leave it out")
-        target = what.output or default_code_output(archives, to)
         return export_code(arm, target, to, precision)
     if what.into is not None:
         return patch_drives(arm, what.into, what)
     if to == "isaaclab" or to == "genesis":
-        return export_drives(arm, what.output or default_drive_output(archives, to), to, what)
-    ensemble = what.count is not None
-    target = what.output or default_output(archives, to, ensemble=ensemble)
+        return export_drives(arm, target, to, what)
     if what.count is not None:
         exported: Exported | ExportedEnsemble = export_ensemble(
             arm, target, to, what.count, what.seed
@@ -147,6 +144,15 @@ def _exported(
     if what.ranges:
         say(f"written: {write_ranges(arm, target, to, what)}", err=True)
     return exported
+
+
+def _default_name(to: ExportName, *, ensemble: bool) -> str:
+    """Return the name of the file or folder, in the campaign folder or the working directory."""
+    if to == "c" or to == "st":
+        return f"arm.{to}"
+    if to == "isaaclab" or to == "genesis":
+        return f"identified_{to}.py"
+    return "identified_ensemble" if ensemble else f"identified{FORMATS[to].suffix}"
 
 
 def print_export(

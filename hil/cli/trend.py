@@ -10,7 +10,7 @@ from typing import Annotated, Final
 import typer
 
 from hil.base.exit_status import ExitStatus
-from hil.base.files import convert_write_errors, make_folder, write_files
+from hil.base.files import convert_write_errors, make_folder, write_into
 from hil.base.one_screen import TAIL_LINES, brief
 from hil.base.progress import reporter as make_reporter
 from hil.base.terminal_text import plural, printable
@@ -136,8 +136,7 @@ def _written(result: FleetTrend, output: Path | None, table: Path | None) -> dic
     """Write the requested report and table; return what each is, by path."""
     written = {}
     if output is not None:
-        make_folder(output.parent)
-        write_files(output.parent, {output.name: trend_page(result)})
+        write_into(output.parent, {output.name: trend_page(result)})
         written[output] = "each joint over time, for a browser"
     if table is not None:
         make_folder(table.parent)

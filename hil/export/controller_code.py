@@ -16,7 +16,7 @@ import numpy as np
 
 from hil.base.arrays import Array
 from hil.base.errors import InputError
-from hil.base.files import make_folder, write_files
+from hil.base.files import write_files, write_into
 from hil.pipeline.identified_model import IdentifiedModel
 from identification.export.controller.c_source import CSource, Precision, c_source
 from identification.export.controller.reference import reference_torque
@@ -141,10 +141,7 @@ def export_code(
             )
         check = "structured text has no compiler here; the tests of hil run its function blocks"
         files = {output.name: structured_text(tables, name, remarks)}
-    make_folder(output.parent)
-    write_files(output.parent, files)
-    paths = tuple(output.parent / written for written in files)
-    return ExportedCode(paths, check, model.verdict, model.origin)
+    return ExportedCode(write_into(output.parent, files), check, model.verdict, model.origin)
 
 
 def _remarks(model: IdentifiedModel) -> tuple[str, ...]:
@@ -158,12 +155,6 @@ def _remarks(model: IdentifiedModel) -> tuple[str, ...]:
         *(f"{key}: {value}" for key, value in others.items()),
         f"archives: {model.provenance.get('archives', '')}",
     )
-
-
-def default_code_output(sources: Sequence[Path], to: CodeName) -> Path:
-    """Return the default path: in the campaign folder, or in the working directory."""
-    folder = sources[0] if sources[0].is_dir() else Path()
-    return folder / f"arm.{to}"
 
 
 def checked(

@@ -12,7 +12,7 @@ import numpy as np
 
 from hil.base.arrays import Array
 from hil.base.errors import InputError
-from hil.base.files import make_folder, write_files
+from hil.base.files import write_files, write_into
 from hil.base.safe_input import read_input
 from hil.pipeline.identified_model import IdentifiedModel, ensemble_of, remarks_of
 from identification.estimators.prior import DETERMINED_STD_RATIO
@@ -43,6 +43,8 @@ _FIELDS: Final[Mapping[str, Mapping[str, Quantity]]] = {
     "isaaclab": ISAAC_LAB,
     "genesis": GENESIS,
 }
+PARSED: Final = "read back: parsed, its values agree with the ones written"
+PATCHED: Final = "not read back: the bodies of the file stay, and are not known here"
 OWN_FILE: Final = "give an MJCF or URDF with the joints of the arm by name"
 """Remedy for a file that cannot be changed."""
 _MIN_SAMPLED_ARMS: Final = 100  # arms of which ranges are estimated
@@ -86,10 +88,9 @@ class ExportedDrives:
 
     def lines(self) -> list[str]:
         """Return the summary as lines of text."""
-        lines = [*([f"parameters: {self.origin}"] if self.origin else [])]
-        return [
-            *lines, f"written: {', '.join(map(str, self.paths))}", self.read_back, self.verdict
-        ]  # fmt: skip
+        origin = [f"parameters: {self.origin}"] if self.origin else []
+        written = f"written: {', '.join(map(str, self.paths))}"
+        return [*origin, written, self.read_back, self.verdict]
 
     def to_dict(self) -> dict[str, object]:
         """Return the summary for JSON."""
@@ -117,17 +118,12 @@ def export_drives(
         WriteBackError: the file reads back with other values.
     """
     actuators = drives_of(model, what.count or 0, what.seed)
-    write = isaac_lab if to == "isaaclab" else genesis
-    text = write(actuators, model.name, remarks_of(model))
-    require_values(text, actuators, _FIELDS[to])
-    files = {output.name: text}
+    remarks = remarks_of(model)
+    files = {output.name: python_text(actuators, model.name, remarks, to)}
     if what.ranges or what.count:
-        files |= _ranges_file(actuators, model, output, to)
-    make_folder(output.parent)
-    write_files(output.parent, files)
-    paths = tuple(output.parent / name for name in files)
-    said = "read back: parsed, its values agree with the ones written"
-    return ExportedDrives(paths, said, model.verdict, model.origin)
+        files |= ranges_file(actuators, _FIELDS[to], remarks, output)
+    paths = write_into(output.parent, files)
+    return ExportedDrives(paths, PARSED, model.verdict, model.origin)
 
 
 def patch_drives(model: IdentifiedModel, into: Path, what: WhatToExport) -> ExportedDrives:
@@ -137,26 +133,13 @@ def patch_drives(model: IdentifiedModel, into: Path, what: WhatToExport) -> Expo
         InputError: the file cannot be patched, or the estimator has no posterior.
     """
     actuators = drives_of(model, 0, what.seed)
-    try:
-        text = patched(read_input(into, OWN_FILE), actuators)
-    except PatchError as error:
-        raise InputError(into, str(error), field="--into", remedy=OWN_FILE) from error
     target = what.output or into
-    files = {target.name: text}
+    files = {target.name: patched_text(into, actuators, OWN_FILE)}
     if what.ranges:
-        kind = "urdf" if into.suffix == ".urdf" else "mjcf"
-        files |= _ranges_file(actuators, model, target, kind)
-    make_folder(target.parent)
-    write_files(target.parent, files)
-    paths = tuple(target.parent / name for name in files)
-    said = "not read back: the bodies of the file stay, and are not known here"
-    return ExportedDrives(paths, said, model.verdict, model.origin)
-
-
-def default_drive_output(sources: Sequence[Path], to: DriveName) -> Path:
-    """Return the default path: in the campaign folder, or in the working directory."""
-    folder = sources[0] if sources[0].is_dir() else Path()
-    return folder / f"identified_{to}.py"
+        fields = _FIELDS["urdf" if into.suffix == ".urdf" else "mjcf"]
+        files |= ranges_file(actuators, fields, remarks_of(model), target)
+    paths = write_into(target.parent, files)
+    return ExportedDrives(paths, PATCHED, model.verdict, model.origin)
 
 
 def write_ranges(model: IdentifiedModel, beside: Path, to: str, what: WhatToExport) -> Path:
@@ -168,17 +151,55 @@ def write_ranges(model: IdentifiedModel, beside: Path, to: str, what: WhatToExpo
         to: its format.
         what: is exported.
     """
-    files = _ranges_file(drives_of(model, what.count or 0, what.seed), model, beside, to)
+    actuators = drives_of(model, what.count or 0, what.seed)
+    files = ranges_file(actuators, _FIELDS[to], remarks_of(model), beside)
     write_files(beside.parent, files)
     (name,) = files
     return beside.parent / name
 
 
-def _ranges_file(
-    actuators: Actuators, model: IdentifiedModel, beside: Path, to: str
+def python_text(actuators: Actuators, name: str, remarks: Sequence[str], to: str) -> str:
+    """Return a Python file for Isaac Lab or Genesis, read back.
+
+    Args:
+        actuators: of the arm.
+        name: of the arm.
+        remarks: comments at its head.
+        to: simulator, see `DriveName`.
+
+    Raises:
+        WriteBackError: the file reads back with other values.
+    """
+    write = isaac_lab if to == "isaaclab" else genesis
+    text = write(actuators, name, remarks)
+    require_values(text, actuators, _FIELDS[to])
+    return text
+
+
+def patched_text(into: Path, actuators: Actuators, remedy: str) -> str:
+    """Return the text of a user's own MJCF or URDF with friction, rotors and servos.
+
+    Raises:
+        InputError: the file cannot be patched; `remedy` says which can.
+    """
+    try:
+        return patched(read_input(into, OWN_FILE), actuators)
+    except PatchError as error:
+        raise InputError(into, str(error), field="--into", remedy=remedy) from error
+
+
+def ranges_file(
+    actuators: Actuators, fields: Mapping[str, Quantity], remarks: Sequence[str], beside: Path
 ) -> dict[str, str]:
-    """Return the file of ranges by its name."""
-    document = ranges_of(actuators, _FIELDS[to], remarks_of(model))
+    """Return the file of ranges by its name.
+
+    Args:
+        actuators: of the arm.
+        fields: quantities by the names that a simulator gives them.
+        remarks: comments.
+        beside: the file whose fields they are.
+    """
+    document = ranges_of(actuators, fields, remarks)
     return {f"{beside.stem}.ranges.json": json.dumps(document, indent=1) + "\n"}
 
 

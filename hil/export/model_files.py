@@ -11,7 +11,7 @@ from typing import Final, Literal
 import numpy as np
 
 from hil.base.arrays import Array
-from hil.base.files import make_folder, write_files
+from hil.base.files import make_folder, write_files, write_into
 from hil.pipeline.identification import Identification
 from hil.pipeline.identified_model import IdentifiedModel, ensemble_of, model_of, remarks_of
 from identification import Samples
@@ -204,12 +204,10 @@ def export_ensemble(
             joint_names=names.joint_names,
             seed=seed,
         )
-        make_folder(output.parent)
-        write_files(output.parent, {output.name: content.getvalue()})
+        write_into(output.parent, {output.name: content.getvalue()})
     else:
         texts, difference = _ensemble_texts(model, ensemble, FORMATS[to], seed)
-        make_folder(output)
-        write_files(output, texts)
+        write_into(output, texts)
     return ExportedEnsemble(output, ensemble, seed, names.joint_names, difference, model.verdict)
 
 
@@ -234,14 +232,6 @@ def _ensemble_texts(
             except MISSING_SIMULATOR_ERRORS as error:
                 missing = str(error)
     return texts, missing or difference
-
-
-def default_output(sources: Sequence[Path], to: FormatName, *, ensemble: bool = False) -> Path:
-    """Return the default path: in the campaign folder, or in the working directory."""
-    folder = sources[0] if sources[0].is_dir() else Path()
-    if ensemble:
-        return folder / "identified_ensemble"
-    return folder / f"identified{FORMATS[to].suffix}"
 
 
 def _motion(held_out: Sequence[Samples]) -> Motion:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -11,24 +10,24 @@ from typing import Final, Literal, NamedTuple
 import numpy as np
 
 from hil.base.errors import InputError
-from hil.base.files import make_folder, write_files
-from hil.base.safe_input import read_input
+from hil.base.files import write_into
 from hil.cell import Cell
-from hil.export.drive_files import OWN_FILE, URDF, WhatToExport
+from hil.export.drive_files import (
+    PARSED,
+    PATCHED,
+    URDF,
+    WhatToExport,
+    patched_text,
+    python_text,
+    ranges_file,
+)
 from hil.pipeline.sources import Source
 from hil.pipeline.stored_servo import actuators_of, servo_arm, servo_sources
 from hil.results.provenance import RESULTS
 from hil.results.servo_result import ServoResults
-from identification.export.actuators import Actuators, Quantity, ranges_of
-from identification.export.patching import PatchError, patched
+from identification.export.actuators import Actuators, Quantity
 from identification.export.playback import played_back
-from identification.export.python_files import (
-    GENESIS,
-    ISAAC_LAB,
-    genesis,
-    isaac_lab,
-    require_values,
-)
+from identification.export.python_files import GENESIS, ISAAC_LAB
 from identification.export.simulators import (
     FORMATS,
     MISSING_SIMULATOR_ERRORS,
@@ -135,7 +134,7 @@ def export_servo(folder: Path, to: str, export: WhatToExport) -> tuple[ExportedS
     actuators = actuators_of(servo, cell, results.windows, export.count or 0, export.seed)
     remarks = _remarks(results)
     target = export.output or export.into or folder / f"identified{form.suffix}"
-    files: dict[str, str | bytes | None] = {}
+    files: dict[str, str] = {}
     played: tuple[PlayedBack, ...] = ()
     if to in ("mjcf", "urdf"):
         text, checked = _description(cell, actuators, remarks, to, export.into)
@@ -145,17 +144,12 @@ def export_servo(folder: Path, to: str, export: WhatToExport) -> tuple[ExportedS
         if export.into is None:
             files |= _sampled_arms(cell, actuators, remarks, to, export, target)
     else:
-        write = isaac_lab if to == "isaaclab" else genesis
-        text = write(actuators, results.cell, remarks)
-        require_values(text, actuators, form.names)
-        checked = "read back: parsed, its values agree with the ones written"
+        text = python_text(actuators, results.cell, remarks, to)
+        checked = PARSED
     files[target.name] = text
     if export.ranges or export.count is not None:
-        document = ranges_of(actuators, form.names, remarks)
-        files[f"{target.stem}.ranges.json"] = json.dumps(document, indent=1) + "\n"
-    make_folder(target.parent)
-    write_files(target.parent, files)
-    paths = tuple(target.parent / name for name in files)
+        files |= ranges_file(actuators, form.names, remarks, target)
+    paths = write_into(target.parent, files)
     return ExportedServo(paths, checked, played, results.verdict.line), results.verdict.good
 
 
@@ -164,12 +158,8 @@ def _description(
 ) -> tuple[str, str]:
     """Return the text of an MJCF or URDF, and how it was read back."""
     if into is not None:
-        try:
-            text = patched(read_input(into, OWN_FILE), actuators)
-        except PatchError as error:
-            remedy = "give an MJCF or URDF with the joints of the results by name"
-            raise InputError(into, str(error), field="--into", remedy=remedy) from error
-        return text, "not read back: the bodies of the file stay, and are not known here"
+        remedy = "give an MJCF or URDF with the joints of the results by name"
+        return patched_text(into, actuators, remedy), PATCHED
     arm = servo_arm(cell, actuators)
     form = FORMATS[to]
     if to == "mjcf":
