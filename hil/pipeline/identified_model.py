@@ -27,7 +27,7 @@ from identification.estimators.consistent import ConsistentEstimate
 from identification.estimators.ensemble import Ensemble, draw_ensemble
 from identification.export.exported_arm import ExportedArm
 from identification.export.friction_curve import median_load
-from identification.factor.blocks import FINE_BLOCK, fine_blocks
+from identification.factor.blocks import FINE_BLOCK
 from identification.model.joint_ranges import JointRanges, urdf_limits
 from identification.model.pseudo_inertia import margin
 from identification.model.robot import RobotModel
@@ -109,7 +109,7 @@ class IdentifiedModel:
         parts = predicted_parts(duration, shortest)
         fold = np.minimum(np.floor(parts * before / rows.sum()).astype(np.intp), parts - 1)
         length = round(total.block / FINE_BLOCK)
-        folds = [fold[fine_blocks(samples) // length] for samples in fitted]
+        folds = [fold[samples.blocks(FINE_BLOCK) // length] for samples in fitted]
         residuals = [np.empty(samples.torque.shape) for samples in fitted]
         for k in range(parts):
             values = self.posterior.values(total.without(fold == k))

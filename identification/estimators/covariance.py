@@ -29,7 +29,7 @@ from numpy.typing import NDArray
 from identification.arrays import Array
 from identification.distributions import student_limit
 from identification.estimators.loss_functions import Loss
-from identification.factor.blocks import FINE_BLOCK, block_slices, fine_blocks, merged
+from identification.factor.blocks import FINE_BLOCK, block_slices, merged
 from identification.factor.estimate import Estimate, mark_undetermined
 from identification.factor.estimation_method import TimeBlocks
 from identification.factor.factor import Factor
@@ -375,13 +375,13 @@ def clustered_covariance(
         weights: of the joints (n,).
         loss: of the residuals.
     """
-    count = max(int(fine_blocks(samples)[-1]) + 1 for samples in recordings)
+    count = max(int(samples.blocks(FINE_BLOCK)[-1]) + 1 for samples in recordings)
     k = solution.root.shape[1]
     information = np.zeros((count, k, k))  # information in coordinates with unit sum of squares
     scores = np.zeros((count, model.n_parameters))
     rows = np.zeros(count, dtype=np.intp)
     for samples in recordings:
-        index = fine_blocks(samples)
+        index = samples.blocks(FINE_BLOCK)
         np.add.at(rows, index, np.count_nonzero(samples.usable, axis=1))
         for part, tables in augmented_rows(model, samples):
             for joint, (table, used) in enumerate(zip(tables, model.plan.columns, strict=True)):

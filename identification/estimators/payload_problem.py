@@ -16,7 +16,7 @@ from identification.arrays import Array
 from identification.errors import IdentificationError
 from identification.estimators.covariance import Clustered, cluster_covariance
 from identification.estimators.torque_scale import scale_sensitivity
-from identification.factor.blocks import FINE_BLOCK, count_by_block, fine_blocks
+from identification.factor.blocks import FINE_BLOCK, count_by_block
 from identification.factor.estimate import Estimate, inverse_variance
 from identification.factor.factor import MIN_NOISE, Factor, no_rows_message
 from identification.factor.normal_equations import MAX_UNDETERMINED_SHARE, NormalEquations, solve
@@ -69,7 +69,7 @@ class Run:
         plan = RegressorPlan.of_bodies(model.chain, model.gravity, joint)
         blocks, columns = samples.regressor(model)
         loads = plan.evaluate(samples.motion.kinematics())
-        index = fine_blocks(samples)
+        index = samples.blocks(FINE_BLOCK)
         tables = []
         places = []
         for j, block in enumerate(blocks):

@@ -10,19 +10,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from identification.arrays import Array, Indices
-from identification.signals.samples import Samples
 
 Blocks = TypeVar("Blocks", NDArray[np.float64], NDArray[np.intp])
 
 FINE_BLOCK: Final = 0.125  # s
 FOLDS: Final = 5
 """Number of interleaved parts of the blocks; each is predicted from the others."""
-
-
-def fine_blocks(samples: Samples) -> Indices:
-    """Return the block of each sample (m,), rising; rows before the origin belong to the first."""
-    since = samples.motion.time - samples.origin
-    return np.maximum(np.floor(since / FINE_BLOCK + 1e-9).astype(np.intp), 0)
 
 
 def block_slices(index: Indices) -> Iterator[tuple[int, slice]]:

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from identification.arrays import Array
-from identification.factor.blocks import FINE_BLOCK, count_by_block, fine_blocks
+from identification.factor.blocks import FINE_BLOCK, count_by_block
 from identification.factor.factor import Factor, time_blocks
 from identification.factor.rows import augmented_rows
 from identification.model.friction import FrictionTerm
@@ -51,7 +51,7 @@ def instrument_factor(
     # The same rows, with the same torque low-pass.
     instrument = replace(instrument, load=samples.motion.load)
     planned = augmented_rows(model, replace(samples, motion=instrument, usable=rows))
-    index = fine_blocks(samples)
+    index = samples.blocks(FINE_BLOCK)
     both = (
         (index[part], [np.concatenate([z[:-1], w]) for z, w in zip(quiet, noisy, strict=True)])
         for (part, noisy), (_, quiet) in zip(measured, planned, strict=True)
@@ -103,8 +103,7 @@ def gain_factor(
         if unknown_inertia:
             moments = [*carried.moment_columns(samples.motion)]
     width = p + moments[0].shape[1]
-    since = samples.motion.time - samples.origin
-    index = np.maximum(np.floor(since / block + 1e-9).astype(np.intp), 0)
+    index = samples.blocks(block)
     usable = np.zeros((m, n), dtype=np.bool_)
     tables = np.zeros((n, width + 3, m))
     for motor, share in enumerate(np.linalg.inv(turns).T):

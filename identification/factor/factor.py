@@ -24,7 +24,6 @@ from identification.factor.blocks import (
     block_slices,
     count_by_block,
     equal_runs,
-    fine_blocks,
     merged,
     part_edges,
 )
@@ -100,7 +99,7 @@ class Factor:
 
     @classmethod
     def by_time(cls, model: RobotModel, samples: Samples) -> Self:
-        """Reduce the usable rows of a recording by :func:`fine_blocks`, longer ones if many."""
+        """Reduce the usable rows of a recording by blocks of `FINE_BLOCK`, longer ones if many."""
         index, block = time_blocks(samples)
         return replace(cls.of(model, samples, index=index), block=block)
 
@@ -421,7 +420,7 @@ class Factor:
 
 def time_blocks(samples: Samples) -> tuple[Indices, float]:
     """Return the block of each sample (m,), and its duration [s]: longer ones if many."""
-    index = fine_blocks(samples)
+    index = samples.blocks(FINE_BLOCK)
     length = 1
     while length < _MAX_FINE_BLOCKS and index.max(initial=0) >= length * _MANY_BLOCKS:
         length *= 2

@@ -23,7 +23,7 @@ from identification.factor.estimate import Estimate
 from identification.factor.factor import Factor
 from identification.hypotheses.explanation import Explanation
 from identification.model.robot import RobotModel
-from identification.signals.block_mean import BlockMean, block_index, block_mean
+from identification.signals.block_mean import BLOCK_SECONDS, BlockMean, block_mean
 from identification.signals.samples import Samples
 
 ChangeKind = Literal["gain", "friction"]
@@ -109,7 +109,7 @@ class _Part(NamedTuple):
         sums: tuple[list[Array], list[Array]] = ([], [])
         for samples in recordings:
             usable = samples.usable
-            block = block_index(samples)
+            block = samples.blocks(BLOCK_SECONDS)
             predicted = samples.predicted_torque(model, values)
             left = np.where(usable, samples.torque - predicted, 0.0)
             torque += np.einsum("mj,mj,mj->j", samples.torque, samples.torque, usable)

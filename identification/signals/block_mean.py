@@ -8,7 +8,6 @@ from typing import Final, NamedTuple
 import numpy as np
 
 from identification.arrays import Array, Indices
-from identification.signals.samples import Samples
 
 # Model errors are correlated over tenths of a second.
 BLOCK_SECONDS: Final = 0.5  # s
@@ -41,9 +40,3 @@ def block_mean(parts: Sequence[Array], repeated: int = 1) -> BlockMean:
     scores = (values - mean * weights) / divisor
     std = np.sqrt((scores**2).sum(axis=0) * blocks / np.maximum(blocks - 1, 1))
     return BlockMean(np.where(enough, mean, np.nan), np.where(enough, std, np.nan), total, blocks)
-
-
-def block_index(samples: Samples) -> Indices:
-    """Return the block of each row (m,), numbered from the start of the motion."""
-    since = samples.motion.time - samples.origin
-    return np.maximum(np.floor(since / BLOCK_SECONDS + 1e-9).astype(np.intp), 0)

@@ -8,7 +8,7 @@ from typing import Final, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from identification.arrays import Array
+from identification.arrays import Array, Indices
 from identification.model.motion import Motion
 from identification.model.regressor import Regressor
 from identification.model.robot import RobotModel
@@ -145,6 +145,14 @@ class Samples:
     def thinned_to(self, rows: int) -> Samples:
         """Return at least this many rows where there are, evenly spaced."""
         return self.thinned(max(1, len(self.torque) // rows))
+
+    def blocks(self, duration: float) -> Indices:
+        """Return the block of time [s] of each row (m,), rising, counted from the origin.
+
+        Rows before the origin belong to the first block.
+        """
+        since = self.motion.time - self.origin
+        return np.maximum(np.floor(since / duration + 1e-9).astype(np.intp), 0)
 
     def moving(self) -> Samples:
         """Return samples with the rows in sliding motion only."""

@@ -24,7 +24,7 @@ from identification.factor.factor import Factor
 from identification.factor.rows import augmented_rows
 from identification.model.robot import RobotModel
 from identification.selection.folds import FOLDS
-from identification.signals.block_mean import BLOCK_SECONDS, MIN_BLOCKS, block_index
+from identification.signals.block_mean import BLOCK_SECONDS, MIN_BLOCKS
 from identification.signals.masks import RowReason
 from identification.signals.samples import Samples
 
@@ -170,7 +170,7 @@ def _means(model: RobotModel, samples: Samples) -> tuple[Array, NDArray[np.intp]
     if samples.mask is not None:
         for reason in (RowReason.EDGE, RowReason.SATURATED, RowReason.UNMEASURED):
             usable &= ~samples.mask.reasons[reason]
-    index = block_index(samples)
+    index = samples.blocks(BLOCK_SECONDS)
     p = model.n_parameters
     present = np.unique(index)
     count = count_by_block(index, usable)[present]

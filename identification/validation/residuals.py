@@ -17,7 +17,7 @@ from identification.arrays import Array, Indices
 from identification.distributions import MAD_TO_STD, student_limit
 from identification.estimators.friction_drift import TREND_PIECES, FrictionDrift, friction_trend
 from identification.model.robot import RobotModel
-from identification.signals.block_mean import BlockMean, block_index, block_mean
+from identification.signals.block_mean import BLOCK_SECONDS, BlockMean, block_mean
 from identification.signals.samples import Samples
 from identification.signals.spectrum import power_density
 from identification.validation.prediction import PredictionError
@@ -97,7 +97,7 @@ def _profile(
     edges = np.linspace(lowest, highest, RESIDUAL_BINS + 1, axis=1)
     sums = []
     for run, residual, quantity in zip(runs, residuals, over, strict=True):
-        block = block_index(run)
+        block = run.blocks(BLOCK_SECONDS)
         binned_sums = np.zeros((2, int(block[-1]) + 1, len(edges), RESIDUAL_BINS))
         for joint, usable in enumerate(run.usable.T):
             bins = np.searchsorted(edges[joint, 1:-1], quantity[:, joint], side="right")

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from identification.arrays import Array, Indices
 from identification.distributions import student_limit
 from identification.model.robot import RobotModel
-from identification.signals.block_mean import BlockMean, block_index, block_mean
+from identification.signals.block_mean import BLOCK_SECONDS, BlockMean, block_mean
 from identification.signals.samples import Samples
 
 # Per motor turn: eccentricity 1; strain wave gears 2; pole pairs and slots of servo motors above.
@@ -73,7 +73,7 @@ def motor_ripple(
 
 def _harmonic_sums(samples: Samples, residual: Array, motor_from_joint: Array) -> Array:
     """Sum a residual (m, n) times each wave, and its squares (2, B, n, H, 2)."""
-    block = block_index(samples)
+    block = samples.blocks(BLOCK_SECONDS)
     motor = samples.motion.position @ motor_from_joint.T
     count = int(block[-1]) + 1
     sums = np.zeros((2, count, residual.shape[1], len(HARMONICS), 2))
@@ -138,7 +138,7 @@ def _rows_of(joint: int, runs: Sequence[Samples], residuals: Sequence[Array]) ->
     first = 0
     for run, residual in zip(runs, residuals, strict=True):
         usable = run.usable[:, joint]
-        block = block_index(run)
+        block = run.blocks(BLOCK_SECONDS)
         parts.append(
             (run.motion.position[usable, joint], residual[usable, joint], first + block[usable])
         )
