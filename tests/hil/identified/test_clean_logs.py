@@ -16,7 +16,7 @@ import hil
 from hil.cli import app
 from hil.identified.identified_arm import IdentifiedArm
 from tests.hil.importers.moving_log import URDF
-from tests.hil.simulated_logs import urdf_path, write_log
+from tests.hil.simulated_logs import urdf_path
 from tests.tiers import quick_ones
 
 COMPLAINTS = {"resolution", "outliers", "generalisation", "joint order"}
@@ -92,26 +92,3 @@ def test_it_is_exported(arm: IdentifiedArm, tmp_path: Path) -> None:
     done = CliRunner().invoke(app, line)
     assert done.exit_code == 0, (done.output, done.exception)
     assert (tmp_path / "arm.urdf").read_text().startswith("<")
-
-
-@pytest.mark.long
-@pytest.mark.filterwarnings("error::RuntimeWarning")
-def test_a_log_of_poses_at_rest_ends_in_a_verdict(tmp_path: Path) -> None:
-    """Torques of gravity alone: there is no motion to show or to judge."""
-    urdf = tmp_path / "arm.urdf"
-    urdf.write_text(URDF)
-    model = pin.buildModelFromUrdf(str(urdf))
-    data = model.createData()
-    random = np.random.default_rng(0)
-    poses = random.uniform(-1.0, 1.0, (20, model.nv))
-    weights = np.array([pin.computeGeneralizedGravity(model, data, pose) for pose in poses])
-    log = tmp_path / "poses.csv"
-    position, torque = (np.repeat(each, 50, axis=0) for each in (poses, weights))
-    torque = torque + random.normal(0.0, 0.01, torque.shape)
-    write_log(log, ["t", "q{}", "tau{}"], np.arange(len(position)) / 50.0, position, torque)
-    output = tmp_path / "found"
-    line = ["identify", str(log), "--urdf", str(urdf), "-o", str(output)]
-    result = CliRunner().invoke(app, line)
-    assert result.exception is None or isinstance(result.exception, SystemExit), result.exception
-    assert result.exit_code == 5
-    assert (output / "report.html").is_file()
