@@ -506,11 +506,12 @@ class ConstantTorque(Conclusion):
 
 @dataclass(frozen=True)
 class LargeTorque(Conclusion):
-    """The largest torque of a joint, and its limit in the URDF [N·m or N]."""
+    """The largest torque of a joint, and its limit in the URDF, in its unit (N·m or N)."""
 
     joint: str
     torque: float
     limit: float
+    unit: str
 
 
 @dataclass(frozen=True)

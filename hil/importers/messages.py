@@ -504,8 +504,8 @@ def _(constant: ConstantTorque) -> str:
 @worded.register
 def _(large: LargeTorque) -> str:
     return (
-        f"the torque of {large.joint} reaches {number(large.torque)}, its limit in the URDF is "
-        f"{number(large.limit)} N·m (or N): check its unit and side (motor or joint)"
+        f"the torque of {large.joint} reaches {number(large.torque)} {large.unit}, its limit in the"
+        f" URDF is {number(large.limit)} {large.unit}: check its unit and side (motor or joint)"
     )
 
 

@@ -112,7 +112,7 @@ def examine(
     is_plausible = not warnings  # torques are compared only if the motion is plausible
     if samples.velocity is not None and not several:
         warnings += _velocities(time, position, samples.velocity, joint_names)
-    warnings += _torques(samples, joint_names, limits.effort)
+    warnings += _torques(samples, joint_names, turning, limits.effort)
     if is_plausible:
         warnings += _torque_size(samples, joint_names, limits.effort, nominal)
     warnings += _constant(position, joint_names, held_joints)
@@ -429,16 +429,20 @@ def against_position(time: Array, position: Array, velocity: Array) -> tuple[Arr
     return factor, correlation
 
 
-def _torques(samples: ImportedSamples, names: Sequence[str], limits: Array) -> Iterator[Conclusion]:
+def _torques(
+    samples: ImportedSamples, names: Sequence[str], turning: NDArray[np.bool_], limits: Array
+) -> Iterator[Conclusion]:
     if samples.torque is None and samples.motor_current is None:
         yield NoTorque(is_commanded=samples.commanded_position is not None)
     if samples.torque is None:
         return
-    for name, largest, limit in zip(names, np.abs(samples.torque).max(axis=0), limits, strict=True):
+    sizes = np.abs(samples.torque).max(axis=0)
+    for name, turns, largest, limit in zip(names, turning, sizes, limits, strict=True):
         if largest == 0.0:
             yield ZeroTorque(name)
         elif largest > MAX_LIMIT_RATIO * limit:
-            yield LargeTorque(name, float(largest), float(limit))
+            unit = "N·m" if turns else "N"
+            yield LargeTorque(name, float(largest), float(limit), unit)
     yield from constant_torques(samples.position, samples.torque, names)
 
 

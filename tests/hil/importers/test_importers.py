@@ -930,7 +930,7 @@ ERRORS = {
     "degrees": ({"position": DEGREES}, "read as degrees, none would"),
     "degrees of rad": ({"position": 1 / DEGREES}, "no joint moves further than"),
     "no velocity": ({"velocity": 0.0}, "does not follow its position"),
-    "torque": ({"torque": 1000.0}, "its limit in the URDF is 150 N·m (or N): check its unit"),
+    "torque": ({"torque": 1000.0}, "its limit in the URDF is 150 N·m: check its unit"),
     "slow clock": ({"clock": 1e3}, "0.1 samples per second are unusual"),
     "fast clock": ({"clock": 1e-3}, "100000 samples per second are unusual"),
     "order": (
@@ -980,6 +980,16 @@ class TestWarnings:
         result = examine(samples, arm.joint_names, robot.urdf)
         stopped = [found for found in result.warnings if isinstance(found, StoppedJoint)]
         assert [found.joint for found in stopped] == [arm.joint_names[1]] * is_named
+
+    def test_the_limit_of_a_slide_is_a_force(self) -> None:
+        urdf = """<robot name="lift"><link name="base"/><link name="cart"/>
+        <joint name="slide" type="prismatic"><parent link="base"/><child link="cart"/>
+        <limit lower="-1" upper="1" effort="100" velocity="10"/></joint></robot>"""
+        time = np.linspace(0.0, 10.0, 1001)
+        position = 0.5 * np.sin(time)[:, None]
+        stamp = np.rint(time * 1e9).astype(np.int64)
+        result = examine(ImportedSamples(stamp, position, torque=1e4 * position), ["slide"], urdf)
+        assert any("limit in the URDF is 100 N:" in worded(found) for found in result.warnings)
 
     def test_velocities_have_factors_by_joint(self, arm: Simulated, panda: Simulated) -> None:
         for factor in (DEGREES, -1.0):
