@@ -33,7 +33,11 @@ ALTERNATIVES: Final[Mapping[str, tuple[Any, ...]]] = {
     "MIN_TERM_IMPROVEMENT": (0.0, 0.05),
     "MIN_REVERSAL_IMPROVEMENT": (0.02, 0.10),
     "EXCLUDED_ROWS": (("halts", "rests", "slow"),),
-    "BANDWIDTHS": ((10.0, 14.0, 7.0, 20.0, 40.0), (20.0, 14.0, 40.0, 10.0, 7.0)),
+    "BANDWIDTHS": (
+        (14.0, 10.0, 20.0, 7.0, 40.0),
+        (10.0, 14.0, 7.0, 20.0, 5.0, 3.5, 40.0),
+        (20.0, 14.0, 40.0, 10.0, 7.0, 5.0, 3.5),
+    ),
     "VELOCITIES": (("position", "measured"),),
     "PRESLIDING_DISTANCES": (
         (1e-5, 3e-5, 1e-6, 1e-4, 3e-4, 1e-3),

@@ -71,8 +71,8 @@ ROWS_IN_MOTION: Final = "rows that are left out, by the error in motion"
 # A drive differentiates its encoder at a higher rate than the log has.
 VELOCITIES: Final[tuple[VelocitySource, ...]] = ("measured", "position")
 # Unmodelled dynamics start at about 10 Hz on most arms. The smoother of 14 Hz, the default, leaves
-# nine tenths of an amplitude there, and half of it at 14 Hz.
-BANDWIDTHS: Final = (14.0, 10.0, 20.0, 7.0, 40.0)  # Hz, by distance from the first
+# nine tenths of an amplitude there, and half of it at 14 Hz. Soft drives swing from 3 Hz on.
+BANDWIDTHS: Final = (14.0, 10.0, 20.0, 7.0, 5.0, 40.0, 3.5)  # Hz, by distance from the first
 # The middle of what gears show first. Zero is no candidate: its sign at rest is noise.
 PRESLIDING_DISTANCES: Final = (3e-5, 1e-5, 1e-4, 3e-4, 1e-6, 1e-3)  # rad or m
 # Rows of a joint that stands while another moves hold its load; but those near a reversal, or at

@@ -299,6 +299,15 @@ class TestChosenSettings:
         assert choice.errors[1] < 0.97 * choice.errors[0]
         assert settings.preprocessing.velocity == source
 
+    @pytest.mark.parametrize(("swing", "bandwidths"), [(0.0, [14.0]), (2e-3, [3.5, 5.0])])
+    def test_a_motor_that_swings_on_a_soft_drive_is_smoothed(self, swing, bandwidths):
+        """At 6 Hz, which the link does not follow."""
+        recording = a_recording(duration=LONG, motion=a_slow_motion(0.5))
+        swings = swing * np.sin(2.0 * np.pi * 6.0 * recording.time)[:, None]
+        swinging = replace(recording, position=recording.position + swings)
+        settings, _ = chosen(swinging, {"bandwidth"})
+        assert settings.preprocessing.rigid_bandwidth in bandwidths
+
     def test_the_true_friction_term_is_found(self):
         cubic = MODEL.with_friction(third="cubic")
         recording = a_recording(cubic, np.append(truth(), [0.5, 0.3]), duration=LONG)
