@@ -304,6 +304,9 @@ def with_readings(
 def unexplained_share(model: RobotModel, rows: Samples, score: Score) -> float:
     """Return the error of a torque, as a share of it, that no masses and rotors explain.
 
+    A short log may predict none of its parts from the others, such as one in which each joint moves
+    once. Masses that fit all of it then explain it, as far as it can be told.
+
     Args:
         model: of the arm.
         rows: of the recording.
@@ -313,7 +316,10 @@ def unexplained_share(model: RobotModel, rows: Samples, score: Score) -> float:
     if error <= UNEXPLAINED:
         return error
     free = score_of(model, rows, score.columns, wide_rotors=True, share=_FREE_SHARE)
-    return min(error, free.overall)
+    factor = Factor.of(model, rows)
+    prior = body_prior(model, factor, _FREE_SHARE, wide_rotors=True).gaussian
+    fitted = _relative_error(factor, posterior_values(factor, prior, ROWS_PER_FACT)[0])
+    return min(error, free.overall, fitted if fitted <= EXPLAINED_ERROR else error)
 
 
 def _is_predicted(score: Score, samples: Samples, noise: Array | None) -> bool:

@@ -84,7 +84,7 @@ def find_inertia_scale(
 ) -> InertiaScale | None:
     """Return the factor that explains a torque much better; None if the described one does.
 
-    None also where heavy rotors explain it as well.
+    None also where heavy rotors, or a load, explain it as well.
 
     Args:
         model: of the arm.
@@ -116,8 +116,13 @@ def find_inertia_scale(
         return None
     if against.ratio > least:
         return None
-    if fits_alike(score_of(model, samples, wide_rotors=True), scaled, model):
-        return None  # heavy rotors are inertia without weight as well
+    # Heavy rotors are inertia without weight as well, and a load is weight far from most axes.
+    rivals = (
+        score_of(model, samples, wide_rotors=True),
+        score_of(model, samples, is_loaded=True),
+    )
+    if any(fits_alike(rival, scaled, model) for rival in rivals):
+        return None
     return InertiaScale(best, error, score.overall, against, _weight(model, samples, best))
 
 

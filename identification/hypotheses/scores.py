@@ -9,7 +9,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from identification.arrays import Array
-from identification.estimators.prior import BODY_STD_SHARE, body_prior, posterior_values
+from identification.estimators.prior import (
+    BODY_STD_SHARE,
+    body_lengths,
+    body_prior,
+    posterior_values,
+)
 from identification.factor.blocks import FOLDS
 from identification.factor.factor import Factor
 from identification.hypotheses.error_ratios import (
@@ -18,6 +23,7 @@ from identification.hypotheses.error_ratios import (
     mean_and_error,
 )
 from identification.hypotheses.little_torque import little_torque
+from identification.model.link_wrenches import MASS_INDEX, N_INERTIA
 from identification.model.motion import Motion
 from identification.model.robot import RobotModel
 from identification.signals.samples import Samples
@@ -128,6 +134,7 @@ def score_of(
     *,
     wide_rotors: bool = False,
     share: float = BODY_STD_SHARE,
+    is_loaded: bool = False,
 ) -> Score:
     """Predict every fifth of `_BLOCKS` blocks of samples from the others.
 
@@ -137,10 +144,12 @@ def score_of(
         columns: of the recorded torque that the joints are read from, by default in order.
         wide_rotors: as for :func:`~identification.estimators.prior.body_prior`.
         share: likewise, of the bodies.
+        is_loaded: whether the last body may carry a load as heavy as the arm.
     """
     columns = np.arange(model.n_joints) if columns is None else columns
     factor = _factor(model, samples)
-    prior = body_prior(model, factor, share, wide_rotors=wide_rotors).gaussian
+    stated = any_load(model) if is_loaded else None
+    prior = body_prior(model, factor, share, stated, wide_rotors=wide_rotors).gaussian
     squares = np.zeros((len(factor), factor.n_joints))
     weights: Array | None = None
     estimates: list[Array] = []
@@ -157,6 +166,22 @@ def score_of(
     rms = np.maximum(np.sqrt(torque / np.maximum(factor.samples, 1)), 1e-300)
     mean = friction.mean(axis=0)
     return Score(squares, torque, mean / np.maximum(deviation, 1e-300), mean / rms, columns)
+
+
+def any_load(model: RobotModel) -> dict[str, tuple[float, float]]:
+    """Return mean and standard deviation of the last body under a load as heavy as the arm.
+
+    By the names of its parameters, as :func:`~identification.estimators.prior.body_prior` has them
+    stated. The load may be as far from the axis as the longest body reaches.
+    """
+    last = model.layout.links[model.chain.last_joint]
+    mass = float(model.nominal[model.layout.links][:, MASS_INDEX].sum())
+    reach = float(body_lengths(model).max())
+    inertias, moments = [mass * reach**2] * N_INERTIA, [mass * reach] * 3
+    return {
+        model.layout.names[place]: (float(model.nominal[place]), std)
+        for place, std in zip(last, [*inertias, *moments, mass], strict=True)
+    }
 
 
 def inertial_torque(model: RobotModel, samples: Samples) -> Array:

@@ -2,17 +2,19 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from functools import cache
 
 import numpy as np
 import pytest
+from numpy.polynomial import Polynomial
 from numpy.typing import NDArray
 
-from identification import Recording
+from identification import Recording, RobotModel
 from identification.estimators.prior import body_prior, posterior_values
 from identification.factor.factor import Factor
 from identification.hypotheses.column_search import find_columns, find_columns_of_unseen
-from identification.hypotheses.diagnosis import TorqueDiagnosis, diagnose
+from identification.hypotheses.diagnosis import UNEXPLAINED, TorqueDiagnosis, diagnose
 from identification.hypotheses.explanation import ExplainedFit, Explanation
 from identification.hypotheses.joint_changes import Change
 from identification.hypotheses.readings import Adequacy
@@ -20,6 +22,7 @@ from identification.hypotheses.scores import ROWS_PER_FACT
 from identification.model.motion import Motion
 from identification.signals.samples import Preprocessing, prepare
 from identification.validation.findings.diagnosis import of_diagnosis
+from tests.identification.robots import robot_text
 from tests.identification.three_axes import HIP, KNEE, NAMES, TIME, model, motion
 
 Floats = NDArray[np.float64]
@@ -161,6 +164,55 @@ def test_a_torque_of_another_run_is_explained_by_nothing() -> None:
     q, torque, _ = motion()
     assert diagnosed(q, np.roll(torque, len(TIME) // 2, axis=0)).is_unexplained
     assert not diagnosed(q, torque).is_unexplained
+
+
+def each_joint_once(robot: RobotModel, load: float, duration: float = 12.0) -> Recording:
+    """A torque under a load on the flange [kg]; each joint moves once, one after the other."""
+    rng = np.random.default_rng(0)
+    n = robot.n_joints
+    time = np.arange(0.0, duration, 1.0 / 30.0)
+    each = duration / n
+    passed = np.clip(time[:, None] / each - np.arange(n), 0.0, 1.0)
+    travel = rng.uniform(1.0, 2.0, n) * rng.choice([-1.0, 1.0], n)
+    q = rng.uniform(-1.0, 1.0, n) + travel * Polynomial([0, 0, 0, 10, -15, 6])(passed)
+    v = travel * Polynomial([0, 0, 30, -60, 30])(passed) / each
+    a = travel * Polynomial([0, 60, -180, 120])(passed) / each**2
+    bodies = robot.nominal.copy()
+    names = robot.layout.names
+    for symbol, lever in zip(("m6", "mc6x", "mc6y", "mc6z"), (1.0, 0.05, 0.1, 0.15), strict=True):
+        bodies[names.index(symbol)] += load * lever
+    values = np.zeros(robot.n_parameters)
+    values[: robot.base.rank] = robot.base.grouping @ bodies
+    torque = robot.torque(values, Motion.of_states(q, v, a))
+    size = np.sqrt(np.mean(torque**2, axis=0))
+    torque += size * (0.1 * np.sign(v) + rng.normal(0.0, 0.02, v.shape))
+    return Recording(time, q, robot.joint_names, torque)
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("load", [0.0, 15.0])
+def test_masses_may_explain_a_torque_of_which_no_part_predicts_another(load: float) -> None:
+    """Under a load as heavy as the arm, the masses of the URDF do not explain it."""
+    robot = RobotModel.from_urdf(robot_text("ur_description/urdf/ur5_robot.urdf"))
+    recording = each_joint_once(robot, load)
+    options = Preprocessing(14.0, exclude_rows="rests")
+
+    def error(torque: Floats) -> float:
+        samples = prepare(replace(recording, torque=torque), robot, options=options)
+        return diagnose(robot, [samples]).error
+
+    assert error(recording.torque) < 0.5 * UNEXPLAINED
+    assert error(np.roll(recording.torque, len(recording.time) // 2, axis=0)) > UNEXPLAINED
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("load", [5.0, 15.0])
+def test_a_load_is_no_other_times(load: float) -> None:
+    """Its weight is far from the axes of most joints, where nobody states its inertia."""
+    robot = RobotModel.from_urdf(robot_text("ur_description/urdf/ur5_robot.urdf"))
+    options = Preprocessing(14.0, exclude_rows="rests")
+    samples = prepare(each_joint_once(robot, load), robot, options=options)
+    assert diagnose(robot, [samples]).inertia is None
 
 
 def test_what_is_known_is_not_searched_again() -> None:
