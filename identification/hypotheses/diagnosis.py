@@ -304,8 +304,8 @@ def with_readings(
 def unexplained_share(model: RobotModel, rows: Samples, score: Score) -> float:
     """Return the error of a torque, as a share of it, that no masses and rotors explain.
 
-    A short log may predict none of its parts from the others, such as one in which each joint moves
-    once. Masses that fit all of it then explain it, as far as it can be told.
+    A short log, such as one in which each joint moves once, may predict none of its parts from the
+    others. Masses that fit all of it explain it nevertheless.
 
     Args:
         model: of the arm.
