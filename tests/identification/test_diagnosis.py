@@ -191,7 +191,7 @@ def each_joint_once(robot: RobotModel, load: float, duration: float = 12.0) -> R
 
 @pytest.mark.long
 @pytest.mark.parametrize("load", [0.0, 15.0])
-def test_masses_may_explain_a_torque_of_which_no_part_predicts_another(load: float) -> None:
+def test_masses_explain_a_log_of_which_no_part_predicts_another(load: float) -> None:
     """Under a load as heavy as the arm, the masses of the URDF do not explain it."""
     robot = RobotModel.from_urdf(robot_text("ur_description/urdf/ur5_robot.urdf"))
     recording = each_joint_once(robot, load)
