@@ -14,9 +14,11 @@ from hil.importers.name_words import kinds_said, words_of
 from hil.importers.stated_units import other_unit
 from hil.importers.units import JOINT_KINDS, Kind, kind_named, unit_of
 from hil.importers.unnamed_columns import ColumnBlocks, blocks_of, roughness
+from identification.text import joined
 
 MAX_NAMED: Final = 30
 """Channels in a list."""
+_MAX_JOINTS: Final = 14  # that a message names
 _ERRORS: Final = frozenset({"error", "errors", "err"})
 """Words of the deviations of a controller, which are no quantity of a joint."""
 # ratio of roughness of times that do not fit the motion to those that do
@@ -105,13 +107,11 @@ def other_number_of_channels(channels: LogChannels, kind: Kind, group: ChannelGr
     joints = channels.joints
     problem = (
         f"{count} {'channel is' if count == 1 else 'channels are'} named as {kind} "
-        f"({group.label}), and the URDF has {len(joints)} joints: {', '.join(joints)}"
+        f"({group.label}), and the URDF has {len(joints)} joints: {joined(joints, _MAX_JOINTS)}"
     )
     otherwise = "or give the URDF's joint of each channel in joints of a map (--map map.toml)"
     if count < len(joints) or channels.recorded:
-        absent, which = _absent_joints(joints, group)
-        options = " ".join(f"--locked {name}" for name in absent)
-        remedy = f"fix the joints that were not recorded, {which} with {options}"
+        remedy = _fix_the_others(joints, group)
         recorded = [name for name in channels.recorded if name in joints]
         return UnrecordedJointError(
             channels.log,
@@ -127,6 +127,15 @@ def other_number_of_channels(channels: LogChannels, kind: Kind, group: ChannelGr
     if len(group.names) == count:
         remedy += f", or the channels of its joints, such as --columns '{kind}={some}'"
     return SourceError(channels.log, problem, field=kind, remedy=f"{remedy}; {otherwise}")
+
+
+def _fix_the_others(joints: Sequence[str], group: ChannelGroup) -> str:
+    """Return how to fix the joints that were not recorded."""
+    if len(group.joints(joints)) == group.size:
+        return "fix the joints that no channel names with --lock-others"
+    absent, which = _absent_joints(joints, group)
+    options = " ".join(f"--locked {name}" for name in absent)
+    return f"fix the joints that were not recorded, {which} with {options}"
 
 
 def _absent_joints(joints: Sequence[str], group: ChannelGroup) -> tuple[Sequence[str], str]:

@@ -349,10 +349,16 @@ class _OfRecordedJoints:
         self._source = source
         self._steps: list[Callable[[Robot], Robot]] = []
         self._robot: Robot | None = None
+        self._locks_others = False
+        self._named: tuple[str, ...] | None = None  # joints that the channels name
         self.concluded: tuple[Conclusion, ...] = ()
 
     def __call__(self, recorded: Callable[[], tuple[str, ...] | None]) -> Robot:
-        robot = self._robot_of(recorded)
+        def names() -> tuple[str, ...] | None:
+            self._locks_others = True  # only then it is asked
+            return self._named or recorded()
+
+        robot = self._robot_of(names)
         for step in self._steps:
             robot = step(robot)
         self._robot = robot
@@ -361,12 +367,17 @@ class _OfRecordedJoints:
     def fix(self, error: UnrecordedJointError) -> bool:
         """Fix joints of a gripper, then joints outside the recorded arm; False without any.
 
+        Instead all that no channel names, if the user says so.
+
         Raises:
             SourceError: several arms have as many joints as were recorded.
         """
         robot = self._robot
         if robot is None:
             return False
+        if self._locks_others and self._named is None and len(error.joints) == error.count:
+            self._named = error.joints
+            return True
         gripping = robot.without_gripper(error.joints)
         fixed = [name for name in robot.joint_names if name not in gripping.joint_names]
         if fixed and error.count <= len(gripping.joint_names):

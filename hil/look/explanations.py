@@ -1,4 +1,4 @@
-"""Rows about what explains the torque error: a constant, a drift, or a change in a part."""
+"""Rows about what explains the torque error: constant, drift, spring, or a change in a part."""
 
 from __future__ import annotations
 
@@ -39,11 +39,17 @@ def explained_rows(finding: TorqueFindings, scale_std: Array) -> Iterator[Row]:
     readings = finding.readings
     if finding.torque.is_otherwise or readings.score.overall > EXPLAINED_ERROR:
         return
+    names = finding.cell.joint_names
+    if finding.explained is not None and (springs := finding.explained.how.springs):
+        change = Change("spring", tuple(names.index(name) for name in springs))
+        ratio = finding.explained.error / finding.torque.error
+        yield _row(Explanation(change, ratio), names, is_likely=True)
+        return
     for found in explain_errors(readings.model, readings.samples, scale_std):
         change = found.change
         if change.meaning not in _NO_FAULTS and not found.is_assumed(scale_std):
             is_likely = found.is_certain and not finding.fits_badly
-            yield _row(found, finding.cell.joint_names, is_likely)
+            yield _row(found, names, is_likely)
 
 
 def _row(found: Explanation, joints: tuple[str, ...], is_likely: bool) -> Row:
@@ -63,4 +69,6 @@ def _decided_by(change: Change) -> tuple[Aspect, NextStep]:
         return "changed part", NextStep.CUT_THE_RECORDING
     if change.meaning == "drift":
         return "zero", NextStep.CHECK_ENCODER_MOUNTING
+    if change.meaning == "spring":
+        return "spring", NextStep.DESCRIBE_SPRING
     return "scale", NextStep.WEIGH_A_LOAD

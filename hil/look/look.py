@@ -54,6 +54,7 @@ from hil.look.torque_sample import (
     SUSPECT_ERROR,
     TorqueSample,
     explained,
+    explained_by_springs,
     prepared,
 )
 from hil.look.undescribed import undescribed_robot
@@ -202,6 +203,9 @@ def _with_torque(
     finding = _finding(
         source, imported, cell, recording, samples, torque, is_explained=found is not None
     )
+    if found is None and torque.error > SUSPECT_ERROR:
+        rows_as_read = few_rows([samples])
+        found = explained_by_springs(cell.model, rows_as_read, score_of(cell.model, rows_as_read))
     if found is not None:
         least = (1.0 - LARGE_REDUCTION) * found.score.overall
         if finding.readings.score.overall > least:

@@ -84,6 +84,7 @@ from hil.look.readings import (
     SlopeFactors,
     SlopeRatio,
     SmoothPositions,
+    SpringsAlike,
     StatedPayload,
     StillJoints,
     StillUnexplained,
@@ -117,7 +118,7 @@ from identification.signals.messages import (
 )
 from identification.signals.row_faults import by_kind
 from identification.signals.sample_times import SampleTimes, TimeBase
-from identification.text import number, percentage
+from identification.text import joined, number, percentage
 
 _FACTS: Final[Mapping[Fact, str]] = {
     Fact.EVERY_JOINT_MOVES: "every joint moves",
@@ -237,6 +238,7 @@ _STEPS: Final[Mapping[NextStep, str]] = {
     NextStep.IMPORT_COMMANDS: "`hil identify` finds their servo and friction",
     NextStep.CHECK_ENCODER: "check encoder and cable, or cut the recording before the jump",
     NextStep.CHECK_ENCODER_MOUNTING: "check its encoder and the coupling of its gear",
+    NextStep.DESCRIBE_SPRING: "describe it in a cell file ([[robot.elements]]), if there is one",
     NextStep.CUT_THE_RECORDING: (
         "find out what changed (load, drive settings, temperature); identify each part by itself"
     ),
@@ -715,6 +717,12 @@ def _(scales: OtherScales) -> str:
 
 
 @_worded.register
+def _(springs: SpringsAlike) -> str:
+    joints = joined(springs.joints)
+    return f"a spring or cable on {joints} instead leaves {springs.ratio:.2f} times its error"
+
+
+@_worded.register
 def _(found: NoBetter) -> str:
     changes = " or ".join(map(described, found.changes))
     return f"{changes} explains no more than chance"
@@ -882,6 +890,7 @@ def _how(explained: ExplainedTorque) -> str:
     parts = (
         f"low-passed at {number(explained.low_pass, 2)} Hz" if explained.low_pass else "",
         "with rotors heavier than the links" if explained.heavy_rotors else "",
+        f"with a spring or balancer on {joined(explained.springs)}" if explained.springs else "",
     )
     return ", ".join(filter(None, parts))
 

@@ -53,6 +53,7 @@ from hil.look.readings import (
     RigidShare,
     Setting,
     SizeRatio,
+    SpringsAlike,
     StatedPayload,
     StillUnexplained,
     TorqueDelay,
@@ -275,8 +276,8 @@ class TorqueFindings:
         files: the recording, parsed.
         gravities: that were tried, by mounting, "" for none [m/s²].
         is_side_open: whether nothing states that the torque acts on the joints, not the motors.
-        explained: how a low-pass or heavy rotors explain the torque as read at least as well as the
-            changes that were found, none of which is then certain; None if they do not.
+        explained: how a low-pass, rotors or springs explain the torque as read at least as well as
+            the changes that were found, none of which is then certain; None if they do not.
     """
 
     cell: Cell
@@ -396,7 +397,7 @@ class TorqueFindings:
     def as_stated(self, rows: Samples, score: Score) -> TorqueFindings:
         """Return the findings without any change, if none explains the torque as well.
 
-        Changes that fit an arm without the low-pass or heavy rotors imitate these, and so do those
+        Changes that fit an arm without what explains the torque imitate it, and so do those
         that come nearest.
 
         Args:
@@ -432,7 +433,15 @@ class TorqueFindings:
         evidence: Evidence = ErrorRatio(ratio, sigmas)
         if all(step.by_friction for step in steps):
             evidence = Basis.DRIVING_FRICTION
-        return Row(aspect, reading, certainty, (evidence,), decider, is_changed=True)
+        springs = tuple(self._springs_alike(steps))
+        return Row(aspect, reading, certainty, (evidence, *springs), decider, is_changed=True)
+
+    def _springs_alike(self, steps: Sequence[Step]) -> Iterator[SpringsAlike]:
+        """Yield the springs that explain the rows best in place of each of some steps."""
+        best = {step.springs[0]: step.error for step in steps if step.springs}
+        names = self.cell.joint_names
+        for (change, error), found in best.items():
+            yield SpringsAlike(tuple(names[joint] for joint in change.joints), error / found)
 
     def _unchanged(
         self, aspect: Aspect, reading: Fact, *meanings: Meaning, decider: Decider | None = None

@@ -412,6 +412,14 @@ class OtherScales:
 
 
 @dataclass(frozen=True)
+class SpringsAlike:
+    """Springs of some joints, and the error with them over that with a change that was found."""
+
+    joints: tuple[str, ...]
+    ratio: float
+
+
+@dataclass(frozen=True)
 class NoBetter:
     """Changes that fit best, but not better than by chance."""
 
@@ -427,7 +435,7 @@ class FreeFit:
 
 @dataclass(frozen=True)
 class ErrorExplained:
-    """Relative error of the torque as read, with what a low-pass or heavy rotors explain of it."""
+    """Relative error of the torque as read, with what explains it: a low-pass, rotors, springs."""
 
     error: float
     how: ExplainedTorque
@@ -624,6 +632,7 @@ Evidence = (
     | PartError
     | ErrorExplained
     | NoBetter
+    | SpringsAlike
     | OtherScales
     | FreeFit
     | RigidShare
@@ -672,6 +681,7 @@ class NextStep(Enum):
     IMPORT_COMMANDS = auto()
     CHECK_ENCODER = auto()
     CHECK_ENCODER_MOUNTING = auto()
+    DESCRIBE_SPRING = auto()
     CUT_THE_RECORDING = auto()
     RECORD_COMMANDS = auto()
     ASK_FOR_POSITIONS = auto()
@@ -740,10 +750,11 @@ Setting = MapEntries | GravityOption | MotorTorque | MotorCurrents
 
 @dataclass(frozen=True)
 class ExplainedTorque(Conclusion):
-    """A torque that follows the arm through a low-pass [Hz] or with heavy rotors."""
+    """A torque that follows the arm through a low-pass [Hz], or with heavy rotors or springs."""
 
     low_pass: float | None
     heavy_rotors: bool
+    springs: tuple[str, ...] = ()  # joints
 
 
 @dataclass(frozen=True)

@@ -42,6 +42,7 @@ Aspect = Literal[
     "angle unit",
     "zero",
     "scale",
+    "spring",
     "coupling",
     "gravity",
     "mounting",

@@ -22,7 +22,8 @@ from identification.hypotheses.diagnosis import (
     torque_of,
     with_readings,
 )
-from identification.hypotheses.scores import Score, score_of
+from identification.hypotheses.scores import Score, fits_alike, score_of
+from identification.hypotheses.springs import may_have_springs, score_with_springs
 from identification.model.robot import RobotModel
 from identification.signals.position_steps import PositionJump, position_steps
 from identification.signals.recording import RIGID_RATE, Recording
@@ -115,7 +116,7 @@ class TorqueSample:
 
 
 class Explained(NamedTuple):
-    """Score of a torque through a low-pass or with heavy rotors."""
+    """Score of a torque through a low-pass, or with heavy rotors or springs."""
 
     score: Score
     how: ExplainedTorque
@@ -145,3 +146,28 @@ def explained(archive: Archive) -> Explained | None:
     except (IdentificationError, ValueError):
         pass  # the identification says what is wrong
     return None
+
+
+def explained_by_springs(model: RobotModel, rows: Samples, score: Score) -> Explained | None:
+    """Return how springs of as few joints as possible explain a torque; None: they do not.
+
+    They do as a low-pass does, see `explained`.
+
+    Args:
+        model: of the arm.
+        rows: some of the recording, as read.
+        score: of these.
+    """
+    least = min(UNEXPLAINED, _EXPLAINED_ERROR_RATIO * score.overall)
+    joints = may_have_springs(model, rows)
+    every = score_with_springs(model, rows, joints)
+    if every is None or not 0.0 < every.overall < least or every.driven.any():
+        return None
+    best = every
+    for joint in joints:
+        fewer = tuple(each for each in joints if each != joint)
+        without = score_with_springs(model, rows, fewer)
+        if without is not None and fits_alike(without, every, model):
+            joints, best = fewer, without
+    names = tuple(model.joint_names[joint] for joint in joints)
+    return Explained(best, ExplainedTorque(None, heavy_rotors=False, springs=names))

@@ -15,6 +15,7 @@ _WORDS: Final[Mapping[Meaning, str]] = {
     "friction drift": "friction that drifts throughout",
     "delay": "another delay of {}",
     "drift": "a drifting zero of {}",
+    "spring": "a spring or cable on {}",
     "load friction": "friction that grows with the load",
     "arm": "another arm, tool or setting",
     "unmodelled": "another motion, which shows more of what the model lacks",

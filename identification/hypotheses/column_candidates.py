@@ -29,7 +29,7 @@ def changes_to_try(fit: ColumnFit) -> Iterator[Change]:
         for joint in fit.moved:
             yield from (Change("delay", (joint,)), Change("scale", (joint,)))
             if fit.model.chain.revolute[joint]:
-                yield Change("drift", (joint,))
+                yield from (Change("drift", (joint,)), Change("spring", (joint,)))
     for part in _later_parts(fit):
         yield from (change._replace(part=part) for change in of_parts)
     yield from (Change("payload", part=part) for part in _inner_parts(fit))

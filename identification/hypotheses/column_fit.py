@@ -147,8 +147,9 @@ class ColumnFit:
         if found is not None and explanation.change.is_constant and _LOAD not in self.known:
             # It changes the torques that a constant is compared with.
             loaded = given([*self.known, _LOAD])
-            if loaded is not None and loaded.differs_from(found):
-                found = None
+            if loaded is not None:
+                is_other = loaded.differs_from(found)
+                found = None if is_other else found.or_as(loaded)
         if found is None:
             return explanation._replace(size=None, std=0.0)
         return explanation._replace(

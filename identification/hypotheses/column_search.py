@@ -1,8 +1,8 @@
 """Changes of recordings that are linear in columns of torque, and predict parts of them better.
 
-Delay, scale, friction and drift of a joint, friction by the load, a load, and some of these in a
-part of the recordings only. The torque of every fifth block is predicted from the others, as it is
-and with one change after the other. The change that reduces the error most is named if the
+Delay, scale, friction, spring and drift of a joint, friction by the load, a load, and some of these
+in a part of the recordings only. The torque of every fifth block is predicted from the others, as
+it is and with one change after the other. The change that reduces the error most is named if the
 reduction is significant and explains the error of the fit: what is left is near the noise, near the
 error of the other joints, or near that of separate parameters for the part. The search is repeated
 with it.
@@ -32,7 +32,7 @@ from identification.hypotheses.column_scores import (
 )
 from identification.hypotheses.explanation import ExplainedFit, Explanation
 from identification.hypotheses.joint_changes import Change, Part
-from identification.hypotheses.part_rivals import excess_of, rivals_of
+from identification.hypotheses.part_rivals import excess_of, rivals_of, springs_alike
 from identification.hypotheses.torque_columns import BLOCKS
 from identification.model.robot import RobotModel
 from identification.signals.samples import Samples
@@ -223,7 +223,9 @@ def _reviewed(fit: ColumnFit, found: Sequence[Explanation]) -> Iterator[Explanat
         given = fit.knowing(changes[:k] + changes[k + 1 :])
         part = each.change.part
         if part is None:
-            yield _given_others(given, each)
+            sized = _given_others(given, each)
+            rivals = springs_alike(given, sized, given.score(each.change))
+            yield sized._replace(rivals=rivals)
             continue
         score = given.score(each.change)
         if given.known:

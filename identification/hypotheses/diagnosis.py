@@ -31,10 +31,12 @@ from identification.hypotheses.scores import (
     Comparison,
     Score,
     compare,
+    fits_alike,
     is_backwards,
     score_of,
 )
 from identification.hypotheses.search import find_readings, find_zeros_and_scales
+from identification.hypotheses.springs import may_have_springs, score_with_springs
 from identification.hypotheses.torque_rate import is_rate
 from identification.model.motion import Motion
 from identification.model.nominal_masses import mass_fault
@@ -99,6 +101,7 @@ class TorqueDiagnosis:
         weightless: error of a torque without gravity, compared with one with it; None if the model
             has none.
         keeps_gravity: whether a part of gravity is left in a torque that fits better without.
+        is_balanced: whether springs of the joints explain such a torque as well.
         rigid: how much of the torque is that of bodies, with gravity or without, as fits better.
         readings: signs, orders, zeros and scales other than stated; None where there is no gravity
             or no body in the torque.
@@ -125,6 +128,7 @@ class TorqueDiagnosis:
     error: float = 0.0
     unseen_error: float | None = None
     keeps_gravity: bool = False
+    is_balanced: bool = False
 
     @property
     def time(self) -> float | None:
@@ -164,8 +168,8 @@ class TorqueDiagnosis:
 
     @property
     def _has_little_weight(self) -> bool:
-        """Whether the torque fits an arm without gravity; other times may make it as little."""
-        if self.time is not None:
+        """Whether the torque fits an arm without gravity, and no other times or springs do."""
+        if self.time is not None or self.is_balanced:
             return False
         found = self.weightless
         return (
@@ -246,12 +250,16 @@ def torque_of(
     """
     read = model
     weightless = None
-    keeps_gravity = False
+    keeps_gravity = is_balanced = False
     if np.any(model.gravity):
         without = model.under_gravity((0.0, 0.0, 0.0))
         score_without = score_of(without, rows)
         weightless = compare(score_without, score, model)
+        springs = None
         if weightless.ratio < 1.0:
+            springs = score_with_springs(model, rows, may_have_springs(model, rows))
+        is_balanced = springs is not None and fits_alike(springs, score_without, model)
+        if weightless.ratio < 1.0 and not is_balanced:
             read = without
             keeps_gravity = has_part_of_gravity(model, rows, score_without)
     backwards = is_backwards(model, rows, score)
@@ -262,6 +270,7 @@ def torque_of(
         is_backwards=backwards,
         error=score.overall,
         keeps_gravity=keeps_gravity,
+        is_balanced=is_balanced,
     )
     if found.rigid.is_nothing:
         return found

@@ -9,6 +9,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import combinations, product
+from operator import itemgetter
 from typing import Final
 
 import numpy as np
@@ -65,6 +66,7 @@ from identification.hypotheses.scores import (
     score_of,
     sigmas_of,
 )
+from identification.hypotheses.springs import may_have_springs, score_with_springs, springs_of
 from identification.model.robot import RobotModel
 from identification.signals.samples import Samples
 
@@ -294,6 +296,38 @@ class Hypothesis:
             trial = self._try(Change("axis sign", joints))
             if fits_alike(trial.score, self.score, self.model):
                 alike[joints] = trial.score.overall
+
+    def with_springs(self, steps: Sequence[Step]) -> list[Step]:
+        """Return steps, zeros and scales with the springs that explain the rows as well."""
+        sized = [step for step in steps if step.change.meaning in SIZED]
+        possible = may_have_springs(self.model, self.samples)
+        own = tuple(sorted({joint for step in sized for joint in step.change.joints}))
+        rivals = {step.change: self._springs_alike([step], step.change.joints) for step in sized}
+        if len(sized) > 1:
+            together = [own, *((joint,) for joint in possible)]
+            of_all = [rival for joints in together for rival in self._springs_alike(sized, joints)]
+            rivals = {change: (*alike, *of_all) for change, alike in rivals.items()}
+        return [
+            replace(step, springs=tuple(sorted(rivals.get(step.change, ()), key=itemgetter(1))))
+            for step in steps
+        ]
+
+    def _springs_alike(
+        self, steps: Sequence[Step], joints: Sequence[int]
+    ) -> tuple[tuple[Change, float], ...]:
+        """Return springs of joints and the error with them, if they may take the place of steps."""
+        changes = {step.change for step in steps}
+        possible = {*may_have_springs(self.model, self.samples)}
+        if not {*joints} <= possible or not changes <= {*self._changes}:
+            return ()
+        again = self.restarted([each for each in self._changes if each not in changes])
+        score = score_with_springs(again.model, again.samples, joints, again.score.columns)
+        if score is None:
+            return ()
+        score = score.of_torque(again._torque_scale(()))
+        if not fits_alike(score, self.score, self.model):
+            return ()
+        return ((springs_of(joints), score.overall),)
 
     def _singles(self, but: _Joints | None = None) -> list[Trial]:
         """Return single fitted zeros and scales, other than the best."""

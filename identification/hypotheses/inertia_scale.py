@@ -27,10 +27,12 @@ from identification.hypotheses.scores import (
     SURE_SIGMAS,
     Comparison,
     Score,
+    any_load,
     compare,
     fits_alike,
     score_of,
 )
+from identification.hypotheses.springs import may_have_springs, score_with_springs
 from identification.model.nominal_masses import mass_fault
 from identification.model.robot import RobotModel
 from identification.signals.samples import Samples
@@ -84,7 +86,7 @@ def find_inertia_scale(
 ) -> InertiaScale | None:
     """Return the factor that explains a torque much better; None if the described one does.
 
-    None also where heavy rotors, or a load, explain it as well.
+    None also where heavy rotors, a load or springs of the joints explain it as well.
 
     Args:
         model: of the arm.
@@ -116,12 +118,14 @@ def find_inertia_scale(
         return None
     if against.ratio > least:
         return None
-    # Heavy rotors are inertia without weight as well, and a load is weight far from most axes.
+    # Heavy rotors are inertia without weight as well, a load is weight far from most axes, and
+    # springs carry weight.
     rivals = (
         score_of(model, samples, wide_rotors=True),
-        score_of(model, samples, is_loaded=True),
+        score_of(model, samples, stated=any_load(model)),
+        score_with_springs(model, samples, may_have_springs(model, samples)),
     )
-    if any(fits_alike(rival, scaled, model) for rival in rivals):
+    if any(rival is not None and fits_alike(rival, scaled, model) for rival in rivals):
         return None
     return InertiaScale(best, error, score.overall, against, _weight(model, samples, best))
 

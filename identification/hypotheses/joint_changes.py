@@ -1,8 +1,8 @@
 """What a recording may be other than stated, as changes that undo it.
 
 Signs, orders, units, zeros and coupled angles of joints are changes of what was recorded; delay,
-drift of a zero, friction by the load, a load, and scale or friction of joints, throughout or in a
-part, are linear in columns of torque (:mod:`identification.hypotheses.torque_columns`).
+drift of a zero, friction by the load, springs, a load, and scale or friction of joints, throughout
+or in a part, are linear in columns of torque (:mod:`identification.hypotheses.torque_columns`).
 """
 
 from __future__ import annotations
@@ -40,6 +40,7 @@ Meaning = Literal[
     "payload",
     "friction",
     "friction drift",
+    "spring",
     "arm",
     "unmodelled",
 ]

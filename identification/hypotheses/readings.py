@@ -35,7 +35,9 @@ class Step:
     """An adopted change, and the changes that fit equally well.
 
     `error` and `before` are errors over all joints with and without it; `alike` are other changes
-    with their errors, of which only knowledge of the arm can choose.
+    with their errors, of which only knowledge of the arm can choose. `springs` are springs of
+    joints that explain the rows as well in place of it, with the error then: they are of the arm,
+    and no other way to read the recording.
     """
 
     change: Change
@@ -45,11 +47,12 @@ class Step:
     sigmas: float
     alike: tuple[tuple[Change, float], ...] = ()
     is_adequate: bool = True  # whether no free fit explains the rows much better
+    springs: tuple[tuple[Change, float], ...] = ()
 
     @property
     def is_clear(self) -> bool:
         """Whether the arm explains the torque with it, and certainly worse without."""
-        is_certain = not self.by_friction and self.sigmas < -SURE_SIGMAS
+        is_certain = not self.by_friction and not self.springs and self.sigmas < -SURE_SIGMAS
         return self.error < EXPLAINED_ERROR and is_certain
 
     @property
@@ -77,7 +80,8 @@ class Step:
         slight = self.ratio > 1.0 - LARGE_REDUCTION and len(self.change.joints) == 1
         if self.change.meaning in SIZED:
             slight = self.sigmas > -SEPARATE_SIGMAS
-        return not self.alike and self.error < EXPLAINED_ERROR and not slight and self.is_adequate
+        is_alone = not self.alike and not self.springs
+        return is_alone and self.error < EXPLAINED_ERROR and not slight and self.is_adequate
 
 
 @dataclass(frozen=True)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from typing import Final, NamedTuple
 
@@ -25,6 +26,7 @@ from identification.hypotheses.error_ratios import (
 from identification.hypotheses.little_torque import little_torque
 from identification.model.link_wrenches import MASS_INDEX, N_INERTIA
 from identification.model.motion import Motion
+from identification.model.nominal_masses import mass_fault
 from identification.model.robot import RobotModel
 from identification.signals.samples import Samples
 
@@ -134,7 +136,7 @@ def score_of(
     *,
     wide_rotors: bool = False,
     share: float = BODY_STD_SHARE,
-    is_loaded: bool = False,
+    stated: Mapping[str, tuple[float, float]] | None = None,
 ) -> Score:
     """Predict every fifth of `_BLOCKS` blocks of samples from the others.
 
@@ -144,11 +146,10 @@ def score_of(
         columns: of the recorded torque that the joints are read from, by default in order.
         wide_rotors: as for :func:`~identification.estimators.prior.body_prior`.
         share: likewise, of the bodies.
-        is_loaded: whether the last body may carry a load as heavy as the arm.
+        stated: likewise, of single parameters.
     """
     columns = np.arange(model.n_joints) if columns is None else columns
     factor = _factor(model, samples)
-    stated = any_load(model) if is_loaded else None
     prior = body_prior(model, factor, share, stated, wide_rotors=wide_rotors).gaussian
     squares = np.zeros((len(factor), factor.n_joints))
     weights: Array | None = None
@@ -172,8 +173,11 @@ def any_load(model: RobotModel) -> dict[str, tuple[float, float]]:
     """Return mean and standard deviation of the last body under a load as heavy as the arm.
 
     By the names of its parameters, as :func:`~identification.estimators.prior.body_prior` has them
-    stated. The load may be as far from the axis as the longest body reaches.
+    stated. The load may be as far from the axis as the longest body reaches. Empty where the
+    description has no masses: then the prior allows any.
     """
+    if mass_fault(model) is not None:
+        return {}
     last = model.layout.links[model.chain.last_joint]
     mass = float(model.nominal[model.layout.links][:, MASS_INDEX].sum())
     reach = float(body_lengths(model).max())

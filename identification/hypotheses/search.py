@@ -127,7 +127,7 @@ def _fewest_signs(hypothesis: Hypothesis, steps: Sequence[Step]) -> tuple[SignRi
 
 def _judged(hypothesis: Hypothesis, found: Readings) -> list[Step]:
     """Return the steps that were found, each adequate if nothing else explains the rows alike."""
-    steps = list(found.steps)
+    steps = hypothesis.with_springs(found.steps)
     if steps and _is_better_without(hypothesis):
         steps = [replace(step, is_adequate=False) for step in steps]
     if not found.adequacy.is_enough:
@@ -351,4 +351,5 @@ def find_zeros_and_scales(model: RobotModel, samples: Samples) -> Readings:
     steps = hypothesis.by_joint_fit(())
     adequacy = hypothesis.adequacy() if steps else Adequacy(1.0, 1.0, agrees=True)
     steps = [replace(step, is_adequate=step.is_adequate and adequacy.is_enough) for step in steps]
+    steps = hypothesis.with_springs(steps)
     return Readings(tuple(steps), model, hypothesis.samples, hypothesis.score, {}, (), adequacy)

@@ -53,6 +53,10 @@ class ChangeSize(NamedTuple):
     std: float  # cluster-robust, with that of the prior
     interval_factor: float  # standard deviations in half a 95 % interval
 
+    def or_as(self, other: ChangeSize) -> ChangeSize:
+        """Return it with a deviation that includes its distance from another estimate of it."""
+        return self._replace(std=math.hypot(self.std, self.size - other.size))
+
     def differs_from(self, other: ChangeSize) -> bool:
         """Whether it differs significantly from another size, by its own deviation."""
         return abs(self.size - other.size) > SIGNIFICANT_SIGMAS * self.std

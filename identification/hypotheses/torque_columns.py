@@ -29,7 +29,8 @@ class ColumnSums:
     """Sums of products of columns over the rows of B blocks, joint by joint.
 
     Columns: parameters (p), payload (10), rate of the predicted torque, friction in proportion to
-    the load, drift of each joint's zero by one radian (n), torques of all joints (n).
+    the load, drift of each joint's zero by one radian (n), cosine and sine of the joint's own
+    angle, torques of all joints (n).
     """
 
     gram: Array  # (B, n, q, q)
@@ -131,13 +132,17 @@ def _tables(model: RobotModel, samples: Samples, values: Array, some: NDArray[np
         loads = tuple(samples.as_measured(j, block)[some] for j, block in enumerate(loads))
     else:
         blocks, columns = model.regressor(motion)
-    tables = np.zeros((n, len(some), p + N_LINK + 2 + 2 * n))
+    tables = np.zeros((n, len(some), p + N_LINK + 4 + 2 * n))
     for j in range(n):
         tables[j][:, columns[j]] = blocks[j]
         tables[j][:, p + payload.columns[j]] = loads[j]
     tables[:, :, p + N_LINK] = _rate(model, samples, values, some).T
     tables[:, :, p + N_LINK + 1] = _load_friction(model, samples, values, part, some).T
-    tables[:, :, p + N_LINK + 2 : -n] = _drift(model, samples, values, some)
+    tables[:, :, p + N_LINK + 2 : -n - 2] = _drift(model, samples, values, some)
+    angle = samples.motion.position[some].T
+    turns = np.array(model.chain.revolute, dtype=np.float64)[:, None]
+    tables[:, :, -n - 2] = turns * np.cos(angle)
+    tables[:, :, -n - 1] = turns * np.sin(angle)
     tables[:, :, -n:] = samples.torque[some]
     return tables
 
@@ -224,7 +229,8 @@ def columns_of(tables: ColumnSums, model: RobotModel, values: Array, change: Cha
         parts = np.zeros((n, width, len(joints)))
         parts[joints, :p, range(len(joints))] = values * model.friction_columns
         return np.concatenate([np.multiply.outer(time**k, parts) for k in (1, 2)], axis=3)
-    count = {"payload": N_LINK, "arm": p, "load friction": n}.get(change.meaning, 1)
+    counts = {"payload": N_LINK, "arm": p, "load friction": n, "spring": 2 * len(joints)}
+    count = counts.get(change.meaning, 1)
     columns = np.zeros((n, width, count))
     if change.meaning == "delay":
         columns[joints, p + N_LINK, 0] = -1.0
@@ -232,6 +238,9 @@ def columns_of(tables: ColumnSums, model: RobotModel, values: Array, change: Cha
         columns[joints, p + N_LINK + 1, joints] = 1.0
     elif change.meaning == "drift":
         columns[:, p + N_LINK + 2 + joints[0], 0] = 1.0
+    elif change.meaning == "spring":
+        places = np.arange(len(joints))
+        columns[joints, -n - 2, 2 * places] = columns[joints, -n - 1, 2 * places + 1] = 1.0
     elif change.meaning == "payload":
         columns[:, p : p + N_LINK] = np.eye(N_LINK)
     elif change.meaning == "arm":

@@ -533,6 +533,15 @@ SENTENCES: Final[Mapping[FindingKey, Sentence]] = {
         "the torque of {axes} {sized}",
         Optional(_CONSTANT, f"has another scale than the other axes, {_UNKNOWN}"),
     ),
+    "torque constant or spring": _fault(
+        "torque constant",
+        "the torque of {axes} has another scale than the other axes, or a spring or cable acts on"
+        " it: both explain the motion alike",
+    ),
+    "spring": _fault(
+        "springs",
+        "a torque of its own angle acts on {axes}, as of a spring, a balancer or a cable",
+    ),
     "torque constant, as assumed": Sentence(
         "torque constant",
         f"the torque of {{axes}} {_CONSTANT}, within the assumed uncertainty of the torques"
@@ -620,7 +629,7 @@ SENTENCES: Final[Mapping[FindingKey, Sentence]] = {
     "changed friction": Sentence(
         "friction",
         "friction on {motion} differs from the estimate: {each}, beyond the {limit:pc0} that gear"
-        " temperature causes; this explains the error of {explained:names}{alike}",
+        " temperature causes; this explains the error of {joints}{alike}",
         "{change:+pc0}",
         optional={"alike": _ALIKE},
     ),
@@ -672,9 +681,10 @@ SENTENCES: Final[Mapping[FindingKey, Sentence]] = {
     ),
     "unexplained error": Sentence(
         "unexplained error",
-        "the torque error on {motion} is {overall:pc1}, {floors:.1f} times the noise floor of"
-        " {floor:pc1}; none of the tested faults explains it (delay, torque constants, signs and"
-        " order of joints, payload, changes between recordings)",
+        "the torque error on {motion} is {overall:pc1} over all axes{beyond}, {floors:.1f} times"
+        " the noise floor of {floor:pc1}; none of the tested faults explains it (delay, torque"
+        " constants, springs, signs and order of joints, payload, changes between recordings)",
+        optional={"beyond": Optional(", limit {limit:pc0}")},
     ),
     "undetermined by the motion": Sentence(
         LEFT_OPEN,
@@ -857,10 +867,11 @@ _COUPLED_DRIVE: Final = (
     " entry for each joint, and coupling = [[{numbers}, FACTOR]] (columns counted from 1)"
 )
 
-MOUNTING_STEP: Final = (
-    "state how the arm is mounted: `--gravity X Y Z` where a log is read with its URDF, or gravity"
-    " of [robot] in the cell file"
+_MOUNTING: Final = (
+    "state how the arm is mounted: `--gravity {}` where a log is read with its URDF, or gravity of"
+    " [robot] in the cell file"
 )
+MOUNTING_STEP: Final = _MOUNTING.format("X Y Z")
 """What to do about a wrong direction of gravity."""
 
 REMEDIES: Final[Mapping[RemedyKey, str]] = {
@@ -874,6 +885,10 @@ REMEDIES: Final[Mapping[RemedyKey, str]] = {
     "resolve the torque": "record the torque of {joints} with sufficient resolution",
     "check the encoder of a joint": (
         "check encoder, coupling and belt of {joints}, and record again from a calibrated posture"
+    ),
+    "describe the spring": (
+        f"describe {_ELEMENTS} on {{joints}} as [[robot.elements]] of the cell file; if there is"
+        " none, check its torque constant and the masses of the URDF"
     ),
     "check the encoder": (
         "check encoder, coupling and cable of {jumping:6} and record again, or cut the recording"
@@ -941,7 +956,7 @@ REMEDIES: Final[Mapping[RemedyKey, str]] = {
         " the units of the masses of the URDF"
     ),
     "state the mounting": (
-        f"{MOUNTING_STEP}; if it is right, check the zero positions of the joints"
+        f"{_MOUNTING.format('{option}')}; if it is right, check the zero positions of the joints"
     ),
     "check the scale": (
         "check unit, side (motor or joint), torque constant and gear ratio of the torque of"

@@ -198,7 +198,8 @@ class TestUnseenMotion:
         assert not verdict.good
         assert "with gravity (" in verdict.reasons[0]
         np.testing.assert_allclose(evidence.gravity.best, mounted, atol=0.1)
-        assert "gravity of [robot]" in verdict.next_steps[0]
+        option = verdict.next_steps[0].partition("`--gravity ")[2].partition("`")[0]
+        np.testing.assert_allclose([float(each) for each in option.split()], mounted, atol=0.1)
         assert not any("gear ratio" in step or "jog" in step for step in verdict.next_steps)
 
     @pytest.mark.parametrize("mass", [4.0, 1.0])
@@ -471,6 +472,25 @@ class TestJudgement:
         (cause,) = (finding for finding in verdict.findings if finding.role == "cause")
         assert "another load with" in cause.words
 
+    def test_one_error_has_one_line(self):
+        """That nothing explains it, with the limit that it exceeds."""
+        findings = found(held_out=an_error(0.12), noise_floor=np.full(2, 0.1), diagnosis=NOTHING)
+        assert "overall error" not in findings
+        assert findings["unexplained error"].level == "wrong"
+        assert_figures(findings["unexplained error"], {"limit": 0.1})
+
+    def test_a_constant_that_a_spring_explains_as_well_has_no_size(self):
+        constant = explained(Change("scale", (1,)), 0.4, 0.1)
+        (only,) = constant.explanations
+        rivalled = only._replace(rivals=((Change("spring", (1,)),),))
+        (cause,) = (
+            finding
+            for finding in found(diagnosis=replace(constant, explanations=(rivalled,))).values()
+            if finding.role == "cause"
+        )
+        assert cause.key == "torque constant or spring"
+        assert "size" not in cause.values
+
     @pytest.mark.parametrize("error", [0.05, 0.5])
     def test_steps_of_wrong_findings_replace_doubtful_ones(self, error):
         verdict = judged(held_out=an_error(error), estimate=an_estimate(condition=450.0))
@@ -582,6 +602,22 @@ class TestJudgement:
             wrong, slight = "changed friction", "slightly changed friction"
             assert cause.key == (wrong if level == "wrong" else slight)
             assert_figures(cause, {"change": (change.ratio - 1.0,)})
+
+    def test_a_friction_within_the_limit_is_not_listed_beyond_it(self):
+        changes = tuple(
+            UnseenChange("friction", joint, ratio, 0.01, 0.01)
+            for joint, ratio in enumerate((1.05, 1.3))
+        )
+        finding = found(changes=changes, held_out=an_error(0.1))["changed friction"]
+        assert finding.joints == (1,)
+
+    def test_friction_beyond_temperature_of_repetitions_is_listed_alone(self):
+        findings = found(
+            systematic=np.array([0.01, 0.04]),
+            systematic_without_friction=np.array([0.01, 0.01]),
+            friction_change=np.array([0.07, 0.2]),
+        )
+        assert findings["changed friction"].joints == (1,)
 
     def test_torque_and_friction_that_are_alike_are_both_named(self):
         changes = (UnseenChange("friction", 1, 1.1001, 0.001, 0.01, alike=True),)
@@ -852,6 +888,7 @@ class TestPatternsOfTheResidual:
             ((0.02, 0.0), 1.0, "small friction drift", (0,)),
             ((0.1, 0.0), 0.2, "small friction drift", (0,)),
             ((0.02, -0.2), 1.0, "large friction drift", (1,)),
+            ((-1.2, -0.2), 1.0, "large friction drift", (1,)),  # no friction falls below zero
         ],
     )
     def test_drift_is_judged_by_its_torque(self, clean, change, share, key, joints):

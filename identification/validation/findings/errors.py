@@ -56,15 +56,20 @@ def _growth(evidence: Evidence, limits: Thresholds) -> tuple[Array, Mask]:
 
 
 def overall_error(evidence: Evidence, limits: Thresholds) -> Finding | None:
-    """Return an error over all axes beyond its limit."""
+    """Return an error over all axes beyond its limit; None where no fault explains it either."""
     overall = evidence.held_out.overall
     limit = evidence.allowed(limits)
-    if not overall > limit:
+    if not overall > limit or unexplained_error(evidence, limits) is not None:
         return None
-    covered = not overall > limits.generalisation * evidence.training.overall
-    step: RemedyKey = "describe elements, or check the drives" if covered else "cover the motion"
     values: dict[str, Value] = {"overall": overall, "limit": limit}
-    return Finding("overall error", "wrong", step, "symptom", values)
+    return Finding("overall error", "wrong", _overall_step(evidence, limits), "symptom", values)
+
+
+def _overall_step(evidence: Evidence, limits: Thresholds) -> RemedyKey:
+    """Return what to do about an error over all axes, of the fitted motion or of another."""
+    overall = evidence.held_out.overall
+    covered = not overall > limits.generalisation * evidence.training.overall
+    return "describe elements, or check the drives" if covered else "cover the motion"
 
 
 def axis_error(evidence: Evidence, limits: Thresholds) -> Finding | None:
@@ -141,13 +146,18 @@ def unexplained_error(evidence: Evidence, limits: Thresholds) -> Finding | None:
     overall = evidence.held_out.overall
     if not overall > max(limits.unexplained, limits.multiple * floor):
         return None
-    level: Level = "wrong" if overall > evidence.allowed(limits) else "doubtful"
+    limit = evidence.allowed(limits)
     values: dict[str, Value] = {
         "overall": overall,
         "floor": floor,
         "floors": overall / max(floor, 1e-300),
     }
-    return Finding("unexplained error", level, "check for missing effects", "symptom", values)
+    if overall > limit:
+        values["limit"] = limit
+        step = _overall_step(evidence, limits)
+        return Finding("unexplained error", "wrong", step, "symptom", values)
+    step = "check for missing effects"
+    return Finding("unexplained error", "doubtful", step, "symptom", values)
 
 
 def left_open(evidence: Evidence, limits: Thresholds) -> Finding | None:

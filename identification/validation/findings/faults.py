@@ -26,6 +26,7 @@ _THROUGHOUT: Final[Mapping[Meaning, tuple[FindingKey, RemedyKey]]] = {
     "delay": ("delay of the torque", "use the delay found"),
     "drift": ("drift of a joint", "check the encoder of a joint"),
     "scale": ("torque constant", "check the constant"),
+    "spring": ("spring", "describe the spring"),
     "load friction": ("load friction", "fit load friction"),
     "torque sign": ("torque sign", "check the sign in the map"),
     "position sign": ("position sign", "check the sign of the position"),
@@ -106,6 +107,7 @@ def gravity(evidence: Evidence, limits: Thresholds) -> Finding | None:
         return None
     values: dict[str, Value] = {
         "best": _vector(evidence.gravity.best),
+        "option": _vector(evidence.gravity.best, " "),
         "declared": _vector(evidence.gravity.declared),
         "angle": float(np.degrees(evidence.gravity.angle)),
         "error": error,
@@ -114,9 +116,9 @@ def gravity(evidence: Evidence, limits: Thresholds) -> Finding | None:
     return Finding("gravity", "wrong", step, "cause", values, explains=1.0 - error**2)
 
 
-def _vector(values: Array) -> str:
+def _vector(values: Array, between: str = ", ") -> str:
     """Return the entries of a vector, without negative zeros."""
-    return ", ".join(f"{value + 0.0:.2f}" for value in np.round(values, 2))
+    return between.join(f"{value + 0.0:.2f}" for value in np.round(values, 2))
 
 
 def faults(evidence: Evidence, limits: Thresholds) -> tuple[Finding, ...]:
@@ -182,6 +184,8 @@ def _fault(each: Explanation, evidence: Evidence, limits: Thresholds) -> Finding
         scale_std = np.zeros(len(evidence.held_out.rows))
     matters = np.nan_to_num(evidence.held_out.relative) > limits.unexplained
     key, remedy = fault_keys(each.change)
+    if each.rivals:
+        key, each = "torque constant or spring", each._replace(size=None)
     values = fault_values(each)
     if each.is_assumed(scale_std):
         return Finding(

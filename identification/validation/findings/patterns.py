@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import Final
 
 import numpy as np
 
@@ -11,6 +12,8 @@ from identification.validation.evidence import Evidence
 from identification.validation.finding import Finding, Mask, Thresholds, Value
 from identification.validation.residuals import Profile, ResidualChecks
 from identification.validation.ripple import Ripple
+
+_NO_FRICTION: Final = -1.0  # relative change of a friction that vanishes
 
 
 def _notable(checks: ResidualChecks, pattern: Profile | Ripple, limits: Thresholds) -> Mask:
@@ -112,14 +115,19 @@ def ripple(evidence: Evidence, limits: Thresholds) -> Finding | None:
 
 
 def friction_drift(evidence: Evidence, limits: Thresholds) -> Finding | None:
-    """Return the joints whose friction changed during the recordings, or that there are none."""
+    """Return the joints whose friction changed during the recordings, or that there are none.
+
+    None where a fault explains most of the residual: what is left of its pattern resembles drift.
+    """
     checks = evidence.residuals
     if checks is None or checks.drift is None:
+        return None
+    if any(each.ratio < limits.cause for each in evidence.explanations or ()):
         return None
     change: Array = checks.drift.change
     # A change counts by its share of the torque.
     torque = np.abs(change) * checks.friction_share
-    joints = checks.drift.significant
+    joints = checks.drift.significant & (change > _NO_FRICTION)
     large = joints & (torque > limits.drift)
     if not joints.any():
         return Finding("no friction drift", "good")

@@ -100,8 +100,9 @@ def friction(evidence: Evidence, limits: Thresholds) -> Finding | None:
         alike = joints & _mask([each.joint for each in found if each.alike], evidence)
         # An error below that of a pattern is one of rounding or smoothing.
         noticed = evidence.held_out.relative > limits.pattern
-        if np.any(joints & noticed & (np.abs(change) > MAX_FRICTION_CHANGE)):
-            return _large_change(change, joints, explained=joints, alike=alike)
+        large = joints & (np.abs(change) > MAX_FRICTION_CHANGE)
+        if np.any(large & noticed):
+            return _large_change(change, large, large & alike)
         if evidence.friction_change is None:
             return _small_change(change, joints, alike, limits)
     if evidence.friction_change is None:
@@ -111,18 +112,14 @@ def friction(evidence: Evidence, limits: Thresholds) -> Finding | None:
     share = np.zeros(n) if share is None else np.nan_to_num(share)
     beyond = (share if apart is None else np.nan_to_num(apart)) > limits.systematic
     explained = (share > limits.systematic) & ~beyond
-    joints = explained | ((np.abs(change) > limits.friction) & ~beyond)
     if explained.any():
-        return _large_change(change, joints, explained=explained, alike=nowhere)
-    return _small_change(change, joints, nowhere, limits)
+        return _large_change(change, explained, nowhere)
+    return _small_change(change, (np.abs(change) > limits.friction) & ~beyond, nowhere, limits)
 
 
-def _large_change(change: Array, joints: Mask, *, explained: Mask, alike: Mask) -> Finding:
-    """Return a change beyond what temperature causes."""
-    values = _alike(alike) | {
-        "limit": MAX_FRICTION_CHANGE,
-        "explained": tuple(np.flatnonzero(explained).tolist()),
-    }
+def _large_change(change: Array, joints: Mask, alike: Mask) -> Finding:
+    """Return a change beyond what temperature causes, of the joints whose change is."""
+    values = _alike(alike) | {"limit": MAX_FRICTION_CHANGE}
     return Finding("changed friction", "wrong", _remedy(alike), "cause", values).about(
         joints, change=change
     )

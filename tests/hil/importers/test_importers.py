@@ -64,6 +64,7 @@ from tests.hil.simulated_logs import (
     urdf_path,
 )
 from tests.hil.simulated_logs import imported as read
+from tests.identification import three_axes
 from tests.near import near
 from tests.tiers import quick_ones
 
@@ -1261,6 +1262,21 @@ class TestRobotOptions:
         assert result.exit_code == 0, result.exception
         assert "locked: shoulder at 0 rad" in result.output
         assert open_archive(place / "o.mcap").joint_names == ("elbow",)
+
+    def test_the_names_of_columns_say_which_others_are_locked(self, place: Path) -> None:
+        log = place / "named.csv"
+        rows = (place / "log.csv").read_text().splitlines()[1:]
+        log.write_text("\n".join(["t,q_elbow,tau_elbow", *rows]))
+        urdf = place / "three.urdf"
+        urdf.write_text(three_axes.urdf().replace("knee", "elbow"))
+
+        def looked(*options: str) -> Result:
+            return CliRunner().invoke(app, ["look", str(log), "--urdf", str(urdf), *options])
+
+        assert "with --lock-others" in str(looked().exception)
+        result = looked("--lock-others")
+        assert result.exit_code == 0, result.exception
+        assert "q_elbow" in result.output
 
     @pytest.mark.long
     def test_joints_of_a_bag_are_renamed(self, place: Path) -> None:
