@@ -69,6 +69,7 @@ _INDEPENDENT_ROW_SHARE: Final = 0.01  # share of the rows for that deviation
 _MIN_EIGENVALUE_RATIO: Final = 1e-12  # over the largest one, of its normal equations
 _NOISE_ROUNDS: Final = 20  # of the noise of the joints
 _NOISE_TOLERANCE: Final = 1e-3  # relative change of the noise
+_SAME_NOISE: Final = 0.01  # relative difference of two noises that are one
 _LEAST_VARIANCE: Final = 1e-280  # whose inverse times sums of squares is still a number
 _SMALL_NOISE: Final = 3e-3  # share of the torque, smaller than most drives allow
 _SAME_ERROR: Final = 0.1  # by which a joint's error may rise and is as good
@@ -154,8 +155,10 @@ class TorqueSums(NamedTuple):
         """Return whether parameters and weights are more probable, at no joint's expense.
 
         If no bodies fit all joints, as with torques of wrong scales, the more probable parameters
-        fit one joint and no other.
+        fit one joint and no other. Where both starts settle at one noise, rounding must not choose.
         """
+        if np.allclose(closer[1], found[1], rtol=_SAME_NOISE, atol=0.0):
+            return False
         theirs, ours = (self.squared_errors(values) for values, _ in (closer, found))
         if np.any(theirs > (1.0 + _SAME_ERROR) ** 2 * ours):
             return False
