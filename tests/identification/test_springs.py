@@ -79,7 +79,7 @@ def test_a_spring_is_no_certain_scale_of_a_torque(moved_panda: Simulated) -> Non
     [Change("zero", (3,), 0.35), Change("scale", (3,), 0.6)],
     ids=lambda fault: fault.meaning,
 )
-def test_a_zero_or_a_scale_is_certain_where_no_spring_explains_it(
+def test_a_zero_or_a_scale_is_certain_if_no_spring_explains_it(
     moved_panda: Simulated, fault: Change
 ) -> None:
     """The weight of a body acts on the joints before it as well; a spring does not."""

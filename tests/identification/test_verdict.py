@@ -611,7 +611,7 @@ class TestJudgement:
         finding = found(changes=changes, held_out=an_error(0.1))["changed friction"]
         assert finding.joints == (1,)
 
-    def test_friction_beyond_temperature_of_repetitions_is_listed_alone(self):
+    def test_friction_beyond_that_of_temperature_is_listed_alone(self):
         findings = found(
             systematic=np.array([0.01, 0.04]),
             systematic_without_friction=np.array([0.01, 0.01]),
