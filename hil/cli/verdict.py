@@ -14,9 +14,9 @@ from hil.base.exit_status import ExitStatus
 from hil.base.one_screen import MAX_JOINT_ROWS, Paragraph, Part, columns, one_screen
 from hil.base.progress import say
 from hil.base.terminal_text import printable, typed
-from hil.results.error_columns import RMS_MEANING, RMS_TITLE, error_columns
+from hil.results.error_columns import RMS_MEANING, RMS_TITLE, error_columns, rms_error
 from hil.results.results import JointJudgement, JudgementResult, Results
-from identification.text import number, percentage
+from identification.text import percentage
 from identification.validation.purpose_messages import TITLES, figure, requirement
 
 MAX_SHOWN: Final = 3
@@ -141,7 +141,7 @@ def _table(
     overall = judgement.all_joints if len(judgement.joints) > 1 else None
     rows = [
         ["joint", *(joint.joint for joint in joints), "all"],
-        [RMS_TITLE, *(f"{number(joint.rms)} {joint.unit}" for joint in joints), ""],
+        [RMS_TITLE, *map(rms_error, joints), ""],
     ]
     for column in error_columns(judgement, limits=everything):
         show = _percent if column.is_share else _three_decimals

@@ -48,7 +48,7 @@ from hil.pipeline.stored_identification import (
     stored_identification,
 )
 from hil.report.output_files import copy_outcome, write_outcome
-from hil.results.error_columns import RMS_TITLE, error_columns
+from hil.results.error_columns import RMS_TITLE, error_columns, rms_error
 from hil.results.results import Results
 from hil.rollout.servo_rollout import without_torque
 from identification.errors import ModelError
@@ -58,7 +58,7 @@ from identification.export.simulators import pinocchio_arm
 from identification.hypotheses.diagnosis import TorqueDiagnosis
 from identification.model.motion import Motion
 from identification.model.single_state import SingleStateTorque
-from identification.text import number, percentage
+from identification.text import percentage
 from identification.validation.verdict import Verdict
 
 if TYPE_CHECKING:
@@ -237,7 +237,7 @@ class IdentifiedArm:
         joints = pandas.DataFrame(
             {
                 "joint": [joint.joint for joint in judgement.joints],
-                RMS_TITLE: [f"{number(joint.rms)} {joint.unit}" for joint in judgement.joints],
+                RMS_TITLE: [rms_error(joint) for joint in judgement.joints],
                 **{
                     column.title: [getattr(joint, column.field) for joint in judgement.joints]
                     for column in shares

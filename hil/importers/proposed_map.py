@@ -105,12 +105,12 @@ def proposed_map(
         groups,
         joints,
         recorded,
-        len(robot.without_gripper().joint_names),
-        chosen,
-        nanoseconds,
-        sample_rate,
-        with_unit,
-        None if log.is_dir() else partial((files or LogFiles()).file, log, form or Format()),
+        arm_joints=len(robot.without_gripper().joint_names),
+        chosen=chosen,
+        nanoseconds=nanoseconds,
+        sample_rate=sample_rate,
+        with_unit=with_unit,
+        file=None if log.is_dir() else partial((files or LogFiles()).file, log, form or Format()),
     )
     return _of_channels(channels, form)
 

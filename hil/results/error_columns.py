@@ -5,7 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Final, Literal
 
-from hil.results.results import JudgementResult
+from hil.results.results import JointJudgement, JudgementResult
+from identification.text import number
 
 Field = Literal[
     "share_of_limit",
@@ -29,6 +30,11 @@ class ErrorColumn:
     meaning: str
     of_all: bool = True  #: whether :class:`OverallJudgement` has it
     is_share: bool = True  #: a relative error, in per cent; else a plain number
+
+
+def rms_error(joint: JointJudgement) -> str:
+    """Return the RMS error with its unit."""
+    return f"{number(joint.rms)} {joint.unit}" if joint.has_moved else "-"
 
 
 def error_columns(judgement: JudgementResult, *, limits: bool = False) -> list[ErrorColumn]:

@@ -125,6 +125,11 @@ class JointJudgement(Frozen):
     over the recorded postures."""
     controller_inertia_spread: Known = None  #: Standard deviation of that ratio
 
+    @property
+    def has_moved(self) -> bool:
+        """Whether a row shows it in motion; without, it has no error."""
+        return self.relative is not None or self.rms > 0.0
+
 
 class OverallJudgement(Frozen):
     """Relative errors over all joints together, each as of :class:`JointJudgement`."""
