@@ -102,6 +102,7 @@ BY_CHECK: Final[Mapping[str, Picture]] = {
     "friction": "friction over time",
     "friction over time": "friction over time",
     "gravity": "position",
+    "springs": "position",
     "zeros": "position",
     "residual over position": "position",
     "residual over speed": "speed",
