@@ -319,7 +319,11 @@ def _of_recorded_joints(
         return read(robots)
     except UnrecordedJointError as error:
         imported = _of_fewer_joints(read, robots, error)
-    return replace(imported, concluded=(*imported.concluded, *robots.concluded))
+    text = imported.map_text
+    if text is not None and robots.named is not None:  # so that it is read again in the same way
+        text = with_values(text, {"joints": [*robots.named]})
+    concluded = (*imported.concluded, *robots.concluded)
+    return replace(imported, map_text=text, concluded=concluded)
 
 
 def _of_fewer_joints(
@@ -341,6 +345,7 @@ class _OfRecordedJoints:
     """Robots with unrecorded joints fixed, after a refused import.
 
     Attributes:
+        named: joints that the channels name, where all others are fixed.
         concluded: what was fixed.
     """
 
@@ -350,13 +355,13 @@ class _OfRecordedJoints:
         self._steps: list[Callable[[Robot], Robot]] = []
         self._robot: Robot | None = None
         self._locks_others = False
-        self._named: tuple[str, ...] | None = None  # joints that the channels name
+        self.named: tuple[str, ...] | None = None
         self.concluded: tuple[Conclusion, ...] = ()
 
     def __call__(self, recorded: Callable[[], tuple[str, ...] | None]) -> Robot:
         def names() -> tuple[str, ...] | None:
             self._locks_others = True  # only then it is asked
-            return self._named or recorded()
+            return self.named or recorded()
 
         robot = self._robot_of(names)
         for step in self._steps:
@@ -375,8 +380,8 @@ class _OfRecordedJoints:
         robot = self._robot
         if robot is None:
             return False
-        if self._locks_others and self._named is None and len(error.joints) == error.count:
-            self._named = error.joints
+        if self._locks_others and self.named is None and len(error.joints) == error.count:
+            self.named = error.joints
             return True
         gripping = robot.without_gripper(error.joints)
         fixed = [name for name in robot.joint_names if name not in gripping.joint_names]

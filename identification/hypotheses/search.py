@@ -16,6 +16,7 @@ from typing import Final
 from identification.hypotheses.gravity_share import has_part_of_gravity
 from identification.hypotheses.hypothesis import SAME_SIZE_TOLERANCE, Hypothesis
 from identification.hypotheses.joint_changes import (
+    GRAVITIES,
     SIGNS,
     SIZED,
     UNITS,
@@ -30,6 +31,7 @@ from identification.hypotheses.readings import Adequacy, Readings, Step, is_disp
 from identification.hypotheses.scores import (
     EXPLAINED_ERROR,
     LARGE_REDUCTION,
+    any_load,
     compare,
     fits_alike,
     score_of,
@@ -128,7 +130,7 @@ def _fewest_signs(hypothesis: Hypothesis, steps: Sequence[Step]) -> tuple[SignRi
 def _judged(hypothesis: Hypothesis, found: Readings) -> list[Step]:
     """Return the steps that were found, each adequate if nothing else explains the rows alike."""
     steps = hypothesis.with_springs(found.steps)
-    if steps and _is_better_without(hypothesis):
+    if steps and (_is_better_without(hypothesis) or _is_load(hypothesis, found)):
         steps = [replace(step, is_adequate=False) for step in steps]
     if not found.adequacy.is_enough:
         steps = _doubted(steps, hypothesis)
@@ -322,6 +324,22 @@ def _is_better_without(found: Hypothesis) -> bool:
     exchanged joints of a wrist imitate in a part.
     """
     return found.restarted().free_fit().ratio_to(found.free_fit()) < 1.0 - LARGE_REDUCTION
+
+
+def _is_load(found: Hypothesis, readings: Readings) -> bool:
+    """Return whether a load explains another gravity as well: it turns the weight of a light arm.
+
+    Its mass and another gravity's sign have the same torque where the motion is slow.
+    """
+    gravities = [step for step in readings.steps if step.change.meaning in GRAVITIES]
+    if not gravities:
+        return False
+    others = [step.change for step in readings.steps if step not in gravities]
+    stated = found.restarted(others)
+    loaded = score_of(
+        stated.model, stated.samples, stated.score.columns, stated=any_load(stated.model)
+    )
+    return fits_alike(loaded, found.score, found.model)
 
 
 def _doubted(steps: Sequence[Step], found: Hypothesis) -> list[Step]:

@@ -19,6 +19,7 @@ from identification.hypotheses.explanation import ExplainedFit, Explanation
 from identification.hypotheses.joint_changes import Change
 from identification.hypotheses.readings import Adequacy
 from identification.hypotheses.scores import ROWS_PER_FACT
+from identification.hypotheses.search import find_readings
 from identification.model.motion import Motion
 from identification.signals.samples import Preprocessing, prepare
 from identification.validation.findings.diagnosis import of_diagnosis
@@ -213,6 +214,19 @@ def test_a_load_is_no_other_times(load: float) -> None:
     options = Preprocessing(14.0, exclude_rows="rests")
     samples = prepare(each_joint_once(robot, load), robot, options=options)
     assert diagnose(robot, [samples]).inertia is None
+
+
+@pytest.mark.long
+@pytest.mark.parametrize(("load", "is_sure"), [(0.0, True), (15.0, False)])
+def test_a_load_leaves_it_open_whether_an_arm_hangs(load: float, is_sure: bool) -> None:
+    """The arm hangs; a load as heavy as the arm makes that torque upright as well."""
+    described = RobotModel.from_urdf(robot_text("ur_description/urdf/ur5_robot.urdf"))
+    hanging = described.under_gravity((0.0, 0.0, 9.81))
+    options = Preprocessing(14.0, exclude_rows="rests")
+    samples = prepare(each_joint_once(hanging, load), described, options=options)
+    found = find_readings(described, samples, mountings={"upside down": hanging})
+    steps = [step for step in found.steps if step.change.meaning == "mounting"]
+    assert any(step.sure for step in steps) == is_sure
 
 
 def test_what_is_known_is_not_searched_again() -> None:

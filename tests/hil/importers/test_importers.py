@@ -1274,9 +1274,11 @@ class TestRobotOptions:
             return CliRunner().invoke(app, ["look", str(log), "--urdf", str(urdf), *options])
 
         assert "with --lock-others" in str(looked().exception)
-        result = looked("--lock-others")
+        result = looked("--lock-others", "-o", str(place / "named.toml"))
         assert result.exit_code == 0, result.exception
         assert "q_elbow" in result.output
+        # With which it is read again, also where the look says that something is otherwise.
+        assert 'joints = ["elbow"]' in (place / "named.toml").read_text()
 
     @pytest.mark.long
     def test_joints_of_a_bag_are_renamed(self, place: Path) -> None:
