@@ -27,7 +27,7 @@ class LogChannels:
         groups: of channels that differ by the joint only.
         joints: of the robot.
         recorded: joints that the log names, in its order; empty if it names the robot's.
-        arm_joints: number of joints without those of a gripper.
+        arm_joints: number of joints, a gripper's excluded.
         chosen: channels that are given, by quantity.
         nanoseconds: column to be added to a given time.
         sample_rate: replaces the time [Hz].

@@ -26,7 +26,7 @@ class ChannelChoice:
         columns: a name, with ``{}`` for the joint, or a list of names or of indices.
         meaning: quantity and unit, and from what they follow.
         used: names of the channels.
-        nanoseconds: column to be added to that of the time.
+        nanoseconds: column to add to the time.
     """
 
     columns: str | Sequence[str | int]

@@ -223,9 +223,7 @@ def _reviewed(fit: ColumnFit, found: Sequence[Explanation]) -> Iterator[Explanat
         given = fit.knowing(changes[:k] + changes[k + 1 :])
         part = each.change.part
         if part is None:
-            sized = _given_others(given, each)
-            rivals = springs_alike(given, sized, given.score(each.change))
-            yield sized._replace(rivals=rivals)
+            yield _given_others(given, each)._replace(rivals=springs_alike(given, each))
             continue
         score = given.score(each.change)
         if given.known:

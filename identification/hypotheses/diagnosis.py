@@ -324,11 +324,13 @@ def unexplained_share(model: RobotModel, rows: Samples, score: Score) -> float:
     error = score.overall
     if error <= UNEXPLAINED:
         return error
-    free = score_of(model, rows, score.columns, wide_rotors=True, share=_FREE_SHARE)
     factor = Factor.of(model, rows)
     prior = body_prior(model, factor, _FREE_SHARE, wide_rotors=True).gaussian
     fitted = _relative_error(factor, posterior_values(factor, prior, ROWS_PER_FACT)[0])
-    return min(error, free.overall, fitted if fitted <= EXPLAINED_ERROR else error)
+    if fitted <= EXPLAINED_ERROR:
+        return fitted
+    free = score_of(model, rows, score.columns, wide_rotors=True, share=_FREE_SHARE)
+    return min(error, free.overall)
 
 
 def _is_predicted(score: Score, samples: Samples, noise: Array | None) -> bool:

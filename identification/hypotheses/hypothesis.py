@@ -66,7 +66,7 @@ from identification.hypotheses.scores import (
     score_of,
     sigmas_of,
 )
-from identification.hypotheses.springs import may_have_springs, score_with_springs, springs_of
+from identification.hypotheses.springs import may_have_springs, score_with_springs
 from identification.model.robot import RobotModel
 from identification.signals.samples import Samples
 
@@ -327,7 +327,7 @@ class Hypothesis:
         score = score.of_torque(again._torque_scale(()))
         if not fits_alike(score, self.score, self.model):
             return ()
-        return ((springs_of(joints), score.overall),)
+        return ((Change("spring", tuple(joints)), score.overall),)
 
     def _singles(self, but: _Joints | None = None) -> list[Trial]:
         """Return single fitted zeros and scales, other than the best."""

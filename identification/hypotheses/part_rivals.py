@@ -37,21 +37,20 @@ def rivals_of(fit: ColumnFit, found: Explanation, score: ColumnScore) -> tuple[R
     return _other_changes(fit, found, score) or _other_constants(fit, found)
 
 
-def springs_alike(fit: ColumnFit, found: Explanation, score: ColumnScore) -> tuple[Rival, ...]:
+def springs_alike(fit: ColumnFit, found: Explanation) -> tuple[Rival, ...]:
     """Return the spring of a joint that explains as much as another torque constant of it.
 
     Args:
         fit: knows all other changes that were found.
         found: change of whole recordings.
-        score: with it.
     """
     if not found.change.is_constant:
         return ()
     spring = Change("spring", found.change.joints)
-    is_alike = fit.columns(spring).any() and fit.score(spring).ratio_to(score)[0] <= (
-        ALIKE_ERROR_RATIO
-    )
-    return ((spring,),) if is_alike else ()
+    if not fit.columns(spring).any():
+        return ()
+    ratio, _ = fit.score(spring).ratio_to(fit.score(found.change))
+    return ((spring,),) if ratio <= ALIKE_ERROR_RATIO else ()
 
 
 def _other_changes(fit: ColumnFit, found: Explanation, score: ColumnScore) -> tuple[Rival, ...]:

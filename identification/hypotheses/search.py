@@ -327,9 +327,9 @@ def _is_better_without(found: Hypothesis) -> bool:
 
 
 def _is_load(found: Hypothesis, readings: Readings) -> bool:
-    """Return whether a load explains another gravity as well: it turns the weight of a light arm.
+    """Return whether a load explains the rows as well as another gravity does.
 
-    Its mass and another gravity's sign have the same torque where the motion is slow.
+    In slow motion, the torque of a light arm with a heavy load is that of the arm upside down.
     """
     gravities = [step for step in readings.steps if step.change.meaning in GRAVITIES]
     if not gravities:

@@ -14,7 +14,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from identification.arrays import Array
-from identification.hypotheses.joint_changes import Change
 from identification.hypotheses.scores import Score, score_of
 from identification.model.elements import ElementError, PositionTorque
 from identification.model.motion import Motion
@@ -24,11 +23,6 @@ from identification.signals.samples import Samples
 
 _ORDER: Final = 1  # periods per turn, as of a weight
 _SPREAD: Final = 3.0  # standard deviation of a coefficient, of torque and weight of its joint
-
-
-def springs_of(joints: Sequence[int]) -> Change:
-    """Return the springs of some joints as a change."""
-    return Change("spring", tuple(joints))
 
 
 def may_have_springs(model: RobotModel, samples: Samples) -> tuple[int, ...]:
@@ -68,13 +62,6 @@ def score_with_springs(
 
 def _largest(model: RobotModel, samples: Samples) -> Array:
     """Return the largest torque of each joint, measured or of the described weight (n,)."""
-    weight = model.torque(_bodies(model), Motion.at_rest(samples.motion.position))
+    weight = model.torque(model.nominal_values, Motion.at_rest(samples.motion.position))
     torque = np.where(samples.usable, samples.torque, 0.0)
     return np.asarray(np.abs(torque).max(axis=0) + np.abs(weight).max(axis=0))
-
-
-def _bodies(model: RobotModel) -> Array:
-    """Return the parameters (p,) of the described bodies, without friction."""
-    values = np.zeros(model.n_parameters)
-    values[: model.base.rank] = model.base.grouping @ model.nominal
-    return values

@@ -319,6 +319,14 @@ class RobotModel:
         values[self.layout.links] = self.chain.inertial
         return values
 
+    @property
+    def nominal_values(self) -> Array:
+        """Parameters (p,) of the URDF's bodies and of nominal springs, without friction."""
+        values = np.zeros(self.n_parameters)
+        values[: self.base.rank] = self.base.grouping @ self.nominal
+        values[self.element_part] = self.elements.nominal
+        return values
+
     def regressor(self, motion: Motion) -> Regressor:
         """Return W for m samples of motion; without a load, the URDF's bodies are the load.
 
@@ -391,10 +399,7 @@ class RobotModel:
         """
         if not self.friction.has_load or motion.load is not None:
             return motion
-        values = np.zeros(self.n_parameters)
-        values[: self.base.rank] = self.base.grouping @ self.nominal
-        values[self.element_part] = self.elements.nominal
-        return replace(motion, load=self.gear_torque(values, motion))
+        return replace(motion, load=self.gear_torque(self.nominal_values, motion))
 
     def _checked(self, values: Array) -> Array:
         values = np.asarray(values, dtype=np.float64)

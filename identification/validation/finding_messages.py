@@ -540,7 +540,7 @@ SENTENCES: Final[Mapping[FindingKey, Sentence]] = {
     ),
     "spring": _fault(
         "springs",
-        "a torque of its own angle acts on {axes}, as of a spring, a balancer or a cable",
+        "{axes} has a torque that depends on its own angle, as from a spring, balancer or cable",
     ),
     "torque constant, as assumed": Sentence(
         "torque constant",

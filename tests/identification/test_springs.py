@@ -15,7 +15,6 @@ from identification.hypotheses.inertia_scale import find_inertia_scale
 from identification.hypotheses.joint_changes import Change
 from identification.hypotheses.scores import score_of
 from identification.hypotheses.search import find_readings
-from identification.hypotheses.springs import springs_of
 from identification.signals.samples import Preprocessing, Samples, prepare
 from tests.hil.simulated_logs import Simulated, simulate
 from tests.identification import three_axes
@@ -69,7 +68,7 @@ def test_a_spring_is_no_certain_scale_of_a_torque(moved_panda: Simulated) -> Non
     assert step.change[:2] == ("scale", (WRIST,))
     assert not step.sure
     (best, error), *_ = step.springs
-    assert best == springs_of([WRIST])
+    assert best == Change("spring", (WRIST,))
     assert error < 0.6 * step.error
 
 
@@ -106,7 +105,7 @@ def test_a_spring_that_bodies_cannot_imitate_is_named(size: float, phase: float)
     torque = simulated.torque + spring(simulated, ELBOW, size, phase)
     samples = samples_of(model, simulated, torque)
     (found,) = explain_errors(model, samples, np.zeros(model.n_joints))
-    assert found.change == springs_of([ELBOW])
+    assert found.change == Change("spring", (ELBOW,))
     assert found.is_certain
 
 
